@@ -47,29 +47,18 @@ def fingerprint() -> str:
 
 
 class Membership:
-    """What a process says of itself in a run: its join, dones and bye.
-
-    Args:
-        name: of the process, role.thing.
-        host: that it runs on.
-        run_id: of the run.
-        next_seq: returns the number of its next message of a kind, from 0.
-        serves: names of processes whose work it does.
-        period_ns: how often it says done; 0 for never.
-        slack_ns: by how much the world may be ahead of the dones of one without a period; 0 for any.
-        calculates: whether its results depend on its arithmetic; else it states no fingerprint.
-    """
+    """What a process says of itself in a run: its join, dones and bye."""
 
     def __init__(
         self,
-        name: str,
-        host: str,
-        run_id: str,
-        next_seq: Callable[[str], int],
-        serves: tuple[str, ...] = (),
-        period_ns: int = 0,
-        slack_ns: int = 0,
-        calculates: bool = True,
+        name: str,  # of the process, role.thing
+        host: str,  # that it runs on
+        run_id: str,  # of the run
+        next_seq: Callable[[str], int],  # returns the number of its next message of a kind, from 0
+        serves: tuple[str, ...] = (),  # names of processes whose work it does
+        period_ns: int = 0,  # how often it says done; 0 for never
+        slack_ns: int = 0,  # by how much the world may be ahead of the dones of one without a period; 0 for any
+        calculates: bool = True,  # whether its results depend on its arithmetic; else it states no fingerprint
     ) -> None:
         self._name, self._host, self._run_id, self._next_seq = name, host, run_id, next_seq
         self._serves, self._period_ns, self._slack_ns = serves, period_ns, slack_ns

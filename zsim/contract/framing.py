@@ -94,16 +94,11 @@ class GateMessages:
         t_ns: int,
         seq: int,
         table: tuple[str, ...],
-        pairs: Sequence[tuple[str, bytes]],
-        stamps: Sequence[int] | None = None,
+        pairs: Sequence[tuple[str, bytes]],  # keys, which are in the table, and payloads
+        stamps: Sequence[int] | None = None,  # t_ns of each [ns]; None stamps all with the gate
         first: Sequence[int] = (),
     ) -> "GateMessages":
-        """Return encoded messages as one object.
-
-        Args:
-            pairs: keys, which are in the table, and payloads.
-            stamps: t_ns of each [ns]; None stamps all with the gate.
-        """
+        """Return encoded messages as one object."""
         places = _places(table)
         which = np.array([places[key] for key, _ in pairs], dtype=np.int64)
         ends = np.cumsum([GAP + len(payload) for _, payload in pairs])

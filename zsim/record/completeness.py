@@ -168,18 +168,13 @@ class _Numbers:
 
 def completeness(
     reader: RecordReader,
-    keys_beside: Container[str] = (),
+    keys_beside: Container[str] = (),  # of messages that are wanted as well, which saves reading the record twice
+    # of messages of which the first in every simulated second and the last are wanted; there may be more
     keys_sampled: Container[str] = (),
+    # called with key and payload of each of these, in the order in which they were written
     take: Callable[[str, bytes], None] = lambda key, payload: None,
 ) -> Completeness:
-    """Return what is missing from a record; all of it is read, and every checksum compared.
-
-    Args:
-        keys_beside: of messages that are wanted as well, which saves reading the record twice.
-        keys_sampled: of messages of which the first in every simulated second and the last are wanted; there may be
-            more.
-        take: called with key and payload of each of these, in the order in which they were written.
-    """
+    """Return what is missing from a record; all of it is read, and every checksum compared."""
     info: messages.Info | None = None
     with suppress(DecodeError):
         info = messages.decode(keys.INFO, last.payload) if (last := reader.last(keys.INFO)) else None

@@ -42,20 +42,15 @@ class _Route(NamedTuple):
 
 
 class Bus:
-    """The keys of one process: every message goes to the sink, the world and the inboxes that read it.
-
-    Args:
-        agents: in the order in which they are stepped.
-        sink: takes every message in order of publication.
-        gate_sink: takes the world's messages of a gate; without it the sink is given each one decoded.
-    """
+    """The keys of one process: every message goes to the sink, the world and the inboxes that read it."""
 
     def __init__(
         self,
         coordinator: SteppedWorld,
-        agents: Sequence[Agent],
+        agents: Sequence[Agent],  # in the order in which they are stepped
         wall_ns: Callable[[], int],
-        sink: Callable[[str, Any], None] = lambda key, message: None,
+        sink: Callable[[str, Any], None] = lambda key, message: None,  # takes every message in order of publication
+        # takes the world's messages of a gate; without it the sink is given each one decoded
         gate_sink: Callable[[GateMessages], None] | None = None,
     ) -> None:
         self._coordinator = coordinator

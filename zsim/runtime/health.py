@@ -21,9 +21,6 @@ ALLOCATIONS = 50_000  # between two collections, chosen: a gate allocates hundre
 class HealthMeter:
     """Counters of one process.
 
-    Args:
-        reads: the expressions that it subscribes to, as its session keeps them.
-
     Attributes:
         received, refused, dropped: messages taken in, messages not decodable, and gates given up.
     """
@@ -33,7 +30,7 @@ class HealthMeter:
         role: str,
         wall_s: Callable[[], float] = time.monotonic,
         host: str | None = None,
-        reads: Sequence[str] = (),
+        reads: Sequence[str] = (),  # the expressions that it subscribes to, as its session keeps them
     ) -> None:
         self._role = role
         self._host = host or socket.gethostname()

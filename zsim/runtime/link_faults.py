@@ -77,23 +77,17 @@ def place_of(process: str, places: Mapping[str, Any], where: Callable[[str], Poi
 
 
 def total_delay_ns(
-    faults: Iterable[Fault],
-    seed: int,
-    link: str,
-    key: str,
+    faults: Iterable[Fault],  # that act on its link
+    seed: int,  # of the scenario
+    link: str,  # name of the link's stream: its receiver
+    key: str,  # which is sent
     message: Any,
+    # returns that between sender and receiver for a radio, None where it is not known
     distance_m: Callable[[Fault], float | None] = lambda fault: None,
 ) -> int | None:
     """Return how much later a message comes because of several faults [ns]; NEVER if one of them loses it.
 
     A message comes over a radio with the probability 1 / (1 + exp((d - range) / spread)).
-
-    Args:
-        faults: that act on its link.
-        seed: of the scenario.
-        link: name of the link's stream: its receiver.
-        key, message: which is sent.
-        distance_m: returns that between sender and receiver for a radio, None where it is not known.
     """
     total_ns = 0
     for fault in faults:

@@ -42,13 +42,6 @@ GATES_KEPT = 2  # gates of which the outputs are kept to answer a get (contract)
 class Participant:
     """One process in one run.
 
-    Args:
-        name: process name, role.thing.
-        serves: names of processes whose work it does.
-        slack_ns: how far the world may be ahead of what it has reported as done; 0 for a process that never gates.
-        period_ns: how often an agent reports done; 0 for other processes.
-        calculates: whether its results depend on its arithmetic; otherwise its join states no fingerprint.
-
     Attributes:
         admitted: whether the world has admitted its newest incarnation.
         successor: host and pid of the process that has taken over the name; empty while it has the name.
@@ -59,11 +52,13 @@ class Participant:
         self,
         link: Session,
         info: messages.Info,
-        name: str,
-        serves: tuple[str, ...] = (),
+        name: str,  # process name, role.thing
+        serves: tuple[str, ...] = (),  # names of processes whose work it does
+        # how far the world may be ahead of what it has reported as done; 0 for a process that never gates
         slack_ns: int = 0,
         *,
-        period_ns: int = 0,
+        period_ns: int = 0,  # how often an agent reports done; 0 for other processes
+        # whether its results depend on its arithmetic; otherwise its join states no fingerprint
         calculates: bool = True,
         next_seq: Callable[[str], int] | None = None,
     ) -> None:
@@ -200,22 +195,17 @@ class AgentParticipant(Participant):
     """The process of an agent in one run.
 
     Whatever the world does not answer is asked for again, until it does (`settle`).
-
-    Args:
-        agent: whose name and sequence numbers it uses.
-        take_in: takes the messages that a replay brings.
-        stopped: tells whether the process is to end.
     """
 
     def __init__(
         self,
         link: Session,
         info: messages.Info,
-        agent: Agent,
-        take_in: Callable[[ReceivedSample], None],
+        agent: Agent,  # whose name and sequence numbers it uses
+        take_in: Callable[[ReceivedSample], None],  # takes the messages that a replay brings
         say: Callable[[str], None],
         wall_s: Callable[[], float] = time.monotonic,
-        stopped: Callable[[], bool] = lambda: False,
+        stopped: Callable[[], bool] = lambda: False,  # tells whether the process is to end
     ) -> None:
         super().__init__(link, info, agent.name, agent.serves, period_ns=agent.period_ns, next_seq=agent.next_seq)
         self._agent = agent

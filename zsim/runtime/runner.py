@@ -33,24 +33,18 @@ VIEW_PERIOD_S = 1 / 20  # contract: at most 30 Hz wall; a console draws 20 pictu
 
 
 class Runner:
-    """One agent on one session.
-
-    Args:
-        stopped: asked every TICK_S; True ends the process with a bye.
-        deserted: asked at the end; True leaves without a bye, as a process that dies, so that the world waits for a
-            successor.
-        snapshot_ns: simulated time between two snapshots of the agent; 0 for none.
-    """
+    """One agent on one session."""
 
     def __init__(
         self,
         link: Session,
         info: messages.Info,
         agent: Agent,
-        stopped: Callable[[], bool] = lambda: False,
+        stopped: Callable[[], bool] = lambda: False,  # asked every TICK_S; True ends the process with a bye
         say: Callable[[str], None] = lambda text: None,
+        # asked at the end; True leaves without a bye, as a process that dies, so that the world waits for a successor
         deserted: Callable[[], bool] = lambda: False,
-        snapshot_ns: int = 0,
+        snapshot_ns: int = 0,  # simulated time between two snapshots of the agent; 0 for none
     ) -> None:
         self._link = link
         self._info = info

@@ -190,10 +190,10 @@ def unstated(kind: FaultKind, parameters: Mapping[str, Any]) -> list[FaultParame
 
 
 def planned(
-    description: Mapping[str, Any],
-    number: int,
+    description: Mapping[str, Any],  # without flaws
+    number: int,  # its id
     source: str,
-    now_ns: int,
+    now_ns: int,  # when it begins where `at_s` is left out
     gate_ns: int,
     kinds: Mapping[str, FaultKind] = KINDS,
 ) -> Fault:
@@ -201,11 +201,6 @@ def planned(
 
     It acts in the gates after `from_ns` up to `until_ns`: on what happens between these instants, and on messages that
     belong to those gates.
-
-    Args:
-        description: without flaws.
-        number: its id.
-        now_ns: when it begins where `at_s` is left out.
     """
     kind, at_s, for_s = kinds[description["kind"]], description.get("at_s"), description.get("for_s")
     from_ns = now_ns if at_s is None else round(at_s * 1e9 / gate_ns) * gate_ns

@@ -70,21 +70,15 @@ def route(
 
 @contextmanager
 def connect(
-    endpoint: str,
+    endpoint: str,  # e.g. "tcp/192.168.1.2:7447"
     federation: str,
-    mode: Mode = "lockstep",
-    wait_s: float | None = None,
+    mode: Mode = "lockstep",  # of the run, if it is known already
+    wait_s: float | None = None,  # how long to try; None tries once
+    # whether it never gates; then a silence of LEASE_READER_MS counts as its death, in lockstep too
     reader: bool = False,
-    identity: Identity | None = None,
+    identity: Identity | None = None,  # host and certificate; by default this host's name and no TLS
 ) -> Iterator[Session]:
     """Open a client of the hub (or of a router).
-
-    Args:
-        endpoint: e.g. "tcp/192.168.1.2:7447".
-        mode: of the run, if it is known already.
-        wait_s: how long to try; None tries once.
-        reader: whether it never gates; then a silence of LEASE_READER_MS counts as its death, in lockstep too.
-        identity: host and certificate; by default this host's name and no TLS.
 
     Raises:
         SessionError: nobody listens there within `wait_s`, or a certificate, here or there, is refused.
@@ -136,23 +130,16 @@ def no_listening(endpoints: Sequence[str], error: str) -> str:
 
 @contextmanager
 def find_world(
-    endpoint: str,
+    endpoint: str,  # see `connect`
     federation: str,
-    wait_s: float | None = None,
-    say: Callable[[str], None] = lambda text: None,
-    stopped: Callable[[], bool] = lambda: False,
+    wait_s: float | None = None,  # how long to wait for a world; None waits for ever
+    say: Callable[[str], None] = lambda text: None,  # called at growing intervals with what is waited for
+    stopped: Callable[[], bool] = lambda: False,  # tells whether to wait no longer
     reader: bool = False,
-    run_id: str | None = None,
+    run_id: str | None = None,  # of the only run to take part in; None takes any
     identity: Identity | None = None,
 ) -> Iterator[tuple[Session, messages.Info]]:
     """Yield a session and the `world/info` of the run that it belongs to.
-
-    Args:
-        endpoint, federation, reader, identity: see `connect`.
-        wait_s: how long to wait for a world; None waits for ever.
-        say: called at growing intervals with what is waited for.
-        stopped: tells whether to wait no longer.
-        run_id: of the only run to take part in; None takes any.
 
     Raises:
         NoWorldError: no world answered within `wait_s`, or `stopped` returned true.

@@ -76,17 +76,13 @@ class _Backlog:
 
 
 class LinkWatch:
-    """Watches the links of the hub, in a thread of its own while it is entered.
-
-    Args:
-        awaited: returns the participants that must not lose anything.
-    """
+    """Watches the links of the hub, in a thread of its own while it is entered."""
 
     def __init__(
         self,
         link: Session,
         tokens: "SessionTokens",
-        awaited: Callable[[], list[Awaited]],
+        awaited: Callable[[], list[Awaited]],  # returns the participants that must not lose anything
         sockets: "LinkSockets | None" = None,
         wall_s: Callable[[], float] = time.monotonic,
     ) -> None:
