@@ -14,29 +14,7 @@ from mcap.records import Channel
 from numpy.typing import NDArray
 
 from zsim.errors import RecordError
-from zsim.record.mcap_layout import (
-    HEAD,
-    INDEX_ENTRY,
-    INDEX_HEAD,
-    MAGIC,
-    MESSAGE,
-    PIECE_BYTES,
-    Index,
-    RecordSpan,
-    Source,
-    check_magic,
-    chunk_head,
-    content_of,
-    crc_until,
-    groups,
-    heads_at,
-    indexes_of,
-    is_complete,
-    is_cut,
-    places,
-    unmap,
-    unpacked,
-)
+from zsim.record import mcap_layout as layout
 
 SHOWN = 3  # gaps, or damaged chunks, in one line; how many more there are is shown
 CRC = struct.Struct("<I")  # of all that stands before the data's end; MCAP has 0 where none was computed
@@ -63,11 +41,11 @@ class MessageSpans(NamedTuple):
 
 
 class _Chunk(NamedTuple):
-    place: RecordSpan
+    place: layout.RecordSpan
     first_ns: int
     last_ns: int
     channels: frozenset[int]
-    indexes: tuple[Index, ...]
+    indexes: tuple[layout.Index, ...]
 
 
 _Held = tuple[int, int, Recorded]  # simulated time, number of its chunk, message
@@ -93,15 +71,15 @@ class RecordReader:
         try:
             with open(path, "rb") as file:
                 empty = not self.path.stat().st_size
-                self._source: Source = b"" if empty else mmap(file.fileno(), 0, access=ACCESS_READ)
+                self._source: layout.Source = b"" if empty else mmap(file.fileno(), 0, access=ACCESS_READ)
         except OSError as error:
             raise RecordError(f"{path}: cannot be read ({error.strerror})") from error
-        check_magic(self._source, self.path)
-        self.complete = is_complete(self._source)  # the record was closed, not cut
+        layout.check_magic(self._source, self.path)
+        self.complete = layout.is_complete(self._source)  # the record was closed, not cut
         self._keys: dict[int, str] = {}
-        self._data_end: RecordSpan | None = None
+        self._data_end: layout.RecordSpan | None = None
         self._rest: int | None = None  # from where on nothing can be read, if so
-        self._damaged: set[RecordSpan] = set()  # chunks
+        self._damaged: set[layout.RecordSpan] = set()  # chunks
         self._chunks = list(self._scan())
 
     def topics(self) -> dict[str, int]:
@@ -136,34 +114,36 @@ class RecordReader:
         for chunk in self._chunks:
             if chunk.channels.isdisjoint(wanted):
                 continue
-            content = content_of(self._source, chunk.place)
+            content = layout.content_of(self._source, chunk.place)
             if content is None:
                 self._damaged.add(chunk.place)
                 continue
             channel, places = self._indexed(chunk, content)
             mapped += chunk.place.end - chunk.place.start
-            if mapped > PIECE_BYTES:
-                unmap(self._source)
+            if mapped > layout.PIECE_BYTES:
+                layout.unmap(self._source)
                 mapped = 0
             rows = np.isin(channel, list(wanted))
             starts = places[rows]
-            heads = heads_at(content, starts)
-            ends = starts + HEAD.size + heads["length"].astype(np.int64)
-            yield MessageSpans(content, channel[rows], starts + MESSAGE.size, ends, heads["log_time"].astype(np.int64))
+            heads = layout.heads_at(content, starts)
+            ends = starts + layout.HEAD.size + heads["length"].astype(np.int64)
+            times = heads["log_time"].astype(np.int64)
+            yield MessageSpans(content, channel[rows], starts + layout.MESSAGE.size, ends, times)
 
     def _indexed(self, chunk: _Chunk, content: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return channel and place of every message of a chunk: by its indexes, if they lead to all of its content."""
-        at = [(index.start + HEAD.size + INDEX_HEAD.size, INDEX_ENTRY * index.messages) for index in chunk.indexes]
+        head = layout.HEAD.size + layout.INDEX_HEAD.size
+        at = [(index.start + head, layout.INDEX_ENTRY * index.messages) for index in chunk.indexes]
         data = b"".join([self._source[start : start + size] for start, size in at])
         if data and len(data) == sum(size for _, size in at):  # a damaged size may lead beyond the end of the file
             places = np.frombuffer(data, "<u8")[1::2].astype(np.int64)
             channel = np.repeat([index.channel for index in chunk.indexes], [index.messages for index in chunk.indexes])
-            if places.min() >= 0 and places.max() <= len(content) - MESSAGE.size:
-                heads = heads_at(content, places)
-                is_whole = int(heads["length"].sum()) + HEAD.size * len(places) == len(content)
+            if places.min() >= 0 and places.max() <= len(content) - layout.MESSAGE.size:
+                heads = layout.heads_at(content, places)
+                is_whole = int(heads["length"].sum()) + layout.HEAD.size * len(places) == len(content)
                 if is_whole and (heads["opcode"] == Opcode.MESSAGE).all() and (heads["channel"] == channel).all():
                     return channel.astype(np.int64), places
-        found = indexes_of(content)
+        found = layout.indexes_of(content)
         channel = np.repeat(list(found), [len(each) // 2 for each in found.values()])
         places = [place for each in found.values() for place in each[1::2]]
         return channel.astype(np.int64), np.array(places, dtype=np.int64)
@@ -171,7 +151,7 @@ class RecordReader:
     @property
     def damaged(self) -> tuple[str, ...]:
         """Return the damage found so far; everything behind unreadable records is one entry."""
-        heads = [(place.start, chunk_head(self._source, place)) for place in sorted(self._damaged)]
+        heads = [(place.start, layout.chunk_head(self._source, place)) for place in sorted(self._damaged)]
         span = "the chunk at byte {}, {:.2f} to {:.2f} s"
         chunks = [span.format(at, head.first_ns / 1e9, head.last_ns / 1e9) for at, head in heads]
         return tuple(chunks if self._rest is None else [*chunks, f"everything from byte {self._rest} on"])
@@ -184,7 +164,7 @@ class RecordReader:
         if not self.complete or self._data_end is None:
             return False
         stated = CRC.unpack_from(self._source, self._data_end.body)[0]
-        return stated not in (0, crc_until(self._source, self._data_end.start))
+        return stated not in (0, layout.crc_until(self._source, self._data_end.start))
 
     def last(self, key: str) -> Recorded | None:
         """Return the message of a key that was written last, None if there is none."""
@@ -218,45 +198,45 @@ class RecordReader:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _places(self) -> Iterator[RecordSpan]:
+    def _places(self) -> Iterator[layout.RecordSpan]:
         """Yield all records, and note the channels, which may be in the summary only, and where the data ends."""
-        opcode, end = 0, len(MAGIC)
-        for place in places(self._source):
+        opcode, end = 0, len(layout.MAGIC)
+        for place in layout.places(self._source):
             opcode, end = place.opcode, place.end
             if opcode == Opcode.CHANNEL:
-                channel = unpacked(Channel, self._source, place)
+                channel = layout.unpacked(Channel, self._source, place)
                 self._keys[channel.id] = channel.topic
             elif opcode == Opcode.DATA_END:
                 self._data_end = self._data_end or place
             yield place
-        if opcode != Opcode.FOOTER and (self.complete or not is_cut(self._source, end)):
+        if opcode != Opcode.FOOTER and (self.complete or not layout.is_cut(self._source, end)):
             self._rest = end
 
     def _scan(self) -> Iterator[_Chunk]:
         known: dict[frozenset[int], frozenset[int]] = {}  # most chunks hold the same channels
         found = self._places()
-        chunk_groups = [group for group in groups(self._source, found) if group.place.opcode == Opcode.CHUNK]
+        chunk_groups = [group for group in layout.groups(self._source, found) if group.place.opcode == Opcode.CHUNK]
         for _ in found:  # of the summary
             continue
         for place, indexes, _ in chunk_groups:
             counts = {index.channel: index.messages for index in indexes}
             if place is chunk_groups[-1].place and not self.complete:  # its indexes may have been cut
-                content = content_of(self._source, place)
+                content = layout.content_of(self._source, place)
                 if content is None:
                     self._damaged.add(place)
-                counts = {channel: len(entries) // 2 for channel, entries in indexes_of(content or b"").items()}
+                counts = {channel: len(entries) // 2 for channel, entries in layout.indexes_of(content or b"").items()}
                 indexes = ()
             self._counts.update(counts)
-            head, channels = chunk_head(self._source, place), frozenset(counts)
+            head, channels = layout.chunk_head(self._source, place), frozenset(counts)
             yield _Chunk(place, head.first_ns, head.last_ns, known.setdefault(channels, channels), indexes)
 
     def _as_written(self, chunks: list[_Chunk], wanted: dict[int, str]) -> Iterator[Recorded]:
         for chunk in chunks:
-            content = content_of(self._source, chunk.place)
+            content = layout.content_of(self._source, chunk.place)
             if content is None:
                 self._damaged.add(chunk.place)
                 continue
-            unpack, payload, head = MESSAGE.unpack_from, MESSAGE.size, HEAD.size
+            unpack, payload, head = layout.MESSAGE.unpack_from, layout.MESSAGE.size, layout.HEAD.size
             if chunk.channels <= wanted.keys():  # without its indexes
                 at, end = 0, len(content) - payload
                 while at <= end:

@@ -6,18 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from yaml import events
 from yaml.error import MarkedYAMLError
-from yaml.events import (
-    AliasEvent,
-    DocumentEndEvent,
-    DocumentStartEvent,
-    MappingEndEvent,
-    ScalarEvent,
-    SequenceEndEvent,
-    SequenceStartEvent,
-    StreamEndEvent,
-    StreamStartEvent,
-)
 
 from zsim.errors import DocumentError
 from zsim.schema.checker import show
@@ -100,11 +90,11 @@ class _Reader:
 
     def document(self) -> Any:
         """Return the content of the only document; None of an empty text."""
-        content, event = None, self._after(StreamStartEvent)
-        if isinstance(event, DocumentStartEvent):
+        content, event = None, self._after(events.StreamStartEvent)
+        if isinstance(event, events.DocumentStartEvent):
             content = self._node(next(self._events), 0)
-            event = self._after(DocumentEndEvent)
-        if not isinstance(event, StreamEndEvent):
+            event = self._after(events.DocumentEndEvent)
+        if not isinstance(event, events.StreamEndEvent):
             raise _refusal("a second document is not allowed", event)
         return content
 
@@ -115,28 +105,28 @@ class _Reader:
 
     def _node(self, event: Any, depth: int) -> Any:
         self._count += 1
-        if isinstance(event, AliasEvent):
+        if isinstance(event, events.AliasEvent):
             raise _refusal("aliases are not allowed", event)
         if event.tag is not None:
             raise _refusal("tags are not allowed", event)
         if self._count > VALUES_MAX:
             raise _refusal(f"there are more than {VALUES_MAX} keys and values", event)
-        if isinstance(event, ScalarEvent):
+        if isinstance(event, events.ScalarEvent):
             return _word(event.value) if event.implicit[0] else event.value
         if depth == DEPTH_MAX:
             raise RecursionError
-        return self._list(depth + 1) if isinstance(event, SequenceStartEvent) else self._map(depth + 1)
+        return self._list(depth + 1) if isinstance(event, events.SequenceStartEvent) else self._map(depth + 1)
 
     def _list(self, depth: int) -> list[Any]:
         items: list[Any] = []
-        while not isinstance(event := next(self._events), SequenceEndEvent):
+        while not isinstance(event := next(self._events), events.SequenceEndEvent):
             items.append(self._node(event, depth))
         return items
 
     def _map(self, depth: int) -> dict[Any, Any]:
         content: dict[Any, Any] = {}
         written: set[str] = set()
-        while not isinstance(event := next(self._events), MappingEndEvent):
+        while not isinstance(event := next(self._events), events.MappingEndEvent):
             key = self._node(event, depth)
             if isinstance(key, list | dict):
                 raise _refusal(f"a key is {show(key)}; must be text or a number", event)
