@@ -36,9 +36,7 @@ T = TypeVar("T")
 def key_table(drones: Sequence[str], own: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the keys of the world's messages about some drones, drone by drone in the order of KINDS.
 
-    Args:
-        drones: their names.
-        own: names of the users' sensors of the run, and that of the sightings; their keys follow those of KINDS.
+    `own` names the users' sensors of the run, and the sightings; their keys follow those of KINDS.
     """
     kinds = (*KINDS, *own)
     return tuple(keys.truth(d) if kind == "truth" else keys.sensor(d, kind) for d in drones for kind in kinds)
@@ -130,10 +128,7 @@ class GateMessages:
         return len(self.which)
 
     def check(self) -> None:
-        """Refuse columns that point outside of table or buffer, and stamps that are no times.
-
-        DecodeError with what is wrong.
-        """
+        """Raise DecodeError for columns that point outside of table or buffer, and for stamps that are no times."""
         which, stamps, ends = self.which.tolist(), self.stamps.tolist(), self.ends.tolist()
         if not ends or ends[-1] != len(self.buffer) or min(map(sub, ends, [0, *ends])) < GAP:
             _refuse("its payloads are not one behind the other")
@@ -160,11 +155,7 @@ class GateMessages:
 
 
 class PerPattern(Generic[T]):
-    """A cache of what a reader derives from the keys of a gate, since the same keys come again and again.
-
-    Args:
-        learn: derives it.
-    """
+    """A cache of what a reader derives, by `learn`, from the keys of a gate: the same keys come again and again."""
 
     def __init__(self, learn: Callable[[GateMessages], T]) -> None:
         self._learn = learn
@@ -172,7 +163,6 @@ class PerPattern(Generic[T]):
         self._known: dict[bytes, T] = {}
 
     def of(self, gate: GateMessages) -> T:
-        """Return what `learn` returned for a gate with this table and these keys."""
         if gate.table is not self._table:
             self._table = gate.table
             self._known.clear()

@@ -188,7 +188,7 @@ def is_output(key: str) -> bool:
 
 
 def output_type(key: str) -> type[Struct]:
-    """Return the message that an agent may return on a key from a step; DecodeError if none."""
+    """Return the message that an agent may return on a key from a step; DecodeError if there is none."""
     kind = type_of(key)
     if kind is None:
         raise DecodeError(f"{key:.80}: is no key of the contract; see docs/protocol.md")
@@ -209,10 +209,7 @@ def encoding(key: str) -> str:
 
 
 def decode(key: str, payload: bytes) -> Any:
-    """Return the message on `key`, checked for type, shape and finiteness.
-
-    DecodeError that names key, field, found and allowed.
-    """
+    """Return the message on `key`; a DecodeError for type, shape or infinity names key, field, found and allowed."""
     kind, read = _reader_of(key)
     if kind is None:
         raise DecodeError(f"{key:.80}: is no key of the contract; see docs/protocol.md")
@@ -232,10 +229,8 @@ def decode_as(kind: type[Struct], payload: bytes, where: str) -> Any:
 
 def fault_at(key: str, error: Exception) -> str:
     """Return the text of a refusal without the key with which it opens."""
-    text = str(error)
-    return next(
-        (text.removeprefix(where) for where in (f"{key}: ", f"{_shown(key)}: ") if text.startswith(where)), text
-    )
+    text, where = str(error), key if len(key) <= 80 or str(error).startswith(key) else _shown(key)
+    return text.removeprefix(f"{where}: ")
 
 
 def _shown(where: str) -> str:
