@@ -304,9 +304,7 @@ class Session:
         self._check("publish", key)
         with _key_errors(key):
             publisher = self._raw.declare_publisher(
-                self._prefix + key,
-                encoding=zenoh.Encoding(encoding),
-                congestion_control=zenoh.CongestionControl.DROP,
+                self._prefix + key, encoding=zenoh.Encoding(encoding), congestion_control=zenoh.CongestionControl.DROP
             )
         self._keep(publisher)
         return lambda payload, attachment: publisher.put(payload, attachment=attachment)

@@ -124,13 +124,7 @@ def test_other_tools_find_encoding_schema_and_sequence(tmp_path):
     path = tmp_path / "run.mcap"
     with RecordWriter(path) as writer:
         for i in range(3):
-            writer.add(
-                "clock",
-                messages.encode(Clock(i, i, "r", i, "running", 1.0)),
-                messages.encoding("clock"),
-                i,
-                i,
-            )
+            writer.add("clock", messages.encode(Clock(i, i, "r", i, "running", 1.0)), messages.encoding("clock"), i, i)
         writer.add("own/pose", b"\x80", "application/msgpack;Pose", 3, 3)
         writer.add("own/text", b"{}", "application/json", 4, 4)
     with open(path, "rb") as file:

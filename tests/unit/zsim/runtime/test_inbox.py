@@ -415,10 +415,7 @@ def baro_pair(drone: str, t_ns: int = GATE_NS) -> tuple[str, bytes]:
 def test_each_reader_gets_what_it_reads_of_a_gate_decoded_once() -> None:
     router = GateRouter(RoutingTable([["drone/*/sensor/status"], [keys.status("d2")], []]))
     routed = list(router.split(gate_messages(baro_pair("d1"), status_pair("d1"), baro_pair("d2"), status_pair("d2"))))
-    assert [(key, readers) for readers, key, _ in routed] == [
-        (keys.status("d1"), (0,)),
-        (keys.status("d2"), (0, 1)),
-    ]
+    assert [(key, readers) for readers, key, _ in routed] == [(keys.status("d1"), (0,)), (keys.status("d2"), (0, 1))]
     assert routed[0][2].count == 2
 
 
@@ -440,11 +437,6 @@ def test_messages_of_a_gate_come_among_the_others_in_canonical_order() -> None:
     other = (keys.estimate("d1"), Status(GATE_NS, 1, "flying", 90.0, False, None, 1))
     router = GateRouter(RoutingTable([["**"]]))
     inputs = [(keys.GATE, gate_messages(status_pair("d2"), baro_pair("d1"), baro_pair("d3", GATE_NS - 1))), other]
-    names = [
-        keys.sensor("d3", "baro"),
-        keys.estimate("d1"),
-        keys.sensor("d1", "baro"),
-        keys.status("d2"),
-    ]
+    names = [keys.sensor("d3", "baro"), keys.estimate("d1"), keys.sensor("d1", "baro"), keys.status("d2")]
     assert [key for key, _ in router.one_by_one(inputs)] == names
     assert router.one_by_one([other]) == [other]
