@@ -215,50 +215,48 @@ class Runner:
             self._member.publish_health()
 
     def _serve_rare(self) -> None:
-        while self._inputs.notices:
-            self._serve_notice(self._inputs.notices.popleft())
-        while self._inputs.links:
-            up = self._inputs.links.popleft()
-            was_lost, self.health.link_lost = self.health.link_lost, not up
-            if not up:
+        while self._inputs.rare:
+            arrived = self._inputs.rare.popleft()
+            if isinstance(arrived, WorldEvent):
+                self._serve_event(arrived)
+            elif isinstance(arrived, Query):
+                self._serve_query(arrived)
+            elif not arrived:
+                self.health.link_lost = True
                 self._say(f"{self._agent.name}: lost the link to the world; waiting for it to come back")
-            elif was_lost:
+            elif self.health.link_lost:
+                self.health.link_lost = False
                 self._say(f"{self._agent.name}: the link is back")
                 self._member.come_back()
-        while self._inputs.queries:
-            query = self._inputs.queries.popleft()
-            try:
-                if query.expression == keys.process(self._agent.name, "outputs"):
-                    answer = ControlAnswer(ok=True, result=self._member.outputs())
-                else:
-                    answer = self._agent.control(query.expression, query.request())
-            except DecodeError as error:
-                answer = ControlAnswer(ok=False, error=str(error))
-            query.answer(answer)
         if not self.health.link_lost:
             self._member.settle()
         if self._member.failure:
             self._leave = str(self._member.failure)
 
-    def _serve_notice(self, read: WorldEvent) -> None:
-        if isinstance(read.data, RunEnd):
-            self._end_ns = read.data.last_ns
+    def _serve_event(self, event: WorldEvent) -> None:
+        if isinstance(event.data, RunEnd):
+            self._end_ns = event.data.last_ns
             self._end_wall_s = time.monotonic()
-        elif read.kind in ("drop", "leave"):
-            self._inputs.ignore_estimates(read.subject)
-        elif isinstance(read.data, ProcessEntry) and read.subject == self._agent.name:
-            self._member.take_entry(read.data)
-        elif isinstance(read.data, ProcessEntry) and read.kind == "join":
-            self._inputs.expect_estimates(read.subject, read.data.from_ns)
+        elif event.kind in ("drop", "leave"):
+            self._inputs.ignore_estimates(event.subject)
+        elif isinstance(event.data, ProcessEntry) and event.subject == self._agent.name:
+            self._member.take_entry(event.data)
+        elif isinstance(event.data, ProcessEntry) and event.kind == "join":
+            self._inputs.expect_estimates(event.subject, event.data.from_ns)
+
+    def _serve_query(self, query: Query) -> None:
+        try:
+            if query.expression == keys.process(self._agent.name, "outputs"):
+                answer = ControlAnswer(ok=True, result=self._member.outputs())
+            else:
+                answer = self._agent.control(query.expression, query.request())
+        except DecodeError as error:
+            answer = ControlAnswer(ok=False, error=str(error))
+        query.answer(answer)
 
 
 class RunnerInputs:
-    """The subscriptions of one agent, sorted into its inbox, and what other threads of Zenoh bring.
-
-    Attributes:
-        inbox: the agent's inputs, by gate.
-        notices, links, queries: what has come from other threads and is to be served in turn.
-    """
+    """The subscriptions of one agent, sorted into its inbox, and what other threads of Zenoh bring."""
 
     def __init__(
         self, link: Session, info: messages.Info, agent: Agent, health: HealthMeter, say: Callable[[str], None]
@@ -287,9 +285,7 @@ class RunnerInputs:
             self._gate_key = keys.GATE
         elif of_world and agent.takes_gates:
             self._gate_key = keys.gate(of_world[0])
-        self.notices: deque[WorldEvent] = deque()
-        self.queries: deque[Query] = deque()
-        self.links: deque[bool] = deque()
+        self.rare: deque[WorldEvent | Query | bool] = deque()  # to be served in turn; a bool: whether the link is up
         self._fault_lists: deque[run_messages.Faults] = deque()
         self._repeated: dict[int, dict[tuple[str, int], Any]] = {}  # by gate, then by key and number
 
@@ -305,9 +301,9 @@ class RunnerInputs:
         self._link.declare_subscriber(keys.FAULTS, lambda sample: self._on_faults(sample.payload))
         if self._is_realtime:
             self._link.declare_subscriber(keys.CLOCK, self._on_clock)
-        self._link.on_link(self._on_link)
+        self._link.on_link(self._on_rare)
         for key in (*self._agent.control_keys(), keys.process(self._agent.name, "outputs")):
-            self._link.declare_queryable(key, self._on_query)
+            self._link.declare_queryable(key, self._on_rare)
         self._link.declare_process(self._agent.name)
 
     def wait(self) -> None:
@@ -402,8 +398,7 @@ class RunnerInputs:
             self._health.refused += 1  # of somebody else; the world's own events can be read
             return
         if read is not None:
-            self.notices.append(read)
-            self.wake()
+            self._on_rare(read)
 
     def _on_clock(self, sample: RawSample) -> None:
         """In realtime, end a wait for a gate that the world has left behind: what it lacks may never come."""
@@ -421,10 +416,6 @@ class RunnerInputs:
         except DecodeError:
             self._health.refused += 1
 
-    def _on_link(self, up: bool) -> None:
-        self.links.append(up)
-        self.wake()
-
-    def _on_query(self, query: Query) -> None:
-        self.queries.append(query)
+    def _on_rare(self, arrived: WorldEvent | Query | bool) -> None:
+        self.rare.append(arrived)
         self.wake()
