@@ -219,7 +219,7 @@ class Runner:
             arrived = self._inputs.rare.popleft()
             if isinstance(arrived, WorldEvent):
                 self._serve_event(arrived)
-            elif isinstance(arrived, Query):
+            elif not isinstance(arrived, bool):
                 self._serve_query(arrived)
             elif not arrived:
                 self.health.link_lost = True
