@@ -131,9 +131,8 @@ def test_the_drone_s_sensors_win_over_the_scenario_s_and_those_over_the_preset()
     assert (second.sensors.gps.position_m.noise, second.sensors.gps.position_m.bias) == (0.5, 0.1)
     assert second.sensors.gps.rate_hz == 5.0
     assert second.sensors.imu.accel_m_s2.noise == 0.35
-    drones[1]["sensors"] = {"preset": "ardrone2"}
-    shared = {"preset": "paper", "as_printed": True}
-    first, second = scenario_file.resolve(document(drones=drones, sensors=shared)).drones
+    drones[0]["sensors"], drones[1]["sensors"] = {"as_printed": True}, {"preset": "ardrone2"}
+    first, second = scenario_file.resolve(document(drones=drones, sensors={"preset": "paper"})).drones
     assert (first.sensors.preset, second.sensors.preset) == ("paper", "ardrone2")
     assert (first.sensors.imu.accel_m_s2.noise, first.sensors.imu.gyro_deg_s.noise) == (0.35 * G_M_S2, 0.01)
     assert second.sensors.imu.accel_m_s2.noise == PRESETS["ardrone2"]["imu"]["accel_m_s2"]["noise"]
