@@ -118,7 +118,6 @@ def _solids(shape: DroneShape) -> dict[str, list[trimesh.Trimesh]]:
 
 @cache
 def rotor() -> Mesh:
-    """Return a propeller of two blades about its own axis."""
     blades = [_moved(box((ROTOR_RADIUS_M, 0.016, 0.002)), (side * ROTOR_RADIUS_M / 2, 0, 0)) for side in (-1, 1)]
     for side, blade in zip((-1, 1), blades, strict=True):
         blade.apply_transform(trimesh.transformations.rotation_matrix(side * 0.2, (1, 0, 0)))
@@ -133,7 +132,6 @@ def ring() -> Mesh:
 
 @cache
 def ball() -> Mesh:
-    """Return a sphere of 1 m radius."""
     return _mesh([icosphere(subdivisions=2)])
 
 

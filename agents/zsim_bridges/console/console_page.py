@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import viser
 
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
-from zsim_bridges.console.console_tables import DroneRow, event_table
+from zsim_bridges.console.console_tables import DroneRow, event_table, figure_lines
 from zsim_bridges.console.control_desk import EVERY, RUN, ControlDesk, ControlForm
 from zsim_bridges.console.drone_forms import DroneForm, FleetTable
 from zsim_bridges.console.formation_form import FormationForm
@@ -35,6 +35,8 @@ SWITCHES = {
 class ConsolePage:
     """The shared controls of one run, in two panels.
 
+    Folders are for each page's own controls.
+
     Args:
         gui: viser's; the controls of another run are removed.
         report: called with requests that are refused here.
@@ -44,12 +46,8 @@ class ConsolePage:
         show_preview: shows what a formation would fly; None: nothing.
 
     Attributes:
-        phases, faults: the tables.
-        forms, plots: of each formation.
         flights: history of single drones, for plots.
         chosen: the formation that is shown; empty if there is none.
-        fleet: requests of all drones.
-        control_folder, drone_folder, figure_folder, event_folder, theme_folder: for each page's own controls.
         parts: what a page must be in control of to use a control, by the control's id.
     """
 
@@ -80,20 +78,6 @@ class ConsolePage:
         gui.set_panel_label(f"zsim {run.scenario.name}")
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_PX)
-        self._right_panel(gui, show, choose_trail)
-        panel = gui.add_panel()
-        with panel.add_tab("Drones", viser.Icon.DRONE):
-            self.drone_folder = gui.add_folder(None)
-            self.figure_folder = gui.add_folder(None)
-        with panel.add_tab("Events", viser.Icon.LIST):
-            self.event_folder = gui.add_folder(None)
-        panel.dock_left()
-        panel.set_width(PANEL_PX)
-
-    def _right_panel(
-        self, gui: viser.GuiApi, show: Callable[[str, bool], None], choose_trail: Callable[[float], None]
-    ) -> None:
-        run = self._run
         self.phases = gui.add_html("")
         self.control_folder = gui.add_folder(None)
         with self._part(gui, EVERY):
@@ -118,6 +102,14 @@ class ConsolePage:
             trail = gui.add_dropdown("trails of", list(lengths), initial_value=f"the last {TRAIL_S:g} s")
             trail.on_update(lambda _: choose_trail(lengths[trail.value]))
             self.theme_folder = gui.add_folder(None)
+        panel = gui.add_panel()
+        with panel.add_tab("Drones", viser.Icon.DRONE):
+            self.drone_folder = gui.add_folder(None)
+            self.figure_folder = gui.add_folder(None)
+        with panel.add_tab("Events", viser.Icon.LIST):
+            self.event_folder = gui.add_folder(None)
+        panel.dock_left()
+        panel.set_width(PANEL_PX)
 
     def _formation_tabs(self, gui: viser.GuiApi, tabs: Any) -> None:
         """Give every formation a folder in two tabs; only that of the chosen one is visible."""
@@ -151,7 +143,6 @@ class ConsolePage:
                 folder.visible = name == chosen
 
     def refresh(self, run: RunCondition) -> None:
-        """Grey out what would be refused."""
         self.fleet.refresh(run)
         self.run_form.refresh(run)
         for form in self.forms.values():
@@ -213,7 +204,7 @@ class PageForms:
 
     def choose(self, client_id: int | None, drone: str) -> None:
         """Choose a drone on one page, as a click on it in the scene does."""
-        if form := self._form(client_id):
+        if (form := self._form(client_id)) and drone in self._names:
             form.drone.choose(drone)
 
     def toggle(self, client_id: int | None, drone: str) -> None:
@@ -226,36 +217,43 @@ class PageForms:
         form = self._form(client_id)
         return form.drone.chosen if form else ""
 
-    def use(self, client_id: int, drone: str) -> str:
+    def use(self, client_id: int | None, drone: str) -> str:
         """Put a page in control of a drone's formation, if that is free; return why it may not be."""
-        return self._desk.use(client_id, self._part_of(drone))
+        return self._desk.use(client_id, self._part_of(drone)) if client_id is not None else ""
 
     def move_rings(self, drones: DronePoses) -> None:
         """Put the ring of each page about the drone that it has chosen."""
         self._update(lambda form: form.ring.move(drones, form.drone.chosen))
 
-    def show_figures(self, instruments_of: Callable[[str], str], sensors_of: Callable[[str], str]) -> None:
-        """Show on each page instruments and sensors, as HTML, of the drone that it has chosen."""
+    def show(
+        self,
+        rows: Sequence[DroneRow],
+        figures: Mapping[str, FlightFigures],
+        sensors_of: Callable[[str], str],
+        events: Sequence[EventRow],
+    ) -> None:
+        """Show on each page the drones as it sorts and filters them, all of the chosen one, and the chosen events.
+
+        `sensors_of` returns the sensors of a drone as HTML.
+        """
         chosen = {form.drone.chosen for form in list(self._forms.values())}
-        contents = {drone: (instruments_of(drone), sensors_of(drone)) for drone in chosen}
+        contents = {drone: (figure_lines(figures.get(drone)), sensors_of(drone)) for drone in chosen}
 
         def show(form: _PageForm) -> None:
             form.instruments.content, form.figures.content = contents.get(form.drone.chosen, ("", ""))
+            form.events.show(events)
+            form.fleet.show(rows, figures, form.drone.chosen)
 
         self._update(show)
 
-    def show_drones(self, rows: Sequence[DroneRow], figures: Mapping[str, FlightFigures]) -> None:
-        """Show on each page the drones as it sorts and filters them."""
-        self._update(lambda form: form.fleet.show(rows, figures, form.drone.chosen))
-
-    def show_events(self, rows: Sequence[EventRow]) -> None:
-        """Show on each page the events that it has chosen."""
-        self._update(lambda form: form.events.show(rows))
-
     def refresh(self, run: RunCondition, formation: str) -> None:
         """Grey out what would be refused; show who controls the formation that is shown, and the run."""
-        self._update(lambda form: form.drone.refresh(run))
-        self._update(lambda form: form.control.refresh([formation, RUN] if formation else [RUN]))
+
+        def refresh(form: _PageForm) -> None:
+            form.drone.refresh(run)
+            form.control.refresh([formation, RUN] if formation else [RUN])
+
+        self._update(refresh)
 
     def _update(self, change: Callable[[_PageForm], None]) -> None:
         """Change the forms of all pages; a page that closes meanwhile, whose handles viser has removed, is dropped."""
@@ -312,7 +310,6 @@ class EventForm:
         self._table = gui.add_html("")
 
     def show(self, rows: Sequence[EventRow]) -> None:
-        """Show the chosen ones of the rows, newest first."""
         self._table.content = event_table(chosen_rows(rows, self._drone.value, self._kind.value)[:ROWS_SHOWN])
 
 

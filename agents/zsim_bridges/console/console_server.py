@@ -53,7 +53,7 @@ class Console:
         self._rate_hz = rate_hz
         self._say = say
         self._run_page: RunPage | None = None
-        self._viser = PrivateViser(self._permits)
+        self._viser = PrivateViser(lambda *use: self._run_page is None or self._run_page.permits(*use))
         server = self._viser.server
         self._camera_follow = CameraFollow(server)
         self._frustums = CameraFrustums(server)
@@ -78,7 +78,7 @@ class Console:
             head=lambda: self._run_page.head() if self._run_page else no_run_head(self._world, self._ended),
             command=self._command,
             files=self._files,
-            looked=self._looked,
+            looked=self._on_look,
         )
         self._proxy = HttpProxy(address, token, backend)
 
@@ -106,7 +106,6 @@ class Console:
         stopped: Callable[[], bool],
         say: Callable[[str], None],
     ) -> None:
-        """Show a run until it is over or `stopped` returns true."""
         shown_by = self._camera_follow, self._frustums, self._rate_hz, self._world
         self._run_page = page = RunPage(self._viser.server, link, info, observer, *shown_by)
         try:
@@ -128,10 +127,7 @@ class Console:
             self._run_page.end(reason)
         self._files.offer(OFFER_S, deserted)
 
-    def _permits(self, client_id: int, control: str) -> bool:
-        return self._run_page is None or self._run_page.permits(client_id, control)
-
-    def _looked(self, key: str, role: str, address: str) -> None:
+    def _on_look(self, key: str, role: str, address: str) -> None:
         client_id = self._frustums.client_id(key)
         if self._run_page and client_id is not None:
             self._run_page.desk.look(client_id, role, address)

@@ -306,11 +306,9 @@ class RunPage:
         page.refresh(run)
         self.desk.release_lost()
         self._page_forms.refresh(run, page.chosen)
-        instruments_of = lambda drone: console_tables.figure_lines(flown.get(drone))  # noqa: E731
-        self._page_forms.show_figures(instruments_of, self._table_rows.sensor_table)
-        self._page_forms.show_events(self.views.log.rows())
+        rows, sensors_of = self._table_rows.drone_rows(), self._table_rows.sensor_table
+        self._page_forms.show(rows, flown, sensors_of, self.views.log.rows())
         page.phases.content = console_tables.formation_lines(run.phases)
-        self._page_forms.show_drones(self._table_rows.drone_rows(), flown)
         watch = self._monitor.fault_watch
         page.faults.content = console_tables.fault_lines(watch.lines(), watch.lines(is_over=True))
         if page.chosen:

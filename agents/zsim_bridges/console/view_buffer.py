@@ -77,14 +77,8 @@ class ViewBuffer:
         asked: called with a formation and a description of each request that somebody else makes of it.
 
     Attributes:
-        drones: the newest view of the drones.
-        clusters: the newest view of each formation.
-        estimators: the newest view of each estimator, by its process.
-        healths: the newest of each process.
         external: names of the drones whose bodies are external.
         faults: injected ones, planned and active.
-        log: events as they are shown.
-        losses: processes and drones that are lost.
         begun: the last injected faults that have begun.
         failsafes: the event of each drone's automatic landing or stop, until it is commanded another mode.
         end: why the run ended, by its last event; empty while it goes on.
@@ -114,7 +108,7 @@ class ViewBuffer:
         self._answers: Counter[str] = Counter()
         self.drones: ViewDrones | None = None
         self.clusters: dict[str, ViewCluster] = {}
-        self.estimators: dict[str, ViewEstimates] = {}
+        self.estimators: dict[str, ViewEstimates] = {}  # by process
         self.healths: dict[str, Health] = {}
         self.external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
         self._links: dict[str, LinkState] = {}
@@ -191,7 +185,6 @@ class ViewBuffer:
         return found
 
     def link_of(self, drone: str) -> ReceivedLink | None:
-        """Return the newest state of an external drone's link, None before the first."""
         key = keys.link(drone)
         return ReceivedLink(self._links[key], self._wall_s() - self._received_s[key]) if key in self._links else None
 
@@ -337,7 +330,6 @@ class EventLog:
                 del self._rows[same[0]]
 
     def rows(self) -> list[EventRow]:
-        """Return the rows, newest first."""
         with self._lock:
             return list(reversed(self._rows.values()))
 
