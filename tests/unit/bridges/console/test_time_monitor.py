@@ -13,9 +13,9 @@ from zsim.contract.messages import DroneInfo
 from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health, Waiting
 from zsim.runtime.participant import Participant
 from zsim_bridges.console import console_tables
+from zsim_bridges.console.console_server import console_state
 from zsim_bridges.console.console_tables import TableRows
 from zsim_bridges.console.run_condition import RunCondition, page_head
-from zsim_bridges.console.run_page import console_state
 from zsim_bridges.console.time_monitor import BEAT_S, SILENT_S, TimeMonitor
 from zsim_bridges.console.view_buffer import ReceivedEstimate, ViewBuffer
 
