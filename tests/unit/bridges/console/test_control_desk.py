@@ -9,9 +9,8 @@ from fake_gui import Control, Gui
 from refused import has_terms, without_tags
 
 from zsim_bridges.console import scene
-from zsim_bridges.console.console_page import ControlForm, PageForms
+from zsim_bridges.console.console_page import ControlForm, DroneForm, PageForms
 from zsim_bridges.console.control_desk import LOST_S, RUN, ControlDesk
-from zsim_bridges.console.drone_forms import DroneForm
 from zsim_bridges.console.run_condition import RunCondition
 
 NAMES = ["drone1", "drone2"]

@@ -6,8 +6,8 @@ import pytest
 from fake_gui import Gui
 
 from zsim_bridges.console.alarms import DroneCondition
+from zsim_bridges.console.console_page import FILTERS, MANY, NO_ROW, SORTINGS, Filtered, FleetTable
 from zsim_bridges.console.console_tables import DroneRow, drone_table
-from zsim_bridges.console.drone_forms import FILTERS, MANY, NO_ROW, SORTINGS, Filtered, FleetTable
 
 
 def row(

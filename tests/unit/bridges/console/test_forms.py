@@ -24,8 +24,7 @@ from zsim_agents.formation.flight_check import (
 )
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
-from zsim_bridges.console.console_page import SWITCHES, ConsolePage
-from zsim_bridges.console.drone_forms import DRONE_MODES, DroneForm
+from zsim_bridges.console.console_page import DRONE_MODES, SWITCHES, ConsolePage, DroneForm
 from zsim_bridges.console.formation_form import OPERATIONS, REST_S, STILL_S, FormationForm
 from zsim_bridges.console.operator_input import slider_ranges
 from zsim_bridges.console.picture import FlightPreview
