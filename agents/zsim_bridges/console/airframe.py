@@ -79,7 +79,6 @@ def coloured(shape: DroneShape) -> bytes:
 
 @cache
 def whole(shape: DroneShape) -> Mesh:
-    """Return a drone as one surface."""
     return _mesh([solid for solids in _solids(shape).values() for solid in solids])
 
 
@@ -126,7 +125,6 @@ def rotor() -> Mesh:
 
 @cache
 def ring() -> Mesh:
-    """Return a flat ring of 1 m radius, about the z axis."""
     return _mesh([annulus(0.93, 1.0, 0.03, sections=40)])
 
 

@@ -70,7 +70,6 @@ class DroneCondition(NamedTuple):
 
 
 def battery_severity(percent: float) -> Severity | None:
-    """Return the severity of the alarm of a battery, None where there is none."""
     if percent < BATTERY_EMPTY_PERCENT:
         return "red"
     return "amber" if percent < BATTERY_LOW_PERCENT else None
@@ -275,7 +274,6 @@ class FaultWatch:
         self._watched: dict[int, _WatchedFault] = {}
 
     def clear(self) -> None:
-        """Remove all: a replay has gone back."""
         self._watched.clear()
 
     def update(
@@ -287,13 +285,7 @@ class FaultWatch:
         lost: Collection[str],
         wind_m_s: float,
     ) -> None:
-        """Take over the present condition.
-
-        Args:
-            begun: faults that have begun, instantaneous ones among them.
-            active: those that act now.
-            lost: processes that are dead or silent.
-        """
+        """Take over the present condition: faults that have begun, or act now; processes that are dead or silent."""
         acting = {fault.id: fault for fault in active}
         known = {fault.id: fault for fault in begun} | acting
         for number in self._watched.keys() - known.keys():
@@ -307,7 +299,6 @@ class FaultWatch:
             del self._watched[number]
 
     def lines(self, is_over: bool = False) -> list[str]:
-        """Return a line for each fault that acts, or for each that is over."""
         return [each.line() for each in self._watched.values() if each.over == is_over]
 
 

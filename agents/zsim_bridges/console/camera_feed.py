@@ -168,12 +168,10 @@ class CameraFeed:
         return ()
 
     def shown(self, camera: str) -> tuple[CameraInfo, CameraPicture] | None:
-        """Return a camera with its newest picture, None before the first."""
         info, picture = self._infos.get(camera), self.picture(camera)
         return None if info is None or picture is None else (info, picture)
 
     def state(self) -> list[dict[str, Any]]:
-        """Return the cameras as plain data for programs and tests."""
         with self._lock:
             watched = {camera: self._watched.get(camera) for camera, _ in self.cameras()}
             return [

@@ -87,13 +87,11 @@ class CommandClient:
         self._queue = DroneQueue(modes, stops)
 
     def close(self) -> None:
-        """Drop waiting requests."""
         self._queue.close()
         for pool in self._pools:
             pool.shutdown(wait=False, cancel_futures=True)
 
     def request_world(self, op: str, **args: Any) -> None:
-        """Request an operation of the world."""
         what = RequestOutcome(f"{op} {arguments_text(args)}".strip(), "")
         self._submit(self._requests.submit, what, self._request, keys.CONTROL, op, args)
 
@@ -163,7 +161,6 @@ class CommandClient:
                 self._submit(turn, what, self._acquire_and_send, drone, mode, stops)
 
     def modes_requested(self, drone: str) -> int:
-        """Return how many modes of a drone have been requested so far."""
         return self._modes[drone]
 
     def take(self, drone: str, done: Callable[[str], None]) -> None:
@@ -270,7 +267,6 @@ class DroneQueue:
         self._closed = False
 
     def close(self) -> None:
-        """Start no more tasks."""
         with self._lock:
             self._closed = True
             self._tasks.clear()

@@ -1,4 +1,7 @@
-"""The console: shows one run after the other on a viser server that only its own HTTP server can reach."""
+"""The console: shows one run after the other on a viser server that only its own HTTP server can reach.
+
+A run on the page: its views as pictures, tables and plots; the operators' requests are sent.
+"""
 
 import math
 import threading
@@ -12,7 +15,7 @@ from typing import Any
 import viser
 from msgspec import UNSET
 
-from zsim.contract.flight_messages import EstimateView, ViewCluster
+from zsim.contract.flight_messages import EstimateView, ViewCluster, ViewDrones
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
 from zsim.errors import DocumentError, RunError
@@ -43,6 +46,15 @@ from zsim_bridges.console.view_buffer import ViewBuffer
 
 REASON_S = 0.1  # wall; between two looks for a reason to end
 OFFER_S = 20.0  # wall; how long pages may take to copy what a run left behind: 100 MB over Wi-Fi of 40 Mbit/s
+TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster
+STAMPS_PER_AGE = 5.0  # a stamp is at most this fraction of a command's largest age old; it ages on its way
+TOLD_S = 2.0  # wall; a slider that is dragged is refused many times
+NOTICE_S = 8.0  # wall; how long a notification stays in the corner
+EVENTS_MAX = 20  # in `state`
+SILENT = "silent"  # in place of the clock's state, when the world does not answer
+FEW_DRONES = 20  # drones from which on pictures come half as often
+RATE_HZ, RATE_LOW_HZ = 20.0, 10.0
+FAST_RATE = 4.0  # × real time; from then on the picture rate is halved, too: the run needs the processors
 
 
 class Console:
@@ -106,11 +118,6 @@ class Console:
 
     @contextmanager
     def open(self) -> Iterator[None]:
-        """Serve pages.
-
-        Raises:
-            RunError: the port is taken.
-        """
         try:
             with self._proxy.open():
                 urls = self._proxy.urls()
@@ -128,6 +135,7 @@ class Console:
         stopped: Callable[[], bool],
         say: Callable[[str], None],
     ) -> None:
+        """Show a run until it is over or `stopped` returns true."""
         shown_by = self._camera_follow, self._frustums, self._rate_hz, self._world
         self._run_page = page = RunPage(self._viser.server, link, info, observer, *shown_by)
         try:
@@ -160,17 +168,6 @@ class Console:
         return {"id": request.id, "op": request.op, "state": "refused", "reason": "there is no run yet"}
 
 
-TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster
-STAMPS_PER_AGE = 5.0  # a stamp is at most this fraction of a command's largest age old; it ages on its way
-TOLD_S = 2.0  # wall; a slider that is dragged is refused many times
-NOTICE_S = 8.0  # wall; how long a notification stays in the corner
-EVENTS_MAX = 20  # in `state`
-SILENT = "silent"  # in place of the clock's state, when the world does not answer
-FEW_DRONES = 20  # drones from which on pictures come half as often
-RATE_HZ, RATE_LOW_HZ = 20.0, 10.0
-FAST_RATE = 4.0  # × real time; from then on the picture rate is halved, too: the run needs the processors
-
-
 class RunPage:
     """The page of one run.
 
@@ -182,8 +179,6 @@ class RunPage:
         world: where the run is, in words.
 
     Attributes:
-        views: the newest of everything.
-        cameras: of the drones.
         record: what a replay plays.
         flying: what pages may do with single drones.
         orders: of the operators, until they are settled.
@@ -246,12 +241,13 @@ class RunPage:
             self._scene.preview,
         )  # fmt: skip
         self.desk = ControlDesk(list(spaces), partial(self._tell, "Control", "orange"))
+        part_of = {drone: name for name, drones in self._members.items() for drone in drones}
         self._page_forms = PageForms(
-            server, self._client, self._page, self._names, self._scene.nodes.radii_m, self.desk, self.part_of,
-            lambda drones: self.flying.returns.request_drones(drones),
+            server, self._client, self._page, self._names, self._scene.nodes.radii_m, self.desk,
+            lambda drone: part_of.get(drone, RUN), lambda drones: self.flying.returns.request_drones(drones),
         )  # fmt: skip
         self.flying = PageFlying(
-            self._monitor, self._client, observer.name, self._scene, self._page_forms, self._note_return
+            self._monitor, self._client, observer.name, self._scene, self._page_forms, self._on_return_over
         )
 
     def close(self) -> None:
@@ -277,7 +273,16 @@ class RunPage:
                 self._update(time.monotonic())
                 next_s = max(next_s + self._period_s(), time.monotonic())
                 pause.wait(next_s - time.monotonic())
-        self._draw_end()
+        # the end of the run, for pages that are opened between two runs
+        self.views.update()
+        if self._observer.end_reason or self.views.end:
+            self._monitor.end(self._observer.end_reason)
+        self._monitor.update(time.monotonic())
+        self._update_orders()
+        with self._server.atomic():
+            if self.views.drones is not None:
+                self._draw(self.views.drones)
+            self._update_tables(time.monotonic())
 
     def end(self, reason: str) -> None:
         """Show that the run is over, after `run`, which may not have learnt of it."""
@@ -286,13 +291,13 @@ class RunPage:
         with self._server.atomic():
             self._update_tables(time.monotonic())
 
+    # For pages, in other threads
+
     def state(self) -> dict[str, Any]:
-        """Return what is shown as plain data for programs and tests."""
         state = console_state(self._run.info.run_id, self.views, self._time_monitor, dict(self._scene.shapes))
         return {**state, "cameras": self.cameras.state(), "timeline": self.record.state(self._monitor.condition)}
 
     def head(self) -> dict[str, Any]:
-        """Return the head of the page as plain data."""
         head, stall = self._monitor.head(time.monotonic()), self._time_monitor.stall
         stood = stall and {"lasted_s": stall.lasted_s, "ago_s": time.monotonic() - stall.ended_s}
         ages = {"heard_s": self._time_monitor.heard_s, "stall": stood}
@@ -304,10 +309,6 @@ class RunPage:
             self._monitor.board.acknowledge()
             return {"id": request.id, "op": request.op, "state": "confirmed", "reason": ""}
         return self.orders.place(request)
-
-    def part_of(self, drone: str) -> str:
-        """Return what a page must be in control of to let a drone take off, or to fly it."""
-        return next((name for name, drones in self._members.items() if drone in drones), RUN)
 
     def permits(self, client_id: int, control: str) -> bool:
         """Return whether a page may use a shared control; tell it why if not."""
@@ -327,9 +328,9 @@ class RunPage:
 
     def _update(self, wall_s: float) -> None:
         self._observer.tick()
-        new = self.views.update() and self.views.drones is not None
-        if new and self.views.drones is not None:
-            self._monitor.flight.update(self.views.drones)
+        view = self.views.drones if self.views.update() else None  # None: nothing new
+        if view is not None:
+            self._monitor.flight.update(view)
         if wall_s - self._monitor_s >= TABLE_S:
             self._monitor_s = wall_s
             if self._run.is_replay and self._scene.drones is not None:
@@ -343,12 +344,12 @@ class RunPage:
         for form in self._page.forms.values():
             form.send(wall_s)
         if not self._server.get_clients():
-            if new and self.views.drones is not None:  # for pages that are opened later
-                self._add_newest_points(self._scene.store(self.views.drones))
+            if view is not None:  # for pages that are opened later
+                self._add_newest_points(self._scene.store(view))
             return
         with self._server.atomic():
-            if new:
-                self._draw()
+            if view is not None:
+                self._draw(view)
             self._frustums.draw(self._scene.drones, self.cameras.shown)
             if wall_s - self._table_s >= TABLE_S:
                 self._table_s = wall_s
@@ -359,21 +360,8 @@ class RunPage:
         states = {**run.drones, **{name: phase for name, (phase, _) in run.phases.items()}}
         self.orders.update(states, drones.t_ns if drones else -1, paused=run.clock != "running")
 
-    def _draw_end(self) -> None:
-        """Draw the end of the run, for pages that are opened between two runs."""
-        self.views.update()
-        if self._observer.end_reason or self.views.end:
-            self._monitor.end(self._observer.end_reason)
-        self._monitor.update(time.monotonic())
-        self._update_orders()
-        with self._server.atomic():
-            if self.views.drones is not None:
-                self._draw()
-            self._update_tables(time.monotonic())
-
-    def _draw(self) -> None:
-        assert self.views.drones is not None
-        drones = self._scene.draw(self.views.drones, self._period_s(), self._page.chosen)
+    def _draw(self, view: ViewDrones) -> None:
+        drones = self._scene.draw(view, self._period_s(), self._page.chosen)
         self._page_forms.move_rings(drones)
         self._add_newest_points(drones)
 
@@ -415,12 +403,11 @@ class RunPage:
         estimates: Mapping[str, EstimateView],
     ) -> None:
         """Add the formations' variables and the drones' flight to the plots."""
-        t_s = drones.t_ns / 1e9
         for name, true_shape in shapes.items():
             view = clusters.get(name)
             if view is not None:
                 true_c = None if true_shape is None else true_shape.c
-                self._page.plots[name].history.add(t_s, view.desired, view.value, true_c)
+                self._page.plots[name].history.add(drones.t_ns / 1e9, view.desired, view.value, true_c)
         self._page.flights.add(drones, estimates)
 
     # Controls and tables
@@ -456,22 +443,21 @@ class RunPage:
         if known or outcome.subject in self._run.spaces:
             self._note("accepted", outcome.subject, f"{outcome.request}: accepted")
 
-    def _note_return(self, subject: str, text: str) -> None:
+    def _on_return_over(self, subject: str, text: str) -> None:
         self._note("refused", subject, text)
         self._notify(f"return of {subject}", text)
 
-    def _note(self, kind: str, subject: str, text: str) -> None:
-        """Log an event of the console's own."""
-        self.views.log.add(Event(self._observer.now_ns, 0, kind, self._observer.name, subject, text))
-
     def _on_refused_command(self, event: Event) -> None:
-        """Show that the world has refused a command of the console's."""
         self._notify(event.subject, str(event.data.get("reason", event.text)))
 
     def _on_foreign_request(self, cluster: str, text: str) -> None:
         """Tell every page of a request that somebody else made of a formation, since the last one counts."""
         for client_id in () if self._run.is_replay else self._server.get_clients():
             self._tell("Control", "orange", client_id, text)
+
+    def _note(self, kind: str, subject: str, text: str) -> None:
+        """Log an event of the console's own."""
+        self.views.log.add(Event(self._observer.now_ns, 0, kind, self._observer.name, subject, text))
 
     def _notify(self, what: str, refusal: str) -> None:
         for client_id in self._server.get_clients():
@@ -501,16 +487,9 @@ def console_state(
     clusters = []
     for name, cluster in dict(views.clusters).items():
         shape = shapes.get(name)
-        clusters.append(
-            {
-                "name": name,
-                "phase": cluster.phase,
-                "reason": cluster.reason,
-                "desired": dict(zip(cluster.names, cluster.desired, strict=True)),
-                "value": dict(zip(cluster.names, cluster.value, strict=True)),
-                "true": {} if shape is None else dict(zip(cluster.names, shape.c.tolist(), strict=True)),
-            }
-        )
+        values = {"desired": cluster.desired, "value": cluster.value, "true": () if shape is None else shape.c.tolist()}
+        named = {what: dict(zip(cluster.names, each, strict=False)) for what, each in values.items()}
+        clusters.append({"name": name, "phase": cluster.phase, "reason": cluster.reason, **named})
     return {
         "run_id": run_id,
         "t_s": view.t_ns / 1e9 if view else 0.0,

@@ -140,13 +140,11 @@ class ControlDesk:
             self._tell(asker, f"{self.name_of(page)} {done} {words(part)}")
 
     def release(self, page: int, part: str) -> None:
-        """Give up a part: it is free, or goes to the page that asks for it."""
         with self._lock:
             if self._holders.get(part) == page:
                 self._pass_on(part, f"{self.name_of(page)} has released")
 
     def holdings(self, page: int, parts: Collection[str]) -> list[Holding]:
-        """Return who is in control of some parts, as a page sees it."""
         found = []
         with self._lock:
             for part in parts:

@@ -116,7 +116,6 @@ class Geofence(NamedTuple):
 
 
 def geofence_of(scenario: Scenario) -> Geofence:
-    """Return the fence of a scenario's drones: around all starts, and below the lowest ceiling."""
     xs, ys, _ = zip(*(drone.position_m for drone in scenario.drones), strict=True)
     low_m, top_m = height_range_m(scenario.drones)
     corner_m = (round(min(xs)) - SIDEWAYS_M, round(min(ys)) - SIDEWAYS_M, low_m)
@@ -287,7 +286,6 @@ class ManualFlight:
         return self.answer(page)
 
     def is_on_way(self, page: Any) -> bool:
-        """Return whether the page's drone flies to a place."""
         with self._lock:
             flight = self._flights.get(page)
             return flight is not None and flight.place_W is not None

@@ -193,10 +193,7 @@ class OrderBook:
     def update(self, states: Mapping[str, str], t_ns: int, *, paused: bool) -> None:
         """Settle orders that have had their effect, and repeat those that have not.
 
-        Args:
-            states: of drones, and phases of formations, by name.
-            t_ns: their simulated time.
-            paused: whether the run stands still, so that accepted commands have no effect yet.
+        `states` of drones, and phases of formations, are of t_ns; commands accepted in a paused run have no effect yet.
         """
         with self._lock:
             self._paused = paused
@@ -322,7 +319,6 @@ class PendingRequests:
         return known
 
     def pop_done(self, clusters: Mapping[str, ViewCluster], drones: Mapping[str, str]) -> list[PendingRequest]:
-        """Return and remove the requests that are done."""
         done = [each for each in list(self._pending.values()) if _is_done(each, clusters, drones)]
         for each in done:
             self._pending.pop(each.subject, None)

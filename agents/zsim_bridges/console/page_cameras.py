@@ -134,7 +134,6 @@ class CameraFollow:
             page.follows, page.fits = follows, fits
 
     def set_target(self, p_W: Array) -> None:
-        """Aim the cameras of later pages at positions (n, 3) [m], unless n is 0."""
         if len(p_W):
             self._points = p_W
 
@@ -222,18 +221,15 @@ class CameraFrustums:
         server.on_client_disconnect(self._on_disconnect)
 
     def client_id(self, page: str) -> int | None:
-        """Return viser's number of a page, None if it is not open."""
         with self._lock:
             return self._pages[page].client.client_id if page in self._pages else None
 
     def choose(self, page: str, camera: str) -> None:
-        """Show a camera's frustum on a page; empty: none."""
         with self._lock:
             if page in self._pages:
                 self._pages[page].camera = camera
 
     def click(self, client_id: int, drone: str) -> None:
-        """Note that a drone was clicked in the scene of a page, by viser's number."""
         with self._lock:
             for page in self._pages.values():
                 if page.client.client_id == client_id:

@@ -105,12 +105,7 @@ class RunFiles:
         self._leaves = False
 
     def shown(self, page: str, has_copies: bool) -> dict[str, Any]:
-        """Return what the head of a page shows of them as plain data.
-
-        Args:
-            page: its name; empty where no page asks.
-            has_copies: whether it has copied everything that it wants to keep.
-        """
+        """Return what the head of a page, by its name, shows of them; `has_copies`: of all that it wants to keep."""
         self._looked_s.pop(page, None)
         if page and not has_copies:
             while len(self._looked_s) >= LOOKS_MAX:
@@ -120,12 +115,7 @@ class RunFiles:
         return {"files": files, "leaves": self._leaves}
 
     def offer(self, within_s: float, deserted: Callable[[], bool]) -> None:
-        """Tell pages to copy the files, since the console leaves; wait until all open ones have.
-
-        Args:
-            within_s: for how long at most [wall].
-            deserted: whether to return at once.
-        """
+        """Tell pages to copy the files, since the console leaves; wait until all open ones have, or `deserted` is true."""
         self._leaves = True
         until_s = time.monotonic() + within_s
         while (now_s := time.monotonic()) < until_s and not deserted():
@@ -188,11 +178,7 @@ class HttpProxy:
 
     @contextmanager
     def open(self) -> Iterator[None]:
-        """Serve pages on a thread of its own.
-
-        Raises:
-            RunError: the port is taken, or the address is none of this machine.
-        """
+        """Serve pages on a thread of its own; a RunError: the port is taken, or the address is none of this machine."""
         with open_on_thread(self._loop, "console server", self._open, self._close):
             yield
 

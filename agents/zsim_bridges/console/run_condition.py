@@ -145,7 +145,6 @@ class RunCondition(NamedTuple):
         return "paused" if self.clock == "paused" else "running" if self.clock == "running" else "waiting"
 
     def off(self) -> str:
-        """Return why no request can be answered."""
         if self.ended:
             return f"the run is over: {self.ended}"
         return f"the world has not answered for {self.silent_s:.0f} s" if self.silent_s else ""
@@ -162,7 +161,6 @@ class RunCondition(NamedTuple):
 
 
 def run_refusals(run: RunCondition) -> dict[str, str]:
-    """Return why each operation on the run's time would be refused."""
     off, state = run.off(), run.clock or "unknown"
     running = "" if state == "running" else f"the run is {state}"
     paused = "" if state == "paused" else f"the run is {state}, not paused"
@@ -171,7 +169,6 @@ def run_refusals(run: RunCondition) -> dict[str, str]:
 
 
 def drone_refusals(run: RunCondition, drone: str) -> dict[str, str]:
-    """Return why each mode of one drone, and its return, would be refused."""
     state = run.drones.get(drone)
     modes = ("takeoff", "land", "return", "emergency", "reset")
     unseen = run.grounded() or ("" if state else f"{drone} was not seen yet")
@@ -181,7 +178,6 @@ def drone_refusals(run: RunCondition, drone: str) -> dict[str, str]:
 
 
 def preflight_refusal(run: RunCondition, drones: Collection[str]) -> str:
-    """Return which failed checks keep drones on the ground from taking off."""
     refusals = []
     for name in drones:
         if run.drones.get(name) == "landed":

@@ -92,7 +92,6 @@ class RunScene:
         camera_follow.restart()
 
     def clicked(self, event: viser.SceneClickEvent) -> str | None:
-        """Return the drone that a click hits."""
         if self.drones is None:
             return None
         return drone_on_ray(self.drones, self.nodes.radii_m, event.ray_origin, event.ray_direction)
@@ -134,7 +133,6 @@ class RunScene:
         self.nodes.previews(list(self.previews.values()))
 
     def draw_trails(self) -> None:
-        """Draw what changes slowly: trails and wind."""
         if self.drones is not None:
             segments, owners, _ = self.trails.segments(self.drones.t_ns / 1e9, self.drones.p_W)
             self.nodes.trails(segments, owners)
@@ -233,7 +231,6 @@ class SceneNodes:
         )  # fmt: skip
 
     def obstacles(self, obstacles: Sequence[Obstacle]) -> None:
-        """Draw the obstacles of the scenario: boxes, cylinders and spheres."""
         for each in obstacles:
             x, y, z = each.position_m
             turn = math.radians(each.yaw_deg) / 2
@@ -292,7 +289,6 @@ class SceneNodes:
             self._ghosts.batched_positions, self._ghosts.batched_wxyzs = positions, attitudes
 
     def previews(self, ways: Sequence[Array]) -> None:
-        """Draw ways (n, M, 3) that formations would fly, with a mark at the end of each drone's."""
         lines = [np.stack((way[:, :-1], way[:, 1:]), axis=2).reshape(-1, 2, 3) for way in ways]
         ends = [way[:, -1] for way in ways]
         segments = np.asarray(np.concatenate(lines) if lines else np.tile(HIDDEN, (1, 2, 1)), np.float32)
@@ -334,7 +330,6 @@ class SceneNodes:
             self._trail_node.points, self._trail_node.colors = segments, colours
 
     def show(self, what: str, visible: bool) -> None:
-        """Show or hide ghosts, estimates or trails."""
         self._trails_shown = visible if what == "trails" else self._trails_shown
         node = {"ghosts": self._ghosts, "estimates": self._ellipsoids, "trails": self._trail_node}[what]
         if node is not None:

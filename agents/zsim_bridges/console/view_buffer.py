@@ -157,7 +157,6 @@ class ViewBuffer:
         return newest
 
     def conditions(self) -> dict[str, DroneCondition]:
-        """Return the condition of each drone in the newest view, by name."""
         estimates, found = self.estimates(), {}
         for drone in self.drones.drones if self.drones else ():
             _, x, y, _ = drone.orientation_wxyz
@@ -189,7 +188,6 @@ class ViewBuffer:
         return ReceivedLink(self._links[key], self._wall_s() - self._received_s[key]) if key in self._links else None
 
     def active_faults(self) -> list[Fault]:
-        """Return the injected faults active at the time of the newest view."""
         now_ns = self.drones.t_ns if self.drones else 0
         return [f for f in self.faults if f.from_ns <= now_ns and (f.until_ns is None or f.until_ns > now_ns)]
 
@@ -201,7 +199,6 @@ class ViewBuffer:
         return max(0, (self.drones.t_ns if self.drones else 0) - received.t_ns) / 1e6
 
     def answered_commands(self, drone: str) -> int:
-        """Return how many commands to a drone the world has accepted or refused."""
         return self._answers[drone]
 
     def await_answer(self, drone: str, beyond: int, within_s: float) -> None:

@@ -71,11 +71,7 @@ class MethodError(ZsimError):
 
 
 def count_request(limit: RateLimit, address: str = "") -> None:
-    """Count a request of an address.
-
-    Raises:
-        TooManyError: there have been too many, with how long to wait.
-    """
+    """Count a request of an address, or raise a TooManyError with how long to wait."""
     if not limit.spend(address):
         wait_s = limit.wait(address)
         raise TooManyError(f"more than {1 / limit.period:g} requests a second; wait {wait_s:.3f} s")
@@ -89,11 +85,7 @@ class ClientLimit:
         self._count = 0
 
     def enter(self) -> None:
-        """Count one more.
-
-        Raises:
-            TooManyError: the limit is reached.
-        """
+        """Count one more, or raise a TooManyError."""
         if self._count >= self._limit:
             raise TooManyError(f"there are {self._limit} clients already; try again later")
         self._count += 1
@@ -130,12 +122,7 @@ def _matches_any(expressions: Sequence[str], key: str) -> bool:
 
 
 def check_not_reserved(key: str) -> None:
-    """Refuse a key on which clients may not publish.
-
-    Raises:
-        DecodeError: it is no key.
-        ForbiddenError: it is reserved.
-    """
+    """Raise a DecodeError for what is no key, a ForbiddenError for a key on which clients may not publish."""
     if "*" in key or not key:
         raise DecodeError(f"{key[:80]!r}: is no key; must be names with / between them")
     if is_reserved(key):
@@ -153,13 +140,7 @@ class MessageDefaults:
         self._next_seq: Counter[str] = Counter()
 
     def fill(self, key: str, value: Any, now_ns: int) -> Any:
-        """Return a value with `t_ns`, `seq` and `source` where its message has them and the value does not.
-
-        Args:
-            key: on which it is published.
-            value: plain data; what is no map is returned as it is.
-            now_ns: simulated time of the newest gate [ns].
-        """
+        """Return plain data with `t_ns` (the newest gate), `seq` and `source` where its message has them and it not."""
         kind = messages.type_of(key)
         if kind is None or not isinstance(value, dict):
             return value
@@ -195,12 +176,7 @@ def payload_to_json(key: str, payload: bytes, encoding: str = "") -> bytes:
     """Return a payload as JSON.
 
     A message of the contract comes with all of its fields; JSON, text and msgpack on other keys as their value, bytes
-    within as base64; anything else as base64 of the whole.
-
-    Args:
-        key: on which it was published.
-        payload: as published.
-        encoding: Zenoh's, where it is known.
+    within as base64; anything else as base64 of the whole. `encoding` is Zenoh's, where it is known.
 
     Raises:
         DecodeError: it is not the message that the contract puts on its key.
@@ -273,7 +249,6 @@ def _with_integers(value: Any) -> Any:
 
 
 def json_entry(key: str, payload: bytes, encoding: str = "") -> dict[str, Any]:
-    """Return a key and its value, to be encoded."""
     return {"key": key, "value": msgspec.Raw(payload_to_json(key, payload, encoding))}
 
 
@@ -389,11 +364,7 @@ OPS = ("hello", "latest", "subscribe", "unsubscribe", "put", "ask", "join", "don
 
 
 def decode_request(line: bytes) -> StreamRequest:
-    """Return the request in a line.
-
-    Raises:
-        DecodeError: it is none.
-    """
+    """Return the request in a line, or raise a DecodeError."""
     try:
         return _decode(line)
     except REFUSALS as error:

@@ -62,12 +62,7 @@ class Outbox:
         self._closed = False
 
     def put(self, line: bytes, droppable: bool = False) -> None:
-        """Add a line; to be called on the loop.
-
-        Args:
-            line: with its end.
-            droppable: whether it may be lost: a newer one of its kind replaces it.
-        """
+        """Add a line, with its end; on the loop. One is droppable if a newer one of its kind replaces it."""
         if self._closed:
             return
         self._lines.append((line, droppable))
@@ -228,17 +223,9 @@ async def stream_events(
     expression: str,
     event_of: Callable[[RawSample], bytes],
 ) -> web.StreamResponse:
-    """Send every publication on an expression until the client leaves.
+    """Send every publication on an expression until the client leaves, as `event_of` makes it; no empty one.
 
-    Args:
-        request: to be answered.
-        subscriptions: to the keys of the expression.
-        expression: what to subscribe to.
-        event_of: makes the event of a publication; an empty one is not sent.
-
-    Raises:
-        SessionError: it is no key expression.
-        TooManyError: the limit of streams is reached.
+    For errors see `SharedSubscriptions.subscribe_stream`.
     """
     lost = b": %d events were lost, they came faster than they were read\n\n"
     outbox = Outbox(_cutter(request), lambda count: lost % count)
@@ -278,14 +265,7 @@ class NumberedPicture(NamedTuple):
 class PictureFeed:
     """The newest picture of a camera, for clients on one loop.
 
-    Args:
-        key: of its pictures.
-        refuse: called with the reason for each message that is no picture.
-
-    Attributes:
-        newest: None before the first.
-        watchers: number of clients.
-        stop: ends its subscription.
+    `refuse` is called with the reason for each message that is no picture; `stop` ends its subscription.
     """
 
     def __init__(self, key: str, refuse: Callable[[str], None]) -> None:
@@ -294,11 +274,10 @@ class PictureFeed:
         self._arrived = asyncio.Event()
         self._count = 0
         self.newest: NumberedPicture | None = None
-        self.watchers = 0
+        self.watchers = 0  # clients
         self.stop: Callable[[], None] = lambda: None
 
     def take(self, sample: RawSample) -> None:
-        """Take a sample of the key."""
         try:
             image: CameraImage = messages.decode(self._key, sample.payload)
         except DecodeError as error:
@@ -320,12 +299,7 @@ class PictureFeed:
 
 
 class PictureFeeds:
-    """The feeds of all cameras with clients, at present or within LINGER_S.
-
-    Args:
-        subscribe: to a key; returns what ends that.
-        refuse: see PictureFeed.
-    """
+    """The feeds of all cameras with clients, at present or within LINGER_S; `subscribe` returns what ends it."""
 
     def __init__(
         self,

@@ -119,11 +119,7 @@ class Gateway:
     # For clients
 
     def run(self) -> RunAccess:
-        """Return the current run.
-
-        Raises:
-            NoWorldError: there is none.
-        """
+        """Return the current run, or raise a NoWorldError."""
         if self._run is None:
             raise NoWorldError("there is no run now; the gateway waits for the next")
         return self._run
@@ -272,11 +268,7 @@ class Gateway:
 
     @contextmanager
     def open(self) -> Iterator[None]:
-        """Serve clients, on a thread of its own.
-
-        Raises:
-            RunError: a port is taken.
-        """
+        """Serve clients, on a thread of its own; a RunError says that a port is taken."""
         with open_on_thread(self.loop, "gateway servers", self._open, lambda servers: self._close(*servers)):
             yield
 
@@ -345,11 +337,8 @@ class Client:
     """One connection of a stream: its requests are executed, answers and values go into its outbox.
 
     Args:
-        gateway: that it is connected to.
-        outbox: of the connection.
         source: name under which it publishes until it gives its own.
         authenticated: whether it has shown the token already, or needs none.
-        limit: of its requests.
 
     Attributes:
         commanded: (source, drone) of the drones that it has commanded, outside of a lockstep session, in this run.
@@ -435,11 +424,7 @@ class Client:
         self.send(answer, request)
 
     def _process_name(self, name: str) -> str:
-        """Return the process name of a client: a name without a role gets ROLE.
-
-        Raises:
-            DecodeError: it is no process name, or the gateway's.
-        """
+        """Return the process name of a client, a name without a role with ROLE, or raise a DecodeError."""
         process = name if "." in name else f"{ROLE}.{name}"
         if not keys.PROCESS_NAME.fullmatch(process) or "." not in process.strip(".") or process == self._gateway.name:
             raise DecodeError(
@@ -552,11 +537,7 @@ class Client:
             self.send({"op": "run", "state": state, "run_id": run_id})
 
     def close(self, connection_lost: bool = True) -> None:
-        """End everything that it has.
-
-        Args:
-            connection_lost: whether the connection broke, so that its process in the lockstep dies rather than leaves.
-        """
+        """End everything that it has; a process in the lockstep whose connection is lost dies rather than leaves."""
         if self._closed:
             return
         self._closed = True

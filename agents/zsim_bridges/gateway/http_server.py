@@ -148,7 +148,6 @@ class AccessCheck:
         self._limit = RateLimit(1 / HTTP_RATE_HZ, HTTP_BURST)
 
     def is_token(self, received: str) -> bool:
-        """Return whether a token is the right one."""
         return self._token is None or tokens_match(received, self._token)
 
     @web.middleware
@@ -211,15 +210,10 @@ def _is_from_this_machine(request: web.Request) -> bool:
 
 @dataclass(frozen=True)
 class RestTree:
-    """Handlers of the tree of full keys.
+    """Handlers of the tree of full keys."""
 
-    Attributes:
-        run: returns the current run.
-        subscriptions: to full keys.
-    """
-
-    run: Callable[[], RunAccess]
-    subscriptions: SharedSubscriptions
+    run: Callable[[], RunAccess]  # the current one
+    subscriptions: SharedSubscriptions  # to full keys
 
     async def get(self, request: web.Request) -> web.StreamResponse:
         """Answer a GET or a POST."""
@@ -253,30 +247,22 @@ class RestTree:
         return [*stored, *(answer for answer in answers if answer.kind == "ERROR" or answer.key not in stored_keys)]
 
     async def put(self, request: web.Request) -> web.Response:
-        """Publish a body on a key."""
         key, body = _key_of(request, "/"), await request.read()
         self.run().put_full_key(key, body, _encoding_of(request))
         return web.Response()
 
     async def delete(self, request: web.Request) -> web.Response:
-        """Publish that a key has no value any more."""
         self.run().delete_full_key(_key_of(request, "/"))
         return web.Response()
 
 
 @dataclass(frozen=True)
 class JsonTree:
-    """Handlers of the tree of JSON.
-
-    Attributes:
-        run: returns the current run.
-        subscriptions: to keys without the federation's name.
-        source: of control requests that name none.
-    """
+    """Handlers of the tree of JSON."""
 
     run: Callable[[], RunAccess]
-    subscriptions: SharedSubscriptions
-    source: str
+    subscriptions: SharedSubscriptions  # to keys without the federation's name
+    source: str  # of control requests that name none
 
     async def get(self, request: web.Request) -> web.StreamResponse:
         """Answer with the last values, or with every value from now on."""
@@ -290,7 +276,6 @@ class JsonTree:
         return _as_json(entries[0]["value"]) if entries else error_response(404, f"{expression[:80]}: {NO_VALUE}")
 
     async def put(self, request: web.Request) -> web.Response:
-        """Publish a value."""
         key, body = _checked_key(request), await request.read()
         try:
             value = msgspec.json.decode(body)
@@ -313,17 +298,11 @@ class JsonTree:
 
 @dataclass(frozen=True)
 class CameraTree:
-    """Handlers of the pictures of cameras.
-
-    Attributes:
-        run: returns the current run.
-        feeds: of the cameras.
-        limit: of clients, in which streams count.
-    """
+    """Handlers of the pictures of cameras."""
 
     run: Callable[[], RunAccess]
     feeds: PictureFeeds
-    limit: ClientLimit
+    limit: ClientLimit  # in which streams count
 
     async def get(self, request: web.Request) -> web.StreamResponse:
         """Answer with all pictures from now on, or with the newest one alone where the path ends with `.jpg`."""
@@ -356,11 +335,7 @@ def methods_of(key: str) -> tuple[str, ...]:
 
 
 def _key_of(request: web.Request, prefix: str) -> str:
-    """Return the key expression in a path.
-
-    Raises:
-        DecodeError: there is none.
-    """
+    """Return the key expression in a path, or raise a DecodeError."""
     try:
         key = unquote(request.raw_path.partition("?")[0], errors="strict").removeprefix(prefix)
     except UnicodeDecodeError as error:
@@ -371,12 +346,7 @@ def _key_of(request: web.Request, prefix: str) -> str:
 
 
 def _checked_key(request: web.Request) -> str:
-    """Return the key of a request that has its method.
-
-    Raises:
-        SessionError: it is no key expression.
-        MethodError: the key has other methods.
-    """
+    """Return the key of a request, or raise a MethodError where the key has other methods."""
     key = _key_of(request, JSON_PREFIX)
     check_expression(key)
     allowed = methods_of(key)
@@ -388,11 +358,7 @@ def _checked_key(request: web.Request) -> str:
 
 
 def _encoding_of(request: web.Request) -> str:
-    """Return the Zenoh encoding of a body.
-
-    Raises:
-        DecodeError: it is none.
-    """
+    """Return the Zenoh encoding of a body, or raise a DecodeError."""
     kind = request.headers.get("Content-Type") or BYTES
     if not (kind.isascii() and kind.isprintable()):
         raise DecodeError(f"Content-Type is {kind[:80]!a}; must be ASCII, e.g. application/json")

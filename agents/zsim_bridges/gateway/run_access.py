@@ -133,14 +133,7 @@ class RunAccess:
     # By keys without the federation's name
 
     def put(self, key: str, value: Any, defaults: MessageDefaults) -> None:
-        """Publish plain data on a key, checked, with what it leaves out filled in.
-
-        Raises:
-            DecodeError: with key, field, value and what is allowed.
-            ForbiddenError: the key is reserved.
-            UnknownError: the run has no such drone or cluster.
-            SessionError: it is no key.
-        """
+        """Publish plain data on a key with what it leaves out filled in; for errors see `encode`, `check_writable`."""
         self.check_writable(key)
         with defaults.transaction():
             payload = self.encode(key, defaults.fill(key, value, self.now_ns))
@@ -158,6 +151,8 @@ class RunAccess:
         Raises:
             DecodeError: with key, field, value and what is allowed.
             ForbiddenError: the key is reserved.
+            UnknownError: the run has no such drone or cluster.
+            SessionError: it is no key.
         """
         self._check_key(key)
         return json_to_payload(key, value)
@@ -171,22 +166,14 @@ class RunAccess:
             raise DecodeError(f"{key[:80]}: is no key of the contract; see docs/protocol.md")
 
     def check_writable(self, key: str) -> None:
-        """Refuse a key on which access control drops the gateway's messages.
-
-        Raises:
-            ForbiddenError: with those on which it does not.
-        """
+        """Raise a ForbiddenError for a key on which access control drops the gateway's messages."""
         if self._may_write is not None and not roles.permits(self._may_write, key):
             raise ForbiddenError(
                 f"{key[:80]}: the gateway's certificate lets it write on {', '.join(self._may_write)} only"
             )
 
     def check_known(self, key: str) -> None:
-        """Refuse a message of the contract about a drone or a cluster that the run does not have.
-
-        Raises:
-            UnknownError: with those that it has.
-        """
+        """Raise an UnknownError for a message of the contract about a drone or cluster that the run does not have."""
         kind, thing, _ = keys.parts(key.removeprefix("view/"))
         names = self._known_names.get(kind)
         if names is not None and (messages.type_of(key) or is_control_key(key)) and thing not in names:
@@ -195,11 +182,7 @@ class RunAccess:
             raise UnknownError(f"{key[:80]}: process is {thing[:60]!r}; must be 1 to 48 of a-z 0-9 _ . -")
 
     def camera_key(self, drone: str, camera: str) -> str:
-        """Return the key of a camera's pictures.
-
-        Raises:
-            UnknownError: with the drones that the run has, or the cameras of a drone.
-        """
+        """Return the key of a camera's pictures, or raise an UnknownError."""
         if camera not in CAMERAS:
             raise UnknownError(f"camera is {camera[:40]!r}; must be {' or '.join(CAMERAS)}")
         if drone not in self._known_names["drone"]:
@@ -207,18 +190,12 @@ class RunAccess:
         return keys.camera(drone, camera)
 
     def count_refused(self) -> None:
-        """Count a message that is not what its key promises."""
         self._observer.health.refused += 1
 
     async def request(
         self, key: str, op: str, args: dict[str, Any], source: str, timeout_s: float = 5.0
     ) -> ControlAnswer:
-        """Send a control request to whoever answers on a key.
-
-        Raises:
-            SessionError: it is no key.
-            TooManyError: REQUESTS_MAX others wait already.
-        """
+        """Send a control request to whoever answers on a key."""
         if "*" in key:
             raise DecodeError(f"{key[:80]!r}: is no key; a request goes to one, without wildcards")
         self.check_known(key)
@@ -227,29 +204,17 @@ class RunAccess:
     # By full keys, with the federation's name; keys of other federations too
 
     def last_samples(self, expression: str) -> list[RawSample]:
-        """Return the last values that a full expression matches."""
         return [
             RawSample("PUT", f"{self._prefix}{key}", payload, self.values.encoding(key), None)
             for key, payload in self.values.matching(expression, self._prefix)
         ]
 
     async def query(self, expression: str, parameters: str, payload: bytes, encoding: str) -> list[RawSample]:
-        """Return the answers to a Zenoh get on a full expression.
-
-        Raises:
-            SessionError: it is no key expression.
-            TooManyError: REQUESTS_MAX others wait already.
-        """
+        """Return the answers to a Zenoh get on a full expression."""
         return await self._in_thread(self.bare_link.query, expression, parameters, payload, encoding)
 
     def put_full_key(self, key: str, payload: bytes, encoding: str) -> None:
-        """Publish a payload on a full key.
-
-        Raises:
-            DecodeError: it is not the message that the contract puts there.
-            ForbiddenError: the key is reserved.
-            SessionError: it is no key.
-        """
+        """Publish a payload on a full key; a DecodeError says that it is not the message of the key."""
         own = self._federation_key(key)
         if own is None:
             self.bare_link.put_sample(key, payload, encoding)
@@ -259,12 +224,7 @@ class RunAccess:
         self.publish(own, payload, encoding)
 
     def delete_full_key(self, key: str) -> None:
-        """Publish that a full key has no value any more.
-
-        Raises:
-            ForbiddenError: the key is reserved.
-            SessionError: it is no key.
-        """
+        """Publish that a full key has no value any more."""
         own = self._federation_key(key)
         self.bare_link.delete(key)
         if own is not None:
@@ -347,7 +307,6 @@ class LastValues:
         self._of_gates: dict[int, tuple[GateMessages, int]] = {}
 
     def add(self, key: str, payload: bytes) -> None:
-        """Store a message."""
         with self._lock:
             self._add(key, payload)
 
@@ -434,7 +393,6 @@ class SharedSubscriptions:
         self._by_expression: dict[str, _SharedSubscription] = {}
 
     def attach(self, link: Session) -> None:
-        """Subscribe on a session."""
         self._link = link
         for expression, shared in self._by_expression.items():
             with suppress(SessionError):  # no right to read it; as from keys without publishers, nothing comes

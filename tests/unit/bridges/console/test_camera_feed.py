@@ -119,14 +119,12 @@ def batch(made: PageBatches, feed: CameraFeed, *want: str) -> tuple[dict[str, An
 # What is subscribed to
 
 
-def test_without_cameras_nothing_is_subscribed_to_and_nothing_is_shown(run: Run):
+def test_what_a_page_looks_at_is_subscribed_to_and_no_more(run: Run):
     run.watch(FRONT)
     assert list(run.link.subscribed) == [keys.camera_info("*", "*")]
     assert run.feed.cameras() == ()
     assert PageBatches().next(run.feed, ()) is None
 
-
-def test_what_a_page_looks_at_is_subscribed_to_and_no_more(run: Run):
     run.say_infos()
     run.feed.update()
     assert [name for name, _ in run.feed.cameras()] == [FRONT, BOTTOM]
@@ -141,11 +139,14 @@ def test_what_a_page_looks_at_is_subscribed_to_and_no_more(run: Run):
     assert list(run.link.subscribed) == [keys.camera_info("*", "*")]
 
 
-def test_two_pages_keep_each_others_pictures(watched: Run):
+def test_what_no_page_watches_costs_nothing(watched: Run):
     watched.feed.ask("another", [FRONT])
     watched.feed.release(PAGE)
     watched.feed.update()
     assert watched.link.pictures() == {"drone/drone1/camera/front"}
+
+    watched.feed.close()
+    assert watched.link.pictures() == set()
 
 
 def test_a_page_that_sleeps_costs_nothing(watched: Run):
@@ -157,12 +158,7 @@ def test_a_page_that_sleeps_costs_nothing(watched: Run):
     assert watched.link.pictures() == set()
 
 
-def test_a_run_that_is_over_leaves_no_subscription_to_pictures(watched: Run):
-    watched.feed.close()
-    assert watched.link.pictures() == set()
-
-
-def test_cameras_of_before_are_asked_for_and_those_of_strangers_left_out():
+def test_cameras_of_before_are_asked_for_where_that_is_allowed():
     run = Run()
     for drone in ("drone1", "stranger"):
         payload = messages.encode(synthetic_camera.info_of("front"))
@@ -170,8 +166,6 @@ def test_cameras_of_before_are_asked_for_and_those_of_strangers_left_out():
     run.feed.open()
     assert [name for name, _ in run.feed.cameras()] == [FRONT]
 
-
-def test_a_certificate_that_may_not_ask_does_no_harm():
     run = Run()
     run.link.refusal = SessionError("may not ask")
     run.feed.open()

@@ -34,9 +34,13 @@ class Actions:
         return self._sockets.act(json.dumps(action), role) is not None
 
 
+@pytest.fixture
+def actions() -> Actions:
+    return Actions()
+
+
 @pytest.mark.parametrize("role", [OPERATOR, VIEWER])
-def test_every_page_moves_its_own_camera(role: str):
-    actions = Actions()
+def test_every_page_moves_its_own_camera(role: str, actions: Actions):
     assert actions.act(role, **LOOK)
     assert actions.act(role, **LOOK | {"page": "gone"})
     assert actions.looked == [(7, True, False, "top")]
@@ -45,21 +49,18 @@ def test_every_page_moves_its_own_camera(role: str):
 @pytest.mark.parametrize(
     "change", [{"do": "stop"}, {"direction": "below"}, {"page": "x" * 65}, {"follows": 1}, {"more": 0}]
 )
-def test_what_is_no_action_closes_the_socket(change: dict[str, Any]):
-    actions = Actions()
+def test_what_is_no_action_closes_the_socket(change: dict[str, Any], actions: Actions):
     assert not actions.act(OPERATOR, **LOOK | change)
     assert actions.looked == []
 
 
-def test_an_operator_plays_a_record_and_a_viewer_does_not():
-    actions = Actions()
+def test_an_operator_plays_a_record_and_a_viewer_does_not(actions: Actions):
     assert actions.act(OPERATOR, do="play", op="seek", value=5.0)
     assert not actions.act(VIEWER, do="play", op="seek", value=5.0)
     assert actions.played == [("seek", 5.0)]
 
 
-def test_without_a_run_nothing_is_played():
-    actions = Actions()
+def test_without_a_run_nothing_is_played(actions: Actions):
     actions.record = None
     assert actions.act(OPERATOR, do="play", op="pause")
     assert actions.played == []
@@ -84,16 +85,14 @@ class FakeFlying:
             leave=partial(self._note, "leave"),
             lose=partial(self._note, "lose"),
         )
+        self.pages: Any = SimpleNamespace(
+            choose=lambda *chosen: self.chosen.append(chosen),
+            use=lambda client_id, drone: "main is held" if client_id == self.refused else "",
+        )
 
     def _note(self, what: str, page: Any, *args: Any) -> FlightAnswer:
         self.done.append((what, page, *args))
         return FlightAnswer("drone2", "flying")
-
-    def take_refusal(self, client_id: int | None, drone: str) -> str:
-        return "main is held" if client_id == self.refused else ""
-
-    def choose(self, client_id: int | None, drone: str) -> None:
-        self.chosen.append((client_id, drone))
 
     def plan(self, client_id: int | None, whole: bool) -> dict[str, Any]:
         return {"page": client_id, "whole": whole}

@@ -192,7 +192,7 @@ def test_a_drone_that_is_missing_is_hidden_and_the_others_keep_their_places(vise
     found = drone_poses(drones(NAMES[2])[1], NAMES)
     stage.drones(found, 0.05)
     stage.wind(found)
-    ((_, frames),) = stage._airframes.nodes
+    ((_, frames),) = stage._airframes
     p_W = np.asarray(frames.batched_positions)
     assert p_W[2].tolist() == [0.0, 3.0, 2.0]
     assert p_W[0].tolist() == p_W[1].tolist() == list(stages.HIDDEN)
@@ -208,7 +208,7 @@ def test_each_drone_is_drawn_with_the_rotors_that_it_has(viser: PrivateViser):
     six = DroneInfo(NAMES[2], "mine", tuple(RotorInfo(f"r{k}", x, y, 1, 0.05) for k, (x, y) in enumerate(ends)))
     stage = stages.SceneNodes(viser.server, (*DRONES[:2], six), ARMS_M, 3, 1)
     stage.drones(drone_poses(drones(*NAMES)[1], NAMES), 0.05)
-    assert [owners.tolist() for owners, _ in stage._airframes.nodes] == [[0, 1], [2]]
+    assert [owners.tolist() for owners, _ in stage._airframes] == [[0, 1], [2]]
     places = np.asarray(stage._rotors._node.batched_positions)
     assert len(places) == 4 + 4 + 6
     np.testing.assert_allclose(places[8:, :2] - (0.0, 3.0), ends, atol=1e-6)
