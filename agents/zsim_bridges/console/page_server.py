@@ -115,7 +115,7 @@ class RunFiles:
         return {"files": files, "leaves": self._leaves}
 
     def offer(self, within_s: float, deserted: Callable[[], bool]) -> None:
-        """Tell pages to copy the files, since the console leaves; wait until all open ones have, or `deserted` is true."""
+        """Tell pages to copy the files, since the console leaves; wait until all open ones have, unless deserted."""
         self._leaves = True
         until_s = time.monotonic() + within_s
         while (now_s := time.monotonic()) < until_s and not deserted():
