@@ -124,7 +124,7 @@ def test_what_a_page_looks_at_is_subscribed_to_and_no_more(run: Run):
     assert list(run.link.subscribed) == [keys.camera_info("*", "*")]
     assert run.feed.cameras() == ()
     assert PageBatches().next(run.feed, ()) is None
-
+    run.feed.release(PAGE)
     run.say_infos()
     run.feed.update()
     assert [name for name, _ in run.feed.cameras()] == [FRONT, BOTTOM]
