@@ -128,14 +128,19 @@ def test_a_page_that_is_silent_or_lost_lets_its_drone_hover_and_gives_it_back(fl
     assert flown.after(1.0) == []
 
 
-def test_a_connection_that_is_lost_lets_the_drone_hover_at_once(flown: Cockpit):
-    flown.control.steer(PAGE, FORWARD)
-    flown.after(0.1)
-    flown.control.lose(PAGE)
-    flown.control.tick()
-    assert flown.client.sent[-1] == ("drone2", STILL)
-    assert set(flown.after(GONE_S + 1.0)) == {STILL}
-    assert flown.client.given_back == ["drone2"]
+def test_a_connection_that_is_lost_lets_the_drone_hover_at_once_and_has_it_back_by_its_request(cockpit: Cockpit):
+    assert cockpit.control.take(PAGE, "drone2", False, "one").state == "flying"
+    cockpit.see("drone2", commander=NAME)
+    cockpit.control.steer(PAGE, FORWARD)
+    cockpit.after(0.1)
+    cockpit.control.lose(PAGE)
+    cockpit.control.tick()
+    assert cockpit.client.sent[-1] == ("drone2", STILL)
+    assert cockpit.control.take(OTHER, "drone2", False, "one").state == "flying"
+    assert cockpit.control.answer(PAGE).state == "none"
+    cockpit.control.lose(OTHER)
+    assert set(cockpit.after(GONE_S + 1.0)) == {STILL}
+    assert cockpit.client.given_back == ["drone2"]
 
 
 def test_a_drone_of_a_formation_is_flown_only_when_it_is_taken_over(cockpit: Cockpit):
@@ -146,6 +151,11 @@ def test_a_drone_of_a_formation_is_flown_only_when_it_is_taken_over(cockpit: Coc
     assert cockpit.client.taken == []
     assert cockpit.control.steer(PAGE, FORWARD).state == "none"
     assert cockpit.after(1.0) == []
+    cockpit.client.refusal = "drone2: flown by 'console.2' with priority 10"
+    answer = cockpit.control.take(PAGE, "drone2", over=True)  # the world refuses it
+    assert (answer.state, answer.text) == ("none", cockpit.client.refusal)
+    assert cockpit.after(1.0) == []
+    cockpit.client.refusal = ""
     assert cockpit.control.take(PAGE, "drone2", over=True).state == "flying"
 
 
@@ -170,13 +180,6 @@ def test_what_cannot_be_flown_is_refused_with_its_reason(
     assert cockpit.client.taken == []
 
 
-def test_what_the_world_refuses_is_not_flown(cockpit: Cockpit):
-    cockpit.client.refusal = "drone2: flown by 'console.2' with priority 10"
-    answer = cockpit.control.take(PAGE, "drone2", over=True)
-    assert (answer.state, answer.text) == ("none", cockpit.client.refusal)
-    assert cockpit.after(1.0) == []
-
-
 def test_a_request_that_is_repeated_is_carried_out_once(cockpit: Cockpit):
     cockpit.client.waiting = []
     for _ in range(3):
@@ -189,13 +192,6 @@ def test_a_request_that_is_repeated_is_carried_out_once(cockpit: Cockpit):
     again = cockpit.control.take(PAGE, "drone2", True, "one")  # a repetition that was late takes it no more
     assert (again.state, again.id) == ("none", "one")
     assert cockpit.client.taken == ["drone2"]
-
-
-def test_a_page_that_has_connected_anew_has_its_drone_back_by_the_request(cockpit: Cockpit):
-    assert cockpit.control.take(PAGE, "drone2", False, "one").state == "flying"
-    cockpit.control.lose(PAGE)
-    assert cockpit.control.take(OTHER, "drone2", False, "one").state == "flying"
-    assert cockpit.control.answer(PAGE).state == "none"
 
 
 def test_a_drone_is_asked_for_again_of_a_world_that_has_not_answered_and_says_for_how_long(cockpit: Cockpit):
@@ -223,12 +219,6 @@ def test_a_console_that_stood_still_says_so_where_it_gives_a_drone_back(flown: C
     flown.now_s += 29.0
     flown.control.tick()
     assert has_terms(flown.control.answer(PAGE).text, "console", "29 s")
-
-
-def test_a_place_is_flown_to_at_the_height_that_was_confirmed(flown: Cockpit):
-    answer = flown.control.go(PAGE, 3.0, 0.0, 7.0)
-    assert answer.goal == (3.0, 0.0, 7.0)
-    assert flown.after(PERIOD_S)[0][2] > 0.0
 
 
 def test_one_drone_is_flown_from_one_page_and_a_page_flies_one_drone(flown: Cockpit):
@@ -292,6 +282,8 @@ def test_a_run_that_stands_still_is_sent_nothing_and_a_slow_one_a_command_for_ea
 
 def test_a_drone_is_sent_to_a_place_at_its_height_and_the_stick_ends_that(flown: Cockpit):
     flown.see("drone2", pose=DronePose((0.0, 0.0, 4.0), math.pi / 2))
+    assert flown.control.go(PAGE, 3.0, 0.0, 7.0).goal == (3.0, 0.0, 7.0)  # a height that was confirmed
+    assert flown.after(PERIOD_S)[0][2] > 0.0
     answer = flown.control.go(PAGE, 0.0, 20.0)
     assert answer.state == "flying"
     assert has_terms(answer.text, "0.0", "20.0", "4.0")

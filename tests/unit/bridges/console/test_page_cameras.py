@@ -231,11 +231,8 @@ def test_a_click_is_on_the_drone_that_its_ray_hits(direction: tuple[float, ...],
     names = ("near", "behind", "far", "distant", "gone")
     poses = DronePoses(0, names, p_W, np.tile(LEVEL, (5, 1)), np.zeros((5, 4)), np.zeros(3))
     assert drone_on_ray(poses, np.full(5, 0.3), (0.0, 0.0, 10.0), direction) == drone
-
-
-def test_without_drones_a_click_is_on_none():
-    poses = DronePoses(0, ("gone",), np.full((1, 3), math.nan), LEVEL[None], np.zeros((1, 4)), np.zeros(3))
-    assert drone_on_ray(poses, np.ones(1), (0.0, 0.0, 10.0), (0.0, 0.0, -1.0)) is None
+    nobody = poses._replace(p_W=np.full((5, 3), math.nan))
+    assert drone_on_ray(nobody, np.ones(5), (0.0, 0.0, 10.0), direction) is None
 
 
 UP_W = np.array([0.0, 0.0, 1.0])
@@ -369,21 +366,17 @@ def test_who_follows_again_after_a_zoom_has_all_in_view_from_the_fitting_distanc
     assert page.distance_m == pytest.approx(fitting_m)
 
 
-def test_a_page_that_went_before_it_was_known_is_forgotten(followed: Pages):
-    gone = FollowingPage(1)
+def test_nothing_moves_a_camera_without_drones_or_of_a_page_that_went_before_it_was_known(followed: Pages):
+    there, gone = followed.come(FollowingPage(2)), FollowingPage(1)
+    before = there.camera.position.tolist()
+    followed.follow.follow(np.zeros((0, 3)))
     followed.go(gone)
     followed.calls["come"](gone)
-    before = gone.camera.position.tolist()
+    before_gone = gone.camera.position.tolist()
     followed.follow.choose(1, follows=True, fits=True, direction="top")
+    assert there.camera.position.tolist() == before
     followed.follow.follow(TRIANGLE)
-    assert gone.camera.position.tolist() == before
-
-
-def test_without_drones_no_camera_moves(followed: Pages):
-    page = followed.come(FollowingPage(1))
-    before = page.camera.position.tolist()
-    followed.follow.follow(np.zeros((0, 3)))
-    assert page.camera.position.tolist() == before
+    assert gone.camera.position.tolist() == before_gone
 
 
 NORTHWARDS = CameraView(np.zeros(3), np.array([0.0, 2.0, 0.0]), np.array([0.0, 0.0, 1.0]), math.radians(90), 1.5)
