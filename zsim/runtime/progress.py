@@ -10,11 +10,13 @@ import threading
 from collections.abc import Callable
 from typing import Any, Protocol, Self
 
+import msgspec
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
 from zsim.contract.flight_messages import ClusterState
+from zsim.contract.run_messages import Waiting, holding_up
 from zsim.errors import printable, without_figures
 
 PERIOD_S = 0.2  # wall time between two updates
@@ -200,10 +202,8 @@ def describe(line: dict[str, Any], duration_s: float, from_s: float = 0.0) -> st
         text += f"  {line['phase']}"
     if line["state"] != "running":
         text += f"  {line['state']}"
-    waiting = [w for w in line["waiting_for"] if line["state"] == "waiting" or w["since_wall_s"] > 0.5]
-    waiting = [w for w in waiting if not w.get("held_by")] or waiting  # causes alone
+    waiting = holding_up(line["state"], msgspec.convert(line["waiting_for"], list[Waiting]))
     if waiting:
-        places = [f"{w['name']} on {w['host']}" if w["host"] else w["name"] for w in waiting[:4]]
-        named = ", ".join(f"{place} ({w['since_wall_s']:.1f} s)" for place, w in zip(places, waiting, strict=False))
-        text += f"  waiting for {named}{' …' if len(waiting) > 4 else ''}"
+        names = [f"{w.name}{w.host and f' on {w.host}'} ({w.since_wall_s:.1f} s)" for w in waiting[:4]]
+        text += f"  waiting for {', '.join(names)}{' …' if len(waiting) > 4 else ''}"
     return text
