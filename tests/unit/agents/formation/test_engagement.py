@@ -438,24 +438,18 @@ def test_a_drone_far_below_its_formation_stays_there_until_it_is_to_rejoin(away_
     assert fleet.p_W[1, 2] == pytest.approx(0.8, abs=0.1)
     assert fleet.engagement.request(Order.REJOIN) is None
     assert has_terms(fleet.step().reason, "drone2", "place", "1")
-    outputs = fleet.fly(60.0)
+    outputs, low_m = [], fleet.p_W[1, 2]
+    place = fleet.engagement.space.inverse(fleet.engagement.guidance.value(fleet.t_s)[0])[0][1]
+    while np.linalg.norm(fleet.p_W[1, :2] - place[:2]) > 1.0:  # over the ground first, and then straight up
+        outputs.append(fleet.step())
+        assert fleet.t_s < 200.0
+        assert fleet.p_W[1, 2] == pytest.approx(low_m, abs=0.05)
+    outputs += fleet.fly(60.0)
     assert fleet.output.phase == "engaged"
     assert fleet.output.value[2] == pytest.approx(8.0, abs=0.02)
     assert fleet.closest_m > 2.0
     speeds = [np.linalg.norm(s.v_W[:2]) for o in outputs for s in o.setpoints if s is not None]
     assert max(speeds) <= 2.0
-
-
-def test_a_drone_rejoins_over_the_ground_first_and_then_straight_up():
-    fleet = fleet_out_of_step(away_m=(6.0, 5.0))
-    assert fleet.engagement.request(Order.REJOIN) is None
-    place = fleet.engagement.space.inverse(fleet.engagement.guidance.value(fleet.t_s)[0])[0][1]
-    low_m = fleet.p_W[1, 2]
-    while np.linalg.norm(fleet.p_W[1, :2] - place[:2]) > 1.0:
-        fleet.step()
-        assert fleet.t_s < 200.0
-        assert fleet.p_W[1, 2] == pytest.approx(low_m, abs=0.05)
-    fleet.fly_until("engaged")
 
 
 def test_to_rejoin_needs_a_formation_held_by_a_fault_and_drones_that_fly_and_nothing_else_is_granted():
@@ -496,15 +490,6 @@ def test_a_hold_a_landing_and_a_lost_estimate_end_the_way_back(end):
     assert fleet.output.phase == "held"
     assert np.array_equal(fleet.p_W, here)
     assert fleet.engagement.request(Order.REJOIN) is None
-
-
-def test_one_that_is_restored_on_the_way_back_goes_on_to_the_same_bits():
-    fleet = fleet_out_of_step(away_m=(3.0, 0.0))
-    assert fleet.engagement.request(Order.REJOIN) is None
-    fleet.fly(2.0)
-    copied = restored(fleet, ())
-    assert [*map(exact, copied.fly(25.0))] == [*map(exact, fleet.fly(25.0))]
-    assert fleet.output.phase == "engaged"
 
 
 # Hold, resume, land
@@ -623,15 +608,16 @@ def restarted(fleet, plan):
     fleet.engagement.warm_start(last.phase, last.desired, last.plan_step)
 
 
-def restored(fleet, plan):
-    """Return a copy of the fleet whose engagement is another one with the snapshot of the former."""
+def assert_the_same_from_here(fleet, plan, seconds=25.0):
+    """Fly the fleet, and a copy whose engagement is another one with the snapshot of the former."""
     copied = copy.deepcopy(fleet)
     copied.engagement = Engagement(SPACE, DRONES, plan=plan)
     copied.gate -= 1
     last = copied._input()
     copied.gate += 1
     copied.engagement.restore(unpack(pack(fleet.engagement.snapshot())), last)
-    return copied
+    assert [*map(exact, copied.fly(seconds))] == [*map(exact, fleet.fly(seconds))]
+    assert fleet.modes == copied.modes
 
 
 def exact(output: GateOutput):
@@ -661,8 +647,15 @@ def test_one_that_is_restored_goes_on_to_the_same_bits(request_, at_s):
     if request_:
         assert fleet.engagement.request(request_) is None
         fleet.fly(1.0)
-    copied = restored(fleet, ALL_PHASES)
-    assert [*map(exact, copied.fly(25.0))] == [*map(exact, fleet.fly(25.0))]
+    assert_the_same_from_here(fleet, ALL_PHASES)
+
+
+def test_one_that_is_restored_on_the_way_back_goes_on_to_the_same_bits():
+    fleet = fleet_out_of_step(away_m=(3.0, 0.0))
+    assert fleet.engagement.request(Order.REJOIN) is None
+    fleet.fly(2.0)
+    assert_the_same_from_here(fleet, ())
+    assert fleet.output.phase == "engaged"
 
 
 @pytest.mark.parametrize(
@@ -678,11 +671,9 @@ def test_one_that_is_restored_in_a_fault_goes_on_to_the_same_bits(spoil, at_s, p
     fleet.spoil = spoil
     fleet.fly(0.5)
     assert fleet.output.phase == phase
-    copied = restored(fleet, FLIGHT)
-    for seconds in (3.0, 20.0):
-        assert [*map(exact, copied.fly(seconds))] == [*map(exact, fleet.fly(seconds))]
-        fleet.spoil = copied.spoil = {}
-    assert fleet.modes == copied.modes
+    assert_the_same_from_here(fleet, FLIGHT, 3.0)
+    fleet.spoil = {}
+    assert_the_same_from_here(fleet, FLIGHT)
 
 
 @pytest.mark.parametrize("gate", [10, 100, 300, 400, 700])
@@ -747,9 +738,7 @@ def test_plans_that_can_never_be_flown_are_refused_at_once(plan, terms):
 
 @pytest.mark.parametrize("n", [2, 4])
 def test_other_numbers_of_drones_fly_too(n):
-    p_W = np.array([(0.0, 1.5, 0), (-1.5, -1.5, 0), (1.5, -1.5, 0), (0.0, -4.5, 0)])[:n]
-    if n == 2:
-        p_W = np.array([(0.0, 1.5, 0), (0.0, -1.5, 0)])
+    p_W = np.array([(0.0, 1.5, 0), (0.0, -1.5, 0)] if n == 2 else [*GROUND, (0.0, -4.5, 0)])
     plan = [*FLIGHT[:2], Scheduled(1.0, MoveTo({"z_c": 6.0, "p": 4.0}))]
     space = cluster_space(n)
     fleet = Fleet(Engagement(space, [f"d{i}" for i in range(n)], plan=plan), p_W=p_W)
@@ -776,8 +765,7 @@ def test_a_large_cluster_comes_into_its_template():
 
 
 def test_requests_are_read_from_the_wire():
-    assert read_request("takeoff") == Order.TAKE_OFF
-    assert read_request("hold", {}) == Order.PAUSE
+    assert [read_request(op, args) for op, args in (("takeoff", None), ("hold", {}))] == [Order.TAKE_OFF, Order.PAUSE]
     assert read_request("target", {"values": {"z_c": 3}, "over_s": 5}) == MoveTo({"z_c": 3}, 5)
     assert read_request("target", {"values": {"z_c": 3}, "over_s": None}) == MoveTo({"z_c": 3})
     follow = read_request("trajectory", {"expressions": {"x_c": "f*t"}, "constants": {"f": 0.1}, "start_s": 9.0})
