@@ -29,15 +29,12 @@ def test_the_package_has_the_types_that_go_over_the_wire(tmp_path: Path, capsys:
     assert "<name>zsim_msgs</name>" in (package / "package.xml").read_text()
 
 
-def test_a_folder_that_cannot_be_written_is_a_line(tmp_path: Path) -> None:
+def test_a_secured_world_needs_a_router_for_ros_and_its_package_a_folder(tmp_path: Path) -> None:
+    with refused(typer.BadParameter, "--tls", "--router"):
+        ros2(tls=tmp_path)
     (tmp_path / "zsim_msgs").write_text("a file is there")
     with refused(RunError, "written", "--write-package"):
         ros2(write_package=tmp_path)
-
-
-def test_a_secured_world_needs_a_router_for_ros(tmp_path: Path) -> None:
-    with refused(typer.BadParameter, "--tls", "--router"):
-        ros2(tls=tmp_path)
 
 
 def test_a_console_gives_way_to_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
