@@ -90,7 +90,7 @@ def recorded(
     link.on_request = lambda key, args: next(left, page([]))  # the world has no more of the gates before the last one
     for passed in (*batches, [clock(99, "stopped")]):
         link.deliver(keys.BATCH, encode_batch(passed))
-    record(link, path)  # type: ignore[arg-type]
+    record(link, path)
     assert next(left, None) is None
     return on_record(path)
 
@@ -107,21 +107,17 @@ def test_a_late_recorder_writes_what_it_hears_twice_once(tmp_path: Path):
     assert stamps(found, keys.CLOCK) == [*range(9), 99]
 
 
-@pytest.mark.parametrize("kept", [True, False])
-def test_which_run_it_is_is_on_record_however_late_the_recorder_comes(tmp_path: Path, kept: bool):
+def test_which_run_it_is_is_on_record_however_late_the_recorder_comes(tmp_path: Path):
     """The replay has lost the world's first words; what the hub still answers comes as it is, once."""
-    info_entry = pair(keys.INFO, INFO)
-    found = recorded(tmp_path / "run.mcap", [page(gates(7))], gates(8), last=LAST if kept else {})
-    assert found[0] == info_entry
+    found = recorded(tmp_path / "run.mcap", [page(gates(7))], gates(8))
+    assert found[0] == pair(keys.INFO, INFO)
     assert [key for key, _ in found].count(keys.INFO) == 1
 
 
 def test_the_newest_faults_are_on_record_once(tmp_path: Path):
     first, second, third = (pair(keys.FAULTS, Faults(gate * GATE_NS, gate, ())) for gate in (1, 5, 8))
     for number, passed in enumerate(([*gates(7)], [first, *gates(2), second, *gates(7)])):
-        found = recorded(
-            tmp_path / f"{number}.mcap", [page(passed)], [third, *gates(8)], last=dict([second, pair(keys.INFO, INFO)])
-        )
+        found = recorded(tmp_path / f"{number}.mcap", [page(passed)], [third, *gates(8)], last=dict([second]))
         assert stamps(found, keys.FAULTS) == ([5, 8], [1, 5, 8])[number]
 
 
@@ -235,7 +231,7 @@ def test_one_that_is_started_again_goes_on_with_the_record(tmp_path: Path):
 def test_what_its_last_chunk_lacks_is_asked_for(tmp_path: Path, cut: int):
     path = tmp_path / "run.mcap"
     died(path, [pair(keys.INFO, INFO), *gates(0, 1, 2)], cut)
-    found = recorded(path, [page(gates(0, 1, 2, 3))], gates(4), last=LAST)
+    found = recorded(path, [page(gates(0, 1, 2, 3))], gates(4))
     assert stamps(found, IMU) == list(range(5))
 
 
@@ -308,7 +304,7 @@ def test_what_passed_while_its_link_was_lost_is_asked_for(tmp_path: Path):
 
     link.last = LAST
     link.on_request, link.on_publish = answer, cut
-    record(link, path)  # type: ignore[arg-type]
+    record(link, path)
     found = on_record(path)
     assert stamps(found, IMU) == list(range(5))
     assert stamps(found, keys.CLOCK) == [*range(6)]
@@ -320,8 +316,7 @@ def test_gates_that_did_not_come_are_asked_for_and_stand_before_what_came_after_
     """No link was lost as far as anybody noticed: the batch of gate 3 went nowhere."""
     path, strange = tmp_path / "run.mcap", ("drone/d1/cmd/velocity", b"of gate 5")
     answers = [page(gates(0, 1)), page([*gates(1, 2, 3), strange, *gates(4)])]
-    last = LAST
-    found = recorded(path, answers, gates(2), [strange, *whole(4)], whole(5), [clock(6)], last=last)
+    found = recorded(path, answers, gates(2), [strange, *whole(4)], whole(5), [clock(6)])
     assert stamps(found, IMU) == list(range(6))
     written = [key for key, _ in on_record(path, keys.CLOCK, strange[0])]
     assert written == [*[keys.CLOCK] * 4, strange[0], *[keys.CLOCK] * 4]
@@ -331,7 +326,7 @@ def test_a_clock_of_time_that_stood_still_is_missed_by_its_number(tmp_path: Path
     """The world died just after it had published that clock: the next one knows of it."""
     path, stood = tmp_path / "run.mcap", clock(1, seq=2)
     after = [clock(1, seq=3), clock(2, seq=4)]
-    recorded(path, [page(gates(0)), page([*gates(0, 1), stood, *after])], gates(1), after, last=LAST)
+    recorded(path, [page(gates(0)), page([*gates(0, 1), stood, *after])], gates(1), after)
     clocks = [messages.decode(*each) for each in on_record(path, keys.CLOCK)]
     assert [(each.step, each.seq) for each in clocks[:-1]] == [(0, 0), (1, 1), (1, 2), (1, 3), (2, 4)]
 
@@ -353,9 +348,9 @@ def test_gates_that_the_world_has_no_longer_are_missing_by_number(tmp_path: Path
 
 def test_a_world_that_is_far_ahead_changes_no_order_and_doubles_nothing(tmp_path: Path):
     """It replays gates that are on their way still, behind the ones that are missing."""
-    path, last = tmp_path / "run.mcap", LAST
+    path = tmp_path / "run.mcap"
     on_their_way = [each for gate in range(5, 30) for each in whole(gate)]
-    found = recorded(path, [page(gates(0)), page(gates(20, 21, 22, 23))], on_their_way, [clock(30)], last=last)
+    found = recorded(path, [page(gates(0)), page(gates(20, 21, 22, 23))], on_their_way, [clock(30)])
     assert stamps(on_record(path, IMU), IMU) == [0, *range(5, 30)] == stamps(found, IMU)
     assert completed(path).gaps[0] == GateGap(4, GATE_NS, 4 * GATE_NS)
 
@@ -376,7 +371,7 @@ def test_the_end_of_a_run_that_passed_while_the_link_was_lost_is_asked_for(
             link.cut(True)
 
     link.on_publish = cut
-    record(link, path, info)  # type: ignore[arg-type]
+    record(link, path, info)
     assert completed(path).complete
 
 
@@ -400,7 +395,7 @@ def test_what_passed_before_a_link_was_back_is_asked_for_in_realtime_though_no_c
             link.deliver(keys.BATCH, encode_batch([*gates(1, 2), clock(3, "stopped")]))
 
     link.on_publish = cut
-    record(link, path, info)  # type: ignore[arg-type]
+    record(link, path, info)
     written = on_record(path, keys.EVENT, keys.CLOCK)
     assert [messages.decode(*each).seq for each in written if each[0] == keys.EVENT] == [0, 1, 2]
     assert [messages.decode(*each).seq for each in written if each[0] == keys.CLOCK] == [0, 1, 2, 3]
@@ -412,7 +407,7 @@ def test_another_run_is_not_asked_for_gates_that_are_missing(tmp_path: Path):
     link.on_request = lambda key, args: next(replays)
     link.last = dict([pair(keys.INFO, replace(INFO, run_id="other"))])
     link.deliver(keys.BATCH, encode_batch([*gates(1), *gates(4), clock(5, "stopped")]))
-    record(link, path)  # type: ignore[arg-type]
+    record(link, path)
     assert completed(path).gates_missing == 2
 
 
@@ -431,7 +426,7 @@ def test_who_goes_on_with_the_record_of_a_run_that_is_over_leaves(tmp_path: Path
     before = [pair(keys.INFO, INFO), *gates(0, 1, 2), clock(3, "stopped")]
     died(path, before)
     link.on_request = lambda key, args: page(before)
-    record(link, path)  # type: ignore[arg-type]
+    record(link, path)
     assert completed(path).complete
 
 
@@ -448,7 +443,7 @@ def test_it_publishes_how_far_the_record_is_on_disk(tmp_path: Path):
     link.on_publish = look
     link.on_request = lambda key, args: page(gates(*range(60)))
     link.deliver(keys.BATCH, encode_batch([*gates(*range(59, 130)), clock(130, "stopped")]))
-    record(link, path)  # type: ignore[arg-type]
+    record(link, path)
     assert on_disk[0] == (59 * GATE_NS, 59 * GATE_NS)
     assert all(done_ns == last_ns for done_ns, last_ns in on_disk)
     (join,) = link.published_on("process/recorder/join")
