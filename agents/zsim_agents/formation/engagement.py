@@ -340,9 +340,9 @@ class Engagement:
         reference: tuple[Array, Array] | None = None,
     ) -> GateOutput:
         """Return the output of a gate; without a reference the present value is the desired one."""
-        alarmed = command.alarmed if command else ()
-        if alarmed:
-            reason = f"{TOO_NEAR}, nearer than {self.gains.separation_alarm_m:g} m: {self._pairs(alarmed)}; {reason}"
+        if command and command.alarmed:
+            near = f"nearer than {self.gains.separation_alarm_m:g} m: {self._pairs(command.alarmed)}"
+            reason = f"{TOO_NEAR}, {near}; {reason}"
         if self.plan.note:
             reason = f"{reason}; {self.plan.note}" if reason else self.plan.note
         desired, desired_rate = reference or (self.check.value, np.zeros(self.space.size))
@@ -357,7 +357,6 @@ class Engagement:
             margin=self.check.margin,
             reason=reason,
             factor=command.factor if command else 1.0,
-            alarmed=alarmed,
             plan_step=self.plan.resume_at(engaged=self._phase == "engaged" and not self.guidance.paused),
         )
 

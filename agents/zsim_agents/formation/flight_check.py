@@ -140,7 +140,6 @@ class GateOutput(Struct, eq=False):
         phase, value, desired, desired_rate, trajectory_t_s, margin, reason, plan_step: as in the message; value and
             desired with wrapped angles.
         factor: common factor of the saturation, 1 where nothing is saturated.
-        alarmed: pairs of drone indices that are nearer than the alarm threshold.
     """
 
     modes: tuple[ModeCommand, ...]
@@ -153,7 +152,6 @@ class GateOutput(Struct, eq=False):
     margin: float
     reason: str
     factor: float
-    alarmed: tuple[tuple[int, int], ...]
     plan_step: int
 
 

@@ -389,9 +389,8 @@ def test_robots_that_are_driven_together_are_parted_and_reported():
     fleet.fly(1.0)
     fleet.p_W[2] = fleet.p_W[1] + (1.3, 0.0, 0.0)
     output = fleet.step()
-    assert output.alarmed == ((1, 2),)
-    assert "ALARM" in output.reason
-    assert has_terms(output.reason, "drone2", "drone3")
+    assert has_terms(output.reason, "ALARM", "drone2", "drone3")
+    assert "drone1" not in output.reason
     fleet.fly(8.0)
     assert closest_pair(fleet.p_W)[0] > 2.0
     assert fleet.output.phase == "engaged"
@@ -624,7 +623,7 @@ def exact(output: GateOutput):
     numbers = [array.tobytes() for array in (output.value, output.desired, output.desired_rate)]
     setpoints = [setpoint and (tuple(setpoint.v_W), setpoint.yaw_rate) for setpoint in output.setpoints]
     state = output.phase, output.trajectory_t_s, output.margin, output.reason, output.factor, output.plan_step
-    return *numbers, setpoints, output.modes, output.alarmed, state
+    return *numbers, setpoints, output.modes, state
 
 
 WAYPOINTS = [{"at_s": 0.0, "values": {"z_c": 8.0}}, {"at_s": 20.0, "values": {"z_c": 6.0, "x_c": 3.0}}]
