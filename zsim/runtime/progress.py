@@ -11,11 +11,13 @@ import threading
 from collections.abc import Callable
 from typing import Any, Protocol, Self
 
+import msgspec
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
 from zsim.contract.flight_messages import ClusterState
+from zsim.contract.run_messages import Waiting, holding_up
 from zsim.errors import printable
 
 PERIOD_S = 0.2  # wall time between two updates
@@ -211,14 +213,8 @@ def describe(line: dict[str, Any], duration_s: float, from_s: float = 0.0) -> st
         text += f"  {line['phase']}"
     if line["state"] != "running":
         text += f"  {line['state']}"
-    waiting = [w for w in line["waiting_for"] if line["state"] == "waiting" or w["since_wall_s"] > 0.5]
-    waiting = [w for w in waiting if not w.get("held_by")] or waiting  # causes alone
+    waiting = holding_up(line["state"], msgspec.convert(line["waiting_for"], list[Waiting]))
     if waiting:
-        named = ", ".join(_name(w) for w in waiting[:4]) + (" …" if len(waiting) > 4 else "")
-        text += f"  waiting for {named}"
+        names = [f"{w.name}{w.host and f' on {w.host}'} ({w.since_wall_s:.1f} s)" for w in waiting[:4]]
+        text += f"  waiting for {', '.join(names)}{' …' if len(waiting) > 4 else ''}"
     return text
-
-
-def _name(waiting: dict[str, Any]) -> str:
-    host = f" on {waiting['host']}" if waiting["host"] else ""
-    return f"{waiting['name']}{host} ({waiting['since_wall_s']:.1f} s)"
