@@ -42,14 +42,11 @@ def test_a_checkout_has_the_commit_of_its_branch(checkout: Path) -> None:
     assert zsim.commit(checkout / "zsim") == head(checkout) != first
 
 
-def test_a_branch_may_be_packed(checkout: Path) -> None:
+def test_a_branch_may_be_packed_and_a_commit_checked_out_without_one(checkout: Path) -> None:
     git(checkout, "branch", "n/main")  # ends as the other one does
     git(checkout, "pack-refs", "--all")
     assert not (checkout / ".git" / "refs" / "heads" / "main").exists()
     assert zsim.commit(checkout / "zsim") == head(checkout)
-
-
-def test_a_commit_may_be_checked_out_without_a_branch(checkout: Path) -> None:
     git(checkout, "checkout", "-q", "--detach")
     assert zsim.commit(checkout / "zsim") == head(checkout)
 
@@ -61,9 +58,11 @@ def test_a_worktree_has_a_commit_of_its_own(checkout: Path) -> None:
     assert zsim.commit(worktree / "zsim") == head(worktree) != head(checkout)
 
 
-def test_what_was_built_has_the_commit_of_the_build(tmp_path: Path) -> None:
+def test_what_was_built_has_the_commit_of_the_build_and_else_the_release_alone(tmp_path: Path) -> None:
     (tmp_path / zsim.COMMIT_FILE).write_text(f"{OTHER}\n")
     assert zsim.commit(tmp_path) == OTHER
+    (tmp_path / zsim.COMMIT_FILE).write_bytes((ROOT / "zsim" / zsim.COMMIT_FILE).read_bytes())
+    assert zsim.commit(tmp_path) == ""
 
 
 def test_an_archive_made_by_git_has_its_commit(checkout: Path) -> None:
@@ -75,11 +74,6 @@ def test_an_archive_made_by_git_has_its_commit(checkout: Path) -> None:
     (checkout.parent / "archive").mkdir()
     subprocess.run(["tar", "xf", "archive.tar", "-C", "archive"], cwd=checkout.parent, check=True)
     assert zsim.commit(checkout.parent / "archive" / "zsim") == head(checkout)
-
-
-def test_without_git_there_is_the_release_alone(tmp_path: Path) -> None:
-    (tmp_path / zsim.COMMIT_FILE).write_bytes((ROOT / "zsim" / zsim.COMMIT_FILE).read_bytes())
-    assert zsim.commit(tmp_path) == ""
 
 
 def test_world_and_participants_state_the_same_version() -> None:
