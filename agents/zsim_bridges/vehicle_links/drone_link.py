@@ -12,7 +12,7 @@ from zsim.contract import flight_messages, keys, messages
 from zsim.math import frames as rotations
 from zsim.math.rotation import LEVEL, Vector
 from zsim.sensors.sensor import Mount
-from zsim_agents.estimation.dead_reckoning import madgwick_step
+from zsim_agents.estimation.strapdown import madgwick_step
 
 BETA_RAD_S = 0.02  # of Madgwick's filter: levels within seconds, and is little disturbed by manoeuvres
 UNIT_SLACK = 0.01  # of a quaternion's length; an estimator of positions alone may publish zeros
