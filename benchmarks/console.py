@@ -27,8 +27,7 @@ from websockets.typing import Subprotocol
 from benchmarks import grid
 from benchmarks.child import RefusedError
 from benchmarks.exchange.lap import free_port
-from benchmarks.progress import Progress
-from benchmarks.sheet import Sheet
+from benchmarks.sheet import Progress, Sheet
 from benchmarks.table import figure, spread, table
 from zsim.contract import keys, messages
 from zsim.transport import connection

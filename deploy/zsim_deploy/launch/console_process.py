@@ -5,7 +5,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 
 from zsim.errors import printable
 from zsim_deploy import SAFE_PATH
@@ -42,9 +41,7 @@ class RunConsole:
     def __enter__(self) -> "RunConsole":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         if self.process is None:
             return
         hurries = self.outcome.interrupted or isinstance(error, (KeyboardInterrupt, SystemExit))
@@ -66,13 +63,8 @@ class RunConsole:
 def console_beside(endpoint: str, record: Path, federation: str | None, tls: Path | None) -> Iterator[None]:
     """Run a console meanwhile, which waits for the world and prints its links.
 
-    Args:
-        endpoint: on which the world listens; where that is all addresses, it is reached on this machine.
-        federation: in whose name; None for that of the record.
-        tls: folder of a certificate, None without.
-
-    Raises:
-        RunError, RecordError: there is no record.
+    It reaches the world at its endpoint, on this machine where that is all addresses, in the name of a federation, by
+    default that of the record.
     """
     if federation is None:
         from zsim_analysis.reading.recorded_run import open_run

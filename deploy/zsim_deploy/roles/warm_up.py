@@ -72,7 +72,6 @@ def _info(scenario: Scenario) -> Info:
 
 
 def formations() -> dict[str, Any]:
-    """Return a scenario with one cluster of each kind."""
     nested, groups, size = NESTED
     names = {kind: [f"{kind}{i}" for i in range(count)] for kind, count in (SIZES | {nested: groups * size}).items()}
     clusters: list[dict[str, Any]] = [{"name": kind, "drones": drones} for kind, drones in names.items()]
