@@ -56,7 +56,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_collection_finish() -> None:
     """Take what is there now for good: the modules that tests have imported, and the variables that these have set."""
     gc.collect()
-    gc.freeze()  # else each search for cycles, of which a run makes some, looks at all tests for a third of a second
+    gc.freeze()  # else each search for cycles looks at all tests, for a third of a second
+    gc.unfreeze = lambda: None  # which a run in this process does when it is over
     if commands := sys.modules.get("forked_commands"):
         commands.FIRST = commands.inherited()
 
