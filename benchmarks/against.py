@@ -170,7 +170,6 @@ def _flown(side: Side, flight: Flight, seconds: float, path: Path) -> tuple[floa
 
 
 def page(sheet: Sheet) -> str:
-    """Return the measured section."""
     here, there = sheet.notes["here"], sheet.notes["against"]
     rows = []
     for name, flight in FLIGHTS.items():
@@ -185,6 +184,5 @@ def page(sheet: Sheet) -> str:
 
 
 def _cell(sheet: Sheet, contender: str, size: int) -> str:
-    """Return the spread, or why there is none."""
     found = sheet.spread(contender, size)
     return spread(found) if found else sheet.refused.get(f"{contender.rsplit('.', 1)[0]}@{size}", "–")

@@ -18,7 +18,6 @@ class Way(NamedTuple):
 
     @property
     def span_s(self) -> float:
-        """Return how long it takes."""
         return (len(self.p_W) - 1) * GATE_S
 
     def at(self, t_s: float) -> int:
@@ -27,11 +26,9 @@ class Way(NamedTuple):
 
 
 def write(way: Way, path: Path) -> None:
-    """Write it for another process."""
     np.savez(path, **way._asdict())
 
 
 def read(path: Path) -> Way:
-    """Return what `write` wrote."""
     with np.load(path) as found:
         return Way(found["p_W"], found["v_W"], found["yaw"])
