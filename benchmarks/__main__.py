@@ -7,13 +7,18 @@ make bench                                        everything; makes the peers' e
 """
 
 import argparse
+import os
+import platform
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable
+from datetime import UTC, datetime
 from functools import partial
+from importlib.metadata import distributions
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from benchmarks import (
     against,
@@ -23,12 +28,11 @@ from benchmarks import (
     growth,
     kernels,
     lockstep,
-    machine,
-    page,
     peers,
     real_time_factor,
     recorder,
     runs_per_hour,
+    table,
 )
 from benchmarks.child import RefusedError
 from benchmarks.sheet import Sheet, read
@@ -89,11 +93,11 @@ def main() -> None:
         if given.against is not None:
             print(told)
         if not given.no_page:
-            page.update(name, told)
+            table.update(name, told)
 
 
 def _measured(name: str, part: Part, repeats: int, path: Path) -> Sheet:
-    start_s, described = time.monotonic(), machine.describe()
+    start_s, described = time.monotonic(), describe()
     sheet = part.measure(repeats)
     sheet.machine = {**described, "peers": peers.versions() if name in BESIDE else {}, "repeats": repeats}
     sheet.machine["minutes"] = round((time.monotonic() - start_s) / 60.0, 1)
@@ -107,7 +111,7 @@ def _where(sheet: Sheet) -> str:
     others = ", ".join(f"{name} {version}" for name, version in sheet.machine["peers"].items())
     peers_told = f" Beside it: {others}." if others else ""
     repeats = sheet.machine["repeats"]
-    return f"{machine.line(sheet.machine)}{peers_told} Medians of {repeats} (least to greatest)."
+    return f"{line(sheet.machine)}{peers_told} Medians of {repeats} (least to greatest)."
 
 
 def _say(text: str) -> None:
@@ -116,3 +120,45 @@ def _say(text: str) -> None:
 
 if __name__ == "__main__":
     main()
+
+
+OURS = ("eclipse-zenoh", "filterpy", "llvmlite", "msgspec", "numba", "numpy", "scipy")
+
+
+def describe() -> dict[str, Any]:
+    """Return processor, cores, load, Python, packages, and the time of asking."""
+    versions = {found.name.lower(): found.version for found in distributions()}
+    return {
+        "utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "load_average": [round(load, 2) for load in os.getloadavg()],
+        "system": f"{platform.system()} {platform.release()}",
+        "python": sys.version.split()[0],
+        "packages": {name: versions[name] for name in OURS if name in versions},
+        "commit": _commit(),
+    }
+
+
+def line(machine: dict[str, Any]) -> str:
+    """Return it as a line of text."""
+    packages = ", ".join(f"{name} {version}" for name, version in machine["packages"].items())
+    load = " / ".join(f"{value:g}" for value in machine["load_average"])
+    return (
+        f"{machine['processor']}, {machine['cores']} cores, {machine['system']}, Python {machine['python']}, "
+        f"{packages}; {machine['utc'][:10]}, load average at the start {load}."
+    )
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((text.split(":", 1)[1].strip() for text in lines if text.startswith("model name")), "unknown")
+
+
+def _commit() -> str:
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    return found.stdout.strip()

@@ -20,10 +20,9 @@ from packaging.requirements import Requirement
 from benchmarks import grid
 from benchmarks.child import RefusedError
 from benchmarks.peers import ROOT
-from benchmarks.progress import Progress
 from benchmarks.real_time_factor import LABELS, OPTIONS
 from benchmarks.run import end_event, spent
-from benchmarks.sheet import Sheet
+from benchmarks.sheet import Progress, Sheet
 from benchmarks.table import spread, table
 
 GRID = 99  # drones: 33 clusters of three, so that nobody is left over and stands by
@@ -32,21 +31,13 @@ FLOWN = ("world", "agents", "record")  # extras that a flight needs
 
 
 class Flight(NamedTuple):
-    """What both revisions fly.
+    """What both revisions fly."""
 
-    Attributes:
-        label: for people.
-        drones: number of drones.
-        options: of `zsim run`.
-        short_s: duration of the short flight, simulated; its processor time is taken from that of the long one.
-        long_s: duration of the long flight, simulated.
-    """
-
-    label: str
-    drones: int
-    options: tuple[str, ...]
-    short_s: float
-    long_s: float
+    label: str  # for people
+    drones: int  # number of drones
+    options: tuple[str, ...]  # of `zsim run`
+    short_s: float  # duration of the short flight, simulated; its processor time is taken from that of the long one
+    long_s: float  # duration of the long flight, simulated
 
 
 FLIGHTS = {
@@ -72,8 +63,7 @@ def measure(repeats: int, revision: str, names: Sequence[str] = tuple(FLIGHTS)) 
         revision: commit that git knows: a hash, a tag, a branch, `HEAD~3`.
         names: of `FLIGHTS`.
 
-    Raises:
-        RefusedError: git does not know the revision, or a package that it needs cannot be installed.
+    RefusedError if git does not know the revision, or a package that it needs cannot be installed.
     """
     sheet = Sheet("c-against", "")
     flights = {name: FLIGHTS[name] for name in FLIGHTS if name in names}
@@ -98,8 +88,7 @@ def measure(repeats: int, revision: str, names: Sequence[str] = tuple(FLIGHTS)) 
 def checked_out(revision: str, folder: Path) -> Iterator[Side]:
     """Check a revision out into a folder, with an environment that shares the installed packages; remove it at the end.
 
-    Raises:
-        RefusedError: git does not know the revision, or a package that it needs cannot be installed.
+    RefusedError if git does not know the revision, or a package that it needs cannot be installed.
     """
     root = folder / "checkout"
     _ran(["git", "-C", str(ROOT), "worktree", "add", "--detach", "--quiet", str(root), revision], "git")

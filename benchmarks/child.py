@@ -23,8 +23,7 @@ class RefusedError(Exception):
 def result(command: Sequence[str], timeout_s: float) -> dict[str, Any]:
     """Run a command in the project's folder and return the JSON of the last line that it prints.
 
-    Raises:
-        RefusedError: it failed, or was not through in time.
+    RefusedError if it failed, or was not through in time.
     """
     with tempfile.TemporaryFile("w+") as errors:
         process = _started(command, errors, stdin=subprocess.DEVNULL)
@@ -52,11 +51,7 @@ class Server:
         return self._process.pid
 
     def ask(self, question: dict[str, Any], timeout_s: float) -> dict[str, Any]:
-        """Return the answer.
-
-        Raises:
-            RefusedError: it refuses, has ended, or does not answer in time.
-        """
+        """Return the answer; RefusedError if it refuses, has ended, or does not answer in time."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError):

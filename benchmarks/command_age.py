@@ -10,9 +10,8 @@ from pathlib import Path
 
 from benchmarks import grid
 from benchmarks.child import RefusedError, result
-from benchmarks.progress import Progress
 from benchmarks.run import fly
-from benchmarks.sheet import Sheet
+from benchmarks.sheet import Progress, Sheet
 from benchmarks.table import spread, table
 
 SIZES = (3, 30)

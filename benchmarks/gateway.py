@@ -12,8 +12,7 @@ from typing import NamedTuple
 
 from benchmarks.child import RefusedError, Server, result
 from benchmarks.exchange.lap import free_port
-from benchmarks.progress import Progress
-from benchmarks.sheet import Sheet
+from benchmarks.sheet import Progress, Sheet
 from benchmarks.table import spread, table
 
 SIZE = 1  # drones; what passes is of no drone

@@ -6,11 +6,8 @@ from pathlib import Path
 
 from benchmarks import onboard, start_up
 from benchmarks.child import RefusedError, result
-from benchmarks.page import PICTURES
-from benchmarks.plot import lines
-from benchmarks.progress import Progress
-from benchmarks.sheet import Sheet, exponent
-from benchmarks.table import figure, spread, table
+from benchmarks.sheet import Progress, Sheet, exponent
+from benchmarks.table import PICTURES, figure, lines, spread, table
 
 SIZES = {1: 10.0, 3: 10.0, 10: 6.0, 30: 3.0, 100: 1.5}  # drones: simulated seconds
 TIMEOUT_S = 300.0

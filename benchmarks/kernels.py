@@ -6,11 +6,8 @@ from typing import NamedTuple
 
 from benchmarks import peers
 from benchmarks.child import RefusedError, Server
-from benchmarks.page import PICTURES
-from benchmarks.plot import lines
-from benchmarks.progress import Progress
-from benchmarks.sheet import Sheet
-from benchmarks.table import ratios, table
+from benchmarks.sheet import Progress, Sheet
+from benchmarks.table import PICTURES, lines, ratios, table
 from benchmarks.table import spread as shown
 
 SIZES = (1, 3, 10, 100, 1000)

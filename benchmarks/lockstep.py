@@ -5,11 +5,8 @@ from typing import NamedTuple
 
 from benchmarks import peers
 from benchmarks.child import RefusedError, result
-from benchmarks.page import PICTURES
-from benchmarks.plot import lines
-from benchmarks.progress import Progress
-from benchmarks.sheet import Sheet, spread
-from benchmarks.table import ratios, table
+from benchmarks.sheet import Progress, Sheet, spread
+from benchmarks.table import PICTURES, lines, ratios, table
 from benchmarks.table import spread as shown
 
 SIZES = (1, 3, 5, 10)

@@ -24,11 +24,7 @@ TIMEOUT_S = 180.0
 
 
 def install(variant: str) -> Path:
-    """Return the Python of a variant, installed as this project is now.
-
-    Raises:
-        RefusedError: it could not be installed.
-    """
+    """Return the Python of a variant, installed as this project is now; RefusedError if it could not be installed."""
     folder = FOLDER / f"onboard-{variant}"
     python = folder / "bin" / "python"
     if not python.exists():
@@ -58,8 +54,7 @@ def installed_mb(python: Path) -> float:
 def fly(python: Path, folder: Path) -> dict[str, float]:
     """Fly one drone with its estimator; return its greatest resident memory [MB] and CPU ms per simulated second.
 
-    Raises:
-        RefusedError: world or estimator failed.
+    RefusedError if world or estimator failed.
     """
     (short_s, _), (long_s, resident) = (_flown(python, folder, seconds) for seconds in (SHORT_S, LONG_S))
     return {"resident_mb": resident, "cpu_ms_per_simulated_s": 1e3 * (long_s - short_s) / (LONG_S - SHORT_S)}

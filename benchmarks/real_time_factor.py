@@ -10,9 +10,8 @@ from pathlib import Path
 from benchmarks import grid
 from benchmarks.child import RefusedError
 from benchmarks.peers import ROOT
-from benchmarks.progress import Progress
 from benchmarks.run import fly
-from benchmarks.sheet import Sheet
+from benchmarks.sheet import Progress, Sheet
 from benchmarks.table import figure, ratios, table
 
 TEST_1 = ROOT / "scenarios" / "step.yaml"

@@ -18,9 +18,8 @@ import psutil
 from benchmarks import grid, run
 from benchmarks.child import RefusedError
 from benchmarks.peers import ROOT
-from benchmarks.progress import Progress
 from benchmarks.run import CLI, role_of
-from benchmarks.sheet import Sheet
+from benchmarks.sheet import Progress, Sheet
 from benchmarks.table import figure, spread, table
 from zsim.contract.messages import REFUSALS
 from zsim.record import RecordReader
@@ -66,8 +65,7 @@ class Flown(NamedTuple):
 def fly(drones: int, seconds: float, *options: str) -> Flown:
     """Fly a grid of drones with everything that they have, estimators and controllers in one process.
 
-    Raises:
-        RefusedError: the run failed.
+    RefusedError if the run failed.
     """
     with tempfile.TemporaryDirectory() as temporary:
         scenario, out = Path(temporary) / "grid.yaml", Path(temporary) / "run"

@@ -28,8 +28,7 @@ LOOK_S = 0.5  # wall time between two looks at what processes have spent; a look
 def fly(scenario: Path, seconds: float, *options: str) -> tuple[dict[str, float], dict[str, float]]:
     """Fly once; return the world's figures (event `end`), and CPU seconds by role, start-up included.
 
-    Raises:
-        RefusedError: the run failed.
+    RefusedError if the run failed.
     """
     with tempfile.TemporaryDirectory() as temporary:
         out = Path(temporary) / "run"
@@ -58,11 +57,7 @@ class Spent(NamedTuple):
 
 
 def spent(command: Sequence[str], folder: Path) -> Spent:
-    """Run a command in a folder and return what it spent.
-
-    Raises:
-        RefusedError: it failed, or was not through in time.
-    """
+    """Run a command in a folder and return what it spent; RefusedError if it failed, or was not through in time."""
     with tempfile.TemporaryFile("w+") as said:
         process = subprocess.Popen(
             command, cwd=folder, stdin=subprocess.DEVNULL, stdout=said, stderr=said, start_new_session=True

@@ -11,8 +11,7 @@ from typing import NamedTuple
 from benchmarks import peers
 from benchmarks.child import RefusedError, Server
 from benchmarks.monte_carlo import way, zsim_sweep
-from benchmarks.progress import Progress
-from benchmarks.sheet import Sheet
+from benchmarks.sheet import Progress, Sheet
 from benchmarks.table import figure, spread, table
 
 WORKERS = 2  # processes, a core each

@@ -3,6 +3,8 @@
 import json
 import math
 import statistics
+import sys
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -90,8 +92,29 @@ def spread(values: Sequence[float | None]) -> Spread | None:
 def exponent(points: dict[int, float]) -> float:
     """Return the least-squares slope of log value against log size: 1 means proportional to the size.
 
-    Raises:
-        StatisticsError: there are fewer than two points.
+    StatisticsError if there are fewer than two points.
     """
     logs = [(math.log(size), math.log(value)) for size, value in points.items()]
     return statistics.linear_regression([x for x, _ in logs], [y for _, y in logs]).slope
+
+
+class Progress:
+    """Counts measurements of a part.
+
+    Args:
+        part: letter.
+        total: number of measurements.
+    """
+
+    def __init__(self, part: str, total: int) -> None:
+        self._part = part
+        self._total = total
+        self._done = 0
+        self._start_s = time.monotonic()
+
+    def tell(self, text: str) -> None:
+        """Say what the next measurement gave."""
+        self._done += 1
+        spent_s = time.monotonic() - self._start_s
+        left_s = spent_s / self._done * max(0, self._total - self._done)
+        print(f"{self._part} {self._done}/{self._total}  {text}  ({left_s:.0f} s to go)", file=sys.stderr, flush=True)

@@ -87,11 +87,7 @@ def _running(command: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def _until(ready: Callable[[], bool], process: subprocess.Popen[bytes]) -> None:
-    """Look until it is ready.
-
-    Raises:
-        RefusedError: it ended, or was not ready in time.
-    """
+    """Look until it is ready; RefusedError if it ended, or was not ready in time."""
     until_s = time.perf_counter() + PATIENCE_S
     while not ready():
         if process.poll() is not None:

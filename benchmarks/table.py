@@ -1,7 +1,9 @@
 """Markdown tables of a sheet."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
+from benchmarks.peers import ROOT
 from benchmarks.sheet import Sheet, Spread
 
 
@@ -44,3 +46,51 @@ def _cell(sheet: Sheet, name: str, reference: str, size: int) -> str:
     """Return the ratio, or why there is none."""
     found = sheet.ratio(name, reference, size)
     return spread(found) if found else sheet.refused.get(f"{name}@{size}", "–")
+
+
+def lines(sheet: Sheet, labels: Mapping[str, str], path: Path, title: str, size_name: str, ours: str = "zsim") -> None:
+    """Draw medians with their spread; contenders whose name begins with `ours` are drawn bold."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    mpl.rcParams["svg.hashsalt"] = "zsim"  # the same figures give the same file
+    figure, axes = plt.subplots(figsize=(8.0, 5.0), layout="constrained")
+    for number, (name, label) in enumerate(labels.items()):
+        found = {size: s for size in sheet.sizes() if (s := sheet.spread(name, size))}
+        if not found:
+            continue
+        middle = [s.median for s in found.values()]
+        errors = [[s.median - s.low for s in found.values()], [s.high - s.median for s in found.values()]]
+        style = {"linewidth": 2.5, "marker": "o"} if name.startswith(ours) else {"linewidth": 1.0, "marker": "."}
+        axes.errorbar(list(found), middle, errors, label=label, capsize=2, color=f"C{number % 10}", **style)
+    axes.set(xscale="log", yscale="log", xlabel=size_name, ylabel=sheet.unit, title=title)
+    axes.set_xticks(sheet.sizes(), [str(size) for size in sheet.sizes()])
+    axes.minorticks_off()
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, metadata={"Date": None})
+    plt.close(figure)
+
+
+PAGE = ROOT / "benchmarks" / "README.md"
+PICTURES = ROOT / "benchmarks" / "results"
+
+
+def replaced(text: str, part: str, content: str) -> str:
+    """Return the text with the section of a part replaced; ValueError if the text has no such section."""
+    begin, end = f"<!-- measured: {part} -->\n", f"<!-- end: {part} -->"
+    before, found, rest = text.partition(begin)
+    _, closed, after = rest.partition(end)
+    if not found or not closed:
+        raise ValueError(
+            f"benchmarks/README.md: has no lines {begin.strip()} and {end}; put them where part {part} goes"
+        )
+    return f"{before}{begin}{content.strip()}\n{end}{after}"
+
+
+def update(part: str, content: str, page: Path = PAGE) -> None:
+    """Replace the section of a part in the page."""
+    page.write_text(replaced(page.read_text(), part, content))

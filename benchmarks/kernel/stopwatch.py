@@ -5,39 +5,42 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 WARM_CALLS = 3
 
 
 class Flight(NamedTuple):
-    """Drones ready to be flown.
+    """Drones ready to be flown."""
 
-    Attributes:
-        advance: flies on; called again and again.
-        span_s: simulated seconds per call.
-    """
-
-    advance: Callable[[], object]
-    span_s: float
+    advance: Callable[[], object]  # flies on; called again and again
+    span_s: float  # simulated seconds per call
 
 
-def serve(build: Callable[[int], Flight]) -> None:
-    """Answer {"drones": N, "cpu_s": S} lines on stdin by {"drone_s_per_cpu_s": …} lines on stdout, until its end."""
-    flights: dict[int, Flight] = {}
+def answer(find: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
+    """Answer each line of JSON on stdin by one on stdout, until its end; an error is a refusal."""
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what peers print is no answer
     for line in sys.stdin:
-        asked = json.loads(line)
-        count = asked["drones"]
         try:
-            if count not in flights:
-                flights[count] = build(count)
-            found = {"drone_s_per_cpu_s": count * rate(flights[count], asked["cpu_s"])}
+            found = find(json.loads(line))
         except Exception as error:
             found = {"refused": f"{type(error).__name__}: {error}"[:200]}
         answers.write(json.dumps(found) + "\n")
         answers.flush()
+
+
+def serve(build: Callable[[int], Flight]) -> None:
+    """Answer {"drones": N, "cpu_s": S} by {"drone_s_per_cpu_s": …}."""
+    flights: dict[int, Flight] = {}
+
+    def find(asked: dict[str, Any]) -> dict[str, Any]:
+        count = asked["drones"]
+        if count not in flights:
+            flights[count] = build(count)
+        return {"drone_s_per_cpu_s": count * rate(flights[count], asked["cpu_s"])}
+
+    answer(find)
 
 
 def rate(flight: Flight, cpu_s: float) -> float:

@@ -4,63 +4,30 @@ It is asked by lines {"seed": n} on stdin and answers on stdout, until its end; 
 """
 
 import argparse
-import json
 import math
 import os
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from benchmarks.kernel.stopwatch import answer
 from benchmarks.monte_carlo.way import Way, read
 
 
 class Flown(NamedTuple):
-    """What came of flights.
+    """What came of flights."""
 
-    Attributes:
-        flights: whole flights of three drones, or fractions.
-        rms_m: root of the mean square distance from the ways, over all flights.
-        closest_m: least distance of two drones in any of them.
-    """
-
-    flights: float
-    rms_m: float
-    closest_m: float
+    flights: float  # whole flights of three drones, or fractions
+    rms_m: float  # root of the mean square distance from the ways, over all flights
+    closest_m: float  # least distance of two drones in any of them
 
 
 Fly = Callable[[int], Flown]  # from a seed
 
 
 def serve(build: Callable[[Way, argparse.Namespace], Fly], **options: Any) -> None:
-    """Answer until stdin ends; `options` are options of the command with their defaults."""
-    given = _arguments(options)
-    cores = sorted(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, {cores[given.worker % len(cores)]})
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what peers print is no answer
-    fly: Fly | None = None
-    for line in sys.stdin:
-        try:
-            fly = fly or build(read(given.way), given)
-            found = _flown(fly, json.loads(line)["seed"])
-        except Exception as error:
-            found = {"refused": f"{type(error).__name__}: {error}"[:200]}
-        answers.write(json.dumps(found) + "\n")
-        answers.flush()
-
-
-def _flown(fly: Fly, seed: int) -> dict[str, Any]:
-    start_s = time.process_time()  # user and system time of all threads
-    flown = fly(seed)
-    cpu_s = time.process_time() - start_s
-    if not math.isfinite(flown.rms_m):
-        return {"refused": "its state diverged"}
-    return {**flown._asdict(), "cpu_s": cpu_s}
-
-
-def _arguments(options: dict[str, Any]) -> argparse.Namespace:
+    """Answer {"seed": n} by what was flown; `options` are options of the command with their defaults."""
     parser = argparse.ArgumentParser()
     parser.add_argument("way", type=Path)
     parser.add_argument("worker", type=int, help="0 or 1: of which core")
@@ -69,4 +36,17 @@ def _arguments(options: dict[str, Any]) -> argparse.Namespace:
             parser.add_argument(f"--{name}", action="store_true")
         else:
             parser.add_argument(f"--{name}", type=type(default), default=default)
-    return parser.parse_args()
+    given = parser.parse_args()
+    cores = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {cores[given.worker % len(cores)]})
+    fly: Fly | None = None
+
+    def find(asked: dict[str, Any]) -> dict[str, Any]:
+        nonlocal fly
+        fly = fly or build(read(given.way), given)
+        start_s = time.process_time()  # user and system time of all threads
+        flown = fly(asked["seed"])
+        cpu_s = time.process_time() - start_s
+        return {**flown._asdict(), "cpu_s": cpu_s} if math.isfinite(flown.rms_m) else {"refused": "its state diverged"}
+
+    answer(find)

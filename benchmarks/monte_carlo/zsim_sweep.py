@@ -23,8 +23,7 @@ TIMEOUT_S = 900.0
 def fly(runs: int, workers: int, duration_s: float | None = None) -> dict[str, float]:
     """Fly a sweep over seeds; return wall and CPU seconds, start-up included, and the least distance of two drones.
 
-    Raises:
-        RefusedError: it failed, or a run of it did.
+    RefusedError if it failed, or a run of it did.
     """
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "sweep"
@@ -40,11 +39,7 @@ def fly(runs: int, workers: int, duration_s: float | None = None) -> dict[str, f
 
 
 def _closest_m(path: Path) -> float:
-    """Return the least distance of two drones in any run of a table.
-
-    Raises:
-        RefusedError: a run failed.
-    """
+    """Return the least distance of two drones in any run of a table; RefusedError if a run failed."""
     rows = pq.read_table(path, columns=["failure", "min_separation_m"]).to_pylist()
     if failures := [row["failure"] for row in rows if row["failure"]]:
         raise RefusedError(f"zsim sweep: {len(failures)} of {len(rows)} runs failed: {failures[0]}"[:200])

@@ -28,10 +28,9 @@ def fly(
     run_id: str | None = None,
     changed: Sequence[str] | None = None,
 ) -> str:
-    """Fly a scenario and record it; return why it ended.
+    """Fly a resolved scenario and record it; return why it ended.
 
     Args:
-        scenario: resolved.
         record: path of the record, None for no record.
         stop_reason: called at every gate; a text ends the run.
         screen: shows progress.
@@ -60,22 +59,13 @@ def fly(
 class FlightObserver(Protocol):
     """Receives messages of a flight, as a record writer does."""
 
-    def add_message(self, key: str, message: Any, wall_ns: int) -> None:
-        """Receive one message."""
-        ...
+    def add_message(self, key: str, message: Any, wall_ns: int) -> None: ...
 
-    def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
-        """Receive the world's messages of a gate."""
-        ...
+    def add_gate(self, gate: GateMessages, wall_ns: int) -> None: ...
 
 
 class InProcessFlight:
-    """A world with its agents, ready to be flown once.
-
-    Args:
-        scenario: resolved.
-        run_id: set only by tests that compare records.
-        changed: as of `World`.
+    """A world with its agents, ready to be flown once; arguments as of `fly`.
 
     Raises:
         ScenarioError, RunError: the scenario cannot be flown.
@@ -94,12 +84,7 @@ class InProcessFlight:
         self._agents = agents(self.world)
 
     def run(self, observers: Sequence[FlightObserver], stop_reason: Callable[[], str | None] = lambda: None) -> None:
-        """Fly to the end; `world.ended` and `world.failure` then have the reason.
-
-        Args:
-            observers: receive every message.
-            stop_reason: called at every gate; a text ends the run.
-        """
+        """Fly to the end; observers receive every message; `world.ended` and `world.failure` then have the reason."""
         takes_message = [observer.add_message for observer in observers]
         takes_gate = [observer.add_gate for observer in observers]
 
@@ -147,14 +132,12 @@ class _Progress:
         self._start = SlowStart(screen.say)
 
     def close(self) -> None:
-        """Show nothing any more."""
         self._start.over()
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
         """Show nothing: it holds truth, status and sensors only."""
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
-        """Show a message of a watched key."""
         if key not in self._watched:
             return
         if isinstance(message, flight_messages.ClusterState):

@@ -10,7 +10,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from zsim import __version__
 from zsim.contract import flight_messages, keys, messages, run_messages
@@ -30,57 +30,35 @@ from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim.schema.message import Message
 from zsim_agents.hosting import hosted
-from zsim_analysis.reading.recorded_run import (
-    GateInputs,
-    RecordedAgents,
-    RecordedRun,
-    decode_or_none,
-    gates,
-    open_run,
-    recorded_agents,
-)
+from zsim_analysis.reading import recorded_run
 from zsim_world.run.coordinator import FLIGHT_REQUESTS
 from zsim_world.run.world import World
 
 Say = Callable[[str], None]
-RecordState = Literal["whole", "cut", "damaged"]
 COUNTED = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_velocity_rad_s")  # of truth_sha256
 JOINED = ("join", "restart", "superseded")  # events of admitted joins
 
 
 class RerunResult(NamedTuple):
-    """The result of flying a run again.
+    """The result of flying a run again."""
 
-    Attributes:
-        compared: with the truth on record.
-        sha256: of the truth.
-        until: why the comparison ended before the record, empty if it did not.
-        refused: requests that were carried out on record and are refused now.
-        first_output: the first output of an agent that differs, empty if none does.
-        failure: of a user's code, empty if none failed.
-    """
-
-    compared: "TruthComparison"
-    sha256: str
-    until: str
-    refused: list[str]
-    first_output: str
-    failure: str
+    compared: "TruthComparison"  # with the truth on record
+    sha256: str  # of the truth
+    until: str  # why the comparison ended before the record, empty if it did not
+    refused: list[str]  # requests that were carried out on record and are refused now
+    first_output: str  # the first output of an agent that differs, empty if none does
+    failure: str  # of a user's code, empty if none failed
 
 
 def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> str:
     """Fly the run of a record again; return how truth differs from the record, empty if it is the same to the bit.
 
-    Args:
-        place: folder of the run, or its record.
-        commands_only: run no agents.
-        say: called with each line of the results.
-        note: called with each warning.
+    With `commands_only` no agents are run. `say` receives each line of the results, `note` each warning.
 
     Raises:
         RunError, RecordError: there is no record, or it is not one from the start of a flight.
     """
-    with open_run(place) as record:
+    with recorded_run.open_run(place) as record:
         if record.info.replay_of:
             raise RunError(f"{place}: is the record of a replay; rerun that of run {record.info.replay_of}")
         if not plugin.may_import() and (names := record.scenario.own_code()):
@@ -89,33 +67,39 @@ def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> str:
         if external := record.scenario.external():
             reason = f"has drones whose bodies are external ({listed(external)}); they cannot be flown again"
             raise RunError(f"{place}: {reason}")
-        agents = recorded_agents(record.reader, record.info, record.scenario)
+        agents = recorded_run.recorded_agents(record.reader, record.info, record.scenario)
         nobody = agents._replace(processes=(), requests=(), failure="")
-        _warn(record.info, agents, note)
+        here, recorded_by = fingerprint(), record.info.version
+        if others := {record.info.fingerprint, *agents.fingerprints} - {here}:
+            of = f"{', '.join(sorted(others))}; here {here}"
+            note(f"recorded with another numeric fingerprint ({of}): the same bits are not promised")
+        if recorded_by != __version__:
+            note(f"recorded by zsim {recorded_by}, flown again by {__version__}: the same bits are not promised")
         if commands_only or agents.why_not:
             why = "as asked" if commands_only else agents.why_not
             say(f"agents are not run again: {why}; the world alone, with all recorded commands")
-            return _judge(agents.truth_sha256, _fly(record, nobody), _state(record.reader), say)
+            return _judge(record.reader, agents.truth_sha256, _fly(record, nobody), say)
         say(f"run again: world, {', '.join(map(str, agents.processes))}")
         again = _fly(record, agents)
-        fault = _judge(agents.truth_sha256, again, _state(record.reader), say)
-        if not fault and (agents.failure or again.failure):
-            fault = _judge_failure(agents.failure, again.failure, say)
-        if again.compared.first is not None:
-            _find_cause(again.first_output, _fly(record, nobody), say)
+        fault = _judge(record.reader, agents.truth_sha256, again, say)
+        if not fault and again.failure != agents.failure:
+            say(f"on record {agents.failure or 'no class of a user failed'}")
+            fault = f"flown again, {again.failure or 'it does not fail'}"
+        elif not fault and again.failure:
+            say(f"ended as on record: {again.failure}")
+        if again.compared.first is None:
+            return fault
+        alone = _fly(record, nobody)
+        if alone.compared.first is not None:
+            say(f"the world alone, with all recorded commands, differs too: first {alone.compared.first}")
+        else:
+            say("the world alone, with all recorded commands, gives the recorded truth: the agents answer differently")
+            if again.first_output:
+                say(f"the first answer that differs is {again.first_output}")
         return fault
 
 
-def _warn(info: messages.Info, agents: RecordedAgents, note: Say) -> None:
-    here = fingerprint()
-    if others := {info.fingerprint, *agents.fingerprints} - {here}:
-        of = f"{', '.join(sorted(others))}; here {here}"
-        note(f"recorded with another numeric fingerprint ({of}): the same bits are not promised")
-    if info.version != __version__:
-        note(f"recorded by zsim {info.version}, flown again by {__version__}: the same bits are not promised")
-
-
-def _fly(record: RecordedRun, agents: RecordedAgents) -> RerunResult:
+def _fly(record: recorded_run.RecordedRun, agents: recorded_run.RecordedAgents) -> RerunResult:
     """Fly from gate to gate of a record, as far as it is whole."""
     reader, info, scenario = record
     world = World(scenario, info.mode, 0.0, time.monotonic_ns, info.run_id)
@@ -125,8 +109,11 @@ def _fly(record: RecordedRun, agents: RecordedAgents) -> RerunResult:
     until, due_ns, throttle, start_s = "", 0, RateLimit(PERIOD_S), time.monotonic()
     line = {"state": "world and agents" if agents.processes else "world alone", "phase": "", "waiting_for": []}
     with Screen(scenario.duration_s) as screen:
-        for gate in gates(reader, world.names):
-            if until := _fault(gate, due_ns, world.names):
+        for gate in recorded_run.gates(reader, world.names):
+            missing = [name for name in world.names if name not in gate.truth]
+            if gate.t_ns != due_ns or missing:
+                what = f"no truth of {missing[0]} at" if gate.t_ns == due_ns else "nothing of"
+                until = f"the record has {what} {due_ns / 1e9:.2f} s"
                 break
             bus.fly_to(gate)
             compared.add(gate.t_ns, gate.truth, bus.truth)
@@ -141,22 +128,7 @@ def _fly(record: RecordedRun, agents: RecordedAgents) -> RerunResult:
     return RerunResult(compared, world.result()["truth_sha256"], until, bus.refused, bus.outputs.first, bus.failure)
 
 
-def _fault(gate: GateInputs, due_ns: int, names: list[str]) -> str:
-    """Return why the next gate of a record cannot be flown, empty if it can."""
-    if gate.t_ns != due_ns:
-        return f"the record has nothing of {due_ns / 1e9:.2f} s"
-    missing = [name for name in names if name not in gate.truth]
-    return f"the record has no truth of {missing[0]} at {due_ns / 1e9:.2f} s" if missing else ""
-
-
-def _state(reader: RecordReader) -> RecordState:
-    """Return the state of a record, as far as it was read."""
-    if reader.damaged:
-        return "damaged"
-    return "whole" if reader.complete else "cut"
-
-
-def _judge(recorded: str | None, result: RerunResult, state: RecordState, say: Say) -> str:
+def _judge(reader: RecordReader, recorded: str | None, result: RerunResult, say: Say) -> str:
     """Print how truth compares; return how it differs, empty if it is the same at all instants of a sound record."""
     compared, until = result.compared, result.until
     for refusal in result.refused:
@@ -164,36 +136,17 @@ def _judge(recorded: str | None, result: RerunResult, state: RecordState, say: S
     if compared.first is not None:
         say(f"truth differs: first {compared.first}")
         say(f"               last  {compared.last}; {compared.instants} instants compared")
-        if state == "damaged":
+        if reader.damaged:
             say("the record is damaged: what it lacks may be the difference")
         return f"truth differs, first {compared.first}"
     if recorded == result.sha256 and not until:
         say(f"truth_sha256 is the same: {result.sha256}")
         return ""
-    condition = {"damaged": "is damaged", "cut": "was cut", "whole": "does not hold the whole run"}[state]
+    condition = "is damaged" if reader.damaged else "does not hold the whole run" if reader.complete else "was cut"
     lacks = f"{recorded} cannot be shown" if recorded else "has no truth_sha256"
     reason = f"{until}, for it {condition}" if until else f"the record {condition} and {lacks}"
     say(f"{reason}; truth is the same at all {compared.instants} instants before, to the bit")
-    return "" if recorded is None and not until and state != "damaged" else reason
-
-
-def _judge_failure(recorded: str, failure: str, say: Say) -> str:
-    """Print whether a user's code that ended the run has failed again; return why it has not, empty if it has."""
-    if failure == recorded:
-        say(f"ended as on record: {failure}")
-        return ""
-    say(f"on record {recorded or 'no class of a user failed'}")
-    return f"flown again, {failure or 'it does not fail'}"
-
-
-def _find_cause(first_output: str, alone: RerunResult, say: Say) -> None:
-    """Print whether the difference came from the world or from the agents."""
-    if alone.compared.first is not None:
-        say(f"the world alone, with all recorded commands, differs too: first {alone.compared.first}")
-        return
-    say("the world alone, with all recorded commands, gives the recorded truth: the agents answer differently")
-    if first_output:
-        say(f"the first answer that differs is {first_output}")
+    return "" if recorded is None and not until and not reader.damaged else reason
 
 
 # Comparison
@@ -271,7 +224,7 @@ class OutputComparison:
 
     @property
     def first(self) -> str:
-        """Return the first output that differs, or that only one of the two has, and when; empty if there is none."""
+        """The first output that differs, or that only one of the two has, and when; empty if there is none."""
         return f"{self._first[1]} at {self._first[0] / 1e9:.2f} s" if self._first else ""
 
     def add(self, key: str, output: Any) -> None:
@@ -322,7 +275,9 @@ class RerunBus(Bus):
         outputs: of the agents, compared with those on record.
     """
 
-    def __init__(self, world: World, agents: RecordedAgents, info: messages.Info, scenario: Scenario) -> None:
+    def __init__(
+        self, world: World, agents: recorded_run.RecordedAgents, info: messages.Info, scenario: Scenario
+    ) -> None:
         requests: defaultdict[int, list[tuple[str, ControlRequest]]] = defaultdict(list)
         for key, request in agents.requests:
             control = ControlRequest(request.op, request.args, request.source)
@@ -332,7 +287,15 @@ class RerunBus(Bus):
             AgentsWithRequests(hosted(info, scenario, process.members), dict(requests), hold_ns)
             for process in agents.processes
         ]
-        super().__init__(world, groups, lambda: 0, self._compare_output, self._keep_truth)
+
+        def compare_output(key: str, message: Any) -> None:
+            if isinstance(message, (*messages.RELAYED, flight_messages.Command)):
+                self.outputs.add(key, message)
+
+        def keep_truth(gate: GateMessages) -> None:
+            self.truth = {keys.thing(key): payload for key, payload in gate.pairs if keys.leaf(key) == "truth"}
+
+        super().__init__(world, groups, lambda: 0, compare_output, keep_truth)
         self._world = world
         self._rerun = agents.names
         self.truth: dict[str, bytes] = {}
@@ -341,7 +304,7 @@ class RerunBus(Bus):
         self._withheld: dict[_Joined, run_messages.Join] = {}
         self.outputs = OutputComparison(world.clock.delay_ns + 2 * world.clock.gate_ns)
 
-    def fly_to(self, gate: GateInputs) -> None:
+    def fly_to(self, gate: recorded_run.GateInputs) -> None:
         """Receive the inputs of a gate, let the agents answer, and advance to that gate.
 
         Raises:
@@ -369,7 +332,7 @@ class RerunBus(Bus):
 
     @property
     def failure(self) -> str:
-        """Return the first failure of a user's code, empty if there was none."""
+        """The first failure of a user's code, empty if there was none."""
         return next((str(failure) for failure in self._failures.values()), "")
 
     def answer_all(self) -> None:
@@ -381,20 +344,13 @@ class RerunBus(Bus):
         """Stop feeding an agent that failed; the world continues as far as it did on record."""
         inbox.start_after(NEVER_NS)
 
-    def _compare_output(self, key: str, message: Any) -> None:
-        if isinstance(message, (*messages.RELAYED, flight_messages.Command)):
-            self.outputs.add(key, message)
-
-    def _keep_truth(self, gate: GateMessages) -> None:
-        self.truth = {keys.thing(key): payload for key, payload in gate.pairs if keys.leaf(key) == "truth"}
-
     def _update_faults(self, faults: run_messages.Faults) -> None:
         if self._rerun:  # alone, the world receives the commands that resulted from them
             super()._update_faults(faults)
 
     def _feed(self, recorded: Recorded) -> None:
         """Repeat what another process published; that of agents that are run again is compared."""
-        key, message = recorded.key, decode_or_none(recorded)
+        key, message = recorded.key, recorded_run.decode_or_none(recorded)
         if message is None:  # the world refused it too
             return
         if key == keys.EVENT:
@@ -414,16 +370,12 @@ class RerunBus(Bus):
                 self.outputs.add(key, message)
             else:
                 self._world.handle(key, message, 0)
-        elif keys.thing(key) not in self._rerun:
-            self._feed_process(key, message)
-
-    def _feed_process(self, key: str, message: Any) -> None:
-        """Repeat a join, done or bye; a join only when it was admitted, as its event says."""
-        joined = (keys.thing(key), message.incarnation) if isinstance(message, run_messages.Join) else None
-        if joined is None or self._admitted is None or joined in self._admitted:
-            self._world.handle(key, message, 0)
-        else:
-            self._withheld[joined] = message
+        elif keys.thing(key) not in self._rerun:  # a join, done or bye; a join when it was admitted, as its event says
+            joined = (keys.thing(key), message.incarnation) if isinstance(message, run_messages.Join) else None
+            if joined is None or self._admitted is None or joined in self._admitted:
+                self._world.handle(key, message, 0)
+            else:
+                self._withheld[joined] = message
 
     def _hand_over(self, key: str, message: Any, source: str) -> None:
         """Pass what another process published to the agents that read it."""
@@ -460,5 +412,5 @@ def _admitted(inputs: Sequence[Recorded]) -> set[_Joined]:
 
     Their joins are repeated in place. A join that was withheld for longer has its event in a later gate.
     """
-    events = (decode_or_none(recorded) for recorded in inputs if recorded.key == keys.EVENT)
+    events = (recorded_run.decode_or_none(recorded) for recorded in inputs if recorded.key == keys.EVENT)
     return {_joined(event) for event in events if event is not None and event.kind in JOINED}

@@ -42,12 +42,10 @@ REPORT_NEEDS = {"report": ("matplotlib", "jinja2", "mcap", "zstandard")}
 
 
 def say(text: str) -> None:
-    """Print a line for a person on standard output."""
     print(printable(text), flush=True)
 
 
 def note(text: str) -> None:
-    """Print a line for a person on standard error."""
     print(printable(text), file=sys.stderr, flush=True)
 
 
@@ -67,26 +65,14 @@ def file_fault(path: Path, fault: str, remedy: str, kind: type[ZsimError] = RunE
 
 
 def require(command: str, needs: Mapping[str, Sequence[str]]) -> None:
-    """Refuse to begin where modules that a command needs are missing.
-
-    Args:
-        needs: modules, by the extra that brings them.
-
-    Raises:
-        RunError: with what to install.
-    """
+    """Refuse to begin where modules that a command needs, by the extra that brings them, are missing."""
     missing = {module: extra for extra, modules in needs.items() for module in modules if find_spec(module) is None}
     if missing:
         lacking = f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} not installed"
         raise RunError(f"{command}: {lacking}; {install_command(missing.values())}")
 
 
-# Checks of values
-
-
 def _check(is_allowed: Callable[[float], bool], allowed: str) -> Callable[[float | None], float | None]:
-    """Return a callback that refuses values which are not allowed; None is."""
-
     def check(value: float | None) -> float | None:
         if value is not None and not is_allowed(value):
             raise BadParameter(f"is {value:g}; must be {allowed}")
@@ -101,12 +87,10 @@ not_negative = _check(lambda value: 0 <= value < math.inf, "a finite number >= 0
 
 
 def between(least: float, greatest: float) -> Callable[[float | None], float | None]:
-    """Return a callback that refuses values outside a range."""
     return _check(lambda value: least <= value <= greatest, f">= {least:g} and <= {greatest:g}")
 
 
 def check_range(from_: float | None, to: float | None) -> None:
-    """Refuse `--to` before `--from`."""
     if from_ is not None and to is not None and to < from_:
         raise BadParameter(f"--to is {to:g}, before --from {from_:g}; must be at or after it")
 
@@ -116,9 +100,6 @@ def endpoint_origin(text: str, arguments: Sequence[str], environment: Mapping[st
     value = environment.get(CONNECT_VARIABLE)
     is_given = any(each.partition("=")[0] == "--connect" for each in arguments)
     return f"{text} ({value} is from {CONNECT_VARIABLE})" if value and value in text and not is_given else text
-
-
-# Options of several commands
 
 
 class RowOrder(StrEnum):
@@ -167,19 +148,19 @@ Recorded = Annotated[Path, Argument(metavar="DIR", help="Folder of a run, or its
 
 
 def process_option(default: str) -> Any:
-    """Return the option by which a process is named.
-
-    Args:
-        default: its name without a certificate.
-    """
+    """Return the option by which a process is named; `default` is its name without a certificate."""
     return Option(help=f"Process name (default {default}, or the certificate's).")
 
 
-# What options are made into
+def port_option(text: str, least: int = 1, **more: Any) -> Any:
+    return Option(min=least, max=PORT_MAX, help=text, **more)
+
+
+def positive_option(text: str, **more: Any) -> Any:
+    return Option(callback=positive, help=text, **more)
 
 
 def identity(host: str | None, tls: Path | None, insecure: bool, access: Path | None = None) -> "Identity":
-    """Return the identity of this process on the network."""
     from zsim.transport.tls import Identity
 
     plain = Identity(tls=tls, access=access, insecure=insecure)
@@ -213,22 +194,15 @@ def changed_fields(overrides: Sequence[str] | None, seed: int | None, duration: 
 
 
 def changed_options(changed: Sequence[str]) -> list[str]:
-    """Return changed fields as options of the world."""
     return [word for text in changed for word in (CHANGED, text)]
 
 
 def pace_options(mode: str, rate: float) -> list[str]:
-    """Return mode and pace as options of the world."""
     return [*([REALTIME] if mode == "realtime" else []), *(["--rate", str(rate)] if rate else [])]
 
 
 class FlightOptions(NamedTuple):
-    """What is to be flown, and how fast.
-
-    Attributes:
-        seed, duration: instead of the scenario's.
-        overrides: texts `a.b.c=value`.
-    """
+    """What is to be flown, and how fast; seed, duration and overrides (texts `a.b.c=value`) change the scenario."""
 
     path: Path
     seed: int | None
@@ -238,7 +212,7 @@ class FlightOptions(NamedTuple):
     overrides: list[str] | None
 
     def scenario(self, elsewhere: bool = False) -> Any:
-        """Return the scenario, the classes that it names loaded here; `elsewhere`: it flies on other hosts."""
+        """Return the scenario, the classes that it names loaded here."""
         from zsim.scenario.roles import check_pace
 
         scenario = load_scenario(self.path, self.overrides, self.seed, self.duration, elsewhere)
@@ -246,7 +220,6 @@ class FlightOptions(NamedTuple):
         return scenario
 
     def changed(self) -> list[str]:
-        """Return the texts `a.b.c=value` by which the scenario is changed against its file."""
         return changed_fields(self.overrides, self.seed, self.duration)
 
     def mode_and_rate(self) -> tuple[str, float]:
@@ -260,24 +233,15 @@ class FlightOptions(NamedTuple):
 
 
 class WorldAccess(NamedTuple):
-    """How to reach a world, and the identity of the process that connects.
+    """How to reach a world, and the identity of the process that connects."""
 
-    Attributes:
-        endpoint: on which the world or a router listens.
-        wait_s: for a world; None waits indefinitely.
-        tls: folder of the process's certificate.
-        insecure: without TLS, on a network of one's own.
-        host: its name, as others see it.
-        launched: run of which it is a part, of processes that a launcher starts.
-    """
-
-    endpoint: str
+    endpoint: str  # on which the world or a router listens
     federation: str
-    wait_s: float | None
-    tls: Path | None
+    wait_s: float | None  # for a world; None waits indefinitely
+    tls: Path | None  # folder of the process's certificate
     insecure: bool
-    host: str | None
-    launched: str | None = None
+    host: str | None  # its name, as others see it
+    launched: str | None = None  # run of which it is a part, of processes that a launcher starts
 
     @property
     def who(self) -> "Identity":
@@ -285,11 +249,9 @@ class WorldAccess(NamedTuple):
 
 
 def option_group(argument: str, make: Callable[..., Any], options: Mapping[str, tuple[Any, Any]]) -> Callable[..., Any]:
-    """Return a decorator that gives a command some options in place of the argument that is made of them.
+    """Return a decorator that gives a command some options, by annotation and default, in place of one argument.
 
-    Args:
-        make: makes it of the values, in the order of the options.
-        options: annotation and default of each.
+    `make` makes that argument of their values, in the order of the options.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
@@ -310,10 +272,6 @@ def option_group(argument: str, make: Callable[..., Any], options: Mapping[str, 
         return with_options
 
     return decorate
-
-
-def _without_tls(connect: str, federation: str, wait: float | None, *more: Any) -> WorldAccess:
-    return WorldAccess(connect, federation, wait, None, *more)
 
 
 _OBSERVER: dict[str, tuple[Any, Any]] = {
@@ -342,7 +300,9 @@ observer_options = option_group("reach", WorldAccess, _OBSERVER)
 participant_options = option_group("reach", WorldAccess, _PARTICIPANT)
 """Of a command that runs a process of a federation, with an argument `reach`: it waits for a world."""
 several_options = option_group(
-    "reach", _without_tls, {name: each for name, each in _PARTICIPANT.items() if name != "tls"}
+    "reach",
+    lambda connect, federation, wait, *more: WorldAccess(connect, federation, wait, None, *more),
+    {name: each for name, each in _PARTICIPANT.items() if name != "tls"},
 )
 """The same for a process that stands for several, which can have no certificate: that is for one."""
 listener_options = option_group(

@@ -49,22 +49,14 @@ Root = x509.Certificate
 
 
 class CertificateRequest(NamedTuple):
-    """A certificate that is to be there.
+    """A certificate that is to be there."""
 
-    Attributes:
-        host: name of the host in the inventory; a folder.
-        process: name of the process; the common name.
-        addresses: of the host, IP or DNS.
-    """
-
-    host: str
-    process: str
-    addresses: tuple[str, ...] = ()
+    host: str  # name in the inventory; a folder
+    process: str  # its name; the common name
+    addresses: tuple[str, ...] = ()  # of the host, IP or DNS
 
 
 class CertificateStatus(NamedTuple):
-    """A certificate that is there, and what is wrong with it."""
-
     host: str
     process: str
     addresses: tuple[str, ...]
@@ -86,40 +78,42 @@ def init_command(placed: InventoryFile, renew: bool = False) -> str:
     return f"zsim certs init {placed.word} --scenario FILE{' --renew' if renew else ''}"
 
 
-# Making certificates
-
-
 def authority(folder: Path, now: datetime, force: bool = False) -> Authority:
     """Return the authority in a folder, made if there is none.
 
-    Args:
-        force: make another one, which invalidates every certificate made before.
-
-    Raises:
-        RunError: half of it is there, it has expired, or it cannot be read or written.
+    `force` makes another one, which invalidates every certificate made before. RunError if half of it is there, it has
+    expired, or it cannot be read or written.
     """
-    paths = (folder / AUTHORITY, folder / AUTHORITY_KEY)
-    there = [path for path in paths if path.exists()]
+    place, key_place = folder / AUTHORITY, folder / AUTHORITY_KEY
+    there = [path for path in (place, key_place) if path.exists()]
     if force or not there:
         return _make_authority(folder, now)
     if len(there) == 1:
-        missing = next(path for path in paths if path not in there)
+        missing = key_place if there == [place] else place
         raise RunError(f"{missing}: is missing beside {there[0].name}; bring it here, or --force makes a new authority")
-    pair = _read_authority(*paths)
-    if now >= pair.certificate.not_valid_after_utc:
-        day = pair.certificate.not_valid_after_utc.date()
-        raise RunError(f"{paths[0]}: the authority expired on {day}; --force makes a new one")
-    return pair
+    try:
+        with file_fault(key_place, "cannot be read", "it belongs to whoever made it"):
+            key = serialization.load_pem_private_key(key_place.read_bytes(), password=None)
+    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+        raise RunError(f"{key_place}: is no private key; --force makes a new authority") from error
+    if (
+        not isinstance(key, ec.EllipticCurvePrivateKey)
+        or (certificate := root(folder)).public_key() != key.public_key()
+    ):
+        raise RunError(f"{key_place}: is not the key of {place.name}; --force makes a new authority")
+    if now >= certificate.not_valid_after_utc:
+        day = certificate.not_valid_after_utc.date()
+        raise RunError(f"{place}: the authority expired on {day}; --force makes a new one")
+    return Authority(certificate, key)
 
 
 def _make_authority(folder: Path, now: datetime) -> Authority:
-    key = ec.generate_private_key(ec.SECP256R1())
     name = _name("zsim certificate authority")
     unused = ("content_commitment", "key_encipherment", "data_encipherment", "key_agreement")
     denied = dict.fromkeys(("digital_signature", *unused, "encipher_only", "decipher_only"), False)
+    key, builder = _key_and_builder(name, name, now, AUTHORITY_DAYS)
     certificate = (
-        _builder(name, name, key, now - BACK, now + timedelta(days=AUTHORITY_DAYS))
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(x509.KeyUsage(key_cert_sign=True, crl_sign=True, **denied), critical=True)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
         .sign(key, hashes.SHA256())
@@ -129,31 +123,13 @@ def _make_authority(folder: Path, now: datetime) -> Authority:
     return Authority(certificate, key)
 
 
-def _read_authority(certificate: Path, key: Path) -> Authority:
-    try:
-        with file_fault(key, "cannot be read", "it belongs to whoever made it"):
-            read = serialization.load_pem_private_key(key.read_bytes(), password=None)
-    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
-        raise RunError(f"{key}: is no private key; --force makes a new authority") from error
-    pair = Authority(_load(certificate), read) if isinstance(read, ec.EllipticCurvePrivateKey) else None
-    if pair is None or pair.certificate.public_key() != pair.key.public_key():
-        raise RunError(f"{key}: is not the key of {certificate.name}; --force makes a new authority")
-    return pair
-
-
 def issue(folder: Path, signer: Authority, wanted: CertificateRequest, now: datetime, days: float = DAYS) -> Path:
-    """Make key and certificate of a process on a host; return the folder that they are in.
-
-    Raises:
-        RunError: they cannot be written.
-    """
-    key = ec.generate_private_key(ec.SECP256R1())
+    """Make key and certificate of a process on a host; return the folder that they are in."""
     purposes = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]  # routers are both
     issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.key.public_key())
-    name, until = _name(wanted.process), now + timedelta(days=days)
+    key, builder = _key_and_builder(_name(wanted.process), signer.certificate.subject, now, days)
     certificate = (
-        _builder(name, signer.certificate.subject, key, now - BACK, until)
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
         .add_extension(x509.SubjectAlternativeName(list(_alternative_names(wanted.addresses))), critical=False)
         .add_extension(issuer, critical=False)
@@ -165,18 +141,13 @@ def issue(folder: Path, signer: Authority, wanted: CertificateRequest, now: date
     return place
 
 
-def _builder(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, start: datetime, end: datetime
-) -> x509.CertificateBuilder:
-    return (
-        x509.CertificateBuilder()
-        .subject_name(subject)
-        .issuer_name(issuer)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(start)
-        .not_valid_after(end)
-    )
+def _key_and_builder(
+    subject: x509.Name, issuer: x509.Name, now: datetime, days: float
+) -> tuple[ec.EllipticCurvePrivateKey, x509.CertificateBuilder]:
+    key = ec.generate_private_key(ec.SECP256R1())
+    builder = x509.CertificateBuilder().subject_name(subject).issuer_name(issuer).public_key(key.public_key())
+    builder = builder.serial_number(x509.random_serial_number())
+    return key, builder.not_valid_before(now - BACK).not_valid_after(now + timedelta(days=days))
 
 
 def _name(text: str) -> x509.Name:
@@ -201,11 +172,7 @@ def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def write(path: Path, content: bytes) -> None:
-    """Put a file in its place at once and readable by its owner alone; half a key is no key.
-
-    Raises:
-        RunError: it cannot be written.
-    """
+    """Put a file in its place at once and readable by its owner alone; half a key is no key."""
     fresh = path.with_name(f".{path.name}.new")
     with file_fault(path, "cannot be written", "give another folder"):
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -215,25 +182,16 @@ def write(path: Path, content: bytes) -> None:
         fresh.replace(path)
 
 
-# Certificates that are there
-
-
 def root(folder: Path) -> Root:
-    """Return the certificate of the authority in a folder; its key need not be there.
-
-    Raises:
-        RunError: there is none.
-    """
+    """Return the certificate of the authority in a folder; its key need not be there."""
     return _load(folder / AUTHORITY)
 
 
 def show(folder: Path, now: datetime) -> list[CertificateStatus]:
-    """Return every certificate in a folder, with what is wrong with it."""
     statuses = []
     for path in sorted(folder.glob(f"*/*/{CERTIFICATE}")):
         certificate, place = _load(path), path.parent
-        fault = _fault(place, certificate, root(folder), now) or ""
-        until = certificate.not_valid_after_utc
+        fault, until = _fault(place, certificate, root(folder), now) or "", certificate.not_valid_after_utc
         statuses.append(CertificateStatus(place.parent.name, place.name, _addresses(certificate), until, fault))
     return statuses
 
@@ -298,8 +256,7 @@ def _addresses(certificate: x509.Certificate) -> tuple[str, ...]:
 def certificate_faults(placed: InventoryFile, places: Mapping[str, str] | None, now: datetime) -> list[str]:
     """Return a line for each fault of a run's certificates and access control.
 
-    Args:
-        places: host of each process that is to be started; its routers need not be among them. None takes the world.
+    `places`: host of each process that is to be started, with or without its routers. None takes the world.
     """
     if placed.inventory.security.insecure:
         return []
@@ -315,7 +272,17 @@ def certificate_faults(placed: InventoryFile, places: Mapping[str, str] | None, 
         signer = root(folder)
         for name, host in {**places, **routers}.items():
             wanted = CertificateRequest(host, name, (placed.inventory.hosts[host].address,))
-            if fault := _unusable(folder, signer, wanted, now):
+            listens = name == WORLD or name in routers
+            why, fault = renewal_reason(folder, signer, wanted, now), None
+            if why == "new":
+                fault = "certificate missing"
+            elif why == "other addresses":
+                fault = "certificate for other addresses" if listens else None  # that of a client is not checked
+            elif why:
+                fault = f"certificate {why}"
+            elif listens and not (folder / host / f"{name}.access.json").exists():
+                fault = "access control missing"
+            if fault:
                 names.setdefault(fault, []).append(f"{name} on {host}")
     except RunError as error:
         return [str(error)]
@@ -327,20 +294,6 @@ def certificate_faults(placed: InventoryFile, places: Mapping[str, str] | None, 
         remedy = f"make them with `{init_command(placed, renew=EXPIRED in fault)}`"
         lines.append(f"{folder}: {fault}: {', '.join(who[:SHOWN_MAX])}{more}; {remedy}")
     return lines
-
-
-def _unusable(folder: Path, signer: Root, wanted: CertificateRequest, now: datetime) -> str | None:
-    """Return what is wrong with a certificate, and with the access control beside it; None if nothing is."""
-    listens = wanted.process == WORLD or wanted.process.startswith(f"{ROUTER}.")
-    why = renewal_reason(folder, signer, wanted, now)
-    if why == "new":
-        return "certificate missing"
-    if why == "other addresses":
-        return "certificate for other addresses" if listens else None  # the address of a client is not checked
-    if why:
-        return f"certificate {why}"
-    there = (folder / wanted.host / f"{wanted.process}.access.json").exists()
-    return None if there or not listens else "access control missing"
 
 
 def exposed_keys(placed: InventoryFile) -> str | None:
@@ -358,80 +311,62 @@ def exposed_keys(placed: InventoryFile) -> str | None:
     return f"{min(exposed)}{more} can be read by others on this machine; chmod -R go= {shlex.quote(str(folder))}"
 
 
-# Who needs a certificate, and access control
+def enrolment(
+    placed: InventoryFile, scenario: Scenario, operators: Sequence[str] = ()
+) -> tuple[list[CertificateRequest], list[tuple[str, str, dict[str, Any]]]]:
+    """Return the certificates, and host, process and access control of every process that listens.
 
-
-class Enrolment:
-    """The certificates and the access control that an inventory and a scenario ask for.
+    A role has a certificate for every host, so that it can be moved there during a run.
 
     Args:
-        scenario: whose processes run.
         operators: people and programs that look and command, each NAME or NAME@HOST; at a host they come in as its
             roles do, through its router if it has one, otherwise at the world. One may be at several places.
 
-    Raises:
-        InventoryError: a process has no place, or an operator is at no host of the inventory.
-        BadNameError: an operator's name is none of the contract.
+    InventoryError if a process has no place, or an operator is at no host; BadNameError if a name is none of the
+    contract.
     """
-
-    def __init__(self, placed: InventoryFile, scenario: Scenario, operators: Sequence[str] = ()) -> None:
-        self._inventory = placed.inventory
-        self._scenario = scenario
-        self._places = inv.placement(placed, scenario)
-        self._operators = list(dict.fromkeys(self._read_operator(text, placed.source) for text in operators))
-        # Any host may run these: what the scenario names, and drivers, which it need not expect.
-        drivers = [name for name in drivers_of(scenario) if name not in self._places]
-        self._movable = [*(name for name in self._places if name != WORLD), *drivers]
-
-    def _read_operator(self, text: str, source: str) -> tuple[str, str | None]:
-        name, at, host = text.partition("@")
+    hosts, routers = placed.inventory.hosts, placed.inventory.routers
+    places = inv.placement(placed, scenario)
+    people: dict[tuple[str, str | None], None] = {}  # names of operators, each with its host
+    for name, at, host in (text.partition("@") for text in operators):
         name = keys.name(name.removeprefix(f"{OPERATOR}."), OPERATOR)
-        if at and host not in self._inventory.hosts:
-            known = ", ".join(self._inventory.hosts)
-            raise InventoryError([f"{source}: operator {name!r} is at {host!r}; must be one of hosts: {known}"])
-        return f"{OPERATOR}.{name}", host or None
+        if at and host not in hosts:
+            known = f"must be one of hosts: {', '.join(hosts)}"
+            raise InventoryError([f"{placed.source}: operator {name!r} is at {host!r}; {known}"])
+        people[f"{OPERATOR}.{name}", host or None] = None
+    # Any host may run these: what the scenario names, and drivers, which it need not expect.
+    movable = [name for name in places if name != WORLD]
+    movable += [name for name in drivers_of(scenario) if name not in places]
+    wanted = [(places[WORLD], WORLD), *((router.host, f"{ROUTER}.{name}") for name, router in routers.items())]
+    wanted += [(host, name) for name in movable for host in hosts]
+    wanted += [(host or OPERATORS, name) for name, host in people]
+    requests = [CertificateRequest(at, name, (hosts[at].address,) if at in hosts else ()) for at, name in wanted]
 
-    def certificates(self) -> list[CertificateRequest]:
-        """Return the certificates; a role has one for every host, so that it can be moved there during a run."""
-        hosts = self._inventory.hosts
-        wanted = [(self._places[WORLD], WORLD)]
-        wanted += [(router.host, f"{ROUTER}.{name}") for name, router in self._inventory.routers.items()]
-        wanted += [(host, name) for name in self._movable for host in hosts]
-        wanted += [(host or OPERATORS, name) for name, host in self._operators]
-        return [
-            CertificateRequest(host, name, (hosts[host].address,) if host in hosts else ()) for host, name in wanted
-        ]
+    def operators_at(router: str | None) -> list[str]:
+        return list(dict.fromkeys(who for who, at in people if (hosts[at].router if at else None) == router))
 
-    def access(self) -> Iterator[tuple[str, str, dict[str, Any]]]:
-        """Yield (host, process, access control) of every process that listens."""
-        clients = [*self._movable, *self._operators_at(None)]
-        yield self._places[WORLD], WORLD, access_control(self._scenario, clients, self._below(None))
-        for name, router in self._inventory.routers.items():
-            above = f"{ROUTER}.{router.upstream}" if router.upstream else WORLD
-            rules = access_control(self._scenario, self._at(name), self._below(name), [above])
-            yield router.host, f"{ROUTER}.{name}", rules
-
-    def _below(self, router: str | None) -> dict[str, list[str]]:
-        """Return the routers that connect to a router, or to the world, with all processes behind each."""
-        behind = {f"{ROUTER}.{name}": self._behind(name) for name in self._lower(router)}
-        return {name: processes for name, processes in behind.items() if processes}
-
-    def _behind(self, router: str) -> list[str]:
-        return [*self._at(router), *(process for name in self._lower(router) for process in self._behind(name))]
-
-    def _lower(self, router: str | None) -> list[str]:
-        return [name for name, below in self._inventory.routers.items() if below.upstream == router]
-
-    def _at(self, router: str) -> list[str]:
+    def clients_of(router: str) -> list[str]:
         """Return the processes that may come to a router: every role, as any may be moved to a host of it."""
-        has_hosts = any(host.router == router for host in self._inventory.hosts.values())
-        return [*(self._movable if has_hosts else []), *self._operators_at(router)]
+        has_hosts = any(host.router == router for host in hosts.values())
+        return [*(movable if has_hosts else []), *operators_at(router)]
 
-    def _operators_at(self, router: str | None) -> list[str]:
-        """Return the operators that come in at a router, or at the world."""
-        hosts = self._inventory.hosts
-        routers = {host: hosts[host].router if host is not None else None for _, host in self._operators}
-        return list(dict.fromkeys(name for name, host in self._operators if routers[host] == router))
+    def lower(router: str | None) -> list[str]:
+        return [name for name, below in routers.items() if below.upstream == router]
+
+    def behind(router: str) -> list[str]:
+        return [*clients_of(router), *(process for name in lower(router) for process in behind(name))]
+
+    def below(router: str | None) -> dict[str, list[str]]:
+        """Return the routers that connect to a router, or to the world, with all processes behind each."""
+        return {f"{ROUTER}.{name}": processes for name in lower(router) if (processes := behind(name))}
+
+    rules = access_control(scenario, [*movable, *operators_at(None)], below(None))
+    access = [(places[WORLD], WORLD, rules)]
+    for name, router in routers.items():
+        above = f"{ROUTER}.{router.upstream}" if router.upstream else WORLD
+        rules = access_control(scenario, clients_of(name), below(name), [above])
+        access.append((router.host, f"{ROUTER}.{name}", rules))
+    return requests, access
 
 
 # (flow, messages, whose keys): what a right is on the wire, seen from the process that listens
@@ -458,23 +393,20 @@ _ASKS_ACCESS = (("ingress", "query"), ("egress", "reply"))
 def access_control(
     scenario: Scenario, clients: Iterable[str], routers: Mapping[str, Iterable[str]], above: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """Return the `access_control` of a process that listens.
+    """Return the `access_control` of a process that listens, as Zenoh's configuration has it.
+
+    Everything is denied that is not in it. A process that is not named may ask what it may do, and nothing else.
 
     Args:
-        scenario: whose drones and clusters the rights are about.
         clients: names of the processes that connect to it.
         routers: names of the routers that connect to it, with the processes behind each.
         above: what it connects to itself, the world or another router.
-
-    Returns:
-        the map of Zenoh's configuration; everything is denied that is not in it. A process that is not named may ask
-        what it may do, and nothing else.
     """
     granted = {name: rights.rights_for(name, scenario) for name in clients}
     for name, behind in routers.items():
         granted[name] = rights.combined(rights.rights_for(process, scenario) for process in behind)
     granted |= dict.fromkeys(above, rights.ALL_RIGHTS)
-    entries = [(name, list(_rules(name, right, scenario.federation))) for name, right in granted.items()]
+    entries = [(name, _rules(name, right, scenario.federation)) for name, right in granted.items()]
     asking = [_rule(ANYONE, (flow,), (act,), (keys.access("*"),), scenario.federation) for flow, act in _ASKS_ACCESS]
     subjects = [{"id": name, "cert_common_names": [name]} for name, _ in entries]
     entries.append((ANYONE, asking))
@@ -487,14 +419,12 @@ def access_control(
     }
 
 
-def _rules(name: str, right: Rights, federation: str) -> Iterator[dict[str, Any]]:
+def _rules(name: str, right: Rights, federation: str) -> list[dict[str, Any]]:
     if right == rights.ALL_RIGHTS:
-        yield _rule(name, ("ingress", "egress"), _MESSAGES, rights.EVERYTHING, federation)
-        return
-    for flow, messages, field in _WIRE:
-        if expressions := getattr(right, field):
-            yield _rule(name, (flow,), messages, expressions, federation)
-    yield _rule(name, ("egress",), _DECLARATIONS, rights.EVERYTHING, federation)
+        return [_rule(name, ("ingress", "egress"), _MESSAGES, rights.EVERYTHING, federation)]
+    granted = [(flow, messages, getattr(right, field)) for flow, messages, field in _WIRE]
+    rules = [_rule(name, (flow,), messages, which, federation) for flow, messages, which in granted if which]
+    return [*rules, _rule(name, ("egress",), _DECLARATIONS, rights.EVERYTHING, federation)]
 
 
 def _rule(

@@ -4,7 +4,6 @@ Pure: reads a file and answers questions; nothing here opens a connection. docs/
 """
 
 import fnmatch
-import importlib.metadata
 import shlex
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -29,7 +28,6 @@ SSH_PORT = 22  # IANA
 HOSTS_MAX = DRONES_MAX  # with more, some have no drone
 ROLES_MAX = PROCESSES_MAX  # each a process at least
 ROUTER_PORT = 7448  # beside a world on the same host
-PROJECT = "zsim"
 MODULE = (SAFE_PATH, "-m", "zsim_deploy.cli")  # after the interpreter
 NAMED = {name: ROLES[name].extra for name in (WORLD, RECORDER)}  # there is one of each; in the order of placement
 OF_CAMERAS = ("camera", "detector")  # roles that no run waits for, unless the scenario names them
@@ -111,11 +109,7 @@ class InventoryFile(NamedTuple):
 
 
 def load(path: Path) -> InventoryFile:
-    """Return the inventory of a YAML file.
-
-    Raises:
-        InventoryError: with every fault, a line each.
-    """
+    """Return the inventory of a YAML file; InventoryError with every fault, a line each."""
     document = yaml_file.read(path, EXAMPLE, InventoryError)
     flaws = chain(faults(document, Inventory), _cross_faults(document))
     lines = first_lines(f"{path.name}: {where} {text}" for where, text in flaws)
@@ -131,42 +125,37 @@ def insecure(placed: InventoryFile) -> InventoryFile:
 
 
 def _cross_faults(document: dict[str, Any]) -> Iterator[Fault]:
-    """Yield the faults between fields: names that must be those of hosts and routers."""
-    hosts, routers = ([key for key, _ in _map(document, name)] for name in ("hosts", "routers"))
-    for key, wanted in _map(document, "roles"):
+    """Yield the faults between fields: names that must be those of hosts and routers, and circles of routers."""
+
+    def entries(name: str) -> list[tuple[Any, Any]]:
+        """Return those of a map, none where it is no map or has too many: they are compared with each other."""
+        value = document.get(name)
+        return list(value.items()) if isinstance(value, dict) and len(value) <= ROLES_MAX else []
+
+    def unknown(path: str, name: Any, known: list[Any], what: str) -> Iterator[Fault]:
+        if isinstance(name, str) and name not in known:
+            yield path, f"is {name!r}; must be one of {what}: {', '.join(map(str, known)) or 'there are none'}"
+
+    hosts, routers = ([key for key, _ in entries(name)] for name in ("hosts", "routers"))
+    for key, wanted in entries("roles"):
         for name in wanted if isinstance(wanted, list) else [wanted]:
-            yield from _unknown(f"roles.{key}", name, hosts, "hosts")
+            yield from unknown(f"roles.{key}", name, hosts, "hosts")
         if wanted == []:
             yield f"roles.{key}", "names no host; must name one at least"
-    for key, router in _map(document, "routers"):
+    upstream = {}
+    for key, router in entries("routers"):
         if isinstance(router, dict):
-            yield from _unknown(f"routers.{key}.host", router.get("host"), hosts, "hosts")
-            yield from _unknown(f"routers.{key}.upstream", router.get("upstream"), routers, "routers")
-    for key, host in _map(document, "hosts"):
+            yield from unknown(f"routers.{key}.host", router.get("host"), hosts, "hosts")
+            yield from unknown(f"routers.{key}.upstream", router.get("upstream"), routers, "routers")
+            if isinstance(router.get("upstream"), str):
+                upstream[key] = router["upstream"]
+    for key, host in entries("hosts"):
         if key in (".", ".."):
             yield f"hosts.{key}", "names a folder that is another's; must have a letter or a digit"
         if isinstance(host, dict):
-            yield from _unknown(f"hosts.{key}.router", host.get("router"), routers, "routers")
+            yield from unknown(f"hosts.{key}.router", host.get("router"), routers, "routers")
     if isinstance(document.get("hosts"), dict) and not hosts:
         yield "hosts", "has 0 entries; must have 1 at least"
-    yield from _circles(document)
-
-
-def _map(document: dict[str, Any], name: str) -> list[tuple[Any, Any]]:
-    """Return the entries of a map, none where it is no map or has too many: they are compared with each other."""
-    value = document.get(name)
-    return list(value.items()) if isinstance(value, dict) and len(value) <= ROLES_MAX else []
-
-
-def _unknown(path: str, name: Any, known: list[Any], what: str) -> Iterator[Fault]:
-    if isinstance(name, str) and name not in known:
-        yield path, f"is {name!r}; must be one of {what}: {', '.join(map(str, known)) or 'there are none'}"
-
-
-def _circles(document: dict[str, Any]) -> Iterator[Fault]:
-    """Yield routers whose chain of upstreams is a circle and never reaches the world."""
-    above = {key: router.get("upstream") for key, router in _map(document, "routers") if isinstance(router, dict)}
-    upstream = {key: above for key, above in above.items() if isinstance(above, str)}
     for start in upstream:
         seen, at = {start}, upstream[start]
         while at in upstream and at not in seen:
@@ -176,20 +165,13 @@ def _circles(document: dict[str, Any]) -> Iterator[Fault]:
             yield f"routers.{start}.upstream", "leads back to itself; must lead to the world"
 
 
-# Placement
-
-
 def roles(scenario: Scenario) -> list[str]:
     """Return the names of the processes that a scenario needs, the world first."""
     return [WORLD, RECORDER, *(name for name in expected_processes(scenario) if name != RECORDER)]
 
 
 def placement(placed: InventoryFile, scenario: Scenario) -> dict[str, str]:
-    """Return the host of every process of a scenario, by the rule of `spread`.
-
-    Raises:
-        InventoryError: a process has no place, or nothing matches a pattern.
-    """
+    """Return the host of every process, by `spread`; InventoryError if one has none, or a pattern matches nothing."""
     names, inventory = roles(scenario), placed.inventory
     entries = inventory.roles
     places = spread(entries, names)
@@ -220,7 +202,8 @@ def spread(roles: Mapping[str, Name | list[Name]], names: Iterable[str]) -> dict
         matching = [key for key in roles if fnmatch.fnmatchcase(name, key)]
         if matching:
             key = max(matching, key=lambda key: (key == name, len(key)))
-            hosts = _hosts_of(roles[key])
+            entry = roles[key]
+            hosts = [entry] if isinstance(entry, str) else entry
             places[name] = hosts[turns[key] % len(hosts)]
             turns[key] += 1
         elif name == RECORDER and WORLD in places:
@@ -228,21 +211,9 @@ def spread(roles: Mapping[str, Name | list[Name]], names: Iterable[str]) -> dict
     return places
 
 
-def _hosts_of(entry: Name | list[Name]) -> list[str]:
-    return [entry] if isinstance(entry, str) else entry
-
-
-# Connections
-
-
 def endpoint(placed: InventoryFile, places: dict[str, str], host: str) -> str:
     """Return where the roles of a host find the federation: their router, or the world."""
     return listening(placed, *_listener(placed.inventory, places, placed.inventory.hosts[host].router))
-
-
-def upstream(placed: InventoryFile, places: dict[str, str], router: str) -> str:
-    """Return what a router connects to."""
-    return listening(placed, *_listener(placed.inventory, places, placed.inventory.routers[router].upstream))
 
 
 def listening(placed: InventoryFile, host: str, port: int) -> str:
@@ -266,24 +237,12 @@ def connections(placed: InventoryFile, places: dict[str, str]) -> dict[tuple[str
 
 
 def _listener(inventory: Inventory, places: dict[str, str], router: str | None) -> tuple[str, int]:
-    """Return host and port of a router, or of the world."""
     if router is None:
         return places[WORLD], inventory.port
     return inventory.routers[router].host, inventory.routers[router].port
 
 
-def routers_in_order(inventory: Inventory) -> list[str]:
-    """Return the routers, each after the one that it connects to."""
-
-    def depth(name: str) -> int:
-        above = inventory.routers[name].upstream
-        return 0 if above is None else 1 + depth(above)
-
-    return sorted(inventory.routers, key=lambda name: (depth(name), name))
-
-
 def below_home(path: str) -> str:
-    """Return a path on a host from its root, or as ~/ from the home of its user."""
     return path if path.startswith(("/", "~/")) else f"~/{path}"
 
 
@@ -296,18 +255,12 @@ def python(host: Host) -> str:
 
 
 class PlannedProcess(NamedTuple):
-    """One process of a run.
+    """One process of a run."""
 
-    Attributes:
-        name: `role.thing`.
-        words: of the command, without what depends on where its files are, and without the name that it is given.
-        thing: that name, of a drone, a cluster or a router; None where the command takes none.
-    """
-
-    name: str
+    name: str  # `role.thing`
     host: str
-    words: tuple[str, ...]
-    thing: str | None
+    words: tuple[str, ...]  # of the command, without what depends on where its files are, and without `thing`
+    thing: str | None  # name of a drone, a cluster or a router that it is given; None where it takes none
     port: int | None
     secure: bool
     on_death: OnDeath
@@ -321,16 +274,16 @@ class PlannedProcess(NamedTuple):
     def role(self) -> str:
         return self.name.partition(".")[0]
 
+    @property
+    def unit(self) -> str:
+        return f"zsim-{self.name}.service"
+
 
 class ProcessFiles(NamedTuple):
-    """Where a process finds its files, as its command line has them.
-
-    Attributes:
-        identity: folder with ca.pem, certificate.pem and key.pem.
-    """
+    """Where a process finds its files, as its command line has them."""
 
     scenario: str
-    identity: str
+    identity: str  # folder with ca.pem, certificate.pem and key.pem
     access: str
     out: str
 
@@ -338,11 +291,7 @@ class ProcessFiles(NamedTuple):
 def processes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> list[PlannedProcess]:
     """Return the processes that zsim can start: the world, the recorder, agents, cameras, then routers.
 
-    Args:
-        pace: options of the world: `--realtime`, `--rate R`.
-
-    Raises:
-        InventoryError: a process has no place, or nothing matches a pattern.
+    `pace`: options of the world. InventoryError as of `placement`.
     """
     inventory, places = placed.inventory, placement(placed, scenario)
 
@@ -364,12 +313,18 @@ def processes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (
 
     def router(name: str) -> PlannedProcess:
         host, port = inventory.routers[name].host, inventory.routers[name].port
-        words = (ROUTER, "--listen", listening(placed, host, port), "--connect", upstream(placed, places, name))
+        upstream = listening(placed, *_listener(inventory, places, inventory.routers[name].upstream))
+        words = (ROUTER, "--listen", listening(placed, host, port), "--connect", upstream)
         more = ("--federation", scenario.federation, *([REALTIME] if REALTIME in pace else []))
         return planned(f"{ROUTER}.{name}", host, (*words, *more), name, port)
 
     ours = [role(name, host) for name, host in places.items() if _is_known(name, scenario)]
-    return ours + [router(name) for name in routers_in_order(inventory)]
+
+    def depth(name: str) -> int:
+        above = inventory.routers[name].upstream
+        return 0 if above is None else 1 + depth(above)
+
+    return ours + [router(name) for name in sorted(inventory.routers, key=lambda name: (depth(name), name))]
 
 
 def own_programs(placed: InventoryFile, scenario: Scenario, host: str | None = None) -> list[str]:
@@ -383,12 +338,10 @@ def own_programs(placed: InventoryFile, scenario: Scenario, host: str | None = N
 
 
 def _is_known(name: str, scenario: Scenario) -> bool:
-    """Return whether zsim has a command for a process."""
     return name in (WORLD, RECORDER, *agent_names(scenario)) or name.partition(".")[0] in OF_CAMERAS
 
 
 def command(process: PlannedProcess, files: ProcessFiles) -> list[str]:
-    """Return the arguments of the interpreter that run a process."""
     words = [*MODULE, *process.words, "--host", process.host]
     if process.name == RECORDER:
         words += ["--out", files.out]
@@ -409,38 +362,25 @@ def on_host(planned: Sequence[PlannedProcess], host: str) -> list[PlannedProcess
 
 
 def used_hosts(planned: Sequence[PlannedProcess]) -> list[str]:
-    """Return the hosts on which something runs, in the order of the processes."""
     return list(dict.fromkeys(process.host for process in planned))
 
 
-# Extras
-
-
 def extras(names: Sequence[str]) -> list[str]:
-    """Return the extras of the distribution that the processes of these names need."""
     named = {NAMED[name] for name in names if name in NAMED}
     return sorted(named | {extra for name in names for kind, extra in KINDS.items() if name.startswith(kind)})
 
 
-def known_extras() -> list[str]:
-    """Return the extras of what is installed here."""
-    return sorted(importlib.metadata.metadata(PROJECT).get_all("Provides-Extra") or [])
-
-
 def needed_extras(inventory: Inventory, more: Iterable[str] = ()) -> dict[str, frozenset[str]]:
-    """Return the extras of every host.
+    """Return the extras of every host, with those of `more`.
 
     A pattern counts for everything that it can match, since the scenario is not known here. A router needs no extra,
     nor does a program of the user's own.
-
-    Args:
-        more: extras for every host, beside those of its roles.
     """
     extras_by_host: dict[str, set[str]] = {name: set(more) for name in inventory.hosts}
     for process, host in spread(inventory.roles, NAMED).items():
         extras_by_host[host].add(NAMED[process])
-    for pattern, hosts in inventory.roles.items():
-        for host in _hosts_of(hosts):
+    for pattern, entry in inventory.roles.items():
+        for host in [entry] if isinstance(entry, str) else entry:
             extras_by_host[host].update(extra for kind, extra in KINDS.items() if _can_match(pattern, kind))
     return {name: frozenset(extras) for name, extras in extras_by_host.items()}
 

@@ -33,7 +33,7 @@ from zsim_deploy.launch.supervisor import RESTART_WINDOW_S, RESTARTS_MAX, SUPERS
 Rendered = dict[str, str]
 """Path inside the output folder to text."""
 TEMPLATES = Path(__file__).with_name("templates")
-TARGET = "zsim.target"
+
 STATE = "/var/lib/zsim"  # StateDirectory=zsim
 CACHE = "/var/cache/zsim"  # CacheDirectory=zsim
 PATH_MAX = 4000  # bytes; Linux takes 4095, and what is in the folder has names too
@@ -44,6 +44,10 @@ IMAGE = f"zsim:{RELEASE}"
 USER = 1000  # first ordinary user of Debian
 CERTIFICATES, ACCESS, SCENARIO, RUNS = "/certs", "/access/access.json", "/scenario/scenario.yaml", "/runs"
 ENVIRONMENT = {**SINGLE_THREADED, "NUMBA_CACHE_DIR": CACHE}
+IN_A_CONTAINER = {
+    "cache": CACHE, "scenario": SCENARIO, "runs": RUNS, "certificates": CERTIFICATES, "access": ACCESS, "user": USER,
+    "stop_s": STOP_S,
+}  # fmt: skip
 NAME_MAX = 63  # RFC 1123 label
 CONFIG_BYTES_MAX = 1_048_576  # of a ConfigMap; Kubernetes, "ConfigMaps"
 FINAL_CODES = [USER_FAULT, SUPERSEDED]  # a new start heals neither a wrong call nor a name that another has taken
@@ -56,29 +60,23 @@ def systemd(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ())
     """Return `HOST/zsim-PROCESS.service`, `HOST/zsim.target`, and the scenario for the world's host.
 
     The options are those of systemd.exec(5) and systemd.service(5). Left out are MemoryDenyWriteExecute (numba
-    compiles) and ProcSubset (the fingerprint reads /proc/cpuinfo).
-
-    Args:
-        pace: options of the world: `--realtime`, `--rate R`.
-
-    Raises:
-        InventoryError: a process has no place, or a host has no user or no absolute path to its interpreter.
+    compiles) and ProcSubset (the fingerprint reads /proc/cpuinfo). `pace`: options of the world. InventoryError if a
+    process has no place, or a host has no user or no absolute path to its interpreter.
     """
     planned, hosts = inv.processes(placed, scenario, pace), placed.inventory.hosts
     _refuse(placed, [f"hosts.{name}.{text}" for name in inv.used_hosts(planned) for text in _lacks(hosts[name])])
     texts: Rendered = {}
     for name in inv.used_hosts(planned):
         here = inv.on_host(planned, name)
-        texts |= {f"{name}/{_unit(process)}": _service(scenario, process, hosts[name], here) for process in here}
-        values = {"scenario": scenario.name, "host": name, "units": " ".join(map(_unit, here))}
-        texts[f"{name}/{TARGET}"] = _text(TARGET, values, inv.own_programs(placed, scenario, name))
+        texts |= {f"{name}/{process.unit}": _service(scenario, process, hosts[name], here) for process in here}
+        values = {"scenario": scenario.name, "host": name, "units": " ".join(process.unit for process in here)}
+        texts[f"{name}/zsim.target"] = _text("zsim.target", values, inv.own_programs(placed, scenario, name))
         if any(process.name == WORLD for process in here):
             texts[f"{name}/scenario.yaml"] = scenario_file.to_text(scenario)
     return texts
 
 
 def _lacks(host: Host) -> Iterator[str]:
-    """Yield what a unit needs and a host's entry lacks."""
     if host.user is None:
         yield "user is missing; a unit needs the user under which it runs; add it"
     elif not _home(host.user):
@@ -103,17 +101,10 @@ def _absolute(host: Host, path: str) -> str:
     return path if path.startswith("/") else f"{_home(host.user)}/{path.removeprefix('~/')}"
 
 
-def _unit(process: PlannedProcess) -> str:
-    return f"zsim-{process.name}.service"
-
-
 def _service(scenario: Scenario, process: PlannedProcess, host: Host, here: Sequence[PlannedProcess]) -> str:
-    """Return the unit of a process.
-
-    What is started later is stopped first: the world ends the run for all, and routers go last.
-    """
+    """What is started later is stopped first: the world ends the run for all, and routers go last."""
     rank = {ROUTER: 0, WORLD: 2}
-    earlier = [_unit(each) for each in here if rank.get(each.role, 1) < rank.get(process.role, 1)]
+    earlier = [each.unit for each in here if rank.get(each.role, 1) < rank.get(process.role, 1)]
     folder = _absolute(host, host.folder)
     files = ProcessFiles(
         scenario=f"{folder}/scenario.yaml",
@@ -157,14 +148,7 @@ def _systemd_word(text: str) -> str:
 
 
 def compose(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
-    """Return `HOST/compose.yaml`, `HOST/Dockerfile`, and the scenario for the world's host.
-
-    Args:
-        pace: options of the world: `--realtime`, `--rate R`.
-
-    Raises:
-        InventoryError: a process has no place, or nothing matches a pattern.
-    """
+    """Return `HOST/compose.yaml`, `HOST/Dockerfile`, and the scenario for the world's host."""
     planned = inv.processes(placed, scenario, pace)
     head, (project,) = _yaml_template("compose.yaml")
     service = project["services"]["process"]
@@ -187,20 +171,14 @@ def _compose_service(template: Any, scenario: Scenario, process: PlannedProcess)
     out = f"{RUNS}/${{ZSIM_RUN:-{scenario.name}}}"
     words = inv.command(process, ProcessFiles(SCENARIO, CERTIFICATES, ACCESS, out))
     values = {
+        **IN_A_CONTAINER,
         "release": RELEASE,
         "host": process.host,
         "words": [word if word == out else word.replace("$", "$$") for word in words],  # for Compose to leave alone
         "environment": ENVIRONMENT,
-        "user": USER,
-        "cache": CACHE,
-        "scenario": SCENARIO,
-        "runs": RUNS,
-        "certificates": CERTIFICATES,
-        "access": ACCESS,
         "process": process.name,
         "access_file": inv.access_file(process),
         "restart": f"on-failure:{RESTARTS_MAX}" if process.is_restarted else "no",
-        "stop_s": STOP_S,
     }
     service, mounted = _filled(template, values), _mounted(process)
     paths = {"cache": CACHE, "scenario": SCENARIO, "runs": RUNS, "certs": CERTIFICATES, "access": ACCESS}
@@ -210,7 +188,6 @@ def _compose_service(template: Any, scenario: Scenario, process: PlannedProcess)
 
 
 def _mounted(process: PlannedProcess) -> set[str]:
-    """Return the names of what a process mounts."""
     uses = {
         "cache": True,
         "tmp": True,
@@ -223,7 +200,6 @@ def _mounted(process: PlannedProcess) -> set[str]:
 
 
 def _unused(placed: InventoryFile, host: str) -> list[str]:
-    """Return a remark on the fields of a host that containers do not use."""
     described = placed.inventory.hosts[host]
     defaults = Host(address=described.address)
     names = [name for name in ("folder", "python") if getattr(described, name) != getattr(defaults, name)]
@@ -234,8 +210,7 @@ def _dockerfile(planned: Sequence[PlannedProcess]) -> str:
     """Return the Dockerfile of an image with the extras of some processes; the wheel is to be beside it."""
     extras = inv.extras([process.name for process in planned])
     wanted = f"[{','.join(extras)}]" if extras else ""
-    values = {"wheel": WHEEL, "base": BASE, "extras": wanted, "cache": CACHE, "runs": RUNS, "user": USER}
-    return _text("Dockerfile", values)
+    return _text("Dockerfile", {**IN_A_CONTAINER, "wheel": WHEEL, "base": BASE, "extras": wanted})
 
 
 # Kubernetes: a run ends, so its roles are Jobs; a router does not, so it is a Deployment
@@ -244,18 +219,12 @@ def _dockerfile(planned: Sequence[PlannedProcess]) -> str:
 def kubernetes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (), image: str = IMAGE) -> Rendered:
     """Return `namespace.yaml`, `secrets.sh`, `zsim.yaml`, `records.yaml` and a Dockerfile.
 
-    The names of the hosts are those of the nodes.
-
-    Args:
-        pace: options of the world: `--realtime`, `--rate R`.
-        image: where the nodes find what the Dockerfile makes.
-
-    Raises:
-        InventoryError: a process has no place, a name is none that Kubernetes takes, or the scenario is too large.
+    The names of the hosts are those of the nodes, which find what the Dockerfile makes as `image`. InventoryError if a
+    process has no place, a name is none that Kubernetes takes, or the scenario is too large.
     """
     planned, text = inv.processes(placed, scenario, pace), scenario_file.to_text(scenario)
     _refuse(placed, _kubernetes_faults(planned, text))
-    shared = {"space": label(scenario.federation), "image": image, "user": USER, "runs": RUNS}
+    shared = {**IN_A_CONTAINER, "space": label(scenario.federation), "image": image}
     head, manifests = _yaml_template("kubernetes/zsim.yaml")
     by_kind = {manifest["kind"]: manifest for manifest in manifests}
     world = next(process for process in planned if process.name == WORLD)
@@ -275,13 +244,17 @@ def kubernetes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = 
         texts[name] = _dump(head, _filled(lasting, shared))
     texts["Dockerfile"] = _dockerfile(planned)
     if not placed.inventory.security.insecure:
-        puts = "\n".join(map(_put_secret, planned))
-        texts["secrets.sh"] = _text("kubernetes/secrets.sh", {**shared, "puts": puts})
+        puts = []  # lines that put certificates from where `zsim certs init` left them into the cluster
+        for process in planned:
+            files = [f'--from-file="$certs/{process.host}/{process.name}"']
+            if process.port is not None:
+                files.append(f'--from-file=access.json="$certs/{process.host}/{inv.access_file(process)}"')
+            puts.append(f"put certs-{label(process.name)} {' '.join(files)}")
+        texts["secrets.sh"] = _text("kubernetes/secrets.sh", {**shared, "puts": "\n".join(puts)})
     return texts
 
 
 def _kubernetes_faults(planned: Sequence[PlannedProcess], text: str) -> list[str]:
-    """Return a line for everything that Kubernetes cannot do."""
     lines = [
         f"hosts.{host} is no name of a node; must be letters, digits, - and ., as `kubectl get nodes` lists them"
         for host in inv.used_hosts(planned)
@@ -308,7 +281,6 @@ def _labels(process: PlannedProcess) -> dict[str, str]:
 
 
 def _role_manifest(by_kind: Mapping[str, Any], shared: Mapping[str, Any], process: PlannedProcess) -> Any:
-    """Return the Job of a role, or the Deployment of a router."""
     kind, restart = ("Deployment", "Always") if process.role == ROUTER else ("Job", "Never")
     words = inv.command(process, ProcessFiles(SCENARIO, CERTIFICATES, ACCESS, f"{RUNS}/{RUN_ID}"))
     values = {
@@ -319,12 +291,9 @@ def _role_manifest(by_kind: Mapping[str, Any], shared: Mapping[str, Any], proces
         "final_codes": FINAL_CODES,
         "restart": restart,
         "host": process.host,
-        "stop_s": STOP_S,
         "role": process.role,
         "words": words,
         "environment": [{"name": key, "value": value} for key, value in ENVIRONMENT.items()],
-        "cache": CACHE,
-        "certificates": CERTIFICATES,
         "port": process.port,
         "secret": f"certs-{label(process.name)}",
     }
@@ -336,17 +305,6 @@ def _role_manifest(by_kind: Mapping[str, Any], shared: Mapping[str, Any], proces
     if process.port is None:
         del container["ports"]
     return _filled(by_kind[kind], {**values, "pod": pod})
-
-
-def _put_secret(process: PlannedProcess) -> str:
-    """Return the line that puts a certificate from where `zsim certs init` left it into the cluster."""
-    files = [f'--from-file="$certs/{process.host}/{process.name}"']
-    if process.port is not None:
-        files.append(f'--from-file=access.json="$certs/{process.host}/{inv.access_file(process)}"')
-    return f"put certs-{label(process.name)} {' '.join(files)}"
-
-
-# Templates
 
 
 def _refuse(placed: InventoryFile, lines: Sequence[str]) -> None:
@@ -362,14 +320,12 @@ def _template(name: str) -> tuple[list[str], str]:
 
 
 def _text(name: str, values: Mapping[str, Any], remarks: Sequence[str] = ()) -> str:
-    """Return a template with values put in, and with remarks for a reader at the end of its head."""
     head, body = _template(name)
     lines = [*_filled(head, values), *(f"# {line}" for line in remarks)]
     return "\n".join(lines) + "\n" + Template(body).substitute(values)
 
 
 def _yaml_template(name: str) -> tuple[list[str], list[Any]]:
-    """Return the comment lines at the head of a YAML template, and its documents."""
     head, body = _template(name)
     return head, list(yaml.safe_load_all(body))
 
@@ -401,46 +357,51 @@ class _Dumper(yaml.SafeDumper):
     def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
         super().increase_indent(flow, False)
 
-
-def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
-    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style="|" if "\n" in text else None)
-
-
-_Dumper.add_representer(str, _represent_text)
+    def represent_text(self, text: str) -> yaml.ScalarNode:
+        return self.represent_scalar("tag:yaml.org,2002:str", text, style="|" if "\n" in text else None)
 
 
-# The output folder
+_Dumper.add_representer(str, _Dumper.represent_text)
 
 
 def write(out: Path, target: str, texts: Mapping[str, str], force: bool = False) -> list[str]:
     """Write the texts into a folder; return the files of an earlier rendering for this target that were removed.
 
     A list beside the files holds their digests, as `sha256sum` prints them: a later rendering removes what an earlier
-    one wrote, and never a file of another origin or one changed since.
-
-    Args:
-        out: the folder, made if it is not there.
-        target: what it is rendered for; each target has a list of its own.
-        texts: by path inside the folder, HOST/FILE or FILE; a host named `..` does not lead out of it.
-        force: overwrite what no rendering wrote, or what was changed since.
-
-    Raises:
-        RunError: it cannot be written, a path leads out of it, or a file in the way was not rendered.
+    one for its target wrote, and never a file of another origin or one changed since. `force` overwrites these.
+    RunError if a file cannot be written, a path leads out of the folder, or a file in the way was not rendered.
     """
     root, record = out.resolve(), out / f".zsim-render-{target}.sha256"
+
+    def is_inside(name: str) -> bool:
+        path = (root / name).resolve()
+        return root in (path.parent, path.parent.parent)
+
+    def digest(content: bytes) -> str:
+        return hashlib.sha256(content).hexdigest()
+
+    def has_digest(path: Path, known: Sequence[str]) -> bool:
+        try:
+            return digest(path.read_bytes()) in known
+        except OSError:
+            return False
+
     for name in texts:
-        if not _is_inside(root, name):
+        if not is_inside(name):
             raise RunError(f"{name}: leads out of {out}; rename that host in the inventory")
-    former = _digests(record)
+    lines: list[str] = []
+    with file_fault(out, "cannot be written", OTHER_OUT), contextlib.suppress(FileNotFoundError):
+        lines = record.read_text(encoding="utf-8", errors="replace").splitlines()
+    former = {name: known for known, _, name in (line.partition("  ") for line in lines) if name}  # digests, by path
     if not force:
         for name, text in texts.items():
-            path, known = root / name, (former.get(name, ""), _digest(text.encode()))
-            if path.exists() and not _has_digest(path, known):
+            path, known = root / name, (former.get(name, ""), digest(text.encode()))
+            if path.exists() and not has_digest(path, known):
                 why = "no rendering wrote it, or it was changed since"
                 raise RunError(f"{path}: {why}; give --out another folder, or --force to replace it")
-    stale = [name for name in former if name not in texts and _is_inside(root, name) and (root / name).is_file()]
+    stale = [name for name in former if name not in texts and is_inside(name) and (root / name).is_file()]
     for name in stale:
-        if not _has_digest(root / name, (former[name],)):
+        if not has_digest(root / name, (former[name],)):
             why = "an earlier rendering wrote it and it was changed since"
             raise RunError(f"{root / name}: {why}; remove it, or give --out another folder")
     for path in (root / name for name in stale):
@@ -449,37 +410,9 @@ def write(out: Path, target: str, texts: Mapping[str, str], force: bool = False)
         if path.parent != root:
             with contextlib.suppress(OSError):  # something else is in it
                 path.parent.rmdir()
-    _put(record, "".join(f"{_digest(text.encode())}  {name}\n" for name, text in texts.items()))
-    for name, text in texts.items():
-        _put(root / name, text)
+    digests = "".join(f"{digest(text.encode())}  {name}\n" for name, text in texts.items())
+    for path, text in {record: digests, **{root / name: text for name, text in texts.items()}}.items():
+        with file_fault(path, "cannot be written", OTHER_OUT):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
     return stale
-
-
-def _is_inside(root: Path, name: str) -> bool:
-    path = (root / name).resolve()
-    return root in (path.parent, path.parent.parent)
-
-
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
-
-
-def _has_digest(path: Path, known: Sequence[str]) -> bool:
-    try:
-        return _digest(path.read_bytes()) in known
-    except OSError:
-        return False
-
-
-def _digests(record: Path) -> dict[str, str]:
-    """Return the digests of what was rendered before, by path."""
-    lines: list[str] = []
-    with file_fault(record.parent, "cannot be written", OTHER_OUT), contextlib.suppress(FileNotFoundError):
-        lines = record.read_text(encoding="utf-8", errors="replace").splitlines()
-    return {name: digest for digest, _, name in (line.partition("  ") for line in lines) if name}
-
-
-def _put(path: Path, text: str) -> None:
-    with file_fault(path, "cannot be written", OTHER_OUT):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")

@@ -33,7 +33,6 @@ HEIGHT_M, CIRCLE_M, CIRCLE_RAD_S = 4.0, 2.0, 0.4  # a circle beside the start, s
 GAIN_1_S, SPEED_M_S = 0.6, 1.0
 
 Array = NDArray[np.float64]
-pytestmark = pytest.mark.xdist_group("consistency")  # the flights of a case are flown once
 
 
 class Runs(NamedTuple):

@@ -369,7 +369,14 @@ def test_a_world_that_is_not_to_be_restarted(federation: Federation) -> None:
     check_end(federation, whole=False)
 
 
-@pytest.mark.parametrize("how", [pytest.param("Ctrl-C", marks=pytest.mark.soak), "kill -9 of everything"])
+@pytest.mark.parametrize(
+    "how",
+    [
+        pytest.param("Ctrl-C", marks=pytest.mark.soak),
+        "kill -9 of everything",
+        pytest.param("kill -9 of everything, of the launcher when the world is back", marks=pytest.mark.soak),
+    ],
+)
 def test_an_interrupted_run_goes_on(federation: Federation, undisturbed: dict[str, np.ndarray], how: str) -> None:
     flight = Flight(federation)
     if how == "Ctrl-C":
@@ -378,6 +385,8 @@ def test_an_interrupted_run_goes_on(federation: Federation, undisturbed: dict[st
     else:
         for name in ("recorder", "world", "controller.main", "estimator.drone1", "estimator.drone2"):
             federation.kill(name)
+        if "when the world is back" in how:
+            flight.run.line("world: goes on at t = ")
         flight.run.signal(signal.SIGKILL)
     federation.nobody_left()
     reached_ns = federation.record().all("clock")[-1]["t_ns"]

@@ -91,7 +91,6 @@ def _unit(vector: Array) -> Array:
 
 
 def _aim(client: viser.ClientHandle, centre: Array, offset: Array) -> None:
-    """Aim a page's camera at a point from an offset [m; W]."""
     with client.atomic():
         client.camera.position = centre + offset
         client.camera.look_at = centre
@@ -99,20 +98,13 @@ def _aim(client: viser.ClientHandle, centre: Array, offset: Array) -> None:
 
 @dataclass
 class _Page:
-    """A page's camera.
-
-    Attributes:
-        follows: whether it moves with the formation.
-        fits: whether it keeps all drones in view by its distance.
-        direction: from which it looks at the next picture; None: unchanged.
-        moved: whether it must be aimed anew.
-    """
+    """A page's camera."""
 
     client: viser.ClientHandle
-    follows: bool = True
-    fits: bool = True
-    direction: Array | None = field(default_factory=DIRECTIONS["reset"].copy)
-    moved: bool = True
+    follows: bool = True  # whether it moves with the formation
+    fits: bool = True  # whether it keeps all drones in view by its distance
+    direction: Array | None = field(default_factory=DIRECTIONS["reset"].copy)  # of the next look; None: unchanged
+    moved: bool = True  # whether it must be aimed anew
 
 
 class CameraFollow:
@@ -127,7 +119,6 @@ class CameraFollow:
         server.on_client_disconnect(self._on_disconnect)
 
     def restart(self) -> None:
-        """Aim all cameras anew at the first picture of another run."""
         with self._lock:
             for page in self._pages.values():
                 page.moved = True
@@ -143,7 +134,6 @@ class CameraFollow:
             page.follows, page.fits = follows, fits
 
     def set_target(self, p_W: Array) -> None:
-        """Aim the cameras of later pages at positions (n, 3) [m], unless n is 0."""
         if len(p_W):
             self._points = p_W
 
@@ -205,20 +195,16 @@ def drone_index(drones: DronePoses | None, camera: str) -> int | None:
 
 @dataclass
 class _KeyedPage:
-    """A page, the camera whose frustum it shows, and the drone clicked last in its scene; empty for none."""
-
     client: viser.ClientHandle
-    camera: str = ""
-    clicked: str = ""
+    camera: str = ""  # whose frustum it shows
+    clicked: str = ""  # the drone clicked last in its scene
 
 
 @dataclass
 class _Frustum:
-    """A frustum of a camera, as viser's node, and the number of its picture."""
-
     camera: str
-    node: Any
-    number: int = 0
+    node: Any  # viser's
+    number: int = 0  # of its picture
 
 
 class CameraFrustums:
@@ -235,18 +221,15 @@ class CameraFrustums:
         server.on_client_disconnect(self._on_disconnect)
 
     def client_id(self, page: str) -> int | None:
-        """Return viser's number of a page, None if it is not open."""
         with self._lock:
             return self._pages[page].client.client_id if page in self._pages else None
 
     def choose(self, page: str, camera: str) -> None:
-        """Show a camera's frustum on a page; empty: none."""
         with self._lock:
             if page in self._pages:
                 self._pages[page].camera = camera
 
     def click(self, client_id: int, drone: str) -> None:
-        """Note that a drone was clicked in the scene of a page, by viser's number."""
         with self._lock:
             for page in self._pages.values():
                 if page.client.client_id == client_id:
@@ -287,7 +270,6 @@ class CameraFrustums:
                 show_jpeg(frustum.node, picture.image.data)
 
     def clear(self) -> None:
-        """Remove all: the run is over."""
         with self._lock:
             for page in self._pages.values():
                 page.camera = ""

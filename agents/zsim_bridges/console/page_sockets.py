@@ -95,10 +95,6 @@ class SteerDrone(_Action, frozen=True, tag="steer"):
     turn: Deflection = 0.0
     speed_m_s: Annotated[float, Meta(ge=0.0, le=SPEED_MAX_M_S)] = 1.0
 
-    def stick(self) -> Stick | None:
-        """Return the stick, None if it is not held."""
-        return Stick(self.forward, self.left, self.up, self.turn, self.speed_m_s) if self.held else None
-
 
 class GoToPlace(_Action, frozen=True, tag="go"):
     """Send the drone that was taken to a place, at its present height unless `z_m` is given."""
@@ -115,12 +111,6 @@ class LeaveDrone(_Action, frozen=True, tag="leave"):
 _Look = LookFrom | LookAtPlan | ChooseDrone | SelectDrone
 _Operate = PlayRecord | TakeDrone | SteerDrone | GoToPlace | LeaveDrone
 _ACTIONS = msgspec.json.Decoder(_Look | _Operate)
-
-
-async def _open(request: web.Request, max_bytes: int) -> web.WebSocketResponse:
-    socket = web.WebSocketResponse(compress=False, max_msg_size=max_bytes, heartbeat=HEARTBEAT_S)
-    await socket.prepare(request)
-    return socket
 
 
 class ActionSockets:
@@ -147,7 +137,8 @@ class ActionSockets:
 
     async def respond(self, request: web.Request, role: str) -> web.StreamResponse:
         """Answer a request for a socket; return when it is closed."""
-        socket = await _open(request, ACTION_MAX)
+        socket = web.WebSocketResponse(compress=False, max_msg_size=ACTION_MAX, heartbeat=HEARTBEAT_S)
+        await socket.prepare(request)
         try:
             async for message in socket:
                 answer = self.act(message.data, role, socket) if message.type is WSMsgType.TEXT else None
@@ -178,9 +169,10 @@ class ActionSockets:
             action: _Look | _Operate = _ACTIONS.decode(text)
         except (msgspec.MsgspecError, ValueError, RecursionError):
             return None
+        flying = self._flying()
         if isinstance(action, _Operate):
-            return self._operate(action, page) if role == OPERATOR else None
-        client_id, flying = self._client_id(action.page), self._flying()
+            return self._operate(action, page, flying) if role == OPERATOR else None
+        client_id = self._client_id(action.page)
         if isinstance(action, LookAtPlan) and page is not None:
             self._keys[page] = action.page
         if isinstance(action, LookFrom):
@@ -191,29 +183,29 @@ class ActionSockets:
         elif isinstance(action, LookAtPlan):
             return {"plan": flying.plan(client_id, action.whole)}
         elif isinstance(action, ChooseDrone):
-            flying.choose(client_id, action.drone)
+            flying.pages.choose(client_id, action.drone)
         else:
-            flying.select(client_id, action.drone)
+            flying.pages.toggle(client_id, action.drone)
         return {}
 
-    def _operate(self, action: _Operate, page: Any) -> dict[str, Any]:
+    def _operate(self, action: _Operate, page: Any, flying: PageFlying | None) -> dict[str, Any]:
         if isinstance(action, PlayRecord):
             record = self._record()
             if record is not None:
                 record.play(action.op, action.value)
             return {}
-        flying = self._flying()
         if flying is None:
             return {}
         if isinstance(action, TakeDrone):
             client_id = self._client_id(self._keys.get(page, "")) if page is not None else None
-            refusal = flying.take_refusal(client_id, action.drone)
+            refusal = flying.pages.use(client_id, action.drone)
             if refusal:
                 answer = FlightAnswer(action.drone, text=refusal)
             else:
                 answer = flying.control.take(page, action.drone, action.over, action.id)
         elif isinstance(action, SteerDrone):
-            answer = flying.control.steer(page, action.stick())
+            deflections = action.forward, action.left, action.up, action.turn
+            answer = flying.control.steer(page, Stick(*deflections, action.speed_m_s) if action.held else None)
         elif isinstance(action, GoToPlace):
             answer = flying.control.go(page, action.x_m, action.y_m, action.z_m)
         else:
@@ -275,11 +267,7 @@ class PageBatches:
 
 
 class CameraSockets:
-    """The sockets for pictures of all pages.
-
-    Args:
-        feed: returns the cameras of the run that is shown, None without one.
-    """
+    """The sockets for pictures of all pages; `feed` returns the cameras of the run that is shown, None without one."""
 
     def __init__(self, feed: Callable[[], CameraFeed | None], frustums: CameraFrustums) -> None:
         self._feed = feed
@@ -287,7 +275,8 @@ class CameraSockets:
 
     async def respond(self, request: web.Request) -> web.StreamResponse:
         """Answer a request for a socket; return when it is closed."""
-        socket = await _open(request, REQUEST_MAX)
+        socket = web.WebSocketResponse(compress=False, max_msg_size=REQUEST_MAX, heartbeat=HEARTBEAT_S)
+        await socket.prepare(request)
         await self.serve(socket)
         await socket.close()
         return socket

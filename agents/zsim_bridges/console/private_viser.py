@@ -93,7 +93,6 @@ class PrivateViser:
 
 
 def _guard_controls(server: viser.ViserServer, permits: Permits) -> None:
-    """Check each use of a shared control before viser handles it."""
     handle_update, pages = server.gui._handle_gui_updates, server.gui._websock_interface
 
     async def guarded(client_id: Any, message: GuiUpdateMessage) -> None:
@@ -131,7 +130,6 @@ def _requiring_secret(secret: str) -> Iterator[None]:
 
 
 def control_ids(gui: viser.GuiApi) -> frozenset[str]:
-    """Return the ids of all controls that were added."""
     return frozenset(getattr(gui, "_gui_input_handle_from_uuid", ()))
 
 

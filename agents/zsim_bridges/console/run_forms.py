@@ -11,7 +11,7 @@ import viser
 
 from zsim.contract.messages import DroneInfo
 from zsim.contract.run_messages import GATES_MAX, RATE_MAX
-from zsim.scenario.faults import PROCESS_KILL, ROTORS, FaultKind, expected, kinds_of, unstated
+from zsim.scenario.faults import PROCESS_KILL, ROTORS, expected, kinds_of, unstated
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor_catalogue import declarations
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
@@ -57,11 +57,8 @@ class RunForm:
         gui.add_html(limits_line(f"gates: 1 to {GATES_MAX}"))
         step = gui.add_button("Step", icon=viser.Icon.PLAYER_TRACK_NEXT)
 
-        def request_step() -> None:
-            count = gates.value  # a fraction is sent as it is, and refused by the world
-            client.request_world("step", gates=int(count) if count == int(count) else count)
-
-        step.on_click(lambda _: request_step())
+        whole = lambda count: int(count) if count == int(count) else count  # noqa: E731  (the world refuses fractions)
+        step.on_click(lambda _: client.request_world("step", gates=whole(gates.value)))
         wanted = gui.add_number(
             "rate", rate, min=0.0, max=RATE_MAX, step=0.5, hint="Real time is 1; 0: as fast as it goes"
         )
@@ -97,7 +94,8 @@ class FleetForm:
         takeoff = gui.add_button("Take off all", icon=viser.Icon.PLANE_DEPARTURE, color="gray")
         takeoff.on_click(lambda _: self._take_off())
         reset = gui.add_button("Reset all", icon=viser.Icon.REFRESH, color="gray")
-        reset.on_click(lambda _: self._reset())
+        stopped = lambda: [d for d in self._drones if self._run.drones.get(d) == "emergency"]  # noqa: E731
+        reset.on_click(lambda _: client.send_mode(stopped(), "reset"))
         self._controls: dict[str, Any] = {"takeoff": takeoff, "reset": reset}
         self._reasons = gui.add_html("")
 
@@ -116,9 +114,6 @@ class FleetForm:
         single = [drone for drone in self._single if not preflight_refusal(self._run, [drone])]
         if single:
             self._client.send_mode(single, "takeoff")
-
-    def _reset(self) -> None:
-        self._client.send_mode([d for d in self._drones if self._run.drones.get(d) == "emergency"], "reset")
 
 
 class FaultForm:
@@ -210,37 +205,29 @@ class FaultForm:
             def choose() -> None:
                 """Describe the kind, and fill in a possible target, and magnitudes that have a default."""
                 chosen = self._kinds[kind.value]
-                help_.content = _help(chosen)
+                magnitudes = unstated(chosen, {})
+                lines = [
+                    f"`{p.name}` {p.description}: {expected(p)}{'' if p in magnitudes else ' (may be left out)'}"
+                    for p in chosen.parameters
+                ]
+                effect = f"{chosen.description}; strikes {STRIKES[chosen.strikes]}."
+                help_.content = f"<sub>{effect} {'; '.join(lines)}</sub>"
                 estimator = f"estimator.{self._drone.value}"
                 targets = {"drone": self._drone.value, "link": f"world/{estimator}", "process": estimator}
                 target.value = targets.get(chosen.strikes, "world")
-                magnitudes = unstated(chosen, {})
                 text.value = " ".join(f"{p.name}={'' if p.default is None else p.default}" for p in magnitudes)
+
+            def inject() -> None:
+                try:
+                    parameters = parse_fault(text.value, kind.value, self._kinds[kind.value])
+                except InputError as error:
+                    self._report(RequestOutcome("fault_add", str(error)))
+                    return
+                self._add(kind.value, target.value.strip(), parameters)
 
             kind.on_update(lambda _: choose())
             choose()
-            gui.add_button("Inject it", color="orange").on_click(
-                lambda _: self._inject(kind.value, target.value, text.value)
-            )
-
-    def _inject(self, kind: str, target: str, text: str) -> None:
-        try:
-            parameters = parse_fault(text, kind, self._kinds[kind])
-        except InputError as error:
-            self._report(RequestOutcome("fault_add", str(error)))
-            return
-        self._add(kind, target.strip(), parameters)
-
-
-def _help(fault: FaultKind) -> str:
-    """Describe a kind's effect, what it strikes, and its parameters with their limits."""
-    stated = unstated(fault, {})
-    lines = [
-        f"`{p.name}` {p.description}: {expected(p)}{'' if p in stated else ' (may be left out)'}"
-        for p in fault.parameters
-    ]
-    strikes = f"{fault.description}; strikes {STRIKES[fault.strikes]}."
-    return f"<sub>{' '.join([strikes, '; '.join(lines)])}</sub>"
+            gui.add_button("Inject it", color="orange").on_click(lambda _: inject())
 
 
 # Elements of forms
@@ -262,13 +249,11 @@ class OrderButton:
         self.disabled = False
         self._html = gui.add_html(self._content())
 
-    def name(self, label: str, of: dict[str, str]) -> None:
-        """Change its label and what it concerns."""
+    def rename(self, label: str, of: dict[str, str]) -> None:
         self._label, self._of = label, of
         assign(self._html, content=self._content())
 
     def lock(self, reason: str) -> None:
-        """Disable it for a reason; enable it if that is empty."""
         self.disabled, self._hint = bool(reason), reason or (HELD_HINT if self._held else "")
         assign(self._html, content=self._content())
 
@@ -281,7 +266,6 @@ class OrderButton:
 
 
 def assign(control: Any, **properties: Any) -> None:
-    """Set the properties of a viser control that differ."""
     for name, value in properties.items():
         if getattr(control, name) != value:
             setattr(control, name, value)

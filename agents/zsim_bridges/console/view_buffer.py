@@ -77,14 +77,8 @@ class ViewBuffer:
         asked: called with a formation and a description of each request that somebody else makes of it.
 
     Attributes:
-        drones: the newest view of the drones.
-        clusters: the newest view of each formation.
-        estimators: the newest view of each estimator, by its process.
-        healths: the newest of each process.
         external: names of the drones whose bodies are external.
         faults: injected ones, planned and active.
-        log: events as they are shown.
-        losses: processes and drones that are lost.
         begun: the last injected faults that have begun.
         failsafes: the event of each drone's automatic landing or stop, until it is commanded another mode.
         end: why the run ended, by its last event; empty while it goes on.
@@ -114,7 +108,7 @@ class ViewBuffer:
         self._answers: Counter[str] = Counter()
         self.drones: ViewDrones | None = None
         self.clusters: dict[str, ViewCluster] = {}
-        self.estimators: dict[str, ViewEstimates] = {}
+        self.estimators: dict[str, ViewEstimates] = {}  # by process
         self.healths: dict[str, Health] = {}
         self.external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
         self._links: dict[str, LinkState] = {}
@@ -163,7 +157,6 @@ class ViewBuffer:
         return newest
 
     def conditions(self) -> dict[str, DroneCondition]:
-        """Return the condition of each drone in the newest view, by name."""
         estimates, found = self.estimates(), {}
         for drone in self.drones.drones if self.drones else ():
             _, x, y, _ = drone.orientation_wxyz
@@ -191,12 +184,10 @@ class ViewBuffer:
         return found
 
     def link_of(self, drone: str) -> ReceivedLink | None:
-        """Return the newest state of an external drone's link, None before the first."""
         key = keys.link(drone)
         return ReceivedLink(self._links[key], self._wall_s() - self._received_s[key]) if key in self._links else None
 
     def active_faults(self) -> list[Fault]:
-        """Return the injected faults active at the time of the newest view."""
         now_ns = self.drones.t_ns if self.drones else 0
         return [f for f in self.faults if f.from_ns <= now_ns and (f.until_ns is None or f.until_ns > now_ns)]
 
@@ -208,7 +199,6 @@ class ViewBuffer:
         return max(0, (self.drones.t_ns if self.drones else 0) - received.t_ns) / 1e6
 
     def answered_commands(self, drone: str) -> int:
-        """Return how many commands to a drone the world has accepted or refused."""
         return self._answers[drone]
 
     def await_answer(self, drone: str, beyond: int, within_s: float) -> None:
@@ -337,7 +327,6 @@ class EventLog:
                 del self._rows[same[0]]
 
     def rows(self) -> list[EventRow]:
-        """Return the rows, newest first."""
         with self._lock:
             return list(reversed(self._rows.values()))
 

@@ -8,6 +8,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from operator import attrgetter
 from typing import Any, Literal, NamedTuple
 
 import msgspec
@@ -26,7 +27,7 @@ from zsim_analysis.reading.recorded_run import decode_or_none
 CELLS = 100_000  # of a batch: some 5 MB as Python objects
 PROGRESS_EVERY = 10_000  # messages
 WHOLE_MAX = 2**63 - 1
-QUATERNION = "_wxyz"
+QUATERNION, NO_WORD = "_wxyz", r"\W"
 COUNTS = ("used", "refused")  # an estimate's counts of a sensor's samples
 _NUMERIC = inspect.IntType | inspect.FloatType
 
@@ -35,20 +36,13 @@ Values = NDArray[Any] | list[Any]
 
 
 class MessageSelection(NamedTuple):
-    """Keys and times to be exported.
+    """Keys and times to be exported."""
 
-    Attributes:
-        expressions: key expressions as Zenoh's; none: every key.
-        from_s: simulated time of the first message [s], None: the start.
-        to_s: of the last one.
-    """
-
-    expressions: tuple[str, ...] = ()
-    from_s: float | None = None
-    to_s: float | None = None
+    expressions: tuple[str, ...] = ()  # key expressions as Zenoh's; none: every key
+    from_s: float | None = None  # simulated time of the first message [s], None: the start
+    to_s: float | None = None  # of the last one
 
     def keys(self, reader: RecordReader) -> list[str]:
-        """Return the selected keys on record."""
         every = not self.expressions
         return [key for key in reader.topics() if every or any(keys.matches(each, key) for each in self.expressions)]
 
@@ -62,56 +56,31 @@ class MessageSelection(NamedTuple):
 def subject(key: str) -> str:
     """Return the drone, cluster or process of a key; `world` if it concerns all."""
     kind, whose, what = keys.parts(key)
-    if kind == "view":
-        return what or "world"
-    return whose if what else "world"
+    return (what or "world") if kind == "view" else whose if what else "world"
 
 
 class RowBatch(NamedTuple):
-    """Rows of one table, in order of time.
+    """Rows of one table, in order of time."""
 
-    Attributes:
-        kind: of the messages.
-        only: the subject of all rows, if each subject has a table of its own.
-        names: subject of each.
-        messages: decoded.
-        wall_ns: when each reached the recorder.
-    """
-
-    kind: type[Struct]
-    only: str
-    names: list[str]
-    messages: list[Any]
-    wall_ns: list[int]
+    kind: type[Struct]  # of the messages
+    only: str  # the subject of all rows, if each subject has a table of its own
+    names: list[str]  # subject of each
+    messages: list[Any]  # decoded
+    wall_ns: list[int]  # when each reached the recorder
 
 
 class Columns(NamedTuple):
-    """The columns that one field of a message becomes.
-
-    Attributes:
-        name: unique in the table.
-        kind: of all its columns.
-        columns: their names.
-        values: returns a value per row, or a table (rows, columns); None or NaN where there is none.
-        names: of the variables, one column each; empty for other fields.
-        keys: the columns of each key of a map; empty for other fields.
-    """
-
-    name: str
-    kind: Kind
-    columns: tuple[str, ...]
+    name: str  # unique in the table
+    kind: Kind  # of all its columns
+    columns: tuple[str, ...]  # their names
+    # returns a value per row, or a table (rows, columns); None or NaN where there is none
     values: Callable[[RowBatch], Values]
-    names: tuple[str, ...] = ()
-    keys: Mapping[str, slice] = {}
+    names: tuple[str, ...] = ()  # of the variables, one column each; empty for other fields
+    keys: Mapping[str, slice] = {}  # the columns of each key of a map; empty for other fields
 
 
 def table_columns(kind: type[Struct], names: Mapping[str, Sequence[str]]) -> tuple[Columns, ...]:
-    """Return the columns of a message's table.
-
-    Args:
-        kind: of the message.
-        names: the names, or keys, that occur in each open field, in their order.
-    """
+    """Return the columns of a message's table, given the names, or keys, that occur in each open field."""
     opens = open_fields(kind)
     hidden = {"t_ns", "seq", *(["names"] if "named" in opens.values() else [])}  # `names` are in the others' columns
     own = [field for field in _fields(kind) if field.name not in hidden]
@@ -158,13 +127,13 @@ def _columns(field: inspect.Field, open_kind: str | None, names: Sequence[str]) 
     if open_kind and not names:
         return []
     if open_kind:
-        return [_named(name, names) if open_kind == "named" else _keyed(name, names, open_kind == "pairs")]
+        return [_open(name, names, open_kind)]
     if isinstance(info, inspect.UnionType):
         others = [each for each in info.types if not isinstance(each, inspect.NoneType)]
         info = others[0] if len(others) == 1 else info
     match info:
         case inspect.IntType():
-            return [Columns(name, "whole", (name,), lambda batch: [_whole(getattr(m, name)) for m in batch.messages])]
+            return [_plain(name, "whole", convert=lambda value: value if abs(value or 0) <= WHOLE_MAX else None)]
         case inspect.FloatType():
             return [_plain(name, "number")]
         case inspect.BoolType():
@@ -172,82 +141,63 @@ def _columns(field: inspect.Field, open_kind: str | None, names: Sequence[str]) 
         case inspect.StrType() | inspect.LiteralType():
             return [_plain(name, "text")]
     if components := _components(name, info):
-        return [Columns(name, "number", tuple(components), lambda batch: _vectors(batch, name, len(components)))]
+        count = len(components)
+
+        def vectors(batch: RowBatch) -> Values:
+            return np.array([getattr(m, name)[:count] for m in batch.messages], np.float64).reshape(-1, count)
+
+        return [Columns(name, "number", tuple(components), vectors)]
     if isinstance(info, inspect.StructType) and all(isinstance(part.type, _NUMERIC) for part in info.fields):
-        return [_part(name, part.name) for part in info.fields]
+        return [_plain(f"{name}_{part.name}", "number", f"{name}.{part.name}") for part in info.fields]
     return [Columns(name, "text", (name,), lambda batch: [json_text(getattr(m, name)) for m in batch.messages])]
 
 
-def _plain(name: str, kind: Kind) -> Columns:
+def _plain(name: str, kind: Kind, path: str = "", convert: Callable[[Any], Any] = lambda value: value) -> Columns:
+    """Return the column of a field, or of what is at a path from the message, converted."""
+    get = attrgetter(path or name)
+
     def values(batch: RowBatch) -> Values:
-        return [None if (value := getattr(m, name)) is UNSET else value for m in batch.messages]
+        return [None if (value := get(message)) is UNSET else convert(value) for message in batch.messages]
 
     return Columns(name, kind, (name,), values)
 
 
-def _part(name: str, part: str) -> Columns:
-    """Return the column of a number inside a field that is a struct."""
-    column = f"{name}_{part}"
-    return Columns(column, "number", (column,), lambda batch: [getattr(getattr(m, name), part) for m in batch.messages])
+def _open(name: str, names: Sequence[str], kind: str) -> Columns:
+    """Return a column for each name, or key, of an open field; for pairs two: FIELD_KEY_used and FIELD_KEY_refused.
 
-
-def _named(name: str, names: Sequence[str]) -> Columns:
-    """Return a column for each of the messages' `names`, which may differ from message to message."""
-
-    def values(batch: RowBatch) -> Values:
-        table = np.full((len(batch.messages), len(names)), np.nan)
-        indices: dict[tuple[str, ...], list[int]] = {}
-        for row, message in zip(table, batch.messages, strict=True):
-            if message.names not in indices:
-                indices[message.names] = [names.index(each) for each in message.names]
-            row[indices[message.names]] = getattr(message, name)
-        return table
-
-    return Columns(name, "number", tuple(f"{name}_{_tidy(each)}" for each in names), values, tuple(names))
-
-
-def _keyed(name: str, names: Sequence[str], pairs: bool) -> Columns:
-    """Return a column for each key of a map, or two for a map of pairs: FIELD_KEY_used and FIELD_KEY_refused."""
-    ends = [f"_{end}" for end in COUNTS] if pairs else [""]
-    columns = tuple(f"{name}_{_tidy(key)}{end}" for key in names for end in ends)
-    places = {key: slice(i * len(ends), (i + 1) * len(ends)) for i, key in enumerate(names)}
+    The messages' `names` may differ from message to message.
+    """
+    ends = [f"_{end}" for end in COUNTS] if kind == "pairs" else [""]
+    columns = tuple(f"{name}_{re.sub(NO_WORD, '_', each)}{end}" for each in names for end in ends)
+    places = {each: slice(i * len(ends), (i + 1) * len(ends)) for i, each in enumerate(names)}
 
     def values(batch: RowBatch) -> Values:
         table = np.full((len(batch.messages), len(columns)), np.nan)
         for row, message in zip(table, batch.messages, strict=True):
-            for key, value in getattr(message, name).items():
-                row[places[key]] = value
+            content = getattr(message, name)
+            for each, value in zip(message.names, content, strict=True) if kind == "named" else content.items():
+                row[places[each]] = value
         return table
 
+    if kind == "named":
+        return Columns(name, "number", columns, values, names=tuple(names))
     return Columns(name, "number", columns, values, keys=places)
-
-
-def _vectors(batch: RowBatch, name: str, count: int) -> Values:
-    return np.array([getattr(m, name)[:count] for m in batch.messages], np.float64).reshape(-1, count)
 
 
 def _components(name: str, info: inspect.Type) -> list[str]:
     """Return the columns of a field with a fixed number of numbers, none for any other field."""
     if isinstance(info, inspect.VarTupleType) and info.min_length == info.max_length == 36:
-        return [f"{name}_{i}{j}" for i in range(6) for j in range(6)]
-    if isinstance(info, inspect.VarTupleType) and info.min_length == len(ROTORS):  # of more rotors, the first four
-        return [f"{name}_{part}" for part in ROTORS]
-    if not isinstance(info, inspect.TupleType) or not all(isinstance(each, _NUMERIC) for each in info.item_types):
-        return []
-    count = len(info.item_types)
-    if name.endswith(QUATERNION):
-        return [f"{name.removesuffix(QUATERNION)}_{part}" for part in "wxyz"]
-    return [f"{name}_{part}" for part in ("xyz" if count == 3 else range(count))]
-
-
-def _whole(value: int | None) -> int | None:
-    """Return an integer, None if it does not fit 64 bits."""
-    return value if value is not None and -WHOLE_MAX <= value <= WHOLE_MAX else None
-
-
-def _tidy(name: str) -> str:
-    """Return a name with letters, digits and underscores only."""
-    return re.sub(r"\W", "_", name)
+        parts = [f"{i}{j}" for i in range(6) for j in range(6)]
+    elif isinstance(info, inspect.VarTupleType) and info.min_length == len(ROTORS):  # of more rotors, the first four
+        parts = list(ROTORS)
+    elif not isinstance(info, inspect.TupleType) or not all(isinstance(each, _NUMERIC) for each in info.item_types):
+        parts = []
+    elif name.endswith(QUATERNION):
+        name, parts = name.removesuffix(QUATERNION), list("wxyz")
+    else:
+        count = len(info.item_types)
+        parts = list("xyz") if count == 3 else [str(i) for i in range(count)]
+    return [f"{name}_{part}" for part in parts]
 
 
 def json_text(value: Any) -> str:
@@ -310,18 +260,25 @@ class TableSurvey:
         self.rows: Counter[type[Struct] | None] = Counter()
         for key in self.wanted:
             self.rows[self.kinds.get(key)] += counts[key]
-        self._names = self._open_names()
+        opened = {kind: open_fields(kind) for kind in set(self.kinds.values())}
+        self._names: dict[type[Struct], dict[str, dict[str, None]]] = {  # that occur in the open fields of all messages
+            kind: {field: {} for field in opens} for kind, opens in opened.items()
+        }
+        wanted = [key for key, kind in self.kinds.items() if opened[kind]]
+        for recorded in selection.messages(reader, wanted) if wanted else ():
+            if (message := decode_or_none(recorded)) is not None:
+                for field, open_kind in opened[type(message)].items():
+                    names = message.names if open_kind == "named" else getattr(message, field)
+                    self._names[type(message)][field].update(dict.fromkeys(names))
         self._tables: dict[type[Struct], tuple[Columns, ...]] = {}
 
     def table(self, kind: type[Struct]) -> tuple[Columns, ...]:
-        """Return the columns of a type's table."""
         if kind not in self._tables:
             names = {field: list(each) for field, each in self._names.get(kind, {}).items()}
             self._tables[kind] = table_columns(kind, names)
         return self._tables[kind]
 
     def width(self, kind: type[Struct]) -> int:
-        """Return the number of columns of a type's table."""
         return sum(len(each.columns) for each in self.table(kind))
 
     def rows_within(self, kind: type[Struct]) -> int:
@@ -339,28 +296,9 @@ class TableSurvey:
             content = json_text({"hexadecimal": recorded.payload.hex()})
         return Foreign(recorded.t_ns, recorded.key, content)
 
-    def _open_names(self) -> dict[type[Struct], dict[str, dict[str, None]]]:
-        """Return the names, or keys, that occur in the open fields of all messages."""
-        opened = {kind: open_fields(kind) for kind in set(self.kinds.values())}
-        found: dict[type[Struct], dict[str, dict[str, None]]] = {
-            kind: {field: {} for field in opens} for kind, opens in opened.items()
-        }
-        wanted = [key for key, kind in self.kinds.items() if opened[kind]]
-        for recorded in self._selection.messages(self._reader, wanted) if wanted else ():
-            if (message := decode_or_none(recorded)) is None:
-                continue
-            for field, open_kind in opened[type(message)].items():
-                names = message.names if open_kind == "named" else getattr(message, field)
-                found[type(message)][field].update(dict.fromkeys(names))
-        return found
-
 
 class DecodedMessages:
-    """Selected messages of a record with their decoded content; those for which `decode` returns None are left out.
-
-    Attributes:
-        refused: messages left out so far.
-    """
+    """Selected messages of a record with their decoded content; those for which `decode` returns None are left out."""
 
     def __init__(
         self, messages: Iterable[Recorded], decode: Callable[[Recorded], Any], progress: Callable[[int], None]
@@ -368,7 +306,7 @@ class DecodedMessages:
         self._messages = messages
         self._decode = decode
         self._progress = progress
-        self.refused = 0
+        self.refused = 0  # messages left out so far
 
     def __iter__(self) -> Iterator[tuple[Recorded, Any]]:
         for count, recorded in enumerate(self._messages):
@@ -384,36 +322,27 @@ class DecodedMessages:
 def batches(
     decoded: Iterable[tuple[Recorded, Any]], width: Callable[[type[Struct]], int], by_name: bool = False
 ) -> Iterator[RowBatch]:
-    """Yield all rows; a table's batches come in order of time.
+    """Yield all rows, those of a table in order of time, given messages in order of time.
 
-    Args:
-        decoded: messages in order of time.
-        width: number of columns of a table, by which its batches have fewer rows.
-        by_name: whether each drone, cluster and process has tables of its own.
+    Batches of wide tables have fewer rows. With `by_name`, each drone, cluster and process has tables of its own.
     """
     incomplete: dict[tuple[type[Struct], str], RowBatch] = {}
-    for recorded, message in _rows(decoded):
-        kind, name = type(message), subject(recorded.key)
-        only = name if by_name and kind is not Foreign else ""  # foreign names may be invalid as names of files
-        batch = incomplete.setdefault((kind, only), RowBatch(kind, only, [], [], []))
-        batch.names.append(name)
-        batch.messages.append(message)
-        batch.wall_ns.append(recorded.wall_ns)
-        if len(batch.names) * width(kind) >= CELLS:
-            yield incomplete.pop((kind, only))
-    yield from incomplete.values()
-
-
-def _rows(decoded: Iterable[tuple[Recorded, Any]]) -> Iterator[tuple[Recorded, Any]]:
-    """Yield messages, and a Sighting for each hat of Sightings."""
     for recorded, message in decoded:
-        if not isinstance(message, Sightings):
-            yield recorded, message
-            continue
-        source = message.source or ("world" if keys.is_sensor(recorded.key) else "")
-        head = (message.t_ns, message.seq, message.t_sample_ns, source, message.camera, len(message.seen))
-        for hat, seen in enumerate(message.seen):
-            numbers = (seen.direction_B, seen.range_m, seen.sigma_direction_rad, seen.sigma_range_m)
-            yield recorded, Sighting(*head, hat, *numbers)
-        if not message.seen:
-            yield recorded, Sighting(*head)
+        name, rows = subject(recorded.key), [message]
+        if isinstance(message, Sightings):
+            source = message.source or ("world" if keys.is_sensor(recorded.key) else "")
+            head = (message.t_ns, message.seq, message.t_sample_ns, source, message.camera, len(message.seen))
+            rows = [
+                Sighting(*head, hat, seen.direction_B, seen.range_m, seen.sigma_direction_rad, seen.sigma_range_m)
+                for hat, seen in enumerate(message.seen)
+            ] or [Sighting(*head)]
+        for row in rows:
+            kind = type(row)
+            only = name if by_name and kind is not Foreign else ""  # foreign names may be invalid as names of files
+            batch = incomplete.setdefault((kind, only), RowBatch(kind, only, [], [], []))
+            batch.names.append(name)
+            batch.messages.append(row)
+            batch.wall_ns.append(recorded.wall_ns)
+            if len(batch.names) * width(kind) >= CELLS:
+                yield incomplete.pop((kind, only))
+    yield from incomplete.values()

@@ -18,16 +18,7 @@ from typing import Any, NamedTuple
 import foxglove
 import msgspec
 import numpy as np
-from foxglove.channels import (
-    CameraCalibrationChannel,
-    CompressedImageChannel,
-    FrameTransformsChannel,
-    LocationFixChannel,
-    LogChannel,
-    PointCloudChannel,
-    PoseInFrameChannel,
-    SceneUpdateChannel,
-)
+from foxglove import channels
 from foxglove.messages import PoseInFrame
 
 from zsim.contract import keys, messages
@@ -58,19 +49,12 @@ ROTOR_RADIUS = 0.57  # of the arm, if the rotors are not known: 0.102 m at the A
 
 
 class ConvertedRun(NamedTuple):
-    """The content of a written file.
+    """The content of a written file."""
 
-    Attributes:
-        topics: messages by topic.
-        variables: by cluster, the fields of its numbers.
-        rotors: of every drone, in the order of the scenario.
-        refused: number of messages that could not be read.
-    """
-
-    topics: dict[str, int]
-    variables: dict[str, tuple[str, ...]]
-    rotors: dict[str, list[RotorDisc]]
-    refused: int
+    topics: dict[str, int]  # messages by topic
+    variables: dict[str, tuple[str, ...]]  # by cluster, the fields of its numbers
+    rotors: dict[str, list[RotorDisc]]  # of every drone, in the order of the scenario
+    refused: int  # number of messages that could not be read
 
 
 def convert(
@@ -85,7 +69,12 @@ def convert(
     scenario = scenario_of(info)
     decoded = DecodedMessages(selection.messages(reader, wanted), _decode, lambda done: progress(done, total))
     rotors = _rotors(info, scenario, dict.fromkeys(subject(key) for key in wanted if key.startswith("drone/")))
-    file = FoxgloveFile(path, rotors, _spaces(scenario))
+    spaces: dict[str, ClusterSpace] = {}
+    if scenario:
+        for cluster in scenario.clusters:
+            with suppress(ValueError, NotTrustedError):
+                spaces[cluster.name] = scenario_space(scenario, cluster)
+    file = FoxgloveFile(path, rotors, spaces)
     with deferred_signals() as check:
         try:
             for instant in chain(_cameras_before(reader, selection, wanted), _instants(decoded)):
@@ -93,7 +82,12 @@ def convert(
                 check()
         finally:
             file.close()
-    return ConvertedRun(dict(sorted(file.counts.items())), file.variables(), rotors, decoded.refused)
+    return ConvertedRun(
+        dict(sorted(file.counts.items())),
+        {name: kind.numbers for name, kind in file.variables.items()},
+        rotors,
+        decoded.refused,
+    )
 
 
 @contextmanager
@@ -140,16 +134,6 @@ def _rotors(info: Info | None, scenario: Scenario | None, present: Mapping[str, 
     return rotors
 
 
-def _spaces(scenario: Scenario | None) -> dict[str, ClusterSpace]:
-    spaces: dict[str, ClusterSpace] = {}
-    if scenario is None:
-        return spaces
-    for cluster in scenario.clusters:
-        with suppress(ValueError, NotTrustedError):
-            spaces[cluster.name] = scenario_space(scenario, cluster)
-    return spaces
-
-
 @dataclass
 class Instant:
     """Messages of one time: the last one of each key, but all events and all of cameras."""
@@ -164,34 +148,29 @@ class Instant:
     pictures: list[tuple[str, CameraImage]] = field(default_factory=list)
     cameras: list[tuple[str, CameraInfo]] = field(default_factory=list)
 
-    def add(self, key: str, message: Any) -> None:
-        """Add a message of a type that is drawn."""
-        match message:
-            case Event():
-                self.events.append(message)
-            case CameraImage():
-                self.pictures.append((key, message))
-            case CameraInfo():
-                self.cameras.append((key, message))
-            case Truth():
-                self.truth[subject(key)] = message
-            case Estimate():
-                self.estimates[subject(key)] = message
-            case Status():
-                self.status[subject(key)] = message
-            case Gps():
-                self.gps[subject(key)] = message
-            case ClusterState():
-                self.states[subject(key)] = message
-
 
 def _instants(decoded: Iterable[tuple[Recorded, Any]]) -> Iterator[Instant]:
     """Gather messages, which come in order of time, by their time; `world/info` is left out."""
     drawn = ((recorded.key, message) for recorded, message in decoded if not isinstance(message, Info))
     for t_ns, group in groupby(drawn, key=lambda pair: pair[1].t_ns):
         instant = Instant(t_ns)
+        newest: dict[type, dict[str, Any]] = {
+            Truth: instant.truth,
+            Estimate: instant.estimates,
+            Status: instant.status,
+            Gps: instant.gps,
+            ClusterState: instant.states,
+        }
         for key, message in group:
-            instant.add(key, message)
+            match message:
+                case Event():
+                    instant.events.append(message)
+                case CameraImage():
+                    instant.pictures.append((key, message))
+                case CameraInfo():
+                    instant.cameras.append((key, message))
+                case _:
+                    newest[type(message)][subject(key)] = message
         yield instant
 
 
@@ -208,11 +187,7 @@ def _cameras_before(reader: RecordReader, selection: MessageSelection, wanted: I
 
 
 class FoxgloveFile:
-    """An MCAP file that is being written; rotors by drone in the order of the scenario, spaces by cluster.
-
-    Attributes:
-        counts: messages by topic.
-    """
+    """An MCAP file that is being written; rotors by drone in the order of the scenario, spaces by cluster."""
 
     def __init__(
         self, path: Path, rotors: Mapping[str, Sequence[RotorDisc]], spaces: Mapping[str, ClusterSpace]
@@ -224,71 +199,61 @@ class FoxgloveFile:
         self._spaces = spaces
         self._colours = colours_of(rotors)
         self._channels: dict[str, Any] = {}
-        self._variables: dict[str, NumericMessageType] = {}
+        self.variables: dict[str, NumericMessageType] = {}  # of each cluster
         self._drone = NumericMessageType("Drone", made.DRONE_NUMBERS, ("state",))
         self._trails = made.DroneTrails()
         self._status: dict[str, Status] = {}
         self._next_ns: dict[str, int] = {}
         self._has_static_scene = False
-        self.counts: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()  # messages by topic
 
     def close(self) -> None:
-        """End the file.
-
-        Raises:
-            OSError: it could not be written.
-        """
+        """End the file; raise OSError if it could not be written."""
         self._file.close()
         self._checked_file.close()
 
-    def variables(self) -> dict[str, tuple[str, ...]]:
-        """Return the names of the numeric fields of each cluster."""
-        return {name: numbers.numbers for name, numbers in self._variables.items()}
-
     def write(self, instant: Instant) -> None:
-        """Write all messages of an instant.
-
-        Raises:
-            OSError: it could not be written.
-        """
+        """Write all messages of an instant; raise OSError if it cannot be written."""
         self._checked_file.check()
         self._status.update(instant.status)
         if not self._has_static_scene and instant.truth:
-            self._log(DRONES, SceneUpdateChannel, made.drones(instant.t_ns, self._rotors), instant.t_ns)
-            self._log(GROUND, SceneUpdateChannel, made.ground(instant.t_ns), instant.t_ns)
+            self._log(DRONES, channels.SceneUpdateChannel, made.drones(instant.t_ns, self._rotors), instant.t_ns)
+            self._log(GROUND, channels.SceneUpdateChannel, made.ground(instant.t_ns), instant.t_ns)
             self._has_static_scene = True
-        self._write_frames(instant)
+        frames: list[made.FramePose] = []
+        for name, truth in instant.truth.items():
+            frames.append((made.frame(name), truth.position_m, truth.orientation_wxyz))
+        for name, estimate in instant.estimates.items():
+            frames.append((f"{made.frame(name)}/estimate", estimate.position_m, estimate.orientation_wxyz))
+        for name, state in instant.states.items():
+            for end, values in (("", state.value), ("/desired", state.desired)):
+                if placed := made.cluster_frame(state.names, values):
+                    frames.append((f"cluster/{name}{end}", *placed))
+        if frames:
+            self._log(TF, channels.FrameTransformsChannel, made.transforms(instant.t_ns, frames), instant.t_ns)
         for name in dict.fromkeys([*instant.truth, *instant.estimates]):
             self._write_drone(instant, name)
         for name, gps in instant.gps.items():
             fix = made.location_fix(gps, name, self._colours.get(name, GREY))
-            self._log(f"/drone/{name}/gps", LocationFixChannel, fix, gps.t_ns)
+            self._log(f"/drone/{name}/gps", channels.LocationFixChannel, fix, gps.t_ns)
         for name, state in instant.states.items():
             self._write_cluster(instant, name, state)
         for event in instant.events:
-            self._log(LOG, LogChannel, made.log_line(event), event.t_ns)
+            self._log(LOG, channels.LogChannel, made.log_line(event), event.t_ns)
         for key, info in instant.cameras:
-            drone, camera = _camera_of(key)
-            calibration = made.camera_calibration(info, made.camera_frame(drone, camera))
-            self._log(f"/drone/{drone}/{camera}_camera/calibration", CameraCalibrationChannel, calibration, info.t_ns)
-            placed = [(made.camera_frame(drone, camera), info.position_m, info.orientation_wxyz)]
-            self._log(TF, FrameTransformsChannel, made.transforms(info.t_ns, placed, made.frame(drone)), info.t_ns)
+            drone, frame = _camera_of(key)
+            calibration = made.camera_calibration(info, frame)
+            self._log(f"/{frame}/calibration", channels.CameraCalibrationChannel, calibration, info.t_ns)
+            placed = [(frame, info.position_m, info.orientation_wxyz)]
+            self._log(
+                TF, channels.FrameTransformsChannel, made.transforms(info.t_ns, placed, made.frame(drone)), info.t_ns
+            )
         for key, image in instant.pictures:
-            drone, camera = _camera_of(key)
-            picture = made.compressed_image(image, made.camera_frame(drone, camera))
-            self._log(f"/drone/{drone}/{camera}_camera/image", CompressedImageChannel, picture, image.t_ns)
+            _, frame = _camera_of(key)
+            self._log(
+                f"/{frame}/image", channels.CompressedImageChannel, made.compressed_image(image, frame), image.t_ns
+            )
         self._write_scene(instant)
-
-    def _write_frames(self, instant: Instant) -> None:
-        frames = [(made.frame(d), t.position_m, t.orientation_wxyz) for d, t in instant.truth.items()]
-        estimates = instant.estimates.items()
-        frames += [(f"{made.frame(d)}/estimate", e.position_m, e.orientation_wxyz) for d, e in estimates]
-        for name, state in instant.states.items():
-            for end, values in (("", state.value), ("/desired", state.desired)):
-                placed = made.cluster_frame(state.names, values)
-                frames += [(f"cluster/{name}{end}", *placed)] if placed else []
-        if frames:
-            self._log(TF, FrameTransformsChannel, made.transforms(instant.t_ns, frames), instant.t_ns)
 
     def _write_drone(self, instant: Instant, name: str) -> None:
         at, t_ns = made.timestamp(instant.t_ns), instant.t_ns
@@ -297,54 +262,47 @@ class FoxgloveFile:
             if state is not None:
                 placed = made.pose(state.position_m, state.orientation_wxyz)
                 message = PoseInFrame(timestamp=at, frame_id=made.WORLD, pose=placed)
-                self._log(topic, PoseInFrameChannel, message, t_ns)
+                self._log(topic, channels.PoseInFrameChannel, message, t_ns)
         status = self._status.get(name)
         values = made.drone_numbers(truth, estimate, status)
         encoded = self._drone.encode(values, (status.state if status else "",))
         self._log(f"/drone/{name}/numbers", self._drone, encoded, t_ns)
 
     def _write_cluster(self, instant: Instant, name: str, state: ClusterState) -> None:
-        if name not in self._variables:
+        if name not in self.variables:
             tidied = [made.tidy(each) for each in state.names]
             fields = [f"{what}_{each}" for what in ("desired", "estimated", "true") for each in tidied]
             kind = NumericMessageType(f"Cluster_{made.tidy(name)}", [*fields, "margin"], ("phase", "reason"))
-            self._variables[name] = kind
-        numbers = self._variables[name]
-        values = [*state.desired, *state.value, *self._true(instant, name, state), state.margin]
+            self.variables[name] = kind
+        numbers = self.variables[name]
+        true = [math.nan] * len(state.names)  # unless they are known and not singular
+        space, truths = self._spaces.get(name), [instant.truth[d] for d in state.drones if d in instant.truth]
+        if space is not None and space.names == state.names and len(truths) == len(state.drones):
+            yaw = heading([truth.orientation_wxyz for truth in truths])
+            with suppress(SingularClusterError):
+                true = space.forward(np.array([truth.position_m for truth in truths]), yaw).tolist()
+        values = [*state.desired, *state.value, *true, state.margin]
         if len(values) == len(numbers.numbers):  # if the number of variables changes, only the first ones are written
             encoded = numbers.encode(values, (state.phase, state.reason))
             self._log(f"/cluster/{name}/variables", numbers, encoded, instant.t_ns)
 
-    def _true(self, instant: Instant, name: str, state: ClusterState) -> Sequence[float]:
-        """Return the true cluster variables, NaN if they are unknown or singular."""
-        unknown = [math.nan] * len(state.names)
-        space = self._spaces.get(name)
-        if space is None or space.names != state.names or not all(drone in instant.truth for drone in state.drones):
-            return unknown
-        truths = [instant.truth[drone] for drone in state.drones]
-        yaw = heading([truth.orientation_wxyz for truth in truths])
-        try:
-            return space.forward(np.array([truth.position_m for truth in truths]), yaw).tolist()
-        except SingularClusterError:
-            return unknown
-
     def _write_scene(self, instant: Instant) -> None:
         t_ns, truth = instant.t_ns, instant.truth
         if truth and self._is_due(TRAILS, t_ns, TRAIL_STEP_NS):
-            self._log(TRAILS, SceneUpdateChannel, self._trails.update(t_ns, truth, self._colours), t_ns)
+            self._log(TRAILS, channels.SceneUpdateChannel, self._trails.update(t_ns, truth, self._colours), t_ns)
         if truth and self._is_due(POINTS, t_ns):
             places = [(state.position_m, self._colours.get(d, GREY)) for d, state in truth.items()]
-            self._log(POINTS, PointCloudChannel, made.points(t_ns, places), t_ns)
+            self._log(POINTS, channels.PointCloudChannel, made.points(t_ns, places), t_ns)
         if instant.states and self._is_due(FORMATIONS, t_ns):
             desired = {c: m for c, state in instant.states.items() if (m := self._places(c, state)) is not None}
             scene = made.formations(t_ns, instant.states, truth, desired)
-            self._log(FORMATIONS, SceneUpdateChannel, scene, t_ns)
+            self._log(FORMATIONS, channels.SceneUpdateChannel, scene, t_ns)
             if desired:
                 places = [(place, MAGENTA) for each in desired.values() for place in each.tolist()]
-                self._log(DESIRED, PointCloudChannel, made.points(t_ns, places), t_ns)
+                self._log(DESIRED, channels.PointCloudChannel, made.points(t_ns, places), t_ns)
         if instant.estimates and self._is_due(ESTIMATES, t_ns):
             scene = made.ellipsoids(t_ns, instant.estimates, self._colours)
-            self._log(ESTIMATES, SceneUpdateChannel, scene, t_ns)
+            self._log(ESTIMATES, channels.SceneUpdateChannel, scene, t_ns)
 
     def _places(self, name: str, state: ClusterState) -> Any:
         """Return the desired positions of a cluster's drones (n, 3), None if they are unknown or singular."""
@@ -376,9 +334,9 @@ class FoxgloveFile:
 
 
 def _camera_of(key: str) -> tuple[str, str]:
-    """Return drone and camera of a camera's key."""
+    """Return drone and frame of a camera by its key; x of the frame is to the right of the picture, y down, z ahead."""
     _, drone, what = keys.parts(key)
-    return drone, what.split("/")[1]
+    return drone, f"{made.frame(drone)}/{what.split('/')[1]}_camera"
 
 
 class CheckedFile:
@@ -396,37 +354,26 @@ class CheckedFile:
         self._at = self._end = 0  # position and end of the file as the library knows them
 
     def write(self, data: bytes | bytearray) -> int:
-        """Write bytes; return how many."""
         self._try(self._file.write, data)
         self._at += len(data)
         self._end = max(self._end, self._at)
         return len(data)
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        """Set the position; return it."""
         self._try(self._file.seek, offset, whence)
         self._at = offset + {SEEK_SET: 0, SEEK_CUR: self._at, SEEK_END: self._end}[whence]
         return self._at
 
     def flush(self) -> None:
-        """Write what is buffered."""
         self._try(self._file.flush)
 
     def check(self) -> None:
-        """Raise the error of a failed write.
-
-        Raises:
-            OSError: a write has failed.
-        """
+        """Raise OSError if a write has failed."""
         if self._failure is not None:
             raise self._failure
 
     def close(self) -> None:
-        """End the file.
-
-        Raises:
-            OSError: a write has failed.
-        """
+        """End the file; raise OSError if a write has failed."""
         self.flush()
         try:
             self._file.close()

@@ -15,33 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from foxglove.messages import (
-    CameraCalibration,
-    Color,
-    CompressedImage,
-    CubePrimitive,
-    CylinderPrimitive,
-    FrameTransform,
-    FrameTransforms,
-    LinePrimitive,
-    LinePrimitiveLineType,
-    LocationFix,
-    LocationFixPositionCovarianceType,
-    Log,
-    LogLevel,
-    PackedElementField,
-    PackedElementFieldNumericType,
-    Point3,
-    PointCloud,
-    Pose,
-    Quaternion,
-    SceneEntity,
-    SceneUpdate,
-    SpherePrimitive,
-    TextPrimitive,
-    Timestamp,
-    Vector3,
-)
+from foxglove import messages as fox
 
 from zsim.contract.flight_messages import CameraImage, CameraInfo, ClusterState, Estimate, Status, Truth
 from zsim.contract.messages import Gps
@@ -85,7 +59,11 @@ class NumericMessageType:
         self._number_keys = [_key(tag, _EIGHT) for tag in range(1, len(numbers) + 1)]
         self._text_keys = [_key(len(numbers) + place, _BYTES) for place in range(1, len(texts) + 1)]
         fields = [*((each, _DOUBLE) for each in numbers), *((each, _STRING) for each in texts)]
-        described = b"".join(_bytes(2, _field(*field, place)) for place, field in enumerate(fields, start=1))
+        described = b""
+        for number, (field, kind) in enumerate(fields, start=1):  # a FieldDescriptorProto each
+            counted = ((3, number), (4, _OPTIONAL), (5, kind))
+            rest = b"".join(_key(tag, 0) + _varint(value) for tag, value in counted)
+            described += _bytes(2, _bytes(1, field.encode()) + rest)
         file = (
             _bytes(1, f"{PACKAGE}/{name}.proto".encode())
             + _bytes(2, PACKAGE.encode())
@@ -95,17 +73,10 @@ class NumericMessageType:
         self.schema = _bytes(1, file)  # a FileDescriptorSet of this one message
 
     def encode(self, numbers: Iterable[float], texts: Iterable[str] = ()) -> bytes:
-        """Return a message of values in the order of the fields."""
         parts = [key + _FLOAT.pack(value) for key, value in zip(self._number_keys, numbers, strict=True)]
         encoded = [text.encode() for text in texts]
         parts += [key + _varint(len(text)) + text for key, text in zip(self._text_keys, encoded, strict=True)]
         return b"".join(parts)
-
-
-def _field(name: str, kind: int, number: int) -> bytes:
-    """Return a FieldDescriptorProto."""
-    counted = ((3, number), (4, _OPTIONAL), (5, kind))
-    return _bytes(1, name.encode()) + b"".join(_key(field, 0) + _varint(value) for field, value in counted)
 
 
 def _bytes(field: int, content: bytes) -> bytes:
@@ -152,57 +123,44 @@ def drone_numbers(truth: Truth | None, estimate: Estimate | None, status: Status
 # Parts of messages
 
 
-def timestamp(t_ns: int) -> Timestamp:
-    return Timestamp(t_ns // 10**9, t_ns % 10**9)
+def timestamp(t_ns: int) -> fox.Timestamp:
+    return fox.Timestamp(t_ns // 10**9, t_ns % 10**9)
 
 
-def vector(v: Vector) -> Vector3:
+def vector(v: Vector) -> fox.Vector3:
     x, y, z = map(float, v)
-    return Vector3(x=x, y=y, z=z)
+    return fox.Vector3(x=x, y=y, z=z)
 
 
-def quaternion(wxyz: Vector) -> Quaternion:
+def quaternion(wxyz: Vector) -> fox.Quaternion:
     w, x, y, z = map(float, wxyz)
-    return Quaternion(x=x, y=y, z=z, w=w)
+    return fox.Quaternion(x=x, y=y, z=z, w=w)
 
 
-def pose(position: Vector, wxyz: Vector = (1.0, 0.0, 0.0, 0.0)) -> Pose:
-    return Pose(position=vector(position), orientation=quaternion(wxyz))
+def pose(position: Vector, wxyz: Vector = (1.0, 0.0, 0.0, 0.0)) -> fox.Pose:
+    return fox.Pose(position=vector(position), orientation=quaternion(wxyz))
 
 
-def colour(text: str, opacity: float = 1.0) -> Color:
+def colour(text: str, opacity: float = 1.0) -> fox.Color:
     """Return the colour of `#rrggbb`."""
     red, green, blue = (part / 255 for part in rgb(text))
-    return Color(r=red, g=green, b=blue, a=opacity)
+    return fox.Color(r=red, g=green, b=blue, a=opacity)
 
 
 def frame(drone: str) -> str:
-    """Return the name of a drone's frame B."""
     return f"drone/{drone}"
-
-
-def camera_frame(drone: str, camera: str) -> str:
-    """Return the name of a camera's frame: x to the right of the picture, y down, z ahead."""
-    return f"{frame(drone)}/{camera}_camera"
 
 
 # Messages
 
 
-def transforms(t_ns: int, frames: Iterable[FramePose], parent: str = WORLD) -> FrameTransforms:
-    """Return the poses of frames in another one."""
-    at = timestamp(t_ns)
-    frame_transforms = [
-        FrameTransform(
-            timestamp=at,
-            parent_frame_id=parent,
-            child_frame_id=child,
-            translation=vector(position),
-            rotation=quaternion(orientation),
-        )
-        for child, position, orientation in frames
-    ]
-    return FrameTransforms(transforms=frame_transforms)
+def transforms(t_ns: int, frames: Iterable[FramePose], parent: str = WORLD) -> fox.FrameTransforms:
+    placed = []
+    for child, position, orientation in frames:
+        pose: dict[str, Any] = {"translation": vector(position), "rotation": quaternion(orientation)}
+        names = {"parent_frame_id": parent, "child_frame_id": child}
+        placed.append(fox.FrameTransform(timestamp=timestamp(t_ns), **names, **pose))
+    return fox.FrameTransforms(transforms=placed)
 
 
 def cluster_frame(names: Sequence[str], values: Sequence[float]) -> tuple[Values, Values] | None:
@@ -213,30 +171,29 @@ def cluster_frame(names: Sequence[str], values: Sequence[float]) -> tuple[Values
     return x_c[:3], quaternion_from_rpy(x_c[3:])
 
 
-def location_fix(gps: Gps, drone: str, tint: str) -> LocationFix:
+def location_fix(gps: Gps, drone: str, tint: str) -> fox.LocationFix:
     """Return the position measured by a drone's GPS, in the drone's colour."""
     variance = gps.sigma_m**2
-    return LocationFix(
+    return fox.LocationFix(
         timestamp=timestamp(max(0, gps.t_sample_ns)),
         frame_id=frame(drone),
         latitude=gps.latitude_deg,
         longitude=gps.longitude_deg,
         altitude=gps.altitude_m,
         position_covariance=[variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance],
-        position_covariance_type=LocationFixPositionCovarianceType.DiagonalKnown,
+        position_covariance_type=fox.LocationFixPositionCovarianceType.DiagonalKnown,
         color=colour(tint),
     )
 
 
-def compressed_image(image: CameraImage, frame_id: str) -> CompressedImage:
-    """Return a picture, at the time of its exposure."""
+def compressed_image(image: CameraImage, frame_id: str) -> fox.CompressedImage:
     at = timestamp(max(0, image.t_sample_ns))
-    return CompressedImage(timestamp=at, frame_id=frame_id, data=image.data, format=image.format)
+    return fox.CompressedImage(timestamp=at, frame_id=frame_id, data=image.data, format=image.format)
 
 
-def camera_calibration(info: CameraInfo, frame_id: str) -> CameraCalibration:
+def camera_calibration(info: CameraInfo, frame_id: str) -> fox.CameraCalibration:
     """Return the calibration of a camera, which is not part of a stereo pair."""
-    return CameraCalibration(
+    return fox.CameraCalibration(
         timestamp=timestamp(info.t_ns),
         frame_id=frame_id,
         width=info.width,
@@ -249,23 +206,22 @@ def camera_calibration(info: CameraInfo, frame_id: str) -> CameraCalibration:
     )
 
 
-def log_line(event: Event) -> Log:
-    """Return an event as a line of the log."""
-    level = LogLevel.Warning if event.kind in WARNINGS else LogLevel.Info
-    level = LogLevel.Error if event.kind in FAILURES else level
+def log_line(event: Event) -> fox.Log:
+    level = fox.LogLevel.Warning if event.kind in WARNINGS else fox.LogLevel.Info
+    level = fox.LogLevel.Error if event.kind in FAILURES else level
     text = f"{event.kind}: {event.text}"
-    return Log(timestamp=timestamp(event.t_ns), level=level, message=text, name=event.source, file=event.subject)
+    return fox.Log(timestamp=timestamp(event.t_ns), level=level, message=text, name=event.source, file=event.subject)
 
 
-def points(t_ns: int, coloured: Iterable[tuple[Sequence[float], str]]) -> PointCloud:
+def points(t_ns: int, coloured: Iterable[tuple[Sequence[float], str]]) -> fox.PointCloud:
     """Return coloured points in W."""
-    kinds = PackedElementFieldNumericType
-    fields = [PackedElementField(name=n, offset=4 * i, type=kinds.Float32) for i, n in enumerate("xyz")]
+    kinds = fox.PackedElementFieldNumericType
+    fields = [fox.PackedElementField(name=n, offset=4 * i, type=kinds.Float32) for i, n in enumerate("xyz")]
     fields += [
-        PackedElementField(name=n, offset=12 + i, type=kinds.Uint8)
+        fox.PackedElementField(name=n, offset=12 + i, type=kinds.Uint8)
         for i, n in enumerate(("red", "green", "blue", "alpha"))
     ]
-    return PointCloud(
+    return fox.PointCloud(
         timestamp=timestamp(t_ns),
         frame_id=WORLD,
         pose=pose((0.0, 0.0, 0.0)),
@@ -312,93 +268,69 @@ def arm_of(discs: Iterable[RotorDisc]) -> float:
     return max(math.hypot(disc.x_m, disc.y_m) for disc in discs)
 
 
-def drones(t_ns: int, rotors: Mapping[str, Sequence[RotorDisc]]) -> SceneUpdate:
+def drones(t_ns: int, rotors: Mapping[str, Sequence[RotorDisc]]) -> fox.SceneUpdate:
     """Return the drones, each in its own frame, so that they are written once; `rotors` are theirs, by name."""
-    at = timestamp(t_ns)
-    return SceneUpdate(entities=[_drone(at, name, rotors[name], tint) for name, tint in colours_of(rotors).items()])
+    at, entities = timestamp(t_ns), []
+    for name, mark in colours_of(rotors).items():
+        discs = rotors[name]
+        arm_m = arm_of(discs)
+        cubes, cylinders = [], []
+        for box in BODY:
+            middle, size = ([arm_m * each for each in part] for part in (box.middle, box.size))
+            cubes.append(fox.CubePrimitive(pose=pose(middle), size=vector(size), color=colour(box.colour)))
+        for disc in discs:
+            size = vector((2 * disc.radius_m, 2 * disc.radius_m, 0.03 * arm_m))
+            look: dict[str, Any] = {"bottom_scale": 1.0, "top_scale": 1.0, "color": colour(mark, 0.5)}
+            cylinders.append(fox.CylinderPrimitive(pose=pose((disc.x_m, disc.y_m, 0.2 * arm_m)), size=size, **look))
+        ends = [end for disc in discs for end in ((0.0, 0.0, 0.0), (disc.x_m, disc.y_m, 0.0))]
+        arms = _line(ends, colour(DARK), fox.LinePrimitiveLineType.LineList, 0.1 * arm_m, scale_invariant=False)
+        look = {"billboard": True, "font_size": 12.0, "scale_invariant": True, "color": colour(mark)}
+        label = fox.TextPrimitive(pose=pose((0, 0, 2 * arm_m)), text=name, **look)
+        parts: dict[str, Any] = {"cubes": cubes, "cylinders": cylinders, "lines": [arms], "texts": [label]}
+        entities.append(fox.SceneEntity(timestamp=at, id=name, frame_id=frame(name), frame_locked=True, **parts))
+    return fox.SceneUpdate(entities=entities)
 
 
-def _drone(at: Timestamp, name: str, discs: Sequence[RotorDisc], mark: str) -> SceneEntity:
-    arm_m = arm_of(discs)
-    cubes = [
-        CubePrimitive(
-            pose=pose([arm_m * each for each in box.middle]),
-            size=vector([arm_m * each for each in box.size]),
-            color=colour(box.colour),
-        )
-        for box in BODY
-    ]
-    cylinders = [
-        CylinderPrimitive(
-            pose=pose((disc.x_m, disc.y_m, 0.2 * arm_m)),
-            size=vector((2 * disc.radius_m, 2 * disc.radius_m, 0.03 * arm_m)),
-            bottom_scale=1.0,
-            top_scale=1.0,
-            color=colour(mark, 0.5),
-        )
-        for disc in discs
-    ]
-    ends = [end for disc in discs for end in ((0.0, 0.0, 0.0), (disc.x_m, disc.y_m, 0.0))]
-    arms = LinePrimitive(
-        type=LinePrimitiveLineType.LineList,
-        pose=pose((0, 0, 0)),
-        thickness=0.1 * arm_m,
-        points=[_point(end) for end in ends],
-        color=colour(DARK),
-    )
-    label = TextPrimitive(
-        pose=pose((0, 0, 2 * arm_m)),
-        billboard=True,
-        font_size=12.0,
-        scale_invariant=True,
-        color=colour(mark),
-        text=name,
-    )
-    parts: dict[str, Any] = {"cubes": cubes, "cylinders": cylinders, "lines": [arms], "texts": [label]}
-    return SceneEntity(timestamp=at, id=name, frame_id=frame(name), frame_locked=True, **parts)
-
-
-def ground(t_ns: int) -> SceneUpdate:
-    """Return a grid on the ground."""
+def ground(t_ns: int) -> fox.SceneUpdate:
     marks = range(-GROUND_M, GROUND_M + 1, GROUND_STEP_M)
     ends = [end for a in marks for end in ((a, -GROUND_M, 0), (a, GROUND_M, 0))]
     ends += [end for a in marks for end in ((-GROUND_M, a, 0), (GROUND_M, a, 0))]
-    grid = _line(ends, colour(GREY, 0.4), LinePrimitiveLineType.LineList, 1.0)
-    return SceneUpdate(entities=[_entity(timestamp(t_ns), "ground", lines=[grid])])
+    grid = _line(ends, colour(GREY, 0.4), fox.LinePrimitiveLineType.LineList, 1.0)
+    return fox.SceneUpdate(entities=[_entity(timestamp(t_ns), "ground", lines=[grid])])
 
 
 def formations(
     t_ns: int, states: Mapping[str, ClusterState], truth: Mapping[str, Truth], desired_m: Mapping[str, Values]
-) -> SceneUpdate:
+) -> fox.SceneUpdate:
     """Return for each cluster the outline of its drones, and ghosts at their desired places (n, 3), if known."""
     at, entities = timestamp(t_ns), []
     for name, state in states.items():
         lines, ghosts = [], []
         places = [truth[drone].position_m for drone in state.drones if drone in truth]
         if len(places) > 1:
-            lines.append(_line(places, colour(DARK), LinePrimitiveLineType.LineLoop))
+            lines.append(_line(places, colour(DARK), fox.LinePrimitiveLineType.LineLoop))
         if name in desired_m:
-            lines.append(_line(desired_m[name], colour(MAGENTA, 0.6), LinePrimitiveLineType.LineLoop))
+            lines.append(_line(desired_m[name], colour(MAGENTA, 0.6), fox.LinePrimitiveLineType.LineLoop))
             ghosts = [
-                SpherePrimitive(pose=pose(place), size=vector((0.5, 0.5, 0.2)), color=colour(MAGENTA, 0.3))
+                fox.SpherePrimitive(pose=pose(place), size=vector((0.5, 0.5, 0.2)), color=colour(MAGENTA, 0.3))
                 for place in desired_m[name]
             ]
         entities.append(_entity(at, name, lines=lines, spheres=ghosts))
-    return SceneUpdate(entities=entities)
+    return fox.SceneUpdate(entities=entities)
 
 
-def ellipsoids(t_ns: int, estimates: Mapping[str, Estimate], colours: Mapping[str, str]) -> SceneUpdate:
+def ellipsoids(t_ns: int, estimates: Mapping[str, Estimate], colours: Mapping[str, str]) -> fox.SceneUpdate:
     """Return the ellipsoids of two standard deviations of the estimated positions."""
     at, entities = timestamp(t_ns), []
     for name, estimate in estimates.items():
         sigma_m, axes = principal_axes(np.array(estimate.covariance).reshape(6, 6)[:3, :3])
-        shown = SpherePrimitive(
+        shown = fox.SpherePrimitive(
             pose=pose(estimate.position_m, axes),
             size=vector([2.0 * SIGMAS * each for each in sigma_m]),
             color=colour(colours.get(name, GREY), 0.25),
         )
         entities.append(_entity(at, name, spheres=[shown]))
-    return SceneUpdate(entities=entities)
+    return fox.SceneUpdate(entities=entities)
 
 
 class DroneTrails:
@@ -408,32 +340,28 @@ class DroneTrails:
         self._paths: dict[str, deque[Sequence[float]]] = {}
         self._length = round(TRAIL_S * 1e9) // TRAIL_STEP_NS + 1
 
-    def update(self, t_ns: int, truth: Mapping[str, Truth], colours: Mapping[str, str]) -> SceneUpdate:
-        """Add the positions of an instant, return the trails."""
+    def update(self, t_ns: int, truth: Mapping[str, Truth], colours: Mapping[str, str]) -> fox.SceneUpdate:
         at, entities = timestamp(t_ns), []
         for name, state in truth.items():
             path = self._paths.setdefault(name, deque(maxlen=self._length))
             path.append(state.position_m)
-            trail = _line(path, colour(colours.get(name, GREY), 0.7), LinePrimitiveLineType.LineStrip)
+            trail = _line(path, colour(colours.get(name, GREY), 0.7), fox.LinePrimitiveLineType.LineStrip)
             entities.append(_entity(at, name, lines=[trail]))
-        return SceneUpdate(entities=entities)
+        return fox.SceneUpdate(entities=entities)
 
 
-def _point(v: Vector) -> Point3:
-    x, y, z = map(float, v)
-    return Point3(x=x, y=y, z=z)
+def _line(
+    points: Iterable[Any],
+    tint: fox.Color,
+    kind: fox.LinePrimitiveLineType,
+    width: float = LINE_PX,
+    scale_invariant: bool = True,
+) -> fox.LinePrimitive:
+    """Return a line with its width in pixels, or in metres if it is not scale invariant."""
+    corners = [fox.Point3(x=x, y=y, z=z) for x, y, z in (map(float, each) for each in points)]
+    look: dict[str, Any] = {"thickness": width, "scale_invariant": scale_invariant, "color": tint}
+    return fox.LinePrimitive(type=kind, pose=pose((0, 0, 0)), points=corners, **look)
 
 
-def _line(points: Iterable[Any], tint: Color, kind: LinePrimitiveLineType, width_px: float = LINE_PX) -> LinePrimitive:
-    return LinePrimitive(
-        type=kind,
-        pose=pose((0, 0, 0)),
-        thickness=width_px,
-        scale_invariant=True,
-        points=[_point(each) for each in points],
-        color=tint,
-    )
-
-
-def _entity(at: Timestamp, name: str, **parts: Any) -> SceneEntity:
-    return SceneEntity(timestamp=at, id=name, frame_id=WORLD, **parts)
+def _entity(at: fox.Timestamp, name: str, **parts: Any) -> fox.SceneEntity:
+    return fox.SceneEntity(timestamp=at, id=name, frame_id=WORLD, **parts)

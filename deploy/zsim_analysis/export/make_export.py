@@ -7,7 +7,7 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -39,17 +39,11 @@ Progress = Callable[[int, int], None]  # messages read so far, and their number
 
 
 class ExportResult(NamedTuple):
-    """The result of an export.
+    """The result of an export."""
 
-    Attributes:
-        paths: that were written.
-        tables: name and rows of each table, or topic and messages.
-        notes: what a reader should know: whether the record was cut or damaged, and what was left out.
-    """
-
-    paths: tuple[Path, ...]
-    tables: dict[str, int]
-    notes: list[str]
+    paths: tuple[Path, ...]  # that were written
+    tables: dict[str, int]  # name and rows of each table, or topic and messages
+    notes: list[str]  # what a reader should know: whether the record was cut or damaged, and what was left out
 
 
 def export(
@@ -87,12 +81,7 @@ def export(
 
 
 def _tables(
-    reader: RecordReader,
-    form: Format,
-    selection: MessageSelection,
-    target: Path,
-    progress: Progress,
-    by_name: bool,
+    reader: RecordReader, form: Format, selection: MessageSelection, target: Path, progress: Progress, by_name: bool
 ) -> ExportResult:
     from zsim_analysis.export.table_files import MatFile, TableFolder
 
@@ -175,30 +164,28 @@ def check_free(target: Path, force: bool, record: Path) -> None:
         raise ReportError(f"{target}: is the record itself; give --out another place")
     if not force:
         raise ReportError(f"{target}: exists; give --out another place, or --force to replace it")
-    if target.is_dir() and (other := _foreign_content(target)):
-        raise ReportError(f"{target}: is a folder of something else than an export ({other}); give --out another place")
-    if target.is_file() and not _is_export(target):
-        raise ReportError(f"{target}: is a file of something else than an export; give --out another place")
-
-
-def _foreign_content(folder: Path) -> str:
-    """Return why a folder is not, or not only, an export; "" if it is one."""
-    try:
-        tables = json.loads((folder / MANIFEST).read_bytes())["tables"].keys()
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        return f"it has no {MANIFEST} of one"
-    others = {path.name for path in folder.iterdir()} - {MANIFEST, *tables}
-    return f"it holds {min(others)}" if others else ""
-
-
-def _is_export(file: Path) -> bool:
-    with file.open("rb") as opened:
-        head = opened.read(HEAD_MAX)
-    if file.name.endswith(LAYOUT):
-        return head.startswith(b"{")
-    if file.name.endswith(BLUEPRINT):
-        return head.startswith(RERUN)
-    return file.name not in RUN_FILES and (head.startswith(MATLAB) or (head.startswith(MCAP) and MCAP_LIBRARY in head))
+    if target.is_dir():
+        try:
+            tables = json.loads((target / MANIFEST).read_bytes())["tables"].keys()
+            others = {path.name for path in target.iterdir()} - {MANIFEST, *tables}
+            other = f"it holds {min(others)}" if others else ""
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+            other = f"it has no {MANIFEST} of one"
+        if other:
+            what = f"is a folder of something else than an export ({other})"
+            raise ReportError(f"{target}: {what}; give --out another place")
+    elif target.is_file():
+        with target.open("rb") as file:
+            head = file.read(HEAD_MAX)
+        if target.name.endswith(LAYOUT):
+            is_export = head.startswith(b"{")
+        elif target.name.endswith(BLUEPRINT):
+            is_export = head.startswith(RERUN)
+        else:
+            is_mcap = head.startswith(MCAP) and MCAP_LIBRARY in head
+            is_export = target.name not in RUN_FILES and (head.startswith(MATLAB) or is_mcap)
+        if not is_export:
+            raise ReportError(f"{target}: is a file of something else than an export; give --out another place")
 
 
 @contextmanager
@@ -210,43 +197,31 @@ def placed(*targets: Path) -> Iterator[tuple[Path, ...]]:
     Raises:
         ReportError: they cannot be written.
     """
+    new_parents = [parent for parent in targets[0].parents if not parent.exists()]
+    # beside the target, so that files can be renamed; a TemporaryDirectory stays if Ctrl-C comes while it is made
+    folder = targets[0].parent / f".export-{secrets.token_hex(4)}"
     try:
-        with _beside(targets[0]) as folder:  # on the same disk, so that it can be renamed
-            written = tuple(folder / target.name for target in targets)
-            yield written
-            _put_in_place(written, targets)
+        folder.mkdir(parents=True)
+        written = tuple(folder / target.name for target in targets)
+        yield written
+        moves = [(new, target, new.with_name(f"{new.name}.old")) for new, target in zip(written, targets, strict=True)]
+        try:
+            for new, target, old in moves:
+                if target.exists():
+                    target.replace(old)
+                new.replace(target)
+        except BaseException:  # after a failure or Ctrl-C the old ones are back
+            for new, target, old in moves:
+                if not new.exists() and target.exists():
+                    target.replace(new)
+                if old.exists():
+                    old.replace(target)
+            raise
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno else error  # without the text that libraries add to it
         raise ReportError(f"{targets[0]}: cannot be written ({reason}); make room and export again") from error
-
-
-@contextmanager
-def _beside(target: Path) -> Iterator[Path]:
-    """Yield a new folder beside a target; at the end it is removed, as are new parents that are still empty."""
-    made = [parent for parent in target.parents if not parent.exists()]
-    folder = target.parent / f".export-{secrets.token_hex(4)}"  # TemporaryDirectory leaves it if Ctrl-C comes within
-    try:
-        folder.mkdir(parents=True)
-        yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         with suppress(OSError):  # one that is not empty stays, and with it those above
-            for parent in made:
+            for parent in new_parents:
                 parent.rmdir()
-
-
-def _put_in_place(written: Sequence[Path], targets: Sequence[Path]) -> None:
-    """Put all files or folders in place; after a failure or Ctrl-C the old ones are back."""
-    moves = [(new, target, new.with_name(f"{new.name}.old")) for new, target in zip(written, targets, strict=True)]
-    try:
-        for new, target, old in moves:
-            if target.exists():
-                target.replace(old)
-            new.replace(target)
-    except BaseException:
-        for new, target, old in moves:
-            if not new.exists() and target.exists():
-                target.replace(new)
-            if old.exists():
-                old.replace(target)
-        raise

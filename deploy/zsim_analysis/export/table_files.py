@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, Protocol
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -13,15 +13,10 @@ import pyarrow.parquet as pq
 from msgspec import Struct
 
 from zsim.errors import ReportError
-from zsim_analysis.export.columns import Columns, RowBatch, TableSurvey, table_name
+from zsim_analysis.export.columns import RowBatch, TableSurvey, table_name
 
 ROW_GROUP = 65_536  # rows of a Parquet row group, of which one per table is held in memory
-_TYPES: dict[str, pa.DataType] = {
-    "whole": pa.int64(),
-    "number": pa.float64(),
-    "flag": pa.bool_(),
-    "text": pa.string(),
-}
+_TYPES = {"whole": pa.int64(), "number": pa.float64(), "flag": pa.bool_(), "text": pa.string()}
 
 
 class WrittenTable(NamedTuple):
@@ -39,12 +34,11 @@ class TableFolder:
         self._folder = folder
         self._suffix = suffix
         self._survey = survey
-        self._sinks: dict[str, _Sink] = {}
+        self._sinks: dict[str, _Csv | _Parquet] = {}
         self._written: dict[str, WrittenTable] = {}
         self._stack = ExitStack()
 
     def write(self, batch: RowBatch) -> None:
-        """Add rows to their table."""
         file = ".".join([table_name(batch.kind), *([batch.only] if batch.only else []), self._suffix])
         table = self._survey.table(batch.kind)
         schema = pa.schema([(column, _TYPES[each.kind]) for each in table for column in each.columns])
@@ -57,15 +51,13 @@ class TableFolder:
         for each in table:
             values = each.values(batch)
             arrays += list(values.T) if isinstance(values, np.ndarray) and values.ndim == 2 else [values]
-        rows = [  # no message holds NaN: it marks a missing value
-            pa.array(values, entry.type, from_pandas=True) for values, entry in zip(arrays, schema, strict=True)
-        ]
+        # no message holds NaN: it marks a missing value
+        rows = [pa.array(values, each.type, from_pandas=True) for values, each in zip(arrays, schema, strict=True)]
         self._sinks[file].write(pa.RecordBatch.from_arrays(rows, schema=schema))
         before = self._written[file].rows if file in self._written else 0
         self._written[file] = WrittenTable(file, before + len(batch.names), schema.names)
 
     def finish(self) -> list[WrittenTable]:
-        """Close all files; return the tables that were written."""
         self._stack.close()
         return sorted(self._written.values())
 
@@ -74,12 +66,6 @@ class TableFolder:
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
-
-
-class _Sink(Protocol):
-    def write(self, batch: pa.RecordBatch) -> None: ...
-
-    def close(self) -> None: ...
 
 
 class _Csv:
@@ -150,21 +136,24 @@ class MatFile:
                 _check_size(table_name(kind), survey.rows_within(kind) * row)
 
     def write(self, batch: RowBatch) -> None:
-        """Take rows."""
         subjects = self._blocks.setdefault(batch.kind, {})
         for name in dict.fromkeys(batch.names):
             rows = [row for row, each in enumerate(batch.names) if each == name]
             messages, wall_ns = [batch.messages[row] for row in rows], [batch.wall_ns[row] for row in rows]
             own = batch._replace(names=[name] * len(rows), messages=messages, wall_ns=wall_ns)
-            block = {each.name: _array(each, own) for each in self._survey.table(batch.kind) if each.name != "name"}
+            block: dict[str, Any] = {}
+            for each in self._survey.table(batch.kind)[1:]:  # the first column is the name
+                values = each.values(own)
+                if each.kind == "text":  # a list until all of it is known
+                    block[each.name] = ["" if value is None else value for value in values]
+                elif each.kind == "whole" and not any(value is None for value in values):
+                    block[each.name] = np.array(values, np.int64)
+                else:
+                    block[each.name] = np.array(values, bool if each.kind == "flag" else np.float64)
             subjects.setdefault(name, []).append(block)
 
     def finish(self) -> list[WrittenTable]:
-        """Write the file; return its variables.
-
-        Raises:
-            ReportError: a variable is larger than MATLAB loads.
-        """
+        """Write the file; return its variables. Raises ReportError: a variable is larger than MATLAB loads."""
         from scipy.io import savemat
 
         variables, written = {}, []
@@ -186,10 +175,15 @@ class MatFile:
         self._blocks.clear()
 
     def _struct(self, kind: type[Struct], name: str, blocks: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        """Return the arrays of one drone, cluster or process."""
         struct: dict[str, Any] = {"name": name}
         for each in self._survey.table(kind)[1:]:
-            values = _joined([block[each.name] for block in blocks])
+            values: Any = [block[each.name] for block in blocks]
+            if each.kind == "text":
+                texts = [text for block in values for text in block]
+                is_short = max(map(len, texts)) <= CHARS_MAX
+                values = np.array(texts) if is_short else np.array(texts, object).reshape(-1, 1)
+            else:
+                values = np.concatenate(values)
             if each.names:
                 known = ~np.isnan(values).all(axis=0)
                 struct["names"] = np.array(each.names, object)[known].reshape(-1, 1)
@@ -214,26 +208,6 @@ def matlab_names(names: Iterable[str]) -> dict[str, str]:
             unique = f"{plain}_{count}"
         valid[name] = unique
     return valid
-
-
-def _array(columns: Columns, batch: RowBatch) -> Any:
-    """Return values as an array; text stays a list until all of it is known."""
-    values = columns.values(batch)
-    if columns.kind == "text":
-        return ["" if value is None else value for value in values]
-    if columns.kind == "whole" and not any(value is None for value in values):
-        return np.array(values, np.int64)
-    return np.array(values, bool if columns.kind == "flag" else np.float64)
-
-
-def _joined(blocks: Sequence[Any]) -> Any:
-    """Return the blocks of a field as one array."""
-    if not isinstance(blocks[0], list):
-        return np.concatenate(blocks)
-    texts = [text for block in blocks for text in block]
-    if max(map(len, texts)) <= CHARS_MAX:
-        return np.array(texts)
-    return np.array(texts, object).reshape(-1, 1)
 
 
 def _bytes(value: Any) -> int:

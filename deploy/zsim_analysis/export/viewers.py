@@ -19,17 +19,7 @@ import numpy as np
 from foxglove import layouts
 
 from zsim.presentation import colours_of, rgb
-from zsim_analysis.export.foxglove_file import (
-    DESIRED,
-    DRONES,
-    ESTIMATES,
-    FORMATIONS,
-    GROUND,
-    LOG,
-    POINTS,
-    TRAILS,
-    ConvertedRun,
-)
+from zsim_analysis.export import foxglove_file
 from zsim_analysis.export.foxglove_messages import BODY, PACKAGE, WORLD, RotorDisc, arm_of, tidy
 
 CURVES: tuple[tuple[str, str, Literal["solid", "dashed"]], ...] = (
@@ -37,11 +27,7 @@ CURVES: tuple[tuple[str, str, Literal["solid", "dashed"]], ...] = (
     ("estimated", "#e69f00", "solid"),
     ("true", "#0072b2", "solid"),
 )
-DRONE_PLOTS = {
-    "altitude (m)": "true_z_m",
-    "error of the estimate (m)": "error_m",
-    "battery (%)": "battery_percent",
-}
+DRONE_PLOTS = {"altitude (m)": "true_z_m", "error of the estimate (m)": "error_m", "battery (%)": "battery_percent"}
 PLOTS_MAX = 12  # plotted variables of a cluster: those of the paper's three drones
 TAB = 3  # plots in a tab
 DRONES_MAX = 12  # plotted drones
@@ -98,7 +84,7 @@ def _pictures(topics: Collection[str]) -> list[str]:
 # Foxglove
 
 
-def layout(run: ConvertedRun) -> str:
+def layout(run: foxglove_file.ConvertedRun) -> str:
     """Return Foxglove's layout of a file as JSON."""
     states = [(_path(f"/cluster/{name}/variables", "phase"), name) for name in run.variables]
     tabs = []
@@ -122,13 +108,19 @@ def layout(run: ConvertedRun) -> str:
         tabs.append(layouts.TabItem(title="cameras", content=_column(*cameras)))
     shown = {
         topic: layouts.BaseRendererSceneUpdateTopicSettings(visible=True)
-        for topic in (DRONES, GROUND, TRAILS, FORMATIONS, ESTIMATES)
+        for topic in (
+            foxglove_file.DRONES,
+            foxglove_file.GROUND,
+            foxglove_file.TRAILS,
+            foxglove_file.FORMATIONS,
+            foxglove_file.ESTIMATES,
+        )
         if topic in run.topics
     }
     camera = layouts.ThreeDeeCameraState(distance=35.0, phi=60.0, theta_offset=45.0, perspective=True)
     config = layouts.ThreeDeeConfig(follow_tf=WORLD, camera_state=camera, topics=dict(shown))
     scene = layouts.ThreeDeePanel(config=config, title="scene")
-    left = _column((3, scene), (1, layouts.LogPanel(config=layouts.LogConfig(topic_to_render=LOG))))
+    left = _column((3, scene), (1, layouts.LogPanel(config=layouts.LogConfig(topic_to_render=foxglove_file.LOG))))
     series = [layouts.StateTransitionsSeries(value=value, label=label, enabled=True) for value, label in states]
     transitions = layouts.StateTransitionsPanel(config=layouts.StateTransitionsConfig(paths=series, is_synced=True))
     right = _column(*([(2, layouts.TabContainer(tabs=tabs))] if tabs else []), (1, transitions))
@@ -161,20 +153,29 @@ def _path(topic: str, field: str) -> str:
 
 
 def has_rerun() -> bool:
-    """Return whether Rerun's library is installed."""
     return find_spec("rerun") is not None
 
 
-def write_blueprint(path: Path, application: str, run: ConvertedRun) -> None:
+def write_blueprint(path: Path, application: str, run: foxglove_file.ConvertedRun) -> None:
     """Write Rerun's blueprint of a file; `application` is the file's name without its suffix, as Rerun calls it."""
     os.environ.setdefault("RUST_LOG", "error")  # otherwise Rerun warns of the entry name derived from an odd name
+    import rerun as rr
     import rerun.blueprint as rrb
+    from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
-    scene = _scene(run)
-    left = rrb.Vertical(scene, rrb.TextLogView(name="log", origin=LOG), row_shares=[3, 1])
+    left = rrb.Vertical(_scene(run), rrb.TextLogView(name="log", origin=foxglove_file.LOG), row_shares=[3, 1])
     views = []
     for title, curves in plots(run):
-        series = _series(curves)
+        series: dict[Any, list[Any]] = {}  # visualizers of the curves by entity
+        for curve in curves:
+            source = VisualizerComponentMapping(
+                target="Scalars:scalars",
+                source_kind=ComponentSourceKind.SourceComponent,
+                source_component=curve.component,
+                selector=f".{curve.field}",
+            )
+            look = rr.SeriesLines(names=curve.name, colors=list(rgb(curve.colour)))
+            series.setdefault(_entity(curve.topic), []).append(look.visualizer(mappings=[source]))
         views.append(rrb.TimeSeriesView(name=title, overrides=series, contents=list(series)))
     groups = [views[i : i + TAB] for i in range(0, len(views), TAB)]
     tabs: list[Any] = [rrb.Vertical(*group, name=", ".join(str(view.name) for view in group)) for group in groups]
@@ -192,8 +193,7 @@ def write_blueprint(path: Path, application: str, run: ConvertedRun) -> None:
         shutil.copyfile(new, path)
 
 
-def plots(run: ConvertedRun) -> list[Plot]:
-    """Return all plots of a blueprint: the clusters' variables, then the drones' numbers."""
+def plots(run: foxglove_file.ConvertedRun) -> list[Plot]:
     several = len(run.variables) > 1
     by_cluster = variable_plots(run.variables).items()
     found = [
@@ -202,25 +202,7 @@ def plots(run: ConvertedRun) -> list[Plot]:
     return found + drone_plots(run.topics, colours_of(run.rotors))
 
 
-def _series(curves: Sequence[Curve]) -> dict[Any, list[Any]]:
-    """Return the visualizers of curves by their entity."""
-    import rerun as rr
-    from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
-
-    series: dict[Any, list[Any]] = {}
-    for curve in curves:
-        source = VisualizerComponentMapping(
-            target="Scalars:scalars",
-            source_kind=ComponentSourceKind.SourceComponent,
-            source_component=curve.component,
-            selector=f".{curve.field}",
-        )
-        look = rr.SeriesLines(names=curve.name, colors=list(rgb(curve.colour)))
-        series.setdefault(_entity(curve.topic), []).append(look.visualizer(mappings=[source]))
-    return series
-
-
-def _scene(run: ConvertedRun) -> Any:
+def _scene(run: foxglove_file.ConvertedRun) -> Any:
     """Return the view in space: the drones' meshes at their poses, the points, everything in W."""
     import rerun as rr
     import rerun.blueprint as rrb
@@ -234,7 +216,11 @@ def _scene(run: ConvertedRun) -> Any:
     return rrb.Spatial3DView(
         name="scene",
         origin="/",
-        contents=[*drawn, *(topic for topic in (POINTS, DESIRED) if topic in run.topics), "/tf"],
+        contents=[
+            *drawn,
+            *(topic for topic in (foxglove_file.POINTS, foxglove_file.DESIRED) if topic in run.topics),
+            "/tf",
+        ],
         overrides=drawn,
         spatial_information=rrb.SpatialInformation(target_frame=WORLD),
         eye_controls=rrb.EyeControls3D(position=EYE_M, look_target=TARGET_M, eye_up=(0.0, 0.0, 1.0)),

@@ -9,7 +9,7 @@ from zsim.errors import ZsimError
 from zsim.math.frames import wrap_angle
 from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_analysis.reading.formation import common_instants
-from zsim_analysis.reading.recorded_flight import Array, DroneEstimates, RecordedFlight, Track, VelocityCommands
+from zsim_analysis.reading.recorded_flight import Array, RecordedFlight
 
 SIGMAS = 2.0  # half width of the band that is drawn, in standard deviations
 DEGREES = 6  # of freedom of a drone's NEES: position and velocity
@@ -19,19 +19,13 @@ INSTANTS = 1500  # at which distances are computed, spread over the flight: more
 
 
 class EstimateErrors(NamedTuple):
-    """Estimate − truth of one drone at K instants.
+    """Estimate − truth of one drone at K instants."""
 
-    Attributes:
-        t_s: (K,) simulated time.
-        error: (K, 4) x, y, z in W [m], heading wrapped to ±π [rad].
-        sigma: (K, 4) their standard deviations as stated by the estimator.
-        nees: (K,) normalised error squared of position and velocity, eᵀ P⁻¹ e; NaN where P is singular. Its mean is
-            DEGREES where the stated covariance is true [Bar-Shalom, Li, Kirubarajan 2001, 5.4.2].
-    """
-
-    t_s: Array
-    error: Array
-    sigma: Array
+    t_s: Array  # (K,) simulated time
+    error: Array  # (K, 4) x, y, z in W [m], heading wrapped to ±π [rad]
+    sigma: Array  # (K, 4) their standard deviations as stated by the estimator
+    # (K,) normalised error squared of position and velocity, eᵀ P⁻¹ e; NaN where P is singular. Its mean is DEGREES
+    # where the stated covariance is true [Bar-Shalom, Li, Kirubarajan 2001, 5.4.2].
     nees: Array
 
     def share_inside(self, rows: np.ndarray) -> Array:
@@ -40,14 +34,10 @@ class EstimateErrors(NamedTuple):
 
 
 class VelocityResponse(NamedTuple):
-    """Commanded and flown velocity of one drone at C instants, those of its commands.
+    """Commanded and flown velocity of one drone at C instants, those of its commands."""
 
-    Attributes:
-        t_s: (C,) simulated time.
-        commanded, flown: (C, 4) forward, left, up [m/s], yaw rate [rad/s], by the true heading.
-    """
-
-    t_s: Array
+    t_s: Array  # (C,) simulated time
+    # commanded, flown: (C, 4) forward, left, up [m/s], yaw rate [rad/s], by the true heading
     commanded: Array
     flown: Array
 
@@ -58,29 +48,20 @@ def estimate_errors(flight: RecordedFlight) -> dict[str, EstimateErrors]:
     Of more than ESTIMATES_MAX estimates, every n-th instant of truth is evaluated, the same for all drones.
     """
     step = 1 + sum(len(each.t_ns) for each in flight.estimates.values()) // ESTIMATES_MAX
-    own = [track for track in flight.tracks if not track.external and track.name in flight.estimates]
-    errors = {track.name: _errors(track, flight.estimates[track.name], step) for track in own}
-    return {name: each for name, each in errors.items() if len(each.t_s)}
-
-
-def velocity_responses(flight: RecordedFlight) -> dict[str, VelocityResponse]:
-    """Return the velocities of every drone that has both truth and velocity commands on record."""
-    own = [track for track in flight.tracks if not track.external and track.name in flight.commands]
-    responses = {track.name: _response(track, flight.commands[track.name]) for track in own}
-    return {name: each for name, each in responses.items() if len(each.t_s)}
-
-
-def _errors(track: Track, estimates: DroneEstimates, step: int) -> EstimateErrors:
-    t_ns, there, here = np.intersect1d(track.t_ns[::step], estimates.t_ns, assume_unique=True, return_indices=True)
-    there = there * step
-    position = estimates.p_W[here] - track.p_W[there]
-    velocity = estimates.v_W[here] - track.truth[there, 3:6]
-    yaw = wrap_angle(estimates.yaw[here] - track.yaw[there])
-    covariance = estimates.covariance[here]
-    variances = np.diagonal(covariance, axis1=1, axis2=2)[:, :3]
-    sigma = np.column_stack([np.sqrt(np.maximum(variances, 0.0)), estimates.yaw_sigma[here]])
-    error = np.column_stack([position, yaw])
-    return EstimateErrors(t_ns / 1e9, error, sigma, nees(np.hstack([position, velocity]), covariance))
+    errors = {}
+    for track in flight.tracks:
+        if track.external or (own := flight.estimates.get(track.name)) is None:
+            continue
+        t_ns, there, here = np.intersect1d(track.t_ns[::step], own.t_ns, assume_unique=True, return_indices=True)
+        there = there * step
+        position, velocity = own.p_W[here] - track.p_W[there], own.v_W[here] - track.truth[there, 3:6]
+        yaw, covariance = wrap_angle(own.yaw[here] - track.yaw[there]), own.covariance[here]
+        variances = np.diagonal(covariance, axis1=1, axis2=2)[:, :3]
+        sigma = np.column_stack([np.sqrt(np.maximum(variances, 0.0)), own.yaw_sigma[here]])
+        squares = nees(np.hstack([position, velocity]), covariance)
+        if len(t_ns):
+            errors[track.name] = EstimateErrors(t_ns / 1e9, np.column_stack([position, yaw]), sigma, squares)
+    return errors
 
 
 def nees(error: Array, covariance: Array) -> Array:
@@ -92,35 +73,35 @@ def nees(error: Array, covariance: Array) -> Array:
     return np.where(definite, squares, np.nan)
 
 
-def _response(track: Track, commands: VelocityCommands) -> VelocityResponse:
-    t_ns, there, here = np.intersect1d(track.t_ns, commands.t_ns, assume_unique=True, return_indices=True)
-    yaw = track.yaw[there]
-    flown = np.column_stack([_in_heading(track.truth[there, 3:6], yaw), track.yaw_rate[there]])
-    velocity = commands.velocity[here]
-    turned = np.where(commands.in_W[here][:, None], _in_heading(velocity, yaw), velocity)
-    return VelocityResponse(t_ns / 1e9, np.column_stack([turned, commands.yaw_rate[here]]), flown)
+def velocity_responses(flight: RecordedFlight) -> dict[str, VelocityResponse]:
+    """Return the velocities of every drone that has both truth and velocity commands on record."""
 
+    def in_heading(v_W: Array) -> Array:
+        """Return velocities (K, 3) forward, left and up, of those in W."""
+        return np.column_stack([c * v_W[:, 0] + s * v_W[:, 1], c * v_W[:, 1] - s * v_W[:, 0], v_W[:, 2]])
 
-def _in_heading(v_W: Array, yaw: Array) -> Array:
-    """Return velocities (K, 3) forward, left and up, of those in W."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.column_stack([c * v_W[:, 0] + s * v_W[:, 1], c * v_W[:, 1] - s * v_W[:, 0], v_W[:, 2]])
+    responses = {}
+    for track in flight.tracks:
+        if track.external or (commands := flight.commands.get(track.name)) is None:
+            continue
+        t_ns, there, here = np.intersect1d(track.t_ns, commands.t_ns, assume_unique=True, return_indices=True)
+        c, s = np.cos(track.yaw[there]), np.sin(track.yaw[there])
+        flown = np.column_stack([in_heading(track.truth[there, 3:6]), track.yaw_rate[there]])
+        velocity = commands.velocity[here]
+        turned = np.where(commands.in_W[here][:, None], in_heading(velocity), velocity)
+        if len(t_ns):
+            commanded = np.column_stack([turned, commands.yaw_rate[here]])
+            responses[track.name] = VelocityResponse(t_ns / 1e9, commanded, flown)
+    return responses
 
 
 class Distances(NamedTuple):
-    """True distances of the drones at K instants.
+    """True distances of the drones at K instants."""
 
-    Attributes:
-        t_s: (K,) simulated time.
-        pairs: names of the drones of each pair, in the order of the columns of `between`.
-        between: (K, P) [m] of every pair; without columns if there are more pairs than requested.
-        nearest: (K, N) [m] of each drone to its nearest neighbour.
-    """
-
-    t_s: Array
-    pairs: tuple[tuple[str, str], ...]
-    between: Array
-    nearest: Array
+    t_s: Array  # (K,) simulated time
+    pairs: tuple[tuple[str, str], ...]  # names, in the order of the columns of `between`
+    between: Array  # (K, P) [m] of every pair; without columns if there are more pairs than requested
+    nearest: Array  # (K, N) [m] of each drone to its nearest neighbour
 
 
 class Separations(NamedTuple):

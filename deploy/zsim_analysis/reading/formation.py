@@ -8,7 +8,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from zsim.errors import NotTrustedError
-from zsim.scenario.scenario import Scenario
+from zsim.scenario.scenario import Cluster, Scenario
 from zsim_agents.formation.expression import ExpressionError
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
@@ -35,46 +35,39 @@ class ParameterErrors(Struct, frozen=True):
 
 @dataclass
 class Formation:
-    """K instants of a cluster of n drones; m or rad, NaN where unknown.
-
-    Attributes:
-        t_s: (K,) simulated time.
-        desired, value, true: (K, 4n).
-        est_error, true_error: (K, 4n) value − desired and true − desired, angles wrapped to ±π.
-        phases: (K,).
-    """
+    """K instants of a cluster of n drones; m or rad, NaN where unknown."""
 
     name: str
     drones: tuple[str, ...]
     names: tuple[str, ...]
-    t_s: Array
+    t_s: Array  # (K,) simulated time
+    # desired, value, true: (K, 4n)
     desired: Array
     value: Array
     true: Array
+    # est_error, true_error: (K, 4n) value − desired and true − desired, angles wrapped to ±π
     est_error: Array
     true_error: Array
-    phases: list[str]
+    phases: list[str]  # (K,)
 
     def column(self, name: str) -> int:
         return self.names.index(name)
 
     @property
     def engaged_s(self) -> float | None:
-        """Return when it was first engaged, None if it never was."""
+        """When it was first engaged, None if it never was."""
         return next((float(t_s) for t_s, phase in zip(self.t_s, self.phases, strict=True) if phase == "engaged"), None)
 
     @property
     def engaged(self) -> NDArray[np.bool_]:
-        """Return at which instants (K,) it was engaged."""
         return np.array([phase == "engaged" for phase in self.phases], bool)
 
     @property
     def since_engaged(self) -> NDArray[np.bool_]:
-        """Return which instants (K,) are not before the first engagement; all if there was none."""
+        """Which instants (K,) are not before the first engagement; all if there was none."""
         return self.t_s >= (-np.inf if self.engaged_s is None else self.engaged_s)
 
     def within(self, window_s: tuple[float, float]) -> NDArray[np.bool_]:
-        """Return which instants (K,) are in a window."""
         return (self.t_s >= window_s[0]) & (self.t_s <= window_s[1])
 
     def judged(self, window_s: tuple[float, float]) -> NDArray[np.bool_]:
@@ -93,16 +86,18 @@ class Formation:
         for i, name in enumerate(self.names):
             est, true = self.est_error[rows, i], self.true_error[rows, i]
             both = np.isfinite(est) & np.isfinite(true)
-            statistics[name] = ParameterErrors(*_moments(est[both] if both.any() else est), *_moments(true[both]))
+            moments: list[float | None] = []
+            for error in (est[both] if both.any() else est[np.isfinite(est)], true[both]):
+                known = (
+                    [float(error.std()), float(np.sqrt(np.mean(error**2))), float(error.mean())] if len(error) else []
+                )
+                moments += known or [None] * 3
+            statistics[name] = ParameterErrors(*moments)
         return statistics
 
 
-def _moments(error: Array) -> tuple[float | None, float | None, float | None]:
-    """Return standard deviation, root mean square and mean of the finite errors."""
-    error = error[np.isfinite(error)]
-    if not len(error):
-        return None, None, None
-    return float(error.std()), float(np.sqrt(np.mean(error**2))), float(error.mean())
+def cluster_of(scenario: Scenario | None, name: str) -> Cluster | None:
+    return next((each for each in scenario.clusters if each.name == name), None) if scenario else None
 
 
 def formations_of(flight: RecordedFlight) -> list[Formation]:
@@ -116,42 +111,24 @@ def formation(states: ClusterStates, tracks: list[Track], scenario: Scenario | N
 
     None if its controller published nothing, or variables of another convention than the scenario's.
     """
-    by_name = {track.name: track for track in tracks}
-    space = _space(states, scenario) if len(states.t_ns) else None
-    if space is None or states.names != space.names:
+    cluster = cluster_of(scenario, states.name)
+    try:  # without the cluster's own space: the default of so many drones
+        space = scenario_space(scenario, cluster) if scenario and cluster else cluster_space(len(states.drones))
+    except (ValueError, NotTrustedError):
+        return None
+    if not len(states.t_ns) or states.names != space.names:
         return None
     # on the wire, all zeros stand for unknown
     value, desired = (
         np.where(rows.any(axis=1, keepdims=True), rows, np.nan) for rows in (states.value, states.desired)
     )
-    members = [by_name[name] for name in states.drones if name in by_name]
-    true = _true(space, members, states.t_ns)
+    by_name = {track.name: track for track in tracks}
+    true = _true(space, [by_name[name] for name in states.drones if name in by_name], states.t_ns)
     est_error, true_error = (
         np.array([space.difference(*pair) for pair in zip(to, desired, strict=True)]) for to in (value, true)
     )
-    return Formation(
-        name=states.name,
-        drones=states.drones,
-        names=states.names,
-        t_s=states.t_ns / 1e9,
-        desired=desired,
-        value=value,
-        true=true,
-        est_error=est_error,
-        true_error=true_error,
-        phases=states.phases,
-    )
-
-
-def _space(states: ClusterStates, scenario: Scenario | None) -> ClusterSpace | None:
-    """Return the space that the scenario gives the cluster of these states, else the default of so many drones."""
-    clusters = {cluster.name: cluster for cluster in scenario.clusters} if scenario else {}
-    try:
-        if scenario and states.name in clusters:
-            return scenario_space(scenario, clusters[states.name])
-        return cluster_space(len(states.drones))
-    except (ValueError, NotTrustedError):
-        return None
+    t_s, drones, names = states.t_ns / 1e9, states.drones, states.names
+    return Formation(states.name, drones, names, t_s, desired, value, true, est_error, true_error, states.phases)
 
 
 def _true(space: ClusterSpace, members: list[Track], wanted_ns: Times) -> Array:
@@ -197,7 +174,11 @@ def _least_m(tracks: list[Track]) -> float | None:
     if len(tracks) < 2 or not len(t_ns):
         return None
     p_W = np.stack([track.p_W[place] for track, place in zip(tracks, places, strict=True)], axis=1)
-    flying = np.stack([_airborne(track, t_ns) for track in tracks], axis=1)
+    flying = np.zeros(p_W.shape[:2], bool)
+    for column, track in zip(flying.T, tracks, strict=True):
+        if track.states:
+            latest = np.searchsorted(track.status_t_ns, t_ns, side="right") - 1
+            column[:] = np.array([state != "landed" for state in track.states], bool)[np.maximum(latest, 0)]
     if (flying.sum(axis=1) < 2).all():
         flying[:] = True
     least = np.inf
@@ -210,32 +191,21 @@ def _least_m(tracks: list[Track]) -> float | None:
     return least if np.isfinite(least) else None
 
 
-def _airborne(track: Track, t_ns: Times) -> NDArray[np.bool_]:
-    flying = np.array([state != "landed" for state in track.states], bool)
-    if not len(flying):
-        return np.zeros(len(t_ns), bool)
-    latest = np.searchsorted(track.status_t_ns, t_ns, side="right") - 1
-    return flying[np.maximum(latest, 0)]
-
-
 class GoalErrors(NamedTuple):
     """Errors (K, 4n) of a formation against its plan's target; NaN once its plan leads it elsewhere.
 
     The paper's Figure 5 shows these errors, which include the climb from the ground.
-
-    Attributes:
-        goal: (4n,) m or rad, NaN for variables that the target does not name.
-        est, true: (K, 4n) estimate − goal and truth − goal, angles wrapped to ±π.
     """
 
-    goal: Array
+    goal: Array  # (4n,) m or rad, NaN for variables that the target does not name
+    # est, true: (K, 4n) estimate − goal and truth − goal, angles wrapped to ±π
     est: Array
     true: Array
 
 
 def goal_errors(formation: Formation, scenario: Scenario | None) -> GoalErrors | None:
     """Return the errors of a formation against its plan's target; None if its plan has none, or it was refused."""
-    cluster = next((each for each in scenario.clusters if each.name == formation.name), None) if scenario else None
+    cluster = cluster_of(scenario, formation.name)
     if scenario is None or cluster is None or not cluster.plan.target or cluster.plan.takeoff_s is None:
         return None
     try:

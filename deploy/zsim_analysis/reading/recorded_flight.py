@@ -1,7 +1,6 @@
 """A flight as arrays: tracks, estimates, commands, cluster states, events and processes.
 
-`read_flight` makes them in one pass over a record; `FlightReader` makes them from messages while the flight is flown in
-this process.
+`read_flight` makes them from a record in one pass, `FlightReader` from the messages of a flight in this process.
 """
 
 from array import array
@@ -29,29 +28,20 @@ from zsim_analysis.reading.recorded_run import scenario_of, search_modules
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
-
 TRUTH_WIDTH = 13  # position, velocity, orientation, angular velocity
 
 
 @dataclass
 class Track:
-    """True motion of one drone, W and B as in the contract.
-
-    Attributes:
-        t_ns: (T,) instants of truth, ascending and unique.
-        truth: (T, 13) position [m], velocity [m/s], orientation w first, angular velocity [rad/s; B].
-        status_t_ns: (S,) instants of status.
-        states: (S,) state of the firmware by name.
-        battery_percent: (S,).
-        external: the body is external, so that `truth` is the pose published by its driver, which is an estimate.
-    """
+    """True motion of one drone, W and B as in the contract."""
 
     name: str
-    t_ns: Times
-    truth: Array
-    status_t_ns: Times
-    states: list[str]
-    battery_percent: Array
+    t_ns: Times  # (T,) instants of truth, ascending and unique
+    truth: Array  # (T, 13) position [m], velocity [m/s], orientation w first, angular velocity [rad/s; B]
+    status_t_ns: Times  # (S,) instants of status
+    states: list[str]  # (S,) state of the firmware by name
+    battery_percent: Array  # (S,)
+    # the body is external, so that `truth` is the pose published by its driver, which is an estimate
     external: bool = False
 
     @property
@@ -74,59 +64,41 @@ class Track:
 
 @dataclass
 class DroneEstimates:
-    """Published estimates of one drone.
+    """Published estimates of one drone."""
 
-    Attributes:
-        t_ns: (E,) ascending and unique.
-        p_W: (E, 3) position [m].
-        v_W: (E, 3) velocity [m/s].
-        yaw, yaw_sigma: (E,) heading and its standard deviation [rad].
-        covariance: (E, 6, 6) of position and velocity [SI].
-    """
-
-    t_ns: Times
-    p_W: Array
-    v_W: Array
+    t_ns: Times  # (E,) ascending and unique
+    p_W: Array  # (E, 3) position [m]
+    v_W: Array  # (E, 3) velocity [m/s]
+    # yaw, yaw_sigma: (E,) heading and its standard deviation [rad]
     yaw: Array
     yaw_sigma: Array
-    covariance: Array
+    covariance: Array  # (E, 6, 6) of position and velocity [SI]
 
 
 @dataclass
 class VelocityCommands:
-    """Velocity commands of one drone that were sent by its commander.
+    """Velocity commands of one drone that were sent by its commander."""
 
-    Attributes:
-        t_ns: (C,) ascending and unique.
-        velocity: (C, 3) [m/s] as sent.
-        yaw_rate: (C,) [rad/s].
-        in_W: (C,) whether the velocity is in W; otherwise x is forward and y left by the sender's estimated heading.
-    """
-
-    t_ns: Times
-    velocity: Array
-    yaw_rate: Array
+    t_ns: Times  # (C,) ascending and unique
+    velocity: Array  # (C, 3) [m/s] as sent
+    yaw_rate: Array  # (C,) [rad/s]
+    # (C,) whether the velocity is in W; otherwise x is forward and y left by the sender's estimated heading
     in_W: NDArray[np.bool_]
 
 
 @dataclass
 class ClusterStates:
-    """Published states of one cluster's controller: K instants, n variables.
-
-    Attributes:
-        reasons: (K,) why it waits or is held.
-        requests: accepted and refused, from sources other than its plan.
-    """
+    """Published states of one cluster's controller: K instants, n variables."""
 
     name: str
     drones: tuple[str, ...]
-    names: tuple[str, ...] = ()
-    t_ns: Times = field(default_factory=lambda: np.zeros(0, np.int64))
-    value: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    desired: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    phases: list[str] = field(default_factory=list)
-    reasons: list[str] = field(default_factory=list)
-    requests: list[ClusterRequest] = field(default_factory=list)
+    names: tuple[str, ...]
+    t_ns: Times
+    value: Array
+    desired: Array
+    phases: list[str]
+    reasons: list[str]  # (K,) why it waits or is held
+    requests: list[ClusterRequest]  # accepted and refused, from sources other than its plan
 
 
 @dataclass
@@ -145,16 +117,7 @@ class RecordedProcess:
 
 @dataclass
 class RecordedFlight:
-    """A flight with all that a report needs of it; fields that are not on record are None or empty.
-
-    Attributes:
-        messages: number on record, over all keys.
-        completeness: of the record.
-        wall_s: wall time from the first to the last truth message, by the recorder's clock.
-        began_ns: wall time of the first truth message, nanoseconds since 1970; None without truth.
-        undecoded: number of payloads that are not of the type of their key.
-        estimates, commands: by drone; empty unless requested.
-    """
+    """A flight with all that a report needs of it; fields that are not on record are None or empty."""
 
     info: Info | None
     scenario: Scenario | None
@@ -162,32 +125,32 @@ class RecordedFlight:
     clusters: list[ClusterStates]
     events: list[Event]
     processes: list[RecordedProcess]
-    messages: int
-    completeness: Completeness
-    wall_s: float
-    undecoded: int = 0
-    began_ns: int | None = None
+    messages: int  # number on record, over all keys
+    completeness: Completeness  # of the record
+    wall_s: float  # wall time from the first to the last truth message, by the recorder's clock
+    undecoded: int = 0  # number of payloads that are not of the type of their key
+    began_ns: int | None = None  # wall time of the first truth message, nanoseconds since 1970; None without truth
+    # estimates, commands: by drone; empty unless requested
     estimates: dict[str, DroneEstimates] = field(default_factory=dict)
     commands: dict[str, VelocityCommands] = field(default_factory=dict)
 
     @property
     def end(self) -> dict[str, Any] | None:
-        """Return the data of the world's last `end` event, None without one."""
+        """Data of the world's last `end` event, None without one."""
         return next((event.data for event in reversed(self.events) if event.kind == "end"), None)
 
     @property
     def replay_of(self) -> str:
-        """Return the run_id of the run that was played back, "" for a flight."""
+        """The run_id of the run that was played back, "" for a flight."""
         return self.info.replay_of if self.info else ""
 
     @property
     def first_ns(self) -> int:
-        """Return the first instant of truth."""
+        """First instant of truth."""
         return min((int(track.t_ns[0]) for track in self.tracks if len(track.t_ns)), default=0)
 
     @property
     def last_ns(self) -> int:
-        """Return the last instant of truth."""
         return max((int(track.t_ns[-1]) for track in self.tracks if len(track.t_ns)), default=0)
 
 
@@ -218,9 +181,10 @@ def read_flight(path: Path, answers: bool = False, motion: bool = True) -> Recor
         return recorded
 
 
-class _Truth(Struct):
-    """The fields of a truth message that are read."""
+# Messages, reduced to the fields that are read
 
+
+class _Truth(Struct):
     t_ns: int
     position_m: Vector3
     velocity_m_s: Vector3
@@ -263,73 +227,19 @@ class _Velocity(Struct):
 
 
 class _Rows:
-    """Rows of numbers with their times, stored compactly."""
+    """Rows of numbers with their times, and for some messages texts of each, stored compactly."""
 
-    def __init__(self, width: int, kind: str = "f") -> None:
-        self.t_ns, self.values, self._width = array("q"), array(kind), width
+    def __init__(self, width: int, kind: str) -> None:
+        self.t_ns, self.values, self.width = array("q"), array(kind), width
+        self.texts: list[tuple[str, ...]] = []
 
-    def by_time(self) -> tuple[Times, np.ndarray]:
-        """Return times (R,) [ns], ascending and unique, and rows (R, width)."""
-        t_ns, first = np.unique(np.array(self.t_ns, np.int64), return_index=True)
-        return t_ns, np.array(self.values).reshape(-1, self._width)[first]
-
-
-class _StatusRows:
-    """Status of one drone."""
-
-    def __init__(self) -> None:
-        self.t_ns, self.battery = array("q"), array("d")
-        self.states: list[str] = []
-
-    def by_time(self) -> tuple[Times, list[str], Array]:
-        """Return times (S,) [ns], ascending and unique, states (S,) and charge (S,) [%]."""
-        t_ns, first = np.unique(np.array(self.t_ns, np.int64), return_index=True)
-        return t_ns, [self.states[i] for i in first], np.array(self.battery)[first]
-
-
-class _StateRows:
-    """States of one cluster by columns: the names in each message of a large formation outweigh its values."""
-
-    def __init__(self) -> None:
-        self._names: tuple[str, ...] = ()
-        self._drones: tuple[str, ...] = ()
-        self._clear()
-
-    def _clear(self) -> None:
-        self._times, self._value, self._desired = array("q"), array("d"), array("d")
-        self._phases: list[str] = []
-        self._reasons: list[str] = []
-
-    def add(self, state: _State) -> None:
-        """Add a state; one with another number of variables replaces all earlier ones."""
-        count = len(state.names)
-        if not len(state.value) == len(state.desired) == count > 0:
-            return
-        if count != len(self._names):
-            self._clear()
-        self._names, self._drones = state.names, state.drones
-        self._times.append(state.t_ns)
-        self._value.extend(state.value)
-        self._desired.extend(state.desired)
-        self._phases.append(intern(state.phase))
-        self._reasons.append(intern(state.reason))
-
-    def states(self, name: str, drones: tuple[str, ...], requests: list[ClusterRequest]) -> ClusterStates:
-        """Return all states by time, the last one of each instant."""
-        count = len(self._times)
-        t_ns, places = np.unique(np.array(self._times, np.int64)[::-1], return_index=True)
-        last = count - 1 - places
-        return ClusterStates(
-            name=name,
-            drones=drones or self._drones,
-            names=self._names,
-            t_ns=t_ns,
-            value=np.array(self._value).reshape(count, len(self._names))[last],
-            desired=np.array(self._desired).reshape(count, len(self._names))[last],
-            phases=[self._phases[i] for i in last],
-            reasons=[self._reasons[i] for i in last],
-            requests=requests,
-        )
+    def by_time(self, last: bool = False) -> tuple[Times, np.ndarray, list[tuple[str, ...]]]:
+        """Return times (R,) [ns], ascending and unique, rows (R, width), texts: the first, or last, of each instant."""
+        step, count = -1 if last else 1, len(self.t_ns)
+        t_ns, chosen = np.unique(np.array(self.t_ns, np.int64)[::step], return_index=True)
+        chosen = count - 1 - chosen if last else chosen
+        texts = [self.texts[i] for i in chosen] if self.texts else []
+        return t_ns, np.array(self.values).reshape(count, self.width)[chosen], texts
 
 
 _Handler = tuple[msgspec.msgpack.Decoder[Any], Callable[[str, Any], None]]
@@ -343,11 +253,12 @@ class FlightReader:
         self._infos: list[Info] = []
         self._events: list[Event] = []
         self._truth: defaultdict[str, _Rows] = defaultdict(lambda: _Rows(TRUTH_WIDTH, "d"))
-        self._status: defaultdict[str, _StatusRows] = defaultdict(_StatusRows)
+        self._status: defaultdict[str, _Rows] = defaultdict(lambda: _Rows(1, "d"))
         self._commanders: defaultdict[str, list[tuple[int, str]]] = defaultdict(list)
-        self._estimates: defaultdict[str, _Rows] = defaultdict(lambda: _Rows(3 + 3 + 1 + 1 + 36))
-        self._commands: defaultdict[tuple[str, str], _Rows] = defaultdict(lambda: _Rows(3 + 1 + 1))
-        self._states: defaultdict[str, _StateRows] = defaultdict(_StateRows)
+        self._estimates: defaultdict[str, _Rows] = defaultdict(lambda: _Rows(3 + 3 + 1 + 1 + 36, "f"))
+        self._commands: defaultdict[tuple[str, str], _Rows] = defaultdict(lambda: _Rows(3 + 1 + 1, "f"))
+        self._states: dict[str, _Rows] = {}
+        self._members: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {}  # names of variables, drones
         self._requests: defaultdict[str, list[ClusterRequest]] = defaultdict(list)
         self._processes: dict[str, RecordedProcess] = {}
         self._first_wall_ns: int | None = None
@@ -366,7 +277,7 @@ class FlightReader:
                 "process/bye": (Bye, self._add_process),
                 "drone/truth": (_Truth, self._add_truth),
                 "drone/sensor/status": (_Status, self._add_status),
-                "cluster/state": (_State, lambda name, message: self._states[name].add(message)),
+                "cluster/state": (_State, self._add_state),
                 "cluster/request": (ClusterRequest, lambda name, message: self._requests[name].append(message)),
             }
             if self._answers:
@@ -378,8 +289,7 @@ class FlightReader:
 
     def add(self, key: str, payload: bytes, wall_ns: int = 0) -> None:
         """Add a message of a record; one that cannot be decoded is counted. `wall_ns` is needed for truth only."""
-        handler = self.handler(key)
-        if handler is None:
+        if (handler := self.handler(key)) is None:
             return
         decoder, store = handler
         try:
@@ -405,33 +315,6 @@ class FlightReader:
             if handler := self.handler(key):
                 handler[1](keys.parts(key)[1], handler[0].decode(payload))
 
-    def flight(self, messages: int = 0, completeness: Completeness | None = None) -> RecordedFlight:
-        """Return the flight after all messages have been added; the arguments describe its record, if any."""
-        info = self._infos[-1] if self._infos else None
-        names = [drone.name for drone in info.drones] if info else sorted(self._truth)
-        external = {drone.name for drone in info.drones if drone.body is not msgspec.UNSET} if info else set[str]()
-        members = {c.name: c.drones for c in info.clusters} if info else dict.fromkeys(self._states, ())
-        return RecordedFlight(
-            info=info,
-            scenario=scenario_of(info),
-            tracks=[
-                Track(name, *self._truth[name].by_time(), *self._status[name].by_time(), name in external)
-                for name in names
-            ],
-            clusters=[
-                self._states[name].states(name, drones, self._requests[name]) for name, drones in members.items()
-            ],
-            events=sorted(self._events, key=lambda event: (event.t_ns, event.seq)),
-            processes=list(self._processes.values()),
-            messages=messages,
-            completeness=completeness or Completeness(),
-            wall_s=(self._last_wall_ns - (self._first_wall_ns or 0)) / 1e9,
-            undecoded=self._undecoded,
-            began_ns=self._first_wall_ns,
-            estimates={drone: _estimates(*rows.by_time()) for drone, rows in self._estimates.items()},
-            commands=self._flown_commands(),
-        )
-
     def _add_truth(self, name: str, truth: _Truth) -> None:
         rows = self._truth[name]
         rows.t_ns.append(truth.t_ns)
@@ -443,8 +326,8 @@ class FlightReader:
     def _add_status(self, name: str, status: _Status) -> None:
         rows = self._status[name]
         rows.t_ns.append(status.t_ns)
-        rows.states.append(status.state)
-        rows.battery.append(status.battery_percent)
+        rows.values.append(status.battery_percent)
+        rows.texts.append((status.state,))
         if self._answers:
             commanders, commander = self._commanders[name], status.commander or ""
             if not commanders or commanders[-1][1] != commander:
@@ -464,6 +347,19 @@ class FlightReader:
         rows.values.extend(command.velocity_m_s)
         rows.values.extend((command.yaw_rate_rad_s, command.frame == "world"))
 
+    def _add_state(self, cluster: str, state: _State) -> None:
+        """Add a state; one with another number of variables replaces all earlier ones."""
+        if not len(state.value) == len(state.desired) == len(state.names) > 0:
+            return
+        width = 2 * len(state.names)
+        if (rows := self._states.get(cluster)) is None or rows.width != width:
+            rows = self._states[cluster] = _Rows(width, "d")
+        self._members[cluster] = state.names, state.drones
+        rows.t_ns.append(state.t_ns)
+        rows.values.extend(state.value)
+        rows.values.extend(state.desired)
+        rows.texts.append((intern(state.phase), intern(state.reason)))
+
     def _add_process(self, name: str, message: Join | Bye) -> None:
         process = self._processes.setdefault(name, RecordedProcess(name))
         if isinstance(message, Bye):
@@ -474,36 +370,65 @@ class FlightReader:
         process.incarnations += 1
         process.left = ""
 
+    def flight(self, messages: int = 0, completeness: Completeness | None = None) -> RecordedFlight:
+        """Return the flight after all messages have been added; the arguments describe its record, if any."""
+        info = self._infos[-1] if self._infos else None
+        external = {drone.name for drone in info.drones if drone.body is not msgspec.UNSET} if info else set[str]()
+        members = {c.name: c.drones for c in info.clusters} if info else dict.fromkeys(self._states, ())
+        tracks = []
+        for name in [drone.name for drone in info.drones] if info else sorted(self._truth):
+            t_ns, truth, _ = self._truth[name].by_time()
+            status_t_ns, battery, texts = self._status[name].by_time()
+            states = [state for (state,) in texts]
+            tracks.append(Track(name, t_ns, truth, status_t_ns, states, battery[:, 0], name in external))
+        clusters = []
+        for name, drones in members.items():
+            t_ns, values, texts = self._states.get(name, _Rows(0, "d")).by_time(last=True)
+            names, known_drones = self._members.get(name, ((), ()))
+            value, desired = np.split(values, 2, axis=1)
+            phases, reasons = [phase for phase, _ in texts], [reason for _, reason in texts]
+            about = (phases, reasons, self._requests[name])
+            clusters.append(ClusterStates(name, drones or known_drones, names, t_ns, value, desired, *about))
+        estimates = {}
+        for drone, rows in self._estimates.items():
+            t_ns, values, _ = rows.by_time()
+            p_W, v_W, yaw, sigma, covariance = np.split(values.astype(np.float64), (3, 6, 7, 8), axis=1)
+            estimates[drone] = DroneEstimates(t_ns, p_W, v_W, yaw[:, 0], sigma[:, 0], covariance.reshape(-1, 6, 6))
+        return RecordedFlight(
+            info=info,
+            scenario=scenario_of(info),
+            tracks=tracks,
+            clusters=clusters,
+            events=sorted(self._events, key=lambda event: (event.t_ns, event.seq)),
+            processes=list(self._processes.values()),
+            messages=messages,
+            completeness=completeness or Completeness(),
+            wall_s=(self._last_wall_ns - (self._first_wall_ns or 0)) / 1e9,
+            undecoded=self._undecoded,
+            began_ns=self._first_wall_ns,
+            estimates=estimates,
+            commands=self._flown_commands(),
+        )
+
     def _flown_commands(self) -> dict[str, VelocityCommands]:
-        """Return the commands of each drone's commander by time; those of other sources were not obeyed."""
+        """Return the commands of each drone that were obeyed, by time.
+
+        Those are obeyed whose source the next status names as commander, or that were sent while no commander was
+        named.
+        """
         kept: defaultdict[str, list[tuple[Times, np.ndarray]]] = defaultdict(list)
         for (drone, source), rows in self._commands.items():
-            t_ns, values = rows.by_time()
-            obeyed = _obeyed(t_ns, source, self._commanders[drone])
-            kept[drone].append((t_ns[obeyed], values[obeyed]))
+            t_ns, values, _ = rows.by_time()
+            if commanders := self._commanders[drone]:
+                place = np.searchsorted(np.array([t for t, _ in commanders]), t_ns, side="right") - 1
+                named = np.array([name for _, name in commanders])
+                now, following = named[np.maximum(place, 0)], named[np.minimum(place + 1, len(named) - 1)]
+                obeyed = (now == source) | ((now == "") & np.isin(following, ("", source)))
+                t_ns, values = t_ns[obeyed], values[obeyed]
+            kept[drone].append((t_ns, values))
         flown = {}
         for drone, parts in kept.items():
             t_ns, first = np.unique(np.concatenate([times for times, _ in parts]), return_index=True)
-            rows = np.concatenate([values for _, values in parts])[first].astype(np.float64)
-            flown[drone] = VelocityCommands(t_ns, rows[:, :3], rows[:, 3], rows[:, 4] > 0)
+            values = np.concatenate([values for _, values in parts])[first].astype(np.float64)
+            flown[drone] = VelocityCommands(t_ns, values[:, :3], values[:, 3], values[:, 4] > 0)
         return flown
-
-
-def _estimates(t_ns: Times, rows: np.ndarray) -> DroneEstimates:
-    p_W, v_W, yaw, sigma, covariance = np.split(rows.astype(np.float64), (3, 6, 7, 8), axis=1)
-    return DroneEstimates(t_ns, p_W, v_W, yaw[:, 0], sigma[:, 0], covariance.reshape(-1, 6, 6))
-
-
-def _obeyed(t_ns: Times, source: str, commanders: list[tuple[int, str]]) -> NDArray[np.bool_]:
-    """Return which commands (C,) of a source were obeyed.
-
-    Those are obeyed whose source the next status names as commander, or that were sent while no commander was named.
-    """
-    if not commanders:
-        return np.ones(len(t_ns), bool)
-    since_ns = np.array([t for t, _ in commanders])
-    place = np.searchsorted(since_ns, t_ns, side="right") - 1
-    named = np.array([name for _, name in commanders])
-    following = named[np.minimum(place + 1, len(named) - 1)]
-    now = named[np.maximum(place, 0)]
-    return (now == source) | ((now == "") & np.isin(following, ("", source)))

@@ -1,7 +1,7 @@
 """The record of a run, opened to be played back or flown again: its messages, its processes, and each gate's inputs.
 
-The order of a record is the order in which messages passed the world: what stands before the clock of a gate was
-received before that gate was integrated.
+A record has the order in which messages passed the world: what stands before the clock of a gate was received before
+that gate was integrated.
 """
 
 from collections import defaultdict
@@ -29,7 +29,6 @@ from zsim_agents.hosting import agents_of
 
 # events of a process that was absent for a part of the run
 ABSENCES = ("death", "failure", "restart", "superseded", "doubled", "drop", "leave")
-PROCESS_MESSAGES = ("join", "done", "bye")  # from processes to the world
 
 
 class RecordedRun(NamedTuple):
@@ -107,26 +106,17 @@ def command_age_ms(path: Path) -> dict[str, float] | None:
 
 
 class DriverLink(Struct, frozen=True):
-    """Quality of the link to one external drone over a run; None for figures that its driver did not report.
+    """Quality of the link to one external drone over a run; None for figures that its driver did not report."""
 
-    Attributes:
-        peer: address of the aircraft.
-        age_max_ms: largest reported age of the newest datagram, in wall time.
-        loss_mean_percent, loss_max_percent: of the datagrams sent by the aircraft.
-        round_trip_ms: median.
-        lost: number of times that the link was lost, which is after a second of silence.
-        lost_s: total duration of the losses, simulated time.
-        refused: datagrams that were malformed or of another sender, over all consecutive drivers.
-    """
-
-    peer: str
-    age_max_ms: float | None
+    peer: str  # address of the aircraft
+    age_max_ms: float | None  # largest reported age of the newest datagram, in wall time
+    # loss_mean_percent, loss_max_percent: of the datagrams sent by the aircraft
     loss_mean_percent: float | None
     loss_max_percent: float | None
-    round_trip_ms: float | None
-    lost: int
-    lost_s: float
-    refused: int
+    round_trip_ms: float | None  # median
+    lost: int  # number of times that the link was lost, which is after a second of silence
+    lost_s: float  # total duration of the losses, simulated time
+    refused: int  # datagrams that were malformed or of another sender, over all consecutive drivers
 
     def __str__(self) -> str:
         figures = (
@@ -147,29 +137,28 @@ def driver_links(path: Path) -> dict[str, DriverLink]:
     Raises:
         RecordError: no such record.
     """
-    reports: defaultdict[str, list[LinkState]] = defaultdict(list)
+    by_drone: defaultdict[str, list[LinkState]] = defaultdict(list)
     with RecordReader(path) as reader:
         for key, report in _read(reader, "drone/*/link"):
-            reports[keys.thing(key)].append(report)
-    return {drone: _link(of_drone) for drone, of_drone in sorted(reports.items())}
-
-
-def _link(reports: Sequence[LinkState]) -> DriverLink:
-    pairs = list(pairwise(reports))
-    ages, losses, trips = (
-        [value for report in reports if (value := getattr(report, name)) is not None]
-        for name in ("age_ms", "loss_percent", "round_trip_ms")
-    )
-    return DriverLink(
-        peer=reports[-1].peer,
-        age_max_ms=max(ages, default=None),
-        loss_mean_percent=sum(losses) / len(losses) if losses else None,
-        loss_max_percent=max(losses, default=None),
-        round_trip_ms=median(trips) if trips else None,
-        lost=sum(before.state != "lost" and after.state == "lost" for before, after in pairs),
-        lost_s=sum(after.t_ns - before.t_ns for before, after in pairs if before.state == "lost") / 1e9,
-        refused=sum(before.refused for before, after in pairs if after.seq == 0) + reports[-1].refused,
-    )
+            by_drone[keys.thing(key)].append(report)
+    links = {}
+    for drone, reports in sorted(by_drone.items()):
+        pairs = list(pairwise(reports))
+        ages, losses, trips = (
+            [value for report in reports if (value := getattr(report, name)) is not None]
+            for name in ("age_ms", "loss_percent", "round_trip_ms")
+        )
+        links[drone] = DriverLink(
+            peer=reports[-1].peer,
+            age_max_ms=max(ages, default=None),
+            loss_mean_percent=sum(losses) / len(losses) if losses else None,
+            loss_max_percent=max(losses, default=None),
+            round_trip_ms=median(trips) if trips else None,
+            lost=sum(before.state != "lost" and after.state == "lost" for before, after in pairs),
+            lost_s=sum(after.t_ns - before.t_ns for before, after in pairs if before.state == "lost") / 1e9,
+            refused=sum(before.refused for before, after in pairs if after.seq == 0) + reports[-1].refused,
+        )
+    return links
 
 
 class AgentProcess(NamedTuple):
@@ -184,27 +173,18 @@ class AgentProcess(NamedTuple):
 
 
 class RecordedAgents(NamedTuple):
-    """The agents that took part in a run.
+    """The agents that took part in a run."""
 
-    Attributes:
-        processes: whose agents can be run again; empty if there is a reason not to.
-        why_not: that reason.
-        requests: to their controllers, in order.
-        fingerprints: numeric, of these processes.
-        truth_sha256: as reported by the world at the end of the run, None if the record has no end.
-        failure: of a user's code in one of these processes, by which the run ended; empty if there was none.
-    """
-
-    processes: tuple[AgentProcess, ...]
-    why_not: str
-    requests: tuple[tuple[str, run_messages.ClusterRequest], ...]
-    fingerprints: frozenset[str]
-    truth_sha256: str | None
-    failure: str
+    processes: tuple[AgentProcess, ...]  # whose agents can be run again; empty if there is a reason not to
+    why_not: str  # that reason
+    requests: tuple[tuple[str, run_messages.ClusterRequest], ...]  # to their controllers, in order
+    fingerprints: frozenset[str]  # numeric, of these processes
+    truth_sha256: str | None  # as reported by the world at the end of the run, None if the record has no end
+    failure: str  # of a user's code in one of these processes, by which the run ended; empty if there was none
 
     @property
     def names(self) -> frozenset[str]:
-        """Return the names of all processes and agents that are run again."""
+        """Names of all processes and agents that are run again."""
         return frozenset(name for process in self.processes for name in (process.name, *process.members))
 
 
@@ -273,23 +253,27 @@ def _read(reader: RecordReader, expression: str) -> Iterator[tuple[str, Any]]:
 
 
 class GateInputs(NamedTuple):
-    """What a record holds of a gate.
-
-    Attributes:
-        t_ns: of the gate.
-        inputs: received by the world since the previous gate, in order.
-        truth: payloads at the gate, by drone.
-    """
+    """What a record holds of a gate."""
 
     t_ns: int
-    inputs: list[Recorded]
-    truth: dict[str, bytes]
+    inputs: list[Recorded]  # received by the world since the previous gate, in order
+    truth: dict[str, bytes]  # payloads at the gate, by drone
 
 
 def gates(reader: RecordReader, drones: list[str]) -> Iterator[GateInputs]:
     """Yield the inputs of each gate of a record, as far as it is whole."""
     truth_keys = {keys.truth(drone): drone for drone in drones}
-    wanted = {key for key in reader.topics() if key in truth_keys or key == keys.CLOCK or _is_input(key)}
+    wanted = {keys.CLOCK, keys.EVENT, *truth_keys}
+    for key in reader.topics():
+        kind, _, what = keys.parts(key)
+        if kind == "process":
+            is_input = what in ("join", "done", "bye")
+        else:
+            is_detection = kind == "drone" and what == keys.SIGHTINGS
+            is_input = is_detection or keys.is_command(key) or messages.type_of(key) in messages.RELAYED
+        if is_input:
+            wanted.add(key)
+    wanted &= reader.topics().keys()
     inputs: list[Recorded] = []
     truth: dict[str, bytes] = {}
     last_ns = -1
@@ -301,12 +285,3 @@ def gates(reader: RecordReader, drones: list[str]) -> Iterator[GateInputs]:
         elif recorded.t_ns > last_ns and truth:  # the clock of a gate is repeated while time stands still
             yield GateInputs(recorded.t_ns, inputs, truth)
             inputs, truth, last_ns = [], {}, recorded.t_ns
-
-
-def _is_input(key: str) -> bool:
-    kind, _, what = keys.parts(key)
-    if kind == "process":
-        return what in PROCESS_MESSAGES
-    if kind == "drone" and what == keys.SIGHTINGS:  # of a detector
-        return True
-    return key == keys.EVENT or keys.is_command(key) or messages.type_of(key) in messages.RELAYED

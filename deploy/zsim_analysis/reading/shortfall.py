@@ -1,7 +1,6 @@
 """The verdict on a flight: which steps of its plan it did not fly, and the incidents of its drones. Pure but `verdict`.
 
-Order of this file: shortfalls, the window of the statistics, and how both are written; then drones (incidents,
-collisions, missions, overrides) and formations (engagement, holds, requests, target and trajectory of the plan).
+Order of this file: shortfalls, the window of the statistics, and how both are written; then drones, then formations.
 """
 
 from collections import Counter
@@ -24,6 +23,7 @@ from zsim_agents.formation.flight_plan import REFUSALS, Follow, MoveTo, plan_of,
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_agents.formation.trajectory import Hold, Reference, variable_of
+from zsim_analysis.reading.formation import cluster_of
 from zsim_analysis.reading.recorded_flight import Array, ClusterStates, RecordedFlight, read_flight
 
 NOT_AS_PLANNED = "NOT AS PLANNED"
@@ -43,24 +43,18 @@ LEADS = ("hold", "land", "target", "trajectory")  # requests by which a formatio
 
 
 class Shortfall(Struct, frozen=True):
-    """A deviation of a flight from its plan, or an incident.
+    """A deviation of a flight from its plan, or an incident."""
 
-    Attributes:
-        kind: of a drone: emergency, flip, impact, touchdown, battery, landing (its first incident), mission (not flown
-            to its end), strayed (far from its place), override (flown by others); of a cluster: plan (a step refused to
-            the end, or flown in part), engagement (never), held (for long), request (led by others), early (the run
-            ended before it was due), window (contains instants at which a cluster was not engaged); collision; process
-            (an expected one died, failed, or never joined); record (incomplete).
-        subject: the cluster, the drone, the process, or "record"; of a collision both, as "drone1, drone2".
-        t_s: its beginning, simulated time.
-        fails: the flight is no example of its plan; the command ends with code 1.
-    """
-
+    # of a drone: emergency, flip, impact, touchdown, battery, landing (its first incident), mission (not flown to its
+    # end), strayed (far from its place), override (flown by others); of a cluster: plan (a step refused to the end,
+    # or flown in part), engagement (never), held (for long), request (led by others), early (the run ended before it
+    # was due), window (contains instants at which a cluster was not engaged); collision; process (an expected one
+    # died, failed, or never joined); record (incomplete)
     kind: str
-    subject: str
-    t_s: float
+    subject: str  # the cluster, the drone, the process, or "record"; of a collision both, as "drone1, drone2"
+    t_s: float  # its beginning, simulated time
     text: str
-    fails: bool
+    fails: bool  # the flight is no example of its plan; the command ends with code 1
 
 
 class Verdict(Struct, frozen=True):
@@ -82,7 +76,7 @@ def verdict(record: Path) -> Verdict:
 
 def shortfalls(flight: RecordedFlight, window_s: tuple[float, float]) -> list[Shortfall]:
     """Return the shortfalls of a flight, failures first; empty for one that flew its plan."""
-    lines = [*_incidents(flight), *_collisions(flight), *_missions(flight)]
+    lines = [*_incidents(flight), *_collisions_and_missions(flight)]
     lines += [line for states in flight.clusters for line in _of_cluster(states, flight, window_s)]
     lines += [*_overrides(flight), *_processes(flight)]
     if not flight.completeness.complete:
@@ -132,7 +126,6 @@ def seconds_text(t_s: float) -> str:
 
 
 def span_text(span_s: tuple[float, float]) -> str:
-    """Return a span of time [s], with its unit."""
     return f"{seconds_text(span_s[0])} to {seconds_text(span_s[1])} s"
 
 
@@ -179,7 +172,12 @@ def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
             del first["touchdown"]
         parts = [_incident_text(event) for event in sorted(first.values(), key=lambda event: (event.t_ns, event.seq))]
         text = f"{drone}: {', '.join(parts)}{_active_faults(drone, (events[0].t_ns, events[0].seq), flight)}"
-        fails = any(not _is_pilots_silence(event) for event in events)
+        fails = not all(  # a landing because a program other than a controller stopped sending commands
+            event.kind == "landing"
+            and event.data.get("cause") == "silence"
+            and not str(event.data.get("commander") or "").startswith(CONTROLLER)
+            for event in events
+        )
         yield Shortfall(events[0].kind, drone, events[0].t_ns / 1e9, text, fails)
     reported = {*by_drone, *(event.subject for event in flight.events if event.data.get("mode") == "emergency")}
     for track in flight.tracks:  # records of versions without these events
@@ -211,13 +209,6 @@ def _incident_text(event: Event) -> str:
             return f"no charge left {at}"
 
 
-def _is_pilots_silence(event: Event) -> bool:
-    """Return whether a drone landed because a program other than a controller stopped sending commands."""
-    commander = str(event.data.get("commander") or "")
-    silent = event.kind == "landing" and event.data.get("cause") == "silence"
-    return silent and not commander.startswith(CONTROLLER)
-
-
 def _active_faults(drone: str, at: tuple[int, int], flight: RecordedFlight) -> str:
     """Return the injected faults of a drone, or of all, that were active at an instant: (t_ns, number of the event)."""
     active: dict[object, str] = {}
@@ -234,8 +225,11 @@ def _active_faults(drone: str, at: tuple[int, int], flight: RecordedFlight) -> s
     return f"; {', '.join(active.values())}" if active else ""
 
 
-def _collisions(flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield a line for each pair of drones, or of a drone and an obstacle, that touched."""
+def _collisions_and_missions(flight: RecordedFlight) -> Iterator[Shortfall]:
+    """Yield each pair of drones, or of a drone and an obstacle, that touched, and the missions not flown to their end.
+
+    Of the missions that a bridge reported, the newest one of each drone counts.
+    """
     pairs: dict[frozenset[object], list[Event]] = {}
     for event in flight.events:
         if event.kind == "collision":
@@ -244,10 +238,6 @@ def _collisions(flight: RecordedFlight) -> Iterator[Shortfall]:
         t_s, more = first.t_ns / 1e9, f" ({1 + len(others)} contacts in all)" if others else ""
         pair = f"{first.subject}, {first.data.get('other', 'something')}"
         yield Shortfall("collision", pair, t_s, f"{first.text} at {seconds_text(t_s)} s{more}", True)
-
-
-def _missions(flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield each drone whose newest mission, of those reported by a bridge, was not flown to its end."""
     newest = {event.subject: event for event in flight.events if event.kind == "mission"}
     for drone, event in newest.items():
         data, t_s = event.data, event.t_ns / 1e9
@@ -259,7 +249,9 @@ def _missions(flight: RecordedFlight) -> Iterator[Shortfall]:
 
 def _overrides(flight: RecordedFlight) -> Iterator[Shortfall]:
     """Yield each drone of a planned cluster that others than its controller flew, or landed."""
-    members = {drone for states in flight.clusters for drone in states.drones if _plan(flight.scenario, states.name)}
+    members = {
+        drone for states in flight.clusters for drone in states.drones if cluster_of(flight.scenario, states.name)
+    }
     for drone in sorted(members):
         if parts := list(_interventions(drone, flight)):
             more = f" (and {len(parts) - 1} more)" if len(parts) > 1 else ""
@@ -297,26 +289,49 @@ def _interventions(drone: str, flight: RecordedFlight) -> Iterator[_Intervention
 # Formations
 
 
-def _line(states: ClusterStates, kind: str, t_s: float, text: str, fails: bool = False) -> Shortfall:
-    return Shortfall(kind, states.name, t_s, f"{states.name}: {text}", fails)
-
-
 def _of_cluster(states: ClusterStates, flight: RecordedFlight, window_s: tuple[float, float]) -> Iterator[Shortfall]:
     if not states.phases:
         return
+    cluster = cluster_of(flight.scenario, states.name)
+    plan, end_s = cluster.plan if cluster else None, flight.last_ns / 1e9
+    takeoff_s = plan.takeoff_s if plan else None
     refused = [*_refused(states)]
     yield from refused
     if "engaged" not in states.phases:
-        yield from _never_engaged(states, takeoff_s(flight.scenario, states.name), flight.last_ns / 1e9)
+        phase = states.phases[-1]
+        if takeoff_s is None:
+            yield _line(states, "window", 0.0, "never engaged; it has no plan to take off by")
+        elif takeoff_s >= end_s:
+            yield _line(states, "early", end_s, f"the run ended before its take-off at {seconds_text(takeoff_s)} s")
+        elif end_s - takeoff_s < ENGAGES_S:
+            after = seconds_text(end_s - takeoff_s)
+            yield _line(states, "early", end_s, f"never engaged; the run ended {after} s after its take-off, {phase}")
+        else:
+            why = f": {states.reasons[-1]}" if states.reasons[-1] else ""
+            yield _line(states, "engagement", takeoff_s, f"never engaged, {phase} to the end{why}", True)
         return
-    yield from _strayed(states, flight)
+    if flight.scenario and cluster:
+        yield from _strayed(states, flight, flight.scenario, cluster)
     yield from _held(states, flight)
-    yield from _requests(states, flight.scenario)
-    yield from _not_begun(states, flight)
-    plan, planned = _plan(flight.scenario, states.name), None if refused else _planned(states, flight.scenario)
-    if planned and plan:
-        yield from (_trajectory_flown if plan.trajectory else _target_reached)(states, planned, plan)
+    asked = [each for each in states.requests if each.ok and each.op in LEADS]
+    if asked and takeoff_s is not None:
+        first = ", ".join(f"{each.op} at {seconds_text(each.t_ns / 1e9)} s ({each.source})" for each in asked[:3])
+        more = f" and {len(asked) - 3} more" if len(asked) > 3 else ""
+        yield _line(states, "request", asked[0].t_ns / 1e9, f"asked {first}{more}")
+    if flight.scenario and cluster and plan and takeoff_s is not None:
+        for step, due_s in (("trajectory", plan.trajectory and plan.trajectory.start_s), ("landing", plan.land_s)):
+            if due_s is not None and due_s >= end_s:
+                yield _line(states, "early", end_s, f"the run ended before its {step} at {seconds_text(due_s)} s")
+        follows = plan.trajectory is not None and plan.trajectory.start_s < end_s
+        if plan.target and not follows and _moves(states):
+            yield _line(states, "early", end_s, "the run ended before its reference was at the target")
+        if not refused and (planned := _planned(states, flight.scenario, cluster, takeoff_s)):
+            yield from (_trajectory_flown if plan.trajectory else _target_reached)(states, planned, plan)
     yield from _outside(states, window_s)
+
+
+def _line(states: ClusterStates, kind: str, t_s: float, text: str, fails: bool = False) -> Shortfall:
+    return Shortfall(kind, states.name, t_s, f"{states.name}: {text}", fails)
 
 
 def _refused(states: ClusterStates) -> Iterator[Shortfall]:
@@ -335,40 +350,24 @@ def _refused(states: ClusterStates) -> Iterator[Shortfall]:
             yield _line(states, "plan", begun[1], f"the {op} of the plan was refused to the end: {why}", True)
 
 
-def _never_engaged(states: ClusterStates, due_s: float | None, end_s: float) -> Iterator[Shortfall]:
-    phase = states.phases[-1]
-    if due_s is None:
-        yield _line(states, "window", 0.0, "never engaged; it has no plan to take off by")
-    elif due_s >= end_s:
-        yield _line(states, "early", end_s, f"the run ended before its take-off at {seconds_text(due_s)} s")
-    elif end_s - due_s < ENGAGES_S:
-        after = seconds_text(end_s - due_s)
-        yield _line(states, "early", end_s, f"never engaged; the run ended {after} s after its take-off, {phase}")
-    else:
-        why = f": {states.reasons[-1]}" if states.reasons[-1] else ""
-        yield _line(states, "engagement", due_s, f"never engaged, {phase} to the end{why}", True)
-
-
-def _strayed(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
+def _strayed(
+    states: ClusterStates, flight: RecordedFlight, scenario: Scenario, cluster: Cluster
+) -> Iterator[Shortfall]:
     """Yield the drones that truly were far from their places in the engaged formation, and for how long.
 
     Their estimates, which the controller relies on, may say otherwise. Interventions of others do not count.
     """
-    cluster = _cluster(flight.scenario, states.name)
-    if flight.scenario is None or cluster is None:
-        return
     engaged = np.array([phase == "engaged" for phase in states.phases], bool)
     settled = states.t_ns >= states.t_ns[engaged][0] + round(SETTLED_S * 1e9)
     rows = _sampled(states, np.flatnonzero(engaged & settled), SECOND_NS)
     try:
-        space = scenario_space(flight.scenario, cluster)
+        space = scenario_space(scenario, cluster)
         places_W = np.array([space.inverse(c)[0] for c in states.desired[rows]] if space.names == states.names else [])
     except (*REFUSALS, ValueError):
         return
     tracks = {track.name: track for track in flight.tracks if not track.external}
     for i, drone in enumerate(states.drones if len(places_W) else ()):
-        track = tracks.get(drone)
-        if track is None:
+        if (track := tracks.get(drone)) is None:
             continue
         t_ns, at, mine = np.intersect1d(states.t_ns[rows], track.t_ns, assume_unique=True, return_indices=True)
         away_m = np.linalg.norm(track.p_W[mine] - places_W[at, i], axis=1)
@@ -406,28 +405,6 @@ def _held(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
     yield _line(states, "held", span_s[0], text, float(lengths_s[~by_others].sum()) > HELD_MAX_S)
 
 
-def _requests(states: ClusterStates, scenario: Scenario | None) -> Iterator[Shortfall]:
-    """Yield the requests of others to a formation that has a plan."""
-    asked = [each for each in states.requests if each.ok and each.op in LEADS]
-    if asked and takeoff_s(scenario, states.name) is not None:
-        first = ", ".join(f"{each.op} at {seconds_text(each.t_ns / 1e9)} s ({each.source})" for each in asked[:3])
-        more = f" and {len(asked) - 3} more" if len(asked) > 3 else ""
-        yield _line(states, "request", asked[0].t_ns / 1e9, f"asked {first}{more}")
-
-
-def _not_begun(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield the steps of the plan that were not due before the run ended."""
-    plan, end_s = _plan(flight.scenario, states.name), flight.last_ns / 1e9
-    if plan is None or plan.takeoff_s is None:
-        return
-    for step, due_s in (("trajectory", plan.trajectory and plan.trajectory.start_s), ("landing", plan.land_s)):
-        if due_s is not None and due_s >= end_s:
-            yield _line(states, "early", end_s, f"the run ended before its {step} at {seconds_text(due_s)} s")
-    follows = plan.trajectory is not None and plan.trajectory.start_s < end_s
-    if plan.target and not follows and _moves(states):
-        yield _line(states, "early", end_s, "the run ended before its reference was at the target")
-
-
 def _moves(states: ClusterStates) -> bool:
     """Return whether the reference moves at the end, and not due to a hold or because the guard separates drones."""
     last = states.t_ns > states.t_ns[-1] - MOVES_NS
@@ -446,21 +423,17 @@ class PlannedReference(NamedTuple):
 
     def flown(self, states: ClusterStates, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Return at which of these rows of its states an engaged formation was led along it."""
-        t_s = (states.t_ns[rows] / 1e9 - self.start_s).tolist()
-        return np.array([self._is_on(states, row, t) for row, t in zip(rows.tolist(), t_s, strict=True)], bool)
+        on = np.zeros(len(rows), bool)
+        for i, row in enumerate(rows.tolist()):
+            if states.phases[row] == "engaged":
+                value = self.reference.value(float(states.t_ns[row] / 1e9 - self.start_s))[0]
+                off = self.space.difference(states.desired[row], value)
+                on[i] = np.abs(off[self.entries]).max(initial=0.0) <= SAME
+        return on
 
-    def _is_on(self, states: ClusterStates, row: int, t_s: float) -> bool:
-        if states.phases[row] != "engaged":
-            return False
-        off = self.space.difference(states.desired[row], self.reference.value(t_s)[0])
-        return bool(np.abs(off[self.entries]).max(initial=0.0) <= SAME)
 
-
-def _planned(states: ClusterStates, scenario: Scenario | None) -> PlannedReference | None:
+def _planned(states: ClusterStates, scenario: Scenario, cluster: Cluster, takeoff_s: float) -> PlannedReference | None:
     """Return the trajectory of a cluster's plan, else its target; None without one, or if it was refused."""
-    cluster = _cluster(scenario, states.name)
-    if scenario is None or cluster is None or cluster.plan.takeoff_s is None:
-        return None
     steps = [each.request for each in plan_of(cluster) if isinstance(each.request, MoveTo | Follow)]
     try:
         space = scenario_space(scenario, cluster)
@@ -468,7 +441,7 @@ def _planned(states: ClusterStates, scenario: Scenario | None) -> PlannedReferen
             return None
         base = states.desired[states.phases.index("engaged")].copy()  # a formation is engaged where it is
         base[space.neutral] = 0.0
-        names, reference, start_s = dict[str, None](), None, cluster.plan.takeoff_s
+        names, reference, start_s = dict[str, None](), None, takeoff_s
         for step in steps:
             if isinstance(step, MoveTo):
                 base = step.goal(space, base)
@@ -563,18 +536,3 @@ def _outside(states: ClusterStates, window_s: tuple[float, float]) -> Iterator[S
         rows = np.flatnonzero((t_s >= window_s[0]) & (t_s <= window_s[1])).tolist()
         first = next(row for row in rows if states.phases[row] != "engaged")
         yield _line(states, "window", float(t_s[first]), text)
-
-
-def takeoff_s(scenario: Scenario | None, cluster: str) -> float | None:
-    """Return the planned take-off of a cluster [s]; None without a plan."""
-    plan = _plan(scenario, cluster)
-    return plan.takeoff_s if plan else None
-
-
-def _plan(scenario: Scenario | None, cluster: str) -> ClusterPlan | None:
-    found = _cluster(scenario, cluster)
-    return found.plan if found else None
-
-
-def _cluster(scenario: Scenario | None, name: str) -> Cluster | None:
-    return next((each for each in scenario.clusters if each.name == name), None) if scenario else None

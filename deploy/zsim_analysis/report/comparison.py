@@ -1,12 +1,11 @@
 """Several runs side by side: how their scenarios and results differ, and the page that shows it."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from os.path import relpath
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -31,13 +30,7 @@ def compare(
     progress: Callable[[str], None] = lambda _: None,
     formats: Sequence[str] = (),
 ) -> list[ComparedRun]:
-    """Read the records of several runs and write the page that compares them.
-
-    Args:
-        directories: of the runs, at least two.
-        out: of the page; an earlier one is replaced when the new one is complete.
-        progress: called with a text at each step.
-        formats: of `zsim_analysis.report.FORMATS`, in which each figure is written into a folder beside the page.
+    """Read the records of several runs and write the page that compares them; arguments as of `write_page`.
 
     Raises:
         RecordError: one of them has no record, or no drone moves on it.
@@ -100,7 +93,6 @@ def runs_id(directories: Sequence[Path]) -> str:
 
 
 def comparison_page(runs: Sequence[ComparedRun], pictures: Sequence[Picture]) -> str:
-    """Return the page."""
     groups = [runs[start : start + RUNS_PER_TABLE] for start in range(0, len(runs), RUNS_PER_TABLE)]
     return template("comparison.html.j2").render(
         runs=runs,
@@ -116,13 +108,8 @@ def comparison_page(runs: Sequence[ComparedRun], pictures: Sequence[Picture]) ->
     )
 
 
-@dataclass(frozen=True)
-class ComparisonRow:
-    """A line of a table with a cell per run.
-
-    Attributes:
-        differs: whether the cells differ.
-    """
+class ComparisonRow(NamedTuple):
+    """A line of a table with a cell per run."""
 
     name: str
     cells: tuple[str, ...]
@@ -135,15 +122,13 @@ class ComparisonRow:
 def fact_rows(runs: Sequence[ComparedRun]) -> list[ComparisonRow]:
     """Return the facts of each run's own page, and more in which runs differ, a line for each label."""
     columns = [
-        dict(
-            [
-                *facts(run.summary),
-                ("Drones", f"{len(run.flight.tracks)}"),
-                ("Clusters", ", ".join(f"{c.name} of {len(c.drones)}" for c in run.flight.clusters) or "none"),
-                ("Scenario's hash", run.flight.info.scenario_sha256[:16] if run.flight.info else "not known"),
-                ("Messages", f"{run.summary.record.messages}"),
-            ]
-        )
+        dict(facts(run.summary))
+        | {
+            "Drones": f"{len(run.flight.tracks)}",
+            "Clusters": ", ".join(f"{c.name} of {len(c.drones)}" for c in run.flight.clusters) or "none",
+            "Scenario's hash": run.flight.info.scenario_sha256[:16] if run.flight.info else "not known",
+            "Messages": f"{run.summary.record.messages}",
+        }
         for run in runs
     ]
     names = dict.fromkeys(name for column in sorted(columns, key=len, reverse=True) for name in column)

@@ -13,43 +13,8 @@ from zsim.presentation import colours_of
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.formation import Formation
 from zsim_analysis.reading.recorded_flight import Array, RecordedFlight
-from zsim_analysis.report.drone_figures import (
-    DRONE_PANELS,
-    NAMED_MAX,
-    draw_drone_panels,
-    draw_obstacles,
-    draw_path,
-    drone_panel_heights,
-    name_states,
-)
-from zsim_analysis.report.figure_style import (
-    BLACK,
-    BLUE,
-    DARK,
-    FAULT,
-    GREEN,
-    GRID,
-    ORANGE,
-    PAGE_IN,
-    PAPER_PT,
-    PURPLE,
-    SKY,
-    TAKE_OVER,
-    VERMILION,
-    ReportFigure,
-    TimeMarks,
-    draw_marks,
-    dress,
-    label,
-    label_time,
-    legend_above,
-    letter_panels,
-    line,
-    new_figure,
-    scale,
-    shade_window,
-    time_marks,
-)
+from zsim_analysis.report import drone_figures as drones
+from zsim_analysis.report import figure_style as style
 from zsim_analysis.report.formation_figures import curves, draw_error, numbered, parameter_groups
 from zsim_analysis.report.paper import flies_paper_test
 from zsim_analysis.report.summary import RunSummary
@@ -58,9 +23,9 @@ UNPLANNED = "†"  # behind the name of a run that was not flown as planned
 COLUMNS = 3  # runs beside each other in a row of a figure, at most
 ROOM = 0.03  # share of the greatest RMS beyond it, so that its mark is whole
 ROWS_MAX = 24  # parameters in one figure; 6 drones
-DESIRED: dict[str, Any] = {"color": BLACK, "lw": 1.0, "ls": (0, (1, 2)), "zorder": 6}
+DESIRED: dict[str, Any] = {"color": style.BLACK, "lw": 1.0, "ls": (0, (1, 2)), "zorder": 6}
 LANE_IN = 0.24  # height of a run's lane of marks
-HATCHES = {"assembly": "////", "held": "xxxx", "landing": "....", FAULT: "", TAKE_OVER: "\\\\\\\\"}
+HATCHES = {"assembly": "////", "held": "xxxx", "landing": "....", style.FAULT: "", style.TAKE_OVER: "\\\\\\\\"}
 POINTS = {"take-off": "^", "engagement": "D", "collision": "X"}
 FACE, FAULT_FACE = 0.35, 0.65
 EMPTY, GREY_FACE = "#e6eaee", "#b6bfc9"  # of an empty lane, and of a bar in the legend
@@ -69,13 +34,9 @@ NAME_MAX = 20  # characters of a run's name beside its lane
 
 @dataclass
 class ComparedRun:
-    """One of several runs.
+    """One of several runs."""
 
-    Attributes:
-        name: unique among the runs.
-    """
-
-    name: str
+    name: str  # unique among the runs
     directory: Path
     flight: RecordedFlight
     formations: list[Formation]
@@ -83,7 +44,7 @@ class ComparedRun:
 
     @property
     def label(self) -> str:
-        """Return its name for tables and figures, with a mark unless it was flown as planned."""
+        """Its name for tables and figures, with a mark unless it was flown as planned."""
         return self.name if self.summary.as_planned else f"{self.name} {UNPLANNED}"
 
     def formation(self, cluster: str) -> Formation | None:
@@ -111,12 +72,12 @@ class RunStyle(NamedTuple):
 
 
 STYLES = (
-    RunStyle(BLUE, "-", "o"),
-    RunStyle(VERMILION, (0, (6, 2)), "s"),
-    RunStyle(GREEN, (0, (6, 2, 1.5, 2)), "^"),
-    RunStyle(PURPLE, (0, (2.5, 1.5)), "D"),
-    RunStyle(ORANGE, (0, (10, 3)), "v"),
-    RunStyle(SKY, (0, (6, 2, 1.5, 2, 1.5, 2)), "P"),
+    RunStyle(style.BLUE, "-", "o"),
+    RunStyle(style.VERMILION, (0, (6, 2)), "s"),
+    RunStyle(style.GREEN, (0, (6, 2, 1.5, 2)), "^"),
+    RunStyle(style.PURPLE, (0, (2.5, 1.5)), "D"),
+    RunStyle(style.ORANGE, (0, (10, 3)), "v"),
+    RunStyle(style.SKY, (0, (6, 2, 1.5, 2, 1.5, 2)), "P"),
 )
 
 
@@ -126,18 +87,18 @@ def run_style(index: int) -> RunStyle:
     return STYLES[place]._replace(dashes=STYLES[(index + repeats) % len(STYLES)].dashes)
 
 
-def comparison_figures(runs: Sequence[ComparedRun]) -> Iterator[ReportFigure]:
+def comparison_figures(runs: Sequence[ComparedRun]) -> Iterator[style.ReportFigure]:
     """Yield the figures for which the records have data."""
     for cluster in clusters(runs):
         yield from _of_cluster(runs, cluster)
     if any(len(track.t_ns) for run in runs for track in run.flight.tracks):
-        yield ReportFigure(
+        yield style.ReportFigure(
             "plan_view.png",
             "Plan view",
             "True paths from above, on one scale; squares: start, dots: end.",
             _draw_plans(runs),
         )
-        yield ReportFigure(
+        yield style.ReportFigure(
             "drones.png",
             "Drones",
             "True altitude, state of the firmware and battery of every drone, run by run on the same axes.",
@@ -151,11 +112,13 @@ def _across(runs: Sequence[ComparedRun]) -> int:
     return -(-len(runs) // rows)
 
 
-def _of_cluster(runs: Sequence[ComparedRun], cluster: str) -> Iterator[ReportFigure]:
+def _of_cluster(runs: Sequence[ComparedRun], cluster: str) -> Iterator[style.ReportFigure]:
     names = parameters(runs, cluster)
-    paper = all(flies_paper_test(run.flight, cluster) and not time_marks(run.flight).has(TAKE_OVER) for run in runs)
+    paper = all(
+        flies_paper_test(run.flight, cluster) and not style.time_marks(run.flight).has(style.TAKE_OVER) for run in runs
+    )
     suffix = f", cluster {cluster}" if len(clusters(runs)) > 1 else ""
-    yield ReportFigure(
+    yield style.ReportFigure(
         f"rms_{cluster}.png",
         f"Errors of the formation's parameters{suffix}",
         "Root of the mean square of truth − desired (full marks) and of estimate − desired (hollow marks) within the "
@@ -165,7 +128,7 @@ def _of_cluster(runs: Sequence[ComparedRun], cluster: str) -> Iterator[ReportFig
     for number, start in enumerate(range(0, len(runs), _across(runs))):
         some = runs[start : start + _across(runs)]
         if any(run.formation(cluster) for run in some):
-            yield ReportFigure(
+            yield style.ReportFigure(
                 f"figure_5_errors_{cluster}_{number}.png",
                 f"Formation parameters' errors{numbered(5, paper)}{suffix}",
                 "Runs side by side, each row on one scale, that of the windows (shaded), which larger errors leave.",
@@ -173,7 +136,7 @@ def _of_cluster(runs: Sequence[ComparedRun], cluster: str) -> Iterator[ReportFig
             )
     for file, number, what, group in parameter_groups(names):
         if shown := group[:ROWS_MAX]:
-            yield ReportFigure(
+            yield style.ReportFigure(
                 f"{file}_{cluster}.png",
                 f"{what}{numbered(number, paper)}{suffix}",
                 f"(a) True and (b) measured (from the estimates) {', '.join(shown)}; dotted: desired. "
@@ -185,88 +148,92 @@ def _of_cluster(runs: Sequence[ComparedRun], cluster: str) -> Iterator[ReportFig
 def _draw_rms(runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -> Figure:
     """Return the RMS errors, with a panel for metres and one for radians."""
     groups = {each: [name for name in names if unit(name) == each] for each in dict.fromkeys(map(unit, names))}
-    figure = new_figure(PAGE_IN, 1.0 + len(groups) * 0.4 + 0.16 * (len(runs) + 1) * len(names))
+    figure = style.new_figure(style.PAGE_IN, 1.0 + len(groups) * 0.4 + 0.16 * (len(runs) + 1) * len(names))
     heights = [len(group) for group in groups.values()]
     panels = figure.subplots(len(groups), 1, squeeze=False, height_ratios=heights)[:, 0]
     for axes, (measure, group) in zip(panels, groups.items(), strict=True):
-        _draw_rms_panel(axes, runs, cluster, group)
-        axes.set_xlabel(f"RMS error ({measure})", fontsize=PAPER_PT)
-    letter_panels(panels)
+        style.dress(axes)
+        lane = 1.0 / (len(runs) + 1)
+        for i, run in enumerate(runs):
+            judged, look = run.summary.clusters.get(cluster), run_style(i)
+            for row, name in enumerate(group):
+                errors = judged.errors.get(name) if judged else None
+                y = row + (i - (len(runs) - 1) / 2) * lane
+                for value, face in ((errors and errors.true_rms, look.color), (errors and errors.est_rms, "white")):
+                    if value is not None:
+                        axes.plot(value, y, look.marker, color=look.color, mfc=face, ms=7, zorder=3, clip_on=False)
+        axes.set_yticks(range(len(group)), [style.label(name) for name in group])
+        axes.set_ylim(len(group) - 0.5, -0.5)
+        axes.margins(x=ROOM)
+        axes.set_xlim(left=0)
+        for row in range(1, len(group)):
+            axes.axhline(row - 0.5, color=style.GRID, lw=0.6, zorder=1)
+        axes.grid(False, axis="y")
+        axes.set_xlabel(f"RMS error ({measure})", fontsize=style.PAPER_PT)
+    style.letter_panels(panels)
     for i, run in enumerate(runs):
         look = run_style(i)
         panels[0].plot([], [], look.marker, color=look.color, ms=7, label=run.label)
-    legend_above(figure, panels[0])
+    style.legend_above(figure, panels[0])
     return figure
-
-
-def _draw_rms_panel(axes: Axes, runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -> None:
-    dress(axes)
-    lane = 1.0 / (len(runs) + 1)
-    for i, run in enumerate(runs):
-        judged, look = run.summary.clusters.get(cluster), run_style(i)
-        for row, name in enumerate(names):
-            errors = judged.errors.get(name) if judged else None
-            y = row + (i - (len(runs) - 1) / 2) * lane
-            for value, face in ((errors and errors.true_rms, look.color), (errors and errors.est_rms, "white")):
-                if value is not None:
-                    axes.plot(value, y, look.marker, color=look.color, mfc=face, ms=7, zorder=3, clip_on=False)
-    axes.set_yticks(range(len(names)), [label(name) for name in names])
-    axes.set_ylim(len(names) - 0.5, -0.5)
-    axes.margins(x=ROOM)
-    axes.set_xlim(left=0)
-    for row in range(1, len(names)):
-        axes.axhline(row - 0.5, color=GRID, lw=0.6, zorder=1)
-    axes.grid(False, axis="y")
 
 
 def _draw_errors(
     some: Sequence[ComparedRun], runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]
 ) -> Figure:
     """Return the errors of a few runs side by side; the scale of a row is that of all runs."""
-    figure = new_figure(PAGE_IN, 0.9 + 0.7 * len(names))
+    figure = style.new_figure(style.PAGE_IN, 0.9 + 0.7 * len(names))
     grid = figure.subplots(len(names), len(some), squeeze=False, sharex=True, sharey="row")
     for run, column in zip(some, grid.T, strict=True):
         formation = run.formation(cluster)
-        column[0].set_title(run.label, fontsize=PAPER_PT)
-        label_time(column[-1:])
+        column[0].set_title(run.label, fontsize=style.PAPER_PT)
+        style.label_time(column[-1:])
         for name, axes in zip(names, column, strict=True):
             if formation and name in formation.names:
                 draw_error(axes, formation, name, np.ones(len(formation.t_s), bool))
-                shade_window(axes, run.summary.window_s)
-                draw_marks([axes], time_marks(run.flight, formation))
+                style.shade_window(axes, run.summary.window_s)
+                style.draw_marks([axes], style.time_marks(run.flight, formation))
             else:
-                dress(axes)
-                look: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": PAPER_PT - 1, "color": "#57606a"}
+                style.dress(axes)
+                look: dict[str, Any] = {
+                    "ha": "center",
+                    "va": "center",
+                    "fontsize": style.PAPER_PT - 1,
+                    "color": "#57606a",
+                }
                 axes.text(0.5, 0.5, "not in this run", transform=axes.transAxes, **look)
-    letter_panels(grid[0])
+    style.letter_panels(grid[0])
     for name, axes in zip(names, grid[:, 0], strict=True):
-        axes.set_ylabel(label(name), fontsize=PAPER_PT)
-        greatest = [_greatest_error(each, name, run) for run in runs if (each := run.formation(cluster))]
-        if limit := max(greatest, default=0.0):
+        axes.set_ylabel(style.label(name), fontsize=style.PAPER_PT)
+        limit = 0.0  # the greatest error within the window of any run
+        for run in runs:
+            formation = run.formation(cluster)
+            if formation and name in formation.names:
+                rows, i = formation.within(run.summary.window_s), formation.column(name)
+                errors = np.abs(np.r_[formation.true_error[rows, i], formation.est_error[rows, i]])
+                limit = max(limit, float(np.max(errors[np.isfinite(errors)], initial=0.0)))
+        if limit:
             axes.set_ylim(-1.15 * limit, 1.15 * limit)
     figure.align_ylabels(grid[:, 0])
-    legend_above(figure, next((axes for axes in grid[0] if axes.lines), grid[0, 0]))
+    style.legend_above(figure, next((axes for axes in grid[0] if axes.lines), grid[0, 0]))
     return figure
-
-
-def _greatest_error(formation: Formation, name: str, run: ComparedRun) -> float:
-    """Return the greatest error of a variable within the window of a run; 0 if it is not known."""
-    if name not in formation.names:
-        return 0.0
-    rows, i = formation.within(run.summary.window_s), formation.column(name)
-    errors = np.abs(np.r_[formation.true_error[rows, i], formation.est_error[rows, i]])
-    return float(np.max(errors[np.isfinite(errors)], initial=0.0))
 
 
 def _draw_parameters(runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -> Figure:
     """Return variables over time: true on the left, measured on the right, the runs over each other."""
-    lanes_in, marks = LANE_IN * len(runs), [RunMarks.of(run, cluster) for run in runs]
-    figure = new_figure(PAGE_IN, 0.9 + 1.4 * len(names) + lanes_in)
+    lanes_in, marks = LANE_IN * len(runs), []
+    for run in runs:
+        times = style.time_marks(run.flight, run.formation(cluster))
+        once = (("take-off", times.takeoff_s), ("engagement", times.engaged_s))
+        points = [(kind, t_s) for kind, t_s in once if t_s is not None]
+        points += [("collision", event.t_ns / 1e9) for event in run.flight.events if event.kind == "collision"]
+        marks.append(RunMarks(run.label, times, points))
+    figure = style.new_figure(style.PAGE_IN, 0.9 + 1.4 * len(names) + lanes_in)
     heights = [lanes_in, *[1.35] * len(names)]
     lanes, *grid = figure.subplots(len(heights), 2, squeeze=False, sharex=True, sharey="row", height_ratios=heights)
     for name, (true_axes, measured_axes) in zip(names, grid, strict=True):
-        dress(true_axes, label(name))
-        dress(measured_axes)
+        style.dress(true_axes, style.label(name))
+        style.dress(measured_axes)
         drawn: list[Array] = []
         for i, run in enumerate(runs):
             formation = run.formation(cluster)
@@ -274,25 +241,35 @@ def _draw_parameters(runs: Sequence[ComparedRun], cluster: str, names: Sequence[
                 continue
             desired, measured, true = curves(formation, name)
             look: dict[str, Any] = {"color": run_style(i).color, "ls": run_style(i).dashes, "lw": 1.3, "zorder": 3}
-            line(true_axes, formation.t_s, true, label=run.label, **look)
-            line(measured_axes, formation.t_s, measured, **look)
+            style.line(true_axes, formation.t_s, true, label=run.label, **look)
+            style.line(measured_axes, formation.t_s, measured, **look)
             for axes in (true_axes, measured_axes):
-                line(axes, formation.t_s, np.where(formation.engaged, desired, np.nan), **DESIRED)
+                style.line(axes, formation.t_s, np.where(formation.engaged, desired, np.nan), **DESIRED)
             since = formation.since_engaged
             drawn += [true, measured[since], desired[since]]
         if drawn:
-            scale(true_axes, *drawn)
-        for axes in (true_axes, measured_axes):
-            _draw_instants(axes, marks)
+            style.scale(true_axes, *drawn)
+        for place, each in enumerate(marks):  # take-off, engagement and collisions, in the colour of the run
+            for kind, t_s in each.points:
+                dashes = {"take-off": ":", "engagement": "-."}.get(kind, "-")
+                for axes in (true_axes, measured_axes):
+                    axes.axvline(t_s, color=run_style(place).color, lw=0.9, ls=dashes, alpha=0.7, zorder=1.5)
     for axes, title in zip(lanes, ("true", "measured (estimates)"), strict=True):
         _draw_lanes(axes, marks, named=axes is lanes[0])
-        axes.set_title(title, fontsize=PAPER_PT)
-    letter_panels(lanes)
-    grid[0][0].plot([], [], label="desired, while engaged", **DESIRED)
-    _name_marks(grid[0][0], marks)
-    label_time(grid[-1])
+        axes.set_title(title, fontsize=style.PAPER_PT)
+    style.letter_panels(lanes)
+    first = grid[0][0]
+    first.plot([], [], label="desired, while engaged", **DESIRED)
+    for kind in dict.fromkeys(band.kind for each in marks for band in each.marks.bands):  # without a run's colour
+        face = style.DARK if kind == style.FAULT else GREY_FACE
+        first.fill_between(
+            [], [], facecolor=face, edgecolor=style.DARK, hatch=HATCHES.get(kind, ""), lw=0.8, label=kind
+        )
+    for kind in dict.fromkeys(kind for each in marks for kind, _ in each.points):
+        first.plot([], [], POINTS[kind], color=style.DARK, ms=7, label=kind)
+    style.label_time(grid[-1])
     figure.align_ylabels([row[0] for row in grid])
-    legend_above(figure, grid[0][0])
+    style.legend_above(figure, first)
     return figure
 
 
@@ -300,17 +277,8 @@ class RunMarks(NamedTuple):
     """The marks of a run: bands, and kind and time [s] of what happened at one instant."""
 
     name: str
-    marks: TimeMarks
+    marks: style.TimeMarks
     points: list[tuple[str, float]]
-
-    @staticmethod
-    def of(run: ComparedRun, cluster: str) -> "RunMarks":
-        """Return the marks of a run, with the phases and the engagement of a cluster."""
-        marks = time_marks(run.flight, run.formation(cluster))
-        first = (("take-off", marks.takeoff_s), ("engagement", marks.engaged_s))
-        points = [(kind, t_s) for kind, t_s in first if t_s is not None]
-        points += [("collision", event.t_ns / 1e9) for event in run.flight.events if event.kind == "collision"]
-        return RunMarks(run.label, marks, points)
 
 
 def _draw_lanes(lanes: Axes, marks: Sequence[RunMarks], named: bool) -> None:
@@ -319,7 +287,7 @@ def _draw_lanes(lanes: Axes, marks: Sequence[RunMarks], named: bool) -> None:
         colour = run_style(place).color
         lanes.axhline(place, color=EMPTY, lw=1.0, zorder=1)
         for band in run.marks.bands:
-            face, hatch = FAULT_FACE if band.kind == FAULT else FACE, HATCHES.get(band.kind, "")
+            face, hatch = FAULT_FACE if band.kind == style.FAULT else FACE, HATCHES.get(band.kind, "")
             span, look = (band.from_s, band.to_s - band.from_s), {"edgecolor": colour, "lw": 0.8, "zorder": 2}
             lanes.broken_barh([span], (place - 0.36, 0.72), facecolor=(colour, face), hatch=hatch, **look)
         for kind, t_s in run.points:
@@ -329,83 +297,66 @@ def _draw_lanes(lanes: Axes, marks: Sequence[RunMarks], named: bool) -> None:
     lanes.set_yticks(range(len(marks)), short)
     for place, text in enumerate(lanes.get_yticklabels()):
         text.set_color(run_style(place).color)
-    lanes.tick_params(axis="y", length=0, labelsize=PAPER_PT - 1, labelleft=named)
+    lanes.tick_params(axis="y", length=0, labelsize=style.PAPER_PT - 1, labelleft=named)
     lanes.tick_params(axis="x", length=0, labelbottom=False)
     lanes.spines[:].set_visible(False)
-
-
-def _draw_instants(axes: Axes, marks: Sequence[RunMarks]) -> None:
-    """Draw take-off, engagement and collisions of each run through axes of curves, in its colour."""
-    for place, each in enumerate(marks):
-        for kind, t_s in each.points:
-            dashes = {"take-off": ":", "engagement": "-."}.get(kind, "-")
-            axes.axvline(t_s, color=run_style(place).color, lw=0.9, ls=dashes, alpha=0.7, zorder=1.5)
-
-
-def _name_marks(axes: Axes, marks: Sequence[RunMarks]) -> None:
-    """Name the marks of the lanes in the legend of axes, without the colour of any run."""
-    for kind in dict.fromkeys(band.kind for each in marks for band in each.marks.bands):
-        face = DARK if kind == FAULT else GREY_FACE
-        axes.fill_between([], [], facecolor=face, edgecolor=DARK, hatch=HATCHES.get(kind, ""), lw=0.8, label=kind)
-    for kind in dict.fromkeys(kind for each in marks for kind, _ in each.points):
-        axes.plot([], [], POINTS[kind], color=DARK, ms=7, label=kind)
 
 
 def _draw_plans(runs: Sequence[ComparedRun]) -> Figure:
     """Return the true paths from above, a plan per run, all on one scale."""
     across, colours = _across(runs), _drone_colours(runs)
     rows = -(-len(runs) // across)
-    figure = new_figure(PAGE_IN, 0.8 + rows * PAGE_IN / across)
+    figure = style.new_figure(style.PAGE_IN, 0.8 + rows * style.PAGE_IN / across)
     grid = figure.subplots(rows, across, squeeze=False, sharex=True, sharey=True)
     for axes in grid.flat[len(runs) :]:
         axes.set_axis_off()
     for run, axes in zip(runs, grid.flat, strict=False):
-        dress(axes)
-        axes.set_title(run.label, fontsize=PAPER_PT)
+        style.dress(axes)
+        axes.set_title(run.label, fontsize=style.PAPER_PT)
         axes.set_aspect("equal", adjustable="box")
-        draw_obstacles(axes, run.flight.scenario)
+        drones.draw_obstacles(axes, run.flight.scenario)
         for track in run.flight.tracks:
-            draw_path(axes, track, colours[track.name], named=False)
+            drones.draw_path(axes, track, colours[track.name], named=False)
     for axes in grid.flat[len(runs) - across : len(runs)]:
-        axes.set_xlabel("east x (m)", fontsize=PAPER_PT)
+        axes.set_xlabel("east x (m)", fontsize=style.PAPER_PT)
         axes.tick_params(labelbottom=True)
     for axes in grid[:, 0]:
-        axes.set_ylabel("north y (m)", fontsize=PAPER_PT)
+        axes.set_ylabel("north y (m)", fontsize=style.PAPER_PT)
     (left, right), (low, high) = grid[0, 0].get_xlim(), grid[0, 0].get_ylim()
     half = 0.52 * max(right - left, high - low)  # of the square range that all plans have
     grid[0, 0].set_xlim((left + right) / 2 - half, (left + right) / 2 + half)
     grid[0, 0].set_ylim((low + high) / 2 - half, (low + high) / 2 + half)
-    letter_panels(grid.flat[: len(runs)])
+    style.letter_panels(grid.flat[: len(runs)])
     _name_drones(figure, grid[0, 0], colours)
     return figure
 
 
 def _draw_drones(runs: Sequence[ComparedRun]) -> Figure:
     """Return true altitude, state and battery of every drone, a column per run."""
-    heights = drone_panel_heights(max(len(run.flight.tracks) for run in runs))
+    heights = drones.drone_panel_heights(max(len(run.flight.tracks) for run in runs))
     across, colours = _across(runs), _drone_colours(runs)
     rows = -(-len(runs) // across)
-    figure = new_figure(PAGE_IN, (1.0 + 0.6 * sum(heights)) * rows)
+    figure = style.new_figure(style.PAGE_IN, (1.0 + 0.6 * sum(heights)) * rows)
     grid = figure.subplots(3 * rows, across, squeeze=False, sharex=True, height_ratios=heights * rows)
     for axes in grid.flat:
         axes.set_axis_off()
     for index, run in enumerate(runs):
         row, column = divmod(index, across)
         panels = list(grid[3 * row : 3 * row + 3, column])
-        for axes, quantity in zip(panels, DRONE_PANELS, strict=True):
+        for axes, quantity in zip(panels, drones.DRONE_PANELS, strict=True):
             axes.set_axis_on()
-            dress(axes, quantity if column == 0 and quantity != "state" else "")
-        panels[0].set_title(run.label, fontsize=PAPER_PT)
-        draw_drone_panels(panels, run.flight.tracks, colours, named=0)
+            style.dress(axes, quantity if column == 0 and quantity != "state" else "")
+        panels[0].set_title(run.label, fontsize=style.PAPER_PT)
+        drones.draw_drone_panels(panels, run.flight.tracks, colours, named=0)
         panels[-1].tick_params(labelbottom=True)
-        draw_marks(panels, time_marks(run.flight, run.formations[0] if run.formations else None))
-    letter_panels([grid[3 * (index // across), index % across] for index in range(len(runs))])
+        style.draw_marks(panels, style.time_marks(run.flight, run.formations[0] if run.formations else None))
+    style.letter_panels([grid[3 * (index // across), index % across] for index in range(len(runs))])
     for kind in (0, 2):  # one range of altitudes, and one of charges
         drawn = [each for each in grid[kind::3].flat if each.lines]
         limits = [each.get_ylim() for each in drawn]
         for each in drawn:
             each.set_ylim(min(low for low, _ in limits), max(high for _, high in limits))
-    name_states(figure, [track for run in runs for track in run.flight.tracks])
+    drones.name_states(figure, [track for run in runs for track in run.flight.tracks])
     _name_drones(figure, grid[0, 0], colours)
     return figure
 
@@ -418,6 +369,6 @@ def _drone_colours(runs: Sequence[ComparedRun]) -> dict[str, str]:
 def _name_drones(figure: Figure, axes: Axes, colours: Mapping[str, str]) -> None:
     """Name the drones in the legend, of many the first and the last."""
     named = list(colours.items())
-    for name, colour in named if len(named) <= NAMED_MAX else (named[0], named[-1]):
+    for name, colour in named if len(named) <= drones.NAMED_MAX else (named[0], named[-1]):
         axes.plot([], [], color=colour, lw=1.1, label=name)
-    legend_above(figure, axes)
+    style.legend_above(figure, axes)

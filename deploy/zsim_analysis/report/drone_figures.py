@@ -4,7 +4,8 @@ Few drones have a line, or a column, each; many are drawn as their spread.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import reduce
 from typing import Any
 
@@ -19,48 +20,15 @@ from scipy.special import chdtri
 from zsim.presentation import colours_of, drone_colours
 from zsim.scenario.obstacle import BOX, CENTRE, COSINE, HALF, SHAPE, SINE, row_of
 from zsim.scenario.scenario import Scenario
-from zsim_analysis.reading.drone_errors import (
-    DEGREES,
-    POSITION,
-    SIGMAS,
-    Distances,
-    EstimateErrors,
-    Separations,
-    VelocityResponse,
-)
+from zsim_analysis.reading import drone_errors
 from zsim_analysis.reading.formation import Formation, common_instants
 from zsim_analysis.reading.recorded_flight import Array, RecordedFlight, Track
-from zsim_analysis.report.figure_style import (
-    AMBER,
-    BLACK,
-    BLUE,
-    COLUMN_IN,
-    DARK,
-    GREEN,
-    GREY,
-    ORANGE,
-    PAGE_IN,
-    PAPER_PT,
-    PURPLE,
-    SKY,
-    VERMILION,
-    TimeMarks,
-    draw_marks,
-    draw_spread,
-    dress,
-    finish,
-    label_time,
-    legend_above,
-    letter_panels,
-    line,
-    new_figure,
-    thinned,
-)
+from zsim_analysis.report import figure_style as style
 
 EACH_MAX = 4  # drones with a column each on a page
 PAIRS_MAX = 6  # pairs with a line each: of four drones
 NAMED_MAX = 12  # drones in a legend
-SMALL_PT = PAPER_PT - 1.5
+SMALL_PT = style.PAPER_PT - 1.5
 
 # Plan view
 
@@ -72,10 +40,10 @@ RING_MAX = 4  # drones whose outline passes through them in their order; of more
 
 def draw_plan(flight: RecordedFlight, formations: Sequence[Formation]) -> Figure:
     """Return the true paths from above with the outlines of the formations at some instants."""
-    figure = new_figure(COLUMN_IN, 1.15 * COLUMN_IN)
+    figure = style.new_figure(style.COLUMN_IN, 1.15 * style.COLUMN_IN)
     axes = figure.subplots()
-    dress(axes, "north y (m)")
-    axes.set_xlabel("east x (m)", fontsize=PAPER_PT)
+    style.dress(axes, "north y (m)")
+    axes.set_xlabel("east x (m)", fontsize=style.PAPER_PT)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(ROOM)
     draw_obstacles(axes, flight.scenario)
@@ -87,15 +55,15 @@ def draw_plan(flight: RecordedFlight, formations: Sequence[Formation]) -> Figure
         if "x_c" in formation.names and len(formation.t_s):
             desired = np.where(formation.engaged[:, None], formation.desired, np.nan)
             x, y = (desired[:: max(1, len(desired) // 4000), formation.column(name)] for name in ("x_c", "y_c"))
-            axes.plot(x, y, color=BLACK, lw=0.9, zorder=3, label=f"{formation.name}, desired")
+            axes.plot(x, y, color=style.BLACK, lw=0.9, zorder=3, label=f"{formation.name}, desired")
         _draw_outlines(axes, formation, flight.tracks)
-    legend_above(figure, axes, columns=3)
+    style.legend_above(figure, axes, columns=3)
     return figure
 
 
 def draw_obstacles(axes: Axes, scenario: Scenario | None) -> None:
     """Draw the outlines of a scenario's obstacles from above; rows as in `zsim.scenario.obstacle`."""
-    look: dict[str, Any] = {"facecolor": "#8c959f99", "edgecolor": DARK, "hatch": "///", "lw": 1.0, "zorder": 1.5}
+    look: dict[str, Any] = {"facecolor": "#8c959f99", "edgecolor": style.DARK, "hatch": "///", "lw": 1.0, "zorder": 1.5}
     for number, obstacle in enumerate(scenario.environment.obstacles if scenario else ()):
         row = row_of(obstacle)
         x, y, a = row[CENTRE], row[CENTRE + 1], row[HALF]
@@ -121,45 +89,31 @@ def draw_path(axes: Axes, track: Track, colour: str, named: bool) -> None:
 
 
 def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) -> None:
+    """Draw the outlines of a formation with their times, at instants at which they do not cover each other."""
     members = [track for name in formation.drones for track in tracks if track.name == name]
-    for number, (t_s, p_W) in enumerate(outlines(members)):
-        ring = p_W if len(p_W) <= RING_MAX else _hull(p_W)
-        name = None if number else f"{formation.name}, at times"
-        axes.fill(ring[:, 0], ring[:, 1], facecolor="#0000000d", edgecolor=DARK, lw=0.7, zorder=4, label=name)
-        out = p_W[0] - p_W.mean(axis=0)
-        axes.annotate(
-            f"{t_s:.0f} s",
-            p_W[0],
-            xytext=9 * out / max(float(np.linalg.norm(out)), 1e-9),
-            textcoords="offset points",
-            ha="center",
-            va="center",
-            fontsize=SMALL_PT,
-            zorder=6,
-            bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
-        )
-
-
-def _hull(p_W: Array) -> Array:
-    """Return the corners (h, 2) of the convex hull of positions (n, 2); all of them if they are collinear."""
-    try:
-        return p_W[ConvexHull(p_W).vertices]
-    except QhullError:
-        return p_W
-
-
-def outlines(members: Sequence[Track]) -> Iterator[tuple[float, Array]]:
-    """Yield times [s] and positions (n, 2) [m] at which the outlines of a formation do not cover each other."""
-    t_ns, places = common_instants(list(members))
+    t_ns, places = common_instants(members)
     if not len(t_ns):
         return
-    p_W = np.stack([track.p_W[place, :2] for track, place in zip(members, places, strict=True)], axis=1)
+    paths_W = np.stack([track.p_W[place, :2] for track, place in zip(members, places, strict=True)], axis=1)
     drawn: list[Array] = []
     for k in np.linspace(len(t_ns) - 1, 0, OUTLINES).astype(int):
-        size = np.linalg.norm(p_W[k] - p_W[k].mean(axis=0), axis=1).max()
-        if all(np.linalg.norm(p_W[k] - other, axis=1).max() > APART * size for other in drawn):
-            drawn.append(p_W[k])
-            yield float(t_ns[k]) / 1e9, p_W[k]
+        p_W = paths_W[k]
+        centre = p_W.mean(axis=0)
+        size = np.linalg.norm(p_W - centre, axis=1).max()
+        if any(np.linalg.norm(p_W - other, axis=1).max() <= APART * size for other in drawn):
+            continue
+        ring = p_W
+        if len(p_W) > RING_MAX:
+            with suppress(QhullError):  # collinear
+                ring = p_W[ConvexHull(p_W).vertices]
+        name = None if drawn else f"{formation.name}, at times"
+        drawn.append(p_W)
+        axes.fill(ring[:, 0], ring[:, 1], facecolor="#0000000d", edgecolor=style.DARK, lw=0.7, zorder=4, label=name)
+        out = p_W[0] - centre
+        offset = 9 * out / max(float(np.linalg.norm(out)), 1e-9)
+        look: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "center", "fontsize": SMALL_PT}
+        look["bbox"] = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8}
+        axes.annotate(f"{t_ns[k] / 1e9:.0f} s", p_W[0], xytext=offset, zorder=6, **look)
 
 
 # Altitude, state and battery
@@ -168,34 +122,34 @@ LANES_IN = 5.0  # height of all states, half of it on the page; more drones shar
 LANES_NAMED = 12  # drones named beside their states, at most
 DRONE_PANELS = ("true altitude (m)", "state", "battery (%)")
 STATES = {
-    "landed": GREY,
-    "taking_off": ORANGE,
-    "hovering": SKY,
-    "flying": BLUE,
-    "landing": PURPLE,
-    "emergency": VERMILION,
+    "landed": style.GREY,
+    "taking_off": style.ORANGE,
+    "hovering": style.SKY,
+    "flying": style.BLUE,
+    "landing": style.PURPLE,
+    "emergency": style.VERMILION,
 }
 
 
-def draw_drones(flight: RecordedFlight, marks: TimeMarks) -> Figure:
+def draw_drones(flight: RecordedFlight, marks: style.TimeMarks) -> Figure:
     """Return altitude, state and battery of every drone over the run."""
     count = len(flight.tracks)
     heights = drone_panel_heights(count)
-    figure = new_figure(COLUMN_IN, 1.6 + 0.5 * sum(heights))
+    figure = style.new_figure(style.COLUMN_IN, 1.6 + 0.5 * sum(heights))
     panels = figure.subplots(3, 1, sharex=True, height_ratios=heights)
     for axes, quantity in zip(panels, DRONE_PANELS, strict=True):
-        dress(axes, quantity)
+        style.dress(axes, quantity)
     colours = colours_of([track.name for track in flight.tracks])
     draw_drone_panels(panels, flight.tracks, colours, count if count <= NAMED_MAX else 0)
     name_states(figure, flight.tracks)
-    draw_marks(panels, marks)
-    letter_panels(panels)
+    style.draw_marks(panels, marks)
+    style.letter_panels(panels)
     figure.align_ylabels()
-    legend_above(figure, panels[0], columns=3)
+    style.legend_above(figure, panels[0], columns=3)
     if count > NAMED_MAX:  # the colours change gradually from the first drone to the last
         ends = [list(colours.items())[place] for place in (0, -1)]
         handles = [Line2D([], [], color=colour, lw=1.5, label=name) for name, colour in ends]
-        look: dict[str, Any] = {"fontsize": PAPER_PT - 1, "title_fontsize": PAPER_PT - 1, "frameon": False}
+        look: dict[str, Any] = {"fontsize": style.PAPER_PT - 1, "title_fontsize": style.PAPER_PT - 1, "frameon": False}
         panels[0].legend(handles=handles, loc="best", title="from … to", **look)
     return figure
 
@@ -209,21 +163,21 @@ def draw_drone_panels(panels: Sequence[Axes], tracks: Sequence[Track], colours: 
     """Draw drones into the axes of DRONE_PANELS, in the given colours; the legend names the first `named`."""
     altitude, state, battery = panels
     for lane, track in enumerate(tracks):
-        style = {"color": colours[track.name], "lw": 0.9, "label": track.name if lane < named else None}
-        line(altitude, track.t_ns / 1e9, track.p_W[:, 2], **style)
-        line(battery, track.status_t_ns / 1e9, track.battery_percent, **style)
+        look = {"color": colours[track.name], "lw": 0.9, "label": track.name if lane < named else None}
+        style.line(altitude, track.t_ns / 1e9, track.p_W[:, 2], **look)
+        style.line(battery, track.status_t_ns / 1e9, track.battery_percent, **look)
         if track.states:
             states = np.array(track.states)
             starts = np.flatnonzero(np.r_[True, states[1:] != states[:-1]])
             edges = np.r_[track.status_t_ns[starts], track.status_t_ns[-1]] / 1e9
             for start, left, right in zip(starts, edges[:-1], edges[1:], strict=True):
-                colour = STATES.get(states[start], GREEN)
+                colour = STATES.get(states[start], style.GREEN)
                 state.broken_barh([(left, right - left)], (lane - 0.36, 0.72), color=colour)
     step = -(-len(tracks) // LANES_NAMED)
     state.set_yticks(range(0, len(tracks), step), [track.name for track in tracks[::step]])
     state.set_ylim(len(tracks) - 0.5, -0.5)
     state.grid(False)
-    label_time([battery])
+    style.label_time([battery])
 
 
 def name_states(figure: Figure, tracks: Sequence[Track]) -> None:
@@ -231,8 +185,8 @@ def name_states(figure: Figure, tracks: Sequence[Track]) -> None:
     occur = [name for name in STATES if any(name in track.states for track in tracks)]
     handles = [Patch(color=STATES[name], label=name.replace("_", " ")) for name in occur]
     if handles:
-        columns = 3 if figure.get_size_inches()[0] <= COLUMN_IN else 6
-        look = {"frameon": False, "fontsize": PAPER_PT, "columnspacing": 1.2, "handlelength": 1.2}
+        columns = 3 if figure.get_size_inches()[0] <= style.COLUMN_IN else 6
+        look = {"frameon": False, "fontsize": style.PAPER_PT, "columnspacing": 1.2, "handlelength": 1.2}
         figure.legend(handles=handles, loc="outside lower center", ncols=min(columns, len(handles)), **look)
 
 
@@ -246,47 +200,50 @@ FLOOR = 0.1  # of NEES on its logarithmic axis
 
 
 def draw_estimates(
-    errors: Mapping[str, EstimateErrors], colours: Mapping[str, str], window_s: tuple[float, float], marks: TimeMarks
+    errors: Mapping[str, drone_errors.EstimateErrors],
+    colours: Mapping[str, str],
+    window_s: tuple[float, float],
+    marks: style.TimeMarks,
 ) -> Figure:
     """Return estimate − truth with its band, and NEES, of every drone; of many their spread."""
     if len(errors) > EACH_MAX:
         return _draw_many_estimates(errors, colours, window_s, marks)
-    figure = new_figure(PAGE_IN, 0.8 + 0.95 * (len(ERRORS) + 1))
+    figure = style.new_figure(style.PAGE_IN, 0.8 + 0.95 * (len(ERRORS) + 1))
     grid = figure.subplots(len(ERRORS) + 1, len(errors), squeeze=False, sharex=True, sharey="row")
     for (name, each), column in zip(errors.items(), grid.T, strict=True):
         rows = _rows(each, window_s)
         inside, known = each.share_inside(rows), each.nees[rows][np.isfinite(each.nees[rows])]
         for i, axes in enumerate(column[:-1]):
-            dress(axes)
-            at, half = thinned(each.t_s, SIGMAS * each.sigma[:, i])
-            band = f"±{SIGMAS:g}σ as stated"
+            style.dress(axes)
+            at, half = style.thinned(each.t_s, drone_errors.SIGMAS * each.sigma[:, i])
+            band = f"±{drone_errors.SIGMAS:g}σ as stated"
             axes.fill_between(at, -half, half, color=BAND_GREY, alpha=0.45, lw=0, zorder=1, label=band)
-            axes.axhline(0, color=BLACK, lw=0.5, zorder=1)
+            axes.axhline(0, color=style.BLACK, lw=0.5, zorder=1)
             look: dict[str, Any] = {"color": colours[name], "lw": 0.6, "zorder": 3, "label": "estimate − truth"}
-            line(axes, each.t_s, each.error[:, i], **look)
+            style.line(axes, each.t_s, each.error[:, i], **look)
         _draw_nees(column[-1], each.t_s, each.nees, colours[name])
-        notes = [f"{100 * share:.0f} % in {SIGMAS:g}σ" for share in inside]
-        notes.append(f"mean {known.mean():.3g}, of {DEGREES}" if len(known) else "P is singular")
-        column[0].set_title(name, loc="left", fontsize=PAPER_PT)
+        notes = [f"{100 * share:.0f} % in {drone_errors.SIGMAS:g}σ" for share in inside]
+        notes.append(f"mean {known.mean():.3g}, of {drone_errors.DEGREES}" if len(known) else "P is singular")
+        column[0].set_title(name, loc="left", fontsize=style.PAPER_PT)
         for axes, note in zip(column, notes, strict=True):  # above the axes, where it covers no curve
             axes.set_title(note, loc="right", fontsize=SMALL_PT, pad=2.0)
-        draw_marks(column, marks)
+        style.draw_marks(column, marks)
     since_s = -np.inf if marks.engaged_s is None else marks.engaged_s  # the large sigmas of the start leave the axes
     for i, row in enumerate(grid[:-1]):
         reach = 0.0
         for each in errors.values():
             rows = each.t_s >= since_s
-            seen = np.maximum(np.abs(each.error[rows, i]), SIGMAS * each.sigma[rows, i])
+            seen = np.maximum(np.abs(each.error[rows, i]), drone_errors.SIGMAS * each.sigma[rows, i])
             reach = max(reach, float(np.nanmax(seen, initial=0.0)))
         if reach > 0:
             row[0].set_ylim(-1.05 * reach, 1.05 * reach)
     for axes, quantity in zip(grid[:, 0], (*ERRORS, "NEES"), strict=True):
-        axes.set_ylabel(quantity, fontsize=PAPER_PT)
-    finish(figure, grid[0], grid, 7)
+        axes.set_ylabel(quantity, fontsize=style.PAPER_PT)
+    style.finish(figure, grid[0], grid, 7)
     return figure
 
 
-def _rows(errors: EstimateErrors, window_s: tuple[float, float]) -> np.ndarray:
+def _rows(errors: drone_errors.EstimateErrors, window_s: tuple[float, float]) -> np.ndarray:
     """Return which instants are within the window; all if none is."""
     rows = (errors.t_s >= window_s[0]) & (errors.t_s <= window_s[1])
     return rows if rows.any() else np.ones(len(rows), bool)
@@ -294,58 +251,65 @@ def _rows(errors: EstimateErrors, window_s: tuple[float, float]) -> np.ndarray:
 
 def _draw_nees(axes: Axes, t_s: Array, nees: Array, colour: str, of: int = 1) -> None:
     """Draw NEES, or its mean over `of` drones, with the range that holds nineteen of twenty consistent ones."""
-    dress(axes)
-    low, high = (float(chdtri(of * DEGREES, share)) / of for share in (0.975, 0.025))
+    style.dress(axes)
+    low, high = (float(chdtri(of * drone_errors.DEGREES, share)) / of for share in (0.975, 0.025))
     axes.axhspan(low, high, zorder=0.6, label=CONSISTENT, fc="none", ec=BAND_GREY, hatch="////", lw=0.0)
-    line(axes, t_s, np.maximum(nees, FLOOR), color=colour, lw=0.6, zorder=3)
+    style.line(axes, t_s, np.maximum(nees, FLOOR), color=colour, lw=0.6, zorder=3)
     axes.set_yscale("log")
-    axes.tick_params(which="both", labelsize=PAPER_PT - 1)
+    axes.tick_params(which="both", labelsize=style.PAPER_PT - 1)
 
 
 def _draw_many_estimates(
-    errors: Mapping[str, EstimateErrors], colours: Mapping[str, str], window_s: tuple[float, float], marks: TimeMarks
+    errors: Mapping[str, drone_errors.EstimateErrors],
+    colours: Mapping[str, str],
+    window_s: tuple[float, float],
+    marks: style.TimeMarks,
 ) -> Figure:
     """Return position error and mean NEES over time, and the statistics of each drone within the window."""
     t_s = reduce(np.intersect1d, (each.t_s for each in errors.values()))  # at which all drones have estimates
     places = [np.searchsorted(each.t_s, t_s) for each in errors.values()]
     pairs = list(zip(errors.values(), places, strict=True))
-    distance = np.column_stack([np.linalg.norm(each.error[place][:, POSITION], axis=1) for each, place in pairs])
+    distance = np.column_stack(
+        [np.linalg.norm(each.error[place][:, drone_errors.POSITION], axis=1) for each, place in pairs]
+    )
     nees = np.column_stack([each.nees[place] for each, place in pairs]).mean(axis=1)
-    figure = new_figure(PAGE_IN, 3.6)
+    figure = style.new_figure(style.PAGE_IN, 3.6)
     grid = figure.subplots(2, 2, width_ratios=(1.3, 1), sharex="col")
-    dress(grid[0, 0], "position error (m)")
-    draw_spread(grid[0, 0], t_s, distance, BLUE)
+    style.dress(grid[0, 0], "position error (m)")
+    style.draw_spread(grid[0, 0], t_s, distance, style.BLUE)
     judged = t_s >= (marks.engaged_s or 0.0)  # before it, the noise of the start would set the scale
     grid[0, 0].set_ylim(0.0, 1.1 * float(np.max(distance[judged], initial=0.0)) or None)
-    _draw_nees(grid[1, 0], t_s, nees, BLUE, of=len(errors))
+    _draw_nees(grid[1, 0], t_s, nees, style.BLUE, of=len(errors))
     grid[1, 0].set_yscale("linear")
-    grid[1, 0].set_ylabel(f"NEES, mean of {len(errors)}", fontsize=PAPER_PT)
-    draw_marks(grid[:, 0], marks)
-    label_time(grid[1:, 0])
+    grid[1, 0].set_ylabel(f"NEES, mean of {len(errors)}", fontsize=style.PAPER_PT)
+    style.draw_marks(grid[:, 0], marks)
+    style.label_time(grid[1:, 0])
     numbers, look = np.arange(1, len(errors) + 1), {"c": [colours[name] for name in errors], "s": 14, "zorder": 3}
-    rms, stated, inside = np.array([_statistics(each, _rows(each, window_s)) for each in errors.values()]).T
+    statistics = []  # of each drone: RMS position error [m], the stated one [m], mean share of x, y, z within SIGMAS
+    for each in errors.values():
+        rows = _rows(each, window_s)
+        squares = (
+            np.mean(np.sum(part[rows][:, drone_errors.POSITION] ** 2, axis=1)) for part in (each.error, each.sigma)
+        )
+        statistics.append((*map(np.sqrt, squares), each.share_inside(rows)[list(drone_errors.POSITION)].mean()))
+    rms, stated, inside = np.array(statistics).T
     upper, lower = grid[:, 1]
-    dress(upper, "RMS (m)")
+    style.dress(upper, "RMS (m)")
     upper.scatter(numbers, rms, clip_on=False, **look)
-    upper.plot(numbers, stated, "_", color=BLACK, ms=5, zorder=2, label="σ as stated", clip_on=False)
+    upper.plot(numbers, stated, "_", color=style.BLACK, ms=5, zorder=2, label="σ as stated", clip_on=False)
     upper.set_ylim(bottom=0)
-    upper.set_title("each drone, within the window", fontsize=PAPER_PT)
-    dress(lower, f"x, y, z in {SIGMAS:g}σ (%)")
+    upper.set_title("each drone, within the window", fontsize=style.PAPER_PT)
+    style.dress(lower, f"x, y, z in {drone_errors.SIGMAS:g}σ (%)")
     lower.scatter(numbers, 100 * inside, clip_on=False, **look)
-    lower.axhline(100 * INSIDE, color=BLACK, lw=0.7, ls="--", label=f"share of a normal error in {SIGMAS:g}σ")
+    lower.axhline(
+        100 * INSIDE, color=style.BLACK, lw=0.7, ls="--", label=f"share of a normal error in {drone_errors.SIGMAS:g}σ"
+    )
     lower.set_ylim(top=101)
-    lower.set_xlabel("drone, in the order of the scenario", fontsize=PAPER_PT)
-    letter_panels(grid.flat)
+    lower.set_xlabel("drone, in the order of the scenario", fontsize=style.PAPER_PT)
+    style.letter_panels(grid.flat)
     figure.align_ylabels()
-    legend_above(figure, grid[0, 0], columns=6)
+    style.legend_above(figure, grid[0, 0], columns=6)
     return figure
-
-
-def _statistics(errors: EstimateErrors, rows: np.ndarray) -> tuple[float, float, float]:
-    """Return RMS position error [m], the stated one [m], and the mean share of x, y and z within SIGMAS."""
-    rms = np.sqrt(np.mean(np.sum(errors.error[rows][:, POSITION] ** 2, axis=1)))
-    stated = np.sqrt(np.mean(np.sum(errors.sigma[rows][:, POSITION] ** 2, axis=1)))
-    return float(rms), float(stated), float(errors.share_inside(rows)[list(POSITION)].mean())
 
 
 # Velocities and distances
@@ -354,26 +318,28 @@ VELOCITIES = ("forward (m/s)", "left (m/s)", "up (m/s)", "yaw rate (rad/s)")
 GAP_S = 0.5  # a drone without commands for longer is not flown by velocity, and its lines break
 
 
-def draw_velocities(responses: Mapping[str, VelocityResponse], colours: Mapping[str, str], marks: TimeMarks) -> Figure:
+def draw_velocities(
+    responses: Mapping[str, drone_errors.VelocityResponse], colours: Mapping[str, str], marks: style.TimeMarks
+) -> Figure:
     """Return commanded and flown velocity of every drone; of many the spread of their difference."""
     if len(responses) > EACH_MAX:
         return _draw_many_velocities(responses, marks)
-    figure = new_figure(PAGE_IN, 0.8 + 0.85 * len(VELOCITIES))
+    figure = style.new_figure(style.PAGE_IN, 0.8 + 0.85 * len(VELOCITIES))
     grid = figure.subplots(len(VELOCITIES), len(responses), squeeze=False, sharex=True, sharey="row")
     for (name, each), column in zip(responses.items(), grid.T, strict=True):
-        column[0].set_title(name, fontsize=PAPER_PT)
+        column[0].set_title(name, fontsize=style.PAPER_PT)
         gaps = np.diff(each.t_s, prepend=each.t_s[0]) > GAP_S
         for i, axes in enumerate(column):
-            dress(axes, VELOCITIES[i] if axes is grid[i, 0] else "")
+            style.dress(axes, VELOCITIES[i] if axes is grid[i, 0] else "")
             flown, commanded = (np.where(gaps, np.nan, values[:, i]) for values in (each.flown, each.commanded))
-            line(axes, each.t_s, flown, color=colours[name], lw=0.6, zorder=3, label="flown")
-            line(axes, each.t_s, commanded, color=BLACK, lw=1.0, zorder=2, label="commanded")
-        draw_marks(column, marks)
-    finish(figure, grid[0], grid, 7)
+            style.line(axes, each.t_s, flown, color=colours[name], lw=0.6, zorder=3, label="flown")
+            style.line(axes, each.t_s, commanded, color=style.BLACK, lw=1.0, zorder=2, label="commanded")
+        style.draw_marks(column, marks)
+    style.finish(figure, grid[0], grid, 7)
     return figure
 
 
-def _draw_many_velocities(responses: Mapping[str, VelocityResponse], marks: TimeMarks) -> Figure:
+def _draw_many_velocities(responses: Mapping[str, drone_errors.VelocityResponse], marks: style.TimeMarks) -> Figure:
     """Return the spread of flown − commanded over all drones."""
     t_s = reduce(np.union1d, (each.t_s for each in responses.values()))
     panels = ("horizontal (m/s)", "up (m/s)", "yaw rate (rad/s)")
@@ -382,42 +348,45 @@ def _draw_many_velocities(responses: Mapping[str, VelocityResponse], marks: Time
         error = each.flown - each.commanded
         columns = np.hypot(error[:, 0], error[:, 1]), error[:, 2], error[:, 3]
         values[:, np.searchsorted(t_s, each.t_s), k] = columns
-    figure = new_figure(COLUMN_IN, 4.0)
+    figure = style.new_figure(style.COLUMN_IN, 4.0)
     grid = figure.subplots(len(panels), 1, squeeze=False, sharex=True)
     for axes, quantity, table in zip(grid[:, 0], panels, values, strict=True):
-        dress(axes, quantity)
-        draw_spread(axes, t_s, table, BLUE)
-    grid[0, 0].set_title("flown − commanded", fontsize=PAPER_PT)
-    draw_marks(grid[:, 0], marks)
-    finish(figure, grid[:, 0], grid, 3)
+        style.dress(axes, quantity)
+        style.draw_spread(axes, t_s, table, style.BLUE)
+    grid[0, 0].set_title("flown − commanded", fontsize=style.PAPER_PT)
+    style.draw_marks(grid[:, 0], marks)
+    style.finish(figure, grid[:, 0], grid, 3)
     return figure
 
 
 def draw_distances(
-    distances: Distances, separations: Separations, colours: Mapping[str, str], marks: TimeMarks
+    distances: drone_errors.Distances,
+    separations: drone_errors.Separations,
+    colours: Mapping[str, str],
+    marks: style.TimeMarks,
 ) -> Figure:
     """Return the distances of every pair in the colours of both, and their limits; of many those to the nearest."""
-    figure = new_figure(COLUMN_IN, 2.5)
+    figure = style.new_figure(style.COLUMN_IN, 2.5)
     axes = figure.subplots()
     if distances.pairs:
-        dress(axes, "distance (m)")
+        style.dress(axes, "distance (m)")
         for (one, other), column in zip(distances.pairs, distances.between.T, strict=True):
             look = {"color": colours[one], "gapcolor": colours[other], "ls": (0, (4, 4)), "lw": 1.0}
             axes.plot(distances.t_s, column, label=f"{one} – {other}", **look)
     else:
-        dress(axes, "nearest drone (m)")
-        draw_spread(axes, distances.t_s, distances.nearest, BLUE)
+        style.dress(axes, "nearest drone (m)")
+        style.draw_spread(axes, distances.t_s, distances.nearest, style.BLUE)
     axes.set_ylim(bottom=0)
-    draw_marks([axes], marks)
+    style.draw_marks([axes], marks)
     for distance_m, name, colour, dashes in (
-        (separations.margin_m, "guard parts", AMBER, "--"),
-        (separations.alarm_m, "alarm", VERMILION, "-."),
-        (separations.touch_m, "hulls touch", VERMILION, "-"),
+        (separations.margin_m, "guard parts", style.AMBER, "--"),
+        (separations.alarm_m, "alarm", style.VERMILION, "-."),
+        (separations.touch_m, "hulls touch", style.VERMILION, "-"),
     ):
         if distance_m:
             axes.axhline(distance_m, color=colour, lw=0.8, ls=dashes, zorder=1.8)
             place = {"ha": "right", "va": "bottom", "transform": axes.get_yaxis_transform(), "zorder": 7}
             axes.text(0.995, distance_m, f"{name}: {distance_m:.2g} m", color=colour, fontsize=SMALL_PT, **place)
-    label_time([axes])
-    legend_above(figure, axes, columns=3)
+    style.label_time([axes])
+    style.legend_above(figure, axes, columns=3)
     return figure

@@ -1,7 +1,7 @@
 """What all figures share: colours, axes, lines, legends, spreads of many lines, and marks of time on their axes."""
 
 import io
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from textwrap import wrap
 from typing import Any
 
@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from msgspec import Struct
 
-from zsim.contract.run_messages import Event
 from zsim.scenario.faults import PROCESS_KILL
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.formation import Formation
@@ -52,13 +51,13 @@ class ReportFigure(Struct, frozen=True):
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """Return width and height of its PNG file, by which a browser lays out the page before it has loaded it."""
+        """Width and height of its PNG file, by which a browser lays out the page before it has loaded it."""
         width, height = self.drawing.get_size_inches() * self.drawing.dpi
         return round(width), round(height)
 
     @property
     def is_column(self) -> bool:
-        """Return whether it is as wide as a column, two of which fit a page."""
+        """Whether it is as wide as a column, two of which fit a page."""
         return self.drawing.get_size_inches()[0] <= COLUMN_IN
 
     def png(self) -> bytes:
@@ -94,7 +93,6 @@ def dress(axes: Axes, label: str = "") -> None:
 
 
 def label_time(axes: Iterable[Axes]) -> None:
-    """Label the time axes of panels."""
     for each in axes:
         each.set_xlabel("simulated time (s)", fontsize=PAPER_PT)
 
@@ -126,11 +124,11 @@ def line(axes: Axes, x: Array, y: Array, **style: Any) -> None:
     axes.plot(*thinned(x, y), **style)
 
 
-def thinned(x: Array, y: Array, points: int = POINTS) -> tuple[Array, Array]:
-    """Return a line of at most `points` points: minimum and maximum of each bin, so that no extreme is lost."""
-    if len(x) <= points:
+def thinned(x: Array, y: Array) -> tuple[Array, Array]:
+    """Return a line of at most POINTS points: minimum and maximum of each bin, so that no extreme is lost."""
+    if len(x) <= POINTS:
         return x, y
-    size = -(-len(x) // (points // 2))
+    size = -(-len(x) // (POINTS // 2))
     starts = np.arange(0, len(x), size)
     bins = np.full((len(starts), size), np.nan)
     bins.flat[: len(x)] = y
@@ -143,11 +141,7 @@ def thinned(x: Array, y: Array, points: int = POINTS) -> tuple[Array, Array]:
 def draw_spread(axes: Axes, t_s: Array, values: Array, colour: str) -> None:
     """Draw many lines as their median, the band that holds nine of ten, and their extremes, none of which is lost.
 
-    Args:
-        axes: to draw into.
-        t_s: (K,) simulated time.
-        values: (K, N), NaN where unknown.
-        colour: of the spread.
+    t_s is (K,) simulated time, values (K, N), NaN where unknown.
     """
     known = np.isfinite(values).any(axis=1)
     t_s, values = t_s[known], values[known]
@@ -192,30 +186,17 @@ def legend_above(figure: Figure, axes: Axes, columns: int = 8) -> None:
     for each in (axes, *figure.axes):
         for handle, name in zip(*each.get_legend_handles_labels(), strict=True):
             named.setdefault(name, handle)
-    handles, labels = list(named.values()), list(named)
-    if handles:
-        longest = (ENTRY_EMS + LETTER_EMS * max(map(len, labels))) * PAPER_PT / 72  # inches
-        columns = min(columns, max(1, int(figure.get_size_inches()[0] / longest)))
-        figure.legend(
-            handles,
-            labels,
-            loc="outside upper center",
-            ncols=min(columns, len(handles)),
-            frameon=False,
-            fontsize=PAPER_PT,
-            columnspacing=1.2,
-            handlelength=1.6,
-        )
+    if named:
+        longest = (ENTRY_EMS + LETTER_EMS * max(map(len, named))) * PAPER_PT / 72  # inches
+        columns = min(columns, max(1, int(figure.get_size_inches()[0] / longest)), len(named))
+        look: Any = {"frameon": False, "fontsize": PAPER_PT, "columnspacing": 1.2, "handlelength": 1.6}
+        figure.legend(list(named.values()), list(named), loc="outside upper center", ncols=columns, **look)
 
 
 def mark_figure(figure: Figure, head: str, reason: str, colour: str) -> None:
-    """Write a warning about its flight above a figure, in space of its own.
+    """Write a warning about its flight above a complete figure, which grows by the height of the mark.
 
-    Args:
-        figure: complete, with its legend; it grows by the height of the mark.
-        head: the first line.
-        reason: wrapped below it, cut after MARK_LINES lines.
-        colour: of the text.
+    `head` is the first line; `reason` is wrapped below it, and cut after MARK_LINES lines.
     """
     width_in, height_in = figure.get_size_inches()
     letters = int(72 * width_in / (MARK_EMS * PAPER_PT))
@@ -255,64 +236,40 @@ class Band(Struct, frozen=True):
 
 
 class TimeMarks(Struct, frozen=True):
-    """Marks on the time axes of a flight; times [s], None where it never happened.
+    """Marks on the time axes of a flight; times [s], None where it never happened."""
 
-    Attributes:
-        takeoff_s: of the first drone.
-        engaged_s: of the formation.
-        bands: phases, faults and take-overs.
-        span_s: the run, which every time axis shows whole; None: only what is drawn.
-    """
-
-    takeoff_s: float | None = None
-    engaged_s: float | None = None
-    bands: tuple[Band, ...] = ()
-    span_s: tuple[float, float] | None = None
+    takeoff_s: float | None = None  # of the first drone
+    engaged_s: float | None = None  # of the formation
+    bands: tuple[Band, ...] = ()  # phases, faults and take-overs
+    span_s: tuple[float, float] | None = None  # the run, which every time axis shows whole; None: only what is drawn
 
     def has(self, kind: str) -> bool:
-        """Return whether there is a band of a kind."""
         return any(band.kind == kind for band in self.bands)
 
 
 def time_marks(flight: RecordedFlight, formation: Formation | None = None) -> TimeMarks:
     """Return the marks of a flight, with the phases and the engagement of a formation."""
-    bands = united([*_faults(flight), *_take_overs(flight), *(_phases(formation) if formation else ())])
-    takeoffs_s = [
-        track.status_t_ns[track.states.index("taking_off")] / 1e9
-        for track in flight.tracks
-        if "taking_off" in track.states
-    ]
+    bands = [*_faults(flight), *_take_overs(flight)]
+    if formation and formation.phases:  # those other than idle and engaged
+        phases = np.array(formation.phases)
+        starts = np.flatnonzero(np.r_[True, phases[1:] != phases[:-1]])
+        ends = np.r_[formation.t_s[starts[1:]], formation.t_s[-1]]
+        for start, end_s in zip(starts, ends, strict=True):
+            kind = ASSEMBLY.get(str(phases[start]), str(phases[start]))
+            if kind in COLOURS:
+                bands.append(Band(kind, float(formation.t_s[start]), float(end_s)))
+    climbing = [track for track in flight.tracks if "taking_off" in track.states]
+    takeoffs_s = [track.status_t_ns[track.states.index("taking_off")] / 1e9 for track in climbing]
     start_s = flight.first_ns / 1e9 if flight.replay_of else 0.0  # a replay may begin anywhere
     engaged_s = formation.engaged_s if formation else None
-    return TimeMarks(min(takeoffs_s, default=None), engaged_s, tuple(bands), (start_s, flight.last_ns / 1e9))
-
-
-def united(bands: Iterable[Band]) -> list[Band]:
-    """Return bands with those of a kind that overlap or touch united, so that those of several drones are one."""
-    by_kind: dict[str, list[Band]] = {}
-    for band in bands:
-        by_kind.setdefault(band.kind, []).append(band)
-    one: list[Band] = []
-    for kind, own in by_kind.items():
-        for band in sorted(own, key=lambda band: band.from_s):
-            if one and one[-1].kind == kind and band.from_s <= one[-1].to_s:
-                one[-1] = Band(kind, one[-1].from_s, max(one[-1].to_s, band.to_s))
-            else:
-                one.append(band)
-    return one
-
-
-def _phases(formation: Formation) -> Iterator[Band]:
-    """Yield the phases of a formation other than idle and engaged."""
-    phases = np.array(formation.phases)
-    if not len(phases):
-        return
-    starts = np.flatnonzero(np.r_[True, phases[1:] != phases[:-1]])
-    ends = np.r_[formation.t_s[starts[1:]], formation.t_s[-1]]
-    for start, end_s in zip(starts, ends, strict=True):
-        kind = ASSEMBLY.get(str(phases[start]), str(phases[start]))
-        if kind in COLOURS:
-            yield Band(kind, float(formation.t_s[start]), float(end_s))
+    kinds = list(dict.fromkeys(band.kind for band in bands))
+    united: list[Band] = []  # those of a kind that overlap or touch, such as of several drones, are one
+    for band in sorted(bands, key=lambda band: (kinds.index(band.kind), band.from_s)):
+        if united and united[-1].kind == band.kind and band.from_s <= united[-1].to_s:
+            united[-1] = Band(band.kind, united[-1].from_s, max(united[-1].to_s, band.to_s))
+        else:
+            united.append(band)
+    return TimeMarks(min(takeoffs_s, default=None), engaged_s, tuple(united), (start_s, flight.last_ns / 1e9))
 
 
 def _faults(flight: RecordedFlight) -> Iterator[Band]:
@@ -321,46 +278,31 @@ def _faults(flight: RecordedFlight) -> Iterator[Band]:
     for place, event in enumerate(flight.events):
         if event.kind == "fault":
             end_ns = ends.get(event.data.get("id"))
-            if end_ns is None and event.data.get("kind") == PROCESS_KILL:
-                end_ns = _return_ns(event, flight.events[place + 1 :])
+            if end_ns is None and event.data.get("kind") == PROCESS_KILL:  # until the process takes part again
+                later = (each for each in flight.events[place + 1 :] if each.subject == event.subject)
+                if back := next((each for each in later if each.kind in RETURNS), None):
+                    done_ns = back.data.get("done_ns", back.t_ns)  # the last gate of its predecessor
+                    is_known = isinstance(done_ns, int)
+                    end_ns = max(event.t_ns, min(back.t_ns, done_ns)) if is_known else back.t_ns
             yield Band(FAULT, event.t_ns / 1e9, (flight.last_ns if end_ns is None else end_ns) / 1e9)
-
-
-def _return_ns(kill: Event, later: Sequence[Event]) -> int | None:
-    """Return the simulated instant from which a killed process takes part again, None if it never does."""
-    for event in later:
-        if event.kind in RETURNS and event.subject == kill.subject:
-            done_ns = event.data.get("done_ns", event.t_ns)  # the last gate of its predecessor, where it continues
-            return max(kill.t_ns, min(event.t_ns, done_ns)) if isinstance(done_ns, int) else event.t_ns
-    return None
 
 
 def _take_overs(flight: RecordedFlight) -> Iterator[Band]:
     """Yield the times in which others than a controller flew a drone: from acquisition or first command to release."""
     since_ns: dict[str, int] = {}
     for event in flight.events:
-        if (change := _commander(event)) is None:
+        op, drone, args = event.kind, event.subject, event.data.get("args")
+        if event.kind == "control" and event.data.get("ok") is True and isinstance(args, dict):
+            op, drone = event.subject, args.get("drone")
+        if op not in ("commander", "acquire", "release") or not isinstance(drone, str):
             continue
-        drone, commander = change
+        commander = "" if op == "release" else event.source
         if commander and not commander.startswith(CONTROLLER):
             since_ns.setdefault(drone, event.t_ns)
         elif (begun_ns := since_ns.pop(drone, None)) is not None:
             yield Band(TAKE_OVER, begun_ns / 1e9, event.t_ns / 1e9)
     for begun_ns in since_ns.values():
         yield Band(TAKE_OVER, begun_ns / 1e9, flight.last_ns / 1e9)
-
-
-def _commander(event: Event) -> tuple[str, str] | None:
-    """Return a drone and its new commander, "" for nobody, by an event; None if the event changes no commander."""
-    if event.kind in ("commander", "release"):
-        return event.subject, event.source if event.kind == "commander" else ""
-    args = event.data.get("args")
-    if event.kind != "control" or event.data.get("ok") is not True or not isinstance(args, dict):
-        return None
-    drone = args.get("drone")
-    if not isinstance(drone, str) or event.subject not in ("acquire", "release"):
-        return None
-    return drone, event.source if event.subject == "acquire" else ""
 
 
 def draw_marks(axes: Iterable[Axes], marks: TimeMarks, whole: bool = True) -> None:
@@ -382,5 +324,4 @@ def draw_marks(axes: Iterable[Axes], marks: TimeMarks, whole: bool = True) -> No
 
 
 def shade_window(axes: Axes, window_s: tuple[float, float]) -> None:
-    """Shade the window of the statistics on a time axis."""
     axes.axvspan(*window_s, color=WINDOW_GREY, lw=0, zorder=0, label=WINDOW)

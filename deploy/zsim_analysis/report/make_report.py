@@ -21,18 +21,11 @@ from zsim_analysis.reading.formation import Formation, formations_of, goal_error
 from zsim_analysis.reading.recorded_flight import RecordedFlight, read_flight
 from zsim_analysis.reading.shortfall import seconds_text, span_text
 from zsim_analysis.report import FORMATS
-from zsim_analysis.report.drone_figures import (
-    PAIRS_MAX,
-    draw_distances,
-    draw_drones,
-    draw_estimates,
-    draw_plan,
-    draw_velocities,
-)
+from zsim_analysis.report import drone_figures as drones
 from zsim_analysis.report.figure_style import DARK, TAKE_OVER, VERMILION, ReportFigure, mark_figure, time_marks
 from zsim_analysis.report.formation_figures import ROWS_MAX, draw_errors, draw_parameters, numbered, parameter_groups
 from zsim_analysis.report.paper import PAPER_NOTE, flies_paper_test
-from zsim_analysis.report.summary import PAPER_COLUMN, EventLine, RunSummary, error_table, summarise
+from zsim_analysis.report.summary import PAPER_COLUMN, RunSummary, error_table, summarise
 
 FAULTS_MAX = 6  # at the head of a page
 REFERENCE = (
@@ -48,12 +41,7 @@ Picture = tuple[ReportFigure, bytes]  # a figure and its PNG file
 def make_report(
     directory: Path, progress: Callable[[str], None] = lambda _: None, formats: Sequence[str] = ()
 ) -> RunSummary:
-    """Read DIR/run.mcap, write DIR/summary.json, DIR/figures/*.png and DIR/report.html.
-
-    Args:
-        directory: the run directory.
-        progress: called with a text at each step.
-        formats: of `zsim_analysis.report.FORMATS`, in which each figure is written too.
+    """Read DIR/run.mcap, write DIR/summary.json, DIR/figures/*.png and DIR/report.html, as `write_report`.
 
     Raises:
         RecordError: there is no record, or it holds no truth of any drone.
@@ -70,10 +58,7 @@ def judge(
 ) -> tuple[RecordedFlight, list[Formation], RunSummary]:
     """Return the flight of a record, its formations and its summary.
 
-    Args:
-        record: its path.
-        progress: called with a text at each step.
-        answers: include the drones' estimates and velocity commands.
+    With `answers` it includes the drones' estimates and velocity commands. `progress` receives a text at each step.
 
     Raises:
         RecordError: there is no record, or it holds no truth of any drone.
@@ -116,22 +101,22 @@ def _unmarked(
             "Plan view",
             "True paths from above, squares where they begin and dots where they end; black: desired centroid; grey: "
             "the formation at some instants of simulated time.",
-            draw_plan(flight, formations),
+            drones.draw_plan(flight, formations),
         )
-    if apart := distances(flight, PAIRS_MAX):
+    if apart := distances(flight, drones.PAIRS_MAX):
         what = "every two drones" if apart.pairs else "each drone to the nearest other one: median, 5 to 95 %, extremes"
         yield ReportFigure(
             "distances.png",
             "Distances between drones",
             f"True distance of {what}; below the first line the controller's guard parts them.",
-            draw_distances(apart, separations(flight), colours, marks),
+            drones.draw_distances(apart, separations(flight), colours, marks),
         )
     if has_truth:
         yield ReportFigure(
             "drones.png",
             "Drones",
             "True altitude, state of the firmware and battery of every drone.",
-            draw_drones(flight, marks),
+            drones.draw_drones(flight, marks),
         )
     if errors := estimate_errors(flight):
         yield ReportFigure(
@@ -141,7 +126,7 @@ def _unmarked(
             "of position and velocity squared and divided by its covariance: 6 on average where that is true. Shares "
             "and means, above the panels, are those of the window; the axes hold all since the engagement, and what is "
             "larger before it leaves them.",
-            draw_estimates(errors, colours, window_s, marks),
+            drones.draw_estimates(errors, colours, window_s, marks),
         )
     if responses := velocity_responses(flight):
         yield ReportFigure(
@@ -149,7 +134,7 @@ def _unmarked(
             "Commanded and flown velocity",
             "By the drone's heading. Flown: in truth; commanded: as sent by whoever flew the drone, without the delay "
             "of the link. Of many drones: median, 5 to 95 % and extremes of the difference.",
-            draw_velocities(responses, colours, marks),
+            drones.draw_velocities(responses, colours, marks),
         )
 
 
@@ -181,7 +166,6 @@ def _of_cluster(
 
 
 def page(summary: RunSummary, pictures: Sequence[Picture]) -> str:
-    """Return report.html."""
     return template("page.html.j2").render(
         summary=summary,
         facts=facts(summary),
@@ -201,7 +185,16 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
     seed = "–" if summary.seed is None else summary.seed
     separation = summary.min_separation_m
     versions = dict.fromkeys(version for name, version in summary.versions.items() if name != "report")
-    misses = "not known"
+    kinds, misses = {each.kind for each in summary.shortfalls}, "not known"
+    but_for = {
+        "as far as the run went": "early" in kinds,
+        "but for what others asked or flew": bool(kinds & {"override", "request"}),
+        "but for a short hold": "held" in kinds,
+    }
+    planned = ", ".join(part for part, holds in but_for.items() if holds) or "yes"
+    begun = [event for event in summary.events if event.kind == "fault"]
+    faults = [f"{event.text.removesuffix(' begins')} at {seconds_text(event.t_s)} s" for event in begun[:FAULTS_MAX]]
+    faults += [f"{len(begun) - FAULTS_MAX} more"] if len(begun) > FAULTS_MAX else []
     if summary.deadline_misses is not None:
         by = ", ".join(f"{name} {count}" for name, count in summary.deadline_misses_by.items() if count)
         misses = f"{summary.deadline_misses} of {summary.deadlines or 0}{f' ({by})' if by else ''}"
@@ -212,8 +205,8 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
         ("Version", ", ".join(versions) or "not known"),
         ("Mode", summary.mode or "not known"),
         ("Ended", summary.ended),
-        ("Flown as planned", _planned(summary)),
-        *(("Injected faults", text) for text in _faults(summary.events)),
+        ("Flown as planned", planned if summary.as_planned else "no"),
+        *([("Injected faults", ", ".join(faults))] if faults else []),
         ("Record", summary.record.state),
         ("Simulated", f"{summary.sim_s:.2f} s in {summary.wall_s:.2f} s of wall time, real-time factor {factor}"),
         ("Deadlines missed", misses),
@@ -233,27 +226,6 @@ def changed_text(changed: Sequence[str] | None) -> str:
 def date_text(date: str | None) -> str:
     """Return a date of ISO 8601 to the minute, for readers."""
     return f"{date[:16].replace('T', ' ')} UTC" if date else "not known"
-
-
-def _planned(summary: RunSummary) -> str:
-    if not summary.as_planned:
-        return "no"
-    kinds = {each.kind for each in summary.shortfalls}
-    parts = {
-        "as far as the run went": "early" in kinds,
-        "but for what others asked or flew": bool(kinds & {"override", "request"}),
-        "but for a short hold": "held" in kinds,
-    }
-    return ", ".join(part for part, holds in parts.items() if holds) or "yes"
-
-
-def _faults(events: Sequence[EventLine]) -> Iterator[str]:
-    """Yield one text about the injected faults, if there were any."""
-    begun = [event for event in events if event.kind == "fault"]
-    faults = [f"{event.text.removesuffix(' begins')} at {seconds_text(event.t_s)} s" for event in begun[:FAULTS_MAX]]
-    more = [f"{len(begun) - FAULTS_MAX} more"] if len(begun) > FAULTS_MAX else []
-    if faults:
-        yield ", ".join([*faults, *more])
 
 
 def template(name: str, package: str = "zsim_analysis.report") -> Template:

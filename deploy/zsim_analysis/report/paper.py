@@ -15,21 +15,14 @@ from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, STOCK
 from zsim_agents.formation.expression import Expression, ExpressionError
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.trajectory import TrajectoryError, named_values
-from zsim_analysis.reading.formation import Formation
+from zsim_analysis.reading.formation import Formation, cluster_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 
 # Table I: standard deviation of the formation parameters for Test 1 after steady state; m and rad.
 PAPER_TABLE_1 = {
-    "x_c": 0.11,
-    "y_c": 0.22,
-    "z_c": 0.13,
-    "roll": 0.004,
-    "pitch": 0.0025,
-    "yaw": 0.044,
-    "p": 0.032,
-    "q": 0.035,
-    "beta": 0.012,
-}
+    "x_c": 0.11, "y_c": 0.22, "z_c": 0.13, "roll": 0.004, "pitch": 0.0025, "yaw": 0.044,
+    "p": 0.032, "q": 0.035, "beta": 0.012,
+}  # fmt: skip
 
 PAPER_NOTE = (
     "With GPS errors of 2.0 m that are independent from drone to drone, the error of a distance between two "
@@ -42,16 +35,9 @@ PAPER_NOTE = (
 
 # Equation (3): the final position of Test 1; m and rad.
 TEST_1_TARGET = {
-    "x_c": 5.0,
-    "y_c": -5.0,
-    "z_c": 15.0,
-    "roll": 0.0,
-    "pitch": 0.0,
-    "yaw": math.pi / 2,
-    "p": 4.0,
-    "q": 4.0,
-    "beta": math.pi / 4,
-}
+    "x_c": 5.0, "y_c": -5.0, "z_c": 15.0, "roll": 0.0, "pitch": 0.0, "yaw": math.pi / 2,
+    "p": 4.0, "q": 4.0, "beta": math.pi / 4,
+}  # fmt: skip
 # Equation (4): the trajectory of Test 2 in t [s]; m and rad.
 TEST_2_F_HZ = 0.01
 TEST_2_REFERENCE = {
@@ -81,9 +67,14 @@ def paper_table_of(flight: RecordedFlight, formation: Formation, window_s: tuple
 
 def paper_table(scenario: Scenario, cluster: str) -> Mapping[str, float]:
     """Return Table I for a cluster whose scenario is Test 1, and lasts long enough; empty for any other one."""
-    own = [each for each in scenario.clusters if each.name == cluster]
-    flies = any(_is_set_up(scenario, c) and _is_judged(scenario, c.plan) and _is_led(c) for c in own)
-    return PAPER_TABLE_1 if flies else {}
+    own, window_s = cluster_of(scenario, cluster), scenario.report.window_s
+    if own is None or window_s is None or own.plan.takeoff_s is None:
+        return {}
+    # the window is within the run, after the formation has settled, and as long as the paper's
+    start, end = window_s
+    over_s = min(scenario.duration_s, scenario.duration_s if own.plan.land_s is None else own.plan.land_s)
+    is_judged = start >= own.plan.takeoff_s + SETTLED_S and end - start >= JUDGED_S and end <= over_s
+    return PAPER_TABLE_1 if is_judged and _is_set_up(scenario, own) and _is_led(own) else {}
 
 
 def flies_paper_test(flight: RecordedFlight, cluster: str) -> bool:
@@ -91,8 +82,8 @@ def flies_paper_test(flight: RecordedFlight, cluster: str) -> bool:
     scenario = flight.scenario
     if scenario is None or any(event.kind == "fault" for event in flight.events):
         return False
-    own = [each for each in scenario.clusters if each.name == cluster and _is_set_up(scenario, each)]
-    return any(_is_led(each) or _is_along_equation_4(each.plan) for each in own)
+    own = cluster_of(scenario, cluster)
+    return own is not None and _is_set_up(scenario, own) and (_is_led(own) or _is_along_equation_4(own.plan))
 
 
 def _is_set_up(scenario: Scenario, cluster: Cluster) -> bool:
@@ -133,16 +124,6 @@ def _is_printed(drone: Drone) -> bool:
         for name, section in PRESETS["paper"].items()
     }
     return drone == plain and not more and {name: getattr(sensors, name) for name in STOCK} == printed
-
-
-def _is_judged(scenario: Scenario, plan: ClusterPlan) -> bool:
-    """Return whether the window is within the run, after the formation has settled, and as long as the paper's."""
-    window_s = scenario.report.window_s
-    if window_s is None or plan.takeoff_s is None:
-        return False
-    start, end = window_s
-    over_s = min(scenario.duration_s, scenario.duration_s if plan.land_s is None else plan.land_s)
-    return start >= plan.takeoff_s + SETTLED_S and end - start >= JUDGED_S and end <= over_s
 
 
 def _is_led(cluster: Cluster) -> bool:

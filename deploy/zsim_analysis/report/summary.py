@@ -1,7 +1,7 @@
 """summary.json: what a run was and how well it flew; and its tables of errors, for the page and the terminal."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from rich.text import Text
 
 from zsim import __version__
 from zsim.contract.fingerprint import TruthHash
-from zsim.contract.run_messages import Event
 from zsim.errors import printable
 from zsim.presentation import Column, FittedTable
 from zsim_agents.formation.spaces.cluster_space import unit
@@ -50,21 +49,14 @@ class EventLine(Struct, frozen=True):
 
 
 class ClusterErrors(Struct, frozen=True):
-    """How one cluster flew within the window.
+    """How one cluster flew within the window."""
 
-    Attributes:
-        drones: of the cluster.
-        errors: over the instants of the window at which it was engaged; None each if it never was.
-        paper_std: Table I beside a flight of Test 1, otherwise empty.
-        engaged_share: share of the window's instants at which it was engaged; None without any.
-        phases: shares of the window's instants by phase.
-    """
-
-    drones: tuple[str, ...]
+    drones: tuple[str, ...]  # of the cluster
+    # over the instants of the window at which it was engaged; None each if it never was
     errors: dict[str, ParameterErrors]
-    paper_std: dict[str, float] = {}
-    engaged_share: float | None = None
-    phases: dict[str, float] = {}
+    paper_std: dict[str, float] = {}  # Table I beside a flight of Test 1, otherwise empty
+    engaged_share: float | None = None  # share of the window's instants at which it was engaged; None without any
+    phases: dict[str, float] = {}  # shares of the window's instants by phase
 
     @property
     def part(self) -> str:
@@ -77,66 +69,45 @@ class ClusterErrors(Struct, frozen=True):
 
 
 class RecordFacts(Struct, frozen=True):
-    """The record from which the report was made.
-
-    Attributes:
-        complete: nothing that the world published is missing, nor the end of the run.
-        state: that, and what is missing, in words.
-        gates: on record.
-        gates_missing: by the clocks.
-        gaps: runs of missing gates: their number, and the first and the last of them.
-        messages_missing: of the world, by their sequence numbers.
-        undecoded: messages that are not of the type of their key.
-        truth_instants: truth messages in the hash: those of simulated drones.
-        truth_missing: truth messages that a complete run of this length would have in addition.
-        truth_sha256: as TruthHash of all truth messages, by time, then in the order of the drones.
-    """
+    """The record from which the report was made."""
 
     messages: int
-    complete: bool
-    state: str
-    gates: int
-    gates_missing: int
-    gaps: list[dict[str, float]]
-    messages_missing: int
-    undecoded: int
-    truth_instants: int
-    truth_missing: int
-    truth_sha256: str
+    complete: bool  # nothing that the world published is missing, nor the end of the run
+    state: str  # that, and what is missing, in words
+    gates: int  # on record
+    gates_missing: int  # by the clocks
+    gaps: list[dict[str, float]]  # runs of missing gates: their number, and the first and the last of them
+    messages_missing: int  # of the world, by their sequence numbers
+    undecoded: int  # messages that are not of the type of their key
+    truth_instants: int  # truth messages in the hash: those of simulated drones
+    truth_missing: int  # truth messages that a complete run of this length would have in addition
+    truth_sha256: str  # as TruthHash of all truth messages, by time, then in the order of the drones
 
 
 class RunSummary(Struct, frozen=True):
-    """The content of summary.json; None if the record does not show a value.
-
-    Attributes:
-        date: when it was flown, to the second in UTC (ISO 8601).
-        changed: texts `a.b.c=value` by which the scenario differs from its file.
-        as_planned: the flight followed its plan, as far as the run went; `shortfalls` has the deviations.
-        links: to the aircraft that flew as external drones, by drone.
-        window_note: why the window is not that of the scenario, empty if it is.
-    """
+    """The content of summary.json; None if the record does not show a value."""
 
     scenario: str | None
     seed: int | None
     mode: str | None
     run_id: str | None
-    date: str | None
-    changed: list[str] | None
+    date: str | None  # when it was flown, to the second in UTC (ISO 8601)
+    changed: list[str] | None  # texts `a.b.c=value` by which the scenario differs from its file
     versions: dict[str, str]
     fingerprint: str | None
     real_time_factor: float | None
     wall_s: float
     sim_s: float
     ended: str
-    as_planned: bool
+    as_planned: bool  # the flight followed its plan, as far as the run went; `shortfalls` has the deviations
     shortfalls: list[Shortfall]
     deadlines: int | None
     deadline_misses: int | None
     deadline_misses_by: dict[str, int]
     command_age_ms: dict[str, float] | None
-    links: dict[str, DriverLink]
+    links: dict[str, DriverLink]  # to the aircraft that flew as external drones, by drone
     window_s: tuple[float, float]
-    window_note: str
+    window_note: str  # why the window is not that of the scenario, empty if it is
     errors: dict[str, ParameterErrors]
     clusters: dict[str, ClusterErrors]
     min_separation_m: float | None
@@ -149,7 +120,6 @@ class RunSummary(Struct, frozen=True):
     notes: list[str]
 
     def json(self) -> bytes:
-        """Return the text of summary.json."""
         return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
 
 
@@ -171,7 +141,18 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         for f in formations
     }
     wall_s, span_s = end.get("wall_s", flight.wall_s), (flight.last_ns - flight.first_ns) / 1e9
-    lines, left_out = _event_lines(flight.events)
+    ended = str(end.get("reason", "ended"))
+    if not flight.end:  # a record without an end does not show which process died
+        at, cut = f"{flight.last_ns / 1e9:.2f} s", not flight.completeness.closed
+        ended = f"the record {'was cut after' if cut else 'ends here at'} {at}: no end is on record"
+    lines: list[EventLine] = []
+    kept, left_out = Counter[str](), Counter[str]()
+    for event in flight.events:
+        if kept[event.kind] >= EVENTS_PER_KIND or len(lines) >= EVENTS_MAX:
+            left_out[event.kind] += 1
+        else:
+            kept[event.kind] += 1
+            lines.append(EventLine(event.t_ns / 1e9, event.kind, event.source, event.subject, event.text))
     participant = ("name", "role", "host", "pid", "incarnations", "left")
     began = datetime.fromtimestamp(flight.began_ns // 10**9, UTC).isoformat() if flight.began_ns else None
     return RunSummary(
@@ -190,7 +171,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         real_time_factor=end.get("real_time_factor", span_s / wall_s if wall_s > 0 else None),
         wall_s=wall_s,
         sim_s=end.get("sim_s", span_s if flight.replay_of else flight.last_ns / 1e9),
-        ended=_ended(flight),
+        ended=ended,
         as_planned=as_planned,
         shortfalls=short,
         deadlines=end.get("deadlines"),
@@ -205,7 +186,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         min_separation_m=min_separation_m(flight.tracks),
         paper_table_1=PAPER_TABLE_1,
         events=lines,
-        events_left_out=left_out,
+        events_left_out=dict(left_out),
         participants=[{name: getattr(each, name) for name in participant} for each in flight.processes],
         truth_sha256=end.get("truth_sha256", facts.truth_sha256),
         record=facts,
@@ -240,34 +221,8 @@ def _record_facts(flight: RecordedFlight, last_ns: int) -> RecordFacts:
     )
 
 
-def _ended(flight: RecordedFlight) -> str:
-    """Return why the run ended; a record without an end does not show which process died."""
-    if flight.end:
-        return str(flight.end.get("reason", "ended"))
-    at = f"{flight.last_ns / 1e9:.2f} s"
-    return f"the record {'ends here at' if flight.completeness.closed else 'was cut after'} {at}: no end is on record"
-
-
-def _event_lines(events: list[Event]) -> tuple[list[EventLine], dict[str, int]]:
-    """Return the first events of every kind, and how many of each kind were left out."""
-    kept: Counter[str] = Counter()
-    left_out: Counter[str] = Counter()
-    lines = []
-    for event in events:
-        if kept[event.kind] >= EVENTS_PER_KIND or len(lines) >= EVENTS_MAX:
-            left_out[event.kind] += 1
-            continue
-        kept[event.kind] += 1
-        lines.append(EventLine(event.t_ns / 1e9, event.kind, event.source, event.subject, event.text))
-    return lines, dict(left_out)
-
-
 def _notes(
-    flight: RecordedFlight,
-    record: RecordFacts,
-    formations: list[Formation],
-    window_s: tuple[float, float],
-    window_note: str,
+    flight: RecordedFlight, record: RecordFacts, formations: list[Formation], window_s: tuple[float, float], note: str
 ) -> Iterator[str]:
     """Yield what a reader should know about the figures."""
     if flight.replay_of:
@@ -288,8 +243,8 @@ def _notes(
     reported = (flight.end or {}).get("truth_sha256")
     if reported and reported != record.truth_sha256:
         yield f"The truth on record has the hash {record.truth_sha256}, the world reported {reported}."
-    if window_note:
-        yield window_note
+    if note:
+        yield note
     judged = {formation.name for formation in formations}
     external = {track.name for track in flight.tracks if track.external}
     for cluster in flight.clusters:
@@ -353,31 +308,23 @@ def error_table(cluster: ClusterErrors) -> ErrorTable:
     single = ErrorTable(columns, rows)
     if len(cluster.errors) <= SINGLY_MAX:
         return single
-    return ErrorTable(list(GROUP_COLUMNS), list(_group_rows(cluster)), single)
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.4f}"
-
-
-def _group_rows(cluster: ClusterErrors) -> Iterator[list[str]]:
-    """Yield a row per group: its size, the root of its mean square errors, and the parameter with the largest RMS."""
+    # of each group its size, the root of its mean square errors, and the parameter with the largest RMS
+    rows = []
     groups: dict[tuple[str, str], list[str]] = {}
     for name in cluster.errors:
         kind = FRAME.get(name) or ("headings" if name.startswith("phi") else "shape")
         groups.setdefault((kind, unit(name)), []).append(name)
     for (kind, measure), names in groups.items():
-        est, true = ([getattr(cluster.errors[name], each) for name in names] for each in ("est_rms", "true_rms"))
-        known = {name: value for name, value in zip(names, true, strict=True) if value is not None}
-        worst = max(known, key=lambda name: known[name]) if known else ""
-        rest = (_number(_together(est)), _number(_together(true)), _number(known.get(worst)), worst or "–")
-        yield [f"{kind} ({measure})", str(len(names)), *rest]
+        est = {name: value for name in names if (value := cluster.errors[name].est_rms) is not None}
+        true = {name: value for name in names if (value := cluster.errors[name].true_rms) is not None}
+        means = (float(np.sqrt(np.mean(np.square([*each.values()])))) if each else None for each in (est, true))
+        worst = max(true, key=lambda name: true[name], default="")
+        rows.append([f"{kind} ({measure})", str(len(names)), *map(_number, (*means, true.get(worst))), worst or "–"])
+    return ErrorTable(list(GROUP_COLUMNS), rows, single)
 
 
-def _together(values: Sequence[float | None]) -> float | None:
-    """Return the root of the mean square of the known values."""
-    known = [value for value in values if value is not None]
-    return float(np.sqrt(np.mean(np.square(known)))) if known else None
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4f}"
 
 
 def terminal_text(summary: RunSummary) -> Group:

@@ -40,8 +40,12 @@ class DaskPool:
         self._address = address
         self._say = say
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # errors that end the sweep are raised
+
+        async def connect_once() -> None:
+            await (await connect(address, timeout=CONNECT_S)).close()
+
         try:
-            asyncio.run(_connect(address))  # first, since a client takes long to give up
+            asyncio.run(connect_once())  # first, since a client takes long to give up
             self._client: Any = Client(address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
             reason = " ".join(str(error).split()) or type(error).__name__
@@ -56,25 +60,33 @@ class DaskPool:
         pending: dict[str, Task] = {}
         try:
             with self._client:
-                self._await_workers()
+                if not self._client.nthreads():
+                    at = self._address
+                    self._say(f"waiting for workers at {at}; start `dask worker {at}` on every host")
+                    self._client.wait_for_workers(1)
+                versions = self._client.run(_version, on_error="return")
+                for worker, version in versions.items():
+                    if version != __version__:
+                        present = f"zsim {version}" if isinstance(version, str) else reason_of(version)
+                        must = f"must have zsim {__version__}"
+                        raise RunError(f"--dask {self._address}: worker {worker} has {present}; {must}")
+                self._say(f"{len(versions)} Dask worker{'s'[: len(versions) != 1]} at {self._address}")
                 flying: Any = _as_completed(loop=self._client.loop)
                 self._fill(flying, pending, tasks)
                 for future in flying:
-                    yield self._row(future, pending.pop(future.key))
+                    task = pending.pop(future.key)
+                    try:
+                        row = future.result()
+                    except KilledWorker:
+                        row = failed_row(task, "several workers died of it, see Dask's allowed-failures")
+                    except CancelledError:
+                        raise
+                    except Exception as error:  # raised by `fly`: every further run would fail as well
+                        raise RunError(f"--dask {self._address}: {reason_of(error)}") from error
+                    yield row
                     self._fill(flying, pending, tasks)
         except (OSError, CancelledError) as error:  # broken links are OSErrors too
             raise RunError(f"--dask {self._address}: the cluster is gone; the same command goes on") from error
-
-    def _await_workers(self) -> None:
-        if not self._client.nthreads():
-            self._say(f"waiting for workers at {self._address}; start `dask worker {self._address}` on every host")
-            self._client.wait_for_workers(1)
-        versions = self._client.run(_version, on_error="return")
-        for worker, version in versions.items():
-            if version != __version__:
-                present = f"zsim {version}" if isinstance(version, str) else reason_of(version)
-                raise RunError(f"--dask {self._address}: worker {worker} has {present}; must have zsim {__version__}")
-        self._say(f"{len(versions)} Dask worker{'s'[: len(versions) != 1]} at {self._address}")
 
     def _fill(self, flying: Any, pending: dict[str, Task], tasks: Iterator[Task]) -> None:
         """Submit tasks up to AHEAD per thread of the cluster; new workers may join at any time."""
@@ -85,21 +97,6 @@ class DaskPool:
             future = self._client.submit(fly_alone, task, key=f"zsim-{id(self)}-{task.run}", pure=False)
             pending[future.key] = task
             flying.add(future)
-
-    def _row(self, future: Any, task: Task) -> Row:
-        try:
-            return future.result()
-        except KilledWorker:
-            return failed_row(task, "several workers died of it, see Dask's allowed-failures")
-        except CancelledError:
-            raise
-        except Exception as error:  # raised by `fly`: every further run would fail as well
-            raise RunError(f"--dask {self._address}: {reason_of(error)}") from error
-
-
-async def _connect(address: str) -> None:
-    link = await connect(address, timeout=CONNECT_S)
-    await link.close()
 
 
 def _version() -> str:

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 import msgspec
-import numpy as np
 from msgspec import UNSET, Struct
 
 from zsim import __version__
@@ -46,25 +45,16 @@ _VALUE = re.compile(r" is [^;]*")  # the part of a fault that differs from run t
 
 
 class SweepPlan(Struct, frozen=True, kw_only=True):
-    """One scenario and its variations: the same plan gives the same runs, on any host and in any order.
+    """One scenario and its variations: the same plan gives the same runs, on any host and in any order."""
 
-    Attributes:
-        source: name of the scenario's file, for messages.
-        document: the file with the overrides of the command line, presets not yet expanded.
-        vary: texts of `--vary`, in their order.
-        runs: their number; a plan with more runs begins with the same ones.
-        records: whether every run keeps its record.
-        changed: texts `a.b.c=value` by which the command line differs from the file; None: not known.
-        version: of zsim; another one need not give the same numbers.
-    """
-
-    source: str
-    document: dict[str, Any]
-    vary: tuple[str, ...]
-    runs: int
-    records: bool = False
+    source: str  # name of the scenario's file, for messages
+    document: dict[str, Any]  # the file with the overrides of the command line, presets not yet expanded
+    vary: tuple[str, ...]  # texts of `--vary`, in their order
+    runs: int  # their number; a plan with more runs begins with the same ones
+    records: bool = False  # whether every run keeps its record
+    # texts `a.b.c=value` by which the command line differs from the file; None: not known
     changed: tuple[str, ...] | None = None
-    version: str = __version__
+    version: str = __version__  # of zsim; another one need not give the same numbers
 
 
 def difference(old: SweepPlan, new: SweepPlan) -> str | None:
@@ -75,7 +65,11 @@ def difference(old: SweepPlan, new: SweepPlan) -> str | None:
         keys = sorted(old.document.keys() | new.document.keys())
         other = next(key for key in keys if old.document.get(key) != new.document.get(key))
         return f"{other} of its scenario is another one"
-    if _whole(old) != _whole(new):
+    fields = []  # of each plan: paths from the top of the scenario, and values
+    for plan in (old, new):
+        parts = [text.partition("=") for text in plan.vary]
+        fields.append([(whole_path(path.strip(), plan.document), values) for path, _, values in parts])
+    if fields[0] != fields[1]:
         return f"it varies {' '.join(old.vary) or 'nothing'}, not {' '.join(new.vary) or 'nothing'}"
     if old.records != new.records:
         return f"it {'keeps' if old.records else 'does not keep'} records"
@@ -84,14 +78,7 @@ def difference(old: SweepPlan, new: SweepPlan) -> str | None:
     return None
 
 
-def _whole(plan: SweepPlan) -> list[str]:
-    """Return texts of `--vary` with their paths from the top of the scenario."""
-    parts = [text.partition("=") for text in plan.vary]
-    return [f"{whole_path(path.strip(), plan.document)}{equals}{values}" for path, equals, values in parts]
-
-
 def is_sweep(folder: Path) -> bool:
-    """Return whether a folder holds a sweep."""
     return (folder / PLAN).is_file()
 
 
@@ -99,16 +86,11 @@ def is_sweep(folder: Path) -> bool:
 
 
 class Seeds(Struct, frozen=True):
-    """A distinct seed for every run or, paired, for every run of a combination: all combinations have the same ones.
-
-    Attributes:
-        paired: drawn values are the same for all combinations, too.
-        values: the seeds; none: they are drawn from the scenario's own.
-    """
+    """A distinct seed for every run or, paired, for every run of a combination: all combinations have the same ones."""
 
     path: str = SEED
-    paired: bool = False
-    values: tuple[int, ...] = ()
+    paired: bool = False  # drawn values are the same for all combinations, too
+    values: tuple[int, ...] = ()  # the seeds; none: they are drawn from the scenario's own
 
     def draw(self, seed: int, count: int) -> list[int]:
         """Return the first seeds, drawn from a scenario's seed; a larger count begins with the same ones."""
@@ -129,8 +111,21 @@ class Grid(Struct, frozen=True):
 
     @property
     def names(self) -> list[str]:
-        """Return abbreviated and unique names of the values."""
-        return _distinct(self.values)
+        """Abbreviated values; those cut to the same text as their differing part, or with their number."""
+        names = [_cut(f"{value:g}" if isinstance(value, float) else text_of(value)) for value in self.values]
+        for short in [name for name, count in Counter(names).items() if count > 1]:
+            alike = [place for place, name in enumerate(names) if name == short]
+            texts = parts = [text_of(self.values[place]) for place in alike]
+            if any(len(text) > SHOWN_MAX for text in texts):  # from the first word in which they differ on
+                letters = enumerate(zip(*texts, strict=False))
+                whole = next((place for place, each in letters if len(set(each)) > 1), min(map(len, texts)))
+                start = max(texts[0].rfind(mark, 0, whole) for mark in " ,[{:") + 1
+                parts = [_cut(f"…{text[start:]}" if start else text) for text in texts]
+            others = {name for name in names if name != short}
+            is_distinct = len({*parts, *others}) == len(parts) + len(others)
+            for place, part in zip(alike, parts, strict=True):
+                names[place] = part if is_distinct else f"{short} ({place + 1})"
+        return names
 
 
 class Draw(Struct, frozen=True):
@@ -144,8 +139,8 @@ class Draw(Struct, frozen=True):
     def draw(self, seed: int, count: int) -> list[float]:
         """Return the values of the first runs; each field has a stream of its own."""
         rng = stream(seed, f"sweep/{self.path}")
-        of_kind: dict[str, Callable[..., np.ndarray]] = {"uniform": rng.uniform, "normal": rng.normal}
-        return of_kind[self.kind](self.first, self.second, count).tolist()
+        draw = rng.uniform if self.kind == "uniform" else rng.normal
+        return draw(self.first, self.second, count).tolist()
 
 
 Axis = Seeds | Grid | Draw
@@ -163,20 +158,28 @@ def parse(text: str, document: Mapping[str, Any] = NOTHING) -> Axis:
     if not equals or not path.strip():
         raise ValueError(f"is no variation; must be {SYNTAX}")
     path = whole_path(path.strip(), document)
-    if path == SEED:
-        return _seeds(values)
-    drawn = _DRAWN.fullmatch(values)
-    return _draw(path, drawn[1], drawn[2]) if drawn else Grid(path, _grid_values(values))
-
-
-def _seeds(text: str) -> Seeds:
-    if text.strip() == PAIRED:
+    if path == SEED and values.strip() == PAIRED:
         return Seeds(paired=True)
-    seeds = _grid_values(text)
-    for seed in seeds:
-        if fault := first_fault(seed, _SEED_TYPE):
-            raise ValueError(f"{fault[1]}; or give seed={PAIRED}, which draws them")
-    return Seeds(paired=True, values=seeds)
+    if path == SEED:
+        seeds = _grid_values(values)
+        for seed in seeds:
+            if fault := first_fault(seed, _SEED_TYPE):
+                raise ValueError(f"{fault[1]}; or give seed={PAIRED}, which draws them")
+        return Seeds(paired=True, values=seeds)
+    if (drawn := _DRAWN.fullmatch(values)) is None:
+        return Grid(path, _grid_values(values))
+    kind, arguments = drawn[1], drawn[2]
+    if kind not in ("uniform", "normal"):
+        raise ValueError(f"draws by {kind}; must be uniform(low,high) or normal(mean,std)")
+    try:
+        first, second = (float(part) for part in arguments.split(","))
+    except ValueError:
+        raise ValueError(f"has {kind}({arguments[:40]}); must hold two numbers") from None
+    span = second - first if kind == "uniform" else second
+    if not (math.isfinite(first) and math.isfinite(second) and 0 < span < math.inf):
+        need = "low < high, high - low finite too" if kind == "uniform" else "std > 0"
+        raise ValueError(f"has {kind}({arguments[:40]}); must be finite numbers with {need}")
+    return Draw(path, kind, first, second)
 
 
 def _grid_values(text: str) -> tuple[Any, ...]:
@@ -192,46 +195,9 @@ def _grid_values(text: str) -> tuple[Any, ...]:
     return tuple(values)
 
 
-def _draw(path: str, kind: str, arguments: str) -> Draw:
-    if kind not in ("uniform", "normal"):
-        raise ValueError(f"draws by {kind}; must be uniform(low,high) or normal(mean,std)")
-    try:
-        first, second = (float(part) for part in arguments.split(","))
-    except ValueError:
-        raise ValueError(f"has {kind}({arguments[:40]}); must hold two numbers") from None
-    span = second - first if kind == "uniform" else second
-    if not (math.isfinite(first) and math.isfinite(second) and 0 < span < math.inf):
-        need = "low < high, high - low finite too" if kind == "uniform" else "std > 0"
-        raise ValueError(f"has {kind}({arguments[:40]}); must be finite numbers with {need}")
-    return Draw(path, kind, first, second)
-
-
 def text_of(value: Any) -> str:
     """Return a value as `--set` takes it, in one line."""
     return value if isinstance(value, str) else json.dumps(value, default=str)
-
-
-def _distinct(values: Sequence[Any]) -> list[str]:
-    """Return abbreviated values; those that are cut to the same text as their differing part, or with their number."""
-    names = [_cut(f"{value:g}" if isinstance(value, float) else text_of(value)) for value in values]
-    for short in [name for name, count in Counter(names).items() if count > 1]:
-        alike = [place for place, name in enumerate(names) if name == short]
-        parts = _differing([text_of(values[place]) for place in alike])
-        others = {name for name in names if name != short}
-        is_distinct = len({*parts, *others}) == len(parts) + len(others)
-        for place, part in zip(alike, parts, strict=True):
-            names[place] = part if is_distinct else f"{short} ({place + 1})"
-    return names
-
-
-def _differing(texts: Sequence[str]) -> list[str]:
-    """Return texts from the first word in which they differ on, cut; short ones are whole."""
-    if all(len(text) <= SHOWN_MAX for text in texts):
-        return list(texts)
-    letters = enumerate(zip(*texts, strict=False))
-    whole = next((place for place, each in letters if len(set(each)) > 1), min(map(len, texts)))
-    start = max(texts[0].rfind(mark, 0, whole) for mark in " ,[{:") + 1
-    return [_cut(f"…{text[start:]}" if start else text) for text in texts]
 
 
 def _cut(text: str) -> str:
@@ -263,7 +229,6 @@ def field_path(document: dict[str, Any], path: str) -> FieldPath:
 
 
 def is_inside(one: FieldPath, other: FieldPath) -> bool:
-    """Return whether one field is part of the other."""
     return len(one) > len(other) and one[: len(other)] == other
 
 
@@ -284,23 +249,23 @@ class SweepDesign:
         self.plan = plan
         self.axes: list[Axis] = [parse(text, plan.document) for text in plan.vary]
         self._grids = [axis for axis in self.axes if isinstance(axis, Grid)]
+        self._names = {grid.path: grid.names for grid in self._grids}
         self.points = math.prod(len(grid.values) for grid in self._grids)
         self.seeds = next((axis for axis in self.axes if isinstance(axis, Seeds)), None)
         self.paired = self.seeds is not None and self.seeds.paired
 
     @property
     def seed(self) -> int:
-        """Return the scenario's own seed, from which seeds and values are drawn; an invalid one is never flown."""
+        """The scenario's own seed, from which seeds and values are drawn; an invalid one is never flown."""
         seed = self.plan.document.get(SEED)
         return seed if isinstance(seed, int) and seed >= 0 else _DEFAULT_SEED
 
     @property
     def varied(self) -> list[str]:
-        """Return the paths that vary, without the seed's."""
+        """The paths that vary, without the seed's."""
         return [axis.path for axis in self.axes if axis.path != SEED]
 
     def point(self, run: int) -> int:
-        """Return the point of the grid that a run flies."""
         return run % self.points
 
     def at(self, point: int) -> dict[str, Any]:
@@ -308,20 +273,14 @@ class SweepDesign:
         return {grid.path: grid.values[place] for grid, place in self._places(point)}
 
     def names(self, point: int) -> dict[str, str]:
-        """Return the abbreviated values of a point by path, unique for each field."""
         return {grid.path: self._names[grid.path][place] for grid, place in self._places(point)}
 
     def _places(self, point: int) -> list[tuple[Grid, int]]:
-        """Return the axes of the grid, each with the index of a point's value."""
         places = []
         for grid in reversed(self._grids):
             point, place = divmod(point, len(grid.values))
             places.append((grid, place))
         return places[::-1]
-
-    @cached_property
-    def _names(self) -> dict[str, list[str]]:
-        return {grid.path: grid.names for grid in self._grids}
 
     def values(self, run: int) -> dict[str, Any]:
         """Return the values that a run sets, by path, in the order of the axes."""
@@ -397,29 +356,35 @@ def make_plan(
     earlier_faults: Sequence[str] = (),
     changed: Sequence[str] | None = None,
 ) -> SweepPlan:
-    """Return the plan of a sweep, all its combinations checked.
+    """Return the plan of a sweep, all its combinations checked; arguments as of the plan, and:
 
     Args:
-        source: name of the scenario's file, for messages.
-        document: raw; see `read_document`.
-        vary: texts of `--vary`.
         runs: their number, None: as many as the grid has combinations, for each given seed.
-        records: whether every run keeps its record.
         progress: called with the number of the combination that is checked, and their number.
         earlier_faults: of the overrides, reported with the others.
-        changed: as of the plan.
 
     Raises:
         ScenarioError: with every fault of the variations and of the resulting scenarios, a line each.
     """
-    texts, vary_faults = _parsed(vary, document)
+    fields: dict[FieldPath, str] = {}  # the valid texts of `--vary`
+    vary_faults = []
+    for text in vary:
+        try:
+            path = parse(text, document).path
+            steps = field_path(document, path)
+            _refuse_overlap(path, steps, fields)
+            fields[steps] = text
+        except ValueError as error:
+            vary_faults.append(f"--vary {_shown(text)}: {error}")
     faults = [*earlier_faults, *vary_faults]
     source = source.encode(errors="surrogateescape").decode(errors="replace")  # a file's name may be any bytes
     sets = None if changed is None else tuple(changed)
-    plan = SweepPlan(source=source, document=document, vary=tuple(texts), runs=runs or 1, records=records, changed=sets)
-    design = SweepDesign(plan)
-    given = len(design.seeds.values) if design.seeds else 0
-    plan = msgspec.structs.replace(plan, runs=runs or design.points * max(given, 1))
+    texts = tuple(fields.values())
+    plan = SweepPlan(source=source, document=document, vary=texts, runs=runs or 1, records=records, changed=sets)
+    if not runs:
+        design = SweepDesign(plan)
+        given = len(design.seeds.values) if design.seeds else 0
+        plan = msgspec.structs.replace(plan, runs=design.points * max(given, 1))
     design = SweepDesign(plan)
     faults += _count_faults(design, all_known=not vary_faults)
     if plan.runs <= RUNS_MAX:
@@ -430,38 +395,19 @@ def make_plan(
     return plan
 
 
-def _parsed(vary: list[str], document: dict[str, Any]) -> tuple[list[str], list[str]]:
-    """Return the valid texts of `--vary`, and a fault for each of the others."""
-    fields: dict[FieldPath, str] = {}
-    faults = []
-    for text in vary:
-        try:
-            path = parse(text, document).path
-        except ValueError as error:
-            faults.append(f"--vary {_shown(text)}: {error}")
-            continue
-        steps = field_path(document, path)
-        if fault := _overlap(path, steps, fields):
-            faults.append(f"--vary {_shown(text)}: {fault}")
-        else:
-            fields[steps] = text
-    return list(fields.values()), faults
-
-
 def _shown(text: str) -> str:
     return text[:80] if text.isprintable() else repr(text)[:80]
 
 
-def _overlap(path: str, steps: FieldPath, fields: dict[FieldPath, str]) -> str | None:
-    """Return the fault of a path of which a part, or the whole, varies already."""
+def _refuse_overlap(path: str, steps: FieldPath, fields: dict[FieldPath, str]) -> None:
+    """Raise ValueError for a path of which a part, or the whole, varies already."""
     for other, text in fields.items():
         if steps == other:
-            return f"{path} varies already by {_shown(text)}; give it once"
+            raise ValueError(f"{path} varies already by {_shown(text)}; give it once")
         if is_inside(steps, other):
-            return f"{path} is part of what varies already by {_shown(text)}; vary one of the two"
+            raise ValueError(f"{path} is part of what varies already by {_shown(text)}; vary one of the two")
         if is_inside(other, steps):
-            return f"{path} holds what varies already by {_shown(text)}; vary one of the two"
-    return None
+            raise ValueError(f"{path} holds what varies already by {_shown(text)}; vary one of the two")
 
 
 def _count_faults(design: SweepDesign, all_known: bool) -> list[str]:

@@ -35,9 +35,15 @@ def work(link: Connection) -> None:
 
     An exception is sent back if every further run would fail as well.
     """
+
+    def exit_with_launcher() -> None:
+        if (launcher := parent_process()) is not None:
+            wait([launcher.sentinel])
+            os._exit(1)
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launcher, which receives it as well, handles it
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    threading.Thread(target=_exit_with_launcher, name="launcher-monitor", daemon=True).start()
+    threading.Thread(target=exit_with_launcher, name="launcher-monitor", daemon=True).start()
     warnings.simplefilter("ignore", RuntimeWarning)  # a state that overflows is reported in the run's row
     from zsim_analysis.sweep.sweep_run import fly  # not before the signals are set: it takes seconds
 
@@ -53,40 +59,24 @@ def work(link: Connection) -> None:
         return
 
 
-def _exit_with_launcher() -> None:
-    launcher = parent_process()
-    if launcher is not None:
-        wait([launcher.sentinel])
-        os._exit(1)
-
-
 def cores() -> int:
     """Return the number of cores available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-@contextlib.contextmanager
-def _safe_path() -> Iterator[None]:
-    """Start interpreters that do not import from the working folder first."""
-    former = os.environ.get(SAFE_PATH)
-    os.environ[SAFE_PATH] = "1"
-    try:
-        yield
-    finally:
-        del os.environ[SAFE_PATH]
-        if former is not None:
-            os.environ[SAFE_PATH] = former
-
-
 class WorkerProcess:
-    """One process and its current task."""
-
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.link, far = context.Pipe()
         self.process = context.Process(target=work, args=(far,), name="zsim-sweep", daemon=True)
-        with _safe_path():
+        former = os.environ.get(SAFE_PATH)
+        os.environ[SAFE_PATH] = "1"  # its interpreter is not to import from the working folder first
+        try:
             self.process.start()
+        finally:
+            del os.environ[SAFE_PATH]
+            if former is not None:
+                os.environ[SAFE_PATH] = former
         far.close()  # so that the link ends when the process dies
         self.ready = False
         self.task: Task | None = None
@@ -116,14 +106,11 @@ class WorkerProcess:
         self.link.close()
 
     def cause(self) -> str:
-        """Return how it ended."""
         code = self.process.exitcode or 0
         return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
 
 
 class ProcessPool:
-    """Flies tasks on worker processes."""
-
     def __init__(self, count: int, say: Callable[[str], None]) -> None:
         self._count = count
         self._say = say
@@ -166,15 +153,12 @@ class ProcessPool:
         else:
             worker.task = None
             yield message  # type: ignore[misc]
-        self._send_next(worker, tasks)
-
-    def _send_next(self, worker: WorkerProcess, tasks: Iterator[Task]) -> None:
         task = self._again.popleft() if self._again else next(tasks, None)
         if task is not None:
             worker.send(task)
-            return
-        del self._workers[worker.link]
-        worker.stop()
+        else:
+            del self._workers[worker.link]
+            worker.stop()
 
     def _on_death(self, worker: WorkerProcess) -> Iterator[Row]:
         """Replace a dead worker; a run in which DEATHS_MAX workers died gets a failed row."""

@@ -11,10 +11,10 @@ The folder of a sweep:
 import os
 import sys
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 import pyarrow as pa
@@ -41,29 +41,13 @@ _TYPES: dict[Any, pa.DataType] = {int: pa.int64(), float: pa.float64(), bool: pa
 
 
 class SweepRequest(Struct, frozen=True):
-    """What to fly, where to, and by which processes.
+    """What to fly, where to, and by which processes."""
 
-    Attributes:
-        plan: what is flown.
-        out: folder of the sweep.
-        workers: processes on this host, None: one per core.
-        dask: address of a Dask scheduler whose workers are used instead.
-        force: whether the folder may hold other files.
-    """
-
-    plan: SweepPlan
-    out: Path
-    workers: int | None = None
-    dask: str | None = None
-    force: bool = False
-
-
-class WorkerPool(Protocol):
-    """Flies tasks on worker processes, here or on other hosts."""
-
-    def rows(self, tasks: Iterator[Task]) -> Generator[Row]:
-        """Yield the rows of tasks as they are finished; when closed, fly no further."""
-        ...
+    plan: SweepPlan  # what is flown
+    out: Path  # folder of the sweep
+    workers: int | None = None  # processes on this host, None: one per core
+    dask: str | None = None  # address of a Dask scheduler whose workers are used instead
+    force: bool = False  # whether the folder may hold other files
 
 
 def sweep(request: SweepRequest) -> list[Row]:
@@ -85,21 +69,19 @@ def sweep(request: SweepRequest) -> list[Row]:
                 screen.say(f"{len(done)} of them {'is' if len(done) == 1 else 'are'} done already")
             try:
                 if missing:
-                    _fly(folder, _pool(request, len(missing), screen.say), missing, screen)
+                    _fly(folder, request, missing, screen)
             finally:
                 rows = folder.compact()
     return rows
 
 
-def _pool(request: SweepRequest, missing: int, say: Callable[[str], None]) -> WorkerPool:
+def _fly(folder: "SweepFolder", request: SweepRequest, missing: list[int], screen: "SweepScreen") -> None:
     if request.dask is None:
-        return ProcessPool(min(request.workers or cores(), missing), say)
-    from zsim_analysis.sweep.dask_pool import DaskPool
+        pool = ProcessPool(min(request.workers or cores(), len(missing)), screen.say)
+    else:
+        from zsim_analysis.sweep.dask_pool import DaskPool
 
-    return DaskPool(request.dask, say)
-
-
-def _fly(folder: "SweepFolder", pool: WorkerPool, missing: list[int], screen: "SweepScreen") -> None:
+        pool = DaskPool(request.dask, screen.say)
     with folder.journal() as journal, closing(pool.rows(_tasks(folder, missing))) as rows:
         for row in rows:
             journal.append(row)
@@ -153,11 +135,9 @@ class SweepScreen:
             self.say(self.line())
 
     def say(self, text: str) -> None:
-        """Show a line that stays."""
         self.console.print(cell(text), soft_wrap=True)
 
     def finished(self, failed: bool) -> None:
-        """Count a run."""
         self._done += 1
         self._failed += failed
         if not self.console.is_terminal and self._done < self._total and self._throttle.spend():
@@ -197,23 +177,18 @@ def span(seconds: float) -> str:
 
 
 class SweepFolder:
-    """A sweep on disk."""
-
     def __init__(self, path: Path, plan: SweepPlan) -> None:
         self.path = path
         self.plan = plan
         self.design = SweepDesign(plan)
 
     def record(self, run: int) -> Path:
-        """Return the folder of a run's record."""
         return self.path / RUNS / f"{run:06d}"
 
     def journal(self) -> "Journal":
-        """Return the journal, opened to be continued."""
         return Journal(self.path / JOURNAL)
 
     def rows(self) -> list[Row]:
-        """Return the finished runs in their order."""
         rows = {row["run"]: row for row in (*read_table(self.path / TABLE), *read_journal(self.path / JOURNAL))}
         return [rows[run] for run in sorted(rows)]
 
@@ -230,11 +205,7 @@ class SweepFolder:
 
 
 def load(path: Path) -> SweepFolder:
-    """Return the sweep in a folder.
-
-    Raises:
-        RunError: its plan cannot be read.
-    """
+    """Return the sweep in a folder. Raises RunError: its plan cannot be read."""
     try:
         return SweepFolder(path, msgspec.json.decode((path / PLAN).read_bytes(), type=SweepPlan))
     except (OSError, msgspec.MsgspecError, ValueError) as error:
@@ -245,10 +216,7 @@ def load(path: Path) -> SweepFolder:
 def locked(path: Path, plan: SweepPlan, force: bool = False) -> Iterator[SweepFolder]:
     """Yield the folder of a sweep, new or continued, locked against other sweeps.
 
-    Args:
-        path: of the folder.
-        plan: of the sweep.
-        force: accept one that holds other files; a run, or another sweep, is always refused.
+    With `force` it may hold other files; a run, or another sweep, is always refused.
 
     Raises:
         RunError: another sweep is at work there, or it holds something else.
@@ -335,19 +303,12 @@ class Journal:
 
 def read_journal(path: Path) -> list[Row]:
     """Return the whole lines of a journal, none if there is no such file."""
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        return []
+    content = path.read_bytes() if path.exists() else b""
     return msgspec.json.Decoder().decode_lines(content[: content.rfind(b"\n") + 1])
 
 
 def write_table(path: Path, rows: Iterable[Row], plan: SweepPlan, axes: Sequence[Axis]) -> None:
-    """Write the rows in the order of the runs, all or nothing.
-
-    Raises:
-        ReportError: it cannot be written.
-    """
+    """Write the rows in the order of the runs, all or nothing. Raises ReportError: it cannot be written."""
     ordered = sorted(rows, key=lambda row: row["run"])
     schema = _schema(ordered, axes).with_metadata({PLAN_METADATA: msgspec.json.encode(plan)})
     json_columns = [field.name for field in schema if field.metadata]
@@ -390,19 +351,15 @@ def _schema(rows: Sequence[Row], axes: Sequence[Axis]) -> pa.Schema:
         (name, next(_TYPES[each] for each in (*getattr(kind, "__args__", ()), kind) if each in _TYPES))
         for name, kind in FIXED.items()
     ]
-    varied = [(axis.path, _varied_type(axis)) for axis in axes if axis.path != SEED]
+    varied: list[tuple[str, pa.DataType | None]] = []  # None: of values that are not all of one kind
+    for axis in axes:
+        kinds = {type(value) for value in axis.values} if isinstance(axis, Grid) else {float}
+        if kinds == {int, float}:
+            kinds = {float}
+        if axis.path != SEED:
+            varied.append((axis.path, _TYPES.get(kinds.pop()) if len(kinds) == 1 else None))
     known = {*FIXED, *(path for path, _ in varied)}
     errors = {name: (name, pa.float64()) for row in rows for name in row if name not in known}
     fields = [*fixed[:3], *varied, *fixed[3:], *errors.values()]
     mixed = {b"encoding": b"json"}  # of values of different types
     return pa.schema([pa.field(name, kind or pa.string(), metadata=None if kind else mixed) for name, kind in fields])
-
-
-def _varied_type(axis: Axis) -> pa.DataType | None:
-    """Return the type of a column whose values are all of one kind, None for any others."""
-    if not isinstance(axis, Grid):
-        return pa.float64()
-    kinds = {type(value) for value in axis.values}
-    if kinds <= {int, float}:
-        return _TYPES[float if float in kinds else int]
-    return _TYPES.get(kinds.pop()) if len(kinds) == 1 else None

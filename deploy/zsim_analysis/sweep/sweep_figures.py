@@ -5,7 +5,7 @@ Order of this file: the figures; one quantity in a panel; means and their interv
 
 import re
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -14,37 +14,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 from msgspec import Struct
 
+from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.shortfall import span_text
-from zsim_analysis.report.figure_style import (
-    AMBER,
-    BLACK,
-    BLUE,
-    COLUMN_IN,
-    GREEN,
-    GREY,
-    ORANGE,
-    PAGE_IN,
-    PAPER_PT,
-    PURPLE,
-    SKY,
-    VERMILION,
-    ReportFigure,
-    dress,
-    label,
-    legend_above,
-    letter_panels,
-    mark_figure,
-    new_figure,
-    padded_range,
-    scale,
-)
+from zsim_analysis.report import figure_style as style
 from zsim_analysis.sweep.design import Grid, SweepDesign
 from zsim_analysis.sweep.sweep_summary import (
     LEVEL,
     RUNS_MIN,
     SEPARATION,
     ConfidenceInterval,
-    FormationParameter,
     Samples,
     SweepResults,
     count_text,
@@ -61,7 +39,11 @@ SLICES = 6  # of a drawn value's range, each with a mean of its own
 LEGEND_COLUMNS = 4
 ONE_RUN, BEYOND_AXIS, TABLE_I = "one run", "the interval goes beyond the axis", "the paper's Table I"
 NEVER_AS_PLANNED = "no run as planned"
-SHARES = (("ended well", "o", GREEN), ("of these, as planned", "D", BLUE), ("of these, without collision", "s", BLACK))
+SHARES = (
+    ("ended well", "o", style.GREEN),
+    ("of these, as planned", "D", style.BLUE),
+    ("of these, without collision", "s", style.BLACK),
+)
 LEVEL_LETTERS, UPRIGHT_LETTERS = 28, 25  # of PAPER_PT that fit a panel's width and height, three across a page
 FORMULA = re.compile(r"\$[^$]*\$")
 
@@ -74,26 +56,18 @@ class Panel(Struct, frozen=True):
     printed: float | None = None
 
 
-def figures(results: SweepResults) -> Iterator[ReportFigure]:
+def figures(results: SweepResults) -> Iterator[style.ReportFigure]:
     """Yield the figures for which the runs have data, with a panel for each quantity."""
-    shown = dict(list(results.parameters.items())[:PANELS_MAX])
+    own = [Panel(column, str(field_name(column))) for column in results.metrics[:PANELS_MAX]]
+    rms, std = list[Panel](), list[Panel]()
+    for prefix, each in list(results.parameters.items())[:PANELS_MAX]:
+        symbol = style.label(each.name).rpartition(" (")[0]
+        in_truth, estimated = f"RMS error of {symbol}\nin truth", f"std of the error of {symbol}\nas estimated"
+        rms.append(Panel(f"{prefix}.true_rms", each.labelled(f"{in_truth} ({unit(each.name)})")))
+        printed = results.paper_std.get(each.name)
+        std.append(Panel(f"{prefix}.est_std", each.labelled(f"{estimated} ({unit(each.name)})"), printed))
     own, rms, std = (
-        [panel for panel in panels if len(finite(results.flown(panel.column)))]
-        for panels in (
-            [Panel(column, str(field_name(column))) for column in results.metrics[:PANELS_MAX]],
-            [
-                Panel(f"{prefix}.true_rms", each.labelled(f"RMS error of {_symbol(each)}\nin truth ({each.unit})"))
-                for prefix, each in shown.items()
-            ],
-            [
-                Panel(
-                    f"{prefix}.est_std",
-                    each.labelled(f"std of the error of {_symbol(each)}\nas estimated ({each.unit})"),
-                    results.paper_std.get(each.name),
-                )
-                for prefix, each in shown.items()
-            ],
-        )
+        [panel for panel in panels if len(finite(results.flown(panel.column)))] for panels in (own, rms, std)
     )
     windows_s = results.windows_s()
     window = f" ({span_text(windows_s)})" if windows_s else ""
@@ -112,8 +86,8 @@ def figures(results: SweepResults) -> Iterator[ReportFigure]:
         ),
     ):
         if panels:
-            yield ReportFigure(f"{name}.png", title, f"{what}{more}", _draw_panels(results, panels))
-    yield ReportFigure(
+            yield style.ReportFigure(f"{name}.png", title, f"{what}{more}", _draw_panels(results, panels))
+    yield style.ReportFigure(
         "safety.png",
         "How the runs ended, and how near the drones came to each other",
         "(a) Share of runs that ended well, and of those flown as planned and without a collision, "
@@ -121,7 +95,7 @@ def figures(results: SweepResults) -> Iterator[ReportFigure]:
         _draw_safety(results),
     )
     for i, path in enumerate(results.drawn if own or rms else ()):
-        yield ReportFigure(
+        yield style.ReportFigure(
             f"drawn_{i + 1}.png",
             f"Against {field_name(path)}",
             f"Each quantity over the value that was drawn; means of {SLICES} slices with as many runs each.",
@@ -129,12 +103,7 @@ def figures(results: SweepResults) -> Iterator[ReportFigure]:
         )
 
 
-def _symbol(parameter: FormationParameter) -> str:
-    return label(parameter.name).rpartition(" (")[0]
-
-
 def _draw_panels(results: SweepResults, panels: Sequence[Panel]) -> Figure:
-    """Return the figure of some quantities."""
     axis = GridAxis(results.design) if results.design.points > 1 else None
     across = COLUMNS if not axis or axis.field or results.design.points <= NARROW_MAX else COLUMNS - 1
     across = min(across, len(panels))
@@ -146,11 +115,10 @@ def _draw_panels(results: SweepResults, panels: Sequence[Panel]) -> Figure:
 
 
 def _panel_grid(count: int, across: int, row_in: float) -> tuple[Figure, Any]:
-    """Return a figure and the axes of so many lettered panels."""
     rows = -(-count // across)
-    figure = new_figure(PAGE_IN if across > 1 else COLUMN_IN, 0.8 + rows * row_in)
+    figure = style.new_figure(style.PAGE_IN if across > 1 else style.COLUMN_IN, 0.8 + rows * row_in)
     grid = figure.subplots(rows, across, squeeze=False).ravel()
-    letter_panels(grid[:count])
+    style.letter_panels(grid[:count])
     for axes in grid[count:]:
         axes.set_visible(False)
     return figure, grid[:count]
@@ -159,22 +127,12 @@ def _panel_grid(count: int, across: int, row_in: float) -> tuple[Figure, Any]:
 def _draw_safety(results: SweepResults) -> Figure:
     """Return the shares of runs that ended well, and the least separations if there are any."""
     axis = GridAxis(results.design) if results.design.points > 1 else None
-    panel = Panel(SEPARATION, "least separation (m)")
-    panels = [panel] if len(finite(results.flown(panel.column))) else []
-    figure = new_figure(PAGE_IN if panels else COLUMN_IN, 3.0)
-    shares, *others = figure.subplots(1, 1 + len(panels), squeeze=False).ravel()
-    _draw_shares(shares, results, axis)
-    beyond = [draw_distribution(axes, results, panel, axis) for axes, panel in zip(others, panels, strict=True)]
-    letter_panels([shares, *others])
-    _name(figure, shares, results, axis, any(beyond), means=bool(panels))
-    return figure
-
-
-def _draw_shares(axes: Axes, results: SweepResults, axis: "GridAxis | None") -> None:
-    """Draw the SHARES of the runs of each point, with their intervals."""
-    dress(axes, "share of runs")
+    has_separations = len(finite(results.flown(SEPARATION))) > 0
+    figure = style.new_figure(style.PAGE_IN if has_separations else style.COLUMN_IN, 3.0)
+    axes, *others = figure.subplots(1, 1 + has_separations, squeeze=False).ravel()
+    style.dress(axes, "share of runs")
     places = axis.places if axis else {0: Place(0.0, (-0.12, 0.12))}
-    counts = (results.ended_well, results.as_planned, results.without_collision)
+    counts = (results.ended_well, partial(results.count, "as_planned"), results.without_collision)
     for side, ((name, mark, own), counted) in enumerate(zip(SHARES, counts, strict=True), -1):
         for point, place in places.items():
             tint = axis.colour(place) if axis and len(axis.series) > 1 else own
@@ -193,6 +151,11 @@ def _draw_shares(axes: Axes, results: SweepResults, axis: "GridAxis | None") -> 
     else:
         axes.set_xticks([])
         axes.set_xlim(-0.8, 0.8)
+    separation = Panel(SEPARATION, "least separation (m)")
+    beyond = any(draw_distribution(each, results, separation, axis) for each in others)
+    style.letter_panels([axes, *others])
+    _name(figure, axes, results, axis, beyond, means=has_separations)
+    return figure
 
 
 def _name(
@@ -205,11 +168,13 @@ def _name(
     means: bool = True,
 ) -> None:
     """Put the legend of dots, means, boxes, marks and colours above a figure."""
-    mean = VERMILION if not axis or len(axis.series) == 1 else GREY
+    mean = style.VERMILION if not axis or len(axis.series) == 1 else style.GREY
     if axis and means:
-        axes.plot([], [], ".", color=BLUE if len(axis.series) == 1 else GREY, ms=7, alpha=0.6, label=ONE_RUN)
+        axes.plot(
+            [], [], ".", color=style.BLUE if len(axis.series) == 1 else style.GREY, ms=7, alpha=0.6, label=ONE_RUN
+        )
         if not axis.field:
-            axes.plot([], [], "s", color="#0072b226", mec=BLUE, ms=8, label="quartiles and median")
+            axes.plot([], [], "s", color="#0072b226", mec=style.BLUE, ms=8, label="quartiles and median")
         axes.errorbar([], [], yerr=[], fmt="o", ms=4, lw=1.4, capsize=3, color=mean, label=mean_label(results))
     elif means:
         axes.plot([], [], "s", color="#d55e0066", ms=8, label=mean_label(results))
@@ -219,13 +184,13 @@ def _name(
     if never and axis:
         axes.plot([], [], "x", color=MARK, ms=6, mew=1.6, label=NEVER_AS_PLANNED)
     if paper:
-        axes.plot([], [], color=AMBER, ls="--", lw=1.2, label=TABLE_I)
+        axes.plot([], [], color=style.AMBER, ls="--", lw=1.2, label=TABLE_I)
     if axis and len(axis.series) > 1:
         for place in {place.series: place for place in axis.places.values()}.values():
             axes.plot([], [], color=axis.colour(place), lw=3, label=axis.series[place.series])
-    legend_above(figure, axes, LEGEND_COLUMNS)
+    style.legend_above(figure, axes, LEGEND_COLUMNS)
     if never and not axis:
-        mark_figure(figure, NEVER_AS_PLANNED, "", MARK)  # none of the runs followed its plan
+        style.mark_figure(figure, NEVER_AS_PLANNED, "", MARK)  # none of the runs followed its plan
 
 
 def mean_label(results: SweepResults) -> str:
@@ -242,38 +207,38 @@ def _draw_slices(results: SweepResults, path: str, panels: Sequence[Panel]) -> F
     figure, grid = _panel_grid(len(panels), COLUMNS, 1.8)
     x, beyond = results.values(path), False
     for axes, panel in zip(grid, panels, strict=True):
-        dress(axes, wrapped(panel.label, UPRIGHT_LETTERS))
-        axes.set_xlabel(wrapped(str(field_name(path)), LEVEL_LETTERS), fontsize=PAPER_PT)
+        style.dress(axes, wrapped(panel.label, UPRIGHT_LETTERS))
+        axes.set_xlabel(wrapped(str(field_name(path)), LEVEL_LETTERS), fontsize=style.PAPER_PT)
         y = results.flown(panel.column)
-        axes.plot(x, y, ".", color=BLUE, ms=4, alpha=0.45, mew=0, zorder=2, clip_on=False)
+        axes.plot(x, y, ".", color=style.BLUE, ms=4, alpha=0.45, mew=0, zorder=2, clip_on=False)
         means = [DrawnMean(middle, mean_interval(samples)) for middle, samples in slices(x, y)]
         for each in means:
             each.draw(axes)
-        scale(axes, finite(y), pad=MEAN_ROOM)
+        style.scale(axes, finite(y), pad=MEAN_ROOM)
         beyond |= mark_beyond(axes, means)
-    grid[0].plot([], [], ".", color=BLUE, ms=7, alpha=0.6, label=ONE_RUN)
+    grid[0].plot([], [], ".", color=style.BLUE, ms=7, alpha=0.6, label=ONE_RUN)
     slice_label = f"mean and {100 * LEVEL:g} % interval of a slice"
-    grid[0].errorbar([], [], yerr=[], fmt="o", ms=4, lw=1.4, capsize=3, color=VERMILION, label=slice_label)
+    grid[0].errorbar([], [], yerr=[], fmt="o", ms=4, lw=1.4, capsize=3, color=style.VERMILION, label=slice_label)
     if beyond:
-        grid[0].plot([], [], "^", color=VERMILION, ms=7, mec="white", mew=0.6, label=BEYOND_AXIS)
-    legend_above(figure, grid[0], LEGEND_COLUMNS)
+        grid[0].plot([], [], "^", color=style.VERMILION, ms=7, mec="white", mew=0.6, label=BEYOND_AXIS)
+    style.legend_above(figure, grid[0], LEGEND_COLUMNS)
     if len(results.never_as_planned()) == results.design.points:
-        mark_figure(figure, NEVER_AS_PLANNED, "", MARK)
+        style.mark_figure(figure, NEVER_AS_PLANNED, "", MARK)
     return figure
 
 
-def slices(x: Samples, y: Samples, count: int = SLICES) -> Sequence[tuple[float, Samples]]:
-    """Return the mean x and the y of `count` groups of runs by rising x, of nearly equal sizes."""
+def slices(x: Samples, y: Samples) -> Sequence[tuple[float, Samples]]:
+    """Return the mean x and the y of SLICES groups of runs by rising x, of nearly equal sizes."""
     both = np.isfinite(x) & np.isfinite(y)
     order = np.argsort(x[both], kind="stable")
-    groups = [part for part in np.array_split(order, count) if len(part) >= 2]
+    groups = [part for part in np.array_split(order, SLICES) if len(part) >= 2]
     return [(float(x[both][part].mean()), y[both][part]) for part in groups]
 
 
-def wrapped(label: str, letters: int) -> str:
+def wrapped(text: str, letters: int) -> str:
     """Return a label in lines of at most so many letters, broken between words; a formula counts as two letters."""
     lines: list[str] = []
-    for each in label.split("\n"):
+    for each in text.split("\n"):
         line = ""
         for word in each.split():
             longer = f"{line} {word}".strip()
@@ -296,20 +261,20 @@ GOLDEN = 0.6180339887  # multiples of the golden ratio, modulo 1, spread dots ev
 def draw_distribution(axes: Axes, results: SweepResults, panel: Panel, axis: "GridAxis | None") -> bool:
     """Draw one quantity: a histogram of one point, otherwise the points; return whether an interval leaves the axis."""
     if axis is None:
-        dress(axes)
-        axes.set_xlabel(wrapped(panel.label, LEVEL_LETTERS), fontsize=PAPER_PT)
+        style.dress(axes)
+        axes.set_xlabel(wrapped(panel.label, LEVEL_LETTERS), fontsize=style.PAPER_PT)
         samples = finite(results.flown(panel.column))
         count = count_text(len(samples), results.ended_well(0)[0])
-        axes.text(0.98, 0.9, count, transform=axes.transAxes, ha="right", fontsize=PAPER_PT - 1, zorder=6)
+        axes.text(0.98, 0.9, count, transform=axes.transAxes, ha="right", fontsize=style.PAPER_PT - 1, zorder=6)
         return _draw_histogram(axes, samples, panel.printed)
-    dress(axes, wrapped(panel.label, UPRIGHT_LETTERS))
+    style.dress(axes, wrapped(panel.label, UPRIGHT_LETTERS))
     drawn: list[tuple[Place, DrawnMean]] = []
     for point, place in axis.places.items():
         if len(samples := finite(results.flown(panel.column, point))):
             mean = _draw_point(axes, samples, place, axis)
             drawn.append((place, mean))
             if count := count_text(len(samples), results.ended_well(point)[0]):  # fewer than the legend says
-                look: dict[str, Any] = {"fontsize": PAPER_PT - 1, "color": mean.colour, "zorder": 6}
+                look: dict[str, Any] = {"fontsize": style.PAPER_PT - 1, "color": mean.colour, "zorder": 6}
                 offset: dict[str, Any] = {"xytext": (0, 7), "textcoords": "offset points", "ha": "center"}
                 axes.annotate(count, (mean.x, mean.mean.value), **look, **offset)
     for series in range(len(axis.series) if axis.field else 0):  # a line for each combination of the other fields
@@ -319,29 +284,29 @@ def draw_distribution(axes: Axes, results: SweepResults, panel: Panel, axis: "Gr
             axes.plot([each.x for each in own], values, color=own[0].colour, lw=1.0, alpha=0.7, zorder=4)
     axis.dress(axes)
     axis.mark(axes, results.never_as_planned())
-    scale(axes, finite(results.flown(panel.column)), pad=MEAN_ROOM)
+    style.scale(axes, finite(results.flown(panel.column)), pad=MEAN_ROOM)
     if panel.printed is not None:
         low, high = axes.get_ylim()
         axes.set_ylim(*_with_printed(low, high, panel.printed))
-        axes.axhline(panel.printed, color=AMBER, ls="--", lw=1.2, zorder=4)
+        axes.axhline(panel.printed, color=style.AMBER, ls="--", lw=1.2, zorder=4)
     return mark_beyond(axes, [mean for _, mean in drawn])
 
 
 def _draw_histogram(axes: Axes, samples: Samples, printed: float | None) -> bool:
-    axes.set_ylabel("runs", fontsize=PAPER_PT)
+    axes.set_ylabel("runs", fontsize=style.PAPER_PT)
     bins = int(np.clip(len(np.histogram_bin_edges(samples, "auto")) - 1, *BINS))
-    axes.hist(samples, bins=bins, color=BLUE, alpha=0.55, edgecolor="white", lw=0.6, zorder=2)
+    axes.hist(samples, bins=bins, color=style.BLUE, alpha=0.55, edgecolor="white", lw=0.6, zorder=2)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     mean = mean_interval(samples)
     if np.isfinite(mean.low):
-        axes.axvspan(mean.low, mean.high, color=VERMILION, alpha=0.25, lw=0, zorder=3)
-    axes.axvline(mean.value, lw=1.4, color=VERMILION, zorder=5)
-    if limits := padded_range(samples, MEAN_ROOM):
+        axes.axvspan(mean.low, mean.high, color=style.VERMILION, alpha=0.25, lw=0, zorder=3)
+    axes.axvline(mean.value, lw=1.4, color=style.VERMILION, zorder=5)
+    if limits := style.padded_range(samples, MEAN_ROOM):
         axes.set_xlim(limits)
     if printed is not None:
         low, high = axes.get_xlim()
         axes.set_xlim(*_with_printed(low, high, printed))
-        axes.axvline(printed, color=AMBER, ls="--", lw=1.2, zorder=4)
+        axes.axvline(printed, color=style.AMBER, ls="--", lw=1.2, zorder=4)
     return mark_beyond(axes, [DrawnMean(float(np.mean(axes.get_ylim())), mean)], along="x")
 
 
@@ -355,27 +320,18 @@ def _draw_point(axes: Axes, samples: Samples, place: "Place", axis: "GridAxis") 
     """Draw the runs of a point and their mean; return the mean."""
     colour = axis.colour(place)
     if not axis.field:
-        line: dict[str, Any] = {"color": BLUE, "lw": 1.0}
-        axes.boxplot(
-            [samples],
-            positions=[place.x],
-            widths=0.5,
-            showfliers=False,
-            patch_artist=True,
-            boxprops={"facecolor": "#0072b226", "edgecolor": BLUE, "lw": 1.0},
-            medianprops={"color": BLUE, "lw": 1.6},
-            whiskerprops=line,
-            capprops=line,
-            zorder=2,
-            manage_ticks=False,
-        )
+        line = {"color": style.BLUE, "lw": 1.0}
+        box = {"facecolor": "#0072b226", "edgecolor": style.BLUE, "lw": 1.0}
+        look: dict[str, Any] = {"boxprops": box, "medianprops": {"color": style.BLUE, "lw": 1.6}}
+        look |= {"whiskerprops": line, "capprops": line, "patch_artist": True, "showfliers": False}
+        axes.boxplot([samples], positions=[place.x], widths=0.5, zorder=2, manage_ticks=False, **look)
     dots = samples[:: max(1, -(-len(samples) // DOTS_MAX))]
     shares = ((np.arange(len(dots)) + 0.5) * GOLDEN + 0.5 * (1 - GOLDEN)) % 1
     low, high = place.room
     size = 7 if len(dots) < 30 else 4
     axes.plot(low + shares * (high - low), dots, ".", color=colour, ms=size, alpha=0.45, mew=0, zorder=3, clip_on=False)
     mean_x = place.x if axis.field else place.x + 0.36  # beside the box
-    mean = DrawnMean(mean_x, mean_interval(samples), VERMILION if len(axis.series) == 1 else colour)
+    mean = DrawnMean(mean_x, mean_interval(samples), style.VERMILION if len(axis.series) == 1 else colour)
     mean.draw(axes)
     return mean
 
@@ -391,10 +347,9 @@ class DrawnMean(Struct, frozen=True):
 
     x: float
     mean: ConfidenceInterval
-    colour: str = VERMILION
+    colour: str = style.VERMILION
 
     def draw(self, axes: Axes) -> None:
-        """Draw the mean, and its interval if it has one."""
         mean = self.mean
         ends = [[mean.value - mean.low], [mean.high - mean.value]] if np.isfinite(mean.low) else None
         axes.errorbar([self.x], [mean.value], yerr=ends, fmt="o", ms=4, lw=1.4, capsize=3, color=self.colour, zorder=5)
@@ -417,26 +372,21 @@ def mark_beyond(axes: Axes, means: Sequence[DrawnMean], along: Literal["x", "y"]
 # The x axis of a grid
 
 POINTS_MAX = 24  # beside each other in one panel; the tables have all
-SERIES = (BLUE, GREEN, PURPLE, ORANGE, SKY, BLACK)  # colours of the combinations of the other fields
+# colours of the combinations of the other fields
+SERIES = (style.BLUE, style.GREEN, style.PURPLE, style.ORANGE, style.SKY, style.BLACK)
 DECADES_MIN = 30.0  # ratio of the greatest and the least value from which an axis is logarithmic
 TURNED_FROM = 34  # characters of all labels, with a space each, that fit side by side in a panel
 ABOVE = 1.1  # of the height of axes: clear of runs, and of the marks of intervals that leave the axes
-MARK = VERMILION
+MARK = style.VERMILION
 TICKS_MAX = 8  # labelled values of an axis; of more, some
 
 
 class Place(Struct, frozen=True):
-    """Where a point of the grid is drawn.
+    """Where a point of the grid is drawn."""
 
-    Attributes:
-        x: of its middle.
-        room: the range of x over which its runs are spread.
-        series: index of its combination of the other fields.
-    """
-
-    x: float
-    room: tuple[float, float]
-    series: int = 0
+    x: float  # of its middle
+    room: tuple[float, float]  # the range of x over which its runs are spread
+    series: int = 0  # index of its combination of the other fields
 
 
 class GridAxis:
@@ -449,57 +399,43 @@ class GridAxis:
     """
 
     def __init__(self, design: SweepDesign) -> None:
-        self._at = [design.at(point) for point in range(design.points)]
+        self._paths = list(design.at(0))
         self._names = [design.names(point) for point in range(design.points)]
-        self.field = _numeric_field(design)
-        self._numbers = [float(at[self.field]) for at in self._at] if self.field else []
-        self._is_logarithmic = bool(self.field) and _has_decades(self._numbers)
-        self.series = list(dict.fromkeys(self._combination(names) for names in self._names)) if self.field else [""]
-        self.places = self._on_numbers() if self.field else self._side_by_side()
+        self.field, self._is_logarithmic = None, False
+        self._numbers: list[float] = []
+        self.series = [""]
+        self.places: dict[int, Place] = {}
+        grids = [axis for axis in design.axes if isinstance(axis, Grid) and len(axis.values) > 1]
+        numeric = [grid for grid in grids if all(type(value) in (int, float) for value in grid.values)]
+        chosen = max(numeric, key=lambda grid: len(grid.values), default=None)
+        if chosen and design.points <= len(chosen.values) * len(SERIES):
+            self._place_on_numbers(design, chosen.path)
+        else:
+            for point in range(min(design.points, POINTS_MAX)):
+                self.places[point] = Place(float(point), (point - 0.18, point + 0.18))
         self._labels = [" · ".join(names.values()) for names in self._names[:POINTS_MAX]]
 
-    def colour(self, place: Place) -> str:
-        """Return the colour of the runs at a place."""
-        return SERIES[place.series]
-
-    @property
-    def is_turned(self) -> bool:
-        """Return whether the labels are too long to stand side by side."""
-        return not self.field and sum(len(text) + 1 for text in self._labels) > TURNED_FROM
-
-    def mark(self, axes: Axes, points: Sequence[int]) -> None:
-        """Draw a cross above axes at some points."""
-        style: dict[str, Any] = {"color": MARK, "ms": 6, "mew": 1.6, "clip_on": False}
-        for place in (self.places[point] for point in points if point in self.places):
-            axes.plot([place.x], [ABOVE], "x", transform=axes.get_xaxis_transform(), **style)
-
-    def dress(self, axes: Axes) -> None:
-        """Give complete axes this x axis."""
-        if self.field:
-            self._dress_numbers(axes, self.field)
-        else:
-            turned = self.is_turned
-            look: dict[str, Any] = {"rotation": 45, "ha": "right"} if turned else {"rotation": 0, "ha": "center"}
-            axes.set_xticks(range(len(self.places)), self._labels, **look)
-            axes.grid(False, axis="x")
-            axes.set_xlim(-0.6, len(self.places) - 0.2)
-            axes.tick_params(axis="x", labelsize=PAPER_PT - 1.5 if turned else PAPER_PT - 1)
-        names = [self.field] if self.field else list(self._at[0])
-        axes.set_xlabel(wrapped(" · ".join(str(field_name(path)) for path in names), LEVEL_LETTERS), fontsize=PAPER_PT)
-
-    def _dress_numbers(self, axes: Axes, field: str) -> None:
-        names = dict(zip(self._numbers, (each[field] for each in self._names), strict=True))
-        if self._is_logarithmic:
-            axes.set_xscale("log")
-            axes.xaxis.set_minor_locator(NullLocator())
-        ticks = sorted(names)[:: -(-len(names) // TICKS_MAX)]
-        axes.set_xticks(ticks, [names[tick] for tick in ticks])
-        rooms = [end for place in self.places.values() for end in place.room]
-        low, high = (float(self._space(np.array(end))) for end in (min(rooms), max(rooms)))
-        axes.set_xlim(*(float(self._value(end)) for end in (low - 0.03 * (high - low), high + 0.03 * (high - low))))
-
-    def _combination(self, names: dict[str, str]) -> str:
-        return ", ".join(field_name(path).at(value) for path, value in names.items() if path != self.field)
+    def _place_on_numbers(self, design: SweepDesign, field: str) -> None:
+        self.field = field
+        self._numbers = [float(design.at(point)[field]) for point in range(design.points)]
+        values = sorted(set(self._numbers))
+        if values[0] > 0 and values[-1] >= DECADES_MIN * values[0]:  # over decades, and most of them small?
+            steps = np.diff(values)
+            self._is_logarithmic = bool(steps.max() > 2 * steps.min())
+        combinations = [
+            ", ".join(field_name(path).at(value) for path, value in names.items() if path != field)
+            for names in self._names
+        ]
+        self.series = list(dict.fromkeys(combinations))
+        numbers = self._space(np.array(self._numbers))
+        distinct = np.unique(numbers)
+        width = 0.6 * min(float(np.diff(distinct).min()), float(np.ptp(distinct)) / 6)
+        each = width / len(self.series)
+        for point, (number, combination) in enumerate(zip(numbers, combinations, strict=True)):
+            series = self.series.index(combination)
+            left = number - width / 2 + series * each
+            x, low, high = (float(self._value(left + share * each)) for share in (0.5, 0.15, 0.85))
+            self.places[point] = Place(x, (low, high), series)
 
     def _space(self, values: Any) -> Any:
         return np.log10(values) if self._is_logarithmic else values
@@ -507,38 +443,38 @@ class GridAxis:
     def _value(self, places: Any) -> Any:
         return 10.0**places if self._is_logarithmic else places
 
-    def _on_numbers(self) -> dict[int, Place]:
-        numbers = self._space(np.array(self._numbers))
-        distinct = np.unique(numbers)
-        width = 0.6 * min(float(np.diff(distinct).min()), float(np.ptp(distinct)) / 6)
-        each = width / len(self.series)
-        places = {}
-        for point, (number, names) in enumerate(zip(numbers, self._names, strict=True)):
-            series = self.series.index(self._combination(names))
-            left = number - width / 2 + series * each
-            x, low, high = (float(self._value(left + share * each)) for share in (0.5, 0.15, 0.85))
-            places[point] = Place(x, (low, high), series)
-        return places
+    def colour(self, place: Place) -> str:
+        return SERIES[place.series]
 
-    def _side_by_side(self) -> dict[int, Place]:
-        points = range(min(len(self._at), POINTS_MAX))
-        return {point: Place(float(point), (point - 0.18, point + 0.18)) for point in points}
+    @property
+    def is_turned(self) -> bool:
+        """Whether the labels are too long to stand side by side."""
+        return not self.field and sum(len(text) + 1 for text in self._labels) > TURNED_FROM
 
+    def mark(self, axes: Axes, points: Sequence[int]) -> None:
+        look: dict[str, Any] = {"color": MARK, "ms": 6, "mew": 1.6, "clip_on": False}
+        for place in (self.places[point] for point in points if point in self.places):
+            axes.plot([place.x], [ABOVE], "x", transform=axes.get_xaxis_transform(), **look)
 
-def _numeric_field(design: SweepDesign) -> str | None:
-    """Return the path with the most numbers, None if there is none, or too many combinations of the others."""
-    grids = [axis for axis in design.axes if isinstance(axis, Grid) and len(axis.values) > 1]
-    numeric = [grid for grid in grids if all(type(value) in (int, float) for value in grid.values)]
-    if not numeric:
-        return None
-    chosen = max(numeric, key=lambda grid: len(grid.values))
-    return chosen.path if design.points <= len(chosen.values) * len(SERIES) else None
-
-
-def _has_decades(values: Sequence[float]) -> bool:
-    """Return whether values need a logarithmic axis: positive, over decades, most of them small."""
-    distinct = sorted(set(values))
-    if distinct[0] <= 0 or distinct[-1] < DECADES_MIN * distinct[0]:
-        return False
-    steps = [b - a for a, b in pairwise(distinct)]
-    return max(steps) > 2 * min(steps)
+    def dress(self, axes: Axes) -> None:
+        if self.field:
+            names = dict(zip(self._numbers, (each[self.field] for each in self._names), strict=True))
+            if self._is_logarithmic:
+                axes.set_xscale("log")
+                axes.xaxis.set_minor_locator(NullLocator())
+            ticks = sorted(names)[:: -(-len(names) // TICKS_MAX)]
+            axes.set_xticks(ticks, [names[tick] for tick in ticks])
+            rooms = [end for place in self.places.values() for end in place.room]
+            low, high = (float(self._space(np.array(end))) for end in (min(rooms), max(rooms)))
+            axes.set_xlim(*(float(self._value(end)) for end in (low - 0.03 * (high - low), high + 0.03 * (high - low))))
+        else:
+            turned = self.is_turned
+            look: dict[str, Any] = {"rotation": 45, "ha": "right"} if turned else {"rotation": 0, "ha": "center"}
+            axes.set_xticks(range(len(self.places)), self._labels, **look)
+            axes.grid(False, axis="x")
+            axes.set_xlim(-0.6, len(self.places) - 0.2)
+            axes.tick_params(axis="x", labelsize=style.PAPER_PT - 1.5 if turned else style.PAPER_PT - 1)
+        names = [self.field] if self.field else self._paths
+        axes.set_xlabel(
+            wrapped(" · ".join(str(field_name(path)) for path in names), LEVEL_LETTERS), fontsize=style.PAPER_PT
+        )

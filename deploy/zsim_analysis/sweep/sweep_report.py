@@ -29,7 +29,6 @@ from zsim_analysis.sweep.sweep_figures import figures
 from zsim_analysis.sweep.sweep_summary import (
     RUNS_MIN,
     SEPARATION,
-    ConfidenceInterval,
     Distribution,
     FieldName,
     FormationParameter,
@@ -50,14 +49,7 @@ QUANTILES = "true RMS, 5 to 95 %"
 def make_sweep_report(
     directory: Path, progress: Callable[[str], None] = lambda _: None, formats: Sequence[str] = ()
 ) -> SweepSummary:
-    """Read the finished runs, write DIR/summary.json, DIR/figures/*.png and DIR/report.html.
-
-    The sweep may still be running.
-
-    Args:
-        directory: of the sweep.
-        progress: called with a text at each step.
-        formats: of `zsim_analysis.report.FORMATS`, in which each figure is written too.
+    """Read the finished runs of a sweep, which may still be running; write its report as `write_report`.
 
     Raises:
         RunError: it holds no sweep.
@@ -83,18 +75,13 @@ class PointTable(NamedTuple):
 
 
 def _table(
-    points: Sequence[GridPoint],
-    titles: Mapping[str, str],
-    text: Callable[[GridPoint, str], str],
-    title: str = "",
-    caption: str = "",
+    points: Sequence[GridPoint], titles: Mapping[str, str], text: Callable[[GridPoint, str], str], *about: str
 ) -> PointTable:
     """Return the table of some columns, given their titles and the text of a column at a point."""
-    return PointTable(list(titles.values()), [[text(p, column) for column in titles] for p in points], title, caption)
+    return PointTable(list(titles.values()), [[text(p, column) for column in titles] for p in points], *about)
 
 
 def page(summary: SweepSummary, pictures: Sequence[Picture]) -> str:
-    """Return report.html."""
     points, axes = summary.flown[:POINTS_MAX], axes_of(summary)
     names = {prefix: each for prefix, each in summary.parameters.items() if f"{prefix}.true_rms" in summary.known}
     errors = {f"{prefix}.true_rms": each.titled for prefix, each in names.items()}
@@ -125,12 +112,11 @@ def page(summary: SweepSummary, pictures: Sequence[Picture]) -> str:
 
 
 def axes_of(summary: SweepSummary) -> list[FieldName]:
-    """Return the full names of the fields of the grid; without any, that of a column which holds all runs."""
+    """Return the names of the fields of the grid; without any, that of a column which holds all runs."""
     return [field_name(path) for path in summary.points[0].values] or [FieldName("point")]
 
 
 def values_of(point: GridPoint) -> list[str]:
-    """Return the values of a point, as many as `axes_of` has names."""
     return list(point.names.values()) or [point.label]
 
 
@@ -179,7 +165,6 @@ def facts(summary: SweepSummary) -> list[tuple[str, str]]:
 
 
 def windows_of(summary: SweepSummary) -> str:
-    """Return the judged windows of all runs in words."""
     return span_text(summary.windows_s) if summary.windows_s else "not known"
 
 
@@ -196,7 +181,6 @@ def marks_of(summary: SweepSummary) -> list[str]:
 
 
 def notes(summary: SweepSummary) -> list[str]:
-    """Return what a reader should know about the figures."""
     lines = []
     if summary.finished < summary.runs:
         lines.append(f"{summary.runs - summary.finished} runs are not finished; the same command goes on with them.")
@@ -242,27 +226,16 @@ def details(point: GridPoint, names: dict[str, FormationParameter], paper_std: d
 
 
 def overview(point: GridPoint, brief: bool = False) -> list[str]:
-    """Return the cells of OVERVIEW at a point: how its runs ended."""
-    well, planned, apart = (
-        _share(share, brief) for share in (point.ended_well, point.as_planned, point.without_collision)
-    )
-    return [
-        str(point.runs),
-        well,
-        _noted(planned, f"{point.excluded} excluded" if point.excluded else ""),
-        "–" if point.engaged is None else str(point.engaged),
-        apart,
-        _mean(point, SEPARATION, ".2f", brief),
-        "–" if point.least_separation_m is None else f"{point.least_separation_m:.2f}",
-    ]
-
-
-def _share(share: ConfidenceInterval | None, brief: bool) -> str:
-    """Return a share in percent, with its interval unless brief."""
-    if share is None:
-        return "–"
-    interval = "" if brief else f" [{100 * share.low:.3g}, {100 * share.high:.3g}]"
-    return f"{100 * share.value:.3g} %{interval}"
+    shares = []  # in percent, with their intervals unless brief
+    for share in (point.ended_well, point.as_planned, point.without_collision):
+        interval = f" [{100 * share.low:.3g}, {100 * share.high:.3g}]" if share and not brief else ""
+        shares.append(f"{100 * share.value:.3g} %{interval}" if share else "–")
+    well, planned, no_collision = shares
+    excluded = f"{point.excluded} excluded" if point.excluded else ""
+    engaged = "–" if point.engaged is None else str(point.engaged)
+    least = "–" if point.least_separation_m is None else f"{point.least_separation_m:.2f}"
+    separation = _mean(point, SEPARATION, ".2f", brief)
+    return [str(point.runs), well, _noted(planned, excluded), engaged, no_collision, separation, least]
 
 
 def _mean(point: GridPoint, column: str, form: str = ".4f", brief: bool = False) -> str:
@@ -317,12 +290,11 @@ class TerminalColumn(Struct, frozen=True):
 
     @property
     def lines(self) -> list[str]:
-        """Return the head in lines."""
         return wrap(self.head, max(map(len, (*self.cells, "x" * HEAD))), break_long_words=False, break_on_hyphens=False)
 
     @property
     def width(self) -> int:
-        """Return the required number of characters, with the space to the next column."""
+        """Characters that it takes, with the space to the next column."""
         return max(map(len, (*self.lines, *self.cells))) + BETWEEN
 
 
@@ -349,53 +321,42 @@ def terminal_tables(summary: SweepSummary) -> list[PointTable]:
     """Return the user's metrics, paired differences, how the runs ended, and errors; tables without heads are empty."""
     points, level = summary.flown[:TERMINAL_POINTS_MAX], f"{100 * summary.level:g} %"
     own = {column: str(field_name(column)) for column in summary.metrics if column in summary.known}
-    errors = _terminal_errors(summary)
+    columns = {f"{prefix}.true_rms": each for prefix, each in summary.parameters.items()}
+    flown = {column: each for column, each in columns.items() if column in summary.known}
+    cluster = next((each.cluster for each in flown.values()), None)
+    # the first parameters of the first cluster that are no headings, which for Test 1 are the paper's
+    shown = [(column, each.name) for column, each in flown.items() if each.cluster == cluster]
+    errors = dict([(column, name) for column, name in shown if not name.startswith("phi_")][:ERRORS_MAX])
     compared = {  # of the user's metrics, otherwise of the errors
         column: title
         for column, title in differing(summary).items()
         if column in summary.metrics or (not summary.metrics and column in errors)
     }
-    cluster = next((each.cluster for each in errors.values()), None)
+    cluster = cluster if errors else None
     of = f" of {cluster}" if cluster else ""
     title = f"RMS of truth − desired{of} from {windows_of(summary)}, means over the runs as planned"
-    names = {column: each.name for column, each in errors.items()}
+    title_own = "Figures of your own, means over the runs as planned"
+    title_pairs = f"Differences from {heading_of(summary.points[0])} of runs with the same seed"
+    caption_pairs = f"means ± half of the {level} interval, of n pairs; of few pairs each one\n"
+    title_ends = f"{summary.scenario}: {summary.finished} of {summary.runs} runs"
+    caption_ends = "means are of the runs as planned, not of those excluded; least of all; "
+    caption_ends += f"{level} intervals are in the report\n"
+    ends = [overview(point, brief=True) for point in points]
     return [
-        _table(
-            points, own, partial(_mean, form=".4g", brief=True), "Figures of your own, means over the runs as planned"
-        ),
-        _table(
-            points,
-            compared,
-            partial(_difference, brief=True),
-            f"Differences from {heading_of(summary.points[0])} of runs with the same seed",
-            f"means ± half of the {level} interval, of n pairs; of few pairs each one\n",
-        ),
-        PointTable(
-            list(OVERVIEW),
-            [overview(point, brief=True) for point in points],
-            f"{summary.scenario}: {summary.finished} of {summary.runs} runs",
-            "means are of the runs as planned, not of those excluded; least of all; "
-            f"{level} intervals are in the report\n",
-        ),
-        _table(points, names, partial(_mean, form=".3f", brief=True), title, "in m; angles in rad\n"),
+        _table(points, own, partial(_mean, form=".4g", brief=True), title_own),
+        _table(points, compared, partial(_difference, brief=True), title_pairs, caption_pairs),
+        PointTable(list(OVERVIEW), ends, title_ends, caption_ends),
+        _table(points, errors, partial(_mean, form=".3f", brief=True), title, "in m; angles in rad\n"),
     ]
-
-
-def _terminal_errors(summary: SweepSummary) -> dict[str, FormationParameter]:
-    """Return the parameters, by the column of their true RMS, whose errors stand on a terminal.
-
-    They are the first ones of the first cluster that are no headings, which for Test 1 are the paper's.
-    """
-    columns = {f"{prefix}.true_rms": each for prefix, each in summary.parameters.items()}
-    flown = {column: each for column, each in columns.items() if column in summary.known}
-    first = next((each.cluster for each in flown.values()), None)
-    own = [(column, each) for column, each in flown.items() if each.cluster == first]
-    return dict([(column, each) for column, each in own if not each.name.startswith("phi_")][:ERRORS_MAX])
 
 
 def _fitted(table: PointTable, summary: SweepSummary, width: int) -> Iterator[Text | Table]:
     """Yield title, tables and caption; tables are at most `width` characters wide if one column fits."""
-    axes = _axis_columns(summary)
+    names = [str(name) for name in axes_of(summary)]
+    values = [values_of(point) for point in summary.flown[:TERMINAL_POINTS_MAX]]
+    if len(names) > AXES_MAX:
+        names, values = [" · ".join(names)], [[" · ".join(row)] for row in values]
+    axes = [TerminalColumn(name, tuple(row[i] for row in values)) for i, name in enumerate(names)]
     cells = zip(*table.rows, strict=True) if table.rows else [()] * len(table.heads)
     columns = [TerminalColumn(head, tuple(each)) for head, each in zip(table.heads, cells, strict=True)]
     yield cell(table.title)
@@ -410,15 +371,6 @@ def _fitted(table: PointTable, summary: SweepSummary, width: int) -> Iterator[Te
     left_out = len(summary.flown) - TERMINAL_POINTS_MAX
     more = f"{left_out} more points are in the report. " if left_out > 0 else ""
     yield cell(f"{more}{table.caption}".strip())
-
-
-def _axis_columns(summary: SweepSummary) -> list[TerminalColumn]:
-    """Return a column for each field of the grid, or one for all of them if they are many."""
-    names = [str(name) for name in axes_of(summary)]
-    rows = [values_of(point) for point in summary.flown[:TERMINAL_POINTS_MAX]]
-    if len(names) > AXES_MAX:
-        return [TerminalColumn(" · ".join(names), tuple(" · ".join(row) for row in rows))]
-    return [TerminalColumn(name, tuple(row[i] for row in rows)) for i, name in enumerate(names)]
 
 
 def _parted(columns: Sequence[TerminalColumn], room: int) -> list[Sequence[TerminalColumn]]:

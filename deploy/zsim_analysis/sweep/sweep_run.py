@@ -35,7 +35,7 @@ from zsim_analysis.in_process import InProcessFlight
 from zsim_analysis.reading.formation import Formation, formations_of
 from zsim_analysis.reading.recorded_flight import FlightReader, RecordedFlight
 from zsim_analysis.reading.shortfall import CRASHES
-from zsim_analysis.report.summary import RunSummary, summarise
+from zsim_analysis.report.summary import summarise
 from zsim_analysis.sweep.design import METRICS
 
 METRIC = "metrics."  # prefix of the columns of the user's metrics
@@ -48,67 +48,45 @@ the errors by their paths in summary.json, and `metrics.NAME` of the user's own.
 
 
 class Task(Struct, frozen=True):
-    """A run to be flown.
+    """A run to be flown."""
 
-    Attributes:
-        run: its number.
-        point: of the grid.
-        varied: values by path, without the seed.
-        scenario: resolved, with the run's seed.
-        record: folder for the record, None to keep none.
-    """
-
-    run: int
-    point: int
-    varied: dict[str, Any]
-    scenario: Scenario
-    record: str | None = None
+    run: int  # its number
+    point: int  # of the grid
+    varied: dict[str, Any]  # values by path, without the seed
+    scenario: Scenario  # resolved, with the run's seed
+    record: str | None = None  # folder for the record, None to keep none
 
 
 class RunResult(Struct, frozen=True, kw_only=True):
-    """The columns that every run has, in their order; None if a failed run has no value.
-
-    Attributes:
-        date: when it was flown (ISO 8601, UTC).
-        failure: why it did not end well, None if it did.
-        ended: the reason given by the world.
-        wall_s: wall time of the flight.
-        collisions: contacts between drones, and with obstacles.
-        crashed: whether a drone was stopped in the air, flipped, hit something hard, or touched the ground in flight.
-        engaged: whether every cluster was engaged at some instant of the judged window, None without a cluster.
-        engaged_throughout: whether every cluster was engaged at every instant of it, None without a cluster.
-        as_planned: whether the flight followed its plan.
-        shortfall: the first deviation by which it did not.
-        metrics_failure: why it has no metrics of the user, None if it has, or none are requested.
-        window_from_s, window_to_s: the judged window.
-        window_note: why it is not that of the scenario, empty if it is.
-        host: where it was flown.
-        fingerprint: numeric; equal ones promise equal bits.
-    """
+    """The columns that every run has, in their order; None if a failed run has no value."""
 
     run: int
     point: int
     seed: int
-    failure: str | None = None
-    ended: str | None = None
+    failure: str | None = None  # why it did not end well, None if it did
+    ended: str | None = None  # the reason given by the world
     truth_sha256: str | None = None
     sim_s: float | None = None
-    wall_s: float | None = None
+    wall_s: float | None = None  # wall time of the flight
     real_time_factor: float | None = None
     min_separation_m: float | None = None
-    collisions: int | None = None
+    collisions: int | None = None  # contacts between drones, and with obstacles
+    # whether a drone was stopped in the air, flipped, hit something hard, or touched the ground in flight
     crashed: bool | None = None
+    # whether every cluster was engaged at some instant of the judged window, None without a cluster
     engaged: bool | None = None
+    # whether every cluster was engaged at every instant of it, None without a cluster
     engaged_throughout: bool | None = None
-    as_planned: bool | None = None
-    shortfall: str | None = None
-    metrics_failure: str | None = None
+    as_planned: bool | None = None  # whether the flight followed its plan
+    shortfall: str | None = None  # the first deviation by which it did not
+    metrics_failure: str | None = None  # why it has no metrics of the user, None if it has, or none are requested
+    # window_from_s, window_to_s: the judged window
     window_from_s: float | None = None
     window_to_s: float | None = None
-    window_note: str | None = None
-    date: str | None = None
-    host: str = ""
-    fingerprint: str = ""
+    window_note: str | None = None  # why it is not that of the scenario, empty if it is
+    date: str | None = None  # when it was flown (ISO 8601, UTC)
+    host: str = ""  # where it was flown
+    fingerprint: str = ""  # numeric; equal ones promise equal bits
 
 
 FIXED = {field.name: field.type for field in msgspec.structs.fields(RunResult)}
@@ -127,7 +105,6 @@ def make_row(result: RunResult, varied: Mapping[str, Any], errors: Mapping[str, 
 
 
 def failed_row(task: Task, reason: str, **known: Any) -> Row:
-    """Return the row of a run that did not end well."""
     result = RunResult(run=task.run, point=task.point, seed=task.scenario.seed, failure=reason, **known)
     return make_row(result, task.varied, {})
 
@@ -177,8 +154,16 @@ def fly(task: Task) -> Row:
         **where,
     )
     columns: dict[str, float | None] = {engaged_column(name): engaged.get(name) for name in clusters}
-    errors = {} if diverged else _errors(summary, engaged)
-    return make_row(result, task.varied, {**columns, **errors, **metrics})
+    for i, (name, cluster) in enumerate([] if diverged else summary.clusters.items()):
+        # Errors by their paths in summary.json. Those of a cluster that was not engaged are None, and all of a flight
+        # that was not as planned: drones that stay on the ground, or hover instead of following a trajectory, do not
+        # hold the requested formation, and a drone that fell errs for a shorter time.
+        prefix = "errors" if i == 0 else f"clusters.{name}.errors"
+        counts = summary.as_planned and engaged[name] is not None
+        for parameter, errors in cluster.errors.items():
+            for statistic, value in msgspec.structs.asdict(errors).items():
+                columns[f"{prefix}.{parameter}.{statistic}"] = value if counts else None
+    return make_row(result, task.varied, {**columns, **metrics})
 
 
 def fly_scenario(scenario: Scenario, writer: RecordWriter | None = None) -> tuple[RecordedFlight, Exception | None]:
@@ -228,22 +213,6 @@ def engaged_s(formations: list[Formation], window_s: tuple[float, float]) -> dic
     return {each.name: float(each.t_s[rows[each.name][0]]) if len(rows[each.name]) else None for each in formations}
 
 
-def _errors(summary: RunSummary, engaged: dict[str, float | None]) -> dict[str, float | None]:
-    """Return the errors of the formations by their paths in summary.json; `errors` is the first cluster.
-
-    Those of a cluster that was not engaged are None, and all of a flight that was not as planned: drones that stay on
-    the ground, or hover instead of following a trajectory, do not hold the requested formation, and a drone that fell
-    errs for a shorter time.
-    """
-    columns: dict[str, float | None] = {}
-    for i, (name, cluster) in enumerate(summary.clusters.items()):
-        prefix, counts = "errors" if i == 0 else f"clusters.{name}.errors", engaged[name] is not None
-        for parameter, errors in cluster.errors.items():
-            for statistic, value in msgspec.structs.asdict(errors).items():
-                columns[f"{prefix}.{parameter}.{statistic}"] = value if counts and summary.as_planned else None
-    return columns
-
-
 def metrics_of(scenario: Scenario, flight: RecordedFlight) -> tuple[dict[str, float | None], str | None]:
     """Return the metrics of a flight by the user's function, by column, or in one line why there are none."""
     name = scenario.report.metrics
@@ -254,18 +223,18 @@ def metrics_of(scenario: Scenario, flight: RecordedFlight) -> tuple[dict[str, fl
         named = returned if isinstance(returned, Mapping) else {name.partition(":")[2]: returned}
         if len(named) > METRICS_MAX:
             raise ReportError(f"returned {len(named)} numbers; must be at most {METRICS_MAX}")
-        return dict(_metric(key, value) for key, value in named.items()), None
+        metrics: dict[str, float | None] = {}
+        for key, value in named.items():
+            if not (isinstance(key, str) and _NAME.fullmatch(key)):
+                must = "must be a letter and up to 63 letters, digits and _"
+                raise ReportError(f"returned the name {show(key)}; {must}")
+            if value is not None and not isinstance(value, Real):
+                kind = show(str(type(value).__name__))
+                raise ReportError(f"returned {kind} for {key}; must be a number or None")
+            number = math.nan if value is None else float(value)
+            metrics[f"{METRIC}{key}"] = number if math.isfinite(number) else None
+        return metrics, None
     except DocumentError as error:
         return {}, error.faults[0]
     except (Exception, SystemExit) as error:  # of any type: the user's function raised it
         return {}, f"{METRICS} {name}: {reason_of(error)}"
-
-
-def _metric(key: Any, value: Any) -> tuple[str, float | None]:
-    """Return column and number of a name and its value, as returned by a user's function."""
-    if not (isinstance(key, str) and _NAME.fullmatch(key)):
-        raise ReportError(f"returned the name {show(key)}; must be a letter and up to 63 letters, digits and _")
-    if value is not None and not isinstance(value, Real):
-        raise ReportError(f"returned {show(str(type(value).__name__))} for {key}; must be a number or None")
-    number = math.nan if value is None else float(value)
-    return f"{METRIC}{key}", number if math.isfinite(number) else None

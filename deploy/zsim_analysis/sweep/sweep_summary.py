@@ -7,6 +7,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import msgspec
@@ -39,7 +40,7 @@ class ConfidenceInterval(Struct, frozen=True):
     high: float
 
 
-def mean_interval(samples: Samples, level: float = LEVEL) -> ConfidenceInterval:
+def mean_interval(samples: Samples) -> ConfidenceInterval:
     """Return the mean of samples (n,) with Student's interval: mean ± t(n − 1) s / √n; none below RUNS_MIN samples.
 
     It holds for normal samples, and for others by the central limit theorem as n grows.
@@ -48,27 +49,23 @@ def mean_interval(samples: Samples, level: float = LEVEL) -> ConfidenceInterval:
     middle = float(np.mean(samples)) if n else math.nan
     if n < RUNS_MIN:
         return ConfidenceInterval(middle, math.nan, math.nan)
-    half = float(stdtrit(n - 1, (1 + level) / 2) * np.std(samples, ddof=1) / math.sqrt(n))
+    half = float(stdtrit(n - 1, (1 + LEVEL) / 2) * np.std(samples, ddof=1) / math.sqrt(n))
     return ConfidenceInterval(middle, middle - half, middle + half)
 
 
-def share_interval(count: int, of: int, level: float = LEVEL) -> ConfidenceInterval:
+def share_interval(count: int, of: int) -> ConfidenceInterval:
     """Return count / of with the exact interval of Clopper and Pearson (Biometrika 26, 1934); of > 0.
 
-    It covers the true share at least as often as `level` says, whatever the share and the number of runs.
+    It covers the true share at least as often as LEVEL says, whatever the share and the number of runs.
     """
-    tail = (1 - level) / 2
+    tail = (1 - LEVEL) / 2
     low = float(betaincinv(count, of - count + 1, tail)) if count else 0.0
     high = float(betaincinv(count + 1, of - count, 1 - tail)) if count < of else 1.0
     return ConfidenceInterval(count / of, low, high)
 
 
 class Distribution(Struct, frozen=True):
-    """The distribution of a quantity over runs of a point.
-
-    Attributes:
-        samples: all of them if they are too few for an interval, otherwise empty.
-    """
+    """The distribution of a quantity over runs of a point."""
 
     runs: int
     mean: ConfidenceInterval
@@ -78,7 +75,7 @@ class Distribution(Struct, frozen=True):
     p95: float
     least: float
     greatest: float
-    samples: tuple[float, ...] = ()
+    samples: tuple[float, ...] = ()  # all of them if they are too few for an interval, otherwise empty
 
 
 def distribution(samples: Samples) -> Distribution | None:
@@ -86,16 +83,13 @@ def distribution(samples: Samples) -> Distribution | None:
     known = finite(samples)
     if not len(known):
         return None
-    p5, median, p95 = (float(value) for value in np.percentile(known, [5, 50, 95]))
-    std = float(np.std(known, ddof=1)) if len(known) > 1 else float("nan")
+    std = float(np.std(known, ddof=1)) if len(known) > 1 else math.nan
+    p5, median, p95, least, greatest = map(float, (*np.percentile(known, [5, 50, 95]), known.min(), known.max()))
     few = tuple(known.tolist()) if len(known) < RUNS_MIN else ()
-    return Distribution(
-        len(known), mean_interval(known), std, p5, median, p95, float(known.min()), float(known.max()), few
-    )
+    return Distribution(len(known), mean_interval(known), std, p5, median, p95, least, greatest, few)
 
 
 def finite(samples: Samples) -> Samples:
-    """Return the finite samples."""
     return samples[np.isfinite(samples)]
 
 
@@ -105,24 +99,15 @@ def count_text(count: int, of: int) -> str:
 
 
 class FormationParameter(Struct, frozen=True):
-    """A variable of a formation.
-
-    Attributes:
-        cluster: the formation's name, None if there is only one.
-    """
+    """A variable of a formation."""
 
     name: str
-    cluster: str | None = None
-
-    @property
-    def unit(self) -> str:
-        """Return the unit, m or rad."""
-        return unit(self.name)
+    cluster: str | None = None  # the formation's name, None if there is only one
 
     @property
     def titled(self) -> str:
-        """Return the name with its unit, and the cluster's if there are several."""
-        return self.labelled(f"{self.name} ({self.unit})")
+        """The name with its unit, and the cluster's if there are several."""
+        return self.labelled(f"{self.name} ({unit(self.name)})")
 
     def labelled(self, text: str) -> str:
         """Return a text about the variable, with the cluster's name if there are several."""
@@ -132,9 +117,7 @@ class FormationParameter(Struct, frozen=True):
 def parameters(columns: Iterable[str], clusters: Sequence[str]) -> dict[str, FormationParameter]:
     """Return the formation parameters of columns of errors, by the columns' prefix; names may contain points.
 
-    Args:
-        columns: names such as errors.x_c.true_rms, or clusters.NAME.errors.x_c.true_rms of a second cluster.
-        clusters: names of all of them.
+    Columns are such as errors.x_c.true_rms, or clusters.NAME.errors.x_c.true_rms of a second one of the clusters.
     """
     prefixes = dict.fromkeys(column.rpartition(".")[0] for column in columns)
     matches = {each: match for each in prefixes if (match := _COLUMN.fullmatch(each))}
@@ -144,102 +127,74 @@ def parameters(columns: Iterable[str], clusters: Sequence[str]) -> dict[str, For
 
 
 class GridPoint(Struct, frozen=True):
-    """One combination of the grid's values.
-
-    Attributes:
-        values: by path; empty if only seeds and drawn values vary.
-        names: the abbreviated values, unique for each field.
-        runs: finished ones.
-        ended_well: share of them; None without a run.
-        without_collision: share of those that ended well in which no drone collided with anything, or fell.
-        engaged: runs that ended well with every cluster engaged at some instant of the judged window; None if no run
-            has a cluster.
-        as_planned: share of those that ended well that followed their plan.
-        excluded: runs that ended well and did not follow their plan: they are in no spread and no difference.
-        spreads: by column of the table, of those that ended well and followed their plan.
-        least_separation_m: of all that ended well, None if no run has any.
-        differences: by column, of its value less that at the first point in the run with the same seed, over the pairs
-            of runs of which both are in the spreads; empty at the first point, and if seeds are not paired.
-    """
+    """One combination of the grid's values."""
 
     label: str
-    values: dict[str, Any]
-    names: dict[str, str]
-    runs: int
-    ended_well: ConfidenceInterval | None
+    values: dict[str, Any]  # by path; empty if only seeds and drawn values vary
+    names: dict[str, str]  # the abbreviated values, unique for each field
+    runs: int  # finished ones
+    ended_well: ConfidenceInterval | None  # share of them; None without a run
+    # share of those that ended well in which no drone collided with anything, or fell
     without_collision: ConfidenceInterval | None
+    # runs that ended well with every cluster engaged at some instant of the judged window; None if no run has a
+    # cluster
     engaged: int | None
-    as_planned: ConfidenceInterval | None
-    spreads: dict[str, Distribution]
-    excluded: int = 0
-    least_separation_m: float | None = None
+    as_planned: ConfidenceInterval | None  # share of those that ended well that followed their plan
+    spreads: dict[str, Distribution]  # by column of the table, of those that ended well and followed their plan
+    excluded: int = 0  # runs that ended well and did not follow their plan: they are in no spread and no difference
+    least_separation_m: float | None = None  # of all that ended well, None if no run has any
+    # by column, of its value less that at the first point in the run with the same seed, over the pairs of runs of
+    # which both are in the spreads; empty at the first point, and if seeds are not paired
     differences: dict[str, Distribution] = {}
-
-    @property
-    def well(self) -> int:
-        """Return how many runs ended well."""
-        return round(self.ended_well.value * self.runs) if self.ended_well else 0
 
     def count(self, column: str) -> str:
         """Return the number of runs behind a mean, "" if it is of all that ended well."""
+        well = round(self.ended_well.value * self.runs) if self.ended_well else 0
         spread = self.spreads.get(column)
-        return count_text(spread.runs, self.well) if spread else ""
+        return count_text(spread.runs, well) if spread else ""
 
 
 class SweepSummary(Struct, frozen=True):
-    """summary.json of a sweep.
-
-    Attributes:
-        changed: texts `a.b.c=value` by which the scenario differs from its file; None: not known.
-        dates: when the first and the last run were flown (ISO 8601, UTC); None if no run has a date.
-        not_engaged: runs that ended well, but a cluster was never engaged within the judged window.
-        not_as_planned: number of runs that ended well and did not follow their plan, by the first deviation; texts
-            that differ in figures only are one.
-        judged_unengaged: runs that ended well whose window holds instants at which a cluster was not engaged.
-        window_notes: number of runs that ended well, by why their window is not that of the scenario.
-        windows_s: the judged windows, least start and greatest end of all runs; None if no run has one.
-        paper_std: Table I by parameter, empty for any flight but Test 1.
-        parameters: of the formations, by the prefix of their columns.
-        metrics: columns of the user's metrics.
-        unmeasured: number of runs that have none of those, by the reason.
-    """
+    """summary.json of a sweep."""
 
     scenario: str
     seed: int
     vary: tuple[str, ...]
-    changed: tuple[str, ...] | None
+    changed: tuple[str, ...] | None  # texts `a.b.c=value` by which the scenario differs from its file; None: not known
+    # when the first and the last run were flown (ISO 8601, UTC); None if no run has a date
     dates: tuple[str, str] | None
     runs: int
     finished: int
     failed: dict[str, int]
-    not_engaged: int
+    not_engaged: int  # runs that ended well, but a cluster was never engaged within the judged window
+    # number of runs that ended well and did not follow their plan, by the first deviation; texts that differ in
+    # figures only are one
     not_as_planned: dict[str, int]
-    judged_unengaged: int
+    judged_unengaged: int  # runs that ended well whose window holds instants at which a cluster was not engaged
+    # the judged windows, least start and greatest end of all runs; None if no run has one
     windows_s: tuple[float, float] | None
-    paper_std: dict[str, float]
+    paper_std: dict[str, float]  # Table I by parameter, empty for any flight but Test 1
     level: float
     flown_wall_s: float
     hosts: dict[str, int]
     fingerprints: dict[str, int]
     version: str
-    parameters: dict[str, FormationParameter]
-    metrics: tuple[str, ...]
-    unmeasured: dict[str, int]
+    parameters: dict[str, FormationParameter]  # of the formations, by the prefix of their columns
+    metrics: tuple[str, ...]  # columns of the user's metrics
+    unmeasured: dict[str, int]  # number of runs that have none of those, by the reason
     points: list[GridPoint]
-    window_notes: dict[str, int] = {}
+    window_notes: dict[str, int] = {}  # number of runs that ended well, by why their window is not that of the scenario
 
     def json(self) -> bytes:
-        """Return the text of summary.json; unknown values are null."""
         return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
 
     @property
     def flown(self) -> list[GridPoint]:
-        """Return the points with finished runs."""
         return [point for point in self.points if point.runs]
 
     @property
     def known(self) -> set[str]:
-        """Return the columns of which some run at some point has a number."""
+        """The columns of which some run at some point has a number."""
         return {column for point in self.points for column in point.spreads}
 
 
@@ -252,20 +207,22 @@ class SweepResults:
         self.points = np.array([row["point"] for row in rows], np.int64)
         self.well = np.array([row["failure"] is None for row in rows], bool)
         columns = dict.fromkeys(name for row in rows for name in row if name not in FIXED)
-        self.errors = [
-            name
-            for name in columns
-            if name.startswith(("errors.", "clusters.")) and name.endswith(tuple(STATISTICS.values()))
-        ]
+        of_clusters = [name for name in columns if name.startswith(("errors.", "clusters."))]
+        self.errors = [name for name in of_clusters if name.endswith(tuple(STATISTICS.values()))]
         prefix, suffix = engaged_column(" ").split(" ")
-        engaged = [name for name in columns if name.startswith(prefix) and name.endswith(suffix)]
+        engaged = [name for name in of_clusters if name.startswith(prefix) and name.endswith(suffix)]
         self.parameters = parameters(self.errors, [name[len(prefix) : -len(suffix)] for name in engaged])
         self.metrics = [name for name in columns if name.startswith(METRIC)]
         report = design.plan.document.get("report")
         self.metrics_function = str(report.get("metrics") or "") if isinstance(report, Mapping) else ""
         self.has_seeds = design.seeds is not None
         self.drawn = [axis.path for axis in design.axes if isinstance(axis, Draw)]
-        self.paper_std = {} if self.drawn else _paper_std(design)
+        self.paper_std: Mapping[str, float] = {}
+        if not self.drawn:
+            scenarios = (design.scenario(point) for point in range(design.points))
+            with suppress(ScenarioError):
+                if all(len(each.clusters) == 1 and paper_table(each, each.clusters[0].name) for each in scenarios):
+                    self.paper_std = PAPER_TABLE_1
 
     def values(self, column: str, point: int | None = None) -> Samples:
         """Return a column for the runs that ended well, at one point or all; NaN where unknown."""
@@ -297,21 +254,16 @@ class SweepResults:
         collisions, crashed = self.values("collisions", point), self.values("crashed", point)
         return int(((collisions == 0) & (crashed != 1)).sum()), len(collisions)
 
-    def engaged(self, point: int | None = None) -> tuple[int, int]:
-        """Return how many runs that ended well had every cluster engaged, and how many have a cluster."""
-        engaged = self.values("engaged", point)
-        return int((engaged == 1).sum()), int(np.isfinite(engaged).sum())
-
-    def as_planned(self, point: int) -> tuple[int, int]:
-        """Return how many of a point's runs that ended well followed their plan, and how many are judged."""
-        planned = self.values("as_planned", point)
-        return int((planned == 1).sum()), int(np.isfinite(planned).sum())
+    def count(self, flag: str, point: int | None = None) -> tuple[int, int]:
+        """Return how many runs that ended well have a flag set, such as `as_planned`, and for how many it is known."""
+        flags = self.values(flag, point)
+        return int((flags == 1).sum()), int(np.isfinite(flags).sum())
 
     def never_as_planned(self) -> list[int]:
         """Return the points with finished runs of which none ended well and followed its plan."""
         points = []
         for point in range(self.design.points):
-            (well, runs), (planned, of) = self.ended_well(point), self.as_planned(point)
+            (well, runs), (planned, of) = self.ended_well(point), self.count("as_planned", point)
             if runs and not planned and (of or not well):  # without a cluster no run that ended well is judged
                 points.append(point)
         return points
@@ -323,10 +275,17 @@ class SweepResults:
         return (float(start[known].min()), float(end[known].max())) if known.any() else None
 
     def summary(self) -> SweepSummary:
-        """Return the content of summary.json."""
+        def texts(rows: Iterable[Row], column: str) -> list[str]:
+            return [row[column] for row in rows if row.get(column)]
+
+        def counted(texts: Iterable[str]) -> dict[str, int]:
+            """Count texts, most frequent first; those that differ in figures only count as the first one."""
+            first: dict[str, str] = {}
+            return dict(Counter(first.setdefault(_FIGURE.sub("#", text), text) for text in texts).most_common())
+
         plan, rows = self.design.plan, self.rows
         well = [row for row, is_well in zip(rows, self.well, strict=True) if is_well]
-        engaged, of = self.engaged()
+        engaged, of = self.count("engaged")
         dates = sorted(row["date"] for row in rows if row.get("date"))
         return SweepSummary(
             scenario=str(plan.document["name"]),
@@ -336,28 +295,28 @@ class SweepResults:
             dates=(dates[0], dates[-1]) if dates else None,
             runs=plan.runs,
             finished=len(rows),
-            failed=dict(Counter(_texts(rows, "failure")).most_common()),
+            failed=dict(Counter(texts(rows, "failure")).most_common()),
             not_engaged=of - engaged,
-            not_as_planned=_counted(_texts(well, "shortfall")),
+            not_as_planned=counted(texts(well, "shortfall")),
             judged_unengaged=sum(row.get("engaged_throughout") is False for row in well),
-            window_notes=_counted(_texts(well, "window_note")),
+            window_notes=counted(texts(well, "window_note")),
             windows_s=self.windows_s(),
             paper_std=dict(self.paper_std),
             level=LEVEL,
             flown_wall_s=sum(row["wall_s"] or 0.0 for row in rows),
-            hosts=dict(Counter(_texts(rows, "host"))),
-            fingerprints=dict(Counter(_texts(rows, "fingerprint"))),
+            hosts=dict(Counter(texts(rows, "host"))),
+            fingerprints=dict(Counter(texts(rows, "fingerprint"))),
             version=plan.version,
             parameters=self.parameters,
             metrics=tuple(self.metrics),
-            unmeasured=dict(Counter(_texts(rows, "metrics_failure")).most_common()),
+            unmeasured=dict(Counter(texts(rows, "metrics_failure")).most_common()),
             points=[self._point(point) for point in range(self.design.points)],
         )
 
     def _point(self, point: int) -> GridPoint:
         well, runs = self.ended_well(point)
-        engaged, of = self.engaged(point)
-        planned, judged = self.as_planned(point)
+        engaged, of = self.count("engaged", point)
+        planned, judged = self.count("as_planned", point)
         columns = (SEPARATION, *self.errors, *self.metrics)
         compared = (*self.metrics, SEPARATION, *(each for each in self.errors if each.endswith(".true_rms")))
         names = self.design.names(point)
@@ -379,73 +338,22 @@ class SweepResults:
         )
 
 
-def _texts(rows: Iterable[Row], column: str) -> list[str]:
-    """Return the texts of a column, empty ones left out."""
-    return [row[column] for row in rows if row.get(column)]
-
-
-def _counted(texts: Iterable[str]) -> dict[str, int]:
-    """Return how often each text occurs, most often first; those that differ in figures only count as the first one."""
-    first: dict[str, str] = {}
-    counts = Counter(first.setdefault(_FIGURE.sub("#", text), text) for text in texts)
-    return dict(counts.most_common())
-
-
-def _paper_std(design: SweepDesign) -> Mapping[str, float]:
-    """Return Table I if every point flies Test 1 with one cluster, otherwise nothing."""
-    scenarios = (design.scenario(point) for point in range(design.points))
-    try:
-        flown = all(len(each.clusters) == 1 and paper_table(each, each.clusters[0].name) for each in scenarios)
-    except ScenarioError:
-        return {}
-    return PAPER_TABLE_1 if flown else {}
-
-
 # Names of fields
 
 UNITS = {  # by the end of a name, longer ones first
-    "_kg_m2": "kg m²",
-    "_kg_m3": "kg/m³",
-    "_nm_s2": "N m s²",
-    "_rad_s": "rad/s",
-    "_deg_s": "deg/s",
-    "_n_s_m": "N s/m",
-    "_n_s2": "N s²",
-    "_1_s2": "1/s²",
-    "_m_s2": "m/s²",
-    "_percent": "%",
-    "_1_s": "1/s",
-    "_m_s": "m/s",
-    "_px2": "px²",
-    "_deg": "deg",
-    "_rad": "rad",
-    "_mah": "mAh",
-    "_px": "px",
-    "_kg": "kg",
-    "_hz": "Hz",
-    "_ms": "ms",
-    "_ut": "µT",
-    "_m": "m",
-    "_s": "s",
-}
+    "_kg_m2": "kg m²", "_kg_m3": "kg/m³", "_nm_s2": "N m s²", "_rad_s": "rad/s", "_deg_s": "deg/s", "_n_s_m": "N s/m",
+    "_n_s2": "N s²", "_1_s2": "1/s²", "_m_s2": "m/s²", "_percent": "%", "_1_s": "1/s", "_m_s": "m/s", "_px2": "px²",
+    "_deg": "deg", "_rad": "rad", "_mah": "mAh", "_px": "px", "_kg": "kg", "_hz": "Hz", "_ms": "ms", "_ut": "µT",
+    "_m": "m", "_s": "s",
+}  # fmt: skip
 OF_CHANNEL = {  # units relative to that of the channel: zsim.sensors
-    "noise": "",
-    "density": "/√Hz",
-    "bias": "",
-    "bias_walk": "/√s",
-    "bias_instability": "",
-    "quantum": "",
-}
+    "noise": "", "density": "/√Hz", "bias": "", "bias_walk": "/√s", "bias_instability": "", "quantum": "",
+}  # fmt: skip
 SECTIONS = ("environment", "sensors", "drones", "clusters", "metrics")  # left out before the names of their fields
 WORDS = {
-    "gps": "GPS",
-    "imu": "IMU",
-    "mag": "magnetometer",
-    "baro": "barometer",
-    "accel": "accelerometer",
-    "gyro": "gyroscope",
-    "takeoff": "take-off",
-}
+    "gps": "GPS", "imu": "IMU", "mag": "magnetometer", "baro": "barometer", "accel": "accelerometer",
+    "gyro": "gyroscope", "takeoff": "take-off",
+}  # fmt: skip
 OF_VARIABLES = ("target", "values", "expressions")  # maps of a plan, by the variables of its cluster
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # as in zsim.scenario.overrides
 
@@ -461,7 +369,7 @@ class FieldName(Struct, frozen=True):
 
     def at(self, value: str) -> str:
         """Return the field with an abbreviated value, e.g. "wind gust 1.5 m/s"."""
-        return f"{self.words} {value}{f' {self.unit}' if self.unit else ''}"
+        return f"{self.words} {value} {self.unit}".rstrip()
 
 
 def field_name(path: str) -> FieldName:
@@ -469,10 +377,14 @@ def field_name(path: str) -> FieldName:
 
     For example, sensors.gps.position_m.noise is the "GPS position noise" in m.
     """
-    steps = [word or bracket for word, bracket in _STEP.findall(path)] or [path]
+    steps: list[str] = [word or bracket for word, bracket in _STEP.findall(path)] or [path]
     kept = steps[1:] if steps[0] in SECTIONS and len(steps) > (1 if steps[0] == "metrics" else 2) else steps
     kept = [f"{steps[0].removesuffix('s')} {kept[0]}", *kept[1:]] if kept[0].isdigit() else kept
-    parted = [_parted(step) for step in kept]
+    parted: list[tuple[str, str]] = []  # words and unit of each step
+    for step in kept:
+        end = next((end for end in UNITS if step.endswith(end) and step != end), "")
+        words = " ".join(WORDS.get(word, word) for word in step.removesuffix(end).split("_"))
+        parted.append((words, UNITS.get(end, "")))
     if steps[0] == "clusters" and "plan" in steps[2:-2] and steps[-2] in OF_VARIABLES:
         name = steps[-1]  # of a variable: angles are in rad, in deg if the name ends so
         parted[-1] = (name[:-4], "deg") if name.endswith("_deg") else (name, unit(name))
@@ -480,10 +392,3 @@ def field_name(path: str) -> FieldName:
     if kept[-1] in OF_CHANNEL and len(kept) > 1 and parted[-2][1]:
         measure = parted[-2][1] + OF_CHANNEL[kept[-1]]
     return FieldName(" ".join(words for words, _ in parted), measure)
-
-
-def _parted(step: str) -> tuple[str, str]:
-    """Return the words and the unit of one step."""
-    end = next((end for end in UNITS if step.endswith(end) and step != end), "")
-    words = step.removesuffix(end).split("_")
-    return " ".join(WORDS.get(word, word) for word in words), UNITS.get(end, "")

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from zsim.contract.messages import Info
     from zsim.transport.session import Session
-    from zsim.transport.tls import Identity
     from zsim_bridges.vehicle_links.failsafe import FlightLimits
 
 FIRST_ADDRESS = "127.0.0.2"  # of the first AR.Drone; 127.0.0.1 is where programs on this host send from
@@ -40,8 +39,7 @@ mavlink = typer.Typer(
 ardrone = typer.Typer(name="ardrone", help="Programs for the AR.Drone fly drones of a run.", no_args_is_help=True)
 
 PaceAsked = Annotated[
-    float | None,
-    Option(callback=opt.positive, help="Simulated per wall second, asked of the world.", show_default=False),
+    float | None, opt.positive_option("Simulated per wall second, asked of the world.", show_default=False)
 ]
 SigningKey = Annotated[
     Path | None, Option(help="File with the key of MAVLink 2 signatures; unsigned messages are refused.")
@@ -55,21 +53,12 @@ def console(
     listen: Annotated[str, Option(help="Address on which the page is served.")] = "127.0.0.1",
     port: Annotated[
         int | None,
-        Option(
-            min=1,
-            max=opt.PORT_MAX,
-            help=f"Port of the page ({opt.CONSOLE_PORT}, or another where that is taken).",
-            show_default=False,
-        ),
+        opt.port_option(f"Port of the page ({opt.CONSOLE_PORT}, or another where that is taken).", show_default=False),
     ] = None,
     token: Annotated[str | None, Option(envvar=TOKEN, help="What operators must show; needed off loopback.")] = None,
     rate_hz: Annotated[
         float | None,
-        Option(
-            callback=opt.positive,
-            help="Pictures a second (20; 10 from 20 drones or 4 × real time on).",
-            show_default=False,
-        ),
+        opt.positive_option("Pictures a second (20; 10 from 20 drones or 4 × real time on).", show_default=False),
     ] = None,
     name: Annotated[str, Option(help="Process name (default the certificate's, or console.1, .2, …).")] = "",
     folder: Annotated[
@@ -100,8 +89,8 @@ def console(
 def gateway(
     reach: opt.WorldAccess,
     listen: Annotated[str, Option(help="Address on which clients come in.")] = "127.0.0.1",
-    http: Annotated[int, Option(min=1, max=opt.PORT_MAX, help="Port of HTTP and WebSocket.")] = 8000,
-    lines: Annotated[int, Option(min=1, max=opt.PORT_MAX, help="Port of JSON lines on TCP.")] = 7470,
+    http: Annotated[int, opt.port_option("Port of HTTP and WebSocket.")] = 8000,
+    lines: Annotated[int, opt.port_option("Port of JSON lines on TCP.")] = 7470,
     token: Annotated[str | None, Option(envvar=TOKEN, help="What clients must show; needed off loopback.")] = None,
     name: Annotated[str, opt.process_option("gateway.main")] = "",
 ) -> None:
@@ -118,7 +107,14 @@ def gateway(
     own_name = process_name("gateway", name, reach.who)
 
     def connect_as(process: str) -> "AbstractContextManager[tuple[Session, Info]]":
-        return find_world(reach.endpoint, reach.federation, opt.LOOK_S, identity=_client_identity(reach.who, process))
+        who = reach.who
+        if who.tls is not None:  # the certificate of a client lies beside the gateway's
+            folder = who.tls.parent / process
+            if not folder.is_dir():
+                remedy = "name it in the scenario and in the inventory"
+                raise SessionError(f"{process}: has no certificate here ({folder}); {remedy}")
+            who = who._replace(tls=folder, process=process)
+        return find_world(reach.endpoint, reach.federation, opt.LOOK_S, identity=who)
 
     require_files(SERVER_FILES, "a gateway and its clients")
     allow_files(SERVER_FILES + CONNECTIONS_MAX + CLIENTS_MAX)
@@ -126,21 +122,6 @@ def gateway(
     served = Gateway(ports, own_name, token, connect_as, log_printer(reach.launched), secured=reach.tls is not None)
     with served.open():
         serve_as("gateway", own_name, served.serve, reach)
-
-
-def _client_identity(who: "Identity", process: str) -> "Identity":
-    """Return the identity of a gateway's client on the network: its certificate lies beside the gateway's."""
-    if who.tls is None:
-        return who
-    folder: Path = who.tls.parent / process
-    if not folder.is_dir():
-        raise SessionError(
-            f"{process}: has no certificate here ({folder}); name it in the scenario and in the inventory"
-        )
-    return who._replace(tls=folder, process=process)
-
-
-# ROS
 
 
 @app.command(rich_help_panel=opt.TRANSLATE)
@@ -185,7 +166,15 @@ def ros2(
     """Show the drones to ROS 2 (RMW_IMPLEMENTATION=rmw_zenoh_cpp) as topics and services, without ROS here."""
     require("ros2", ROS2_NEEDS)
     if write_package is not None:
-        _write_package(write_package / "zsim_msgs")
+        from zsim_bridges.ros2.ros_types import PACKAGE
+
+        folder = write_package / "zsim_msgs"
+        with file_fault(folder, "cannot be written", "give --write-package another folder"):
+            for file, text in PACKAGE.items():
+                path = folder / file
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(text)
+        say(f"wrote {folder}; build it with colcon in a ROS workspace")
         return
     from zsim.transport.tls import Identity, is_tls
     from zsim_bridges.ros2.ros2_bridge import RosNetwork, serve
@@ -197,25 +186,6 @@ def ros2(
     to_router = who if router and is_tls(router) else Identity(host=who.host, insecure=reach.insecure)
     network = RosNetwork(domain, router, to_router)
     serve_as("ros2", name, partial(serve, network=network, wall_ns=time.time_ns), reach, lowered=True)
-
-
-def _write_package(folder: Path) -> None:
-    """Write a ROS package, whose build makes ROS know our own messages.
-
-    Raises:
-        RunError: the folder cannot be written.
-    """
-    from zsim_bridges.ros2.ros_types import PACKAGE
-
-    with file_fault(folder, "cannot be written", "give --write-package another folder"):
-        for name, text in PACKAGE.items():
-            path = folder / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text)
-    say(f"wrote {folder}; build it with colcon in a ROS workspace")
-
-
-# MAVLink
 
 
 @mavlink.command("serve")
@@ -230,17 +200,10 @@ def serve_mavlink(
     listen: Annotated[str, Option(help="Address on which the vehicles' ports are opened.")] = "127.0.0.1",
     gcs_local: Annotated[
         int | None,
-        Option(
-            min=1,
-            max=opt.PORT_MAX,
-            help=f"First port that talks with the ground station; +1 each (default {GCS_LOCAL_PORT}).",
-        ),
+        opt.port_option(f"First port that talks with the ground station; +1 each (default {GCS_LOCAL_PORT})."),
     ] = None,
     api_local: Annotated[
-        int | None,
-        Option(
-            min=1, max=opt.PORT_MAX, help=f"First port that talks with programs; +1 each (default {API_LOCAL_PORT})."
-        ),
+        int | None, opt.port_option(f"First port that talks with programs; +1 each (default {API_LOCAL_PORT}).")
     ] = None,
     first_system_id: Annotated[
         int, Option(min=1, max=254, help="Of the first drone; +1 each. The default ports move with it.")
@@ -274,7 +237,6 @@ def serve_mavlink(
 
 
 def _endpoint(option: str, text: str, listen: str) -> tuple[str, int]:
-    """Return the address of HOST:PORT."""
     from socket import gaierror, gethostbyname
 
     from zsim_bridges.web import is_loopback
@@ -292,11 +254,7 @@ def _endpoint(option: str, text: str, listen: str) -> tuple[str, int]:
 
 
 def read_key(path: Path) -> bytes:
-    """Return the key in a file: 32 bytes, 64 hexadecimal digits, or a passphrase, whose SHA-256 it is.
-
-    Raises:
-        RunError: the file cannot be read, or is empty.
-    """
+    """Return the key in a file: 32 bytes, 64 hexadecimal digits, or a passphrase, whose SHA-256 it is."""
     from hashlib import sha256
 
     with file_fault(path, "cannot be read", "give --signing-key a file with the key"):
@@ -312,9 +270,6 @@ def read_key(path: Path) -> bytes:
     except ValueError:
         return sha256(text).digest()
     return key if len(key) == KEY_BYTES else sha256(text).digest()
-
-
-# AR.Drone
 
 
 @ardrone.command("serve")
@@ -339,21 +294,13 @@ def serve_ardrone(
     serve_as("ardrone", name, partial(ArdroneServer.serve, options=options), reach)
 
 
-# Real aircraft
-
-
 DroneName = Annotated[str, Argument(help="The drone of the run that it is; `body: external` in the scenario.")]
 Armed = Annotated[bool, Option("--armed", help="Obey from the start; else an operator asks `arm` first.")]
-Speed = Annotated[float, Option(callback=opt.positive, help="Greatest horizontal speed, m/s.")]
-Climb = Annotated[float, Option(callback=opt.positive, help="Greatest vertical speed, m/s.")]
-Radius = Annotated[float | None, Option(callback=opt.positive, help="Fence about the origin of W, m.")]
-Ceiling = Annotated[float | None, Option(callback=opt.positive, help="Greatest height over the origin of W, m.")]
 
 
 def _bounds(
     armed: bool, speed: float, climb: float, radius: float | None, ceiling: float | None
 ) -> "tuple[FlightLimits, bool]":
-    """Return within what a driver flies, and whether it obeys from the start."""
     from zsim_bridges.vehicle_links.failsafe import FlightLimits
 
     radius_m, ceiling_m = (math.inf if limit is None else limit for limit in (radius, ceiling))
@@ -365,10 +312,10 @@ driver_options = opt.option_group(
     _bounds,
     {
         "armed": (Armed, False),
-        "speed": (Speed, 2.0),
-        "climb": (Climb, 1.0),
-        "radius": (Radius, None),
-        "ceiling": (Ceiling, None),
+        "speed": (Annotated[float, opt.positive_option("Greatest horizontal speed, m/s.")], 2.0),
+        "climb": (Annotated[float, opt.positive_option("Greatest vertical speed, m/s.")], 1.0),
+        "radius": (Annotated[float | None, opt.positive_option("Fence about the origin of W, m.")], None),
+        "ceiling": (Annotated[float | None, opt.positive_option("Greatest height over the origin of W, m.")], None),
     },
 )
 
@@ -381,7 +328,7 @@ def drive_mavlink(
     bounds: "tuple[FlightLimits, bool]",
     drone: DroneName,
     address: Annotated[str, Argument(help="UDP port of the vehicle: udp://HOST:PORT.")],
-    local_port: Annotated[int, Option(min=0, max=opt.PORT_MAX, help="UDP port here; 0 for any.")] = 0,
+    local_port: Annotated[int, opt.port_option("UDP port here; 0 for any.", least=0)] = 0,
     system: Annotated[int, Option(min=0, max=255, help="Its system id; 0 for the first that shows itself.")] = 0,
     signing_key: SigningKey = None,
     origin: Annotated[
@@ -390,8 +337,7 @@ def drive_mavlink(
 ) -> None:
     """Let a MAVLink vehicle (PX4, ArduPilot, or its simulator) fly as a drone of the run."""
     from zsim_bridges.mavlink.autopilot_session import AutopilotSession
-    from zsim_bridges.vehicle_links.driver import drive
-    from zsim_bridges.vehicle_links.driver_options import DriverOptions, check_host, position, udp_channel
+    from zsim_bridges.vehicle_links.driver import DriverOptions, check_host, drive, position, udp_channel
 
     options = DriverOptions(drone, *bounds, position(origin) if origin else None, None)
     channel = udp_channel(address, local_port)
@@ -421,11 +367,10 @@ def drive_ardrone(
     ] = 8,
 ) -> None:
     """Let an AR.Drone 2.0 fly as a drone of the run."""
-    from zsim_bridges.ardrone.aircraft_session import AircraftSession, AircraftSettings
-    from zsim_bridges.vehicle_links.driver import drive
-    from zsim_bridges.vehicle_links.driver_options import DriverOptions, aircraft_host, check_host, position
+    from zsim_bridges.ardrone.aircraft_session import AircraftSession
+    from zsim_bridges.vehicle_links.driver import DriverOptions, aircraft_host, check_host, drive, position
 
     options = DriverOptions(drone, *bounds, position(origin) if origin else None, yaw)
     check_host(aircraft_host(address))
-    make_session = partial(AircraftSession.of_run, host=address, settings=AircraftSettings(ultrasound=ultrasound))
+    make_session = partial(AircraftSession.of_run, host=address, ultrasound=ultrasound)
     serve_as("driver", "", partial(drive, options=options, make_session=make_session), reach, drone)

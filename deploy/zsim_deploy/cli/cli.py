@@ -5,7 +5,7 @@ import importlib
 import os
 import sys
 from functools import cache
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import typer
 from typer.main import get_command
@@ -27,16 +27,12 @@ from zsim_deploy.roles.closed_output import STREAMS, is_unread
 
 UsageError: Any = importlib.import_module(typer.BadParameter.__module__).UsageError  # of the click that typer uses
 UNREAD = 128 + 13  # exit code of a command whose output is no longer read: that of SIGPIPE
-FILE_FAULTS = {  # of a path that a person gave, or of its disk, wherever it is looked at first
-    *(errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ELOOP, errno.EROFS, errno.EIO, errno.ESTALE),
-}
+# of a path that a person gave, or of its disk, wherever it is looked at first
+FILE_FAULTS = {errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ELOOP, errno.EROFS, errno.EIO, errno.ESTALE}
 PATH_SHOWN = 200  # characters
 EXIT_CODES = {  # of what is no wrong input
+    **dict.fromkeys((BehindError, RequestRefusedError, RunFailedError, UserCodeError), 1),
     SupersededError: 3,
-    BehindError: 1,
-    RequestRefusedError: 1,
-    RunFailedError: 1,
-    UserCodeError: 1,
 }
 ABOUT = "Co-simulate drone formations: one world, estimators and controllers as processes on Zenoh, in lockstep."
 
@@ -80,7 +76,14 @@ def command() -> Any:
 
 def main() -> None:
     """Run the command line; a user's fault is a line, not a traceback."""
-    code = _exit_code()
+    try:
+        code = _run()
+    except BrokenPipeError:
+        if not any(map(is_unread, STREAMS)):
+            raise  # of a connection
+        code = UNREAD
+    except SystemExit as ended:  # click exits with 1 where the output is not read
+        code = UNREAD if isinstance(ended.__context__, BrokenPipeError) else ended.code
     try:
         sys.stdout.flush()
     except BrokenPipeError:
@@ -91,44 +94,32 @@ def main() -> None:
     sys.exit(code)
 
 
-def _exit_code() -> int | str | None:
-    """Run the command line; return its exit code; UNREAD where the output is not read, for which click has 1."""
-    try:
-        _run()
-    except BrokenPipeError:
-        if not any(map(is_unread, STREAMS)):
-            raise  # of a connection
-        return UNREAD
-    except SystemExit as ended:
-        return UNREAD if isinstance(ended.__context__, BrokenPipeError) else ended.code
-
-
-def _run() -> NoReturn:
+def _run() -> int | str | None:
     try:
         code = command()(standalone_mode=False, prog_name="zsim")
     except ZsimError as error:
         note(endpoint_origin(str(error), sys.argv, os.environ))
-        sys.exit(EXIT_CODES.get(type(error), USER_FAULT))
+        return EXIT_CODES.get(type(error), USER_FAULT)
     except UsageError as error:
         _show_usage(error)
-        sys.exit(2)
+        return USER_FAULT
     except ModuleNotFoundError as error:
         if (lacking := errors.missing(error)) is None:
             raise
         note(f"{' '.join(sys.argv[1:2])}: {lacking}")
-        sys.exit(USER_FAULT)
+        return USER_FAULT
     except OSError as error:
         if error.errno not in FILE_FAULTS or error.filename is None:
             raise
         path = os.fsdecode(error.filename)
         shown = path if len(path) <= PATH_SHOWN else f"{path[: PATH_SHOWN // 2]}…{path[-PATH_SHOWN // 2 :]}"
         note(f"{shown}: cannot be used ({error.strerror}); give another path")
-        sys.exit(USER_FAULT)
+        return USER_FAULT
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     if code == INTERRUPTED:
         note("interrupted")
-    sys.exit(code)
+    return code
 
 
 def _show_usage(error: Any) -> None:

@@ -3,7 +3,7 @@
 import json
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -136,31 +136,26 @@ def connected(reach: WorldAccess) -> Iterator[tuple["Session", "Info"]]:
             sys.exit(INTERRUPTED)
 
 
-def seconds(text: str | None) -> float | None:
-    """Return the duration in a text such as 10s, 500ms or 2min."""
-    if text is None:
-        return None
+def duration(text: str | None) -> str | None:
+    """Refuse an option that is no duration such as 10s, 500ms or 2min."""
+    _seconds(text)
+    return text
+
+
+def _seconds(text: str | None) -> float | None:
     from zsim.scenario.faults import typed_duration_s
 
     try:
-        return typed_duration_s(text)
+        return None if text is None else typed_duration_s(text)
     except ValueError as error:
         raise BadParameter(str(error)) from None
 
 
-def _duration(text: str | None) -> str | None:
-    """Refuse a text that is no duration, with the name of its option."""
-    seconds(text)
-    return text
-
-
 For = Annotated[
-    str | None,
-    Option("--for", callback=_duration, help="E.g. 10s, 500ms, 2min; until it is cleared if not given."),
+    str | None, Option("--for", callback=duration, help="E.g. 10s, 500ms, 2min; until it is cleared if not given.")
 ]
 At = Annotated[
-    str | None,
-    Option("--at", callback=_duration, help="Simulated time when it begins, e.g. 40s; now if not given."),
+    str | None, Option("--at", callback=duration, help="Simulated time when it begins, e.g. 40s; now if not given.")
 ]
 
 
@@ -179,8 +174,13 @@ def add(
     at: At = None,
 ) -> None:
     """Inject a fault, e.g. `zsim fault add drone2 gps_dropout --for 10s`. Exit code 1 where the world refuses it."""
-    times = {"for_s": seconds(for_), "at_s": seconds(at)}
-    args = {"kind": kind, "target": target, **times, **_values(parameters or ())}
+    from zsim.scenario.faults import typed_parameters
+
+    try:
+        values = typed_parameters(parameters or ())
+    except ValueError as error:
+        raise BadParameter(str(error)) from None
+    args = {"kind": kind, "target": target, "for_s": _seconds(for_), "at_s": _seconds(at), **values}
     with connected(reach) as (link, _):
         done = _ask(link, "fault_add", args)
     until = "until it is cleared" if done["until_ns"] is None else f"to {done['until_ns'] / 1e9:.2f} s"
@@ -262,22 +262,11 @@ def selector(which: str, scenario: str) -> dict[str, Any]:
 
 
 def row(fault: "Fault", now_ns: int) -> tuple[str, ...]:
-    """Return the cells that a fault has in a list."""
     until = "..." if fault.until_ns is None else f"{fault.until_ns / 1e9:.2f}"
     state = "acts" if fault.from_ns <= now_ns else "planned"
     parameters = " ".join(f"{name}={value}" for name, value in fault.parameters.items() if value is not None)
     times = f"{fault.from_ns / 1e9:.2f} to {until} s"
     return (str(fault.id), state, fault.target, fault.kind, times, parameters)
-
-
-def _values(parameters: Sequence[str]) -> dict[str, Any]:
-    """Return the map that texts NAME=VALUE make; values are YAML."""
-    from zsim.scenario.faults import typed_parameters
-
-    try:
-        return typed_parameters(parameters)
-    except ValueError as error:
-        raise BadParameter(str(error)) from None
 
 
 def _ask(link: "Session", op: str, args: dict[str, Any]) -> dict[str, Any]:

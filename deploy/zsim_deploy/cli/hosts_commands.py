@@ -5,10 +5,9 @@ import contextlib
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 from typer import Argument, Option
@@ -18,9 +17,7 @@ from zsim.scenario.roles import ROUTER, WORLD
 from zsim.transport.tls import DAYS
 from zsim_deploy import arguments as opt
 from zsim_deploy.arguments import note, require, say
-
-if TYPE_CHECKING:
-    from zsim_deploy.inventory import InventoryFile
+from zsim_deploy.hosts import control_socket
 
 UP_NEEDS = {"hosts": ("asyncssh", "cryptography"), "record": ("mcap", "zstandard")}
 EVERY = ""  # federation
@@ -141,9 +138,6 @@ def up(
                 folder.rmdir()
 
 
-# Of a run that is up
-
-
 @app.command(rich_help_panel=opt.HOSTS)
 def ps(
     roles: Annotated[
@@ -159,7 +153,6 @@ def ps(
     A narrow terminal shows fewer columns, --json all of them, in a line for each run.
     """
     from zsim.presentation import print_table
-    from zsim_deploy.hosts import control_socket
     from zsim_deploy.hosts.status_table import RowChoice, table
 
     runs = []
@@ -189,8 +182,6 @@ def logs(
     federation: Federation = "zsim",
 ) -> None:
     """Print the log of a process of the run that is up; progress and events are shown by `zsim up` itself."""
-    from zsim_deploy.hosts import control_socket
-
     where = control_socket.ask(federation, "where")
     if role not in where["roles"]:
         raise RunError(f"role is {role!r}; must be one of {', '.join(where['roles'])}")
@@ -199,19 +190,6 @@ def logs(
         shown = "its progress and events are shown by `zsim up`, and are in the record"
         note(f"{role} has logged nothing; {shown}" if role == WORLD else f"{role} has logged nothing yet")
 
-    def goes_on() -> bool:
-        try:
-            return control_socket.ask(federation, "where")["out"] == where["out"]
-        except RunError:
-            return False
-
-    for text in _written(path, follow, goes_on):
-        sys.stdout.write(printable(text))
-        sys.stdout.flush()
-
-
-def _written(path: Path, follow: bool, goes_on: Callable[[], bool]) -> Iterator[str]:
-    """Yield the content of a file, which may not exist yet, and what is appended while the run goes on."""
     done, last = 0, not follow
     decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")
     while True:
@@ -220,18 +198,20 @@ def _written(path: Path, follow: bool, goes_on: Callable[[], bool]) -> Iterator[
                 log.seek(done)
                 new = log.read()
             done += len(new)
-            yield decoder.decode(new)
+            sys.stdout.write(printable(decoder.decode(new)))
+            sys.stdout.flush()
         if last:
             return
         time.sleep(FOLLOW_S)
-        last = not goes_on()
+        try:
+            last = control_socket.ask(federation, "where")["out"] != where["out"]
+        except RunError:
+            last = True
 
 
 @app.command(rich_help_panel=opt.HOSTS)
 def restart(role: Role, federation: Federation = "zsim") -> None:
     """Start a process of the run anew where it is; it takes over from its former self."""
-    from zsim_deploy.hosts import control_socket
-
     say(f"restarting {control_socket.ask(federation, 'restart', role=role)}")
 
 
@@ -242,20 +222,13 @@ def move(
     federation: Federation = "zsim",
 ) -> None:
     """Let another host run a process of the run from now on."""
-    from zsim_deploy.hosts import control_socket
-
     say(f"moving {control_socket.ask(federation, 'move', role=role, host=host)}")
 
 
 @app.command(rich_help_panel=opt.HOSTS)
 def down(federation: Federation = "zsim") -> None:
     """End the run that is up, on all hosts."""
-    from zsim_deploy.hosts import control_socket
-
     control_socket.ask(federation, "down")
-
-
-# Certificates
 
 
 @certs.command()
@@ -277,15 +250,16 @@ def init(
     placed, now = inventory.load(hosts), datetime.now(UTC)
     folder = certificates.folder_of(placed)
     operators = [*(operator or ()), *certificates.operators(folder, placed.inventory.hosts)] or [FIRST_OPERATOR]
-    enrolment = certificates.Enrolment(placed, opt.load_scenario(scenario, set_, elsewhere=True), operators)
-    signer, wanted = certificates.authority(folder, now, force), enrolment.certificates()
+    wanted, access = certificates.enrolment(placed, opt.load_scenario(scenario, set_, elsewhere=True), operators)
+    signer = certificates.authority(folder, now, force)
     lacking = [each for each in wanted if renew or certificates.renewal_reason(folder, signer.certificate, each, now)]
     for each in lacking:
         certificates.issue(folder, signer, each, now, days)
-    for host, process, rules in enrolment.access():
+    for host, process, rules in access:
         content = json.dumps(rules, indent=2) + "\n"
         certificates.write(folder / host / f"{process}.access.json", content.encode())
-    _warn_of_exposed_keys(placed)
+    if warning := certificates.exposed_keys(placed):
+        note(f"warning: {warning}")
     kept = len(wanted) - len(lacking)
     say(f"{folder}: {len(lacking)} certificates made, {kept} kept; zsim certs show {hosts} lists them")
 
@@ -310,17 +284,9 @@ def show(hosts: Inventory) -> None:
     print_table(FittedTable([Column("", kind) for kind in ("name", "name", "figure", "text", "text")], rows))
     if over or any(status.fault for status in statuses):
         note(f"make them anew with `{certificates.init_command(placed, renew=over)}`")
-    _warn_of_exposed_keys(placed)
-
-
-def _warn_of_exposed_keys(placed: "InventoryFile") -> None:
-    from zsim_deploy.certificates import exposed_keys
-
-    if warning := exposed_keys(placed):
+    if warning := certificates.exposed_keys(placed):
         note(f"warning: {warning}")
 
-
-# Files for other launchers
 
 Out = Annotated[Path, Option("--out", help="Folder to write into; what was rendered there before is replaced.")]
 ForceRendering = Annotated[
@@ -332,18 +298,14 @@ ForceRendering = Annotated[
 @opt.flight_options
 def systemd(flight: opt.FlightOptions, hosts: Hosts, out: Out, force: ForceRendering = False) -> None:
     """Write HOST/zsim-PROCESS.service and HOST/zsim.target for every host."""
-    from zsim_deploy import render
-
-    _write(out, "systemd", render.systemd(*_placed_and_scenario(hosts, flight), flight.pace()), force)
+    _render("systemd", flight, hosts, out, force)
 
 
 @rendering.command()
 @opt.flight_options
 def compose(flight: opt.FlightOptions, hosts: Hosts, out: Out, force: ForceRendering = False) -> None:
     """Write HOST/compose.yaml and HOST/Dockerfile for every host."""
-    from zsim_deploy import render
-
-    _write(out, "compose", render.compose(*_placed_and_scenario(hosts, flight), flight.pace()), force)
+    _render("compose", flight, hosts, out, force)
 
 
 @rendering.command()
@@ -356,26 +318,19 @@ def kubernetes(
     force: ForceRendering = False,
 ) -> None:
     """Write the manifests of a run, a Dockerfile, and a script that makes the Secrets from the certificates."""
-    from zsim_deploy import render
-
-    texts = render.kubernetes(*_placed_and_scenario(hosts, flight), flight.pace(), image or render.IMAGE)
-    _write(out, "kubernetes", texts, force)
+    _render("kubernetes", flight, hosts, out, force, *([image] if image else []))
 
 
-def _placed_and_scenario(hosts: Path, flight: opt.FlightOptions) -> tuple[Any, Any]:
-    """Return the inventory and the scenario; print what has no command in them."""
-    from zsim_deploy import inventory
+def _render(target: str, flight: opt.FlightOptions, hosts: Path, out: Path, force: bool, *more: str) -> None:
+    from zsim_deploy import inventory, render
 
     loaded = flight.scenario(elsewhere=True)
     placed = inventory.load(hosts)
     for remark in inventory.own_programs(placed, loaded):
         note(remark)
-    return placed, loaded
-
-
-def _write(out: Path, target: str, texts: Mapping[str, str], force: bool) -> None:
-    from zsim_deploy import render
-
+    texts = {"systemd": render.systemd, "compose": render.compose, "kubernetes": render.kubernetes}[target](
+        placed, loaded, flight.pace(), *more
+    )
     removed = render.write(out, target, texts, force)
-    more = f"; removed of an earlier rendering: {', '.join(removed)}" if removed else ""
-    say(f"{len(texts)} files in {out}{more}")
+    also = f"; removed of an earlier rendering: {', '.join(removed)}" if removed else ""
+    say(f"{len(texts)} files in {out}{also}")

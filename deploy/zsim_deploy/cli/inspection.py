@@ -28,17 +28,13 @@ PUB, ASK = "zsim.pub", "zsim.ask"
 COMMANDS = "drone/*/cmd/*"
 
 
-def list_keys(link: Session, expression: str, listen_s: float = LISTEN_S) -> list[tuple[str, str, int]]:
-    """Return (key, message, messages received) of every key with a message or an answer within `listen_s`.
-
-    Raises:
-        SessionError: the expression of the keys that are wanted is none.
-    """
+def list_keys(link: Session, expression: str) -> list[tuple[str, str, int]]:
+    """Return (key, message, messages received) of every key with a message or an answer within LISTEN_S."""
     check_expression(expression)
     counts: Counter[str] = Counter()
     for known in (keys.INFO, keys.CLOCK, "drone/*/truth", "drone/*/estimate", "cluster/*/state"):
         counts.update({sample.key: 0 for sample in link.get(known) if keys.matches(expression, sample.key)})
-    for sample in _samples(link.subscribe(expression), time.monotonic() + listen_s):
+    for sample in _samples(link.subscribe(expression), time.monotonic() + LISTEN_S):
         counts[sample.key] += 1
     kinds = {key: messages.type_of(key) for key in counts}
     names = {key: kind.__name__ if kind else "not of the contract" for key, kind in kinds.items()}
@@ -54,14 +50,9 @@ def echo(
     timeout_s: float = math.inf,
     note: Callable[[str], None] = lambda text: None,
 ) -> int:
-    """Hand every message on an expression to `emit` until `count` have come, or the time is over; return how many came.
+    """Hand the messages on an expression to `emit` until `count` came, or the time is over; return how many came.
 
-    Args:
-        count: after which it returns, None for none.
-        emit: takes key and message.
-        raw: payloads in hexadecimal digits.
-        timeout_s: wall time after which it returns.
-        note: takes a line for people, such as that the key has no publisher.
+    `emit` takes key and message, its payload in hexadecimal digits if `raw`; `note` takes lines for people.
     """
     subscription = link.subscribe(expression)
     until_s, number = time.monotonic() + timeout_s, 0
@@ -120,7 +111,6 @@ class MessageRate:
             self._stamps.append(t_ns)
 
     def line(self, now_s: float) -> str:
-        """Return the rates as text, or since when nothing comes."""
         gaps = [b - a for a, b in zip(self._walls, list(self._walls)[1:], strict=False)]
         silent_s = now_s - self._walls[-1]
         if silent_s > max(SILENCE_S, 2 * max(gaps, default=0.0)):
@@ -136,11 +126,7 @@ class MessageRate:
 
 
 def hz(link: Session, expression: str, window: int, seconds: float, emit: Callable[[str], None]) -> int:
-    """Show once a second, and at the end, how often messages come on an expression; return how many came.
-
-    Raises:
-        SessionError: it is no key expression.
-    """
+    """Show once a second, and at the end, how often messages come on an expression; return how many came."""
     check_expression(expression)
     arrived: deque[tuple[float, bytes]] = deque()
 
@@ -184,33 +170,19 @@ def _samples(subscription: Subscription, until_s: float) -> Iterator[ReceivedSam
 
 
 class Published(NamedTuple):
-    """What became of commands that were sent by hand.
-
-    Attributes:
-        refused: how many of them the world refused, as far as its events say.
-        reason: of the first refusal.
-        note: why nothing is known of them, empty if it is.
-    """
+    """What became of commands that were sent by hand."""
 
     sent: int
-    refused: int = 0
-    reason: str = ""
-    note: str = ""
+    refused: int = 0  # how many of them the world refused, as far as its events say
+    reason: str = ""  # of the first refusal
+    note: str = ""  # why nothing is known of them, empty if it is
 
 
 def publish(link: Session, info: messages.Info, key: str, text: str, count: int, rate_hz: float) -> Published:
     """Publish a JSON text as the command of its key, `count` times, and wait for what becomes of it.
 
-    t_ns, seq and source are filled in.
-
-    Args:
-        key: `drone/NAME/cmd/KIND` of a drone of the run.
-        text: a JSON map of the message's fields.
-        count: how many times, the first at once.
-        rate_hz: how often per wall second.
-
-    Raises:
-        RunError: no JSON, not the message of that key, or a key that takes no commands.
+    t_ns, seq and source are filled in. RunError where it is no JSON, not the message of that key, or no key of a
+    drone of the run that takes commands.
     """
     _refuse_wildcards(key, "pub")
     kind = messages.type_of(key)
@@ -239,11 +211,7 @@ def publish(link: Session, info: messages.Info, key: str, text: str, count: int,
 
 
 def _outcome(events: Subscription, clock: "_Now", gate_ns: int, ours: tuple[str, str], sent: int) -> Published:
-    """Return what the world's events say of commands, once the last has taken effect or was refused.
-
-    Args:
-        ours: key and source of the commands.
-    """
+    """Return what the world's events say of commands, once the last has taken effect or was refused."""
     key, source = ours
     accepted, refused, last_ns, reason = 0, 0, 0, ""
     until_s = time.monotonic() + OUTCOME_S
@@ -261,7 +229,9 @@ def _outcome(events: Subscription, clock: "_Now", gate_ns: int, ours: tuple[str,
         if refused >= sent or (accepted + refused >= sent and now_ns >= last_ns):
             return Published(sent, min(refused, sent), reason)
         if time.monotonic() >= until_s:
-            note = f"the world is {clock.state()}; whether it carries them out is known when time goes on"
+            now = clock.clock()
+            state = now.state if now else "unknown"
+            note = f"the world is {state}; whether it carries them out is known when time goes on"
             return Published(sent, min(refused, sent), reason, note)
         time.sleep(PACKET_S)
 
@@ -273,20 +243,14 @@ class _Now:
         self._subscription = link.subscribe(keys.CLOCK)
         self._newest = next(iter(link.get(keys.CLOCK)), None)
 
-    def t_ns(self) -> int:
-        """Return the time of the newest clock, 0 where no world answers."""
-        clock = self._clock()
-        return clock.t_ns if clock else 0
-
-    def state(self) -> str:
-        """Return whether time goes on: waiting, running, paused or stopped."""
-        clock = self._clock()
-        return clock.state if clock else "unknown"
-
-    def _clock(self) -> run_messages.Clock | None:
+    def clock(self) -> run_messages.Clock | None:
         for sample in self._subscription.drain():
             self._newest = sample
         return messages.decode(keys.CLOCK, self._newest.payload) if self._newest else None
+
+    def t_ns(self) -> int:
+        clock = self.clock()
+        return clock.t_ns if clock else 0
 
 
 def _refuse_wildcards(key: str, command: str) -> None:
@@ -310,11 +274,7 @@ def _map(what: str, text: str, example: str) -> dict[str, Any]:
 
 
 def ask(link: Session, key: str, op: str, text: str) -> Any:
-    """Send a request with the arguments in a JSON text; return its result as JSON can hold it.
-
-    Raises:
-        RunError: no JSON, nobody answers, or (RequestRefusedError) the answer is a refusal.
-    """
+    """Send a request with the arguments in a JSON text; return its result as JSON can hold it, or raise its refusal."""
     _refuse_wildcards(key, "ask")
     result = result_of(link.request(key, op, ASK, _map(f"{op}: args", text, '{"gates": 50}')))
     with suppress(DecodeError):  # a replay is the only result that holds messages
@@ -323,12 +283,7 @@ def ask(link: Session, key: str, op: str, text: str) -> Any:
 
 
 def result_of(answer: run_messages.ControlAnswer) -> Any:
-    """Return the result of a request.
-
-    Raises:
-        RequestRefusedError: the answer is a refusal.
-        RunError: no answer came.
-    """
+    """Return the result of a request; RequestRefusedError if it is refused, RunError if no answer came."""
     if answer.ok:
         return answer.result
     raise (RunError if isinstance(answer, Unanswered) else RequestRefusedError)(answer.error)

@@ -1,9 +1,8 @@
 """The commands that are one role of a federation each."""
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Argument, Option
@@ -14,12 +13,11 @@ from zsim_deploy.arguments import require
 
 if TYPE_CHECKING:
     from zsim.transport.tls import Identity
-    from zsim_deploy.roles.roles import Drones as Chosen
-    from zsim_deploy.roles.roles import Serve
+    from zsim_deploy.roles.roles import Remain, Serve
 
-SOME_DRONES = "Drones, or patterns: 'drone*'; all that have cameras if not given."
 
 app = typer.Typer()
+SOME_DRONES = "Drones, or patterns: 'drone*'; all that have cameras if not given."
 Drones = Annotated[list[str] | None, Argument(metavar="[DRONE]...", help=SOME_DRONES, show_default=False)]
 
 
@@ -54,7 +52,6 @@ def world(
 
 
 def _agent_command(name: str, role: Role) -> Callable[..., None]:
-    """Return the command of a role that has agents, named after drones or clusters."""
     about = str(role.about)
     several_help = f"{about.capitalize()}s, or patterns: '{about}*'."
 
@@ -142,8 +139,7 @@ def camera(
     require("camera", opt.CAMERA_NEEDS)
     from zsim_deploy.roles import roles
 
-    serve = partial(roles.camera, names=drones or ())
-    _serve_pictures("camera", serve, roles.of_camera, reach, drones, name)
+    roles.serve_pictures("camera", drones or (), name, reach)
 
 
 @app.command(rich_help_panel=opt.ROLES)
@@ -160,20 +156,7 @@ def detect(
     require("detect", opt.CAMERA_NEEDS)
     from zsim_deploy.roles import roles
 
-    serve = partial(roles.detector, names=drones or (), diameter_m=diameter)
-    _serve_pictures("detector", serve, roles.of_detector, reach, drones, name)
-
-
-def _serve_pictures(
-    role: str, serve: "Serve", chosen: "Chosen", reach: opt.WorldAccess, drones: Sequence[str] | None, name: str
-) -> None:
-    """Serve as a camera or a detector, named after its drone if one alone is named."""
-    from zsim_deploy.roles.roles import PATTERN, slack_ns, stands_for
-
-    one = drones[0] if drones and len(drones) == 1 else ""
-    thing = one if one and not set(one) & set(PATTERN) else "main"
-    does = {"stands_for": partial(stands_for, role, chosen, drones or ()), "slack_ns": partial(slack_ns, role)}
-    serve_as(role, name, serve, reach, thing, lowered=True, **does)
+    roles.serve_pictures("detector", drones or (), name, reach, diameter)
 
 
 def serve_as(
@@ -183,15 +166,11 @@ def serve_as(
     reach: opt.WorldAccess,
     thing: str = "main",
     lowered: bool = False,
-    **does: Any,
+    remain: "Remain | None" = None,
 ) -> None:
-    """Serve one run after the other as the process that a command means.
+    """Serve one run after the other as the process that role, name and thing mean.
 
-    Args:
-        role, name, thing: of which its name is made.
-        serve: what it does in a run.
-        lowered: with lower priority than what the world waits for.
-        does: what more `serve_runs` is given.
+    `lowered`: with lower priority than what the world waits for; `remain`: what is left to do after a launched run.
     """
     from zsim_deploy.roles import roles
     from zsim_deploy.roles.roles import process_name
@@ -199,4 +178,4 @@ def serve_as(
 
     if lowered:
         lower_priority()
-    roles.serve_runs(process_name(role, name, reach.who, thing), serve, reach, **does)
+    roles.serve_runs(process_name(role, name, reach.who, thing), serve, reach, remain=remain)

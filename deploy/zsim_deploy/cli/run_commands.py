@@ -23,7 +23,7 @@ from zsim_deploy.roles.stop_channel import interruptible
 if TYPE_CHECKING:
     from zsim.transport.tls import Identity
     from zsim_analysis.reading.shortfall import Shortfall
-    from zsim_analysis.sweep.design import SweepPlan
+
 
 SWEEP_NEEDS = {"sweep": ("pyarrow", "numba", "filterpy", "mcap", "matplotlib", "jinja2")}
 DASK_NEEDS = {**SWEEP_NEEDS, "dask": ("distributed",)}
@@ -114,40 +114,35 @@ def _given(context: typer.Context, options: Sequence[str]) -> str:
 
 def conclude(outcome: Any, out: Path, report: bool) -> None:
     """Print how a run ended, make its report, and end with the exit code for it."""
-    record = out / "run.mcap"
+    record, fault = out / "run.mcap", "nothing was recorded"
     if outcome.interrupted:
         note(f"ended: {outcome.reason}")
         if record.exists():
             note(f"the record so far is {record}; `zsim report {out}` makes its report")
         sys.exit(INTERRUPTED)
-    fault = _judged_at_the_end(out, report, outcome.failed) if record.exists() else "nothing was recorded"
     if record.exists():
+        try:
+            if report:
+                fault = _report(out)
+            else:
+                from zsim_analysis.reading.shortfall import marks_of, verdict
+
+                judged = verdict(record)
+                for mark, _ in marks_of(judged.shortfalls):
+                    say(mark)
+                fault = _fault_of(judged.completeness.complete, str(judged.completeness), judged.shortfalls)
+        except ZsimError as error:
+            if not outcome.failed:
+                raise
+            note(str(error))
+        except KeyboardInterrupt:
+            note(f"interrupted; the record is kept, `zsim report {out}` makes its report")
+            sys.exit(INTERRUPTED)
         say(f"ended: {outcome.reason}; the record is {record}")
     if fault := outcome.reason if outcome.failed else fault:
         if (out / "logs").exists():
             note(f"logs are in {out / 'logs'}")
         raise failed(f"ended: {fault}")
-
-
-def _judged_at_the_end(out: Path, report: bool, failed: bool) -> str:
-    """Make the report of a run if that is wanted; return what the run did not do or lacks, empty if nothing."""
-    try:
-        if report:
-            return _report(out)
-        from zsim_analysis.reading.shortfall import marks_of, verdict
-
-        judged = verdict(out / "run.mcap")
-        for mark, _ in marks_of(judged.shortfalls):
-            say(mark)
-        return _fault_of(judged.completeness.complete, str(judged.completeness), judged.shortfalls)
-    except ZsimError as error:
-        if not failed:
-            raise
-        note(str(error))
-        return str(error)
-    except KeyboardInterrupt:
-        note(f"interrupted; the record is kept, `zsim report {out}` makes its report")
-        sys.exit(INTERRUPTED)
 
 
 def _fault_of(complete: bool, state: str, shortfalls: "Sequence[Shortfall]") -> str:
@@ -209,7 +204,20 @@ def report(
         raise BadParameter(f"--format is {formats!r}; must be {allowed}")
     with plugin.names_only(not trust) as skipped:
         if len(directories) > 1:
-            _compare(directories, out, wanted)
+            from rich.console import Console
+
+            from zsim.runtime.progress import cell
+            from zsim_analysis.report.comparison import compare, comparison_path
+
+            for directory in directories:
+                if is_sweep(directory):
+                    why = "runs can be compared, a sweep has a report of its own"
+                    raise BadParameter(f"{directory} is a sweep; {why}")
+                record_in(directory)
+            page = out or comparison_path(directories)
+            with Console(stderr=True).status("reading the records …") as status:
+                compare(directories, page, lambda text: status.update(cell(text)), wanted)
+            say(f"report: {page}")
         elif out is not None:
             raise BadParameter("--out is for the page that compares several runs; leave it out")
         else:
@@ -220,12 +228,7 @@ def report(
 
 
 def _report(folder: Path, formats: Sequence[str] = ()) -> str:
-    """Make the report of a run or of a sweep, and print its table; return what the run did not do, or lacks.
-
-    Args:
-        folder: of the run or the sweep.
-        formats: of figures, beside PNG.
-    """
+    """Make the report of a run or of a sweep, and print its table; return what the run did not do, or lacks."""
     from rich.console import Console
 
     from zsim.runtime.progress import PipedConsole, cell
@@ -243,24 +246,6 @@ def _report(folder: Path, formats: Sequence[str] = ()) -> str:
     fault = "" if is_sweep(folder) else _fault_of(summary.record.complete, summary.record.state, summary.shortfalls)
     say(f"report: {folder / 'report.html'}")
     return fault
-
-
-def _compare(directories: list[Path], out: Path | None, formats: Sequence[str]) -> None:
-    from rich.console import Console
-
-    from zsim.output_folder import record_in
-    from zsim.runtime.progress import cell
-    from zsim_analysis.report.comparison import compare, comparison_path
-    from zsim_analysis.sweep.design import is_sweep
-
-    for directory in directories:
-        if is_sweep(directory):
-            raise BadParameter(f"{directory} is a sweep; runs can be compared, a sweep has a report of its own")
-        record_in(directory)
-    page = out or comparison_path(directories)
-    with Console(stderr=True).status("reading the records …") as status:
-        compare(directories, page, lambda text: status.update(cell(text)), formats)
-    say(f"report: {page}")
 
 
 @app.command(rich_help_panel=opt.RUN)
@@ -292,10 +277,20 @@ def sweep(
         useless = "--keep-records" if keep_records else "--workers"
         raise BadParameter(f"{useless} is for processes of this host; leave it out, or --dask")
     require("sweep", SWEEP_NEEDS if dask is None else DASK_NEEDS)
+    from rich.console import Console
+
+    from zsim_analysis.sweep.design import make_plan, read_document
     from zsim_analysis.sweep.sweep import SweepRequest
     from zsim_analysis.sweep.sweep import sweep as fly
 
-    plan = _plan(scenario, vary or [], set_ or [], seed, duration, runs, keep_records)
+    document, faults = read_document(scenario, set_ or [], seed=seed, duration_s=duration)
+    changed = opt.changed_fields(set_, seed, duration)
+    with Console(stderr=True).status("checking every combination …") as status:
+
+        def look(run: int, of: int) -> None:
+            status.update(f"checking combination {run + 1} of {of}")
+
+        plan = make_plan(scenario.name, document, vary or [], runs, keep_records, look, faults, changed)
     folder = out or Path("runs") / f"{plan.document['name']}-sweep-{time.strftime('%Y%m%d-%H%M%S')}"
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
@@ -306,29 +301,6 @@ def sweep(
     failures = [row["failure"] for row in rows if row["failure"]]
     short = [row["shortfall"] for row in rows if row.get("shortfall") and not row["failure"]]
     _conclude(folder, failures, len(rows), report, short)
-
-
-def _plan(
-    path: Path,
-    vary: list[str],
-    overrides: list[str],
-    seed: int | None,
-    duration: float | None,
-    runs: int | None,
-    records: bool,
-) -> "SweepPlan":
-    from rich.console import Console
-
-    from zsim_analysis.sweep.design import make_plan, read_document
-
-    document, faults = read_document(path, overrides, seed=seed, duration_s=duration)
-    changed = opt.changed_fields(overrides, seed, duration)
-    with Console(stderr=True).status("checking every combination …") as status:
-
-        def look(run: int, of: int) -> None:
-            status.update(f"checking combination {run + 1} of {of}")
-
-        return make_plan(path.name, document, vary, runs, records, look, faults, changed)
 
 
 def _conclude(folder: Path, failures: list[str], runs: int, report: bool, short: Sequence[str] = ()) -> None:
@@ -382,12 +354,9 @@ def export(
 
     selection = MessageSelection(tuple(keys or ()), from_, to)
     console = Console(stderr=True)
-    hidden = not console.is_terminal
-    with (
-        interruptible(),
-        plugin.names_only(not trust) as skipped,
-        Progress(console=console, transient=True, disable=hidden) as bar,
-    ):
+
+    shown = Progress(console=console, transient=True, disable=not console.is_terminal)
+    with interruptible(), plugin.names_only(not trust) as skipped, shown as bar:
         task = bar.add_task("looking through the record", total=None)
 
         def advance(count: int, of: int) -> None:

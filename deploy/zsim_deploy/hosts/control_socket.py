@@ -36,32 +36,22 @@ def place(federation: str) -> Path:
 
 
 def launchers() -> list[str]:
-    """Return the names under which launchers of this user listen on this machine; what killed ones left is removed."""
+    """Return the names under which this user's launchers listen here; what killed ones left is removed."""
     found = []
     for path in sorted(place("").parent.glob("*.sock")):
         _, is_of_run, pid = path.stem.partition("@")
-        if is_of_run and not _lives(pid):
+        try:
+            if is_of_run:
+                os.kill(int(pid), 0)  # fails if it does not live
+            found.append(path.stem)
+        except (OSError, ValueError):
             path.unlink(missing_ok=True)
             path.with_suffix(".lock").unlink(missing_ok=True)
-        else:
-            found.append(path.stem)
     return found
 
 
-def _lives(pid: str) -> bool:
-    try:
-        os.kill(int(pid), 0)
-    except (OSError, ValueError):
-        return False
-    return True
-
-
 def ask(federation: str, op: str, **args: Any) -> Any:
-    """Ask the launcher of a federation on this machine.
-
-    Raises:
-        RunError: no launcher is up, it does not answer, or it refuses; with its reason.
-    """
+    """Ask the launcher of a federation on this machine; RunError if none is up, or it does not answer, or refuses."""
     path = place(federation)
     with socket.socket(socket.AF_UNIX) as line:
         line.settimeout(ANSWER_S)
@@ -94,14 +84,10 @@ def seen_by_ps(federation: str, status: Callable[[], dict[str, Any]]) -> Iterato
 
 
 class ControlSocket:
-    """The launcher's end.
+    """The launcher's end. RunError if another launcher of the federation runs here, or there is no place to listen.
 
     Args:
-        federation: whose launcher it is.
         acts: by name; each is called in a thread, with the request's arguments, and returns what JSON can hold.
-
-    Raises:
-        RunError: another launcher of the federation runs on this machine, or there is no place to listen.
     """
 
     def __init__(self, federation: str, acts: dict[str, Act]) -> None:
@@ -110,7 +96,17 @@ class ControlSocket:
         with file_fault(path.parent, "cannot be made", "set XDG_RUNTIME_DIR to a folder of yours"):
             path.parent.mkdir(mode=0o700, exist_ok=True)
         _refuse_if_foreign(path.parent)
-        self._lock = _lock(federation, path.with_suffix(".lock"))
+        lock = path.with_suffix(".lock")  # held for as long as the launcher lives, however it ends
+        with file_fault(lock, "cannot be made", "set XDG_RUNTIME_DIR to another folder"):
+            self._lock = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        if not take_lock(self._lock):
+            os.close(self._lock)
+            raise RunError(
+                f"federation {federation!r} is up already on this machine; end it with "
+                f"`zsim down --federation {federation}`, or fly in another one: --set federation=NAME"
+            )
+        if "@" not in path.stem and (warning := no_locks(path.parent)):  # a run has a name of its own
+            note(warning)
         self._socket = socket.socket(socket.AF_UNIX)
         try:
             path.unlink(missing_ok=True)  # of a launcher that was killed: its lock is ours
@@ -136,27 +132,26 @@ class ControlSocket:
     def _answer(self, connection: socket.socket) -> None:
         with connection, contextlib.suppress(OSError):
             connection.settimeout(REQUEST_S)
-            with connection.makefile("rb") as request:
-                line = request.readline(LINE_MAX)
-            connection.sendall(json.dumps(self._carry_out(line)).encode() + b"\n")
-
-    def _carry_out(self, line: bytes) -> dict[str, Any]:
-        try:
-            request = json.loads(line)
-            act, args = self._acts[request["op"]], request.get("args", {})
-            inspect.signature(act).bind(**args)
-        except (ValueError, KeyError, TypeError) as error:
-            other = f"it is no request of zsim {__version__} ({error}); is `zsim up` of another version?"
-            return {"ok": False, "error": other}
-        try:
-            return {"ok": True, "result": act(**args)}
-        except (ZsimError, TimeoutError) as error:
-            return {"ok": False, "error": str(error) or "it took too long"}
-        except Exception as error:
-            return {"ok": False, "error": f"it failed by a fault of zsim: {error!r}"}
+            with connection.makefile("rb") as stream:
+                line = stream.readline(LINE_MAX)
+            answer: dict[str, Any] = {"ok": False}
+            try:
+                request = json.loads(line)
+                act, args = self._acts[request["op"]], request.get("args", {})
+                inspect.signature(act).bind(**args)
+            except (ValueError, KeyError, TypeError) as error:
+                other = "is `zsim up` of another version?"
+                answer["error"] = f"it is no request of zsim {__version__} ({error}); {other}"
+            else:
+                try:
+                    answer = {"ok": True, "result": act(**args)}
+                except (ZsimError, TimeoutError) as error:
+                    answer["error"] = str(error) or "it took too long"
+                except Exception as error:
+                    answer["error"] = f"it failed by a fault of zsim: {error!r}"
+            connection.sendall(json.dumps(answer).encode() + b"\n")
 
     def close(self) -> None:
-        """Stop answering."""
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
@@ -174,29 +169,10 @@ class ControlSocket:
 
 
 def _refuse_if_foreign(folder: Path) -> None:
-    """Refuse a folder in which another user could listen instead of us.
-
-    Raises:
-        RunError: it belongs to another user, others may write in it, or it is no folder.
-    """
+    """Refuse a folder in which another user could listen instead of us."""
     status = folder.lstat()
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
         raise RunError(
             f"{folder}: is not a folder that is yours alone (owner {status.st_uid}, mode {status.st_mode & 0o777:o}); "
             f"must be of user {os.getuid()} with mode 700; remove it, or set XDG_RUNTIME_DIR to a folder of yours"
         )
-
-
-def _lock(federation: str, path: Path) -> int:
-    """Return the lock that one launcher of a federation holds for as long as it lives, however it ends."""
-    with file_fault(path, "cannot be made", "set XDG_RUNTIME_DIR to another folder"):
-        lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    if not take_lock(lock):
-        os.close(lock)
-        raise RunError(
-            f"federation {federation!r} is up already on this machine; end it with "
-            f"`zsim down --federation {federation}`, or fly in another one: --set federation=NAME"
-        )
-    if "@" not in path.stem and (warning := no_locks(path.parent)):  # a run has a name of its own
-        note(warning)
-    return lock

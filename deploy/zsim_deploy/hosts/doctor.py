@@ -51,22 +51,15 @@ PATH_COLUMNS = (
 
 
 class HostReport(NamedTuple):
-    """The facts of a host by its own probe, and what asking it showed.
-
-    Attributes:
-        clock_offset_s: its wall clock minus ours, good to half the round trip.
-        remedy: how it gets another zsim.
-    """
+    """The facts of a host by its own probe, and what asking it showed."""
 
     facts: dict[str, Any]
     round_trip_s: float
-    clock_offset_s: float
-    remedy: str = "run `zsim push --hosts FILE`"
+    clock_offset_s: float  # its wall clock minus ours, good to half the round trip
+    remedy: str = "run `zsim push --hosts FILE`"  # how it gets another zsim
 
 
 class NetworkPath(NamedTuple):
-    """How a host reaches the port on which another listens."""
-
     source: str
     target: str
     port: int
@@ -83,70 +76,58 @@ class CheckResult(NamedTuple):
 
 def check_hosts(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
     """Check certificates and hosts; with a placement also the paths to where the world and the routers listen."""
-    result = asyncio.run(_check_hosts(placed, places))
+
+    async def check() -> tuple[list[FittedTable], list[str], list[str]]:
+        links = {name: HostLink(name, host, placed.folder) for name, host in placed.inventory.hosts.items()}
+        pythons = {name: inv.python(host) for name, host in placed.inventory.hosts.items()}
+        try:
+            asked = (host_report(link, pythons[name], placed.word) for name, link in links.items())
+            results = await asyncio.gather(*asked, return_exceptions=True)
+            reports = {name: each for name, each in zip(links, results, strict=True) if isinstance(each, HostReport)}
+            for result in results:
+                if isinstance(result, BaseException) and not isinstance(result, ZsimError):
+                    raise result
+            faults = [str(result) for result in results if isinstance(result, ZsimError)]
+            wrong, warnings = compare_reports(reports)
+            paths: list[NetworkPath] = []  # one after the other
+            for (target, port), sources in inv.connections(placed, places).items() if places else ():
+                if target in reports:
+                    chosen = [links[name] for name in sorted(sources & set(reports))]
+                    paths += await network_paths(chosen, links[target], pythons, port)
+            cut, slow = path_faults(paths)
+            left = await asyncio.gather(*(leftovers(links[name], placed.folder) for name in reports))
+            tables = [hosts_table(reports), *([paths_table(paths)] if paths else [])]
+            return tables, [*faults, *wrong, *cut], [*warnings, *slow, *(line for lines in left for line in lines)]
+        finally:
+            for link in links.values():
+                await link.close()
+
+    tables, faults, warnings = asyncio.run(check())
     lacks = certificates.certificate_faults(placed, places, datetime.now(UTC))
-    warning = certificates.exposed_keys(placed)
-    warnings = [*result.warnings, *([warning] if warning else [])]
-    return result._replace(faults=[*lacks, *result.faults], warnings=warnings)
-
-
-async def _check_hosts(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
-    links = {name: HostLink(name, host, placed.folder) for name, host in placed.inventory.hosts.items()}
-    pythons = {name: inv.python(host) for name, host in placed.inventory.hosts.items()}
-    try:
-        results = await asyncio.gather(
-            *(host_report(link, pythons[name], placed.word) for name, link in links.items()), return_exceptions=True
-        )
-        reports: dict[str, HostReport] = {}
-        faults: list[str] = []
-        for name, result in zip(links, results, strict=True):
-            if isinstance(result, HostReport):
-                reports[name] = result
-            elif isinstance(result, ZsimError):
-                faults.append(str(result))
-            else:
-                raise result
-        wrong, warnings = compare_reports(reports)
-        paths: list[NetworkPath] = []  # one after the other
-        for (target, port), sources in inv.connections(placed, places).items() if places else ():
-            if target in reports:
-                chosen = [links[name] for name in sorted(sources & set(reports))]
-                paths += await network_paths(chosen, links[target], pythons, port)
-        cut, slow = path_faults(paths)
-        left = await asyncio.gather(*(leftovers(links[name], placed.folder) for name in reports))
-        tables = [hosts_table(reports), *([paths_table(paths)] if paths else [])]
-        warnings = [*warnings, *slow, *(line for lines in left for line in lines)]
-        return CheckResult(tables, [*faults, *wrong, *cut], warnings)
-    finally:
-        for link in links.values():
-            await link.close()
-
-
-# Hosts
+    exposed = certificates.exposed_keys(placed)
+    return CheckResult(tables, [*lacks, *faults], [*warnings, *([exposed] if exposed else [])])
 
 
 async def host_report(link: HostLink, python: str, hosts: str = "FILE") -> HostReport:
-    """Ask a host about itself.
-
-    Args:
-        hosts: the inventory's path, for remedies.
-
-    Raises:
-        HostsError: it has no zsim, or cannot be asked.
-    """
+    """Ask a host about itself; HostsError if it has no zsim, or cannot be asked. `hosts`: the inventory's path."""
     push = f"run `zsim push --hosts {hosts}`"  # which leaves a zsim with a Python of its own alone
     remedy = f"install it there, or leave hosts.{link.name}.python out and {push}" if link.host.python else push
+    answers: list[tuple[float, float]] = []  # round trip of a line and the clock's offset, in seconds
     try:
         async with _probe(link, python, "about", link.host.folder) as there:
             facts = await there.answer(ABOUT_S)
-            round_trip_s, offset_s = min([await _offset(there) for _ in range(OFFSET_ASKS)])
+            for _ in range(OFFSET_ASKS):
+                start_s, sent_s = time.time(), time.monotonic()
+                there.send("\n")
+                there_s = (await there.answer(ABOUT_S))["time_ns"] / 1e9
+                took_s = time.monotonic() - sent_s
+                answers.append((took_s, there_s - (start_s + took_s / 2)))
     except ProgramEndedError as error:
         raise HostsError(f"{link.name}: {_probe_fault(link, python, remedy, error)}") from error
-    return HostReport(facts, round_trip_s, offset_s, remedy)
+    return HostReport(facts, *min(answers), remedy)
 
 
 def _probe_fault(link: HostLink, python: str, remedy: str, error: ProgramEndedError) -> str:
-    """Return what a host lacks, from how its probe ended."""
     text, why = error.last.lower(), error.last or "it printed nothing"
     if NO_MODULE in text:
         return f"{python} has no zsim {__version__}; {remedy}"
@@ -161,44 +142,33 @@ def _probe(link: HostLink, python: str, *words: str) -> AbstractAsyncContextMana
     return open_program(link, f"{shell_word(python)} {SAFE_PATH} -m zsim_deploy.hosts.probe {shell_line(words)}")
 
 
-async def _offset(probe: RemoteProgram) -> tuple[float, float]:
-    """Return the round trip of a line and the clock's offset, in seconds."""
-    start_s, sent_s = time.time(), time.monotonic()
-    probe.send("\n")
-    there_s = (await probe.answer(ABOUT_S))["time_ns"] / 1e9
-    took_s = time.monotonic() - sent_s
-    return took_s, there_s - (start_s + took_s / 2)
-
-
 def compare_reports(reports: dict[str, HostReport]) -> tuple[list[str], list[str]]:
     """Return faults that keep the hosts from flying together, and warnings, a line each."""
-    faults = [line for name, report in reports.items() for line in _faults(name, report)]
-    warnings = [line for name, report in reports.items() for line in _warnings(name, report)]
+    faults, warnings = [], []
+    ours = platform.python_version_tuple()[:2]
+    for name, report in reports.items():
+        facts = report.facts
+        if facts["zsim"] != __version__:
+            faults.append(f"{name}: zsim is {facts['zsim']}; must be {__version__} as here; {report.remedy}")
+        if tuple(facts["python"].split(".")[:2]) != ours:
+            wanted = f"must be {'.'.join(ours)} as here, for the same bits"
+            faults.append(f"{name}: Python is {facts['python']}; {wanted}")
+        if why := facts["unwritable"]:
+            remedy = f"correct hosts.{name}.folder, or make it there"
+            faults.append(f"{name}: its folder cannot be used ({why}); {remedy}")
+        if abs(report.clock_offset_s) > CLOCK_OFFSET_MAX_S + report.round_trip_s:
+            warnings.append(f"{name}: its clock is {report.clock_offset_s:+.1f} s off; set it with chrony or ntp")
+        if facts["load"] > LOAD_MAX * facts["cores"]:
+            load = f"load is {facts['load']:.1f} on {facts['cores']} cores"
+            warnings.append(f"{name}: {load}; lockstep goes at the pace of the slowest")
+        if slow := set(facts["governors"]) - PERFORMANCE:
+            governors = f"the CPU governor is {', '.join(sorted(slow))}"
+            warnings.append(f"{name}: {governors}; performance is steadier (cpupower frequency-set)")
+        if facts["free_bytes"] < FREE_MIN_BYTES:
+            free = f"{facts['free_bytes'] / 1e9:.1f} GB are free on its disk"
+            warnings.append(f"{name}: {free}; a record of an hour takes about 1 GB")
     computing = {name: report for name, report in reports.items() if NEEDED_TO_COMPUTE in report.facts["parts"]}
     return faults, [*warnings, *_different_fingerprints(computing)]
-
-
-def _faults(name: str, report: HostReport) -> Iterator[str]:
-    facts = report.facts
-    if facts["zsim"] != __version__:
-        yield f"{name}: zsim is {facts['zsim']}; must be {__version__} as here; {report.remedy}"
-    ours = platform.python_version_tuple()[:2]
-    if tuple(facts["python"].split(".")[:2]) != ours:
-        yield f"{name}: Python is {facts['python']}; must be {'.'.join(ours)} as here, for the same bits"
-    if why := facts["unwritable"]:
-        yield f"{name}: its folder cannot be used ({why}); correct hosts.{name}.folder, or make it there"
-
-
-def _warnings(name: str, report: HostReport) -> Iterator[str]:
-    facts = report.facts
-    if abs(report.clock_offset_s) > CLOCK_OFFSET_MAX_S + report.round_trip_s:
-        yield f"{name}: its clock is {report.clock_offset_s:+.1f} s off; set it with chrony or ntp"
-    if facts["load"] > LOAD_MAX * facts["cores"]:
-        yield f"{name}: load is {facts['load']:.1f} on {facts['cores']} cores; lockstep goes at the pace of the slowest"
-    if slow := set(facts["governors"]) - PERFORMANCE:
-        yield f"{name}: the CPU governor is {', '.join(sorted(slow))}; performance is steadier (cpupower frequency-set)"
-    if facts["free_bytes"] < FREE_MIN_BYTES:
-        yield f"{name}: {facts['free_bytes'] / 1e9:.1f} GB are free on its disk; a record of an hour takes about 1 GB"
 
 
 def _different_fingerprints(reports: dict[str, HostReport]) -> Iterator[str]:
@@ -219,24 +189,12 @@ def _different_fingerprints(reports: dict[str, HostReport]) -> Iterator[str]:
 
 
 def hosts_table(reports: Mapping[str, HostReport]) -> FittedTable:
-    rows = [
-        (
-            name,
-            report.facts["python"],
-            report.facts["zsim"],
-            f"{1e3 * report.round_trip_s:.1f} ms",
-            f"{1e3 * report.clock_offset_s:+.1f} ms",
-            f"{report.facts['load']:.2f}",
-            str(report.facts["cores"]),
-            ", ".join(report.facts["governors"]) or "-",
-            report.facts["fingerprint"][:8],
-        )
-        for name, report in reports.items()
-    ]
+    rows = []
+    for name, report in reports.items():
+        facts, shown_s = report.facts, (f"{1e3 * report.round_trip_s:.1f} ms", f"{1e3 * report.clock_offset_s:+.1f} ms")
+        computer = (f"{facts['load']:.2f}", str(facts["cores"]), ", ".join(facts["governors"]) or "-")
+        rows.append((name, facts["python"], facts["zsim"], *shown_s, *computer, facts["fingerprint"][:8]))
     return FittedTable(HOST_COLUMNS, rows)
-
-
-# The network between them
 
 
 async def network_paths(
@@ -263,26 +221,22 @@ async def network_paths(
 
 def path_faults(paths: Sequence[NetworkPath]) -> tuple[list[str], list[str]]:
     """Return the paths that do not exist, and those that are slow, a line each."""
-    faults = [_path_fault(path) for path in paths if "error" in path.figures]
-    slow = [
-        f"{path.source} reaches {path.target} at {path.figures['bits_per_s'] / 1e6:.1f} Mbit/s only"
-        for path in paths
-        if path.figures.get("bits_per_s", BITS_PER_S_MIN) < BITS_PER_S_MIN
-    ]
-    return faults, slow
-
-
-def _path_fault(path: NetworkPath) -> str:
-    why = path.figures["error"]
-    match path.figures.get("taken"):
-        case True:
-            return port_in_use(path.target, path.port)
-        case False:
+    faults, slow = [], []
+    for path in paths:
+        why, taken = path.figures.get("error"), path.figures.get("taken")
+        if why is None:
+            if path.figures["bits_per_s"] < BITS_PER_S_MIN:
+                shown = f"{path.figures['bits_per_s'] / 1e6:.1f} Mbit/s"
+                slow.append(f"{path.source} reaches {path.target} at {shown} only")
+        elif taken:
+            faults.append(port_in_use(path.target, path.port))
+        elif taken is False:
             fault = f"nothing may listen on port {path.port} there ({why}); give another port in the inventory"
-            return f"{path.target}: {fault}"
-        case _:
+            faults.append(f"{path.target}: {fault}")
+        else:
             fault = f"port {path.port} of {path.target} cannot be reached ({why}); is it open in the firewall?"
-            return f"{path.source}: {fault}"
+            faults.append(f"{path.source}: {fault}")
+    return faults, slow
 
 
 def paths_table(paths: Sequence[NetworkPath]) -> FittedTable:

@@ -18,7 +18,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Mapping
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import asyncssh
 from asyncssh.constants import OPEN_REQUEST_SESSION_FAILED
@@ -29,7 +29,6 @@ from zsim_deploy.inventory import SSH_PORT, Host, InventoryFile
 CONNECT_S = 10.0  # wall time; a host on a poor link answers within a few round trips
 KEEPALIVE_S = 15.0  # asked when nothing came for so long …
 KEEPALIVE_COUNT = 4  # … and given up after a minute: a link that is cut for 20 s keeps its connection
-NO_SFTP = "its sshd has no SFTP; set `Subsystem sftp internal-sftp` in sshd_config there and restart sshd"
 ECHO_S = 0.5  # how often a line goes to the host and back
 RETRY_S = 0.5  # between two attempts to connect again
 CLOSE_S = 1.0  # how long a connection may take to close; a cut one never does
@@ -44,19 +43,13 @@ Connection = asyncssh.SSHClientConnection
 
 
 class EventLoopThread:
-    """An event loop in a thread."""
-
     def __init__(self) -> None:
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="ssh", daemon=True)
         self._thread.start()
 
     def call(self, work: Coroutine[Any, Any, Result], timeout_s: float | None = None) -> Result:
-        """Run a coroutine to its end and return its result.
-
-        Raises:
-            TimeoutError: it took longer; it is cancelled.
-        """
+        """Run a coroutine to its end and return its result; TimeoutError, and it is cancelled, if it takes longer."""
         future = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return future.result(timeout_s)
@@ -65,11 +58,9 @@ class EventLoopThread:
             raise
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> Future[None]:
-        """Start a coroutine without waiting for it; it can be cancelled."""
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
     def call_soon(self, act: Any, *args: Any) -> None:
-        """Call a plain function on the loop's thread."""
         self._loop.call_soon_threadsafe(act, *args)
 
     def close(self) -> None:
@@ -89,85 +80,53 @@ class EventLoopThread:
 
 
 class HostLink:
-    """One host; more connections are opened to it as one has no room for another channel.
-
-    Args:
-        base: folder of the inventory, from which relative paths count.
-
-    Attributes:
-        round_trip_s: of the last line that came back.
-        answered_s: monotonic time of it; 0 before the first.
-    """
+    """One host; more connections are opened to it as one has no room for another channel."""
 
     def __init__(self, name: str, host: Host, base: Path) -> None:
         self.name = name
         self.host = host
-        self.round_trip_s = 0.0
-        self.answered_s = 0.0
-        self._base = base
+        self.round_trip_s = 0.0  # of the last line that came back
+        self.answered_s = 0.0  # monotonic time of it; 0 before the first
+        self._base = base  # folder of the inventory, from which relative paths count
         self._channels: dict[Connection, int] = {}  # in use, by connection
         self._lock = asyncio.Lock()
 
     async def open(self) -> Connection:
-        """Return a connection on which there is room for a short use, made anew where it is lost.
-
-        Raises:
-            HostsError: the host cannot be reached, or does not let us in.
-        """
+        """Return a connection with room for one more short use; HostsError if the host does not let us in."""
         async with self._lock:
-            return await self._with_room()
+            for connection, channels in list(self._channels.items()):
+                if connection.is_closed():
+                    del self._channels[connection]
+                elif channels < CHANNELS:
+                    return connection
+            connection = await connect(self.name, self.host, self._base)
+            self._channels[connection] = 0
+            return connection
 
     @contextlib.asynccontextmanager
     async def channel(self, retry: bool = False) -> AsyncIterator[Connection]:
-        """Yield a connection for one channel.
-
-        Args:
-            retry: try until the host is there.
-
-        Raises:
-            HostsError: as `open`, if not retry.
-        """
-        connection = await self._reserved(retry)
+        """Yield a connection for one channel; `retry`: try until the host is there, else raise as `open` does."""
+        while True:
+            try:
+                connection = await self.open()
+                self._channels[connection] += 1
+                break
+            except HostsError:
+                if not retry:
+                    raise
+            await asyncio.sleep(RETRY_S)
         try:
             yield connection
         finally:
             if connection in self._channels:
                 self._channels[connection] -= 1
 
-    async def _reserved(self, retry: bool) -> Connection:
-        while True:
-            try:
-                async with self._lock:
-                    connection = await self._with_room()
-                    self._channels[connection] += 1
-                    return connection
-            except HostsError:
-                if not retry:
-                    raise
-            await asyncio.sleep(RETRY_S)
-
-    async def _with_room(self) -> Connection:
-        for connection, channels in list(self._channels.items()):
-            if connection.is_closed():
-                del self._channels[connection]
-            elif channels < CHANNELS:
-                return connection
-        connection = await connect(self.name, self.host, self._base)
-        self._channels[connection] = 0
-        return connection
-
     async def run(
         self, command: str, stdin: bytes = b"", timeout_s: float = ANSWER_S, what: str = "", retry: bool = False
     ) -> bytes:
-        """Return what a command prints.
+        """Return what a line of a POSIX shell prints; HostsError with its last line if it fails or takes too long.
 
-        Args:
-            command: line of a POSIX shell.
-            what: it does, for errors; its first word if not given.
-            retry: try until the host is there; the time counts from then.
-
-        Raises:
-            HostsError: it failed, or took too long; with the last line that it printed.
+        `what` it does, for errors; `retry`: try until the host is there, the time counts from then.
         """
         async with self.channel(retry) as connection:
             try:
@@ -176,10 +135,10 @@ class HostLink:
                 act = what or repr(command[:60])
                 raise HostsError(f"{self.name}: no answer within {timeout_s:g} s to {act}") from error
             except (asyncssh.Error, OSError) as error:
-                raise _broke(self.name, error) from error
+                raise _broken(self.name, error) from error
         if done.exit_status != 0:
-            said = done.stderr.decode(errors="replace") if isinstance(done.stderr, bytes) else str(done.stderr or "")
-            lines = said.strip().splitlines() or ["it printed nothing"]
+            text = done.stderr.decode(errors="replace") if isinstance(done.stderr, bytes) else str(done.stderr or "")
+            lines = text.strip().splitlines() or ["it printed nothing"]
             what = what or command.split(" ", 1)[0]
             raise HostsError(f"{self.name}: {what} failed ({done.exit_status}): {lines[-1][:200]}")
         return done.stdout if isinstance(done.stdout, bytes) else b""
@@ -187,15 +146,9 @@ class HostLink:
     async def put_files(
         self, folder: str, files: Mapping[str, bytes], timeout_s: float = ANSWER_S, retry: bool = False
     ) -> None:
-        """Write files below a folder of the host, readable by their owner alone: all, or none where the link breaks.
+        """Write files, by path below a folder, readable by their owner alone: all, or none where the link breaks.
 
-        Args:
-            folder: made if it is not there.
-            files: path below the folder to content.
-            retry: as `run`.
-
-        Raises:
-            HostsError: they could not be written.
+        Raises HostsError if they cannot be written.
         """
         packed = io.BytesIO()
         with tarfile.open(fileobj=packed, mode="w", format=tarfile.USTAR_FORMAT) as tar:
@@ -226,7 +179,6 @@ class HostLink:
             await asyncio.sleep(RETRY_S)
 
     def silent_s(self) -> float:
-        """Return for how long the host has not answered."""
         return max(0.0, time.monotonic() - self.answered_s - ECHO_S) if self.answered_s else 0.0
 
     async def close(self) -> None:
@@ -238,21 +190,17 @@ class HostLink:
             await asyncio.wait_for(closed, CLOSE_S)
 
 
-def _broke(name: str, error: Exception) -> HostsError:
+def _broken(name: str, error: Exception) -> HostsError:
     return HostsError(f"{name}: the connection broke ({error}); is the host up?")
 
 
 class HostLinks:
-    """A link to each host that takes part.
-
-    Attributes:
-        by_name: the links; a new dictionary when there is one more, for others look at it meanwhile.
-    """
+    """A link to each host that takes part."""
 
     def __init__(self, placed: InventoryFile, names: Iterable[str], loop: EventLoopThread) -> None:
         self._placed = placed
         self._loop = loop
-        self.by_name = {name: self.to(name) for name in names}
+        self.by_name = {name: self.to(name) for name in names}  # a new one when a link is added: others look at it
 
     def to(self, name: str) -> HostLink:
         """Return a new link to a host of the inventory, which is not kept."""
@@ -268,10 +216,8 @@ class HostLinks:
             self._loop.spawn(link.measure_round_trips())
 
     def on_all(self, work: Callable[[HostLink], Coroutine[Any, Any, Any]], within_s: float) -> dict[str, Any]:
-        """Run the same coroutine for all hosts at once; return the results by name.
-
-        Raises:
-            HostsError: it failed, or took longer, with a line for every such host.
+        """Run a coroutine for all hosts at once; return results by name, or raise a line for each that fails or is
+        late.
         """
 
         async def bounded(link: HostLink) -> Any:
@@ -287,7 +233,6 @@ class HostLinks:
         return dict(zip(self.by_name, raise_faults(self._loop.call(gathered())), strict=True))
 
     def close(self) -> None:
-        """Close all of them at once."""
         self.on_all(HostLink.close, 2 * CLOSE_S)
 
 
@@ -301,16 +246,8 @@ def raise_faults(results: list[Any]) -> list[Any]:
     return results
 
 
-# Programs on a host, and files from there
-
-
 class ProgramEndedError(HostsError):
-    """A program on a host has ended without an answer.
-
-    Attributes:
-        status: exit code.
-        last: line that it printed on standard error; empty if it printed nothing.
-    """
+    """A program on a host has ended without an answer, with an exit code and a last line on standard error."""
 
     def __init__(self, name: str, status: int | None, last: str) -> None:
         super().__init__(f"{name}: it ended with code {status} ({last or 'it printed nothing'})")
@@ -330,12 +267,7 @@ class RemoteProgram:
     async def answer(self, within_s: float, late: str = "") -> dict[str, Any]:
         """Return its next answer; a greeting of the login shell is skipped.
 
-        Args:
-            late: text of the error if it takes longer; empty for the usual one.
-
-        Raises:
-            ProgramEndedError: it has ended.
-            HostsError: it took longer.
+        ProgramEndedError if it has ended, HostsError if it took longer, with the text `late` if that is given.
         """
         try:
             async with asyncio.timeout(within_s):
@@ -352,11 +284,7 @@ class RemoteProgram:
 
 @contextlib.asynccontextmanager
 async def open_program(link: HostLink, command: str) -> AsyncIterator[RemoteProgram]:
-    """Run a program on a host as long as the block lasts.
-
-    Raises:
-        HostsError: the host cannot be reached, or the connection breaks.
-    """
+    """Run a program on a host while the block lasts; HostsError if the host is not reached or the connection breaks."""
     try:
         async with link.channel() as connection:
             process = await connection.create_process(command, encoding="utf-8", errors="replace")
@@ -365,28 +293,34 @@ async def open_program(link: HostLink, command: str) -> AsyncIterator[RemoteProg
             finally:
                 process.close()  # not waited for: on a link that is cut it would take a minute
     except (asyncssh.Error, OSError) as error:
-        raise _broke(link.name, error) from error
+        raise _broken(link.name, error) from error
 
 
 async def fetch(link: HostLink, source: str, into: Path) -> bool:
     """Copy a file from a host, under its name only when it is whole; return False if there is none.
 
-    Args:
-        source: path there; a leading ~/ is the home.
-        into: path here; what has come so far lies beside it, with .part at the end.
-
-    Raises:
-        HostsError: it cannot be read, the host has no SFTP or does not answer, or nothing came any more.
-        OSError: it cannot be written here.
+    What has come so far lies beside it, with .part at the end. HostsError if it cannot be read, or nothing comes any
+    more; OSError if it cannot be written here.
     """
-    part = into.with_name(f"{into.name}.part")
+    part, moved = into.with_name(f"{into.name}.part"), asyncio.Event()
     try:
         async with link.channel() as connection:
             sftp = await asyncio.wait_for(start_sftp(link.name, connection), OPEN_S)
+            copy = asyncio.create_task(
+                sftp.get(
+                    source.removeprefix("~/"), part, block_size=BLOCK_BYTES, progress_handler=lambda *_: moved.set()
+                )
+            )
+            copy.add_done_callback(lambda task: task.cancelled() or task.exception())  # else asyncio reports it
             try:
-                await _copy(sftp, source.removeprefix("~/"), part)
+                while not (await asyncio.wait([copy], timeout=STALL_S))[0]:
+                    if not moved.is_set():
+                        raise HostsError(f"nothing came for {STALL_S:g} s; what did is {part}")
+                    moved.clear()
             finally:
+                copy.cancel()
                 sftp.exit()  # not waited for: a link that is cut does not report that it has closed
+            copy.result()
     except TimeoutError as error:
         raise HostsError(f"{link.name}: no answer within {OPEN_S:g} s") from error
     except asyncssh.SFTPNoSuchFile:
@@ -397,41 +331,16 @@ async def fetch(link: HostLink, source: str, into: Path) -> bool:
     return True
 
 
-async def _copy(sftp: asyncssh.SFTPClient, source: str, into: Path) -> None:
-    moved = asyncio.Event()
-    copy = asyncio.create_task(
-        sftp.get(source, into, block_size=BLOCK_BYTES, progress_handler=lambda *_: moved.set()),
-    )
-    copy.add_done_callback(
-        lambda task: task.cancelled() or task.exception()
-    )  # else asyncio reports one that nobody retrieved
-    try:
-        while not (await asyncio.wait([copy], timeout=STALL_S))[0]:
-            if not moved.is_set():
-                raise HostsError(f"nothing came for {STALL_S:g} s; what did is {into}")
-            moved.clear()
-    finally:
-        copy.cancel()
-    copy.result()
-
-
 async def start_sftp(name: str, connection: Connection) -> asyncssh.SFTPClient:
-    """Return a way to copy files over a connection.
-
-    Raises:
-        HostsError: the host has no SFTP.
-        asyncssh.Error: the connection broke.
-    """
+    """Return a way to copy files over a connection; HostsError if the host has no SFTP."""
     try:
         return await connection.start_sftp_client()
-    except asyncssh.ChannelOpenError as error:
-        if error.code != OPEN_REQUEST_SESSION_FAILED:
+    except (asyncssh.ChannelOpenError, asyncssh.SFTPConnectionLost, asyncssh.SFTPEOFError) as error:
+        is_refused = isinstance(error, asyncssh.ChannelOpenError) and error.code == OPEN_REQUEST_SESSION_FAILED
+        if not is_refused and (isinstance(error, asyncssh.ChannelOpenError) or connection.is_closed()):
             raise
-        raise HostsError(f"{name}: {NO_SFTP}") from error
-    except (asyncssh.SFTPConnectionLost, asyncssh.SFTPEOFError) as error:
-        if connection.is_closed():
-            raise
-        raise HostsError(f"{name}: {NO_SFTP}") from error
+        remedy = "set `Subsystem sftp internal-sftp` in sshd_config there and restart sshd"
+        raise HostsError(f"{name}: its sshd has no SFTP; {remedy}") from error
 
 
 def shell_word(path: str) -> str:
@@ -453,104 +362,72 @@ def json_answer(lines: Iterable[str]) -> dict[str, Any] | None:
     return None
 
 
-# Connecting
-
-
-class Refused(NamedTuple):
-    """A host key that is not trusted, and under which name, address and port it was looked for."""
-
-    host: str
-    address: str
-    port: int
-    key: asyncssh.SSHKey
-
-
 class _Client(asyncssh.SSHClient):
-    """Notes the host key that is refused."""
+    """Notes the host key that is refused: the host name, address and port that it was looked for under, and the key."""
 
-    refused: Refused | None = None
+    refused: tuple[str, str, int, asyncssh.SSHKey] | None = None
 
     def validate_host_public_key(self, host: str, addr: str, port: int, key: asyncssh.SSHKey) -> bool:
-        self.refused = Refused(host, addr, port, key)
+        self.refused = (host, addr, port, key)
         return False
 
 
 async def connect(name: str, host: Host, base: Path) -> Connection:
-    """Connect to a host.
+    """Connect to a host; what its entry leaves open is filled in by ~/.ssh/config.
 
-    Args:
-        name: of the host in the inventory, for errors.
-        host: its entry in the inventory; ~/.ssh/config fills in what that leaves open.
-        base: folder of the inventory, from which relative paths of `key` and `known_hosts` count.
-
-    Raises:
-        HostsError: it cannot be reached, has another key than known_hosts, or refuses the user or key.
+    Relative paths of `key` and `known_hosts` count from `base`, the folder of the inventory. HostsError if the host
+    cannot be reached, has another key than known_hosts, or refuses the user or key.
     """
-    client = _Client()
+    client, address = _Client(), host.ssh or host.address
     options: dict[str, Any] = {"keepalive_interval": KEEPALIVE_S, "keepalive_count_max": KEEPALIVE_COUNT}
-    if host.user is not None:
-        options["username"] = host.user
+    known = Path("~/.ssh/known_hosts")
     try:
+        if host.user is not None:
+            options["username"] = host.user
         if host.key is not None:
-            options["client_keys"] = [str(_path(base, host.key))]
+            options["client_keys"] = [str(base / Path(host.key).expanduser())]
         if host.known_hosts is not None:
-            options["known_hosts"] = str(_path(base, host.known_hosts))
-        opening = asyncssh.connect(host.ssh or host.address, host.port, client_factory=lambda: client, **options)
+            known = base / Path(host.known_hosts).expanduser()
+            options["known_hosts"] = str(known)
+        opening = asyncssh.connect(address, host.port, client_factory=lambda: client, **options)
         return await asyncio.wait_for(opening, CONNECT_S)
     except (asyncssh.Error, asyncssh.KeyImportError, OSError, ValueError, TimeoutError) as error:
-        refused = client.refused or await _shown_key(host, error)
-        reason = _changed_key(name, host, base, refused) or _reason(name, host, base, error)
-        raise HostsError(f"{name}: {reason}") from error
+        refused = client.refused
+        if refused is None and isinstance(
+            error, asyncssh.ConnectionLost | asyncssh.KeyExchangeFailed | ConnectionResetError
+        ):  # there may be no host key to agree on: only known kinds are asked for
+            with contextlib.suppress(asyncssh.Error, OSError, ValueError, TimeoutError):
+                key = await asyncio.wait_for(asyncssh.get_server_host_key(address, host.port), CONNECT_S)
+                refused = (address, "", host.port, key) if key else None
+        reason = _changed_key(name, host, known, *refused) if refused else ""
+        raise HostsError(f"{name}: {reason or _reason(name, host, base, known, error)}") from error
 
 
-def _path(base: Path, path: str) -> Path:
-    return base / Path(path).expanduser()
-
-
-def _known_hosts(host: Host, base: Path) -> Path:
-    return _path(base, host.known_hosts) if host.known_hosts else Path("~/.ssh/known_hosts")
-
-
-async def _shown_key(host: Host, error: Exception) -> Refused | None:
-    """Return the host key of a host with which there was none to agree on: only known kinds are asked for."""
-    if not isinstance(error, asyncssh.ConnectionLost | asyncssh.KeyExchangeFailed | ConnectionResetError):
-        return None
-    address = host.ssh or host.address
-    try:
-        key = await asyncio.wait_for(asyncssh.get_server_host_key(address, host.port), CONNECT_S)
-    except (asyncssh.Error, OSError, ValueError, TimeoutError):
-        return None
-    return Refused(address, "", host.port, key) if key else None
-
-
-def _changed_key(name: str, host: Host, base: Path, refused: Refused | None) -> str:
+def _changed_key(
+    name: str, host: Host, known: Path, looked_for: str, address: str, port: int, shown: asyncssh.SSHKey
+) -> str:
     """Return that a host shows another key than is known of it, where it does; empty otherwise."""
-    if refused is None:
-        return ""
-    known, port = _known_hosts(host, base), None if refused.port == SSH_PORT else refused.port
+    path = str(known.expanduser())
     try:
-        keys = asyncssh.match_known_hosts(str(known.expanduser()), refused.host, refused.address, port)[0]
+        keys = asyncssh.match_known_hosts(path, looked_for, address, None if port == SSH_PORT else port)[0]
     except (OSError, ValueError):
         return ""
-    if not keys or refused.key in keys:
+    if not keys or shown in keys:
         return ""
-    at = f"{host.ssh or host.address} port {host.port}"
-    entry = refused.host if host.port == SSH_PORT else f"[{refused.host}]:{host.port}"
-    forget = shlex.join(["ssh-keygen", "-f", str(known.expanduser()), "-R", entry])
+    entry = looked_for if host.port == SSH_PORT else f"[{looked_for}]:{host.port}"
     return (
-        f"the host key of {at} is not the one in {known} (it shows {refused.key.get_fingerprint()}); another machine "
-        f"may pose as {name}; ask who runs it, and only if the key was changed there, remove the old one ({forget}) "
-        "and add the new one"
+        f"the host key of {host.ssh or host.address} port {host.port} is not the one in {known} (it shows "
+        f"{shown.get_fingerprint()}); another machine may pose as {name}; ask who runs it, and only if the key was "
+        f"changed there, remove the old one ({shlex.join(['ssh-keygen', '-f', path, '-R', entry])}) and add the new one"
     )
 
 
-def _reason(name: str, host: Host, base: Path, error: Exception) -> str:
+def _reason(name: str, host: Host, base: Path, known: Path, error: Exception) -> str:
     """Describe what failed and what to do."""
     address = host.ssh or host.address
     at = f"{address} port {host.port}"
     user = host.user or getpass.getuser()
-    known = _known_hosts(host, base)
-    key = f"key {_path(base, host.key)}" if host.key else "the keys of ~/.ssh and the agent"
+    key = f"key {base / Path(host.key).expanduser()}" if host.key else "the keys of ~/.ssh and the agent"
     match error:
         case asyncssh.HostKeyNotVerifiable():
             scan = shlex.join(["ssh-keyscan", "-p", str(host.port), address])

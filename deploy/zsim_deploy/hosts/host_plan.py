@@ -1,7 +1,7 @@
 """What a run puts on each host, processes and files, and what earlier runs have left there."""
 
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
@@ -52,28 +52,16 @@ TRY_PORTS_S = 20.0  # wall time to start Python on a small computer
 
 
 class HostPlan:
-    """The processes of one run that zsim starts, and where; it does not change.
-
-    Args:
-        run_id: names the run's folder on each host.
-        pace: options of the world: `--realtime`, `--rate R`.
-
-    Attributes:
-        processes: by name, the routers first, each after the one that it connects to.
-        remarks: on programs of the user's own, which are not started.
-
-    Raises:
-        InventoryError: a process has no place.
-    """
+    """The processes of one run that zsim starts, and where; it does not change. InventoryError if one has no place."""
 
     def __init__(self, placed: InventoryFile, scenario: Scenario, run_id: str, pace: Sequence[str] = ()) -> None:
         self.placed = placed
         self._scenario = scenario
-        self._run_id = run_id
-        self._pace = pace
+        self._run_id = run_id  # names the run's folder on each host
+        self._pace = pace  # options of the world
         in_order = sorted(inv.processes(placed, scenario, pace), key=lambda process: process.role != ROUTER)
-        self.processes = {process.name: process for process in in_order}
-        self.remarks = inv.own_programs(placed, scenario)
+        self.processes = {process.name: process for process in in_order}  # each after the one that it connects to
+        self.remarks = inv.own_programs(placed, scenario)  # on programs of the user's own, which are not started
 
     def moved(self, name: str, host: str) -> "HostPlan":
         """Return the same plan but for the host of one process."""
@@ -82,7 +70,6 @@ class HostPlan:
         return HostPlan(placed, self._scenario, self._run_id, self._pace)
 
     def hosts(self) -> list[str]:
-        """Return the hosts on which something runs."""
         return sorted({process.host for process in self.processes.values()})
 
     def host(self, name: str) -> str:
@@ -105,11 +92,9 @@ class HostPlan:
         return f"{name}:{self.record()} (fetch it with `{command}`)"
 
     def ports(self, host: str) -> list[int]:
-        """Return the ports of a host on which processes of the run will listen."""
         return [process.port for process in self.processes.values() if process.host == host and process.port]
 
     def certificate_faults(self, now: datetime) -> list[str]:
-        """Return a line for each fault of the certificates at a given time."""
         return certificates.certificate_faults(self.placed, {name: self.host(name) for name in self.processes}, now)
 
     def python(self, host: str) -> str:
@@ -125,11 +110,7 @@ class HostPlan:
         return [role, "--launched", self._run_id, *journal, *options]
 
     def files(self, host: str) -> dict[str, bytes]:
-        """Return what the processes of a host need in the run's folder, by path below it.
-
-        Raises:
-            HostsError: a certificate is not there.
-        """
+        """Return what the processes of a host need, by path below the run's folder; HostsError as `identity`."""
         contents: dict[str, bytes] = {}
         for name, process in self.processes.items():
             if process.host == host:
@@ -139,7 +120,10 @@ class HostPlan:
         return contents
 
     def identity(self, name: str) -> dict[str, bytes]:
-        """Return certificate, key and access control of a process, by path below the run's folder."""
+        """Return certificate, key and access control of a process, by path below the run's folder.
+
+        HostsError if one is not there.
+        """
         process = self.processes[name]
         if not process.secure:
             return {}
@@ -164,25 +148,18 @@ def runs_folder(host: Host) -> str:
 async def leftovers(link: HostLink, base: Path) -> list[str]:
     """Describe what earlier runs have left on a host: at most a line on records, and one on private keys.
 
-    Raises:
-        HostsError: it could not be asked.
+    A greeting of the login shell is skipped. HostsError if the host could not be asked.
     """
-    folder = runs_folder(link.host)
+    name, folder = link.name, runs_folder(link.host)
     script = f"cd {shell_word(folder)} 2>/dev/null || exit 0{LIST_RUNS}"
     output = (await link.run(script, what=f"looking into {folder}")).decode(errors="replace")
-    return leftover_lines(link.name, link.host, base, output.splitlines())
-
-
-def leftover_lines(name: str, host: Host, base: Path, output: Iterable[str]) -> list[str]:
-    """Describe what LIST_RUNS prints; a greeting of the login shell is skipped."""
-    folder = runs_folder(host)
-    words = [line.split(" ", 1) for line in output]
+    words = [line.split(" ", 1) for line in output.splitlines()]
     runs = {kind: [word[1] for word in words if word[0] == kind and len(word) > 1] for kind in (RECORD, KEY)}
     lines = []
     if records := [f"{folder}/{run}/{RECORD}" for run in runs[RECORD]]:
         lines.append(
             f"{name}: records of earlier runs were not fetched: {', '.join(f'{name}:{path}' for path in records)}; "
-            f"fetch with `{scp(host, base, records[0])}`, then remove the folder of the run there"
+            f"fetch with `{scp(link.host, base, records[0])}`, then remove the folder of the run there"
         )
     if keys := [f"{folder}/{run}/{FOLDER}" for run in runs[KEY]]:
         lines.append(
@@ -205,11 +182,7 @@ def scp(host: Host, base: Path, path: str) -> str:
 
 
 async def port_faults(link: HostLink, python: str, ports: Sequence[int]) -> list[str]:
-    """Return a line for each port of a host that is in use by another program.
-
-    Raises:
-        HostsError: it could not be asked.
-    """
+    """Return a line for each port of a host that another program uses; HostsError if it could not be asked."""
     if not ports:
         return []
     command = f"{shell_word(python)} - {shell_line([link.host.address, *map(str, ports)])}"
@@ -219,6 +192,5 @@ async def port_faults(link: HostLink, python: str, ports: Sequence[int]) -> list
 
 
 def port_in_use(host: str, port: int) -> str:
-    """Return a line on a port of a host that is in use by another program."""
     remedy = "end that (`ss -ltnp` there shows it), or give another port in the inventory"
     return f"{host}: port {port} is in use there, perhaps by another run; {remedy}"

@@ -7,12 +7,12 @@ socket.
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import CancelledError, wait
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from zsim.errors import HostsError, RunError, ZsimError
 from zsim.record import repair
@@ -43,20 +43,8 @@ LOOK_S = 0.1  # between two looks whether it has
 ORDER_S = 5.0  # until the supervisor, which looks every 50 ms, carries out an order
 
 
-class HostInspection(NamedTuple):
-    """A host before the run: its report, ports that are taken, and what earlier runs have left."""
-
-    report: HostReport
-    taken: list[str]
-    left: list[str]
-
-
 class HostRun:
-    """One run on several hosts.
-
-    Raises:
-        InventoryError: a process has no place.
-    """
+    """One run on several hosts; InventoryError if a process has no place."""
 
     def __init__(
         self, scenario: Scenario, placed: InventoryFile, out: Path, launch: Launch, status: StatusTable
@@ -77,12 +65,11 @@ class HostRun:
     def run(self) -> Outcome:
         """Run to the end; whatever happens, no process or key of it is left on any host that can be reached.
 
-        Raises:
-            RunError: the federation is up already on this machine.
-            HostsError: with a line for every certificate that is missing, or every host that cannot take part.
+        RunError if the federation is up already on this machine; HostsError with a line for every certificate that is
+        missing, or every host that cannot take part.
         """
         requests = {
-            "ps": lambda: {"rows": self._status.rows(), "clock": self._status.clock_now(), **self._where()},
+            "ps": lambda: {"rows": self._status.rows(), "clock": self._status.clock_now, **self._where()},
             "where": self._where,
             "down": lambda: self._supervisor.interrupt("ended by zsim down"),
             "restart": self._restart,
@@ -94,34 +81,39 @@ class HostRun:
                     raise HostsError("\n".join(faults))
                 if warning := exposed_keys(self._placed):
                     self._status.say(f"warning: {warning}")
-                self._timed("connect", lambda: self._links.on_all(HostLink.open, CONNECT_S))
-                self._timed("check", self._check)
+                with self._timed("connect"):
+                    self._links.on_all(HostLink.open, CONNECT_S)
+                with self._timed("check"):
+                    self._check()
                 with self._cleaned():
-                    self._timed("prepare", lambda: self._links.on_all(self._prepare, PREPARE_S))
+                    with self._timed("prepare"):
+                        self._links.on_all(self._prepare, PREPARE_S)
                     return self._fly()
         finally:
             with contextlib.suppress(HostsError):
                 self._links.close()
             self._loop.close()
 
-    def _timed(self, what: str, act: Callable[[], Any]) -> None:
+    @contextlib.contextmanager
+    def _timed(self, what: str) -> Iterator[None]:
         start_s = time.monotonic()
-        act()
+        yield
         self._status.stages_s[what] = time.monotonic() - start_s
 
     def _check(self) -> None:
-        looks = self._links.on_all(self._inspect, CHECK_S)
-        faults, warnings = compare_reports({name: look.report for name, look in looks.items()})
-        for warning in [*warnings, *(line for look in looks.values() for line in look.left)]:
-            self._status.say(f"warning: {warning}")
-        if faults := [*faults, *(line for look in looks.values() for line in look.taken)]:
-            raise HostsError("\n".join(faults))
+        async def inspect(link: HostLink) -> tuple[HostReport, list[str], list[str]]:
+            """Return the report of a host, the ports that are taken there, and what earlier runs have left."""
+            python = self._plan.python(link.name)
+            report = await host_report(link, python, self._placed.word)
+            taken = await port_faults(link, python, self._plan.ports(link.name))
+            return report, taken, await leftovers(link, self._placed.folder)
 
-    async def _inspect(self, link: HostLink) -> HostInspection:
-        python = self._plan.python(link.name)
-        report = await host_report(link, python, self._placed.word)
-        taken = await port_faults(link, python, self._plan.ports(link.name))
-        return HostInspection(report, taken, await leftovers(link, self._placed.folder))
+        found = self._links.on_all(inspect, CHECK_S)
+        faults, warnings = compare_reports({name: report for name, (report, _, _) in found.items()})
+        for warning in [*warnings, *(line for _, _, left in found.values() for line in left)]:
+            self._status.say(f"warning: {warning}")
+        if faults := [*faults, *(line for _, taken, _ in found.values() for line in taken)]:
+            raise HostsError("\n".join(faults))
 
     async def _prepare(self, link: HostLink) -> None:
         """Put the scenario, and the certificates where there are any, on a host."""
@@ -154,9 +146,8 @@ class HostRun:
 
     def _look(self) -> None:
         """End the run when nobody can see its output any more; show which hosts are silent."""
-        self._signals.look()
-        if self._signals.reason:
-            self._supervisor.interrupt(self._signals.reason)
+        if reason := self._signals.look():
+            self._supervisor.interrupt(reason)
         self._status.report_silent_hosts()
 
     def _remote(self, plan: HostPlan, name: str) -> RemoteProcess:
@@ -166,8 +157,6 @@ class HostRun:
         command = [plan.python(host), *MODULE, *plan.arguments(name)]
         files = (plan.folder(host), plan.identity(name))
         return RemoteProcess(name, command, self._links.by_name[host], self._loop, log, on_line, files)
-
-    # The end
 
     def _fetch(self) -> str:
         """Fetch the record; return why that failed, empty if it did not."""
@@ -278,11 +267,7 @@ class HostRun:
 
 
 async def _refuse_unless_able(link: HostLink, python: str, role: str) -> None:
-    """Refuse a host whose Python cannot import what a role is made of.
-
-    Raises:
-        HostsError: with what it lacks.
-    """
+    """Refuse a host whose Python cannot import what a role is made of: HostsError with what it lacks."""
     for extra in extras([role]):
         code = f"import {MODULES[extra]}"
         command = f"{shell_word(python)} -c {shell_word(code)}"

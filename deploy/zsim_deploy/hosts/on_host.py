@@ -33,7 +33,6 @@ NOTE = "zsim-installed.json"  # in the environment: what was installed; missing 
 
 
 def inspect_folder(folder: Path) -> dict:
-    """Return what decides which wheels fit, and which are still needed."""
     return {
         "folder": str(folder),
         "version": list(sys.version_info[:2]),
@@ -71,11 +70,7 @@ class CommandRunner:
         self._child: subprocess.Popen | None = None
 
     def run(self, command: list) -> None:
-        """Run a command to its end.
-
-        Raises:
-            CommandError: it failed.
-        """
+        """Run a command to its end; CommandError if it failed."""
         with self._gate:
             self._child = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -99,13 +94,8 @@ class CommandRunner:
 def install(folder: Path, order: dict, children: CommandRunner) -> None:
     """Install wheels that lie in FOLDER/wheels, and nothing from anywhere else.
 
-    Args:
-        order: project and pip (names of their wheels), wheels (names of the others that are new), extras, modules (to
-            import for proof), note (to keep).
-
-    Raises:
-        CommandError: pip failed, or the proof.
-        OSError: no room.
+    Order: project and pip (names of their wheels), wheels (names of the others that are new), extras, modules (to
+    import for proof), note (to keep). CommandError if pip or the proof fails, OSError where there is no room.
     """
     environment, wheels = folder / "venv", folder / "wheels"
     fresh = _installed(environment) is None
@@ -127,11 +117,7 @@ def install(folder: Path, order: dict, children: CommandRunner) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path, who: str) -> Iterator[str]:
-    """Work in a folder alone; while another does, report who, and wait. Yield why that cannot be, empty if it can.
-
-    Raises:
-        OSError: the folder cannot be made or written.
-    """
+    """Work in a folder alone; while another does, report who, and wait. Yield why that cannot be, empty if it can."""
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / LOCK, "a+") as file:
         fault = ""
@@ -154,7 +140,6 @@ def say(answer: dict) -> None:
 
 
 def execute(folder: Path, order: dict, children: CommandRunner) -> dict:
-    """Carry out a request and return the answer."""
     try:
         if order["act"] == "look":
             return inspect_folder(folder)

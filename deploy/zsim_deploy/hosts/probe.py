@@ -37,7 +37,6 @@ DONE = b"."
 
 def about(folder: Path) -> dict[str, Any]:
     """Return what matters for a run about this host, where a folder is to be written."""
-    there = _nearest(folder)
     return {
         "python": platform.python_version(),
         "zsim": __version__,
@@ -46,7 +45,7 @@ def about(folder: Path) -> dict[str, Any]:
         "cores": os.cpu_count() or 1,
         "load": os.getloadavg()[0],
         "governors": governors(Path(GOVERNORS)),
-        "free_bytes": shutil.disk_usage(there).free,
+        "free_bytes": shutil.disk_usage(_nearest(folder)).free,
         "unwritable": unwritable(folder),
     }
 
@@ -65,7 +64,6 @@ def _nearest(folder: Path) -> Path:
 
 
 def clock(requests: TextIO) -> None:
-    """Print the wall-clock time for each line received."""
     for _ in requests:
         print(json.dumps({"time_ns": time.time_ns()}), flush=True)
 
@@ -120,25 +118,22 @@ def answer(connection: socket.socket) -> None:
 
 
 def reach(address: str, port: int) -> dict[str, Any]:
-    """Return the round trip [s] and the bandwidth [bit/s] to a host that serves, or why there is none."""
+    """Return the round trip [s] and the bandwidth [bit/s] to a host that serves, or why there is none.
+
+    The bandwidth is that of the first bulk that takes a while, so that a slow link is not kept busy for minutes.
+    """
     try:
         with socket.create_connection((address, port), TIMEOUT_S) as link:
             link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            round_trip_s = statistics.median(_send_s(link, 0) for _ in range(PINGS))
-            return {"round_trip_s": round_trip_s, "bits_per_s": _bits_per_s(link, round_trip_s)}
+            round_trip_s, bits_per_s = statistics.median(_send_s(link, 0) for _ in range(PINGS)), 0.0
+            for size in BULKS_BYTES:
+                took_s = max(_send_s(link, size) - round_trip_s, SHORTEST_S)
+                bits_per_s = 8 * size / took_s
+                if took_s >= BULK_S:
+                    break
+            return {"round_trip_s": round_trip_s, "bits_per_s": bits_per_s}
     except OSError as error:
         return {"error": error.strerror or str(error)}
-
-
-def _bits_per_s(link: socket.socket, round_trip_s: float) -> float:
-    """Return the bandwidth by the first bulk that takes a while, so that a slow link is not kept busy for minutes."""
-    bits_per_s = 0.0
-    for size in BULKS_BYTES:
-        took_s = max(_send_s(link, size) - round_trip_s, SHORTEST_S)
-        bits_per_s = 8 * size / took_s
-        if took_s >= BULK_S:
-            break
-    return bits_per_s
 
 
 def _send_s(link: socket.socket, size: int) -> float:

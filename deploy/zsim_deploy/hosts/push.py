@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import getpass
+import importlib.metadata
 import json
 import os
 import re
@@ -32,7 +33,7 @@ from zsim_deploy.hosts.host_link import (
     start_sftp,
 )
 from zsim_deploy.hosts.wheelhouse import Wheel, Wheelhouse, WheelSet, wheel_target
-from zsim_deploy.inventory import MODULES, Host, InventoryFile, known_extras, needed_extras
+from zsim_deploy.inventory import MODULES, Host, InventoryFile, needed_extras
 from zsim_deploy.roles import warm_up
 
 LAUNCHER = "launcher"  # name of this machine among the hosts, in progress lines
@@ -55,25 +56,16 @@ Progress = Callable[[str, str], None]  # host, what is being done there
 async def push(
     placed: InventoryFile, names: Sequence[str], more: Iterable[str], progress: Progress, cache: Path
 ) -> dict[str, bool]:
-    """Install on hosts what their roles need.
+    """Install on hosts, by default on all, what their roles need; return for each whether anything had to be done
+    there.
 
-    Args:
-        names: of the hosts; all of the inventory if empty.
-        more: extras for each of them beside those of its roles.
-        progress: takes a host and what is being done there.
-        cache: folder of the wheelhouse.
-
-    Returns:
-        For each host whether anything had to be done there.
-
-    Raises:
-        InventoryError: a host is not in the inventory, or there is no such extra.
-        HostsError: with a line for each host at which it failed; the others are done.
+    `more`: extras for each of them beside those of its roles; `cache`: folder of the wheelhouse. InventoryError if a
+    host or an extra is unknown; HostsError with a line for each host at which it failed; the others are done.
     """
     hosts = placed.inventory.hosts
     more = list(more)
     unknown = [f"--host {name}: must be one of {', '.join(hosts)}" for name in names if name not in hosts]
-    known = known_extras()
+    known = sorted(importlib.metadata.metadata("zsim").get_all("Provides-Extra") or [])
     unknown += [f"--extra {name}: must be one of {', '.join(known)}" for name in more if name not in known]
     if unknown:
         raise InventoryError(unknown)
@@ -88,7 +80,6 @@ async def push(
 async def _push_to(
     name: str, host: Host, base: Path, wanted: frozenset[str], wheelhouse: Wheelhouse, progress: Progress
 ) -> bool:
-    """Install on one host; return whether anything had to be done."""
     if host.python:
         progress(name, f"has zsim of its own in {host.python}")
         return False
@@ -108,11 +99,7 @@ async def _push_to(
 
 
 async def _install(
-    link: HostLink,
-    there: "Installer",
-    wanted: frozenset[str],
-    wheelhouse: Wheelhouse,
-    progress: Callable[[str], None],
+    link: HostLink, there: "Installer", wanted: frozenset[str], wheelhouse: Wheelhouse, progress: Callable[[str], None]
 ) -> bool:
     """Install what is wanted; return whether anything had to be done."""
     facts = await there.ask("look", ASK_S)
@@ -194,12 +181,7 @@ def default_cache() -> Path:
         raise HostsError(f"push: {why}") from error
 
 
-# The Python of a host
-
-
 class Interpreter(NamedTuple):
-    """A Python of a host."""
-
     command: str
     version: tuple[int, int, int]
     path: str
@@ -221,8 +203,7 @@ def parse_interpreters(answer: str) -> list[Interpreter]:
 def choose_interpreter(name: str, interpreters: Sequence[Interpreter], here: tuple[int, int]) -> Interpreter:
     """Return the Python to install for: of the launcher's minor version, `python3` rather than another.
 
-    Raises:
-        HostsError: there is none; no run takes a host with another one, as its bits would differ.
+    HostsError if there is none; no run takes a host with another one, as its bits would differ.
     """
     fit = [each for each in interpreters if each.version[:2] == here]
     if fit:
@@ -238,59 +219,21 @@ def choose_interpreter(name: str, interpreters: Sequence[Interpreter], here: tup
     )
 
 
-# The program on a host
-
-
 class Installer:
-    """on_host.py as it runs on a host: asked over one ssh channel, it ends with all that it does when that closes.
-
-    Args:
-        name: of the host, for errors.
-        python: that runs it, for errors.
-    """
+    """on_host.py as it runs on a host: asked over one ssh channel, it ends with all that it does when that closes."""
 
     def __init__(self, name: str, python: str, program: RemoteProgram) -> None:
         self._name, self._python, self._program = name, python, program
 
-    async def lock(self, progress: Callable[[str], None]) -> None:
-        """Wait until no other push installs there.
-
-        Args:
-            progress: takes a line on who installs there.
-
-        Raises:
-            HostsError: the folder cannot be used, or another push takes too long.
-        """
-        message = await self._answer(START_S)
-        if holder := message.get("waits"):
-            progress(f"waiting for the push of {holder}")
-            message = await self._answer(WAIT_S, f"{holder} is pushing to it; wait for that to end, or end it there")
-        if why := message.get("unwritable"):
-            remedy = f"correct hosts.{self._name}.folder, or make it there"
-            raise HostsError(f"{self._name}: its folder cannot be used ({why}); {remedy}")
-        if why := message.get("unlocked"):
-            progress(f"its folder cannot be locked ({why}); do not let two commands push to it at a time")
-
     async def ask(self, act: str, timeout_s: float, **order: Any) -> dict[str, Any]:
-        """Give an order and return the answer.
-
-        Raises:
-            HostsError: it failed, took longer, or the host is gone.
-        """
+        """Give an order and return the answer; HostsError if it failed, took longer, or the host is gone."""
         self._program.send(json.dumps({"act": act, **order}) + "\n")
-        message = await self._answer(timeout_s, f"to {act} took longer than {timeout_s:g} s; is it busy?")
+        message = await self.answer(timeout_s, f"to {act} took longer than {timeout_s:g} s; is it busy?")
         if "error" in message:
             raise HostsError(f"{self._name}: {message['error'][:300]}")
         return message
 
-    async def beat(self) -> None:
-        """Send a sign of life at intervals."""
-        with contextlib.suppress(asyncssh.Error, OSError):
-            while True:
-                await asyncio.sleep(BEAT_S)
-                self._program.send("\n")
-
-    async def _answer(self, timeout_s: float, late: str = "") -> dict[str, Any]:
+    async def answer(self, timeout_s: float, late: str = "") -> dict[str, Any]:
         try:
             return await self._program.answer(timeout_s, late)
         except ProgramEndedError as error:
@@ -302,25 +245,36 @@ class Installer:
 async def open_installer(
     link: HostLink, python: str, folder: str, progress: Callable[[str], None]
 ) -> AsyncIterator[Installer]:
-    """Let the program run on a host as long as the block lasts; it alone installs there.
+    """Let the program run by a Python of a host as long as the block lasts; it alone installs there.
 
-    Args:
-        python: that runs it.
-        folder: of zsim on the host.
-        progress: takes a line on who is waited for.
-
-    Raises:
-        HostsError: the host cannot be reached, its folder not be used, or the connection breaks.
+    `folder`: of zsim on the host; `progress` takes a line on who is waited for. HostsError if the host cannot be
+    reached, its folder not be used or another push takes too long.
     """
     script = Path(on_host.__file__).read_bytes()
     start = f"import sys; exec(sys.stdin.buffer.read({len(script)}))"  # not to the end: that means to end
     who = f"{getpass.getuser()}@{socket.gethostname()}"
     async with open_program(link, shell_line([python, "-P", "-c", start, folder, who, f"{SILENT_S:g}"])) as program:
+
+        async def beat() -> None:
+            with contextlib.suppress(asyncssh.Error, OSError):
+                while True:
+                    await asyncio.sleep(BEAT_S)
+                    program.send("\n")
+
         program.send(script.decode())
         there = Installer(link.name, python, program)
-        beats = asyncio.create_task(there.beat())
+        beats = asyncio.create_task(beat())
         try:
-            await there.lock(progress)
+            message = await there.answer(START_S)
+            if holder := message.get("waits"):
+                progress(f"waiting for the push of {holder}")
+                late = f"{holder} is pushing to it; wait for that to end, or end it there"
+                message = await there.answer(WAIT_S, late)
+            if why := message.get("unwritable"):
+                remedy = f"correct hosts.{link.name}.folder, or make it there"
+                raise HostsError(f"{link.name}: its folder cannot be used ({why}); {remedy}")
+            if why := message.get("unlocked"):
+                progress(f"its folder cannot be locked ({why}); do not let two commands push to it at a time")
             yield there
         finally:
             beats.cancel()

@@ -31,11 +31,8 @@ PID = "zsim-pid "  # begins the line with its process id; a login shell may prin
 class RemoteProcess:
     """A role on another host.
 
-    Args:
-        command: words of its command line there.
-        log: of its output.
-        on_line: takes every line of its standard output; None sends that to the log too.
-        files: what it needs below a folder and takes away when it ends; brought again whenever it is started again.
+    `on_line` takes every line of its standard output; None sends that to the log too. `files`: what it needs below a
+    folder and takes away when it ends; brought again whenever it is started again.
     """
 
     def __init__(
@@ -62,26 +59,21 @@ class RemoteProcess:
         self._starts = 0
         self._process: asyncssh.SSHClientProcess[str] | None = None
         self._life: Future[None] | None = None
-        self._code: int | None = None
+        self.code: int | None = None  # exit code, None while it lives or is on its way; negative for a signal
         self._fault = ""
         self._ended = threading.Event()
         self._stop: str | None = None
 
     @property
-    def code(self) -> int | None:
-        """Return its exit code, None while it lives or is on its way; negative for a signal."""
-        return self._code
-
-    @property
     def state(self) -> str:
-        if self._code is not None:
+        if self.code is not None:
             return "ended"
         return "running" if self.pid else "starting"
 
     def start(self) -> None:
         """Start it, or start it again; returns at once."""
         self._starts += 1
-        self.pid, self._code, self._process, self._stop, self._fault = 0, None, None, None, ""
+        self.pid, self.code, self._process, self._stop, self._fault = 0, None, None, None, ""
         self._ended.clear()
         self._life = self._loop.spawn(self._live())
 
@@ -97,7 +89,7 @@ class RemoteProcess:
         finally:
             if self._fault:
                 self._log.write(f"{self._fault}\n")
-            self._code = code
+            self.code = code
             self._ended.set()
 
     async def _run(self) -> int:
@@ -106,6 +98,10 @@ class RemoteProcess:
                 while True:
                     await asyncio.sleep(BEAT_S)
                     process.stdin.write("beat\n")
+
+        async def read(stream: Any, on_line: Callable[[str], None]) -> None:
+            async for line in stream:
+                on_line(line)
 
         if self._starts > 1 and self._files:
             await self._link.put_files(self._folder, self._files, LEND_S, retry=True)
@@ -125,7 +121,8 @@ class RemoteProcess:
                 self._send(f"stop {self._stop}\n")
             beats = asyncio.create_task(beat(process))
             try:
-                await asyncio.gather(self._read_lines(process.stdout, self._on_line), self._read_lines(process.stderr))
+                log = self._log.write
+                await asyncio.gather(read(process.stdout, self._on_line or log), read(process.stderr, log))
                 done = await process.wait()
             finally:
                 beats.cancel()
@@ -133,17 +130,10 @@ class RemoteProcess:
                 return -int(getattr(signal, f"SIG{done.exit_signal[0]}", signal.SIGKILL))
             return done.exit_status if done.exit_status is not None else LOST
 
-    async def _read_lines(self, stream: Any, on_line: Callable[[str], None] | None = None) -> None:
-        async for line in stream:
-            if on_line:
-                on_line(line)
-            else:
-                self._log.write(line)
-
     def outcome(self) -> str:
-        if self._code == LOST:
+        if self.code == LOST:
             return self._fault or f"the connection to {self.host} broke"
-        return end_text(self._code, self.last_log_line())
+        return end_text(self.code, self.last_log_line())
 
     def last_log_line(self) -> str:
         return self._log.last
@@ -159,12 +149,11 @@ class RemoteProcess:
                 self._process.stdin.write(line)
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until it has ended; return whether it has."""
         return self._ended.wait(max(0.0, timeout_s))
 
     def kill(self) -> None:
         """Send SIGKILL, as to one that hangs, or stop trying to start it; returns at once."""
-        if self._code is not None or self._life is None:
+        if self.code is not None or self._life is None:
             return
         if not self.pid:
             self._life.cancel()
@@ -184,24 +173,15 @@ class RemoteProcess:
 
 
 class ProcessLog:
-    """The log file of a process; where it cannot be written, that is reported once, and only the last line is kept.
-
-    Args:
-        path: of the file, named after the process.
-        say: takes a line when it cannot be written.
-
-    Attributes:
-        last: line that is not empty.
-    """
+    """The log file of a process; where it cannot be written, `say` is told once, and only the last line is kept."""
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:
-        self.last = ""
+        self.last = ""  # line that is not empty
         self._path = path
         self._say = say
         self._is_whole = True
 
     def write(self, line: str) -> None:
-        """Add a line, which ends in a line feed."""
         self.last = line.strip() or self.last
         try:
             with self._path.open("a", errors="replace") as file:

@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,6 +14,7 @@ from zsim.presentation import Column, FittedTable
 from zsim.runtime.progress import Screen, cell, describe
 from zsim.scenario.roles import WORLD
 from zsim_deploy.arguments import RowOrder
+from zsim_deploy.launch.supervisor import status_row
 
 if TYPE_CHECKING:
     from zsim_deploy.hosts.host_link import HostLink
@@ -37,6 +38,12 @@ ATTENTION = (  # beginnings of states, the most urgent first; then all others, a
     "waits for",
 )
 NOTHING_AMISS = ("running", "ended")
+FIGURES = {  # by which rows are sorted, the greatest first: field, and what stands for one that is not known
+    "age": ("age_s", LONGEST_S),
+    "lag": ("lag_ms", LONGEST_S),
+    "messages": ("messages_per_s", 0.0),
+    "restarts": ("restarts", 0.0),
+}
 COLUMNS = (
     Column("role", "name"),
     Column("host", "name"),
@@ -52,31 +59,23 @@ Row = Mapping[str, Any]
 
 
 class StatusTable(Screen):
-    """Progress of a run on several hosts; a table on a terminal, lines elsewhere.
-
-    Attributes:
-        members: the processes; to be given before it is shown.
-        stages_s: how long each step before the processes' start took.
-
-    Args:
-        choice: which rows the live table has, in which order.
-    """
+    """Progress of a run on several hosts; a table of chosen rows on a terminal, lines elsewhere."""
 
     def __init__(self, duration_s: float, console: Console | None = None, choice: "RowChoice | None" = None) -> None:
         super().__init__(duration_s, console)
         self._choice = choice or RowChoice()
-        self.members: Sequence[Any] = ()
+        self.members: Sequence[Any] = ()  # to be given before it is shown
         self.links: dict[str, HostLink] = {}
-        self.stages_s: dict[str, float] = {}
+        self.stages_s: dict[str, float] = {}  # how long each step before the processes' start took
         self._begun_s = time.monotonic()
         self._flies = False
         self._health: dict[str, dict[str, Any]] = {}
-        self._clock: dict[str, Any] | None = None
+        self.clock_now: dict[str, Any] | None = None  # the world's last line on time
         self._silent: set[str] = set()
         self._live = Live(get_renderable=self._render, console=self.console, refresh_per_second=4, transient=True)
 
     def clock(self, line: dict[str, Any]) -> None:
-        self._clock = {**line, "wall_s": time.monotonic()}
+        self.clock_now = {**line, "wall_s": time.monotonic()}
         if line["t_s"] >= FIRST_S and not self._flies:
             self._flies = True
             took_s = time.monotonic() - self._begun_s
@@ -86,7 +85,7 @@ class StatusTable(Screen):
             super().clock(line)
 
     def health(self, line: dict[str, Any]) -> None:
-        """Take a process's health; the messages that it has taken in since the last one give its rate."""
+        """Take a process's health; the messages that it has received since the last one give its rate."""
         now_s = time.monotonic()
         former = self._health.get(line["name"])
         rate = None
@@ -106,33 +105,21 @@ class StatusTable(Screen):
                 self._silent.discard(name)
                 self.say(f"host {name} answers again")
 
-    def clock_now(self) -> dict[str, Any] | None:
-        return self._clock
-
     def rows(self) -> list[dict[str, Any]]:
-        return [self._row(member) for member in self.members]
-
-    def _row(self, member: "RemoteProcess") -> dict[str, Any]:
-        link, health = self.links[member.host], self._health.get(member.name)
-        fresh = health is not None and time.monotonic() - health["wall_s"] < STALE_S
-        return {
-            "role": member.name,
-            "host": member.host,
-            "pid": member.pid or None,
-            "state": self._state(member, link),
-            "age_s": self._age_s(member.name),
-            "lag_ms": health["lag_ns"] / 1e6 if health and fresh else None,
-            "messages_per_s": health["per_s"] if health and fresh else None,
-            "round_trip_ms": 1e3 * link.round_trip_s if link.answered_s and not _is_silent(link) else None,
-            "restarts": member.restarts,
-        }
-
-    def _age_s(self, name: str) -> float | None:
-        """Return for how long nothing has come of a process [s, wall], None if nothing ever has."""
-        last_s = self._health[name]["wall_s"] if name in self._health else None
-        if name == WORLD and self._clock is not None:
-            last_s = max(last_s or 0.0, self._clock["wall_s"])
-        return None if last_s is None else time.monotonic() - last_s
+        rows, now_s = [], time.monotonic()
+        for member in self.members:
+            link, health = self.links[member.host], self._health.get(member.name)
+            last_s = health["wall_s"] if health else None
+            if member.name == WORLD and self.clock_now is not None:
+                last_s = max(last_s or 0.0, self.clock_now["wall_s"])
+            row = status_row(member.name, member.host, member.pid, self._state(member, link), member.restarts)
+            row["age_s"] = None if last_s is None else now_s - last_s  # since anything has come of it
+            if health and now_s - health["wall_s"] < STALE_S:
+                row |= {"lag_ms": health["lag_ns"] / 1e6, "messages_per_s": health["per_s"]}
+            if link.answered_s and not _is_silent(link):
+                row["round_trip_ms"] = 1e3 * link.round_trip_s
+            rows.append(row)
+        return rows
 
     def _state(self, member: "RemoteProcess", link: "HostLink") -> str:
         if member.state != "running":
@@ -141,14 +128,12 @@ class StatusTable(Screen):
             return f"host silent {link.silent_s():.0f} s"
         if silent_s := self._no_sign_s(member.name, link):
             return f"no sign of life for {silent_s:.0f} s"
-        for waited in (self._clock or {}).get("waiting_for", ()):
-            if waited["name"] != member.name:
-                continue
-            if waited.get("held_by"):
-                return f"waits for {', '.join(waited['held_by'])}"
-            if waited["since_wall_s"] > WAITED_S:
-                return f"waited for {waited['since_wall_s']:.0f} s"
-            break
+        waiting = (self.clock_now or {}).get("waiting_for", ())
+        waited = next((each for each in waiting if each["name"] == member.name), None)
+        if waited and waited.get("held_by"):
+            return f"waits for {', '.join(waited['held_by'])}"
+        if waited and waited["since_wall_s"] > WAITED_S:
+            return f"waited for {waited['since_wall_s']:.0f} s"
         return member.state
 
     def _no_sign_s(self, name: str, link: "HostLink") -> float:
@@ -159,13 +144,13 @@ class StatusTable(Screen):
         now_s, patience_s = time.monotonic(), SILENT_PROCESS_S + ROUND_TRIPS * link.round_trip_s
         heard_s = self._health[name]["wall_s"] if name in self._health else None
         world_s = max([health["wall_s"] for health in self._health.values()], default=now_s)
-        world_s = max(world_s, (self._clock or {}).get("wall_s", world_s))
+        world_s = max(world_s, (self.clock_now or {}).get("wall_s", world_s))
         last_s = world_s if name == WORLD else heard_s if now_s - world_s < patience_s else None
         silent_s = 0.0 if last_s is None else now_s - last_s
         return silent_s if silent_s >= patience_s else 0.0
 
     def _render(self) -> Group:
-        clock = self._clock
+        clock = self.clock_now
         head = cell(describe(clock, self._duration_s) if clock else "starting …")
         rows = self._choice.of(self.rows())
         lines = max(1, self.console.height - AROUND)
@@ -209,27 +194,26 @@ def _figure(value: float | None, form: str) -> str:
 
 
 class RowChoice(NamedTuple):
-    """What of a table is shown.
+    """What of a table is shown: rows by patterns of roles (`estimator.*2`), of what they work for, or of hosts."""
 
-    Attributes:
-        only: patterns of roles (`estimator.*2`), of what they work for (`drone1*`) or of hosts; all rows if empty.
-        sort: by what; as they come if None.
-    """
-
-    only: Sequence[str] = ()
-    sort: RowOrder | None = None
+    only: Sequence[str] = ()  # all rows if empty
+    sort: RowOrder | None = None  # by what; as they come if None
 
     def of(self, rows: Sequence[Row]) -> list[Any]:
         """Return the rows that are shown, in their order; of equal ones the first stays first."""
         shown = [row for row in rows if not self.only or any(_matches(pattern, row) for pattern in self.only)]
-        return shown if self.sort is None else sorted(shown, key=_KEYS[self.sort])
+        if self.sort is None:
+            return shown
+        by = self.sort.value
+        if self.sort is RowOrder.ATTENTION:
+            return sorted(shown, key=needs_attention)
+        if by not in FIGURES:
+            return sorted(shown, key=lambda row: row[by])
+        field, unknown = FIGURES[by]
+        return sorted(shown, key=lambda row: -(unknown if row.get(field) is None else row[field]))
 
     def check(self, rows: Sequence[Row]) -> None:
-        """Refuse a pattern that matches no row.
-
-        Raises:
-            RunError: with some roles that there are.
-        """
+        """Refuse a pattern that matches no row: RunError with some roles that there are."""
         for pattern in self.only:
             if not any(_matches(pattern, row) for row in rows):
                 roles = [row["role"] for row in rows]
@@ -249,19 +233,3 @@ def needs_attention(row: Row) -> int:
     if state in NOTHING_AMISS:
         return len(ATTENTION) + 1 + NOTHING_AMISS.index(state)
     return next((rank for rank, begins in enumerate(ATTENTION) if state.startswith(begins)), len(ATTENTION))
-
-
-def _greatest(field: str, unknown: float) -> Callable[[Row], float]:
-    return lambda row: -(unknown if row.get(field) is None else row[field])
-
-
-_KEYS: dict[RowOrder, Callable[[Row], Any]] = {
-    RowOrder.ROLE: lambda row: row["role"],
-    RowOrder.HOST: lambda row: row["host"],
-    RowOrder.STATE: lambda row: row["state"],
-    RowOrder.AGE: _greatest("age_s", LONGEST_S),
-    RowOrder.LAG: _greatest("lag_ms", LONGEST_S),
-    RowOrder.MESSAGES: _greatest("messages_per_s", 0.0),
-    RowOrder.RESTARTS: _greatest("restarts", 0.0),
-    RowOrder.ATTENTION: needs_attention,
-}

@@ -48,19 +48,14 @@ class UnreachableError(Exception):
 
 
 class WheelTarget(NamedTuple):
-    """What wheels must fit.
-
-    Attributes:
-        abi: such as cp311; PEP 425.
-        platforms: platform tags that run there, the best first.
-    """
+    """What wheels must fit."""
 
     version: tuple[int, int]
-    abi: str
-    platforms: tuple[str, ...]
+    abi: str  # such as cp311; PEP 425
+    platforms: tuple[str, ...]  # tags of those that run there, the best first
 
     def options(self) -> list[str]:
-        """Return the options by which pip takes wheels for this target."""
+        """Return them as options of pip."""
         platforms = [word for name in self.platforms for word in ("--platform", name)]
         version = ".".join(map(str, self.version))
         return ["--implementation", "cp", "--python-version", version, "--abi", self.abi, *platforms]
@@ -70,15 +65,7 @@ class WheelTarget(NamedTuple):
 
 
 def wheel_target(name: str, facts: Mapping[str, Any]) -> WheelTarget:
-    """Return what wheels for a host must fit.
-
-    Args:
-        name: of the host, for errors.
-        facts: of the host, by on_host.py.
-
-    Raises:
-        HostsError: wheels are not made for such a system.
-    """
+    """Return what wheels for a host must fit, from what on_host.py says of it; HostsError where none are made."""
     major, minor = facts["version"]
     if facts["implementation"] != "cpython":
         raise HostsError(f"{name}: its Python is {facts['implementation']}; must be CPython; install that there")
@@ -117,9 +104,6 @@ class WheelSet(NamedTuple):
     others: tuple[Wheel, ...]
     extras: tuple[str, ...]
 
-    def wheels(self) -> tuple[Wheel, ...]:
-        return (self.project, self.pip, *self.others)
-
     def manifest(self) -> dict[str, Any]:
         wheels = {wheel.path.name: wheel.sha256 for wheel in self.others}
         return {"project": self.project.sha256, "extras": list(self.extras), "wheels": wheels}
@@ -139,11 +123,7 @@ class Wheelhouse:
     async def wheel_set(self, host: str, target: WheelTarget, extras: Iterable[str]) -> WheelSet:
         """Return what a host needs.
 
-        Args:
-            host: its name, for errors.
-
-        Raises:
-            HostsError: the project cannot be built, a wheel that fits the host does not exist, or pip has no index.
+        HostsError if the project cannot be built, a wheel that fits the host does not exist, or pip has no index.
         """
         async with self._lock:
             if self._unreachable:
@@ -152,7 +132,10 @@ class Wheelhouse:
                 project = await self._project()
                 wanted = tuple(sorted(extras))
                 key = _key([requirements(project), wanted, target.options(), constraints()])
-                names = self._known(key) or await self._gather(host, key, project, wanted, target)
+                note = self._houses / f"{key}.json"
+                names = json.loads(note.read_text()) if note.exists() else []
+                if not names or not all((self._wheels / name).exists() for name in names):
+                    names = await self._gather(host, note, project, wanted, target)
             except UnreachableError as error:
                 self._unreachable = (
                     f"launcher: the package index cannot be reached ({error}); connect this machine to it for the "
@@ -165,75 +148,63 @@ class Wheelhouse:
         return WheelSet(_wheel(project), installer, others, wanted)
 
     async def _project(self) -> Path:
-        """Return the wheel of this project: of the checkout, or of what is installed."""
+        """Return the wheel of this project: of the checkout, or of what is installed.
+
+        What builds it is kept, so that the next time no index is asked.
+        """
         checkout = _checkout()
         source = str(checkout) if checkout else requirement(importlib.metadata.distribution(PROJECT))
         folder = self._folder / PROJECT / _key([zsim.__version__, _sources(checkout)] if checkout else source)
         if not folder.is_dir():
             self._progress(f"building the wheel of {PROJECT}")
-            with tempfile.TemporaryDirectory(dir=self._folder) as made:
+            with tempfile.TemporaryDirectory(dir=self._folder) as temporary:
+                built = Path(temporary, "wheel")
+                build = ("wheel", "--no-deps", "--wheel-dir", str(built), source)
                 try:
-                    await self._build(source, checkout, f"{made}/wheel")
+                    if not await is_kept(self._builders, build, self._progress):
+                        if needs := _description(checkout)["build-system"]["requires"] if checkout else []:
+                            await pip("download", "--dest", str(self._builders), *needs, progress=self._progress)
+                        await pip(*build, "--find-links", str(self._builders), progress=self._progress)
                 except PipError as error:
                     raise HostsError(f"launcher: no wheel of {PROJECT} from {source}: {error}") from error
                 folder.parent.mkdir(exist_ok=True)
                 try:
-                    Path(made, "wheel").rename(folder)
+                    built.rename(folder)
                 except OSError:
                     if not folder.is_dir():  # else another process has put the same there meanwhile
                         raise
-                    shutil.rmtree(Path(made, "wheel"))
+                    shutil.rmtree(built)
         return next(folder.glob("*.whl"))
 
-    async def _build(self, source: str, checkout: Path | None, into: str) -> None:
-        """Build the wheel; what that needs is kept, so that the next time no index is asked."""
-        build = ("wheel", "--no-deps", "--wheel-dir", into, source)
-        if await is_kept(self._builders, build, self._progress):
-            return
-        if needs := _description(checkout)["build-system"]["requires"] if checkout else []:
-            await pip("download", "--dest", str(self._builders), *needs, progress=self._progress)
-        await pip(*build, "--find-links", str(self._builders), progress=self._progress)
-
-    def _known(self, key: str) -> list[str]:
-        """Return the wheels of a set that was gathered before; none if one of them is missing."""
-        note = self._houses / f"{key}.json"
-        names = json.loads(note.read_text()) if note.exists() else []
-        return names if all((self._wheels / name).exists() for name in names) else []
-
     async def _gather(
-        self, host: str, key: str, project: Path, extras: Sequence[str], target: WheelTarget
+        self, host: str, note: Path, project: Path, extras: Sequence[str], target: WheelTarget
     ) -> list[str]:
         self._progress(f"gathering the wheels for {target}" + (f" with {', '.join(extras)}" if extras else ""))
         wanted = f"{project}[{','.join(extras)}]" if extras else str(project)
-        with tempfile.TemporaryDirectory(dir=self._folder) as made:
+        with tempfile.TemporaryDirectory(dir=self._folder) as temporary:
             try:
                 other_versions = await download_wheels(
-                    [wanted, PIP], target, Path(made), constraints(), self._wheels, self._progress
+                    [wanted, PIP], target, Path(temporary), constraints(), self._wheels, self._progress
                 )
             except PipError as error:
-                raise HostsError(f"{host}: {_lacking(error, target)}") from error
-            names = sorted(path.name for path in Path(made).glob("*.whl") if path.name != project.name)
+                line = f"no wheels for {target}: {error}"
+                if match := re.search(r"satisfies the requirement ([\w.-]+)", str(error)):
+                    other = (
+                        "take another Python there, or build it there and give its folder to pip here (PIP_FIND_LINKS)"
+                    )
+                    line = f"no wheel of {match[1]} for {target}; {other}"
+                raise HostsError(f"{host}: {line}") from error
+            names = sorted(path.name for path in Path(temporary).glob("*.whl") if path.name != project.name)
             for name in names:
-                os.replace(Path(made, name), self._wheels / name)
+                os.replace(Path(temporary, name), self._wheels / name)
         if other_versions:
             self._progress(f"{host}: {target} gets other versions of packages than are here: not the same bits")
-        note = self._houses / f"{key}.json"
         note.with_suffix(".part").write_text(json.dumps(names))
         os.replace(note.with_suffix(".part"), note)
         return names
 
 
-def _lacking(error: PipError, target: WheelTarget) -> str:
-    """Return a line on the wheel that does not exist, from pip's error."""
-    match = re.search(r"satisfies the requirement ([\w.-]+)", str(error))
-    if match is None:
-        return f"no wheels for {target}: {error}"
-    other = "take another Python there, or build it there and give its folder to pip here (PIP_FIND_LINKS)"
-    return f"no wheel of {match[1]} for {target}; {other}"
-
-
 def requirements(project: Path) -> list[str]:
-    """Return the requirements in a wheel's metadata, for all extras."""
     with zipfile.ZipFile(project) as archive:
         name = next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
         lines = archive.read(name).decode().partition("\n\n")[0].splitlines()
@@ -300,21 +271,10 @@ async def download_wheels(
 ) -> bool:
     """Collect wheels for a target; where a project has only sources, build them here.
 
-    The versions are those of this machine where there are such wheels for the target, because equal versions are a
-    condition for equal bits. No index is asked where all of them are kept already.
-
-    Args:
-        wanted: requirements, as for pip.
-        into: folder, for the wheels only.
-        held: constraints, as for pip.
-        kept: folder with wheels of before.
-
-    Returns:
-        Whether the versions had to differ from the held ones.
-
-    Raises:
-        PipError: there are no wheels for the target.
-        UnreachableError: the index does not answer, so it is unknown whether there are.
+    The versions are those of this machine (`held`, constraints of pip) where there are such wheels for the target,
+    because equal versions are a condition for equal bits; return whether they had to differ. No index is asked where
+    all of them are in the folder `kept` already. PipError if there are no wheels for the target, UnreachableError if
+    the index does not answer, so that it is unknown whether there are.
     """
     fit = ("download", "--only-binary=:all:", *target.options(), "--dest", str(into))
 
@@ -356,12 +316,7 @@ async def is_kept(kept: Path, arguments: Sequence[str], progress: Progress) -> b
 async def pip(*arguments: str, progress: Progress) -> None:
     """Run pip of this Python, as the user has configured it but for how often it tries again.
 
-    Args:
-        progress: takes a line when an index does not answer.
-
-    Raises:
-        PipError: with its last line.
-        UnreachableError: with the reason why an index did not answer.
+    PipError with its last line; UnreachableError with the reason why an index did not answer.
     """
     options = ("--disable-pip-version-check", "--no-input", "-q")
     process = await asyncio.create_subprocess_exec(

@@ -5,7 +5,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 
 from zsim.errors import printable
 from zsim_deploy import SAFE_PATH
@@ -23,15 +22,11 @@ class RunConsole:
     """Owns the console of a run, which goes on until the report is there and pages have copies.
 
     To be entered before the run, so that the console never outlives it. Ctrl-C ends the wait for its pages.
-
-    Attributes:
-        process: once there is one.
-        outcome: of the run, to be set; without one it was interrupted.
     """
 
     def __init__(self) -> None:
         self.process: RunProcess | None = None
-        self.outcome = Outcome("interrupted", interrupted=True)
+        self.outcome = Outcome("interrupted", interrupted=True)  # of the run, to be set
 
     def own(self, process: RunProcess) -> None:
         """Take a process that is not started yet; a former one ends."""
@@ -42,9 +37,7 @@ class RunConsole:
     def __enter__(self) -> "RunConsole":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         if self.process is None:
             return
         hurries = self.outcome.interrupted or isinstance(error, (KeyboardInterrupt, SystemExit))
@@ -66,13 +59,8 @@ class RunConsole:
 def console_beside(endpoint: str, record: Path, federation: str | None, tls: Path | None) -> Iterator[None]:
     """Run a console meanwhile, which waits for the world and prints its links.
 
-    Args:
-        endpoint: on which the world listens; where that is all addresses, it is reached on this machine.
-        federation: in whose name; None for that of the record.
-        tls: folder of a certificate, None without.
-
-    Raises:
-        RunError, RecordError: there is no record.
+    It reaches the world at its endpoint, on this machine where that is all addresses, in the name of a federation, by
+    default that of the record.
     """
     if federation is None:
         from zsim_analysis.reading.recorded_run import open_run

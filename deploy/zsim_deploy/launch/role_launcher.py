@@ -17,8 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import IO, NamedTuple, Protocol
+from typing import IO, Protocol
 
 from zsim.runtime.progress import SlowStart
 from zsim_deploy import SAFE_PATH
@@ -42,8 +41,6 @@ UNKNOWN = 0  # exit code, as of Popen, where the status was collected elsewhere
 
 
 class RoleProcess(Protocol):
-    """A role that was started, as of `subprocess.Popen`."""
-
     pid: int
     stdin: IO[str] | None
     stdout: IO[str] | None
@@ -54,12 +51,9 @@ class RoleProcess(Protocol):
 
 
 class ChildProcess:
-    """A role as a child process.
+    """A role as a child process, by arguments of the `zsim` command; `logs`: folder for its standard error.
 
-    Args:
-        arguments: of the `zsim` command.
-        logs: folder for its standard error.
-        on_line: takes every line of its standard output; None sends that to the log too.
+    `on_line` takes every line of its standard output; None sends that to the log too.
     """
 
     def __init__(
@@ -81,7 +75,6 @@ class ChildProcess:
         self._process: RoleProcess | None = None
 
     def start(self) -> None:
-        """Start it, or start it again."""
         with self._log.open("a") as log:
             self._process = process = self._launcher.start(self._arguments, log, listened=self._on_line is not None)
         if on_line := self._on_line:
@@ -122,7 +115,6 @@ class ChildProcess:
             self._process.stdin.flush()
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until it has ended; return whether it has."""
         if self._process is None:
             return True
         try:
@@ -134,12 +126,10 @@ class ChildProcess:
         return True
 
     def kill(self) -> None:
-        """Send SIGKILL, as to one that hangs."""
         if self._process is not None:
             self._process.kill()
 
     def close(self) -> None:
-        """End it in any case, and close its pipes."""
         if self._process is None:
             return
         self.kill()
@@ -155,9 +145,7 @@ class ChildProcess:
 class RoleLauncher:
     """Starts roles. To be entered by the main thread, which then waits until they can be started.
 
-    Args:
-        say: takes a line on what takes long.
-        run: what the run is known by, shown by `ps` for the fork server.
+    `say` takes a line on what takes long; `run`: by what `ps` shows the fork server.
     """
 
     def __init__(self, say: Callable[[str], None], run: str = "") -> None:
@@ -177,18 +165,13 @@ class RoleLauncher:
                 raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop_forkserver()
 
     def start(self, arguments: Sequence[str], log: IO[str], listened: bool) -> RoleProcess:
         """Start a `zsim` command, its standard input a pipe.
 
-        Args:
-            arguments: of the command.
-            log: for what it prints on standard error.
-            listened: whether its standard output is a pipe too; else that goes to the log.
+        Its standard error goes to the log; its standard output too, unless it is `listened` to: then that is a pipe.
         """
         with self._lock:
             return self._fork(arguments, log, listened) or subprocess.Popen(
@@ -202,7 +185,6 @@ class RoleLauncher:
             )
 
     def _start_forkserver(self) -> None:
-        """Start the fork server, and wait until it has loaded everything."""
         self._line, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with other:
             quiet, environment = subprocess.DEVNULL, {**SINGLE_THREADED, **os.environ}
@@ -217,35 +199,32 @@ class RoleLauncher:
             start.over()
 
     def _fork(self, arguments: Sequence[str], log: IO[str], listened: bool) -> "ForkedProcess | None":
-        """Return None where the fork server cannot do it."""
+        """Return None where the fork server cannot do it. The process waits for a byte before it begins."""
         packet = json.dumps(list(arguments)).encode()
         if self._line is None or len(packet) > PACKET_MAX:
             return None
-        go, stdin = _Pipe(*os.pipe()), _Pipe(*os.pipe())
-        stdout = _Pipe(*os.pipe()) if listened else None
-        theirs = [stdin.read, stdout.write if stdout else log.fileno(), log.fileno(), go.read]
-        pid = self._request_fork(packet, theirs)
-        _close(go.read, stdin.read, *([stdout.write] if stdout else []))
-        if pid is None:
-            _close(go.write, stdin.write, *([stdout.read] if stdout else []))
-            return None
-        with suppress(BrokenPipeError):  # killed already
-            os.write(go.write, b"!")
-        os.close(go.write)
-        return ForkedProcess(pid, os.fdopen(stdin.write, "w"), os.fdopen(stdout.read) if stdout else None)
-
-    def _request_fork(self, packet: bytes, files: Sequence[int]) -> int | None:
-        """Return the number of the process that was forked; it waits for a byte before it begins."""
-        assert self._line is not None
+        (go_read, go_write), (stdin_read, stdin_write) = os.pipe(), os.pipe()
+        out_read, out_write = os.pipe() if listened else (None, log.fileno())
         self._line.settimeout(ANSWER_S)
+        reply = b""
         with _subreaper():
             try:
-                socket.send_fds(self._line, [packet], files)
+                socket.send_fds(self._line, [packet], [stdin_read, out_write, log.fileno(), go_read])
             except OSError:
                 self._stop_forkserver()
-                return None
-            reply = self._receive()
-        return int(reply) if reply else None
+            else:
+                reply = self._receive()
+        for file in (go_read, stdin_read, *([out_write] if listened else [])):
+            os.close(file)
+        if not reply:
+            for file in (go_write, stdin_write, out_read):
+                if file is not None:
+                    os.close(file)
+            return None
+        with suppress(BrokenPipeError):  # killed already
+            os.write(go_write, b"!")
+        os.close(go_write)
+        return ForkedProcess(int(reply), os.fdopen(stdin_write, "w"), None if out_read is None else os.fdopen(out_read))
 
     def _receive(self) -> bytes:
         """Return an answer; empty where the fork server is gone or silent, and then it is stopped."""
@@ -268,36 +247,26 @@ class RoleLauncher:
 
 
 class ForkedProcess:
-    """A child of this process, with our ends of its pipes."""
-
     def __init__(self, pid: int, stdin: IO[str], stdout: IO[str] | None) -> None:
         self.pid = pid
         self.stdin: IO[str] | None = stdin
         self.stdout = stdout
         self._code: int | None = None
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
 
     def poll(self) -> int | None:
-        """Return its exit code, negative for a signal; None while it lives."""
         with self._lock:
-            return self._poll()
-
-    def _poll(self) -> int | None:
-        if self._code is None:
-            try:
-                pid, status = os.waitpid(self.pid, os.WNOHANG)
-            except ChildProcessError:
-                self._code = UNKNOWN
-            else:
-                self._code = os.waitstatus_to_exitcode(status) if pid else None
-        return self._code
+            if self._code is None:
+                try:
+                    pid, status = os.waitpid(self.pid, os.WNOHANG)
+                except ChildProcessError:
+                    self._code = UNKNOWN
+                else:
+                    self._code = os.waitstatus_to_exitcode(status) if pid else None
+            return self._code
 
     def wait(self, timeout: float | None = None) -> int:
-        """Return its exit code when it has ended.
-
-        Raises:
-            subprocess.TimeoutExpired: it has not, within so many seconds.
-        """
+        """Return its exit code when it has ended; subprocess.TimeoutExpired if it has not within so many seconds."""
         until_s = None if timeout is None else time.monotonic() + timeout
         while (code := self.poll()) is None:
             if until_s is not None and time.monotonic() >= until_s:
@@ -306,22 +275,13 @@ class ForkedProcess:
         return code
 
     def kill(self) -> None:
-        """Send SIGKILL; harmless when it is gone."""
         with self._lock, suppress(ProcessLookupError):
-            if self._poll() is None:
+            if self.poll() is None:
                 os.kill(self.pid, signal.SIGKILL)
-
-
-class _Pipe(NamedTuple):
-    """Both ends, as file numbers."""
-
-    read: int
-    write: int
 
 
 @contextmanager
 def _subreaper() -> Iterator[None]:
-    """Adopt orphaned descendants for as long as the block lasts."""
     libc, former = ctypes.CDLL(None), ctypes.c_int()
     libc.prctl(PR_GET_CHILD_SUBREAPER, ctypes.byref(former), 0, 0, 0)
     libc.prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
@@ -329,8 +289,3 @@ def _subreaper() -> Iterator[None]:
         yield
     finally:
         libc.prctl(PR_SET_CHILD_SUBREAPER, former.value, 0, 0, 0)
-
-
-def _close(*files: int) -> None:
-    for file in files:
-        os.close(file)

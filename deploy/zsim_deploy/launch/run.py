@@ -1,6 +1,7 @@
 """A whole run on this host: every process of a scenario started, watched, recorded, and ended."""
 
 import contextlib
+import json
 import os
 import re
 import signal
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 from msgspec.structs import replace
 
 from zsim.errors import RecordError, RunFailedError, SessionError
@@ -30,7 +32,7 @@ from zsim_deploy.launch import run_folder
 from zsim_deploy.launch.console_process import RunConsole
 from zsim_deploy.launch.role_launcher import ChildProcess, RoleLauncher
 from zsim_deploy.launch.run_folder import JOURNAL, Launch
-from zsim_deploy.launch.supervisor import EndSignals, Outcome, Supervisor
+from zsim_deploy.launch.supervisor import EndSignals, Outcome, Supervisor, status_row
 from zsim_deploy.roles.stop_channel import REASONS, StopChannel, handled_by
 
 RECORDER = "recorder"
@@ -41,41 +43,31 @@ PORTS_TRIED = 5  # when other runs that start at this moment take each before ou
 
 @dataclass
 class RunOptions:
-    """How to run a scenario.
-
-    Attributes:
-        launch: what is kept of it, for a run that goes on.
-        order: names of processes in the order in which they are started.
-        console: owns the console that is started; None for a run without.
-        continued: whether it goes on where an earlier launch of it was interrupted.
-        supervisor: over its processes, once they are started.
-    """
+    """How to run a scenario."""
 
     scenario: Scenario
     out: Path
-    launch: Launch
-    order: Sequence[str] = ()
-    console: RunConsole | None = None
+    launch: Launch  # what is kept of it, for a run that goes on
+    order: Sequence[str] = ()  # names of processes in the order in which they are started
+    console: RunConsole | None = None  # owns the console that is started; None for a run without
     cameras: bool = False
     detect: bool = False
-    continued: bool = False
-    supervisor: Supervisor | None = None
+    continued: bool = False  # it goes on where an earlier launch of it was interrupted
+    supervisor: Supervisor | None = None  # over its processes, once they are started
 
     def status(self) -> dict[str, Any]:
         """Return what `zsim ps` shows of the run; callable from any thread."""
-        figures = dict.fromkeys(("lag_ms", "messages_per_s", "round_trip_ms"))
-        here = {"role": "in-process", "host": socket.gethostname(), "pid": os.getpid(), "state": "running"}
-        rows = self.supervisor.rows() if self.supervisor else [{**here, "restarts": 0, **figures}]
-        clock = self.supervisor.clock if self.supervisor else None
+        if self.supervisor:
+            rows, clock = self.supervisor.rows(), self.supervisor.clock
+        else:
+            rows, clock = [status_row("in-process", socket.gethostname(), os.getpid(), "running")], None
         return {"rows": rows, "clock": clock, "out": str(self.out.absolute()), "roles": [row["role"] for row in rows]}
 
     def camera_children(self) -> "list[CameraChild]":
-        """Return the cameras and detectors that are started."""
         return camera_children(self.scenario, self.cameras or self.scenario.gates("camera"), self.detect)
 
 
 def fly(options: RunOptions) -> Outcome:
-    """Run a scenario, as real processes or in this one, and show its progress; Ctrl-C is an outcome, too."""
     run = run_in_process if options.launch.in_process else run_processes
     with Screen(options.scenario.duration_s) as screen:
         try:
@@ -87,8 +79,7 @@ def fly(options: RunOptions) -> Outcome:
 def run_processes(options: RunOptions, screen: Screen) -> Outcome:
     """Run a scenario as real processes; the record is finished in any case.
 
-    Raises:
-        KeyboardInterrupt: with the reason, where nothing flew yet, or Ctrl-C came twice.
+    KeyboardInterrupt, with the reason, where nothing flew yet, or Ctrl-C came twice.
     """
 
     def interrupt(number: int, _: object) -> None:
@@ -110,9 +101,7 @@ def run_processes(options: RunOptions, screen: Screen) -> Outcome:
 
 def _run(options: RunOptions, screen: Screen, signals: EndSignals) -> Outcome:
     """Prepare the folder and the fork server, and run on an endpoint; on another one where its port was lost."""
-    if not options.continued:
-        _write_scenario(options)
-    _say_headline(options, screen)
+    _prepare(options, screen)
     if options.camera_children() and not options.launch.rate and not options.scenario.gates("camera"):
         screen.say("as fast as it goes, a lockstep run is faster than its cameras; --rate 1 leaves them time")
     with RoleLauncher(screen.say, str(options.out)) as launcher:
@@ -138,9 +127,8 @@ def _run_on(options: RunOptions, endpoint: str, screen: Screen, launcher: RoleLa
     supervisor.lasting = options.console.process if options.console else None
 
     def end_with_output() -> None:
-        signals.look()
-        if signals.reason:
-            supervisor.interrupt(signals.reason)
+        if reason := signals.look():
+            supervisor.interrupt(reason)
 
     return supervisor.run(end_with_output)
 
@@ -176,19 +164,15 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
 
 
 def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
-    """Run a scenario in this process: the same bits, without Zenoh."""
     from zsim_analysis.in_process import fly
     from zsim_world.fleet.fleet import DivergedError
 
-    if not options.continued:
-        _write_scenario(options)
-    _say_headline(options, screen)
+    _prepare(options, screen)
     with EndSignals(options.out / "run.log", screen.hang_up) as signals:
         stop = StopChannel()
 
         def reason() -> str | None:
-            signals.look()
-            return signals.reason or stop.reason()
+            return signals.look() or stop.reason()
 
         try:
             ended = fly(options.scenario, options.out / RECORD, reason, screen, changed=options.launch.changed)
@@ -202,36 +186,25 @@ def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
         return Outcome(ended, interrupted=interrupted)
 
 
-def _say_headline(options: RunOptions, screen: Screen) -> None:
+def _prepare(options: RunOptions, screen: Screen) -> None:
+    """Put what is to be flown, and how, into the run's folder, and show it; RunError if it cannot be written."""
     scenario = options.scenario
+    if not options.continued:
+        with file_fault(options.out, "cannot be written", OTHER_OUT):
+            if not options.launch.in_process:
+                (options.out / "logs").mkdir(exist_ok=True)
+            (options.out / "scenario.yaml").write_text(scenario_file.to_text(scenario))
+            (options.out / JOURNAL).mkdir(exist_ok=True)
+            content = json.dumps(msgspec.to_builtins(options.launch))  # not msgspec's: a path may hold no UTF-8
+            (options.out / JOURNAL / run_folder.LAUNCH).write_text(content, "utf-8")
     screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
     for line in (*unflown_plans(scenario), no_locks(options.out)):
         if line:
             screen.say(line)
 
 
-def _write_scenario(options: RunOptions) -> None:
-    """Put what is to be flown, and how, into the run's folder.
-
-    Raises:
-        RunError: it cannot be written.
-    """
-    with file_fault(options.out, "cannot be written", OTHER_OUT):
-        if not options.launch.in_process:
-            (options.out / "logs").mkdir(exist_ok=True)
-        (options.out / "scenario.yaml").write_text(scenario_file.to_text(options.scenario))
-        run_folder.keep_launch(options.out, options.launch)
-
-
-# Before anything is started
-
-
 def options_of(folder: Path) -> RunOptions:
-    """Return how an interrupted run goes on; one in one process is flown anew, all of it.
-
-    Raises:
-        RunError, RecordError: nothing of it is left to fly, or it cannot be gone on with.
-    """
+    """Return how an interrupted run goes on, if there is something left to fly; one in process is flown anew."""
     launch = run_folder.launch_of(folder)
     if launch.in_process:
         (folder / RECORD).unlink(missing_ok=True)
@@ -242,11 +215,7 @@ def options_of(folder: Path) -> RunOptions:
 
 
 def check_endpoint(endpoint: str | None, insecure: bool) -> None:
-    """Refuse an endpoint on which no world can listen.
-
-    Raises:
-        SessionError: it is malformed, or less secure than was asked for.
-    """
+    """Refuse an endpoint on which no world can listen: malformed, or less secure than was asked for."""
     if endpoint is None:
         return
     from zsim.transport.connection import check_listening
@@ -257,11 +226,7 @@ def check_endpoint(endpoint: str | None, insecure: bool) -> None:
 
 
 def check_open_files(options: RunOptions) -> None:
-    """Refuse a run of more processes than this machine allows files for.
-
-    Raises:
-        SessionError: with how many files there must be.
-    """
+    """Refuse a run of more processes than this machine allows files for."""
     cameras = {child.name for child in options.camera_children()}
     expected = {*expected_processes(options.scenario), RECORDER}
     agents = 1 if options.launch.hosted else len(expected - cameras) - 1
@@ -281,7 +246,6 @@ def free_port(screen: Screen) -> int:
 
 
 def is_free(port: int) -> bool:
-    """Return whether a port of this machine is free."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -295,12 +259,7 @@ def is_free(port: int) -> bool:
 
 
 class CameraChild(NamedTuple):
-    """A camera or detector that is started with a run.
-
-    Attributes:
-        role: `camera` or `detector`.
-        drones: whose cameras it is for; empty for all that have cameras.
-    """
+    """A camera or detector that is started with a run, for some drones; for all that have cameras if empty."""
 
     role: str
     name: str
@@ -317,13 +276,10 @@ def with_cameras(scenario: Scenario) -> Scenario:
 
 
 def camera_children(scenario: Scenario, cameras: bool, detect: bool) -> list[CameraChild]:
-    """Return the cameras and detectors that a scenario expects, as far as they are known by name, or that a user wants.
+    """Return the cameras and detectors that a scenario expects, as far as they are known by name, or a user wants.
 
-    There is one for each drone that a name in `expect` is about, and ROLE.main for the others.
-
-    Args:
-        cameras: whether the pictures of all that have cameras are to be drawn.
-        detect: whether hats are to be found in the pictures of all.
+    There is one for each drone that a name in `expect` is about, and ROLE.main for the others. `cameras`, `detect`:
+    draw the pictures of all that have cameras, find hats in the pictures of all.
     """
     having = watched_drones("", scenario)
     everybody = [drone.name for drone in scenario.drones]  # a detector's cameras need not be zsim's

@@ -31,15 +31,11 @@ WRITTEN_INTO = {LOGS: (".log",), FIGURES: (".png", ".pdf", ".svg")}  # suffixes 
 
 
 def make_directory(out: Path | None, scenario: Scenario, force: bool = False) -> Path:
-    """Return the run's folder.
+    """Return the run's folder: `out`, or a new one named after scenario and time.
 
-    Args:
-        out: as given; None for a new one named after scenario and time.
-        force: take one that holds other files, too, which stay as they are; an earlier run of zsim's is removed.
-
-    Raises:
-        RunError: it holds a run, or other files, or cannot be made; with `force`, the run is under way, or its record
-            is not zsim's.
+    With `force`, one that holds other files, too, which stay as they are; an earlier run of zsim's is removed.
+    RunError if it holds a run, or other files, or cannot be made; with `force`, if the run is under way, or its record
+    is not zsim's.
     """
     if out is None:  # two runs may start within one second
         first = Path("runs") / f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -49,30 +45,17 @@ def make_directory(out: Path | None, scenario: Scenario, force: bool = False) ->
         out.mkdir(parents=True, exist_ok=True)
         if force:
             _remove_run(out)
-        else:
-            _refuse_run(out)
+        elif any((out / JOURNAL).glob("*.entries")):
+            way = f"`zsim run --continue {out}` goes on with it, --force replaces it, or give --out another folder"
+            raise RunError(f"{out}: holds a run that was interrupted; {way}")
+        elif (out / RECORD).exists() or any(not log.is_file() or log.stat().st_size for log in (out / LOGS).glob("*")):
+            raise RunError(f"{out}: holds a run already; --force replaces it, or give --out another folder")
         refuse_others(out, (*LEFT, LOGS, JOURNAL), force, "fly into")
     return out
 
 
-def _refuse_run(folder: Path) -> None:
-    """Refuse a folder with a record, or with logs in which something was written."""
-    logs = folder / LOGS
-    written = [log.name for log in logs.iterdir() if not log.is_file() or log.stat().st_size] if logs.exists() else []
-    if any((folder / JOURNAL).glob("*.entries")):
-        way = f"`zsim run --continue {folder}` goes on with it, --force replaces it, or give --out another folder"
-        raise RunError(f"{folder}: holds a run that was interrupted; {way}")
-    if (folder / RECORD).exists() or written:
-        raise RunError(f"{folder}: holds a run already; --force replaces it, or give --out another folder")
-
-
 def _remove_run(folder: Path) -> None:
-    """Remove what a run of zsim's has written, and its report; whatever else is there stays, exports too.
-
-    Raises:
-        RunError: the record is not zsim's, or the run is under way.
-        OSError: it cannot be removed.
-    """
+    """Remove what a run of zsim's has written, and its report; whatever else is there stays, exports too."""
     record, journal = folder / RECORD, folder / JOURNAL
     if record.exists():
         with record.open("rb") as file:
@@ -97,16 +80,8 @@ def _remove_run(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
-# An interrupted run
-
-
 class Launch(msgspec.Struct, frozen=True):
-    """How a run was launched.
-
-    Attributes:
-        modules: folders in which those that its scenario names were looked for.
-        changed: texts `a.b.c=value` by which the scenario was changed against its file.
-    """
+    """How a run was launched."""
 
     run_id: str
     mode: str = "lockstep"
@@ -115,24 +90,13 @@ class Launch(msgspec.Struct, frozen=True):
     hosted: bool = False
     insecure: bool = False
     listen: str | None = None
-    modules: tuple[str, ...] = ()
-    changed: tuple[str, ...] = ()
+    modules: tuple[str, ...] = ()  # folders in which those that its scenario names were looked for
+    changed: tuple[str, ...] = ()  # texts `a.b.c=value` by which the scenario was changed against its file
 
 
 def new_launch(**how: Any) -> Launch:
     """Return a launch of a new run, with the modules that its scenario has been loaded with."""
     return Launch(uuid.uuid4().hex[:12], modules=tuple(map(str, plugin.folders())), **how)
-
-
-def keep_launch(folder: Path, launch: Launch) -> None:
-    """Note how a run is launched.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    (folder / JOURNAL).mkdir(exist_ok=True)
-    content = json.dumps(msgspec.to_builtins(launch))  # not msgspec's: a path may hold bytes that are no UTF-8
-    (folder / JOURNAL / LAUNCH).write_text(content, "utf-8")
 
 
 def forget_launch(folder: Path) -> None:
@@ -143,11 +107,7 @@ def forget_launch(folder: Path) -> None:
 
 
 def launch_of(folder: Path) -> Launch:
-    """Return how a run was launched that is to go on.
-
-    Raises:
-        RunError: nothing is left of it to do, or it is no run.
-    """
+    """Return how a run was launched that is to go on; RunError if nothing is left of it to do, or it is no run."""
     place = folder / JOURNAL / LAUNCH
     try:
         return msgspec.convert(json.loads(place.read_bytes()), Launch)
@@ -159,11 +119,7 @@ def launch_of(folder: Path) -> Launch:
 
 
 def reopen_record(folder: Path) -> None:
-    """Take the end of the interrupted run off its record.
-
-    Raises:
-        RecordError: it cannot be written, or another process writes it.
-    """
+    """Take the end of the interrupted run off its record; RecordError if another process writes it."""
 
     def is_end(payload: bytes) -> bool:
         try:

@@ -8,7 +8,7 @@ import signal
 import socket
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,8 +38,6 @@ OUTPUT_LOOK_S = 0.1  # between two looks at who reads the output
 
 
 class RunProcess(Protocol):
-    """A process of a run."""
-
     name: str
     role: str
     restarts: int
@@ -58,38 +56,30 @@ class RunProcess(Protocol):
 
 
 def end_text(code: int | None, last_line: str) -> str:
-    """Describe how a process ended, by its exit code and the last line of its log."""
     if code is not None and code < 0:
         return f"killed by signal {-code}"
     return f"exit code {code}" + (f": {last_line}" if last_line else "")
 
 
+def status_row(role: str, host: str, pid: int, state: str, restarts: int = 0) -> dict[str, Any]:
+    figures = dict.fromkeys(("lag_ms", "messages_per_s", "round_trip_ms"))
+    return {"role": role, "host": host, "pid": pid or None, "state": state, "restarts": restarts, **figures}
+
+
 @dataclass
 class Outcome:
-    """How a run ended."""
-
     reason: str
     failed: bool = False
     interrupted: bool = False
 
 
 class Supervisor:
-    """Starts the processes of a run, watches them, and leaves nothing behind.
-
-    Args:
-        processes: what the scenario says of their deaths.
-        show: takes progress.
-
-    Attributes:
-        members: to be given before `run`; the world among them.
-        lasting: the one of them that goes on after the run; the caller has to stop and close it in any case.
-        clock: the world's last; None before the first.
-    """
+    """Starts the processes of a run, watches them, and leaves nothing behind; `show` takes progress."""
 
     def __init__(self, processes: Processes, show: ProgressSink) -> None:
-        self.members: list[RunProcess] = []
-        self.lasting: RunProcess | None = None
-        self.clock: dict[str, Any] | None = None
+        self.members: list[RunProcess] = []  # to be given before `run`; the world among them
+        self.lasting: RunProcess | None = None  # goes on after the run; the caller has to stop and close it
+        self.clock: dict[str, Any] | None = None  # the world's last
         self._deaths = DeathPolicy(processes)
         self._show = show
         self._reason = ""
@@ -106,12 +96,9 @@ class Supervisor:
         self._requests: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
 
     def run(self, look: Callable[[], None] = lambda: None) -> Outcome:
-        """Start everything, watch it to its end, leave nothing behind.
+        """Start everything, watch it to its end, leave nothing behind; `look` is called at every look at the processes.
 
         Ctrl-C and SIGTERM are requests to end the run in order; a second Ctrl-C does not wait.
-
-        Args:
-            look: called at every look at the processes.
         """
         if self._interrupted:
             return Outcome(self._interrupted, interrupted=True)
@@ -131,33 +118,23 @@ class Supervisor:
                 while not self._requests.empty():
                     self._requests.get()[1].cancel()
                 replaced = [*(child for child, _ in self._leaving.values()), *self._gone]
-                _close([*self._leaving_with_run(), *replaced])
+                members = [*(child for child in self.members if child is not self.lasting), *replaced]
+                with ThreadPoolExecutor(len(members)) as pool:  # one that cannot be reached does not delay the others
+                    for closed in [pool.submit(member.close) for member in members]:
+                        closed.result()
         return Outcome(self._reason or "ended", self._failed, self._interrupted is not None)
 
-    def _leaving_with_run(self) -> list[RunProcess]:
-        return [child for child in self.members if child is not self.lasting]
-
     def rows(self) -> list[dict[str, Any]]:
-        """Return name, process number, state and restarts of each process, for `zsim ps`; callable from any thread."""
-        host = socket.gethostname()
-        return [
-            {
-                "role": child.name,
-                "host": host,
-                "pid": child.pid or None,
-                "state": "running" if child.code is None else f"ended ({child.outcome()})" if child.code else "ended",
-                "lag_ms": None,
-                "messages_per_s": None,
-                "round_trip_ms": None,
-                "restarts": child.restarts,
-            }
-            for child in self.members
-        ]
+        """Return what `zsim ps` shows of each process; callable from any thread."""
+        rows = []
+        for child in self.members:
+            state = "running" if child.code is None else f"ended ({child.outcome()})" if child.code else "ended"
+            rows.append(status_row(child.name, socket.gethostname(), child.pid, state, child.restarts))
+        return rows
 
     # What the world says
 
     def handle_line(self, text: str) -> None:
-        """Take a line of the world's progress."""
         try:
             line = json.loads(text)
         except ValueError:
@@ -165,7 +142,7 @@ class Supervisor:
         if not isinstance(line, dict):
             return  # a number that was printed is JSON too
         self._silent_s = None
-        self._world_watch.received(time.monotonic())
+        self._world_watch.last_s = time.monotonic()
         if "clock" in line:
             self._flies = self._flies or line["clock"].get("state") == "running"
             self.clock = line["clock"]
@@ -179,24 +156,24 @@ class Supervisor:
             self._show.say(line["say"])
 
     def _on_event(self, event: dict[str, Any]) -> None:
+        def give_up() -> None:
+            for child in self.members:
+                if child.name == subject:
+                    self._dead.add(subject)
+                    child.kill()
+
         self._show.event(event)
         kind, subject, data = event["kind"], event.get("subject", ""), event.get("data", {})
         if kind == "end":
             self._reason = self._reason or event["text"]
         elif kind == "overdue" and data.get("on_overdue") == "drop":  # it has not come back, the run goes on without
-            self.submit(lambda: self._give_up(subject))
+            self.submit(give_up)
         elif kind == "overdue" or (kind == "failure" and data.get("on_death") == "end"):
             self._fail(event["text"])
         elif kind == "death" and data.get("on_death") == "end":
             self._fail(f"{subject} died")
         elif kind == "death" and data.get("on_death") == "restart":
             self.submit(lambda: self._on_death(subject, data.get("pid")))
-
-    def _give_up(self, name: str) -> None:
-        for child in self.members:
-            if child.name == name:
-                self._dead.add(name)
-                child.kill()
 
     def _on_death(self, name: str, pid: int | None) -> None:
         """Restart a process that the world reports dead where its exit code gave no reason to.
@@ -216,7 +193,6 @@ class Supervisor:
     # Watching
 
     def _watch(self, look: Callable[[], None]) -> None:
-        """Return when the world has ended, or is to be ended."""
         world = next(child for child in self.members if child.role == "world")
         self._silent_s = time.monotonic() + SILENT_S
         while world.code is None or self._restarts_world(world):
@@ -228,7 +204,13 @@ class Supervisor:
             for child in self.members:
                 if child is not world and child.code is not None and child.name not in self._dead:
                     self._on_exit(child, world)
-            self._carry_out_requests()
+            while not self._requests.empty():
+                act, outcome = self._requests.get()
+                if outcome.set_running_or_notify_cancel():
+                    try:
+                        outcome.set_result(act())
+                    except Exception as error:  # whatever it is, the run goes on
+                        outcome.set_exception(error)
             self._release_replaced()
             if self._silent_s is not None and time.monotonic() > self._silent_s:
                 self._silent_s = None
@@ -239,21 +221,14 @@ class Supervisor:
             look()
             world.wait(POLL_S)
         if world.code != 0:
-            self._fail_after_end(f"the world died: {world.outcome()}")
+            self._fail(f"the world died: {world.outcome()}", after_end=True)
 
     def _restarts_world(self, world: RunProcess) -> bool:
-        """Restart a world that died in its run; return whether it was restarted."""
         code = world.code
         flew = code is not None and code not in (0, USER_FAULT) and (self._flies or code < 0)
-        if not flew or self._reason or self._interrupted:
-            return False
-        action, why = self._deaths.decide(world.name, code, flies=True)
-        if action != "restart":
-            return False
-        self._show.say(f"{world.name} (pid {world.pid}) ended: {world.outcome()}; {why}")
-        world.restarts += 1
-        world.start()
-        return True
+        return (
+            flew and not self._reason and not self._interrupted and self._apply_on_death(world, flies=True) == "restart"
+        )
 
     def _on_exit(self, child: RunProcess, world: RunProcess) -> None:
         """Apply on_death to a role that ended while the world runs."""
@@ -262,47 +237,39 @@ class Supervisor:
             if child.code == SUPERSEDED:
                 self._show.say(child.last_log_line())
             return
-        action, why = self._deaths.decide(child.name, child.code, self._flies)
-        self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; {why}")
-        if action == "restart":
-            child.restarts += 1
-            child.start()
-            return
-        self._dead.add(child.name)
+        action = self._apply_on_death(child, self._flies)
+        if action != "restart":
+            self._dead.add(child.name)
         if action == "end":
             self._fail(f"{child.name} ended: {child.outcome()}")
             world.request_stop(self._reason)
 
-    # Orders from other threads
+    def _apply_on_death(self, child: RunProcess, flies: bool) -> OnDeath:
+        """Return what is to be done after the death of a process; if that is to restart it, it is done."""
+        action, why = self._deaths.decide(child.name, child.code, flies)
+        if child.role != "world" or action == "restart":
+            self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; {why}")
+        if action == "restart":
+            child.restarts += 1
+            child.start()
+        return action
 
     def submit(self, act: Callable[[], Any]) -> Future[Any]:
         """Let the watch do something between two looks at the processes; callable from any thread.
 
-        Returns:
-            its result or exception; cancelled when the run ends before.
+        The outcome is cancelled when the run ends before.
         """
         outcome: Future[Any] = Future()
         self._requests.put((act, outcome))
         return outcome
 
-    def _carry_out_requests(self) -> None:
-        while not self._requests.empty():
-            act, outcome = self._requests.get()
-            if outcome.set_running_or_notify_cancel():
-                try:
-                    outcome.set_result(act())
-                except Exception as error:  # whatever it is, the run goes on
-                    outcome.set_exception(error)
-
     def interrupt(self, reason: str) -> None:
-        """End the run for all processes, as Ctrl-C does."""
         self._interrupted = self._interrupted or reason
 
     def replace(self, new: RunProcess) -> None:
         """Start a process that takes the place of the one of its name, which then leaves or is killed.
 
-        Raises:
-            RunError: another one is taking that place at this moment; the last to come would not be the last to join.
+        RunError if another one is taking that place at this moment: the last to come would not be the last to join.
         """
         self._release_replaced()
         if self.is_being_replaced(new.name):
@@ -321,7 +288,6 @@ class Supervisor:
         return name in self._leaving
 
     def _release_replaced(self) -> None:
-        """Release replaced processes that have ended; kill one that hangs."""
         for name, (child, since_s) in list(self._leaving.items()):
             hangs = child.code is None and time.monotonic() - since_s > TAKE_OVER_S
             if hangs:
@@ -331,20 +297,15 @@ class Supervisor:
                 del self._leaving[name]
                 self._gone.append(child)
 
-    # Ending
-
-    def _fail(self, reason: str) -> None:
-        self._reason, self._failed = self._reason or reason, True
-
-    def _fail_after_end(self, reason: str) -> None:
-        """Note a failure of a process that was to end with the run: it overrides an orderly end that was reported."""
-        if not self._failed and not self._interrupted:
+    def _fail(self, reason: str, after_end: bool = False) -> None:
+        """Note a failure; `after_end`: it overrides an orderly end that was reported, but no interrupt."""
+        if after_end and not self._failed and not self._interrupted:
             self._reason = ""
-        self._fail(reason)
+        self._reason, self._failed = self._reason or reason, True
 
     def _finish(self) -> None:
         """Let all processes leave; the recorder leaves last, by itself."""
-        members = self._leaving_with_run()
+        members = [child for child in self.members if child is not self.lasting]
         for child in members:
             if self._failed or self._interrupted or child.role != "recorder":
                 child.request_stop(self._reason)
@@ -353,7 +314,7 @@ class Supervisor:
                 continue
         recorder = next(child for child in members if child.role == "recorder")
         if recorder.code not in (0, None) and recorder.name not in self._dead:
-            self._fail_after_end(f"the recorder ended: {recorder.outcome()}")
+            self._fail(f"the recorder ended: {recorder.outcome()}", after_end=True)
 
     def _left_s(self) -> float:
         """Return how long the others may still take, now that the run is to end; Ctrl-C makes it shorter."""
@@ -363,16 +324,7 @@ class Supervisor:
         return max(0.0, self._until_s - now_s)
 
 
-def _close(members: Sequence[RunProcess]) -> None:
-    """End all of them at once, so one that cannot be reached does not delay the others."""
-    with ThreadPoolExecutor(len(members)) as pool:
-        for closed in [pool.submit(member.close) for member in members]:
-            closed.result()
-
-
 class DeathDecision(NamedTuple):
-    """What to do, and why, for people."""
-
     action: OnDeath
     why: str
 
@@ -385,29 +337,25 @@ class DeathPolicy:
         self._deaths: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=RESTARTS_MAX + 1))
 
     def decide(self, name: str, code: int | None, flies: bool) -> DeathDecision:
-        """Count the death of a process; return what to do.
-
-        Args:
-            flies: whether the run has begun.
-        """
-        action = on_death(self._processes.on_death, name)
+        """Count the death of a process; return what to do, and why. `flies`: the run has begun."""
+        processes, role = self._processes, name.partition(".")[0]
+        action = on_death(processes.on_death, name)
         if action == "end":
             return DeathDecision("end", "on_death: end")
-        is_settled = flies and (action == "wait" or lets_drop(self._processes.on_death, name))  # by the scenario itself
+        is_settled = flies and (action == "wait" or lets_drop(processes.on_death, name))  # by the scenario itself
+        ends, why = False, ""
         if code == USER_FAULT and not is_settled:
-            return self._without(name, flies, "a restart would not help", is_needed(name))
-        if action == "restart":
+            ends, why = is_needed(name), "a restart would not help"
+        elif action == "restart":
             deaths = self._deaths[name]
             deaths.append(time.monotonic())
             if len(deaths) > RESTARTS_MAX and deaths[-1] - deaths[0] < RESTART_WINDOW_S:
-                return self._without(name, flies, f"more than {RESTARTS_MAX} restarts within {RESTART_WINDOW_S:g} s")
-        return DeathDecision(action, f"on_death: {action}")
-
-    def _without(self, name: str, flies: bool, why: str, ends: bool = False) -> DeathDecision:
-        """Return what to do where no restart helps."""
-        overdue = on_overdue(self._processes.on_overdue or {}, name, gating=self._processes.gating or ())
-        ends = ends or overdue == "end" or self._processes.gates(name.partition(".")[0])
-        is_awaited = not flies and not is_needed(name) and name in (self._processes.expect or ())
+                why = f"more than {RESTARTS_MAX} restarts within {RESTART_WINDOW_S:g} s"
+        if not why:
+            return DeathDecision(action, f"on_death: {action}")
+        overdue = on_overdue(processes.on_overdue or {}, name, gating=processes.gating or ())
+        ends = ends or overdue == "end" or processes.gates(role)
+        is_awaited = not flies and not is_needed(name) and name in (processes.expect or ())
         if ends or is_awaited:  # a run that has not begun would wait for it indefinitely
             return DeathDecision("end", f"{why}; the run ends")
         return DeathDecision("drop", f"{why}; it is given up, and the run goes on without it")
@@ -420,13 +368,9 @@ class WorldWatch:
     """
 
     def __init__(self) -> None:
-        self._last_s: float | None = None
+        self.last_s: float | None = None  # when a line of the world came (monotonic); set by any thread
         self._is_silent = False
         self._ends_for: list[str] = []
-
-    def received(self, now_s: float) -> None:
-        """Note a line of the world; callable from any thread."""
-        self._last_s = now_s
 
     def clock(self, line: dict[str, Any]) -> None:
         """Note whom a world that has ended waits for: its links to them close only when they take what is left."""
@@ -434,8 +378,8 @@ class WorldWatch:
             self._ends_for = [each["name"] for each in line.get("waiting_for", ())]
 
     def change(self, now_s: float, pid: int) -> str | None:
-        """Return the line for the user when the world has fallen silent or is back, None as long as it is as before."""
-        if self._last_s is None or self._is_silent == (now_s - self._last_s >= QUIET_WORLD_S):
+        """Return a line when the world has fallen silent or is back, None as long as it is as before."""
+        if self.last_s is None or self._is_silent == (now_s - self.last_s >= QUIET_WORLD_S):
             return None
         self._is_silent = not self._is_silent
         if not self._is_silent:
@@ -443,7 +387,7 @@ class WorldWatch:
         if self._ends_for:
             named = ", ".join(self._ends_for)
             return f"world (pid {pid}) has ended and waits for {named}: stopped, or out of reach"
-        silent_s = now_s - self._last_s
+        silent_s = now_s - self.last_s
         go_on = f"kill -CONT {pid} lets it go on"
         return f"world (pid {pid}) shows no sign of life for {silent_s:.1f} s: it is stopped ({go_on}) or out of reach"
 
@@ -452,20 +396,13 @@ class EndSignals:
     """Takes SIGTERM and SIGHUP for as long as it is entered; SIGHUP stays ignored under nohup.
 
     Nothing is raised for a closed terminal, as shells send that signal more than once: `hung_up` is called, and output
-    goes to a file from then on.
-
-    Args:
-        log: that file; it is made when there is something to write.
-        hung_up: called, in a signal handler too, when nothing more can be drawn.
-
-    Attributes:
-        reason: why the output can no longer be seen; empty while it can.
+    goes to the file `log` from then on.
     """
 
     def __init__(self, log: Path, hung_up: Callable[[], None]) -> None:
         self._log = log
         self._hung_up = hung_up
-        self.reason = ""
+        self.reason = ""  # why the output can no longer be seen
         self._looked_s = 0.0
 
     def __enter__(self) -> "EndSignals":
@@ -487,14 +424,13 @@ class EndSignals:
         redirect_output(self._log)
         self._hung_up()
 
-    def look(self) -> None:
-        """Notice that the reader of a pipe has gone; to be called repeatedly, as nothing need be written for it."""
-        if time.monotonic() - self._looked_s < OUTPUT_LOOK_S:
-            return
-        unread = [stream for stream in STREAMS if is_unread(stream)]
-        if unread:
-            self.reason = self.reason or UNREAD
-            redirect_output(self._log, unread, UNREAD)
-        if STREAMS[-1] in unread:
-            self._hung_up()
-        self._looked_s = time.monotonic()
+    def look(self) -> str:
+        """Return why the output can no longer be seen; to be called repeatedly, as nothing need be written for it."""
+        if time.monotonic() - self._looked_s >= OUTPUT_LOOK_S:
+            if unread := [stream for stream in STREAMS if is_unread(stream)]:
+                self.reason = self.reason or UNREAD
+                redirect_output(self._log, unread, UNREAD)
+            if STREAMS[-1] in unread:
+                self._hung_up()
+            self._looked_s = time.monotonic()
+        return self.reason

@@ -63,7 +63,6 @@ def renew_streams() -> None:
 
 
 def is_unread(stream: int) -> bool:
-    """Tell whether a stream is a broken pipe."""
     with contextlib.suppress(OSError):
         if stat.S_ISFIFO(os.fstat(stream).st_mode) and hasattr(select, "poll"):  # not on Windows
             poller = select.poll()
@@ -74,22 +73,16 @@ def is_unread(stream: int) -> bool:
 
 def redirect_output(log: Path, streams: Sequence[int] = STREAMS, why: str = CLOSED) -> None:
     """Send to a file what is written from now on to a terminal or a pipe that may be gone."""
-    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
     try:
-        into = os.open(log, flags, 0o644)
+        into = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     except OSError:
         into = os.open(os.devnull, os.O_WRONLY)
-    lost = [stream for stream in streams if not _is_file(stream)]
+    lost = []
+    for stream in streams:
+        with contextlib.suppress(OSError):  # not open at all
+            lost += [] if stat.S_ISREG(os.fstat(stream).st_mode) else [stream]
     if lost:
         write_error(f"{why}; what there is still to say is in {log}")
     for stream in lost:
         os.dup2(into, stream)
     os.close(into)
-
-
-def _is_file(stream: int) -> bool:
-    """Tell whether a stream is a file already, or not open at all."""
-    try:
-        return stat.S_ISREG(os.fstat(stream).st_mode)
-    except OSError:
-        return True

@@ -1,7 +1,6 @@
 """The roles of a run as processes: agents, recorder, router, and those that serve one run after the other.
 
-The latter (`serve_runs`) are console, gateway, bridges, drivers, cameras and detectors. The world has a file of its
-own.
+The latter (`serve_runs`) are console, gateway, bridges, drivers, cameras and detectors.
 """
 
 import gc
@@ -42,14 +41,14 @@ from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import Hats
 from zsim.transport import tls
 from zsim.transport.connection import find_world, route
-from zsim.transport.link_watch import Awaited, ClosedLink, LinkWatch, SessionTokens
+from zsim.transport.link_watch import Awaited, LinkWatch, SessionTokens
 from zsim.transport.session import RawSample, Session
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
 from zsim_agents.hosting import agent_class, chosen, hosted, make_agents
 from zsim_deploy import USER_FAULT
-from zsim_deploy.arguments import RUN_ID, WorldAccess
-from zsim_deploy.roles.stop_channel import StopChannel
+from zsim_deploy.arguments import OTHER_OUT, RUN_ID, WorldAccess, file_fault
+from zsim_deploy.roles.stop_channel import StopChannel, lower_priority
 
 RUN_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # an id of a run that is part of a folder's name
 PATTERN = "*?["  # signs of a pattern; fnmatch
@@ -69,7 +68,6 @@ StandsFor = Callable[[Info], tuple[str, ...]]  # names of processes whose work a
 SlackNs = Callable[[Info], int]  # how far the world of a run may be ahead of a process; 0 for one that never gates
 Remain = Callable[[Callable[[], str | None], Callable[[], bool]], None]
 """Does with (reason, deserted) what is left to do after a run, until there is a reason to stop; deserted, at once."""
-Drones = Callable[[Info, Sequence[str]], list[str]]
 
 
 def log_printer(launched: str | None) -> Say:
@@ -83,47 +81,33 @@ def log_printer(launched: str | None) -> Say:
     return say
 
 
-# Agents
-
-
 def agent(build: Build, reach: WorldAccess, name: str = "") -> None:
-    """Run one agent against a world.
+    """Run one agent against a world; `name` is the process's, where that is known before the world is.
 
-    Args:
-        build: makes it.
-        reach: of the world.
-        name: of the process, where that is known before the world is.
-
-    Raises:
-        UserCodeError: a user's class raised, or returned what cannot be used.
+    UserCodeError if a user's class raised, or returned what cannot be used.
     """
-    try:
-        _agent(build, reach, name)
-    except UserCodeError as error:
-        if not reach.launched:
-            raise
-        print(printable(str(error)), file=sys.stderr)
-        sys.exit(USER_FAULT)  # its launcher is not to start it again
-
-
-def _agent(build: Build, reach: WorldAccess, name: str) -> None:
     launched, who = reach.launched, reach.who._replace(process=name)
     stop = StopChannel(launched, who)
     say = log_printer(launched)
-    connection = find_world(
-        reach.endpoint, reach.federation, reach.wait_s, say, stop.stopped, run_id=launched, identity=who
-    )
-    with connection as (link, info):
-        scenario = scenario_file.from_text(info.scenario)
-        member = build(info, scenario)
-        check_certificate(member, who)
-        also = f", and stands for {', '.join(member.serves)}" if member.serves else ""
-        say(f"{member.name}: in run {info.run_id}{also}")
-        gc.collect()
-        gc.freeze()
-        snapshot_ns = round(scenario.processes.snapshot_s * 1e9)
-        runner = Runner(link, info, member, stop.stopped, say, stop.orphaned, snapshot_ns)
-        reason = runner.run()
+    try:
+        with find_world(
+            reach.endpoint, reach.federation, reach.wait_s, say, stop.stopped, run_id=launched, identity=who
+        ) as (link, info):
+            scenario = scenario_file.from_text(info.scenario)
+            member = build(info, scenario)
+            check_certificate(member, who)
+            also = f", and stands for {', '.join(member.serves)}" if member.serves else ""
+            say(f"{member.name}: in run {info.run_id}{also}")
+            gc.collect()
+            gc.freeze()
+            snapshot_ns = round(scenario.processes.snapshot_s * 1e9)
+            runner = Runner(link, info, member, stop.stopped, say, stop.orphaned, snapshot_ns)
+            reason = runner.run()
+    except UserCodeError as error:
+        if not launched:
+            raise
+        print(printable(str(error)), file=sys.stderr)
+        sys.exit(USER_FAULT)  # its launcher is not to start it again
     say(f"{member.name}: left, {reason}")
     if runner.killed:  # end as by kill -9, so that the launcher sees it die; Windows has no SIGKILL
         os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))
@@ -143,22 +127,14 @@ def agent_of(role: str, names: Sequence[str]) -> Build:
 
 
 def host(names: Sequence[str]) -> Build:
-    """Return a function that makes several estimators and controllers as one agent, by name or by patterns."""
     return lambda info, scenario: hosted(info, scenario, names)
 
 
-# The recorder
-
-
 def recorder(out: Path, reach: WorldAccess) -> None:
-    """Record the run of a world into a folder, whose name may contain RUN_ID.
-
-    Raises:
-        RecordError: the folder cannot be made, or the file cannot be written.
-    """
+    """Record the run of a world into a folder, whose name may contain RUN_ID; RecordError if that cannot be."""
     from zsim.output_folder import RECORD
     from zsim.record.completeness import record_completeness
-    from zsim_agents.recorder import record
+    from zsim_agents.recorder import Recorder
 
     launched, who = reach.launched, reach.who._replace(process=RECORDER)
     stop = StopChannel(launched, who)
@@ -172,17 +148,13 @@ def recorder(out: Path, reach: WorldAccess) -> None:
             say(f"recorder: {warning}")
         path = folder / RECORD
         say(f"recorder: run {info.run_id} into {path}")
-        reason = record(link, info, path, stopped=stop.stopped, say=say, deserted=stop.orphaned)
+        reason = Recorder(link, info, path, stopped=stop.stopped, say=say, deserted=stop.orphaned).run()
     say(f"recorder: {path}: {'closed' if launched else record_completeness(path)}, {reason}")
     stop.exit_if_terminated()
 
 
 def record_folder(out: Path, run_id: str) -> Path:
-    """Return the folder of a run's record.
-
-    Raises:
-        RecordError: the id, which the world gives, would lead to another folder.
-    """
+    """Return the folder of a run's record; RecordError where the world's id would lead to another folder."""
     if RUN_ID not in out.name:
         return out
     if not RUN_NAME.fullmatch(run_id):
@@ -192,34 +164,14 @@ def record_folder(out: Path, run_id: str) -> Path:
 
 
 def make_folder(folder: Path) -> None:
-    """Make the folder of a record.
-
-    Raises:
-        RecordError: it cannot be made.
-    """
-    try:
+    with file_fault(folder, "cannot be made", OTHER_OUT, RecordError):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RecordError(f"{folder}: cannot be made ({error.strerror}); give --out another folder") from error
-
-
-# Routers
 
 
 def router(
-    name: str,
-    endpoint: str,
-    upstream: str,
-    federation: str,
-    mode: Mode,
-    launched: str | None,
-    identity: Identity,
+    name: str, endpoint: str, upstream: str, federation: str, mode: Mode, launched: str | None, identity: Identity
 ) -> None:
-    """Run a router on an endpoint until it is stopped.
-
-    Raises:
-        SessionError: the port is taken, or a certificate, here or upstream, is refused.
-    """
+    """Run a router on an endpoint until it is stopped; SessionError if port or certificate cannot be used."""
     identity = identity._replace(process=f"{ROUTER}.{name}")
     stop = StopChannel(launched, identity)
     say = log_printer(launched)
@@ -243,13 +195,6 @@ class RouterLinks:
 
     A router does not know the run. A process that nobody waits for has said so in its join, or shows no token of its
     session.
-
-    Args:
-        link: its session.
-        say: takes a line for each link that was closed.
-
-    Attributes:
-        watch: closes the links.
     """
 
     def __init__(self, link: Session, say: Say) -> None:
@@ -277,17 +222,11 @@ class RouterLinks:
         return awaited
 
     def report(self) -> None:
-        """Show the links that were closed since the last time."""
         while self.watch.closed:
-            self._say(_text(self.watch.closed.popleft()))
-
-
-def _text(closed: ClosedLink) -> str:
-    who = f"{closed.process or 'somebody'} at {closed.address} ({', '.join(closed.names) or 'no process of the run'})"
-    return f"{who} took nothing of {closed.held_bytes / 1e6:.1f} MB; its link is closed ({closed.times} so far)"
-
-
-# Processes that serve one run after the other
+            closed = self.watch.closed.popleft()
+            names = ", ".join(closed.names) or "no process of the run"
+            what = f"took nothing of {closed.held_bytes / 1e6:.1f} MB; its link is closed ({closed.times} so far)"
+            self._say(f"{closed.process or 'somebody'} at {closed.address} ({names}) {what}")
 
 
 def serve_runs(
@@ -300,23 +239,20 @@ def serve_runs(
 ) -> None:
     """Serve one run after the other of the world on an endpoint, until stopped; a launched process serves only one.
 
+    NoWorldError if there was no first world within `wait_s`; SupersededError if another process of the name that was
+    given has taken over; SystemExit if it is launched, and was not ended by its launcher.
+
     Args:
         name: of the process; `role.*` for the first free number, kept until another process takes it.
-        serve: what it does in a run.
-        reach: of the world.
         stands_for: whose work it does in a run, beside its own.
         slack_ns: how far the world of a run may be ahead of it; 0 for a process that never gates.
         remain: what it does after the run of its launcher, until that asks it to stop.
-
-    Raises:
-        NoWorldError: there was no first world within `wait_s`.
-        SupersededError: another process of the name that was given has taken over.
-        SystemExit: it is launched, and was not ended by its launcher.
     """
     launched, wait_s = reach.launched, reach.wait_s
     who = reach.who._replace(process="" if name.endswith(ANY) else name)
     stop = StopChannel(launched, who)
     say = log_printer(launched)
+    role, _, thing = name.partition(".")
     own_name, served = name, ""
     try:
         while not stop.stopped():
@@ -325,7 +261,9 @@ def serve_runs(
                 info,
             ):
                 if info.run_id != served:
-                    own_name = _free(link, own_name)
+                    if own_name.endswith(f".{ANY}"):
+                        taken = link.tokens(keys.token(f"{role}.$*"))
+                        own_name = next(free for i in count(1) if keys.token(free := f"{role}.{i}") not in taken)
                     participant = Participant(link, info, own_name, stands_for(info), slack_ns(info))
                     try:
                         _serve(serve, link, participant, info, stop, say)
@@ -334,8 +272,10 @@ def serve_runs(
                         if launched:
                             raise
                         say(str(error))
-                    if participant.superseded:
-                        own_name, served = _next(name, participant), ""
+                    if participant.superseded and thing != ANY:
+                        raise SupersededError(f"{name}: {participant.end_reason}; this one ends")
+                    if participant.superseded:  # two processes may have chosen the same free number
+                        own_name, served = f"{role}.{int(participant.name.rpartition('.')[2]) + 1}", ""
                 else:
                     time.sleep(PAUSE_S)
             if launched:
@@ -347,27 +287,6 @@ def serve_runs(
     if launched and remain is not None:
         remain(stop.reason, stop.orphaned)
     stop.exit_if_terminated()
-
-
-def _free(link: Session, name: str) -> str:
-    """Return a name; for `role.*` the first of role.1, role.2, ... that no process has."""
-    role, _, thing = name.partition(".")
-    if thing != ANY:
-        return name
-    taken = link.tokens(keys.token(f"{role}.$*"))
-    return next(free for i in count(1) if keys.token(free := f"{role}.{i}") not in taken)
-
-
-def _next(name: str, participant: Participant) -> str:
-    """Return the name under which to join again; two processes may have chosen the same free number.
-
-    Raises:
-        SupersededError: the name was given.
-    """
-    role, _, thing = name.partition(".")
-    if thing != ANY:
-        raise SupersededError(f"{name}: {participant.end_reason}; this one ends")
-    return f"{role}.{int(participant.name.rpartition('.')[2]) + 1}"
 
 
 def _serve(serve: Serve, link: Session, participant: Participant, info: Info, stop: StopChannel, say: Say) -> None:
@@ -385,84 +304,49 @@ def _serve(serve: Serve, link: Session, participant: Participant, info: Info, st
     say(f"{name}: left, {reason}")
 
 
-# Cameras and detectors, for drones that are known once the run is
-
-
-def camera(
-    link: Session, info: Info, participant: Participant, stopped: Stopped, say: Say, names: Sequence[str]
+def serve_pictures(
+    role: str, drones: Sequence[str], name: str, reach: WorldAccess, diameter_m: float | None = None
 ) -> None:
-    """Serve a run with pictures of the cameras of some drones, by name or by patterns.
+    """Serve one run after the other as a camera or a detector of some drones, by name or by patterns.
 
-    Raises:
-        RunError: no drone with a camera has such a name.
+    RunError if a run has no such drone. A detector's cameras need not be zsim's; it looks for hats of `diameter_m`,
+    None for the scenario's.
     """
-    from zsim_agents.cameras import camera_process
 
-    drones = of_camera(info, names)
-    say(f"{participant.name}: draws for {', '.join(drones)}")
-    camera_process.serve(link, info, participant, stopped, scenario_file.from_text(info.scenario), drones)
+    def drones_of(scenario: Scenario) -> list[str]:
+        with_cameras = [drone.name for drone in scenario.drones if drone.sensors.cameras()]
+        if role == "camera":
+            return chosen("camera: drone with a camera", drones or ["*"], with_cameras)
+        everybody = [drone.name for drone in scenario.drones]
+        return chosen("detect: drone", drones, everybody) if drones else watched_drones("", scenario) or everybody
 
+    def serve(link: Session, info: Info, participant: Participant, stopped: Stopped, say: Say) -> None:
+        scenario = scenario_file.from_text(info.scenario)
+        own = drones_of(scenario)
+        if role == "camera":
+            from zsim_agents.cameras.camera_process import CameraProcess
 
-def of_camera(info: Info, names: Sequence[str]) -> list[str]:
-    """Return the drones of a camera process.
+            say(f"{participant.name}: draws for {', '.join(own)}")
+            CameraProcess(link, info, participant, scenario, own).run(stopped)
+        else:
+            from zsim_agents.cameras.detector_process import DetectorProcess
 
-    Raises:
-        RunError: no drone with a camera has such a name.
-    """
-    scenario = scenario_file.from_text(info.scenario)
-    with_cameras = [drone.name for drone in scenario.drones if drone.sensors.cameras()]
-    return chosen("camera: drone with a camera", names or ["*"], with_cameras)
+            say(f"{participant.name}: looks at the pictures of {', '.join(own)}")
+            hats = scenario.environment.hats
+            diameter = diameter_m or (Hats() if hats is UNSET else hats).diameter_m
+            DetectorProcess(link, participant, say, own, diameter).run(stopped)
 
+    def stands_for(info: Info) -> tuple[str, ...]:
+        return tuple(f"{role}.{drone}" for drone in drones_of(scenario_file.from_text(info.scenario)))
 
-def detector(
-    link: Session,
-    info: Info,
-    participant: Participant,
-    stopped: Stopped,
-    say: Say,
-    names: Sequence[str],
-    diameter_m: float | None,
-) -> None:
-    """Serve a run with what is seen in the pictures of some drones; their cameras need not be zsim's.
+    def slack_ns(info: Info) -> int:
+        """Return how far the world may be ahead; 0 where nothing waits for it, as in a replay."""
+        gates = not info.replay_of and scenario_file.from_text(info.scenario).gates(role)
+        return SLACK_GATES * info.gate_ns if gates else 0
 
-    Args:
-        diameter_m: of a hat; None for the scenario's.
-
-    Raises:
-        RunError: no drone has such a name.
-    """
-    from zsim_agents.cameras import detector_process
-
-    drones = of_detector(info, names)
-    say(f"{participant.name}: looks at the pictures of {', '.join(drones)}")
-    hats = scenario_file.from_text(info.scenario).environment.hats
-    diameter_m = diameter_m or (Hats() if hats is UNSET else hats).diameter_m
-    detector_process.serve(link, participant, stopped, say, drones, diameter_m)
-
-
-def of_detector(info: Info, names: Sequence[str]) -> list[str]:
-    """Return the drones of a detector process; their cameras need not be zsim's.
-
-    Raises:
-        RunError: no drone has such a name.
-    """
-    scenario = scenario_file.from_text(info.scenario)
-    everybody = [drone.name for drone in scenario.drones]
-    return chosen("detect: drone", names, everybody) if names else watched_drones("", scenario) or everybody
-
-
-def stands_for(role: str, drones: Drones, names: Sequence[str], info: Info) -> tuple[str, ...]:
-    """Return the names of the processes, one for each drone, whose work a process for several drones does."""
-    return tuple(f"{role}.{drone}" for drone in drones(info, names))
-
-
-def slack_ns(role: str, info: Info) -> int:
-    """Return how far the world may be ahead of a role; 0 where nothing waits for it, as in a replay."""
-    gates = not info.replay_of and scenario_file.from_text(info.scenario).gates(role)
-    return SLACK_GATES * info.gate_ns if gates else 0
-
-
-# Names and certificates: access control knows processes by nothing else
+    lower_priority()
+    thing = process_of(role, drones).partition(".")[2] or "main"
+    serve_runs(process_name(role, name, reach.who, thing), serve, reach, stands_for, slack_ns)
 
 
 def process_of(role: str, names: Sequence[str]) -> str:
@@ -471,11 +355,7 @@ def process_of(role: str, names: Sequence[str]) -> str:
 
 
 def process_name(role: str, name: str, who: Identity, thing: str = "main") -> str:
-    """Return a process's name: as given, or its certificate's, or the role's first.
-
-    Raises:
-        SessionError: the certificate cannot be used.
-    """
+    """Return a process's name: as given, its certificate's, or the role's; SessionError if that cannot be used."""
     if name or who.tls is None:
         return name or f"{role}.{thing}"
     if fault := tls.own_fault(who):
@@ -484,11 +364,7 @@ def process_name(role: str, name: str, who: Identity, thing: str = "main") -> st
 
 
 def check_certificate(member: Agent, identity: Identity) -> None:
-    """Refuse to publish for other processes where access control would drop it silently.
-
-    Raises:
-        RunError: the agent stands for other processes, or the certificate is not its own.
-    """
+    """Refuse to publish for other processes where access control would drop it silently."""
     if not identity.tls:
         return
     if member.serves:

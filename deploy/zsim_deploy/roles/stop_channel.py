@@ -56,7 +56,7 @@ class StopChannel:
             handlers = {signal.SIGTERM: self._on_kill, signal.SIGINT: signal.SIG_IGN}
             threading.Thread(target=self._read, name="stop channel", daemon=True).start()
         else:
-            handlers = {signal.SIGTERM: self._on_term, signal.SIGINT: self._on_interrupt}
+            handlers = {signal.SIGTERM: lambda *_: self._stop("terminated"), signal.SIGINT: self._on_interrupt}
             # neither ignored, as under nohup, nor handled already
             fatal = (number for number in HANGUP if signal.getsignal(number) is signal.SIG_DFL)
             handlers |= dict.fromkeys(fatal, self._on_hangup)
@@ -64,11 +64,9 @@ class StopChannel:
             signal.signal(number, handler)
 
     def reason(self) -> str | None:
-        """Return why to stop, None to go on."""
         return self._reason
 
     def stopped(self) -> bool:
-        """Tell whether to stop."""
         return self._reason is not None
 
     def orphaned(self) -> bool:
@@ -76,11 +74,7 @@ class StopChannel:
         return self._orphaned
 
     def exit_if_terminated(self) -> None:
-        """Report to the launcher, by the exit code, that it was not the one that ended this process; to be called last.
-
-        Raises:
-            SystemExit: another process has sent SIGTERM.
-        """
+        """Exit, at the very end, with the code that tells the launcher that it was another who sent SIGTERM."""
         if self._terminated:
             raise SystemExit(TERMINATED)
 
@@ -97,9 +91,6 @@ class StopChannel:
             self._orphaned = self._terminated = True
         self._stop(REASONS[signal.SIGTERM])
 
-    def _on_term(self, *_: object) -> None:
-        self._stop(REASONS[signal.SIGTERM])
-
     def _on_hangup(self, *_: object) -> None:
         """End as after SIGTERM, and write nothing more to a terminal that may be gone."""
         redirect_output(Path(os.devnull))
@@ -112,20 +103,19 @@ class StopChannel:
         self._stop(REASONS[signal.SIGINT])
 
     def _read(self) -> None:
+        def await_beats(limit_s: float) -> None:
+            while (left_s := self._last_line_s + limit_s - time.monotonic()) > 0:
+                time.sleep(left_s)
+            self._leave(f"nothing came from the launcher for {limit_s:g} s")
+
         for line in sys.stdin:
             self._last_line_s = time.monotonic()
             word, _, rest = line.strip().partition(" ")
             if word == "stop":
                 self._stop(rest or "stopped by the launcher")
             elif word == "orphan-after":
-                threading.Thread(target=self._await_beats, args=(float(rest),), name="beats", daemon=True).start()
+                threading.Thread(target=await_beats, args=(float(rest),), name="beats", daemon=True).start()
         self._leave("the launcher is gone")
-
-    def _await_beats(self, limit_s: float) -> None:
-        """End this process when nothing has come for so long."""
-        while (left_s := self._last_line_s + limit_s - time.monotonic()) > 0:
-            time.sleep(left_s)
-        self._leave(f"nothing came from the launcher for {limit_s:g} s")
 
     def _leave(self, reason: str) -> None:
         self._orphaned = True
@@ -138,11 +128,7 @@ class StopChannel:
 
 
 class KeyLease:
-    """A key that was copied to this host for this process, and is removed when the process ends for whatever reason.
-
-    Args:
-        folder: with the key.
-    """
+    """A key that was copied to this host for this process, and is removed when the process ends for whatever reason."""
 
     def __init__(self, folder: Path) -> None:
         self._key = folder / KEY
@@ -203,18 +189,18 @@ def interruptible() -> Iterator[None]:
             raise
 
 
-def lower_priority(niceness: int = NICE) -> None:
+def lower_priority() -> None:
     """Let the world go first: make this process nicer, and the session that it leads, if it leads one.
 
     Where Linux shares processors between sessions, niceness counts within each of them only.
     """
     if hasattr(os, "nice"):
-        os.nice(niceness)
+        os.nice(NICE)
     if sys.platform != "linux" or os.getsid(0) != os.getpid():
         return
     for _ in range(TRIES):
         try:
-            AUTOGROUP.write_text(str(niceness))
+            AUTOGROUP.write_text(str(NICE))
         except BlockingIOError:
             time.sleep(AGAIN_S)
         except OSError:

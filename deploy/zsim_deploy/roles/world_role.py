@@ -2,13 +2,13 @@
 
 import gc
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
-from zsim.contract import keys, run_messages
+from zsim.contract import keys
 from zsim.errors import RunError, RunFailedError
 from zsim.runtime.progress import PERIOD_S, QUIET, HoldReasons, JsonProgress, ProgressSink, Screen, SlowStart
 from zsim.runtime.rate_limit import RateLimit
@@ -22,7 +22,6 @@ from zsim.transport.zenoh_settings import hub_files, require_files
 from zsim_deploy.roles.stop_channel import StopChannel
 
 if TYPE_CHECKING:
-    from zsim.record import RecordReader
     from zsim_world.run.playback import PlaybackRange
 
 SHOWN_EVENTS = 2000  # events shown per run besides those below; all of them are in the record
@@ -44,14 +43,8 @@ def world(
 ) -> None:
     """Run the world of a scenario on the endpoints until the scenario ends or the process is stopped.
 
-    Args:
-        journal: its folder.
-        all_died: whether all participants of the run have to be started again too, when it goes on from its journal.
-        changed: see `World`.
-
-    Raises:
-        RunError: the journal is of another run.
-        SessionError: an endpoint is taken, or the identity cannot be used.
+    `journal`: its folder; `all_died`: all participants have to be started again too when it goes on from there.
+    RunError if the journal is of another run; SessionError if an endpoint is taken, or the identity cannot be used.
     """
     from zsim.math.compiled import is_kept
     from zsim_world.fleet.kernel import advance
@@ -82,25 +75,20 @@ def world(
     if launched:
         progress = JsonProgress()
         kept = RunJournal(journal, run_world.run_id, sha256, progress.say, all_died)
-        run(run_world, endpoints, stop.reason, world_progress(progress), identity=identity, journal=kept)
+        run(run_world, endpoints, stop.reason, WorldProgress(progress).show, identity=identity, journal=kept)
         stop.exit_if_terminated()
         return
     with Screen(scenario.duration_s) as screen:
         listening = f"world of {scenario.federation!r} on {', '.join(endpoints)}; Ctrl-C ends the run"
-        kept, progress = RunJournal(journal, run_world.run_id, sha256, screen.say, all_died), world_progress(screen)
-        run(run_world, endpoints, stop.reason, progress, lambda: screen.say(listening), identity, kept)
+        kept, show = RunJournal(journal, run_world.run_id, sha256, screen.say, all_died), WorldProgress(screen).show
+        run(run_world, endpoints, stop.reason, show, lambda: screen.say(listening), identity, kept)
         screen.say(f"ended: {run_world.ended}")
     if run_world.left_early:  # a launcher reads it from the record
         raise RunFailedError("; ".join(run_world.left_early))
 
 
-def world_progress(show: ProgressSink) -> Callable[[str, Any, str], None]:
-    """Return what the world calls with its clocks, its events, and what passes it."""
-    return _WorldProgress(show).show
-
-
-class _WorldProgress:
-    """Chooses what of a run is shown, and how often."""
+class WorldProgress:
+    """Chooses what of a run is shown, and how often; the world calls `show` with its clocks, events, and the like."""
 
     def __init__(self, sink: ProgressSink) -> None:
         self._sink = sink
@@ -113,7 +101,12 @@ class _WorldProgress:
     def show(self, kind: str, message: Any, about: str) -> None:
         sink = self._sink
         if kind == "clock" and (self._clocks.spend() or message.state == "stopped"):
-            sink.clock(_clock_line(message, about))
+            waiting = [
+                {"name": w.name, "host": w.host, "since_wall_s": round(w.since_wall_s, 1), "held_by": w.held_by}
+                for w in message.waiting_for
+            ]
+            clock = {"t_s": message.t_ns / 1e9, "rate": message.rate, "state": message.state}
+            sink.clock({**clock, "phase": about, "waiting_for": waiting})
         elif kind == "state" and (line := self._reasons.line(about, message)):
             sink.say(line)
         elif kind == "health" and self._healths.spend(about):
@@ -125,60 +118,27 @@ class _WorldProgress:
             self._links[about] = message.state
         elif kind == "resumed":
             sink.say(f"{about}: goes on at t = {message / 1e9:.2f} s")
-        elif kind == "event" and (message.kind in VITAL or message.data.get("fails") or self._shown < SHOWN_EVENTS):
-            self._shown += message.kind not in QUIET
-            sink.event(_event_line(message))
-
-
-def _clock_line(clock: run_messages.Clock, phase: str) -> dict[str, Any]:
-    waiting = [
-        {"name": w.name, "host": w.host, "since_wall_s": round(w.since_wall_s, 1), "held_by": w.held_by}
-        for w in clock.waiting_for
-    ]
-    return {
-        "t_s": clock.t_ns / 1e9,
-        "rate": clock.rate,
-        "state": clock.state,
-        "phase": phase,
-        "waiting_for": waiting,
-    }
-
-
-def _event_line(event: run_messages.Event) -> dict[str, Any]:
-    data = event.data if event.kind in VITAL or event.data.get("fails") else {}
-    return {
-        "t_s": event.t_ns / 1e9,
-        "kind": event.kind,
-        "subject": event.subject,
-        "text": event.text,
-        "data": data,
-    }
+        elif kind == "event":
+            is_vital = message.kind in VITAL or message.data.get("fails")
+            if is_vital or self._shown < SHOWN_EVENTS:
+                self._shown += message.kind not in QUIET
+                event = {name: getattr(message, name) for name in ("kind", "subject", "text")}
+                sink.event({"t_s": message.t_ns / 1e9, **event, "data": message.data if is_vital else {}})
 
 
 class ReplayOptions(NamedTuple):
-    """How a record is to be played.
+    """How a record is to be played."""
 
-    Attributes:
-        choice: which part of it.
-        rate: simulated per wall seconds; 0 = as fast as possible.
-        expect: names of the processes that are waited for.
-        endpoints: on which others connect.
-        federation: None for that of the record.
-    """
-
-    choice: "PlaybackRange"
-    rate: float
-    expect: tuple[str, ...]
-    endpoints: tuple[str, ...]
-    federation: str | None = None
+    choice: "PlaybackRange"  # which part of it
+    rate: float  # simulated per wall seconds; 0 = as fast as possible
+    expect: tuple[str, ...]  # names of the processes that are waited for
+    endpoints: tuple[str, ...]  # on which others connect
+    federation: str | None = None  # None for that of the record
 
 
 def play(place: Path, options: ReplayOptions, who: Identity) -> None:
-    """Play a record until it is over or the process is stopped.
-
-    Raises:
-        RunError, RecordError: there is no record, or nothing in it to play.
-        SessionError: an endpoint is taken, a key is no expression, or the identity cannot be used.
+    """Play a record until it is over or the process is stopped; RunError, RecordError, SessionError if that cannot
+    be.
     """
     from zsim.record.record_reader import record_notes
     from zsim_analysis.reading.recorded_run import open_run
@@ -189,7 +149,10 @@ def play(place: Path, options: ReplayOptions, who: Identity) -> None:
         check_expression(expression)
     stop = StopChannel()
     with open_run(place) as (reader, info, scenario):
-        _check(options.choice.keys, reader)
+        for expression in options.choice.keys:
+            if not any(keys.matches(expression, key) for key in reader.topics()):
+                known = ", ".join(list(reader.topics())[:20])
+                raise RunError(f"--keys is {expression!r}; must match a key on record: {known} …")
         if options.federation is not None:
             federation = keys.name(options.federation, "federation")
             scenario = msgspec.structs.replace(scenario, federation=federation)
@@ -202,15 +165,8 @@ def play(place: Path, options: ReplayOptions, who: Identity) -> None:
         with Screen(end_s, from_s=options.choice.from_ns / 1e9) as screen:
             where = f"{scenario.federation!r} on {', '.join(options.endpoints)}"
             text = f"replay of run {info.run_id} as {where}; Ctrl-C ends it"
-            run(playback, options.endpoints, stop.reason, world_progress(screen), lambda: screen.say(text), who)
+            show = WorldProgress(screen).show
+            run(playback, options.endpoints, stop.reason, show, lambda: screen.say(text), who)
             for note in record_notes(reader):
                 screen.say(note)
             screen.say(f"ended: {playback.ended}")
-
-
-def _check(expressions: Sequence[str], reader: "RecordReader") -> None:
-    """Check that each expression matches a key on record."""
-    on_record = reader.topics()
-    for expression in expressions:
-        if not any(keys.matches(expression, key) for key in on_record):
-            raise RunError(f"--keys is {expression!r}; must match a key on record: {', '.join(list(on_record)[:20])} …")

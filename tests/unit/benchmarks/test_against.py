@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from refused import refused
 
-from benchmarks import against, page
+from benchmarks import against, table
 from benchmarks.child import RefusedError
 from benchmarks.run import spent
 from benchmarks.sheet import Sheet
@@ -21,12 +21,11 @@ needs_git = pytest.mark.skipif(
 
 def sheet() -> Sheet:
     made = Sheet("c-against", "", notes={"here": "b of 2026-02-02", "against": "a of 2026-01-01"})
-    for factor, cpu_ms, peak_mb in ((60.0, 2.0, 300.0), (80.0, 1.0, 300.0)):
-        for key, value in zip(against.QUANTITIES, (factor, cpu_ms, peak_mb), strict=True):
-            made.add(f"here.in_process.{key}", 3, value)
-    for factor, cpu_ms, peak_mb in ((40.0, 4.0, 200.0), (40.0, 4.0, 200.0)):
-        for key, value in zip(against.QUANTITIES, (factor, cpu_ms, peak_mb), strict=True):
-            made.add(f"there.in_process.{key}", 3, value)
+    flown = {"here": ((60.0, 2.0, 300.0), (80.0, 1.0, 300.0)), "there": ((40.0, 4.0, 200.0), (40.0, 4.0, 200.0))}
+    for side, flights in flown.items():
+        for figures in flights:
+            for key, value in zip(against.QUANTITIES, figures, strict=True):
+                made.add(f"{side}.in_process.{key}", 3, value)
     return made
 
 
@@ -47,10 +46,7 @@ def test_a_revision_that_does_not_fly_is_a_row_that_says_why() -> None:
         del made.values[f"there.in_process.{key}"]
     made.refuse("there.in_process", 3, "exit code 2", [])
     assert {row[2] for row in rows(against.page(made))[2:]} == {"exit code 2"}
-
-
-def test_the_page_has_a_place_for_it() -> None:
-    assert "| x |" in page.replaced(page.PAGE.read_text(), "c-against", "| x |")
+    assert "| x |" in table.replaced(table.PAGE.read_text(), "c-against", "| x |")  # the page has a place for it
 
 
 @needs_git
@@ -73,12 +69,9 @@ def test_a_revision_that_git_does_not_know_is_refused(tmp_path: Path) -> None:
         pass
 
 
-def test_what_a_process_and_its_children_spend_is_counted() -> None:
+def test_what_a_process_and_its_children_spend_is_counted_and_one_that_fails_is_refused() -> None:
     burns = "import time\nwhile time.process_time() < 0.2: pass"
     parent = f"import subprocess, sys\nsubprocess.run([sys.executable, '-c', {burns!r}])\n{burns}"
     assert 0.4 <= spent([sys.executable, "-c", parent], against.ROOT).cpu_s < 4.0
-
-
-def test_a_process_that_fails_is_refused_with_its_last_words() -> None:
     with refused(RefusedError, "3", "no wind"):
         spent([sys.executable, "-c", "import sys; print('no wind'); sys.exit(3)"], against.ROOT)

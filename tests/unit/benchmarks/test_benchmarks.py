@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 from refused import has_terms, refused
 
-from benchmarks import grid, lockstep, page, peers
+from benchmarks import grid, lockstep, peers, table
 from benchmarks.child import RefusedError, Server, result
 from benchmarks.exchange.lap import Lap
 from benchmarks.run import role_of
@@ -34,26 +34,22 @@ def sheet() -> Sheet:
     return made
 
 
-def test_a_ratio_compares_each_repeat_with_the_same_repeat() -> None:
-    assert sheet().spread("zsim", 1) == Spread(40.0, 30.0, 50.0)
-    assert sheet().ratio("zsim", "other", 1) == Spread(4.0, 1.5, 5.0)  # 4, 1.5, 5: not 40 / 10 of the medians' spread
-    assert sheet().ratio("zsim", "other", 10) is None
-    assert sheet().best(["zsim", "other"], 1) == "zsim"
-    assert sheet().best(["other"], 10) is None
-
-
-def test_a_repeat_that_failed_is_left_out_of_the_ratio_with_its_partner() -> None:
-    made = Sheet("a", "steps/s")
+def test_a_ratio_compares_each_repeat_with_the_same_repeat(tmp_path: Path) -> None:
+    """One that failed is left out with its partner."""
+    made = sheet()
+    assert made.spread("zsim", 1) == Spread(40.0, 30.0, 50.0)
+    assert made.ratio("zsim", "other", 1) == Spread(4.0, 1.5, 5.0)  # 4, 1.5, 5: not 40 / 10 of the medians' spread
+    assert made.ratio("zsim", "other", 10) is None
+    assert made.best(["zsim", "other"], 1) == "zsim"
+    assert made.best(["other"], 10) is None
+    made.write(tmp_path / "new" / "a.json")
+    assert read(tmp_path / "new" / "a.json") == made
+    failed = Sheet("a", "steps/s")
     for ours, theirs in ((40.0, None), (30.0, 10.0)):
-        made.add("zsim", 1, ours)
-        made.add("other", 1, theirs)
-    assert made.ratio("zsim", "other", 1) == Spread(3.0, 3.0, 3.0)
-    assert made.spread("other", 1) == Spread(10.0, 10.0, 10.0)
-
-
-def test_a_sheet_is_read_as_it_was_written(tmp_path: Path) -> None:
-    sheet().write(tmp_path / "new" / "a.json")
-    assert read(tmp_path / "new" / "a.json") == sheet()
+        failed.add("zsim", 1, ours)
+        failed.add("other", 1, theirs)
+    assert failed.ratio("zsim", "other", 1) == Spread(3.0, 3.0, 3.0)
+    assert failed.spread("other", 1) == Spread(10.0, 10.0, 10.0)
 
 
 @pytest.mark.parametrize("power", [0.0, 1.0, 1.7])
@@ -68,13 +64,10 @@ def test_three_digits_are_shown(value: float, shown: str) -> None:
     assert figure(value) == shown
 
 
-def cells(line: str) -> list[str]:
-    return [cell.strip() for cell in line.strip().strip("|").split("|")]
-
-
 def test_who_has_no_figure_is_a_row_that_says_why() -> None:
     labels = {"zsim": "zsim", "other": "the other", "absent": "the absent"}
-    rows = [cells(line) for line in ratios(sheet(), labels, "zsim").splitlines()]
+    lines = ratios(sheet(), labels, "zsim").splitlines()
+    rows = [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in lines]
     assert rows[0] == ["", "N = 1", "N = 10"]
     assert rows[2] == ["zsim [steps/s]", "40 (30 to 50)", "7 (7 to 7)"]
     assert rows[3][:2] == ["the other", "0.25 (0.2 to 0.667)"]
@@ -87,14 +80,11 @@ def test_who_has_no_figure_is_a_row_that_says_why() -> None:
 def test_only_the_measured_section_of_the_page_is_replaced() -> None:
     begin, end = "words\n<!-- measured: a -->\n", "<!-- end: a -->\nmore\n"
     text = f"{begin}old\n{end}"
-    assert page.replaced(text, "a", "new\n") == f"{begin}new\n{end}"
+    assert table.replaced(text, "a", "new\n") == f"{begin}new\n{end}"
+    for part in "abcdef":  # the page has a section for every part
+        table.replaced(table.PAGE.read_text(), part, "")
     with refused(ValueError, "measured: b"):
-        page.replaced(text, "b", "new")
-
-
-def test_the_page_has_a_section_for_every_part() -> None:
-    for part in "abcdef":
-        page.replaced(page.PAGE.read_text(), part, "")
+        table.replaced(text, "b", "new")
 
 
 def test_a_contender_that_fails_is_refused_with_its_last_words() -> None:

@@ -50,9 +50,6 @@ def places(folder: Path, scenario: Scenario, roles: dict[str, Any]) -> dict[str,
     return inventory.placement(placed(folder, roles=roles), scenario)
 
 
-# The one that comes with it
-
-
 def test_the_example_is_secure_and_places_every_process_of_the_step_scenario(step: Scenario) -> None:
     example = inventory.load(ROOT / "examples/hosts.yaml")
     assert not example.inventory.security.insecure
@@ -60,9 +57,6 @@ def test_the_example_is_secure_and_places_every_process_of_the_step_scenario(ste
     estimators = {f"estimator.drone{i}": f"onboard{i}" for i in (1, 2, 3)}
     fixed = dict.fromkeys(("world", "recorder", "controller.main"), "lab-pc")
     assert inventory.placement(example, step) == {**fixed, **estimators}
-
-
-# Where a process runs
 
 
 @pytest.mark.parametrize(
@@ -87,24 +81,18 @@ def test_where_processes_are_placed(
     assert (found["recorder"], found["controller.main"]) == (recorder, "lab")
 
 
-def test_programs_of_the_user_s_own_are_placed_too(tmp_path: Path) -> None:
-    expect = ["my.drone1", "recorder", "controller.main"]
-    own = scenario_file.load(ROOT / "scenarios/step.yaml", [f"processes.expect=[{', '.join(expect)}]"])
+def test_what_has_no_place_and_what_places_nobody_are_told_at_once(tmp_path: Path, step: Scenario) -> None:
+    """Programs of the user's own are placed too."""
+    with pytest.raises(InventoryError) as caught:
+        places(tmp_path, step, {"world": "lab", "estimator.drone1": "one", "estimater.*": "two"})
+    *lines, last = caught.value.faults
+    for name, line in zip(("estimator.drone2", "estimator.drone3", "controller.main"), lines, strict=True):
+        assert has_terms(line, "hosts.yaml", "roles", "no place", name, repr(name))
+    assert has_terms(last, "hosts.yaml", "roles.estimater.*", "'step'", "world", "recorder")
+    own = scenario_file.load(ROOT / "scenarios/step.yaml", ["processes.expect=[my.drone1, recorder, controller.main]"])
     found = places(tmp_path, own, {"world": "lab", "my.*": "one", "controller.main": "two"})
     assert found == {"world": "lab", "recorder": "lab", "my.drone1": "one", "controller.main": "two"}
 
-
-def test_what_has_no_place_and_what_places_nobody_are_told_at_once(tmp_path: Path, step: Scenario) -> None:
-    with pytest.raises(InventoryError) as caught:
-        places(tmp_path, step, {"world": "lab", "estimator.drone1": "one", "estimater.*": "two"})
-    lines = caught.value.faults
-    assert len(lines) == 4
-    for name, line in zip(("estimator.drone2", "estimator.drone3", "controller.main"), lines, strict=False):
-        assert has_terms(line, "hosts.yaml", "roles", "no place", name, repr(name))
-    assert has_terms(lines[3], "hosts.yaml", "roles.estimater.*", "'step'", "world", "recorder")
-
-
-# Who connects to whom
 
 SITES = {"site": {"host": "one", "port": 7448}, "yard": {"host": "two", "port": 7449, "upstream": "site"}}
 
@@ -120,30 +108,22 @@ def test_who_connects_to_whom_across_hosts(sites: InventoryFile, step: Scenario)
     found = inventory.placement(sites, step)
     assert inventory.endpoint(sites, found, "one") == "tls/192.168.1.10:7447"
     assert inventory.endpoint(sites, found, "two") == "tls/192.168.1.22:7449"
-    assert inventory.upstream(sites, found, "yard") == "tls/192.168.1.21:7448"
-    assert inventory.upstream(sites, found, "site") == "tls/192.168.1.10:7447"
+    routers = [process for process in inventory.processes(sites, step) if process.role == "router"]
+    upstream = {process.name: process.words[process.words.index("--connect") + 1] for process in routers}
+    assert upstream == {"router.site": "tls/192.168.1.10:7447", "router.yard": "tls/192.168.1.21:7448"}
+    assert list(upstream) == ["router.site", "router.yard"]  # after those that they connect to
     assert inventory.connections(sites, found) == {("lab", 7447): {"one"}, ("one", 7448): {"two"}}
 
 
-def test_a_host_that_has_a_router_only_connects_too(tmp_path: Path, step: Scenario) -> None:
+def test_a_host_that_has_a_router_only_connects_too_and_the_world_to_nobody(tmp_path: Path, step: Scenario) -> None:
     hosts = {**HOSTS, "one": {"address": "192.168.1.21", "router": "gate"}, "gate": {"address": "192.168.1.30"}}
     found = placed(tmp_path, hosts=hosts, routers={"gate": {"host": "gate"}}, roles={**ROLES, "estimator.*": "one"})
     ways = inventory.connections(found, inventory.placement(found, step))
     assert ways == {("gate", 7448): {"one"}, ("lab", 7447): {"gate"}}
-
-
-def test_the_world_itself_connects_to_nobody(tmp_path: Path, step: Scenario) -> None:
     hosts = {**HOSTS, "lab": {"address": "192.168.1.10", "router": "gate"}}
-    roles = {"world": "lab", "*": "one"}
-    found = placed(tmp_path, hosts=hosts, routers={"gate": {"host": "two"}}, roles=roles)
+    found = placed(tmp_path, hosts=hosts, routers={"gate": {"host": "two"}}, roles={"world": "lab", "*": "one"})
     ways = inventory.connections(found, inventory.placement(found, step))
     assert ways == {("lab", 7447): {"one", "two"}}
-
-
-def test_routers_come_after_those_that_they_connect_to(tmp_path: Path) -> None:
-    chain = {f"r{i}": {"host": "lab", "port": 8000 + i, "upstream": f"r{i + 1}"} for i in range(4)}
-    found = placed(tmp_path, routers={**chain, "r4": {"host": "one"}, "a": {"host": "two"}})
-    assert inventory.routers_in_order(found.inventory) == ["a", "r4", "r3", "r2", "r1", "r0"]
 
 
 @pytest.mark.parametrize(
@@ -160,9 +140,6 @@ def test_endpoints(tmp_path: Path, step: Scenario, address: str, insecure: bool,
     found = placed(tmp_path, hosts=hosts, port=7000, security={"insecure": insecure})
     assert inventory.listening(found, "lab", 7000) == endpoint
     assert inventory.endpoint(found, inventory.placement(found, step), "one") == endpoint
-
-
-# Faults
 
 
 def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
@@ -189,15 +166,6 @@ def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
     ]
 
 
-def test_an_unknown_name_is_told_with_the_known_ones(tmp_path: Path) -> None:
-    document = {"hosts": HOSTS, "roles": {**ROLES, "world": "lba"}}
-    (line,) = faults(tmp_path, document)
-    assert has_terms(line, "hosts.yaml", "roles.world", "'lba'", "hosts", "lab", "one", "two")
-    document = {"hosts": {**HOSTS, "two": {"address": "x", "router": "yard"}}, "roles": ROLES}
-    (line,) = faults(tmp_path, document)
-    assert has_terms(line, "hosts.yaml", "hosts.two.router", "'yard'", "routers", "none")
-
-
 @pytest.mark.parametrize("circle", [["a"], ["a", "b"], ["a", "b", "c"]])
 def test_routers_in_a_circle_are_each_told_and_one_that_leads_there_is_not(tmp_path: Path, circle: list[str]) -> None:
     after = dict(zip(circle, circle[1:] + circle[:1], strict=True))
@@ -220,18 +188,15 @@ def test_routers_in_a_circle_are_each_told_and_one_that_leads_there_is_not(tmp_p
         ("hosts: {a: {address: x}}\nroles: {world: a}\nrouters: {r: null}", [("routers.r", "null", "map")]),
         ("hosts: {a: {address: 'x y'}}\nroles: {world: a}", [("hosts.a.address", "'x y'", "[A-Za-z0-9_.:%-]{1,253}")]),
         ("hosts: {A: {address: x}}\nroles: {}", [("hosts.A", "key", "'A'", "[a-z0-9_.-]{1,32}")]),
+        ("hosts: {.: {address: x}}\nroles: {world: .}", [("hosts..", "folder")]),  # after which one is named
+        ("hosts: {..: {address: x}}\nroles: {world: ..}", [("hosts...", "folder")]),
+        ("hosts: {a: {address: x}, b: {address: y}}\nroles: {world: c}", [("roles.world", "'c'", "hosts", "a", "b")]),
+        ("hosts: {a: {address: x, router: r}}\nroles: {world: a}", [("hosts.a.router", "'r'", "routers", "none")]),
     ],
 )  # fmt: skip
 def test_faults(tmp_path: Path, text: str, terms_of_each: list[tuple[str, ...]]) -> None:
     for line, terms in zip(faults(tmp_path, text), terms_of_each, strict=True):
         assert has_terms(line, "hosts.yaml", *terms)
-
-
-@pytest.mark.parametrize("name", [".", ".."])
-def test_a_host_is_no_way_out_of_a_folder(tmp_path: Path, name: str) -> None:
-    """Folders are named after hosts, here and by `zsim certs` and `zsim render`."""
-    (line,) = faults(tmp_path, {"hosts": {name: {"address": "x"}}, "roles": {"world": name}})
-    assert line.startswith(f"hosts.yaml: hosts.{name} ")
 
 
 def test_two_cannot_listen_on_one_port(tmp_path: Path, step: Scenario) -> None:
@@ -286,8 +251,6 @@ def test_a_megabyte_that_is_no_inventory_is_refused_at_once(tmp_path: Path, name
     assert has_terms(lines[0], where)
 
 
-# Extras
-
 AGENTS, RECORD, WORLD = "agents", "record", "world"
 
 
@@ -319,21 +282,17 @@ def test_a_router_needs_none_and_extras_can_be_added() -> None:
     assert needed_extras(inventory, ["report"]) == {"a": {WORLD, RECORD, "report"}, "gate": {"report"}}
 
 
-def distributions(extra: str | None) -> set[str]:
-    """Return what is installed with an extra beside that which everybody has; with None, what everybody has."""
-    project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
-    found: set[str] = set()
-    for line in project["dependencies"] if extra is None else project["optional-dependencies"][extra]:
-        name, more = re.fullmatch(r"([A-Za-z0-9_.-]+)(?:\[(.*?)\])?.*", line).groups()  # type: ignore[union-attr]
-        found |= (
-            {name.lower()} if name != "zsim" else {each for part in more.split(",") for each in distributions(part)}
-        )
-    return found
-
-
 @pytest.mark.parametrize("extra", [AGENTS, WORLD])
 def test_who_calculates_has_all_that_its_bits_depend_on(extra: str) -> None:
     """Else a host that `zsim push` has installed on would compute with another fingerprint."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+    def distributions(lines: list[str]) -> set[str]:
+        matches = [re.match(r"([A-Za-z0-9_.-]+)(?:\[(.*?)\])?", line) for line in lines]
+        ours = [part for match in matches if match and match[1] == "zsim" for part in match[2].split(",")]
+        others = {match[1].lower() for match in matches if match and match[1] != "zsim"}
+        return others.union(*(distributions(project["optional-dependencies"][part]) for part in ours))
+
     brought_along = {"llvmlite": "numba"}
     wanted = {brought_along.get(package, package) for package in PACKAGES}
-    assert wanted <= distributions(extra) | distributions(None)
+    assert wanted <= distributions([*project["dependencies"], f"zsim[{extra}]"])

@@ -6,7 +6,6 @@ import os
 import re
 import shlex
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -70,12 +69,11 @@ def hosts(tmp_path: Path) -> InventoryFile:
 
 
 def of_systemd(texts: dict[str, str]) -> Words:
-    found = {}
-    for path, text in texts.items():
-        if match := re.fullmatch(r"(\w+)/zsim-(.+)\.service", path):
-            (line,) = re.findall(r"^ExecStart=(.*)$", text, re.MULTILINE)
-            found[match[2]] = (match[1], cli_words(shlex.split(line)[1:]))
-    return found
+    units = {match: text for path, text in texts.items() if (match := re.fullmatch(r"(\w+)/zsim-(.+)\.service", path))}
+    return {
+        match[2]: (match[1], cli_words(shlex.split(options_of(text)["ExecStart"][0])[1:]))
+        for match, text in units.items()
+    }
 
 
 def of_compose(texts: dict[str, str]) -> Words:
@@ -114,11 +112,7 @@ def pods(texts: dict[str, str]) -> list[dict[str, Any]]:
     return [one["spec"]["template"]["spec"] for one in manifests(texts) if one["kind"] in ("Job", "Deployment")]
 
 
-READ: dict[str, Callable[[dict[str, str]], Words]] = {
-    "systemd": of_systemd,
-    "compose": of_compose,
-    "kubernetes": of_kubernetes,
-}
+READ = {"systemd": of_systemd, "compose": of_compose, "kubernetes": of_kubernetes}
 ALL = pytest.mark.parametrize("target", TARGETS)
 
 
@@ -127,18 +121,20 @@ def option(words: list[str], name: str) -> str | None:
     return words[words.index(name) + 1] if name in words else None
 
 
-@ALL
-def test_every_process_is_there_once_and_on_its_host(target: str, hosts: InventoryFile, step: Scenario) -> None:
-    found = READ[target](TARGETS[target](hosts, step))
-    assert {name: host for name, (host, _) in found.items()} == PLACES
-    assert {name: option(words, "--host") for name, (_, words) in found.items()} == PLACES
+def rendered(target: str, hosts: InventoryFile, scenario: Scenario, *pace: str) -> Words:
+    return READ[target](TARGETS[target](hosts, scenario, pace))
 
 
 @ALL
 @pytest.mark.parametrize("insecure", [False, True])
-def test_endpoints_are_the_inventory_s(target: str, insecure: bool, tmp_path: Path, step: Scenario) -> None:
+def test_every_process_is_there_once_on_its_host_with_its_endpoints(
+    target: str, insecure: bool, tmp_path: Path
+) -> None:
     text = HOSTS + "security: {insecure: true}" if insecure else HOSTS
-    found = READ[target](TARGETS[target](placed(tmp_path, text), step))
+    found = rendered(target, placed(tmp_path, text), scenario_file.load(STEP, ["federation=lab.2"]))
+    assert {name: host for name, (host, _) in found.items()} == PLACES
+    assert {name: option(words, "--host") for name, (_, words) in found.items()} == PLACES
+    assert {option(words, "--federation") for name, (_, words) in found.items() if name != "world"} == {"lab.2"}
     scheme = "tcp" if insecure else "tls"
     connects = {name: option(words, "--connect") for name, (_, words) in found.items()}
     assert connects == {"world": None, **{name: f"{scheme}/{at}" for name, at in CONNECTS.items()}}
@@ -147,43 +143,29 @@ def test_endpoints_are_the_inventory_s(target: str, insecure: bool, tmp_path: Pa
 
 
 @ALL
-def test_everybody_is_of_the_scenario_s_federation(target: str, hosts: InventoryFile) -> None:
-    other = scenario_file.load(STEP, ["federation=lab.2"])
-    found = READ[target](TARGETS[target](hosts, other))
-    assert {option(words, "--federation") for name, (_, words) in found.items() if name != "world"} == {"lab.2"}
-
-
-@ALL
 def test_names_that_begin_with_a_dash_are_names(target: str, tmp_path: Path) -> None:
     """The commands are read as `zsim` itself reads them."""
     text = STEP.read_text().replace("name: drone1", "name: -d1").replace("[drone1,", "[-d1,").replace("main", "-c")
     (tmp_path / "dashes.yaml").write_text(text)
     dashes = placed(tmp_path, HOSTS.replace("yard", "-r"))
-    found = READ[target](TARGETS[target](dashes, scenario_file.load(tmp_path / "dashes.yaml")))
+    found = rendered(target, dashes, scenario_file.load(tmp_path / "dashes.yaml"))
     assert {"estimator.-d1", "controller.-c", "router.-r"} <= set(found)
+    commands: Any = typer.main.get_command(app)
     for name, (host, words) in found.items():
-        read = parameters(words)
+        read = commands.commands[words[0]].make_context(words[0], words[1:]).params
         assert read["host"] == host
         thing = name.partition(".")[2]
         assert not thing or thing in (*read.get("things", ()), read.get("thing"), read.get("name"))
-
-
-def parameters(words: list[str]) -> dict[str, Any]:
-    """Return what a command of `zsim` takes from its words."""
-    group = typer.main.get_command(app)
-    command = group.commands[words[0]]  # type: ignore[attr-defined]
-    return command.make_context(words[0], words[1:]).params
 
 
 @ALL
 def test_certificates_are_for_who_has_tls_and_access_control_for_who_listens(
     target: str, hosts: InventoryFile, tmp_path: Path, step: Scenario
 ) -> None:
-    found = READ[target](TARGETS[target](hosts, step))
+    found = rendered(target, hosts, step)
     assert all("--tls" in words for _, words in found.values())
     assert {name for name, (_, words) in found.items() if "--access" in words} == set(LISTENS)
-    open_ = placed(tmp_path, HOSTS + "security: {insecure: true}")
-    texts = TARGETS[target](open_, step)
+    texts = TARGETS[target](placed(tmp_path, HOSTS + "security: {insecure: true}"), step)
     assert not any({"--tls", "--access"} & set(words) for _, words in READ[target](texts).values())
     assert not any("certs" in text or "secret" in text.lower() for text in texts.values())
 
@@ -192,11 +174,10 @@ def test_certificates_are_for_who_has_tls_and_access_control_for_who_listens(
 def test_the_pace_is_the_world_s_and_routers_know_of_realtime(
     target: str, hosts: InventoryFile, step: Scenario
 ) -> None:
-    found = READ[target](TARGETS[target](hosts, step, ["--realtime", "--rate", "2.0"]))
+    found = rendered(target, hosts, step, "--realtime", "--rate", "2.0")
     assert {name for name, (_, words) in found.items() if "--realtime" in words} == {"world", "router.yard"}
-    assert {name: option(words, "--rate") for name, (_, words) in found.items() if "--rate" in words} == {
-        "world": "2.0"
-    }
+    rates = {name: option(words, "--rate") for name, (_, words) in found.items()}
+    assert rates == {**dict.fromkeys(PLACES), "world": "2.0"}
 
 
 @ALL
@@ -231,8 +212,7 @@ def test_no_key_and_no_launcher_s_access_is_in_a_text(target: str, tmp_path: Pat
 
 @ALL
 def test_the_same_input_gives_the_same_text(target: str, tmp_path: Path) -> None:
-    first = TARGETS[target](placed(tmp_path), scenario_file.load(STEP))
-    second = TARGETS[target](placed(tmp_path), scenario_file.load(STEP))
+    first, second = (TARGETS[target](placed(tmp_path), scenario_file.load(STEP)) for _ in range(2))
     assert list(first.items()) == list(second.items())
 
 
@@ -244,9 +224,8 @@ def test_a_program_of_the_user_s_own_is_told_of_and_not_started(target: str, tmp
     assert set(READ[target](texts)) == {"world", "recorder", "controller.main", "router.yard"}
     remark = "# my.drone1 on two is a program of your own: start it yourself, it connects to tls/192.168.1.21:7448"
     remarked = [path for path, text in texts.items() if remark in text.splitlines()]
-    assert remarked == [
-        {"systemd": "two/zsim.target", "compose": "two/compose.yaml", "kubernetes": "zsim.yaml"}[target]
-    ]
+    where = {"systemd": "two/zsim.target", "compose": "two/compose.yaml", "kubernetes": "zsim.yaml"}
+    assert remarked == [where[target]]
 
 
 @ALL
@@ -256,9 +235,6 @@ def test_a_process_without_a_place_is_refused(target: str, tmp_path: Path, step:
         TARGETS[target](placed(tmp_path, text), step)
 
 
-# systemd
-
-
 def options_of(text: str) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for name, value in re.findall(r"^(\w+)=(.*)$", text, re.MULTILINE):
@@ -266,7 +242,7 @@ def options_of(text: str) -> dict[str, list[str]]:
     return found
 
 
-def test_units_run_the_host_s_python_as_its_user(hosts: InventoryFile, step: Scenario) -> None:
+def test_units_run_the_host_s_python_as_its_user_and_write_nowhere_else(hosts: InventoryFile, step: Scenario) -> None:
     texts = systemd(hosts, step)
     for path, user, python in [
         ("lab/zsim-world.service", "lab", "/opt/zsim/venv/bin/python"),
@@ -276,13 +252,7 @@ def test_units_run_the_host_s_python_as_its_user(hosts: InventoryFile, step: Sce
         options = options_of(texts[path])
         assert options["User"] == [user]
         assert options["ExecStart"][0].split()[0] == f":{python}"
-
-
-def test_units_read_certificates_and_write_nowhere_else(hosts: InventoryFile, step: Scenario) -> None:
-    texts = systemd(hosts, step)
-    for path, text in texts.items():
-        if not path.endswith(".service"):
-            continue
+    for text in (text for path, text in texts.items() if path.endswith(".service")):
         options = options_of(text)
         assert options["ProtectSystem"] == ["strict"]
         assert options["ProtectHome"] == ["read-only"]
@@ -306,21 +276,14 @@ def test_a_recorder_that_is_started_again_has_the_folder_of_its_run(hosts: Inven
 def test_systemd_restarts_what_on_death_says(hosts: InventoryFile) -> None:
     lines = ["processes.on_death={estimator: wait, estimator.drone3: restart, controller: end}"]
     texts = systemd(hosts, scenario_file.load(STEP, lines))
-    restarts = {path.split("zsim-")[1]: options_of(text)["Restart"] for path, text in texts.items() if "zsim-" in path}
-    assert restarts == {
-        "world.service": ["no"],
-        "recorder.service": ["on-failure"],
-        "estimator.drone1.service": ["no"],
-        "estimator.drone2.service": ["no"],
-        "estimator.drone3.service": ["on-failure"],
-        "controller.main.service": ["no"],
-        "router.yard.service": ["on-failure"],
-    }
+    units = {path.split("zsim-")[1]: options_of(text) for path, text in texts.items() if "zsim-" in path}
+    restarted = {name.removesuffix(".service") for name, unit in units.items() if unit["Restart"] == ["on-failure"]}
+    assert restarted == {"recorder", "estimator.drone3", "router.yard"}
+    assert {unit["Restart"][0] for unit in units.values()} == {"no", "on-failure"}
     assert has_terms(texts["one/zsim-estimator.drone1.service"], "# on_death", "wait")
     assert not has_terms(texts["one/zsim-estimator.drone3.service"], "# on_death", "wait")
     # nor is a name fought for that another process took
-    units = [text for path, text in texts.items() if path.endswith(".service")]
-    assert all(options_of(text)["RestartPreventExitStatus"] == ["2 3"] for text in units)
+    assert all(unit["RestartPreventExitStatus"] == ["2 3"] for unit in units.values())
 
 
 def test_the_world_is_stopped_first_and_a_router_last(tmp_path: Path, step: Scenario) -> None:
@@ -373,9 +336,6 @@ def test_no_line_of_an_inventory_becomes_an_option(field: str, tmp_path: Path, s
         systemd(placed(tmp_path, HOSTS.replace("folder: /opt/zsim", f"{field}: /opt/zsim{'/' + 3999 * 'n'}")), step)
 
 
-# Compose
-
-
 def test_containers_may_write_records_and_nothing_else_and_end_as_roles_do(
     hosts: InventoryFile, step: Scenario
 ) -> None:
@@ -415,9 +375,6 @@ def test_what_containers_do_not_need_of_the_inventory_is_said(hosts: InventoryFi
     assert "not used" not in texts["one/compose.yaml"]
 
 
-# Kubernetes
-
-
 def test_pods_are_locked_and_end_as_roles_do(hosts: InventoryFile, step: Scenario) -> None:
     for one in pods(kubernetes(hosts, step)):
         (box,) = one["containers"]
@@ -452,15 +409,9 @@ def test_pods_have_their_own_certificate_read_only(hosts: InventoryFile, step: S
 
 def test_roles_are_jobs_and_routers_deployments(hosts: InventoryFile, step: Scenario) -> None:
     found = manifests(kubernetes(hosts, step))
-    jobs = {one["metadata"]["name"]: one["spec"] for one in found if one["kind"] == "Job"}
-    assert {name: spec["backoffLimit"] for name, spec in jobs.items()} == {
-        "world": 0,
-        "recorder": 5,
-        "estimator-drone1": 5,
-        "estimator-drone2": 5,
-        "estimator-drone3": 5,
-        "controller-main": 5,
-    }
+    jobs = {one["metadata"]["name"]: one["spec"]["backoffLimit"] for one in found if one["kind"] == "Job"}
+    restarted = [name.replace(".", "-") for name in PLACES if name not in ("world", "router.yard")]
+    assert jobs == {"world": 0, **dict.fromkeys(restarted, 5)}
     assert [one["metadata"]["name"] for one in found if one["kind"] == "Deployment"] == ["router-yard"]
 
 
@@ -494,9 +445,6 @@ def test_a_scenario_beyond_a_config_map_is_refused(tmp_path: Path) -> None:
     text = HOSTS.replace('"controller.*": two, ', "")
     with refused(InventoryError, "scenario", "bytes", "ConfigMap", "1048576"):
         kubernetes(placed(tmp_path, text), large)
-
-
-# The command
 
 
 def call(folder: Path, target: str, *options: str) -> Any:
@@ -581,7 +529,10 @@ def test_a_file_of_somebody_s_is_not_overwritten_unless_forced(tmp_path: Path, c
     assert (out / "one/compose.yaml").read_text() == "a: 3"
 
 
-def test_a_list_that_leads_out_of_the_folder_removes_nothing(hosts: InventoryFile, tmp_path: Path) -> None:
+def test_nothing_is_written_or_removed_out_of_the_folder(hosts: InventoryFile, tmp_path: Path) -> None:
+    with refused(RunError, "../two/compose.yaml", "out"):
+        write(tmp_path / "out", "compose", {"one/compose.yaml": "", "../two/compose.yaml": ""})
+    assert [path.name for path in tmp_path.iterdir()] == ["hosts.yaml"]
     (tmp_path / "mine.txt").write_text("mine")
     call(tmp_path, "systemd")
     (record,) = [path for path in (tmp_path / "out").iterdir() if path.is_file()]
@@ -589,12 +540,6 @@ def test_a_list_that_leads_out_of_the_folder_removes_nothing(hosts: InventoryFil
     record.write_text(f"{record.read_text()}{digest}  ../mine.txt\n{digest}  {tmp_path / 'mine.txt'}\nnonsense\n")
     assert call(tmp_path, "systemd").exit_code == 0
     assert (tmp_path / "mine.txt").exists()
-
-
-def test_a_text_that_leads_out_of_the_folder_is_refused(tmp_path: Path) -> None:
-    with refused(RunError, "../two/compose.yaml", "out"):
-        write(tmp_path / "out", "compose", {"one/compose.yaml": "", "../two/compose.yaml": ""})
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_command_takes_the_options_of_a_run(hosts: InventoryFile, tmp_path: Path) -> None:
@@ -611,14 +556,13 @@ def test_the_command_takes_the_options_of_a_run(hosts: InventoryFile, tmp_path: 
     assert {one["containers"][0]["image"] for one in pods(texts)} == {"registry.example.org/zsim:7"}
 
 
-def test_a_rate_that_is_none_is_refused(hosts: InventoryFile, tmp_path: Path) -> None:
+def test_a_rate_that_is_none_and_a_folder_that_cannot_be_written_are_lines(
+    hosts: InventoryFile, tmp_path: Path
+) -> None:
     done = call(tmp_path, "systemd", "--rate", "0")
     assert done.exit_code == 2
     assert has_terms(done.output, ">", "0", "<=", "1000")
     assert not (tmp_path / "out").exists()
-
-
-def test_a_folder_that_cannot_be_written_is_a_line(hosts: InventoryFile, tmp_path: Path) -> None:
     (tmp_path / "out").write_text("a file")
     done = call(tmp_path, "compose")
     assert has_terms(str(done.exception), "written", os.strerror(errno.ENOTDIR), "--out", "another")

@@ -41,16 +41,11 @@ def is_safe(text: ast.expr) -> bool:
     return isinstance(text, ast.Constant) or (isinstance(text, ast.Call) and ast.unparse(text.func) in SAFE)
 
 
-def test_all_that_is_printed_has_no_codes() -> None:
-    printed = [(place, call) for place, call in calls() if ast.unparse(call.func) == "print" and call.args]
-    assert printed
-    assert [place for place, call in printed if not is_safe(call.args[0])] == []
-
-
-def test_all_that_rich_shows_has_no_codes() -> None:
-    texts = [(place, call) for place, call in calls() if ast.unparse(call.func) == "Text"]
-    assert texts
-    assert [place for place, call in texts if not is_safe(call.args[0])] == []
+@pytest.mark.parametrize("function", ["print", "Text"])
+def test_all_that_is_printed_or_that_rich_shows_has_no_codes(function: str) -> None:
+    found = [(place, call) for place, call in calls() if ast.unparse(call.func) == function and call.args]
+    assert found
+    assert [place for place, call in found if not is_safe(call.args[0])] == []
 
 
 def shown(renderable: Any) -> str:

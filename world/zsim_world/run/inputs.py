@@ -85,13 +85,13 @@ class Run:
     def enter(self, entry: "Entry") -> Any:
         """Apply an input, and note it in the journal; return the answer to a request.
 
-        What ends the run is not noted, unless that is its last gate: it continues from the journal. The world's own
-        messages are noted after the end as well, since they are numbered on.
+        What ends the run before its time, and what comes after that, is not noted: `zsim run --continue` takes such an
+        end back. After its last gate the world's own messages are noted as well, since they are numbered on.
         """
         answer = entry.apply(self)
-        kind, clock = type(entry), self._clock
-        is_last = kind is Advanced and clock.is_complete and self.world.failure is None
-        if clock.ended is None or is_last or kind is Published:
+        clock = self._clock
+        is_complete = clock.is_complete and self.world.failure is None
+        if clock.ended is None or (is_complete and isinstance(entry, Advanced | Published)):
             self._note(entry)
         return answer
 

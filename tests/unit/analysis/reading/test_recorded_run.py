@@ -95,14 +95,14 @@ def agents(reader: RecordReader, **info: Any) -> RecordedAgents:
 # Who is run again
 
 
-def test_our_agents_are_run_again_by_their_processes(write: Any):
-    found = agents(write(*reversed(OURS), join("recorder", ""), event("end", "world", truth_sha256="abc")))
-    assert found.processes == (
-        AgentProcess("estimator.d1", ("estimator.d1",)),
-        AgentProcess("estimator.d2", ("estimator.d2",)),
-        AgentProcess("controller.main", ("controller.main",)),
-    )
+def test_our_agents_are_run_again_by_their_processes_with_their_requests(write: Any):
+    key, end = keys.cluster_request("main"), event("end", "world", truth_sha256="abc")
+    asked = [(key, ClusterRequest(gate * GATE_NS, gate, "hold", {}, "operator.pilot", True)) for gate in range(3)]
+    found = agents(write(*reversed(OURS), join("recorder", ""), *asked, end))
+    names = ("estimator.d1", "estimator.d2", "controller.main")
+    assert found.processes == tuple(AgentProcess(name, (name,)) for name in names)
     assert (found.why_not, found.truth_sha256, found.fingerprints) == ("", "abc", {PRINT})
+    assert list(found.requests) == asked
 
 
 def test_who_served_others_does_so_again(write: Any):
@@ -145,26 +145,15 @@ def test_why_agents_are_not_run_again(write: Any, entries: RecordedEntry, terms:
     ],
 )
 def test_what_is_no_reason(write: Any, entries: RecordedEntry):
-    assert (
-        agents(write(*OURS, entries, event("end", "world", gate=9), event("leave", "estimator.d1", gate=9))).why_not
-        == ""
-    )
+    ends = (event("end", "world", gate=9), event("leave", "estimator.d1", gate=9))
+    assert agents(write(*OURS, entries, *ends)).why_not == ""
 
 
-def test_a_run_in_realtime_or_without_ours_has_a_reason(write: Any):
+def test_a_run_in_realtime_or_without_ours_or_with_a_planned_kill_has_a_reason(write: Any):
     assert "realtime" in agents(write(*OURS), mode="realtime").why_not
     assert has_terms(agents(write(join("matlab.main"))).why_not, "none", "zsim's")
-
-
-def test_a_kill_in_the_scenario_is_a_reason(write: Any):
     scenario = scenario_file.from_text(f"{TEXT}faults: [{{kind: process_kill, target: estimator.d1, at_s: 0.5}}]")
     assert has_terms(recorded_agents(write(*OURS), INFO, scenario).why_not, "process_kill", "planned")
-
-
-def test_requests_are_kept_in_their_order(write: Any):
-    key = keys.cluster_request("main")
-    asked = [(key, ClusterRequest(gate * GATE_NS, gate, "hold", {}, "operator.pilot", True)) for gate in range(3)]
-    assert list(agents(write(*OURS, *asked)).requests) == asked
 
 
 # What is fed
@@ -183,10 +172,7 @@ def test_inputs_count_before_the_clock_that_follows_them(write: Any):
     assert (first.t_ns, [m.key for m in first.inputs]) == (0, ["process/tester.one/join"])
     assert (second.t_ns, [m.key for m in second.inputs]) == (GATE_NS, [mode[0], keys.estimate("d1")])
     assert first.truth == {drone: messages.encode(truth(0, drone)[1]) for drone in ("d1", "d2")}
-
-
-def test_a_gate_without_its_clock_is_no_passage(write: Any):
-    assert list(gates(write(truth(0, "d1"), truth(0, "d2")), ["d1", "d2"])) == []
+    assert list(gates(write(truth(0, "d1"), truth(0, "d2")), ["d1", "d2"])) == []  # without its clock, no gate
 
 
 def test_pictures_are_no_inputs_and_what_detectors_saw_is(write: Any) -> None:
@@ -231,24 +217,9 @@ def record(path: Path, reports: list[list[tuple]] = REPORTS) -> Path:
 def test_a_link_is_judged_over_all_drivers_of_its_drone(tmp_path: Path):
     (link,) = driver_links(record(tmp_path / "run.mcap")).values()
     assert link == DriverLink(PEER, 1200.0, 2.0, 4.0, 6.0, lost=1, lost_s=1.0, refused=5)
-
-
-def test_what_is_not_known_is_left_out(tmp_path: Path):
-    path = record(tmp_path / "run.mcap", [[("waiting", None, None, None, 0)]])
-    assert driver_links(path) == {"drone3": DriverLink(PEER, None, None, None, None, 0, 0.0, 0)}
-    assert str(driver_links(path)["drone3"]).split(", ")[0] == PEER
-
-
-def test_a_report_has_the_link_of_an_external_drone_and_no_other(tmp_path: Path):
-    summary = judge(record(tmp_path / "run.mcap"))[-1]
-    assert list(summary.links) == ["drone3"]
-    assert [label for label, _ in facts(summary) if "drone" in label] == ["Link of drone3"]
-
-
-def test_a_run_without_external_drones_has_no_links(tmp_path: Path):
-    synthetic_record.write(tmp_path / "run.mcap", Flown(duration_s=1.0))
-    assert judge(tmp_path / "run.mcap")[-1].links == {}
-    assert driver_links(tmp_path / "run.mcap") == {}
+    unknown = driver_links(record(tmp_path / "unknown.mcap", [[("waiting", None, None, None, 0)]]))
+    assert unknown == {"drone3": DriverLink(PEER, None, None, None, None, 0, 0.0, 0)}
+    assert str(unknown["drone3"]).split(", ")[0] == PEER
 
 
 def test_a_run_with_a_link_is_compared_with_one_without(tmp_path: Path):
@@ -257,7 +228,11 @@ def test_a_run_with_a_link_is_compared_with_one_without(tmp_path: Path):
         directory.mkdir()
     synthetic_record.write(directories[0] / "run.mcap", Flown(duration_s=1.0))
     record(directories[1] / "run.mcap")
-    rows = fact_rows([ComparedRun(d.name, d, *judge(d / "run.mcap")) for d in directories])
+    runs = [ComparedRun(d.name, d, *judge(d / "run.mcap")) for d in directories]
+    assert [list(run.summary.links) for run in runs] == [[], ["drone3"]]
+    assert [label for label, _ in facts(runs[1].summary) if "drone" in label] == ["Link of drone3"]
+    assert driver_links(directories[0] / "run.mcap") == {}
+    rows = fact_rows(runs)
     (link,) = (row.cells for row in rows if row.name == "Link of drone3")
     assert link[0] == ABSENT
     assert PEER in link[1]

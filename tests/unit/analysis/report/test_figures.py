@@ -68,8 +68,7 @@ def colours(count: int) -> dict[str, str]:
 
 
 def estimates(count: int) -> dict[str, EstimateErrors]:
-    rng = np.random.default_rng(3)
-    size = (len(T_S), 4)
+    rng, size = np.random.default_rng(3), (len(T_S), 4)
     return {
         name: EstimateErrors(T_S, 0.1 * rng.standard_normal(size), np.full(size, 0.1), rng.chisquare(6, len(T_S)))
         for name in names(count)
@@ -77,16 +76,13 @@ def estimates(count: int) -> dict[str, EstimateErrors]:
 
 
 def responses(count: int) -> dict[str, VelocityResponse]:
-    rng = np.random.default_rng(4)
-    size = (len(T_S), 4)
+    rng, size = np.random.default_rng(4), (len(T_S), 4)
     return {name: VelocityResponse(T_S, np.zeros(size), rng.standard_normal(size)) for name in names(count)}
 
 
 def apart(count: int) -> Distances:
-    ones = np.ones((len(T_S), count))
-    if count == 3:
-        return Distances(T_S, (("drone1", "drone2"), ("drone1", "drone3"), ("drone2", "drone3")), 3 * ones, 3 * ones)
-    return Distances(T_S, (), np.zeros((len(T_S), 0)), 3 * ones)
+    pairs = (("drone1", "drone2"), ("drone1", "drone3"), ("drone2", "drone3")) if count == 3 else ()
+    return Distances(T_S, pairs, np.full((len(T_S), len(pairs)), 3.0), np.full((len(T_S), count), 3.0))
 
 
 def large(count: int) -> Formation:
@@ -104,12 +100,6 @@ def legend_of(figure: Figure) -> set[str]:
     texts = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
     assert len(set(texts)) == len(texts)
     return set(texts)
-
-
-def test_what_was_flown_lies_over_what_was_commanded() -> None:
-    for axes in draw_velocities(responses(3), colours(3), MARKS).axes:
-        order = {str(line.get_label()): line.get_zorder() for line in axes.lines}
-        assert order["flown"] > order["commanded"]
 
 
 @pytest.mark.parametrize("count", [30, 100])
@@ -149,6 +139,17 @@ def test_figures_of_drones_fit_a_page(count: int) -> None:
         assert sum(len(axes.lines) for axes in figure.axes) < 100
 
 
+def test_drones_are_drawn_in_their_colours_what_was_flown_over_what_was_commanded() -> None:
+    drawn = draw_velocities(responses(3), colours(3), MARKS)
+    assert [axes.lines[0].get_color() for axes in drawn.axes[:3]] == list(colours(3).values())
+    for axes in drawn.axes:
+        order = {str(line.get_label()): line.get_zorder() for line in axes.lines}
+        assert order["flown"] > order["commanded"]
+    pairs = draw_distances(apart(3), Separations(None, None, None), colours(3), MARKS).axes[0].lines
+    assert pairs[1].get_color() == colours(3)["drone1"]
+    assert pairs[1].get_gapcolor() == colours(3)["drone3"]  # type: ignore[attr-defined]
+
+
 def test_few_drones_have_a_column_each_with_band_and_nees() -> None:
     figure = draw_estimates(estimates(3), colours(3), WINDOW_S, MARKS)
     assert len(figure.axes) == 5 * 3
@@ -181,14 +182,6 @@ def test_the_time_axis_of_velocities_is_that_of_the_run_with_its_marks(count: in
         assert 20.0 <= high < 21.0
         along = [np.asarray(line.get_xdata()).tolist() for line in axes.lines]
         assert [each for each in along if len(each) == 2] == [[1.0, 1.0], [3.0, 3.0]]
-
-
-def test_a_drone_is_drawn_in_its_colour() -> None:
-    drawn = draw_velocities(responses(3), colours(3), MARKS)
-    assert [axes.lines[0].get_color() for axes in drawn.axes[:3]] == list(colours(3).values())
-    pairs = draw_distances(apart(3), Separations(None, None, None), colours(3), MARKS).axes[0].lines
-    assert pairs[1].get_color() == colours(3)["drone1"]
-    assert pairs[1].get_gapcolor() == colours(3)["drone3"]  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("count", [4, 30])
@@ -235,17 +228,13 @@ def test_a_large_formation_has_a_table_by_groups_first() -> None:
     assert few.rest is None
 
 
-def written(figure: Any) -> dict[str, bytes]:
-    return {form: figure.vector(form) for form in FORMATS}
-
-
 def test_vector_files_have_true_fonts_and_the_same_bytes_each_time() -> None:
-    def figure() -> ReportFigure:
+    def written() -> dict[str, bytes]:
         drawing = draw_distances(apart(3), Separations(2.0, 1.5, 0.52), colours(3), MARKS)
-        return ReportFigure("distances.png", "", "", drawing)
+        return {form: ReportFigure("distances.png", "", "", drawing).vector(form) for form in FORMATS}
 
-    files = written(figure())
-    assert files == written(figure())
+    files = written()
+    assert files == written()
     assert files["pdf"].startswith(b"%PDF")
     assert b"/Type3" not in files["pdf"]
     size = re.search(rb'<svg [^>]*width="([\d.]+)pt"', files["svg"])
@@ -367,7 +356,7 @@ def seconds(t_s: float) -> int:
     return round(t_s * 1e9)
 
 
-def test_a_take_over_of_all_drones_is_marked_once_from_acquisition_to_release() -> None:
+def test_a_take_over_of_all_drones_is_marked_once_from_acquisition_to_release_as_are_faults_that_overlap() -> None:
     """As a console does it: each drone is acquired, flown, and released again; the controller goes on."""
     done = [
         Event(seconds(t_s + 0.5 * i), i, "control", "eve", op, "done", {"args": {"drone": f"drone{i + 1}"}, "ok": True})
@@ -377,6 +366,9 @@ def test_a_take_over_of_all_drones_is_marked_once_from_acquisition_to_release() 
     refused = Event(seconds(9.0), 9, "control", "bob", "acquire", "no", {"args": {"drone": "drone1"}, "ok": False})
     assert spans(flight_of(*done, refused)) == [("taken over", 5.0, 8.0)]
     assert spans(flight_of(*done[:3])) == [("taken over", 5.0, 12.0)]
+    faults = [Event(seconds(t_s), i, "fault", "world", "drone1", "", {"id": i}) for i, t_s in enumerate((5.0, 6.0))]
+    ends = [Event(seconds(t_s), i, "fault_end", "world", "drone1", "", {"id": i}) for i, t_s in enumerate((7.0, 8.0))]
+    assert spans(flight_of(*faults, *ends)) == [("fault", 5.0, 8.0)]
 
 
 def test_a_killed_process_that_is_back_ends_its_fault() -> None:
@@ -389,18 +381,13 @@ def test_a_killed_process_that_is_back_ends_its_fault() -> None:
     assert spans(flight_of(kill, other)) == [("fault", 5.0, 12.0)]
     (axes,) = draw_parameters(formations_of(flight)[0], ["x_c"], time_marks(flight)).axes
     lines = [line for line in axes.lines if line.get_color() == COLOURS[FAULT]]
-    assert [float(np.asarray(line.get_xdata())[0]) for line in lines] == [
-        pytest.approx(5.01)
-    ]  # of .02 s nothing else is seen
+    (x,) = (float(np.asarray(line.get_xdata())[0]) for line in lines)
+    assert x == pytest.approx(5.01)  # of .02 s nothing else is seen
 
 
-def test_faults_that_overlap_are_one_band() -> None:
-    faults = [Event(seconds(t_s), i, "fault", "world", "drone1", "", {"id": i}) for i, t_s in enumerate((5.0, 6.0))]
-    ends = [Event(seconds(t_s), i, "fault_end", "world", "drone1", "", {"id": i}) for i, t_s in enumerate((7.0, 8.0))]
-    assert spans(flight_of(*faults, *ends)) == [("fault", 5.0, 8.0)]
-
-
-def test_every_band_has_its_entry_in_the_legend(flight: RecordedFlight, formation: Formation) -> None:
+def test_every_band_is_in_the_legend_truth_lies_over_estimates_and_panels_have_letters(
+    flight: RecordedFlight, formation: Formation
+) -> None:
     marks = time_marks(flight, formation)
     kinds = {band.kind for band in marks.bands}
     goal = goal_errors(formation, flight.scenario)
@@ -411,13 +398,7 @@ def test_every_band_has_its_entry_in_the_legend(flight: RecordedFlight, formatio
         (draw_parameters(formation, ["x_c", "y_c"], marks), {"true", "measured", "desired"}),
         (draw_drones(flight, marks), set[str]()),
     ):
-        named = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
-        assert kinds | more <= set(named)
-        assert len(set(named)) == len(named)
-
-
-def test_truth_lies_over_estimates_and_panels_have_letters(flight: RecordedFlight, formation: Formation) -> None:
-    marks = time_marks(flight, formation)
+        assert kinds | more <= legend_of(figure)
     errors, position = draw_errors(formation, (5.0, 11.0), marks), draw_parameters(formation, ["x_c", "y_c"], marks)
     for axes in (errors.axes[0], position.axes[0]):
         order = {str(line.get_label()).split()[0]: line.get_zorder() for line in axes.lines}

@@ -109,19 +109,13 @@ def test_a_run_that_is_fatal_to_every_worker_is_a_row() -> None:
     assert found == dict.fromkeys((0, 1, 3, 4))
 
 
-def test_workers_that_cannot_start_end_the_sweep() -> None:
+def test_workers_that_cannot_start_end_the_sweep_as_does_what_no_run_survives() -> None:
+    FakeWorker.stillborn = 2  # these are replaced
+    assert len(rows(5, [])) == 5
     FakeWorker.stillborn = 99
     with refused(RunError, "killed", "SIGKILL"):
         rows(5, [])
-
-
-def test_a_worker_that_did_not_start_once_is_replaced() -> None:
-    FakeWorker.stillborn = 2
-    assert len(rows(5, [])) == 5
-
-
-def test_what_no_run_survives_ends_the_sweep() -> None:
-    FakeWorker.answer = RuntimeError("no space left")
+    FakeWorker.stillborn, FakeWorker.answer = 0, RuntimeError("no space left")
     with refused(RunError, "no space left"):
         rows(5, [])
 

@@ -30,6 +30,8 @@ from zsim_analysis.sweep.sweep import (
 
 
 def test_a_journal_keeps_what_was_finished_and_drops_a_cut_line(tmp_path: Path) -> None:
+    with refused(RunError, "nowhere/journal.jsonl", os.strerror(errno.ENOENT)):
+        Journal(tmp_path / "nowhere/journal.jsonl")
     of, path = plan("seed", runs=5), tmp_path / "journal.jsonl"
     assert read_journal(path) == []
     with Journal(path) as book:
@@ -44,21 +46,9 @@ def test_a_journal_keeps_what_was_finished_and_drops_a_cut_line(tmp_path: Path) 
     assert read_journal(path) == [well(of, 0), well(of, 4)]
 
 
-def test_a_journal_that_cannot_be_written(tmp_path: Path) -> None:
-    with refused(RunError, "nowhere/journal.jsonl", os.strerror(errno.ENOENT)):
-        Journal(tmp_path / "nowhere/journal.jsonl")
-
-
 def test_the_table_has_a_typed_column_for_all_that_is_known(tmp_path: Path) -> None:
-    vary = (
-        "seed",
-        "duration_s=1,2.5",
-        "sensors.preset=paper,ardrone2",
-        "a=[1,2],[3]",
-        "b=uniform(0,1)",
-        "c=true,false",
-    )
-    of = plan(*vary, runs=32)
+    presets = "sensors.preset=paper,ardrone2"
+    of = plan("seed", "duration_s=1,2.5", presets, "a=[1,2],[3]", "b=uniform(0,1)", "c=true,false", runs=32)
     rows = [made(of, 0, failure="diverged"), *(well(of, run) for run in range(1, 32))]
     path = tmp_path / "sweep.parquet"
     write_table(path, reversed(rows), of, SweepDesign(of).axes)
@@ -72,14 +62,11 @@ def test_the_table_has_a_typed_column_for_all_that_is_known(tmp_path: Path) -> N
     assert found.column("a").to_pylist()[:4:2] == ["[1,2]", "[3]"]
     assert found.column("errors.x_c.true_rms").null_count == 1
     assert msgspec.json.decode(found.schema.metadata[PLAN_METADATA], type=SweepPlan) == of
-    again = read_table(path)
-    assert [{name: value for name, value in each.items() if value is not None} for each in again] == [
-        {name: value for name, value in each.items() if value is not None} for each in rows
-    ]
-
-
-def test_a_table_that_is_none(tmp_path: Path) -> None:
-    path = tmp_path / "sweep.parquet"
+    again, written = (
+        [{name: value for name, value in each.items() if value is not None} for each in table]
+        for table in (read_table(path), rows)
+    )
+    assert again == written
     path.write_bytes(b"PAR1")
     with pytest.raises(ReportError, match=r"sweep\.parquet: "):
         read_table(path)
@@ -102,10 +89,7 @@ def test_a_folder_goes_on_with_its_own_plan_and_refuses_any_other(tmp_path: Path
         assert folder.record(12) == out / "runs/000012"
     assert load(out).plan == longer
     for other in (of, plan("seed", runs=6, duration_s=3), plan(runs=6)):
-        with (
-            pytest.raises(RunError, match=r"sweep: .*--out"),
-            locked(out, other),
-        ):
+        with pytest.raises(RunError, match=r"sweep: .*--out"), locked(out, other):
             pass
     (tmp_path / "run").mkdir()
     (tmp_path / "run/run.mcap").touch()
@@ -136,14 +120,8 @@ def test_a_sweep_of_which_nothing_is_finished_claims_no_folder(tmp_path: Path) -
         book.append(well(folder.plan, 1))
     with pytest.raises(RunError, match=f"^{tmp_path}: .*--out"), locked(tmp_path, plan("seed", runs=4)):
         pass
-
-
-def test_a_plan_that_is_no_text_is_refused_in_a_line(tmp_path: Path) -> None:
-    with (
-        pytest.raises(RunError, match=r"plan\.json: .*'\\udcfc'"),
-        locked(tmp_path, plan("name=a\udcfc")),
-    ):
-        pass
+    with pytest.raises(RunError, match=r"plan\.json: .*'\\udcfc'"), locked(tmp_path / "b", plan("name=a\udcfc")):
+        pass  # a plan that is no text
 
 
 def test_a_crash_between_table_and_journal_doubles_nothing(tmp_path: Path) -> None:
@@ -167,14 +145,5 @@ def test_the_screen_tells_runs_per_hour_and_the_time_to_go() -> None:
     screen.finished(failed=False)
     screen.finished(failed=True)
     assert has_terms(screen.line(), "42 / 100", "200 runs/h", "17 min 24 s", "1 failed")
-
-
-def test_times_in_words() -> None:
-    assert [span(s) for s in (0.4, 59, 61, 3599, 3600, 90_060)] == [
-        "0 s",
-        "59 s",
-        "1 min 01 s",
-        "59 min 59 s",
-        "1 h 00 min",
-        "25 h 01 min",
-    ]
+    times = {0.4: "0 s", 59: "59 s", 61: "1 min 01 s", 3599: "59 min 59 s", 3600: "1 h 00 min", 90_060: "25 h 01 min"}
+    assert {s: span(s) for s in times} == times

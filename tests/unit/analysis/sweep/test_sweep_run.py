@@ -5,7 +5,6 @@ import itertools
 import os
 import pickle
 import sys
-from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -114,11 +113,6 @@ def test_a_run_whose_plan_nobody_can_fly_is_a_row_with_the_factor_that_fits() ->
     assert row["as_planned"] is None
 
 
-def test_a_run_without_a_cluster_has_none_engaged() -> None:
-    row = fly(task())
-    assert (row["failure"], row["engaged"]) == (None, None)
-
-
 def test_only_what_is_within_the_window_is_engaged() -> None:
     no = np.zeros((4, 0))
     phases = ["assembling", "engaged", "engaged", "held"]
@@ -126,10 +120,6 @@ def test_only_what_is_within_the_window_is_engaged() -> None:
     assert engaged_s([of], (0.0, 9.0)) == {"a": 2.0}
     assert engaged_s([of], (2.5, 9.0)) == {"a": 3.0}
     assert engaged_s([of], (3.5, 9.0)) == {"a": None}
-
-
-def test_a_task_can_be_sent() -> None:
-    assert pickle.loads(pickle.dumps(task(PAIR))) == task(PAIR)
 
 
 def test_a_run_that_diverges_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,7 +131,7 @@ def test_a_run_that_diverges_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not [name for name in row if name.startswith("errors.")]
 
 
-def test_a_run_that_crashes_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_crashes_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     row = fly(task(ONE.replace("[]}", "[console.1]}")))
     assert has_terms(row["failure"], "world", "console.1", "processes.expect")
     assert (row["run"], row["seed"], row["truth_sha256"]) == (7, 3, None)
@@ -150,7 +140,9 @@ def test_a_run_that_crashes_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ZeroDivisionError("two\nlines")
 
     monkeypatch.setattr(Fleet, "advance", crash)
-    assert fly(task())["failure"] == "ZeroDivisionError: two lines"
+    sent = pickle.loads(pickle.dumps(task(record=tmp_path / "000007")))
+    assert fly(sent)["failure"] == "ZeroDivisionError: two lines"
+    assert [path.name for path in tmp_path.iterdir()] == ["000007"]  # the record is kept
 
 
 def test_a_full_disk_is_the_sweep_s_end_and_no_fault_of_the_run(
@@ -158,39 +150,26 @@ def test_a_full_disk_is_the_sweep_s_end_and_no_fault_of_the_run(
 ) -> None:
     """What was written of the record keeps the name under which the error speaks of it."""
 
-    def full(file: Any, data: bytes) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
+    calls, write = itertools.count(), record_writer.write_all
+
+    def full_after_two(file: Any, data: bytes) -> None:
+        if next(calls) >= 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(file, data)
 
     monkeypatch.setattr(record_writer, "CHUNK_BYTES", 1000)
-    monkeypatch.setattr(record_writer, "write_all", full_after(2, record_writer.write_all, full))
+    monkeypatch.setattr(record_writer, "write_all", full_after_two)
     part = tmp_path / "000007.part"
     with refused(RecordError, "000007.part/run.mcap", os.strerror(errno.ENOSPC)):
         fly(task(record=tmp_path / "000007"))
     assert [path.name for path in tmp_path.iterdir()] == [part.name]
     monkeypatch.undo()
-    assert fly(task(record=tmp_path / "000007"))["failure"] is None
+    row = fly(task(record=tmp_path / "000007"))
+    assert (row["failure"], row["engaged"]) == (None, None)  # without a cluster
     assert [path.name for path in tmp_path.iterdir()] == ["000007"]
-
-
-def full_after(count: int, write: Callable[..., None], full: Callable[..., None]) -> Callable[..., None]:
-    """Return what writes some times, and then finds the disk full."""
-    calls = itertools.count()
-    return lambda file, data: (write if next(calls) < count else full)(file, data)
-
-
-def test_a_folder_of_records_that_cannot_be_made_is_told_in_a_line(tmp_path: Path) -> None:
     (tmp_path / "runs").touch()
     with refused(RecordError, "runs/000007.part", os.strerror(errno.ENOTDIR)):
         fly(task(record=tmp_path / "runs/000007"))
-
-
-def test_the_record_of_a_run_that_crashes_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def crash(fleet: Fleet) -> None:
-        raise ZeroDivisionError("a bug")
-
-    monkeypatch.setattr(Fleet, "advance", crash)
-    assert fly(task(record=tmp_path / "000007"))["failure"] == "ZeroDivisionError: a bug"
-    assert [path.name for path in tmp_path.iterdir()] == ["000007"]
 
 
 SOURCE = """
@@ -321,9 +300,6 @@ def test_a_function_that_is_not_there_is_refused_before_anything_flies(beside: P
     document, _ = read_document(beside / "one.yaml", [f"report.metrics={function}"])
     with refused(ScenarioError, "report.metrics", f"'{function}'"):
         make_plan("one.yaml", document, ["seed"], 2)
-
-
-def test_a_plan_with_a_function_resolves(beside: Path) -> None:
-    function = "sweep_figures_of_mine:several"
-    document, _ = read_document(beside / "one.yaml", [f"report.metrics={function}"])
-    assert SweepDesign(make_plan("one.yaml", document, ["seed"], 2)).scenario(1).report.metrics == function
+    own = "sweep_figures_of_mine:several"
+    document, _ = read_document(beside / "one.yaml", [f"report.metrics={own}"])
+    assert SweepDesign(make_plan("one.yaml", document, ["seed"], 2)).scenario(1).report.metrics == own

@@ -35,15 +35,13 @@ def drones(x_m: float = 0.0) -> DronePoses:
     return DronePoses(0, ("drone1", "drone2"), p_W, np.tile(LEVEL, (2, 1)), np.zeros((2, 4)), np.zeros(3))
 
 
-def test_a_front_camera_looks_where_its_drone_looks():
+def test_cameras_look_where_their_drone_does():
     north = frames.quaternion_from_heading(np.array(math.pi / 2))
     p_WK, q_WK = frustum_pose(FRONT, np.array([1.0, 2.0, 3.0]), north)
     assert p_WK == pytest.approx((1.0 - 0.0, 2.162, 3.012))
     assert frames.rotate(q_WK, AHEAD_K) == pytest.approx((0.0, 1.0, 0.0), abs=1e-9)
     assert frames.rotate(q_WK, DOWN_K) == pytest.approx((0.0, 0.0, -1.0), abs=1e-9)
 
-
-def test_a_bottom_camera_looks_down_with_ahead_at_the_top_of_its_picture():
     p_WK, q_WK = frustum_pose(BOTTOM, np.array([0.0, 0.0, 3.0]), LEVEL)
     assert p_WK == pytest.approx((0.0, 0.0, 2.97))
     assert frames.rotate(q_WK, AHEAD_K) == pytest.approx((0.0, 0.0, -1.0), abs=1e-9)
@@ -146,13 +144,10 @@ def test_a_page_shows_the_frustum_that_was_clicked_on_it_and_the_others_do_not(
     assert node._image_data == b"JPEG 2"
 
 
-def test_a_frustum_that_is_in_view_leaves_its_page_s_camera_alone(frustums: CameraFrustums, pages: list[Page]):
-    frustums.choose(pages[0].key, "drone1/front")
-    frustums.draw(drones(1.0), shown)
-    assert pages[0].camera.position.tolist() == [0.0, -6.0, 2.0]
-
-
 def test_a_frustum_that_appears_out_of_view_is_brought_into_it_once(frustums: CameraFrustums, pages: list[Page]):
+    frustums.choose(pages[1].key, "drone1/front")
+    frustums.draw(drones(1.0), shown)
+    assert pages[1].camera.position.tolist() == [0.0, -6.0, 2.0]
     frustums.choose(pages[0].key, "drone1/front")
     frustums.draw(drones(50.0), shown)
     camera = pages[0].camera
@@ -163,20 +158,18 @@ def test_a_frustum_that_appears_out_of_view_is_brought_into_it_once(frustums: Ca
     assert camera.look_at[0] == pytest.approx(50.162)
 
 
-def test_another_click_hides_it(frustums: CameraFrustums, pages: list[Page]):
-    frustums.choose(pages[0].key, "drone1/front")
-    frustums.draw(drones(), shown)
-    frustums.choose(pages[0].key, "")
-    frustums.draw(drones(), shown)
-    assert pages[0].nodes == []
-
-
-def test_another_camera_takes_its_place(frustums: CameraFrustums, pages: list[Page]):
+def test_another_camera_takes_its_place_and_another_click_hides_it(frustums: CameraFrustums, pages: list[Page]):
     for camera in ("drone1/front", "drone1/bottom"):
         frustums.choose(pages[0].key, camera)
         frustums.draw(drones(), shown)
     (node,) = pages[0].nodes
     assert node.aspect == pytest.approx(4 / 3)
+
+    frustums.choose(pages[0].key, "drone1/front")
+    frustums.draw(drones(), shown)
+    frustums.choose(pages[0].key, "")
+    frustums.draw(drones(), shown)
+    assert pages[0].nodes == []
 
 
 @pytest.mark.parametrize("camera", ["drone2/front", "elsewhere", "drone9/front"])
@@ -195,7 +188,12 @@ def test_nobody_chooses_for_a_page_without_its_key(frustums: CameraFrustums, pag
     assert pages[0].key != pages[1].key
 
 
-def test_a_page_that_has_gone_is_forgotten(frustums: CameraFrustums, pages: list[Page], server: Server):
+def test_a_page_or_run_that_has_gone_leaves_no_frustum(frustums: CameraFrustums, pages: list[Page], server: Server):
+    frustums.choose(pages[1].key, "drone1/front")
+    frustums.draw(drones(), shown)
+    frustums.clear()
+    assert pages[1].nodes == []
+
     frustums.choose(pages[0].key, "drone1/front")
     server.goes(pages[0])
     frustums.draw(drones(), shown)
@@ -205,20 +203,11 @@ def test_a_page_that_has_gone_is_forgotten(frustums: CameraFrustums, pages: list
     assert pages[0].nodes == []
 
 
-def test_a_run_that_is_over_leaves_none(frustums: CameraFrustums, pages: list[Page]):
-    frustums.choose(pages[1].key, "drone1/front")
-    frustums.draw(drones(), shown)
-    frustums.clear()
-    assert pages[1].nodes == []
-
-
-def test_a_click_in_a_scene_is_for_its_page_and_told_once(frustums: CameraFrustums, pages: list[Page]):
+def test_clicks_are_for_their_page_and_told_once(frustums: CameraFrustums, pages: list[Page], server: Server):
     frustums.click(2, "drone1")
     assert frustums.take_click(pages[0].key) == ""
     assert [frustums.take_click(pages[1].key) for _ in range(2)] == ["drone1", ""]
 
-
-def test_a_click_on_a_page_that_has_gone_is_forgotten(frustums: CameraFrustums, pages: list[Page], server: Server):
     frustums.click(1, "drone1")
     server.goes(pages[0])
     frustums.click(1, "drone1")
@@ -242,11 +231,8 @@ def test_a_click_is_on_the_drone_that_its_ray_hits(direction: tuple[float, ...],
     names = ("near", "behind", "far", "distant", "gone")
     poses = DronePoses(0, names, p_W, np.tile(LEVEL, (5, 1)), np.zeros((5, 4)), np.zeros(3))
     assert drone_on_ray(poses, np.full(5, 0.3), (0.0, 0.0, 10.0), direction) == drone
-
-
-def test_without_drones_a_click_is_on_none():
-    poses = DronePoses(0, ("gone",), np.full((1, 3), math.nan), LEVEL[None], np.zeros((1, 4)), np.zeros(3))
-    assert drone_on_ray(poses, np.ones(1), (0.0, 0.0, 10.0), (0.0, 0.0, -1.0)) is None
+    nobody = poses._replace(p_W=np.full((5, 3), math.nan))
+    assert drone_on_ray(nobody, np.ones(5), (0.0, 0.0, 10.0), direction) is None
 
 
 UP_W = np.array([0.0, 0.0, 1.0])
@@ -299,14 +285,20 @@ class Pages:
         self.calls["go"](page)
 
 
+@pytest.fixture
+def followed() -> Pages:
+    return Pages()
+
+
 @pytest.mark.parametrize("aspect", [0.5, 1.0, 2.2])
 @pytest.mark.parametrize("direction", ["reset", "top", "side"])
 @pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
-def test_a_formation_is_in_view_whatever_its_size_and_the_page_s(aspect: float, direction: str, scale: float):
-    pages = Pages()
-    page = pages.come(FollowingPage(1, aspect))
-    pages.follow.choose(1, follows=True, fits=True, direction=direction)
-    pages.follow.follow(scale * TRIANGLE)
+def test_a_formation_is_in_view_whatever_its_size_and_the_page_s(
+    aspect: float, direction: str, scale: float, followed: Pages
+):
+    page = followed.come(FollowingPage(1, aspect))
+    followed.follow.choose(1, follows=True, fits=True, direction=direction)
+    followed.follow.follow(scale * TRIANGLE)
     assert page.shows(scale * TRIANGLE)
     assert page.distance_m >= DISTANCE_MIN_M
 
@@ -316,86 +308,75 @@ def test_a_hidden_page_has_a_camera_all_the_same():
     assert math.isfinite(distance_m)
 
 
-def test_cameras_follow_from_the_start_and_go_back_where_a_formation_grows():
-    pages = Pages()
-    page = pages.come(FollowingPage(1))
+def test_cameras_follow_and_keep_their_direction(followed: Pages):
+    page = followed.come(FollowingPage(1))
     for t in range(60):
         flown = (1.0 + t / 10) * TRIANGLE + np.array((t, -t, 0.0))
-        pages.follow.follow(flown)
+        followed.follow.follow(flown)
         assert page.shows(flown)
     before_m = page.distance_m
-    pages.follow.follow(TRIANGLE)
+    followed.follow.follow(TRIANGLE)
     assert page.distance_m < before_m
 
 
-def test_a_camera_keeps_the_direction_that_its_page_gave_it():
-    pages = Pages()
-    page = pages.come(FollowingPage(1))
-    pages.follow.follow(TRIANGLE)
+def test_a_camera_keeps_the_direction_that_its_page_gave_it(followed: Pages):
+    page = followed.come(FollowingPage(1))
+    followed.follow.follow(TRIANGLE)
     page.camera.position = page.camera.look_at + np.array((0.0, page.distance_m, 0.0))
-    pages.follow.follow(TRIANGLE + np.array((40.0, 0.0, 0.0)))
+    followed.follow.follow(TRIANGLE + np.array((40.0, 0.0, 0.0)))
     back = (page.camera.position - page.camera.look_at) / page.distance_m
     assert back == pytest.approx((0.0, 1.0, 0.0), abs=1e-9)
     assert page.camera.look_at[0] == pytest.approx(40.0)
 
 
-def test_a_formation_that_hovers_moves_no_camera():
-    pages = Pages()
-    page = pages.come(FollowingPage(1))
-    pages.follow.follow(TRIANGLE)
+def test_a_formation_that_hovers_moves_no_camera(followed: Pages):
+    page = followed.come(FollowingPage(1))
+    followed.follow.follow(TRIANGLE)
     before = page.camera.position.copy()
-    pages.follow.follow(TRIANGLE + np.array((0.1, 0.0, 0.05)))
+    followed.follow.follow(TRIANGLE + np.array((0.1, 0.0, 0.05)))
     assert page.camera.position.tolist() == before.tolist()
 
 
-def test_who_zooms_keeps_the_distance_and_who_does_not_follow_the_place():
-    pages = Pages()
-    zoomed, still = pages.come(FollowingPage(1)), pages.come(FollowingPage(2))
-    pages.follow.follow(TRIANGLE)
+def test_who_zooms_keeps_the_distance_and_who_does_not_follow_the_place(followed: Pages):
+    zoomed, still = followed.come(FollowingPage(1)), followed.come(FollowingPage(2))
+    followed.follow.follow(TRIANGLE)
     zoomed.camera.position = zoomed.camera.look_at + np.array((0.0, -2.0, 0.0))
-    pages.follow.choose(1, follows=True, fits=False)
-    pages.follow.choose(2, follows=False, fits=True)
+    followed.follow.choose(1, follows=True, fits=False)
+    followed.follow.choose(2, follows=False, fits=True)
     place = still.camera.look_at.tolist()
-    pages.follow.follow(TRIANGLE + np.array((40.0, 0.0, 0.0)))
+    followed.follow.follow(TRIANGLE + np.array((40.0, 0.0, 0.0)))
     assert zoomed.distance_m == pytest.approx(2.0)
     assert zoomed.camera.look_at[0] == pytest.approx(40.0)
     assert still.camera.look_at.tolist() == place
-    pages.follow.restart()  # another run: everybody looks there
-    pages.follow.follow(TRIANGLE + np.array((80.0, 0.0, 0.0)))
+    followed.follow.restart()  # another run: everybody looks there
+    followed.follow.follow(TRIANGLE + np.array((80.0, 0.0, 0.0)))
     assert still.camera.look_at[0] == pytest.approx(80.0)
 
 
-def test_who_follows_again_after_a_zoom_has_all_in_view_from_the_fitting_distance():
-    pages = Pages()
-    page = pages.come(FollowingPage(1))
-    pages.follow.follow(TRIANGLE)
+def test_who_follows_again_after_a_zoom_has_all_in_view_from_the_fitting_distance(followed: Pages):
+    page = followed.come(FollowingPage(1))
+    followed.follow.follow(TRIANGLE)
     fitting_m = page.distance_m
     page.camera.position = page.camera.look_at + 1.3 * (page.camera.position - page.camera.look_at)
-    pages.follow.choose(1, follows=True, fits=False)
-    pages.follow.follow(TRIANGLE)
+    followed.follow.choose(1, follows=True, fits=False)
+    followed.follow.follow(TRIANGLE)
     assert page.distance_m == pytest.approx(1.3 * fitting_m)
-    pages.follow.choose(1, follows=True, fits=True)
-    pages.follow.follow(TRIANGLE)
+    followed.follow.choose(1, follows=True, fits=True)
+    followed.follow.follow(TRIANGLE)
     assert page.distance_m == pytest.approx(fitting_m)
 
 
-def test_a_page_that_went_before_it_was_known_is_forgotten():
-    pages = Pages()
-    gone = FollowingPage(1)
-    pages.go(gone)
-    pages.calls["come"](gone)
-    before = gone.camera.position.tolist()
-    pages.follow.choose(1, follows=True, fits=True, direction="top")
-    pages.follow.follow(TRIANGLE)
-    assert gone.camera.position.tolist() == before
-
-
-def test_without_drones_no_camera_moves():
-    pages = Pages()
-    page = pages.come(FollowingPage(1))
-    before = page.camera.position.tolist()
-    pages.follow.follow(np.zeros((0, 3)))
-    assert page.camera.position.tolist() == before
+def test_nothing_moves_a_camera_without_drones_or_of_a_page_that_went_before_it_was_known(followed: Pages):
+    there, gone = followed.come(FollowingPage(2)), FollowingPage(1)
+    before = there.camera.position.tolist()
+    followed.follow.follow(np.zeros((0, 3)))
+    followed.go(gone)
+    followed.calls["come"](gone)
+    before_gone = gone.camera.position.tolist()
+    followed.follow.choose(1, follows=True, fits=True, direction="top")
+    assert there.camera.position.tolist() == before
+    followed.follow.follow(TRIANGLE)
+    assert gone.camera.position.tolist() == before_gone
 
 
 NORTHWARDS = CameraView(np.zeros(3), np.array([0.0, 2.0, 0.0]), np.array([0.0, 0.0, 1.0]), math.radians(90), 1.5)

@@ -1,5 +1,6 @@
 """`zsim fault`: what a person types becomes a request, or a line."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +16,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.faults import COMMON, KINDS, OPTION_OF
 from zsim.transport.session import Session
 from zsim_deploy.cli import federation_commands
-from zsim_deploy.cli.federation_commands import row, seconds, selector
+from zsim_deploy.cli.federation_commands import duration, row, selector
 
 EXAMPLES = Path(__file__).parents[4] / "examples"
 
@@ -30,44 +31,47 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    ("text", "value"), [("10s", 10.0), ("500ms", 0.5), ("2min", 120.0), ("3", 3.0), ("1.5 s", 1.5), (None, None)]
-)
-def test_durations(text: str | None, value: float | None):
-    assert seconds(text) == value
+@pytest.mark.parametrize("text", ["10s", "500ms", "2min", "3", "1.5 s", None])
+def test_durations(text: str | None):
+    assert duration(text) == text
 
 
 @pytest.mark.parametrize("text", ["", "s", "-1s", "10h", "1e3s", "nan"])
 def test_what_is_no_duration(text: str):
     with refused(typer.BadParameter, "10s", "500ms", "2min"):
-        seconds(text)
+        duration(text)
 
 
-@pytest.mark.parametrize("name", sorted({each.name for kind in KINDS.values() for each in kind.parameters}))
-def test_every_parameter_of_every_kind_can_be_typed(name: str):
-    assert federation_commands._values([f"{name}=1"]) == {name: 1}
+def added(monkeypatch: pytest.MonkeyPatch, parameters: list[str], **times: str) -> dict[str, Any]:
+    """Return what `zsim fault add` asks of the world."""
+    asked: list[dict[str, Any]] = []
+
+    def request(link: object, op: str, args: dict[str, Any]) -> dict[str, Any]:
+        asked.append(args)
+        return {"id": 1, "from_ns": 0, "until_ns": None}
+
+    monkeypatch.setattr(federation_commands, "connected", lambda _: nullcontext((None, None)))
+    monkeypatch.setattr(federation_commands, "_ask", request)
+    federation_commands.add(target="drone2", kind="gps_dropout", parameters=parameters, **times)
+    return asked[0]
 
 
-def test_parameters():
-    given = ["factor=3", "value_m=[2, 0, -1]", "place={controller.main: d1}", "rotor=all", "one_way=true"]
-    assert federation_commands._values(given) == {
-        "factor": 3,
-        "value_m": [2, 0, -1],
-        "place": {"controller.main": "d1"},
-        "rotor": "all",
-        "one_way": True,
-    }
-
-
-@pytest.mark.parametrize("text", ["factor", "=3", "a b=3", "value=[1"])
-def test_what_is_no_parameter(text: str):
-    with pytest.raises(typer.BadParameter):
-        federation_commands._values([text])
+def test_what_is_typed_is_asked_of_the_world(monkeypatch: pytest.MonkeyPatch):
+    typed = ["factor=3", "value_m=[2, 0, -1]", "place={controller.main: d1}", "rotor=all", "one_way=true"]
+    values = {"factor": 3, "value_m": [2, 0, -1], "place": {"controller.main": "d1"}, "rotor": "all", "one_way": True}
+    fault = {"kind": "gps_dropout", "target": "drone2"}
+    assert added(monkeypatch, typed, for_="500ms") == {**fault, "for_s": 0.5, "at_s": None, **values}
+    for name in {each.name for kind in KINDS.values() for each in kind.parameters}:
+        assert added(monkeypatch, [f"{name}=1"], at="2min") == {**fault, "for_s": None, "at_s": 120.0, name: 1}
 
 
 @pytest.mark.parametrize(
     ("given", "terms"),
     [
+        (["factor"], ()),
+        (["=3"], ()),
+        (["a b=3"], ()),
+        (["value=[1"], ()),
         (["target=drone2"], ("target", "TARGET")),
         (["kind=gps_stuck"], ("kind", "KIND")),
         (["for_s=2"], ("for_s", "--for")),
@@ -75,9 +79,11 @@ def test_what_is_no_parameter(text: str):
         (["factor=2", "factor=3"], ("factor", "twice", "once")),
     ],
 )
-def test_what_is_given_elsewhere_or_twice_is_no_parameter(given: list[str], terms: tuple[str, ...]):
+def test_what_is_no_parameter_given_elsewhere_or_twice_is_refused(
+    monkeypatch: pytest.MonkeyPatch, given: list[str], terms: tuple[str, ...]
+):
     with refused(typer.BadParameter, *terms):
-        federation_commands._values(given)
+        added(monkeypatch, given)
     assert set(OPTION_OF) == set(COMMON)
 
 
@@ -110,12 +116,6 @@ def test_a_row_says_when_and_what():
     assert row(fault, 0)[1].strip() == "planned"
 
 
-def test_every_kind_is_listed(capsys: pytest.CaptureFixture[str]):
-    federation_commands.kinds()
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == list(KINDS)
-
-
 @pytest.mark.parametrize("columns", [80, 120])
 def test_the_list_of_kinds_fits_a_terminal(
     columns: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -123,6 +123,7 @@ def test_the_list_of_kinds_fits_a_terminal(
     monkeypatch.setenv("COLUMNS", str(columns))
     federation_commands.kinds()
     text = capsys.readouterr().out
+    assert list(dict.fromkeys(line.split()[0] for line in text.splitlines() if line[0] != " ")) == list(KINDS)
     assert max(map(len, text.splitlines())) <= columns
     named = {f"{parameter.name}:" for kind in KINDS.values() for parameter in kind.parameters}
     assert named <= set(text.split())  # none is broken

@@ -59,18 +59,16 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
 def test_an_unknown_role_is_refused_with_those_that_there_are() -> None:
     with refused(RunError, "role", "'nobody'", "world", "recorder", "estimator.d1"):
         logs("nobody", federation="zsim")
+    with refused(RunError, "role", "'controller.*'", "world", "recorder", "estimator.d1"):
+        ps(["controller.*"], federation="zsim")
 
 
-@pytest.mark.usefixtures("run")
-def test_who_has_said_nothing_is_no_fault(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_was_said_is_printed_and_silence_is_no_fault(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     logs("estimator.d1", federation="zsim")
     logs("world", federation="zsim")
     silent, world = capsys.readouterr().err.splitlines()
     assert silent.startswith("estimator.d1 ")
     assert has_terms(world, "zsim up", "record")
-
-
-def test_what_was_said_is_printed(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     run.write("drone ä\n")
     logs("estimator.d1", federation="zsim")
     assert capsys.readouterr().out == "drone ä\n"
@@ -99,9 +97,3 @@ def test_processes_are_chosen_by_patterns(
     ps(only=patterns, federation="zsim", as_json=True)
     for printed in capsys.readouterr().out.splitlines():
         assert [entry["role"] for entry in json.loads(printed)["rows"]] == shown
-
-
-@pytest.mark.usefixtures("run")
-def test_a_pattern_that_fits_no_process_is_refused() -> None:
-    with refused(RunError, "role", "'controller.*'", "world", "recorder", "estimator.d1"):
-        ps(["controller.*"], federation="zsim")

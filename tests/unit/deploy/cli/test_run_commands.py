@@ -35,23 +35,18 @@ def raising(error: BaseException) -> Any:
     return report
 
 
-def test_ctrl_c_before_there_is_a_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    with pytest.raises(SystemExit, match="130"):
-        run_commands.conclude(INTERRUPTED, tmp_path, True)
-    assert capsys.readouterr().err == f"ended: {INTERRUPTED.reason}\n"
-
-
-def test_ctrl_c_in_flight(recorded: Path, capsys: pytest.CaptureFixture[str]):
-    with pytest.raises(SystemExit, match="130"):
-        run_commands.conclude(INTERRUPTED, recorded, True)
-    assert has_terms(capsys.readouterr().err, "record", str(recorded / "run.mcap"))
-
-
-def test_ctrl_c_in_the_report(recorded: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("where", ["before", "flight", "report"])
+def test_ctrl_c(recorded: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, where: str):
+    record = recorded / "run.mcap"
+    record.unlink() if where == "before" else None
     monkeypatch.setattr(run_commands, "_report", raising(KeyboardInterrupt()))
     with pytest.raises(SystemExit, match="130"):
-        run_commands.conclude(Outcome("over"), recorded, True)
-    assert has_terms(capsys.readouterr().err, "interrupted", "record", f"zsim report {recorded}")
+        run_commands.conclude(Outcome("over") if where == "report" else INTERRUPTED, recorded, True)
+    err = capsys.readouterr().err
+    if where == "before":
+        assert err == f"ended: {INTERRUPTED.reason}\n"
+    else:
+        assert has_terms(err, "record", f"zsim report {recorded}")
 
 
 def test_a_failed_run_of_which_nothing_can_be_reported(
@@ -65,9 +60,6 @@ def test_a_failed_run_of_which_nothing_can_be_reported(
     assert (str(NO_MESSAGE) in lines, lines[-1]) == (True, f"ended: {DIED.reason}")
     with pytest.raises(RecordError):
         run_commands.conclude(Outcome("ended"), recorded, True)
-
-
-# What a record lacks
 
 
 def write(path: Path, missing: range = range(0), gates: int = 50, end: bool = True) -> Path:
@@ -119,7 +111,11 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_summary_page_terminal_and_exit_code_agree(tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str):
     options, terms = CASES[case]
-    shown = judged(write(tmp_path, **options), capsys)
+    without = judged(write(tmp_path, **options), capsys, report=False)
+    assert without.code == (case != "whole")
+    assert has_terms(without.out, "record", *terms)
+    assert case == "whole" or has_terms(without.err.splitlines()[-1], *terms)
+    shown = judged(tmp_path, capsys)
     assert has_terms(shown.summary["state"], *terms)
     assert (shown.summary["complete"], shown.code) == ((True, 0) if case == "whole" else (False, 1))
     assert shown.summary["state"] in shown.page
@@ -132,28 +128,12 @@ def test_summary_page_terminal_and_exit_code_agree(tmp_path: Path, capsys: pytes
         assert shown.summary["gaps"] == [{"gates": 4, "from_s": 0.4, "to_s": 0.46}]
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_without_a_report_the_same_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str):
-    options, terms = CASES[case]
-    shown = judged(write(tmp_path, **options), capsys, report=False)
-    assert shown.code == (case != "whole")
-    assert has_terms(shown.out, "record", *terms)
-    assert case == "whole" or has_terms(shown.err.splitlines()[-1], *terms)
-
-
-@pytest.mark.parametrize("outcome", [Outcome("over"), DIED])
-def test_every_run_says_why_it_ended_and_where_its_record_is(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], outcome: Outcome
-):
-    shown = judged(write(tmp_path), capsys, outcome, report=False)
-    assert has_terms(shown.out, "ended", outcome.reason, "record", str(tmp_path / "run.mcap"))
-
-
 @pytest.mark.parametrize("report", [True, False])
 def test_the_last_line_is_why_a_run_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str], report: bool):
     (tmp_path / "logs").mkdir()
     shown = judged(write(tmp_path, end=False), capsys, DIED, report)
     assert shown.code == 1
+    assert has_terms(shown.out, "ended", DIED.reason, "record", str(tmp_path / "run.mcap"))
     assert has_terms(shown.err.splitlines()[-1], DIED.reason)
 
 
@@ -174,9 +154,6 @@ def test_a_rerun_and_a_sweep_that_fail_end_with_why(
         run_commands._conclude(tmp_path, ["too heavy", "too heavy"], 2, report=False)
     assert ended.value.exit_code == 1
     assert has_terms(capsys.readouterr().err.splitlines()[-1], "2", "too heavy")
-
-
-# Formats of figures
 
 
 @pytest.fixture

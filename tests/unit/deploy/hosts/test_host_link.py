@@ -3,6 +3,7 @@
 import asyncio
 import errno
 import os
+import shutil
 import subprocess
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
@@ -11,11 +12,11 @@ from typing import Any
 
 import asyncssh
 import pytest
+from local_host import LocalHost
 from refused import has_terms, refused
 
 from zsim.errors import HostsError
 from zsim_deploy.hosts import host_link
-from zsim_deploy.hosts import host_link as module
 from zsim_deploy.hosts.host_link import CHANNELS, EventLoopThread, HostLink, HostLinks, fetch
 from zsim_deploy.inventory import Host, Inventory, InventoryFile
 
@@ -45,25 +46,17 @@ def link() -> HostLink:
     return HostLink("h1", Host(address="127.0.0.1"), Path())
 
 
-def test_more_channels_than_sshd_allows_are_spread_over_connections(connections: list[Any]) -> None:
+def test_more_channels_than_sshd_allows_are_spread_over_connections_and_given_back(connections: list[Any]) -> None:
     async def lend(count: int) -> list[Any]:
+        host = link()
+        for _ in range(3 * CHANNELS):  # one after the other
+            async with host.channel():
+                pass
         async with AsyncExitStack() as stack:
-            host = link()
             return [await stack.enter_async_context(host.channel()) for _ in range(count)]
 
     used = asyncio.run(lend(2 * CHANNELS + 1))
     assert [used.count(connection) for connection in connections] == [CHANNELS, CHANNELS, 1]
-
-
-def test_a_channel_that_was_given_back_is_used_again(connections: list[Any]) -> None:
-    async def lend() -> None:
-        host = link()
-        for _ in range(3 * CHANNELS):
-            async with host.channel():
-                pass
-
-    asyncio.run(lend())
-    assert len(connections) == 1
 
 
 def test_a_connection_that_is_lost_is_made_anew(connections: list[Any]) -> None:
@@ -77,26 +70,8 @@ def test_a_connection_that_is_lost_is_made_anew(connections: list[Any]) -> None:
     assert not asyncio.run(lose())
 
 
-class Local(HostLink):
-    """A host that is this machine, and takes so many bytes only."""
-
-    takes: int | None = None
-
-    async def run(self, command: str, given: bytes = b"", *_: Any, what: str = "", **__: Any) -> bytes:
-        done = subprocess.run(["sh", "-c", command], input=given[: self.takes], capture_output=True, check=False)
-        if done.returncode:
-            raise HostsError(f"{what}: {done.stderr.decode()}")
-        return done.stdout
-
-
-def local(takes: int | None = None) -> Local:
-    made = Local("h1", Host(address="127.0.0.1"), Path())
-    made.takes = takes
-    return made
-
-
 def test_files_come_below_a_folder_and_are_their_owners_alone(tmp_path: Path) -> None:
-    asyncio.run(local().put_files(str(tmp_path / "a run"), FILES))
+    asyncio.run(LocalHost().put_files(str(tmp_path / "a run"), FILES))
     found = {str(path.relative_to(tmp_path / "a run")): path for path in (tmp_path / "a run").rglob("*.*")}
     assert {name: path.read_bytes() for name, path in found.items() if path.is_file()} == FILES
     assert all(path.stat().st_mode & 0o077 == 0 for path in (tmp_path / "a run").rglob("*"))
@@ -105,22 +80,15 @@ def test_files_come_below_a_folder_and_are_their_owners_alone(tmp_path: Path) ->
 @pytest.mark.parametrize("takes", [0, 600, 20_000])
 def test_of_files_that_come_in_part_none_is_seen(tmp_path: Path, takes: int) -> None:
     with refused(HostsError, "writing", "in part"):
-        asyncio.run(local(takes).put_files(str(tmp_path / "run"), FILES))
+        asyncio.run(LocalHost(takes).put_files(str(tmp_path / "run"), FILES))
     assert [path.name for path in tmp_path.rglob("*")] == ["run"]
 
 
-class Progress(HostLink):
-    """A host that does nothing; it keeps the commands that it is given, each with its input."""
-
-    async def run(self, command: str, given: bytes = b"", *_: Any, **__: Any) -> bytes:
-        self.commands = [*getattr(self, "commands", []), (command, given)]
-        return b""
-
-
 def test_two_that_write_into_one_folder_do_not_disturb_each_other(tmp_path: Path) -> None:
-    host = Progress("h1", Host(address="127.0.0.1"), Path())
+    host = LocalHost()
     for name in ("one", "two"):
         asyncio.run(host.put_files(str(tmp_path / "run"), {name: name.encode() * 9000}))
+    shutil.rmtree(tmp_path / "run")
     (one, first), (two, second) = host.commands
     with subprocess.Popen(["sh", "-c", one], stdin=subprocess.PIPE) as slow:
         assert slow.stdin is not None
@@ -140,26 +108,22 @@ def links() -> Any:
     loop.close()
 
 
-def test_every_host_that_is_late_or_fails_is_named(links: HostLinks) -> None:
+def test_what_all_hosts_say_comes_back_by_name_and_each_that_is_late_or_fails_is_named(links: HostLinks) -> None:
+    async def name(host: HostLink) -> str:
+        return host.name
+
     async def work(host: HostLink) -> None:
         if host.name == "h1":
             await asyncio.Event().wait()
         if host.name == "h2":
             raise HostsError("h2: no certificate")
 
+    assert links.on_all(name, 5.0) == {"h1": "h1", "h2": "h2", "h3": "h3"}
     with pytest.raises(HostsError) as error:
         links.on_all(work, 0.5)
     late, failed = str(error.value).splitlines()
     assert has_terms(late, "h1", "not done", "0.5 s")
     assert failed == "h2: no certificate"
-
-
-def test_what_all_hosts_say_comes_back_by_name(links: HostLinks) -> None:
-    async def name(host: HostLink) -> str:
-        return host.name
-
-    say: Callable[[HostLink], Any] = name
-    assert links.on_all(say, 5.0) == {"h1": "h1", "h2": "h2", "h3": "h3"}
 
 
 Get = Callable[[Path, Callable[..., None]], Awaitable[None]]
@@ -213,41 +177,39 @@ async def slowly(into: Path, progress: Callable[..., None]) -> None:
     into.write_bytes(b"all of it")
 
 
-async def none_there(into: Path, progress: Callable[..., None]) -> None:
-    raise asyncssh.SFTPNoSuchFile("No such file")
+def raising(error: Exception) -> Get:
+    async def get(into: Path, progress: Callable[..., None]) -> None:
+        raise error
+
+    return get
 
 
-async def not_readable(into: Path, progress: Callable[..., None]) -> None:
-    raise asyncssh.SFTPPermissionDenied("Permission denied")
-
-
-def test_a_file_comes_under_its_name(tmp_path: Path) -> None:
-    assert fetched(whole, tmp_path / "run.mcap").asked == [".zsim/runs/1/run.mcap"]  # sftp starts at the home
-    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
-
-
-def test_a_host_from_which_nothing_comes_any_more_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "STALL_S", 0.05)
-    with refused(HostsError, "nothing", "0.05 s"):
-        fetched(for_ever, tmp_path / "run.mcap")
-    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap.part"]
-
-
-def test_a_file_may_take_longer_than_a_stall(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Something comes three times as often as it has to; all of it takes longer than one stall."""
-    monkeypatch.setattr(module, "STALL_S", 0.8)
-    fetched(slowly, tmp_path / "run.mcap")
-    assert (tmp_path / "run.mcap").read_bytes() == b"all of it"
-
-
-def test_a_host_that_does_not_let_us_in_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "OPEN_S", 0.05)
-    with refused(HostsError, "h2", "no answer", "0.05 s"):
-        fetched(None, tmp_path / "run.mcap")
-
-
-def test_a_file_that_is_not_there_is_told_from_one_that_cannot_be_read(tmp_path: Path) -> None:
-    fetched(none_there, tmp_path / "run.mcap", there=False)
-    with refused(HostsError, "h2", os.strerror(errno.EACCES)):
-        fetched(not_readable, tmp_path / "run.mcap")
+def test_a_file_comes_under_its_name_and_may_take_longer_than_a_stall(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the slow one something comes three times as often as it has to; all of it takes longer than one stall."""
+    monkeypatch.setattr(host_link, "STALL_S", 0.8)
+    for get in (whole, slowly):
+        assert fetched(get, tmp_path / "run.mcap").asked == [".zsim/runs/1/run.mcap"]  # sftp starts at the home
+        assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"all of it"]
+    (tmp_path / "run.mcap").unlink()
+    fetched(raising(asyncssh.SFTPNoSuchFile("No such file")), tmp_path / "run.mcap", there=False)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("get", "terms", "left"),
+    [
+        (for_ever, ("nothing", "0.05 s"), ["run.mcap.part"]),
+        (None, ("h2", "no answer", "0.05 s"), []),
+        (raising(asyncssh.SFTPPermissionDenied("Permission denied")), ("h2", os.strerror(errno.EACCES)), []),
+    ],
+)
+def test_what_keeps_a_file_from_coming_is_a_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, get: Get | None, terms: tuple[str, ...], left: list[str]
+) -> None:
+    monkeypatch.setattr(host_link, "STALL_S", 0.05)
+    monkeypatch.setattr(host_link, "OPEN_S", 0.05)
+    with refused(HostsError, *terms):
+        fetched(get, tmp_path / "run.mcap")
+    assert [path.name for path in tmp_path.iterdir()] == left

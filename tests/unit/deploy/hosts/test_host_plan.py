@@ -2,6 +2,7 @@
 
 import asyncio
 import shutil
+import socket
 import subprocess
 import sys
 from datetime import UTC, datetime, timedelta
@@ -10,17 +11,15 @@ from typing import Any
 
 import pytest
 import yaml
+from local_host import LocalHost
 from refused import has_terms, refused
 
 from zsim.errors import HostsError, RunError
 from zsim.scenario import scenario_file
-from zsim_deploy import certificates as certificates
-from zsim_deploy import inventory
-from zsim_deploy.certificates import Enrolment
+from zsim_deploy import certificates, inventory
 from zsim_deploy.cli import hosts_commands
 from zsim_deploy.hosts.control_socket import ControlSocket
-from zsim_deploy.hosts.host_link import HostLink
-from zsim_deploy.hosts.host_plan import HostPlan, leftover_lines, leftovers, port_faults, scp
+from zsim_deploy.hosts.host_plan import HostPlan, leftovers, port_faults, scp
 from zsim_deploy.hosts.host_run import _refuse_unless_able
 from zsim_deploy.inventory import Host
 
@@ -55,9 +54,10 @@ def plan(paths: tuple[Path, Path]) -> HostPlan:
     return HostPlan(inventory.load(hosts), scenario_file.load(scenario), "abc", ["--rate", "4"])
 
 
-def test_a_program_of_the_users_own_is_left_to_the_user(plan: HostPlan) -> None:
+def test_where_what_runs(plan: HostPlan) -> None:
     assert list(plan.processes) == ["router.field", "world", "recorder", "estimator.drone1", "estimator.-d2"]
     assert plan.hosts() == ["h1"]
+    assert (sorted(plan.ports("h1")), plan.ports("h3")) == ([7447, 7448], [])
     (remark,) = plan.remarks
     assert has_terms(remark, "my.drone1", "h2")
 
@@ -85,7 +85,7 @@ def test_a_move_changes_one_place_and_keeps_the_others(plan: HostPlan) -> None:
     assert plan.host("estimator.drone1") == "h1"
 
 
-def test_the_files_of_a_host(plan: HostPlan, tmp_path: Path) -> None:
+def test_the_files_of_a_host_and_a_certificate_that_is_not_there(plan: HostPlan, tmp_path: Path) -> None:
     for name in plan.processes:
         for file in ("ca.pem", "certificate.pem", "key.pem"):
             path = tmp_path / "certs" / "h1" / name / file
@@ -98,9 +98,6 @@ def test_the_files_of_a_host(plan: HostPlan, tmp_path: Path) -> None:
     assert found["identity/estimator.-d2/key.pem"] == b"key.pem of estimator.-d2"
     assert b"name: pair" in found["scenario.yaml"]
     assert plan.files("h3") == {}
-
-
-def test_a_certificate_that_is_not_there_is_a_line(plan: HostPlan) -> None:
     certificate = "certs/h3/estimator.drone1/ca.pem"
     with refused(HostsError, certificate, "read", "zsim certs init", "hosts.yaml", "--scenario FILE") as error:
         plan.moved("estimator.drone1", "h3").identity("estimator.drone1")
@@ -144,21 +141,17 @@ def test_certificates_that_are_missing_or_expired_are_told_before_any_host_is_as
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     with refused(HostsError, "certs", "no certificates", "zsim certs init"):
         hosts_commands.up(scenario=paths[0], hosts=paths[1], out=tmp_path / "out")
-    certify(paths, datetime.now(UTC) - timedelta(days=10))
+    now, placed = datetime.now(UTC) - timedelta(days=10), inventory.load(paths[1])
+    folder = placed.folder / "certs"
+    wanted, access = certificates.enrolment(placed, scenario_file.load(paths[0]))
+    signer = certificates.authority(folder, now)
+    for each in wanted:
+        certificates.issue(folder, signer, each, now, days=1.0)
+    for host, name, _ in access:
+        (folder / host / f"{name}.access.json").write_text("{}")
     with refused(HostsError, "expired", "router.field", "h1", "estimator.drone1", "--renew"):
         hosts_commands.up(scenario=paths[0], hosts=paths[1], out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def certify(paths: tuple[Path, Path], now: datetime) -> None:
-    """Make certificates that are good for a day, and the access control beside them."""
-    placed = inventory.load(paths[1])
-    signer, folder = certificates.authority(placed.folder / "certs", now), placed.folder / "certs"
-    enrolment = Enrolment(placed, scenario_file.load(paths[0]))
-    for wanted in enrolment.certificates():
-        certificates.issue(folder, signer, wanted, now, days=1.0)
-    for host, name, _ in enrolment.access():
-        (folder / host / f"{name}.access.json").write_text("{}")
 
 
 def test_without_tls_as_the_command_line_says_it(paths: tuple[Path, Path]) -> None:
@@ -169,25 +162,11 @@ def test_without_tls_as_the_command_line_says_it(paths: tuple[Path, Path]) -> No
     assert (plan.files("h1").keys(), plan.certificate_faults(datetime.now(UTC))) == ({"scenario.yaml"}, [])
 
 
-def test_the_ports_of_a_host(plan: HostPlan) -> None:
-    assert (sorted(plan.ports("h1")), plan.ports("h3")) == ([7447, 7448], [])
-
-
 WAITS = "import sys; print('there', flush=True); sys.stdin.read()"
 
 
-class Local(HostLink):
-    """A host that is this machine."""
-
-    async def run(self, command: str, given: bytes = b"", *_: Any, what: str = "", **__: Any) -> bytes:
-        done = subprocess.run(["sh", "-c", command], input=given, capture_output=True, timeout=60.0, check=False)
-        if done.returncode:
-            raise HostsError(f"{self.name}: {what} failed: {done.stderr.decode().splitlines()[-1]}")
-        return b"Welcome to run.mcap\n" + done.stdout
-
-
-def local(folder: Path) -> Local:
-    return Local("h1", Host(address="127.0.0.1", folder=str(folder), user="pi", port=2222), Path("/inventory"))
+def local(folder: Path) -> LocalHost:
+    return LocalHost(base=Path("/inventory"), folder=str(folder), user="pi", port=2222)
 
 
 def run_of(folder: Path, run: str, *files: str) -> None:
@@ -197,14 +176,11 @@ def run_of(folder: Path, run: str, *files: str) -> None:
         path.touch()
 
 
-def test_a_host_on_which_nothing_ever_ran_has_nothing(tmp_path: Path) -> None:
-    assert asyncio.run(leftovers(local(tmp_path / "not there"), tmp_path)) == []
-    run_of(tmp_path, "abc", "scenario.yaml", "identity/world/ca.pem")
-    assert asyncio.run(leftovers(local(tmp_path), tmp_path)) == []
-
-
 def test_records_and_keys_are_told_in_a_line_each(tmp_path: Path) -> None:
+    assert asyncio.run(leftovers(local(tmp_path / "not there"), tmp_path)) == []
     folder = tmp_path / "our zsim"
+    run_of(folder, "ghi", "scenario.yaml", "identity/world/ca.pem")
+    assert asyncio.run(leftovers(local(folder), tmp_path)) == []
     run_of(folder, "abc", "run.mcap")
     run_of(folder, "def", "run.mcap", "identity/world/key.pem")
     records, keys = asyncio.run(leftovers(local(folder), Path("/inventory")))
@@ -229,27 +205,18 @@ def test_the_way_of_a_copy_is_that_of_the_launcher() -> None:
     host = Host(address="::1", ssh="fe80::1", key="keys/a b", known_hosts="/etc/known")
     command = "scp -i '/lab/keys/a b' -o UserKnownHostsFile=/etc/known '[fe80::1]:.zsim/runs/1/run.mcap' ."
     assert scp(host, Path("/lab"), "~/.zsim/runs/1/run.mcap") == command
-    (line,) = leftover_lines("h1", Host(address="h1"), Path(), ["run.mcap 1"])
-    assert has_terms(line, "h1:~/.zsim/runs/1/run.mcap", "scp h1:.zsim/runs/1/run.mcap")
+    assert scp(Host(address="h1"), Path(), "~/.zsim/runs/1/run.mcap") == "scp h1:.zsim/runs/1/run.mcap ."
 
 
-def test_a_port_on_which_somebody_listens_is_a_line(free_ports: list[Any]) -> None:
-    taken, free = free_ports
-    link = local(Path("/z"))
-    numbers = [found.getsockname()[1] for found in (taken, free)]
-    free.close()
-    (line,) = asyncio.run(port_faults(link, sys.executable, numbers))
+def test_a_port_on_which_somebody_listens_is_a_line() -> None:
+    link = LocalHost()
+    with socket.create_server(("127.0.0.1", 0)) as taken, socket.create_server(("127.0.0.1", 0)) as free:
+        numbers = [found.getsockname()[1] for found in (taken, free)]
+        free.close()
+        (line,) = asyncio.run(port_faults(link, sys.executable, numbers))
     assert has_terms(line, "h1", f"port {numbers[0]}", "in use")
     assert asyncio.run(port_faults(link, sys.executable, numbers[1:])) == []
     assert asyncio.run(port_faults(link, "/no/python", [])) == []
-
-
-@pytest.fixture
-def free_ports() -> Any:
-    import socket
-
-    with socket.create_server(("127.0.0.1", 0)) as taken, socket.create_server(("127.0.0.1", 0)) as free:
-        yield [taken, free]
 
 
 def test_a_host_whose_python_lacks_the_agents_takes_no_role(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ HOSTS = {
     "roles": {"world": "h1"},
     "security": {"insecure": True},
 }
+INTERRUPTED = Outcome("interrupted", interrupted=True)
 AT = r"h1:~/\.zsim/runs/abc/run\.mcap \(fetch it with `scp pi@10\.0\.0\.1:\.zsim/runs/abc/run\.mcap \.`\)"
 
 
@@ -57,63 +58,49 @@ def up(board: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     found._loop.close()
 
 
-def fetching(found: Any) -> Any:
-    """Return a fetch that returns or raises."""
+def ends_as(up: Any, outcome: Any, fetched: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the processes of a run and the fetching of its record end so, by a result or an exception."""
 
-    async def fetch(*_: Any) -> bool:
+    def result_of(found: Any) -> Any:
         if isinstance(found, BaseException):
             raise found
         return found
 
-    return fetch
+    async def fetch(*_: Any) -> bool:
+        return result_of(fetched)
 
-
-def ends_as(up: Any, outcome: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    def run(_: Any) -> Outcome:
-        if isinstance(outcome, BaseException):
-            raise outcome
-        return outcome
-
-    monkeypatch.setattr(up._supervisor, "run", run)
+    monkeypatch.setattr(up._supervisor, "run", lambda _: result_of(outcome))
+    monkeypatch.setattr(module, "fetch", fetch)
 
 
 @pytest.mark.parametrize("early", [True, False], ids=["processes end", "record is fetched"])
 def test_a_second_ctrl_c_does_not_wait_and_says_where_the_record_is(
     up: Any, board: Said, monkeypatch: pytest.MonkeyPatch, early: bool
 ) -> None:
-    ends_as(up, KeyboardInterrupt() if early else Outcome("interrupted", interrupted=True), monkeypatch)
+    def interrupt(work: Any) -> None:
+        work.close()
+        raise KeyboardInterrupt
+
+    ends_as(up, KeyboardInterrupt() if early else INTERRUPTED, True, monkeypatch)
     with monkeypatch.context() as patched:
-        patched.setattr(up._loop, "call", interrupting)
+        patched.setattr(up._loop, "call", interrupt)
         with pytest.raises(KeyboardInterrupt):
             up._fly()
     assert re.search(rf"not fetched.* {AT}", board.text())
     assert has_terms(board.text(), "fetching") is not early
 
 
-def interrupting(work: Any) -> None:
-    work.close()
-    raise KeyboardInterrupt
-
-
-def matches(pattern: str, board: Said) -> bool:
-    return re.search(pattern, board.text()) is not None
-
-
 def test_a_run_that_was_ended_before_it_flew_has_no_record(
     up: Any, board: Said, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ends_as(up, Outcome("interrupted", interrupted=True), monkeypatch)
-    monkeypatch.setattr(module, "fetch", fetching(False))
-    assert up._fly() == Outcome("interrupted", interrupted=True)
+    ends_as(up, INTERRUPTED, False, monkeypatch)
+    assert up._fly() == INTERRUPTED
     assert has_terms(board.text(), "nothing", "recorded")
     assert not up._record_stays
 
 
-def test_a_record_that_stays_away_fails_a_run_that_ended_well(
-    up: Any, board: Said, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ends_as(up, Outcome("duration"), monkeypatch)
-    monkeypatch.setattr(module, "fetch", fetching(HostsError("h1: gone")))
+def test_a_record_that_stays_away_fails_a_run_that_ended_well(up: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    ends_as(up, Outcome("duration"), HostsError("h1: gone"), monkeypatch)
     outcome = up._fly()
     assert outcome.failed
     assert has_terms(outcome.reason, "record", "h1: gone", "h1:…")

@@ -1,7 +1,6 @@
 """What a push leaves alone, what it copies, and how the failures of several hosts are shown."""
 
 import asyncio
-import contextlib
 import errno
 import getpass
 import os
@@ -10,18 +9,20 @@ import socket
 import subprocess
 import sys
 from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
+from local_host import Text
 from refused import has_terms, refused
 
 from zsim.errors import HostsError, InventoryError
-from zsim_deploy import inventory
 from zsim_deploy.hosts import on_host
 from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.hosts.push import (
     ASK_S,
+    Installer,
     Interpreter,
     choose_interpreter,
     interpreter_query,
@@ -43,34 +44,32 @@ HOUSE = WheelSet(wheel("zsim-1"), wheel("pip-26"), (wheel("numpy-2", 9), wheel("
 NOTE = HOUSE.manifest()
 
 
-def test_what_was_installed_last_is_there() -> None:
-    assert is_installed(HOUSE, NOTE)
+def test_what_is_installed_is_known_by_the_note_of_the_last_push() -> None:
+    """More than is needed may be there."""
+    there = [HOUSE, HOUSE._replace(extras=(), others=(wheel("numpy-2"),)), HOUSE._replace(pip=wheel("pip-27"))]
+    assert all(is_installed(wanted, NOTE) for wanted in there)
     assert not is_installed(HOUSE, None)
+    others = [
+        HOUSE._replace(project=wheel("zsim-1", sha256="changed")),
+        HOUSE._replace(extras=("agents", "world")),
+        HOUSE._replace(others=(wheel("numpy-3"), wheel("scipy-1"))),
+    ]
+    assert not any(is_installed(wanted, NOTE) for wanted in others)
 
 
-def test_another_build_an_extra_or_another_version_of_a_package_is_not_there() -> None:
-    assert not is_installed(HOUSE._replace(project=wheel("zsim-1", sha256="changed")), NOTE)
-    assert not is_installed(HOUSE._replace(extras=("agents", "world")), NOTE)
-    assert not is_installed(HOUSE._replace(others=(wheel("numpy-3"), wheel("scipy-1"))), NOTE)
-
-
-def test_more_than_is_needed_may_be_there() -> None:
-    assert is_installed(HOUSE._replace(extras=(), others=(wheel("numpy-2"),)), NOTE)
-    assert is_installed(HOUSE._replace(pip=wheel("pip-27")), NOTE)
-
-
-def names(wheels: list[Wheel]) -> list[str]:
-    return [each.path.stem for each in wheels]
-
-
-def test_a_fresh_host_gets_everything_and_large_files_first() -> None:
-    assert names(missing(HOUSE, {"installed": None, "wheels": {}})) == ["numpy-2", "scipy-1", "zsim-1", "pip-26"]
-
-
-def test_what_is_installed_or_was_copied_before_is_not_copied_again() -> None:
-    assert names(missing(HOUSE, {"installed": NOTE, "wheels": {}})) == ["zsim-1", "pip-26"]
-    copied = {"numpy-2.whl": "sha of numpy-2", "scipy-1.whl": "cut short"}
-    assert names(missing(HOUSE, {"installed": None, "wheels": copied})) == ["scipy-1", "zsim-1", "pip-26"]
+@pytest.mark.parametrize(
+    ("installed", "copied", "lacking"),
+    [
+        (None, {}, ["numpy-2", "scipy-1", "zsim-1", "pip-26"]),  # large files first
+        (NOTE, {}, ["zsim-1", "pip-26"]),
+        (None, {"numpy-2.whl": "sha of numpy-2", "scipy-1.whl": "cut short"}, ["scipy-1", "zsim-1", "pip-26"]),
+    ],
+)
+def test_what_is_installed_or_was_copied_before_is_not_copied_again(
+    installed: Any, copied: dict[str, str], lacking: list[str]
+) -> None:
+    found = missing(HOUSE, {"installed": installed, "wheels": copied})
+    assert [each.path.stem for each in found] == lacking
 
 
 class Local:
@@ -99,20 +98,6 @@ class Local:
         return self.process.returncode
 
 
-class Text:
-    """The text of a stream of bytes."""
-
-    def __init__(self, stream: asyncio.StreamReader | None) -> None:
-        assert stream is not None
-        self._stream = stream
-
-    async def readline(self) -> str:
-        return (await self._stream.readline()).decode()
-
-    async def read(self) -> str:
-        return (await self._stream.read()).decode()
-
-
 class Greeting(HostLink):
     """This machine, as a host whose login shell greets."""
 
@@ -120,7 +105,7 @@ class Greeting(HostLink):
         super().__init__("h1", Host(address="192.0.2.1"), Path())
         self.processes: list[Local] = []
 
-    @contextlib.asynccontextmanager
+    @asynccontextmanager
     async def channel(self, retry: bool = False) -> AsyncIterator[Any]:
         try:
             yield self
@@ -137,23 +122,27 @@ class Greeting(HostLink):
         return self.processes[-1]
 
 
-def hush(_text: str) -> None:
-    """Hear what is being done."""
+@asynccontextmanager
+async def installer(
+    folder: Path, host: Greeting | None = None, python: str = sys.executable, tell: Any = lambda _: None
+) -> AsyncIterator[Installer]:
+    async with open_installer(host or Greeting(), python, str(folder), tell) as program:
+        yield program
 
 
-def test_a_greeting_of_the_login_shell_is_passed_over(tmp_path: Path) -> None:
+def ask(folder: Path, act: str, **order: Any) -> dict[str, Any]:
     async def work() -> dict[str, Any]:
-        async with open_installer(Greeting(), sys.executable, str(tmp_path), hush) as program:
-            return await program.ask("look", ASK_S)
+        async with installer(folder) as program:
+            return await program.ask(act, ASK_S, **order)
 
-    assert asyncio.run(work())["folder"] == str(tmp_path)
+    return asyncio.run(work())
 
 
 def start_refusal(python: str, folder: Path) -> str:
     """Return what keeps an installer from starting."""
 
     async def work() -> None:
-        async with open_installer(Greeting(), python, str(folder), hush):
+        async with installer(folder, python=python):
             pass
 
     with pytest.raises(HostsError) as caught:
@@ -161,20 +150,14 @@ def start_refusal(python: str, folder: Path) -> str:
     return str(caught.value)
 
 
-def test_a_python_that_says_nothing_is_a_line(tmp_path: Path) -> None:
+def test_what_keeps_a_host_from_being_asked_is_a_line(tmp_path: Path) -> None:
+    """Not a login shell that greets."""
+    assert ask(tmp_path, "look")["folder"] == str(tmp_path)
     silent = shutil.which("true") or ""
     assert has_terms(start_refusal(silent, tmp_path), "h1", str(silent), "nothing")
-
-
-def test_a_folder_that_cannot_be_used_is_a_line_that_says_what_to_do(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    assert has_terms(
-        start_refusal(sys.executable, tmp_path / "file" / "zsim"),
-        "h1",
-        f"{tmp_path}/file/zsim",
-        os.strerror(errno.ENOTDIR),
-        "hosts.h1.folder",
-    )
+    wrong, why = f"{tmp_path}/file/zsim", os.strerror(errno.ENOTDIR)
+    assert has_terms(start_refusal(sys.executable, Path(wrong)), "h1", wrong, why, "hosts.h1.folder")
 
 
 def write_pip(folder: Path, text: str) -> dict[str, Any]:
@@ -192,7 +175,7 @@ def test_what_is_being_installed_ends_with_the_channel(tmp_path: Path) -> None:
     order = write_pip(tmp_path, f"import signal; held = open({str(pipe)!r}, 'w'); signal.pause()")
 
     async def work() -> None:
-        async with open_installer(Greeting(), sys.executable, str(tmp_path), hush) as program:
+        async with installer(tmp_path) as program:
             asked = asyncio.create_task(program.ask("install", ASK_S, **order))
             reading = await asyncio.to_thread(open, pipe)
             asked.cancel()
@@ -217,7 +200,7 @@ def test_a_launcher_that_lives_shows_it(tmp_path: Path, monkeypatch: pytest.Monk
 
     async def work() -> dict[str, Any]:
         host = Greeting()
-        async with open_installer(host, sys.executable, str(tmp_path), hush) as program:
+        async with installer(tmp_path, host) as program:
             await host.processes[0].beaten.wait()
             return await program.ask("look", ASK_S)
 
@@ -226,82 +209,75 @@ def test_a_launcher_that_lives_shows_it(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_what_pip_says_is_a_line(tmp_path: Path) -> None:
     order = write_pip(tmp_path, "import sys; sys.exit('ERROR: No space left on device\\nnote: more')")
-
-    async def work() -> None:
-        async with open_installer(Greeting(), sys.executable, str(tmp_path), hush) as program:
-            await program.ask("install", ASK_S, **order)
-
     with refused(HostsError, "h1", "ERROR", os.strerror(errno.ENOSPC)) as raised:
-        asyncio.run(work())
+        ask(tmp_path, "install", **order)
     assert "\n" not in str(raised.value)
 
 
 def test_a_second_push_says_whom_it_waits_for(tmp_path: Path) -> None:
-    async def second(waits: asyncio.Event, steps: list[str]) -> dict[str, Any]:
+    steps: list[str] = []
+
+    async def second(waits: asyncio.Event) -> dict[str, Any]:
         def tell(text: str) -> None:
             steps.append(text)
             waits.set()
 
-        async with open_installer(Greeting(), sys.executable, str(tmp_path), tell) as program:
+        async with installer(tmp_path, tell=tell) as program:
             return await program.ask("look", ASK_S)
 
-    async def work() -> list[str]:
-        steps: list[str] = []
-        waits = asyncio.Event()
-        first = Greeting()
-        async with open_installer(first, sys.executable, str(tmp_path), hush):
-            waiting = asyncio.create_task(second(waits, steps))
+    async def work() -> int:
+        waits, first = asyncio.Event(), Greeting()
+        async with installer(tmp_path, first):
+            waiting = asyncio.create_task(second(waits))
             await waits.wait()
-            pid = first.processes[0].process.pid
         assert (await waiting)["folder"] == str(tmp_path)
-        (line,) = steps
-        assert has_terms(line, f"{getpass.getuser()}@{socket.gethostname()}", f"process {pid}")
-        return steps
+        return first.processes[0].process.pid
 
-    assert asyncio.run(work())
+    pid = asyncio.run(work())
+    (line,) = steps
+    assert has_terms(line, f"{getpass.getuser()}@{socket.gethostname()}", f"process {pid}")
 
 
 def test_who_pushes_for_too_long_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("zsim_deploy.hosts.push.WAIT_S", 0.01)
 
     async def work() -> str:
-        async with open_installer(Greeting(), sys.executable, str(tmp_path), hush):
+        async with installer(tmp_path):
             return await asyncio.to_thread(start_refusal, sys.executable, tmp_path)
 
     refusal = asyncio.run(work())
     assert has_terms(refusal, "h1", f"{getpass.getuser()}@{socket.gethostname()}", "process", "pushing")
 
 
-def placed(**hosts: Host) -> InventoryFile:
-    return InventoryFile(Inventory(hosts=dict(hosts), roles={}), Path("/nowhere"), "hosts.yaml")
-
-
-def pushed(where: InventoryFile, names: list[str], cache: Path) -> dict[str, bool]:
-    return asyncio.run(push(where, names, [], lambda host, text: None, cache))
+def pushed(cache: Path, names: list[str], extras: list[str], progress: Any = print, **hosts: Host) -> dict[str, bool]:
+    where = InventoryFile(Inventory(hosts=dict(hosts), roles={}), Path("/nowhere"), "hosts.yaml")
+    return asyncio.run(push(where, names, extras, progress, cache))
 
 
 def test_a_host_with_an_interpreter_of_its_own_is_left_alone(tmp_path: Path) -> None:
-    assert pushed(placed(a=Host(address="192.0.2.1", python="/opt/zsim/bin/python")), [], tmp_path) == {"a": False}
+    own = Host(address="192.0.2.1", python="/opt/zsim/bin/python")
+    assert pushed(tmp_path, [], [], a=own) == {"a": False}
 
 
-def test_a_host_that_is_not_in_the_inventory_is_a_line(tmp_path: Path) -> None:
-    with refused(InventoryError, "--host c", "a", "b"):
-        pushed(placed(a=Host(address="192.0.2.1"), b=Host(address="192.0.2.2")), ["c"], tmp_path)
-
-
-def test_an_extra_that_is_none_is_a_line_with_those_that_are(tmp_path: Path) -> None:
-    where = placed(a=Host(address="192.0.2.1"))
-    with refused(InventoryError, "--extra nonsense", "agents", "all", "world"):
-        asyncio.run(push(where, [], ["agents", "nonsense"], lambda host, text: None, tmp_path))
+@pytest.mark.parametrize(
+    ("names", "extras", "terms"),
+    [
+        (["c"], [], ("--host c", "a", "b")),
+        ([], ["agents", "nonsense"], ("--extra nonsense", "agents", "all", "world")),
+    ],
+)
+def test_a_host_or_an_extra_that_is_none_is_a_line_with_those_that_are(
+    tmp_path: Path, names: list[str], extras: list[str], terms: tuple[str, ...]
+) -> None:
+    with refused(InventoryError, *terms):
+        pushed(tmp_path, names, extras, a=Host(address="192.0.2.1"), b=Host(address="192.0.2.2"))
 
 
 def test_every_host_that_fails_has_its_line(tmp_path: Path) -> None:
-    port = inventory.SSH_PORT - 21  # tcpmux; nobody has it
-    closed = Host(address="127.0.0.1", port=port)
-    where = placed(a=closed, b=closed, c=Host(address="127.0.0.1", python="/opt/python"))
-    steps: list[tuple[str, str]] = []
+    closed = Host(address="127.0.0.1", port=1)  # tcpmux; nobody has it
+    steps: list[tuple[str, ...]] = []
     with pytest.raises(HostsError) as caught:
-        asyncio.run(push(where, [], [], lambda host, text: steps.append((host, text)), tmp_path))
+        pushed(tmp_path, [], [], lambda *step: steps.append(step), a=closed, b=closed, c=Host(address="h", python="/p"))
     assert {("a", "failed"), ("b", "failed")} <= set(steps)  # why is said once, in the end
     lines = str(caught.value).splitlines()
     assert [line.partition(": ")[0] for line in lines] == ["a", "b"]
@@ -339,14 +315,11 @@ def test_a_python_of_another_minor_version_is_a_line_before_anything_is_copied(
         choose_interpreter("onboard1", there, HERE)
 
 
-def test_the_question_finds_the_pythons_of_a_machine() -> None:
+def test_the_question_finds_the_pythons_of_a_machine_and_no_greeting() -> None:
     answer = subprocess.run(["sh", "-c", interpreter_query()], capture_output=True, text=True, check=True).stdout
     assert parse_interpreters(answer)
     for each in parse_interpreters(answer):
         version = subprocess.run([each.path, "--version"], capture_output=True, text=True, check=True).stdout
         assert version.strip() == f"Python {'.'.join(map(str, each.version))}"
-
-
-def test_a_greeting_of_the_login_shell_is_no_python() -> None:
     output = "Welcome to lab\nlast login 3.11.2 today\n\npython3 3.11.2 /usr/bin/python3\npython3.12 is here\n"
     assert parse_interpreters(output) == [Interpreter("python3", (3, 11, 2), "/usr/bin/python3")]

@@ -114,21 +114,18 @@ def test_what_a_process_says_is_kept_and_a_greeting_of_the_shell_is_not_its_id(s
     assert (tmp_path / "estimator.d1.log").read_text() == "here\n\n"
 
 
-def test_a_fault_of_whoever_takes_its_lines_ends_it(started: Start) -> None:
+def test_a_link_that_breaks_or_a_fault_of_whoever_takes_its_lines_ends_it(started: Start) -> None:
     def fail(line: str) -> None:
         raise TypeError("not iterable")
 
-    remote = started(Link(Process("zsim-pid 77\n", "1234\n")), fail)
-    assert remote.wait(PATIENCE_S)
-    assert remote.code == LOST
-    assert has_terms(remote.outcome(), "launcher", "TypeError('not iterable')")
-
-
-def test_a_link_that_breaks_is_said(started: Start) -> None:
-    remote = started(Absent(HostsError("h1: gone")))
-    assert remote.wait(PATIENCE_S)
-    assert remote.outcome() == remote.last_log_line()
-    assert has_terms(remote.outcome(), "connection", "h1", "h1: gone")
+    for link, on_line, terms in (
+        (Link(Process("zsim-pid 77\n", "1234\n")), fail, ("launcher", "TypeError('not iterable')")),
+        (Absent(HostsError("h1: gone")), None, ("connection", "h1", "h1: gone")),
+    ):
+        remote = started(link, on_line)
+        assert remote.wait(PATIENCE_S)
+        assert (remote.code, remote.outcome()) == (LOST, remote.last_log_line())
+        assert has_terms(remote.outcome(), *terms)
 
 
 def test_a_log_that_cannot_be_written_is_said_once_and_the_process_goes_on(started: Start, tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """The console of a run: it goes on until the report is there, and ends whatever happens."""
 
 import signal
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -41,56 +40,41 @@ class LateConsole:
         self.closed = True
 
 
-def end(console: LateConsole, interrupted: bool = False, report: Callable[[], None] = lambda: None) -> None:
-    """End a run with a console."""
+def end(console: LateConsole, interrupted: bool = False, error: BaseException | None = None) -> None:
+    """End a run with a console, or break its report off."""
     process: Any = console
     with RunConsole() as run_console:
         run_console.own(process)
         run_console.outcome = Outcome(REASON, interrupted=interrupted)
-        report()
+        if error:
+            raise error
         assert not console.stopped_for
 
 
-def raises(error: BaseException) -> Callable[[], None]:
-    def report() -> None:
-        raise error
-
-    return report
-
-
-def test_a_console_is_asked_to_stop_when_the_report_is_there(capfd: pytest.CaptureFixture[str]) -> None:
-    console = LateConsole(0.5)
-    end(console)
-    assert capfd.readouterr().err == ""
-    assert (console.stopped_for, console.waited_s, console.closed) == (REASON, 0.5, True)
-
-
-def test_what_is_waited_for_long_is_named(capfd: pytest.CaptureFixture[str]) -> None:
-    console = LateConsole(SLOW_S + 3.0)
-    end(console)
-    assert console.name in capfd.readouterr().err
-    assert console.waited_s == SLOW_S + 3.0
-
-
-def test_nobody_is_waited_for_without_an_end() -> None:
-    console = LateConsole(1000.0)
-    end(console)
-    assert (console.waited_s, console.closed) == (COPIED_S, True)
+@pytest.mark.parametrize(
+    ("ends_after_s", "interrupted", "waited_s", "named"),
+    [
+        (0.5, False, 0.5, False),
+        (SLOW_S + 3.0, False, SLOW_S + 3.0, True),
+        (1000.0, False, COPIED_S, True),
+        (1000.0, True, INTERRUPTED_S, False),
+    ],
+)
+def test_a_console_is_asked_to_stop_when_the_report_is_there_and_waited_for_so_long(
+    capfd: pytest.CaptureFixture[str], ends_after_s: float, interrupted: bool, waited_s: float, named: bool
+) -> None:
+    console = LateConsole(ends_after_s)
+    end(console, interrupted=interrupted)
+    assert (console.name in capfd.readouterr().err) is named
+    assert (console.stopped_for, console.waited_s, console.closed) == (REASON, waited_s, True)
     assert COPIED_S > OFFER_S
-
-
-def test_after_ctrl_c_a_console_has_little_time_and_is_not_named(capfd: pytest.CaptureFixture[str]) -> None:
-    console = LateConsole(1000.0)
-    end(console, interrupted=True)
-    assert capfd.readouterr().err == ""
-    assert (console.waited_s, console.closed) == (INTERRUPTED_S, True)
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), SystemExit(130)])
 def test_who_interrupts_the_report_waits_no_longer_than_in_flight(error: BaseException) -> None:
     console = LateConsole(1000.0)
     with pytest.raises(type(error)):
-        end(console, report=raises(error))
+        end(console, error=error)
     assert (console.waited_s, console.closed) == (INTERRUPTED_S, True)
 
 
@@ -101,7 +85,7 @@ def test_a_signal_ends_the_wait_and_the_run_has_ended_as_it_did(number: int) -> 
     assert (console.waited_s, console.closed) == (0.0, True)
     failed = LateConsole(1000.0, number)
     with pytest.raises(ValueError, match="the run failed"):
-        end(failed, report=raises(ValueError("the run failed")))
+        end(failed, error=ValueError("the run failed"))
 
 
 def test_a_run_that_is_broken_off_before_it_has_an_outcome_leaves_nothing() -> None:
@@ -122,12 +106,8 @@ def test_the_console_of_a_run_whose_port_was_taken_makes_way() -> None:
     first, second = LateConsole(0.5), LateConsole(0.5)
     processes: Any = [first, second]
     with RunConsole() as run_console:
+        assert run_console.process is None
         for process in processes:
             run_console.own(process)
         assert (first.closed, second.closed) == (True, False)
     assert second.closed
-
-
-def test_a_run_without_a_console_ends_at_once() -> None:
-    with RunConsole() as run_console:
-        assert run_console.process is None

@@ -21,6 +21,7 @@ from zsim_deploy.launch.role_launcher import ForkedProcess, RoleLauncher, RolePr
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="roles are forked on Linux alone")
 WAITING = ["record", "--connect", "tcp/127.0.0.1:1", "--launched", "0", "--wait", "100"]  # for a world that never comes
+VERSION = f"zsim {__version__}\n"
 END_S = 30.0
 LOOK_S = 0.02
 
@@ -45,13 +46,6 @@ def start(role_launcher: RoleLauncher, log: Path, *arguments: str, listened: boo
         return role_launcher.start([*arguments], file, listened)
 
 
-def await_words(log: Path) -> None:
-    """Wait until a role has begun to do what it is for."""
-    until_s = time.monotonic() + END_S
-    while not log.read_text() and time.monotonic() < until_s:
-        time.sleep(LOOK_S)
-
-
 def end(*roles: RoleProcess) -> None:
     for role in roles:
         role.kill()
@@ -61,27 +55,28 @@ def end(*roles: RoleProcess) -> None:
                 pipe.close()
 
 
-def test_what_a_role_prints_and_its_exit_code_come_back(role_launcher: RoleLauncher, log: Path) -> None:
-    role = start(role_launcher, log, "--version", listened=True)
-    assert role.stdout is not None
-    assert role.stdout.read() == f"zsim {__version__}\n"
-    assert role.wait(END_S) == role.poll() == 0
-    assert log.read_text() == ""
-    end(role)
-
-
-def test_what_is_wrong_is_in_its_log(role_launcher: RoleLauncher, log: Path) -> None:
-    role = start(role_launcher, log, "estimator")
-    assert role.wait(END_S) == 2
-    assert "missing argument" in log.read_text()
-    end(role)
-
-
-def test_without_a_reader_what_it_prints_goes_to_the_log(role_launcher: RoleLauncher, log: Path) -> None:
-    role = start(role_launcher, log, "--version")
-    role.wait(END_S)
-    assert role.stdout is None
-    assert log.read_text() == f"zsim {__version__}\n"
+@pytest.mark.parametrize(
+    ("arguments", "listened", "output", "code", "logged"),
+    [
+        (["--version"], True, VERSION, 0, ""),
+        (["--version"], False, None, 0, VERSION),
+        (["estimator"], False, None, 2, "missing argument"),
+    ],
+)
+def test_what_a_role_prints_and_its_exit_code_come_back(
+    role_launcher: RoleLauncher,
+    log: Path,
+    arguments: list[str],
+    listened: bool,
+    output: str | None,
+    code: int,
+    logged: str,
+) -> None:
+    role = start(role_launcher, log, *arguments, listened=listened)
+    assert (role.stdout.read() if role.stdout else None) == output
+    assert role.wait(END_S) == role.poll() == code
+    assert logged in log.read_text()
+    assert bool(logged) is bool(log.read_text())
     end(role)
 
 
@@ -96,12 +91,19 @@ def test_a_role_that_is_killed_says_so_by_its_code(role_launcher: RoleLauncher, 
     end(role)
 
 
-def test_it_is_a_child_of_its_own_session_under_its_own_name(role_launcher: RoleLauncher, log: Path) -> None:
+def test_it_is_a_child_under_its_own_name_and_heeds_what_it_is_told(role_launcher: RoleLauncher, log: Path) -> None:
     role = start(role_launcher, log, *WAITING)
-    await_words(log)
+    until_s = time.monotonic() + END_S
+    while not log.read_text() and time.monotonic() < until_s:  # until it has begun to do what it is for
+        time.sleep(LOOK_S)
     seen = psutil.Process(role.pid)
     assert seen.ppid() == psutil.Process().pid
     assert [word for word in seen.cmdline() if word] == [sys.executable, "-P", "-m", "zsim_deploy.cli", *WAITING]
+    assert role.stdin is not None
+    role.stdin.write("stop it is enough\n")
+    role.stdin.flush()
+    role.wait(END_S)
+    assert has_terms(log.read_text(), "stopped", "waiting", "world")
     end(role)
 
 
@@ -116,25 +118,17 @@ def test_no_role_holds_the_pipes_of_another(role_launcher: RoleLauncher, log: Pa
     end(first, second)
 
 
-def test_it_heeds_what_it_is_told(role_launcher: RoleLauncher, log: Path) -> None:
-    role = start(role_launcher, log, *WAITING)
-    await_words(log)
-    assert role.stdin is not None
-    role.stdin.write("stop it is enough\n")
-    role.stdin.flush()
-    role.wait(END_S)
-    assert has_terms(log.read_text(), "stopped", "waiting", "world")
-    end(role)
-
-
 def test_where_the_fork_server_fails_a_role_is_started_as_a_program(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[str] = []
+    monkeypatch.setattr(progress, "SLOW_S", 0.0)
     monkeypatch.setattr(module, "FORKSERVER", (sys.executable, "-c", "pass"))
-    with RoleLauncher(quiet) as role_launcher:
+    with RoleLauncher(shown.append) as role_launcher:
+        assert shown == [progress.SLOW_NOTICE] or sys.platform != "linux"
         roles = [start(role_launcher, log, "--version") for _ in range(2)]
         assert all(isinstance(role, subprocess.Popen) for role in roles)
         assert [role.wait(END_S) for role in roles] == [0, 0]
         end(*roles)
-    assert log.read_text() == 2 * f"zsim {__version__}\n"
+    assert log.read_text() == 2 * VERSION
 
 
 @LINUX
@@ -155,12 +149,20 @@ def test_a_fork_server_that_dies_or_stands_is_done_without(
 
 @LINUX
 def test_a_role_of_which_the_launcher_does_not_know_never_begins(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with RoleLauncher(quiet) as role_launcher:
-        monkeypatch.setattr(role_launcher, "_receive", lambda: b"")
-        role = start(role_launcher, log, "--version")
-        assert role.wait(END_S) == 0
+    """One launcher within another leaves it its children."""
+    with RoleLauncher(quiet) as outer:
+        with RoleLauncher(quiet) as inner:
+            monkeypatch.setattr(inner, "_receive", lambda: b"")
+            role = start(inner, log, "--version")
+            assert role.wait(END_S) == 0
+            end(role)
+        assert inner._forkserver is not None
+        assert inner._forkserver.poll() is not None
+        assert log.read_text() == VERSION  # once: the one that was forked has printed nothing
+        role = start(outer, log, "estimator")
+        assert isinstance(role, ForkedProcess)
+        assert role.wait(END_S) == 2
         end(role)
-    assert log.read_text() == f"zsim {__version__}\n"  # once: the one that was forked has printed nothing
 
 
 @LINUX
@@ -176,17 +178,6 @@ def test_a_command_that_is_too_long_for_a_packet_is_no_matter(log: Path, monkeyp
 
 
 @LINUX
-def test_one_within_another_leaves_it_its_children(log: Path) -> None:
-    with RoleLauncher(quiet) as outer:
-        with RoleLauncher(quiet) as inner:
-            assert inner._forkserver is not None
-        assert inner._forkserver.poll() is not None
-        role = start(outer, log, "estimator")
-        assert role.wait(END_S) == 2
-        end(role)
-
-
-@LINUX
 def test_the_fork_server_ends_with_its_launcher() -> None:
     code = "import time\nfrom zsim_deploy.launch.role_launcher import RoleLauncher\n"
     code += "with RoleLauncher(lambda _: None) as roles: print(roles._forkserver.pid, flush=True); time.sleep(100)"
@@ -195,13 +186,6 @@ def test_the_fork_server_ends_with_its_launcher() -> None:
         forkserver = psutil.Process(int(launcher.stdout.readline()))
         launcher.kill()
     forkserver.wait(END_S)
-
-
-def test_what_takes_long_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    shown: list[str] = []
-    monkeypatch.setattr(progress, "SLOW_S", 0.0)
-    with RoleLauncher(shown.append):
-        assert shown == [progress.SLOW_NOTICE] or sys.platform != "linux"
 
 
 @LINUX

@@ -81,93 +81,65 @@ def options(out: Path, *overrides: str, cameras: bool = False, detect: bool = Fa
     return RunOptions(scenario, out, new_launch(**how), cameras=cameras, detect=detect)
 
 
-def test_a_port_taken_in_between_is_another_port(watched: type[FakeSupervisor], tmp_path: Path):
-    watched.outcomes = [TAKEN, TAKEN, "ended"]
-    outcome = run.run_processes(options(tmp_path), Say())  # type: ignore[arg-type]
-    assert not outcome.failed
-    assert watched.ports[0] == run.DEFAULT_PORT
-    assert len(set(watched.ports)) == 3
+@pytest.mark.parametrize(
+    ("outcomes", "listen", "fails", "tries"),
+    [
+        ([TAKEN, TAKEN, "ended"], None, False, 3),
+        ([TAKEN], "tcp/127.0.0.1:20001", True, 1),  # a port that is asked for is tried once
+        (["the world died: killed by signal 9"], None, True, 1),
+        ([TAKEN] * 100, None, True, run.PORTS_TRIED),
+    ],
+)
+def test_a_port_taken_in_between_is_another_port(
+    watched: type[FakeSupervisor], tmp_path: Path, outcomes: list[str], listen: str | None, fails: bool, tries: int
+):
+    watched.outcomes = list(outcomes)
+    assert run.run_processes(options(tmp_path, listen=listen), Say()).failed == fails  # type: ignore[arg-type]
+    assert watched.ports[0] == (20001 if listen else run.DEFAULT_PORT)
+    assert len(set(watched.ports)) == len(watched.ports) == tries
 
 
-def test_a_port_asked_for_is_tried_once(watched: type[FakeSupervisor], tmp_path: Path):
-    watched.outcomes = [TAKEN]
-    outcome = run.run_processes(options(tmp_path, listen="tcp/127.0.0.1:20001"), Say())  # type: ignore[arg-type]
-    assert outcome.failed
-    assert watched.ports == [20001]
+def lines_of(made: RunOptions) -> dict[str, list[str]]:
+    """Return the arguments of every process of a run."""
+    children = run._children(made, "tcp/127.0.0.1:20001", FakeSupervisor(), NoRoleLauncher(print))  # type: ignore[arg-type]
+    return {child.name: child._arguments for child in children}
 
 
-def test_another_end_is_the_end(watched: type[FakeSupervisor], tmp_path: Path):
-    watched.outcomes = ["the world died: killed by signal 9"]
-    assert run.run_processes(options(tmp_path), Say()).failed  # type: ignore[arg-type]
-    assert len(watched.ports) == 1
-
-
-def test_trying_ports_has_an_end(watched: type[FakeSupervisor], tmp_path: Path):
-    watched.outcomes = [TAKEN] * 100
-    assert run.run_processes(options(tmp_path), Say()).failed  # type: ignore[arg-type]
-    assert len(watched.ports) == run.PORTS_TRIED
-
-
-def test_the_world_is_told_what_was_changed_of_the_file(tmp_path: Path):
+def test_the_world_is_told_what_was_changed_of_the_file_and_no_name_is_taken_for_an_option(tmp_path: Path):
     changed = changed_fields(["wind.gust_m_s=1"], 12345678, 20.0)
     assert changed == ["wind.gust_m_s=1", "seed=12345678", "duration_s=20.0"]
-    made = options(tmp_path, changed=tuple(changed))
-    children = run._children(made, "tcp/127.0.0.1:20001", FakeSupervisor(), NoRoleLauncher(print))  # type: ignore[arg-type]
-    world = next(child._arguments for child in children if child.name == "world")
-    assert [word for flag, word in pairwise(world) if flag == "--changed"] == changed
-
-
-def test_no_name_is_taken_for_an_option(tmp_path: Path):
-    made = options(tmp_path, "drones.drone1.name=-._", "clusters.main.drones=[-._, drone2, drone3]")
-    children = run._children(made, "tcp/127.0.0.1:20001", FakeSupervisor(), NoRoleLauncher(print))  # type: ignore[arg-type]
-    lines = [child._arguments for child in children]
-    (line,) = (line for line in lines if "-._" in line)
+    overrides = ("drones.drone1.name=-._", "clusters.main.drones=[-._, drone2, drone3]")
+    lines = lines_of(options(tmp_path, *overrides, changed=tuple(changed)))
+    assert [word for flag, word in pairwise(lines["world"]) if flag == "--changed"] == changed
+    (line,) = (line for line in lines.values() if "-._" in line)
     assert line[0] == "estimator"
     assert line[-2:] == ["--", "-._"]
 
 
 EYES = "sensors={preset: paper, front_camera: {}}"
+BOTH = {"camera.main": [], "detector.main": []}
+EACH = {f"detector.drone{i}": [f"drone{i}"] for i in (1, 2, 3)}
+THE_OTHERS = {"camera.drone2": ["drone2"], "camera.main": ["drone1", "drone3"]}
 
 # name: (overrides, --cameras, --detect; process: drones, none for all with cameras)
-CAMERAS = {
+CAMERAS: dict[str, tuple[list[str], bool, bool, dict[str, list[str]]]] = {
     "none": ([EYES], False, False, {}),
     "gating": ([EYES, "processes.gating=[camera]"], False, False, {"camera.main": []}),
-    "all": ([EYES], True, True, {"camera.main": [], "detector.main": []}),
+    "all": ([EYES], True, True, BOTH),
     "one": ([EYES, "processes.expect=[camera.drone1]"], False, False, {"camera.drone1": ["drone1"]}),
-    "the others too": (
-        [EYES, "processes.expect=[camera.drone2]"],
-        True,
-        False,
-        {"camera.drone2": ["drone2"], "camera.main": ["drone1", "drone3"]},
-    ),
-    "no others": (
-        [EYES, "processes.expect=[detector.drone1, detector.drone2, detector.drone3]"],
-        False,
-        True,
-        {f"detector.drone{i}": [f"drone{i}"] for i in (1, 2, 3)},
-    ),
-    "main": (
-        [EYES, "processes.expect=[camera.main, detector.main]"],
-        False,
-        False,
-        {"camera.main": [], "detector.main": []},
-    ),
+    "the others too": ([EYES, "processes.expect=[camera.drone2]"], True, False, THE_OTHERS),
+    "no others": ([EYES, f"processes.expect=[{', '.join(EACH)}]"], False, True, EACH),
+    "main": ([EYES, "processes.expect=[camera.main, detector.main]"], False, False, BOTH),
     "names of one's own": ([EYES, "processes.expect=[camera.left, detector.left]"], False, False, {}),
-    "somebody's own cameras": (
-        ["processes.expect=[camera.drone1, camera.main, detector.drone1]"],
-        False,
-        False,
-        {"detector.drone1": ["drone1"]},
-    ),
-}
+    "somebody's own cameras": (["processes.expect=[camera.drone1, camera.main, detector.drone1]"], False, False, {"detector.drone1": ["drone1"]}),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_which_cameras_are_started(tmp_path: Path, name: str):
     overrides, cameras, detect, started = CAMERAS[name]
     made = options(tmp_path, *overrides, cameras=cameras, detect=detect)
-    children = run._children(made, "tcp/127.0.0.1:20001", FakeSupervisor(), NoRoleLauncher(print))  # type: ignore[arg-type]
-    lines = {child.name: child._arguments for child in children if child.role in ("camera", "detector")}
+    lines = {name: line for name, line in lines_of(made).items() if name.startswith(("camera.", "detector."))}
     assert {name: line[line.index("--") + 1 :] for name, line in lines.items()} == started
     assert all(line[line.index("--name") + 1] == name for name, line in lines.items())
 
@@ -186,28 +158,21 @@ def test_a_run_that_leaves_its_cameras_no_time_says_so(
     "endpoint", ["bogus", "tcp/127.0.0.1", "tcp/127.0.0.1:", "tcp/127.0.0.1:0", "tls/127.0.0.1:7000", ""]
 )
 def test_an_endpoint_is_checked_before_anything_starts(endpoint: str):
+    for good in (None, "tcp/127.0.0.1:20001", "tcp/[::1]:20001", "tcp/localhost:20001"):
+        run.check_endpoint(good, insecure=False)
     with pytest.raises(SessionError):
         run.check_endpoint(endpoint, insecure=False)
 
 
-@pytest.mark.parametrize("endpoint", [None, "tcp/127.0.0.1:20001", "tcp/[::1]:20001", "tcp/localhost:20001"])
-def test_good_endpoints_pass(endpoint: str | None):
-    run.check_endpoint(endpoint, insecure=False)
-
-
 def test_a_run_in_one_process_says_where_it_is_recorded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setattr("zsim_analysis.in_process.fly", lambda *_, changed: "over")
-    screen = Say()
-    screen.hang_up = lambda: None  # type: ignore[attr-defined]
-    run.run_in_process(options(tmp_path, in_process=True), screen)  # type: ignore[arg-type]
+    screen, made = Say(), options(tmp_path, in_process=True)
+    run.run_in_process(made, screen)  # type: ignore[arg-type]
     assert any(has_terms(line, "into", str(tmp_path)) for line in screen.lines)
-
-
-def test_a_folder_that_takes_no_files_is_a_line(tmp_path: Path):
-    made = options(tmp_path)
+    (tmp_path / "scenario.yaml").unlink()
     (tmp_path / "scenario.yaml").mkdir()
     with refused(RunError, "written"):
-        run._write_scenario(made)
+        run.run_in_process(made, screen)  # type: ignore[arg-type]
 
 
 class NoStopChannel:

@@ -1,6 +1,7 @@
 """Into which folders a run flies."""
 
 from collections.abc import Iterable
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -25,11 +26,10 @@ def test_a_folder_with_other_files_is_refused_unless_forced(tmp_path: Path) -> N
 
 
 def test_what_a_run_leaves_that_never_flew_is_in_nobodys_way(tmp_path: Path) -> None:
-    for name in ("scenario.yaml", "run.log", "up.log"):
-        (tmp_path / name).write_text("left")
-    (tmp_path / "logs").mkdir()
-    (tmp_path / "logs" / "world.log").touch()
+    flown(tmp_path, ("scenario.yaml", "run.log", "up.log", "logs/world.log"))
+    (tmp_path / "logs" / "world.log").write_text("")
     assert make_directory(tmp_path, STEP) == tmp_path
+    assert make_directory(tmp_path / "runs" / "mine", STEP).is_dir()
 
 
 OF_A_RUN = (
@@ -78,20 +78,10 @@ def test_force_removes_nothing_of_a_folder_that_is_no_run(tmp_path: Path) -> Non
     assert files(tmp_path) == mine
 
 
-def test_force_removes_no_record_of_another_tool(tmp_path: Path) -> None:
-    flown(tmp_path, ["run.mcap", "logs/world.log", "scenario.yaml"])
-    with refused(RunError, str(tmp_path / "run.mcap"), "--out"):
-        make_directory(tmp_path, STEP, force=True)
-    assert files(tmp_path) == {"run.mcap", "logs/world.log", "scenario.yaml"}
-
-
-def test_force_does_not_touch_a_run_under_way(tmp_path: Path) -> None:
-    with RecordWriter(tmp_path / "run.mcap"):
-        flown(tmp_path, ["scenario.yaml", "logs/world.log"])
-        with refused(RunError, str(tmp_path), "--out"):
+@pytest.mark.parametrize("is_under_way", [False, True])
+def test_force_removes_no_record_of_another_tool_and_no_run_under_way(tmp_path: Path, is_under_way: bool) -> None:
+    flown(tmp_path, ["logs/world.log", "scenario.yaml", *([] if is_under_way else ["run.mcap"])])
+    with RecordWriter(tmp_path / "run.mcap") if is_under_way else nullcontext():
+        with refused(RunError, str(tmp_path if is_under_way else tmp_path / "run.mcap"), "--out"):
             make_directory(tmp_path, STEP, force=True)
-        assert files(tmp_path) == {"run.mcap", "scenario.yaml", "logs/world.log"}
-
-
-def test_a_folder_that_is_not_there_is_made(tmp_path: Path) -> None:
-    assert make_directory(tmp_path / "runs" / "mine", STEP).is_dir()
+        assert files(tmp_path) == {"run.mcap", "logs/world.log", "scenario.yaml"}

@@ -97,6 +97,11 @@ class Team:
 
         return self.watch.run(live)
 
+    def tell(self, kind: str, subject: str = "", text: str = "", **data: Any) -> None:
+        """Let the world say an event."""
+        event = {"kind": kind, "subject": subject, "text": text, "data": data}
+        self.watch.handle_line(json.dumps({"event": event}))
+
 
 def test_a_run_that_ends_well():
     team = Team(Member("estimator.d1"))
@@ -119,7 +124,7 @@ def test_who_fails_after_the_end_is_why_the_run_failed(name: str):
     team = Team(world=(143 if name == "world" else 0,))
     if name == "recorder":
         team.recorder = team.watch.members[1] = Member("recorder", 143, lives_for=21)
-    team.watch.handle_line(json.dumps({"event": {"kind": "end", "text": "over", "data": {}}}))
+    team.tell("end", text="over")
     outcome = team.go()
     assert outcome.failed
     assert has_terms(outcome.reason, name, "143")
@@ -134,11 +139,10 @@ def test_a_dead_estimator_is_started_again():
 
 def test_who_has_left_its_place_takes_it_back_when_its_successor_is_dead():
     team = Team(Member("estimator.d1", SUPERSEDED, None))
-    death = {"event": {"kind": "death", "subject": "estimator.d1", "text": "", "data": {"on_death": "restart"}}}
 
     def look() -> None:
         if team.others[0].code == SUPERSEDED:
-            team.watch.handle_line(json.dumps(death))
+            team.tell("death", "estimator.d1", on_death="restart")
 
     assert not team.go(look).failed
     assert team.others[0].restarts == 1
@@ -150,11 +154,8 @@ def test_who_ends_with_0_without_a_bye_has_died(codes: tuple[int | None, ...]):
     team = Team(Member("estimator.d1", *codes), looks=60)
 
     def look() -> None:
-        member = team.others[0]
-        data = {"on_death": "restart", "pid": member.pid}
-        if member.code == 0:
-            death = {"event": {"kind": "death", "subject": "estimator.d1", "text": "", "data": data}}
-            team.watch.handle_line(json.dumps(death))
+        if team.others[0].code == 0:
+            team.tell("death", "estimator.d1", on_death="restart", pid=team.others[0].pid)
 
     outcome = team.go(look)
     assert outcome.failed == (len(codes) > 2)
@@ -164,36 +165,28 @@ def test_who_ends_with_0_without_a_bye_has_died(codes: tuple[int | None, ...]):
 
 def test_nobody_is_started_twice_for_one_death():
     team = Team(Member("estimator.d1", None))
-    death = {"event": {"kind": "death", "subject": "estimator.d1", "text": "", "data": {"on_death": "restart"}}}
-    team.go(lambda: team.watch.handle_line(json.dumps(death)))
+    team.go(lambda: team.tell("death", "estimator.d1", on_death="restart"))
     assert team.others[0].restarts == 0
 
 
-def test_too_many_deaths_in_a_row_end_the_run():
-    team = Team(Member("estimator.d1", *[1] * 20), looks=100)
+@pytest.mark.parametrize(
+    ("name", "processes", "ends"),
+    [
+        ("estimator.d1", {}, True),
+        ("estimator.d1", {"return_s": 1, "on_overdue": {"estimator": "drop"}}, False),  # left to the world
+        ("camera.main", {}, False),  # no gate waits for it
+        ("camera.drone1", {}, False),
+        ("detector.main", {}, False),
+        ("camera.main", {"return_s": 1, "on_overdue": {"camera": "end"}}, True),
+    ],
+)
+def test_too_many_deaths_in_a_row_end_the_run_where_it_cannot_go_on(name: str, processes: dict[str, Any], ends: bool):
+    team = Team(Member(name, *[1] * 20), looks=100, **processes)
     outcome = team.go()
-    assert outcome.failed
-    assert outcome.reason.startswith("estimator.d1 ended")
+    assert (outcome.failed, outcome.reason.startswith(f"{name} ended")) == (ends, ends)
     assert team.others[0].restarts == RESTARTS_MAX
-
-
-def test_or_it_is_left_to_the_world_to_go_on_without_it():
-    team = Team(Member("estimator.d1", *[1] * 20), looks=100, return_s=1, on_overdue={"estimator": "drop"})
-    assert not team.go().failed
-    assert team.others[0].restarts == RESTARTS_MAX
-
-
-@pytest.mark.parametrize("name", ["camera.main", "camera.drone1", "detector.main"])
-def test_one_for_which_no_gate_waits_is_given_up_and_named(name: str):
-    team = Team(Member(name, *[1] * 20), looks=100)
-    assert not team.go().failed
-    assert team.others[0].restarts == RESTARTS_MAX
-    assert has_terms(team.show.lines[-1], name, "exit code 1", f"{RESTARTS_MAX} restarts", "given up")
-
-
-def test_or_the_run_ends_where_the_scenario_says_so():
-    team = Team(Member("camera.main", *[1] * 20), looks=100, return_s=1, on_overdue={"camera": "end"})
-    assert team.go().reason.startswith("camera.main ended")
+    if not ends:
+        assert has_terms(team.show.lines[-1], name, "exit code 1", f"{RESTARTS_MAX} restarts", "given up")
 
 
 @pytest.mark.parametrize(("flies", "fails"), [(False, True), (True, False)])
@@ -207,8 +200,7 @@ def test_a_run_that_cannot_begin_without_a_camera_ends(flies: bool, fails: bool)
 @pytest.mark.parametrize(("action", "fails"), [("drop", False), ("end", True)])
 def test_who_does_not_come_back_in_its_time(action: str, fails: bool):
     team = Team(Member("estimator.d1"))
-    overdue = {"kind": "overdue", "subject": "estimator.d1", "text": "late", "data": {"on_overdue": action}}
-    outcome = team.go(lambda: team.watch.handle_line(json.dumps({"event": overdue})))
+    outcome = team.go(lambda: team.tell("overdue", "estimator.d1", "late", on_overdue=action))
     assert outcome.failed == fails
     assert team.others[0].killed is not fails
 
@@ -275,23 +267,19 @@ def test_a_dead_world_fails_the_run_and_stops_the_rest():
     assert team.others[0].stopped_for == outcome.reason
 
 
-def test_a_dead_world_is_started_again():
-    team = Team(Member("estimator.d1"), world=[-signal.SIGKILL, -signal.SIGKILL, 0])
-    outcome = team.go()
-    assert (outcome.failed, team.world.restarts) == (False, 2)
-
-
-def test_a_world_that_dies_again_and_again_fails_the_run():
-    team = Team(Member("estimator.d1"), world=[-signal.SIGKILL] * 20, looks=1)
-    assert team.go().failed
-    assert team.world.restarts == RESTARTS_MAX
-
-
-@pytest.mark.parametrize("code", [USER_FAULT, 1])
-def test_a_world_that_cannot_begin_is_not_started_again(code: int):
-    team = Team(Member("estimator.d1"), world=[code, 0])
-    assert team.go().failed
-    assert team.world.restarts == 0
+@pytest.mark.parametrize(
+    ("codes", "looks", "fails", "restarts"),
+    [
+        ([-signal.SIGKILL, -signal.SIGKILL, 0], 20, False, 2),
+        ([-signal.SIGKILL] * 20, 1, True, RESTARTS_MAX),
+        ([USER_FAULT, 0], 20, True, 0),  # it cannot begin
+        ([1, 0], 20, True, 0),
+    ],
+)
+def test_a_dead_world_is_started_again(codes: list[int], looks: int, fails: bool, restarts: int):
+    team = Team(Member("estimator.d1"), world=codes, looks=looks)
+    assert team.go().failed == fails
+    assert team.world.restarts == restarts
 
 
 def test_an_interrupt_ends_everybody():
@@ -430,18 +418,18 @@ def test_a_world_that_does_not_begin_is_named_to_those_who_wait(monkeypatch: pyt
 def test_a_stopped_world_is_named_once_within_two_seconds_and_once_when_it_is_back():
     watch = WorldWatch()
     assert watch.change(100.0, 7) is None  # it may still compile
-    watch.received(100.0)
+    watch.last_s = 100.0
     assert watch.change(100.0 + 0.9 * QUIET_WORLD_S, 7) is None
     assert has_terms(watch.change(102.0, 7) or "", "world", "2.0 s", "stopped")
     assert watch.change(110.0, 7) is None
-    watch.received(110.0)
+    watch.last_s = 110.0
     assert has_terms(watch.change(110.1, 7) or "", "world", "back")
     assert watch.change(110.2, 7) is None
 
 
 def test_a_world_that_ends_is_not_taken_for_the_one_that_it_waits_for():
     watch = WorldWatch()
-    watch.received(100.0)
+    watch.last_s = 100.0
     watch.clock({"state": "running", "waiting_for": [{"name": "estimator.d1"}]})
     watch.clock({"state": "stopped", "waiting_for": [{"name": "recorder"}]})
     text = watch.change(102.0, 7) or ""

@@ -82,9 +82,6 @@ def test_who_serves_run_after_run_waits_for_the_next_where_a_world_goes_as_it_co
     assert str(gone) in said
 
 
-# The folder of a record that is named after its run
-
-
 @pytest.mark.parametrize(
     ("out", "folder"), [("runs/step-{run}", "runs/step-0badcafe"), ("runs/step", "runs/step"), (".", "."), ("{run}/x", "{run}/x")]
 )  # fmt: skip
@@ -97,9 +94,6 @@ def test_an_id_that_leads_elsewhere_is_a_line(run_id: str) -> None:
     with refused(RecordError, "runs/step-{run}", repr(run_id[:40]), "1", "64", "--out"):
         record_folder(Path("runs/step-{run}"), run_id)
     assert record_folder(Path("runs/step"), run_id) == Path("runs/step")
-
-
-# Links of a router
 
 
 ESTIMATOR, RECORDER, CONSOLE, OWN = "estimator.d1", "recorder", "console.1", "planner.own"

@@ -37,25 +37,17 @@ def key(tmp_path: Path) -> Path:
     return path
 
 
-def role(key: Path, given: str) -> list[str]:
-    """Run a process that lives until it is stopped, or orphaned; return what it prints."""
-    command = [sys.executable, "-c", ROLE, str(key.parent)]
-    done = subprocess.run(command, input=given, capture_output=True, text=True, timeout=60.0, check=True)
-    return done.stdout.split()
-
-
-def test_a_deserted_process_has_given_its_key_back_before_it_does_anything_else(key: Path) -> None:
-    assert role(key, "") == ["ready", "True", "False"]
-
-
-def test_a_process_that_is_told_to_stop_keeps_its_key_to_its_end(key: Path) -> None:
+@pytest.mark.parametrize(("given", "printed"), [("", ["True", "False"]), ("stop enough\n", ["False", "True"])])
+def test_a_process_that_is_told_to_stop_keeps_its_key_and_a_deserted_one_gives_it_back_first(
+    key: Path, given: str, printed: list[str]
+) -> None:
     command = [sys.executable, "-c", ROLE, str(key.parent)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdin
         assert process.stdout
-        process.stdin.write("stop enough\n")
-        process.stdin.flush()
-        assert process.stdout.read().split() == ["ready", "False", "True"]
+        process.stdin.write(given)
+        process.stdin.flush() if given else process.stdin.close()
+        assert process.stdout.read().split() == ["ready", *printed]
         process.wait(60.0)
     assert not key.exists()
 
@@ -130,9 +122,6 @@ def test_a_closed_terminal_ends_a_process_in_order(
         assert process.wait(60.0) == 7
 
 
-# Signals that end a command
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_interrupts(number: signal.Signals) -> None:
     former = signal.getsignal(number)
@@ -142,21 +131,15 @@ def test_a_signal_interrupts(number: signal.Signals) -> None:
 
 
 def test_what_a_library_makes_of_it_is_an_interrupt_still() -> None:
-    def lose() -> None:
+    def fail(number: int = 0) -> None:
         with suppress(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number) if number else None
         raise SystemError("returned NULL without setting an exception")
 
     with pytest.raises(KeyboardInterrupt), interruptible():
-        lose()
-
-
-def test_other_errors_are_what_they_are() -> None:
+        fail(signal.SIGINT)
     with pytest.raises(SystemError), interruptible():
-        raise SystemError("returned NULL without setting an exception")
-
-
-# Which processes give way, where Linux shares processors between sessions too
+        fail()
 
 
 AUTOGROUP = Path("/proc/self/autogroup")

@@ -8,11 +8,14 @@ from typing import Any
 import pytest
 from fake_link import FakeLink
 
-from zsim.contract import keys
+from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Mode
 from zsim.contract.run_messages import Event
 from zsim.errors import RunError
+from zsim.runtime.health import HealthMeter
 from zsim.scenario import scenario_file
+from zsim.scenario.roles import WORLD
+from zsim_world.run.inputs import Entry, Published, Run
 from zsim_world.run.world import World
 from zsim_world.server import run_journal
 from zsim_world.server.run_journal import RunJournal
@@ -97,3 +100,17 @@ def test_a_checkpoint_of_another_fleet_is_refused(tmp_path: Path):
     fly(tmp_path, 560)
     with pytest.raises(RunError, match="does not fit"):
         fly(tmp_path, scenario=SCENARIO.replace("[{name: d1", "[{name: d2, position_m: [3, 0, 0]}, {name: d1"))
+
+
+@pytest.mark.parametrize("is_complete", [True, False])
+def test_what_follows_an_end_is_noted_after_the_last_gate_only(is_complete: bool):
+    """An end before the last gate is taken back by who continues the run, whose recorder must not read of it."""
+    noted: list[Entry] = []
+    run = Run(World(scenario_file.from_text(SCENARIO), run_id="run1"), HealthMeter(WORLD), noted.append)
+    end = run.world.clock.complete if is_complete else run.world.clock.stop
+    end("the launcher is gone")
+    run.world.publish_end()
+    clock = run.world.clock_message(())
+    run.enter(Published(keys.CLOCK, clock.seq, messages.encode(clock)))
+    assert clock.state == "stopped"
+    assert [type(entry) for entry in noted] == [Published] * is_complete
