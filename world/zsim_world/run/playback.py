@@ -6,7 +6,9 @@ and can be paused, stepped and stopped. No drone can be flown.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from bisect import bisect_left
+from collections import defaultdict, deque
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -15,16 +17,19 @@ import msgspec
 import numpy as np
 
 from zsim.contract import flight_messages, keys, messages, run_messages
-from zsim.contract.flight_messages import CameraImage, CameraInfo, Sightings
+from zsim.contract.flight_messages import CameraImage, CameraInfo, Sightings, ViewDrones, ViewEstimates
 from zsim.contract.framing import KINDS, GateMessages, run_key_table
+from zsim.contract.messages import REFUSALS
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import DecodeError, RecordError
 from zsim.record import Recorded, RecordReader
+from zsim.record.record_reader import OVERLAP_NS
 from zsim.runtime.agent import Output
+from zsim.scenario import roles
+from zsim.scenario.faults import PROCESS_KILL
 from zsim.scenario.scenario import Scenario
 from zsim_world.run.coordinator import FLIGHT_REQUESTS, Coordinator
 from zsim_world.run.outbox import Refusal
-from zsim_world.run.recorded_gates import Gate, PlaybackViews, RecordedGates, author, is_played, without_kills
 from zsim_world.run.run_clock import number, refused_argument
 
 RECORD_OVER = "the record is over"  # why a replay of the whole record ended
@@ -38,6 +43,7 @@ OF_CAMERAS = {CameraImage: "camera", CameraInfo: "camera", Sightings: "detector"
 MARKS_MAX = 400  # on a timeline; more would be narrower than a pixel
 LEFT_OUT = frozenset({"command", "end"})  # kinds of events: too many commands to be marked
 TEXT_MAX = 120  # characters
+SOURCED = (flight_messages.Command, CameraImage, CameraInfo, Sightings)  # say who published them
 
 
 class PlaybackRange(NamedTuple):
@@ -95,11 +101,13 @@ class Playback(Coordinator):
         self._table = run_key_table(info)
         self._kinds = len(self._table) // len(self.names)  # of messages about a drone
         self._place = {key: place for place, key in enumerate(self._table)}
-        self._views = PlaybackViews(self.names, [cluster.name for cluster in scenario.clusters])
+        of_drones = (key for name in self.names for key in (keys.truth(name), keys.status(name), keys.estimate(name)))
+        of_clusters = (keys.cluster_state(cluster.name) for cluster in scenario.clusters)
+        self._view_sources = {*of_drones, keys.VIEW_DRONES, *of_clusters}
         self._last: dict[str, bytes] = {}
         topics = reader.topics()
-        wanted = {key for key in topics if is_played(key, played.keys)}
-        self._viewed = self._views.sources & wanted
+        wanted = {key for key in topics if _is_played(key) and roles.permits(played.keys, key)}
+        self._viewed = self._view_sources & wanted
         self._recounts = any(keys.is_sensor(key) and key not in wanted for key in topics)
         self._reader = reader
         # published only when they change, so that the last ones before the first gate are played with it
@@ -178,18 +186,18 @@ class Playback(Coordinator):
         """Tell whether a participant publishes a message in place of one on record."""
         role = OF_CAMERAS.get(messages.type_of(recorded.key))
         if role is None:
-            return bool(live.names) and author(recorded) in live.names
+            return bool(live.names) and _author(recorded) in live.names
         _, drone, what = keys.parts(recorded.key)
         if f"{role}.{drone}" in live.names:  # of the cameras that the scenario has; where it has none, of any
             cameras, camera = self._cameras.get(drone), what.removeprefix("camera/").removesuffix("/info")
             if not cameras or camera == what or camera in cameras:
                 return True
-        return bool(live.by_name) and author(recorded) in live.by_name
+        return bool(live.by_name) and _author(recorded) in live.by_name
 
     def _play(self, gate: Gate, wall_ns: int) -> None:
         live, played = self._live(), [*self._pending, *gate.messages]
         self._pending = []
-        self._last.update((m.key, m.payload) for m in gate.messages if m.key in self._views.sources)
+        self._last.update((m.key, m.payload) for m in gate.messages if m.key in self._view_sources)
         for recorded in played:
             if recorded.key == keys.FAULTS:  # they are known before the gate
                 self._publish(recorded)
@@ -211,7 +219,7 @@ class Playback(Coordinator):
                 if event.kind != "end":  # the replay has an end of its own
                     self.outbox.put(key, msgspec.structs.replace(event, seq=self.outbox.next_seq(key)))
         elif key == keys.FAULTS:
-            self.outbox.put(key, msgspec.Raw(without_kills(payload)))
+            self.outbox.put(key, msgspec.Raw(_without_kills(payload)))
         elif key != keys.VIEW_DRONES:
             self.outbox.put(key, msgspec.Raw(payload))
 
@@ -241,7 +249,31 @@ class Playback(Coordinator):
         live = self._live().names
         own = {keys.estimates_view(name) for name in live}
         own |= {keys.cluster_view(name.removeprefix("controller.")) for name in live if name.startswith("controller.")}
-        return [output for output in self._views.views(self._last, self.now_ns, seq) if output.key not in own]
+        return [output for output in self._made_views(self._last, self.now_ns, seq) if output.key not in own]
+
+    def _made_views(self, last: Mapping[str, bytes], t_ns: int, seq: int) -> Iterator[Output]:
+        """Yield the views of the gate t_ns, as far as the last values of their sources go."""
+        drones = []
+        estimates: defaultdict[str, list[flight_messages.EstimateView]] = defaultdict(list)
+        for drone in self.names:
+            truth, status = _read(last, keys.truth(drone)), _read(last, keys.status(drone))
+            if truth is not None and status is not None:
+                pose = (truth.position_m, truth.orientation_wxyz, truth.rotor_rad_s)
+                about = (status.state, status.battery_percent, status.commander)
+                drones.append(flight_messages.DroneView(drone, *pose, *about))
+            estimate = _read(last, keys.estimate(drone))
+            if estimate is not None:
+                estimates[f"estimator.{drone}"].append(flight_messages.estimate_view(drone, estimate))
+        if drones:
+            wind = _read(last, keys.VIEW_DRONES)
+            wind_m_s = wind.wind_m_s if wind is not None and len(wind.wind_m_s) == len(drones) else ()
+            yield Output(keys.VIEW_DRONES, ViewDrones(t_ns, seq, tuple(drones), wind_m_s))
+        for cluster in self.scenario.clusters:
+            state = _read(last, keys.cluster_state(cluster.name))
+            if state is not None:
+                yield Output(keys.cluster_view(cluster.name), flight_messages.cluster_view(state, t_ns, seq))
+        for process, of_process in estimates.items():
+            yield Output(keys.estimates_view(process), ViewEstimates(t_ns, seq, tuple(of_process)))
 
     def result(self) -> dict[str, Any]:
         """Return the figures of the replay so far."""
@@ -317,5 +349,150 @@ class Playback(Coordinator):
         for seq, (t_ns, passed) in enumerate(self._recorded_gates.before(instants, self._viewed, BEFORE_NS)):
             last |= passed
             if any(key.endswith("/truth") for key in passed):  # else the record has a gap there, or has ended
-                found += [(view.key, messages.encode(view.message)) for view in self._views.views(last, t_ns, seq)]
+                found += [(key, messages.encode(message)) for key, message in self._made_views(last, t_ns, seq)]
         return ControlAnswer(True, result=found)
+
+
+class Gate(NamedTuple):
+    """The messages of a gate: stamped after the gate before, up to this one; in order of writing."""
+
+    t_ns: int
+    messages: list[Recorded]
+
+
+class _Clock(msgspec.Struct):
+    state: str
+
+
+class _Sourced(msgspec.Struct):
+    source: str = ""
+
+
+_decode_clock = msgspec.msgpack.Decoder(_Clock).decode
+_decode_sourced = msgspec.msgpack.Decoder(_Sourced).decode
+
+
+class RecordedGates:
+    """Reads a record from any gate on.
+
+    An answer to a gate is written a few gates later, since the world runs ahead of the agents; it is played with the
+    gate of its stamp. A message whose stamp is further from where it was written (of a program that stamps nothing, or
+    in realtime) is played where it was written.
+
+    Args:
+        delay_ns: of the run's commands, by which the world may be ahead.
+        wanted: keys.
+    """
+
+    def __init__(self, reader: RecordReader, gate_ns: int, delay_ns: int, wanted: Collection[str]) -> None:
+        self._reader = reader
+        self._gate_ns = gate_ns
+        self._slack_ns = delay_ns + gate_ns
+        self._keys = {*wanted, keys.CLOCK}
+
+    def gates(self, from_ns: int = 0) -> Iterator[Gate]:
+        """Yield the gates from the first one at or after `from_ns` on; a gate that the record lacks is left out."""
+        for gate in self._all(from_ns):
+            if gate.t_ns >= from_ns:
+                yield gate
+
+    def _all(self, from_ns: int) -> Iterator[Gate]:
+        held: dict[int, list[Recorded]] = {}
+        gates: deque[int] = deque()
+        newest = None
+
+        def take(t_ns: int) -> Gate:
+            """Return a gate, with the messages of gates before it that the record lacks."""
+            due = sorted(gate_ns for gate_ns in held if gate_ns <= t_ns)
+            return Gate(t_ns, [recorded for gate_ns in due for recorded in held.pop(gate_ns)])
+
+        # What answers the first gate, or was sampled for it, may stand in a chunk that begins before it.
+        for recorded in self._reader.messages(self._keys, by_time=False, from_ns=max(0, from_ns - self._slack_ns)):
+            if recorded.key != keys.CLOCK:
+                due_ns = -(-recorded.t_ns // self._gate_ns) * self._gate_ns
+                if newest is not None:
+                    writing_ns = newest + self._gate_ns
+                    due_ns = due_ns if newest - self._slack_ns < due_ns <= writing_ns else writing_ns
+                held.setdefault(due_ns, []).append(recorded)
+            elif (newest is None or recorded.t_ns > newest) and _is_gate(recorded.payload):
+                newest = recorded.t_ns
+                gates.append(newest)
+                while gates[0] + self._slack_ns <= newest:
+                    yield take(gates.popleft())
+        for t_ns in gates:
+            yield take(t_ns)
+
+    def before(
+        self, instants_ns: Sequence[int], wanted: Collection[str], back_ns: int
+    ) -> Iterator[tuple[int, dict[str, bytes]]]:
+        """Yield each instant with the last payload by key since the instant before; for the first one since back_ns.
+
+        Args:
+            instants_ns: ascending.
+            wanted: keys.
+            back_ns: how far before the first instant is looked.
+        """
+        first_ns, last_ns = instants_ns[0] - back_ns, instants_ns[-1]
+        newest: list[dict[str, Recorded]] = [{} for _ in instants_ns]
+        for recorded in self._reader.messages(wanted, by_time=False, from_ns=max(0, first_ns)):
+            if recorded.t_ns > last_ns + OVERLAP_NS:
+                break
+            if first_ns <= recorded.t_ns <= last_ns:
+                of_instant = newest[bisect_left(instants_ns, recorded.t_ns)]
+                held = of_instant.get(recorded.key)
+                if held is None or held.t_ns <= recorded.t_ns:
+                    of_instant[recorded.key] = recorded
+        for t_ns, of_instant in zip(instants_ns, newest, strict=True):
+            yield t_ns, {key: recorded.payload for key, recorded in of_instant.items()}
+
+
+def _is_gate(payload: bytes) -> bool:
+    """Tell whether a clock belongs to a gate: while a run waits for its start, it does not."""
+    try:
+        return _decode_clock(payload).state != "waiting"
+    except REFUSALS:
+        return False  # not the world's
+
+
+def _is_played(key: str) -> bool:
+    """Tell whether the messages of a key may be played.
+
+    A replay publishes its own info, clock and views; what is about the processes on record is left out.
+    """
+    views = (ViewDrones, flight_messages.ViewCluster, ViewEstimates)
+    anew = key in (keys.INFO, keys.CLOCK) or messages.type_of(key) in views
+    return not anew and not key.startswith("process/")
+
+
+def _author(recorded: Recorded) -> str:
+    """Return the process that published a message, empty for the world and for unknown roles."""
+    kind = messages.type_of(recorded.key)
+    if kind is flight_messages.Estimate:
+        return f"estimator.{keys.thing(recorded.key)}"
+    if kind in (flight_messages.ClusterState, run_messages.ClusterRequest):
+        return f"controller.{keys.thing(recorded.key)}"
+    if kind is None or not issubclass(kind, SOURCED):
+        return ""
+    try:
+        return _decode_sourced(recorded.payload).source
+    except REFUSALS:
+        return ""
+
+
+def _without_kills(payload: bytes) -> bytes:
+    """Return a list of faults without those that kill a process: the participants of a replay are others."""
+    try:
+        listed: run_messages.Faults = messages.decode(keys.FAULTS, payload)
+    except DecodeError:
+        return payload
+    others = tuple(fault for fault in listed.faults if fault.kind != PROCESS_KILL)
+    return payload if others == listed.faults else messages.encode(msgspec.structs.replace(listed, faults=others))
+
+
+def _read(last: Mapping[str, bytes], key: str) -> Any:
+    """Return the last message on a key, None where there is none that can be read."""
+    payload = last.get(key)
+    try:
+        return messages.decode(key, payload) if payload is not None else None
+    except DecodeError:
+        return None

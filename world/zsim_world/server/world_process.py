@@ -32,8 +32,7 @@ from zsim_world.run_state import restore
 from zsim_world.server.admission import Admission
 from zsim_world.server.liveliness import LivelinessMonitor, SlowReaders
 from zsim_world.server.run_journal import RunJournal
-from zsim_world.server.world_inputs import TICK_S, open_inputs, recover_lost
-from zsim_world.server.world_outputs import WorldOutputs
+from zsim_world.server.world_link import TICK_S, WorldOutputs, open_inputs, recover_lost
 
 CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall

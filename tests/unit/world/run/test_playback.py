@@ -18,8 +18,7 @@ from zsim.record import Recorded, RecordReader, RecordWriter
 from zsim.scenario import scenario_file
 from zsim.schema.message import Message
 from zsim.sensors.camera import FrontCamera
-from zsim_world.run.playback import MARKS_MAX, NOT_FLYABLE, RECORD_OVER, Playback, PlaybackRange
-from zsim_world.run.recorded_gates import RecordedGates
+from zsim_world.run.playback import MARKS_MAX, NOT_FLYABLE, RECORD_OVER, Playback, PlaybackRange, RecordedGates
 from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
