@@ -46,10 +46,10 @@ class Inbox:
 
     def __init__(
         self,
-        # one message of each with t_ns == t closes the gate t; the `count` of a counted drone's sensor/status is checked
+        # a message of each with t_ns == t closes the gate t; the `count` of a counted drone's sensor/status is checked
         gate_keys: Sequence[str],
         counted: Sequence[str] = (),  # drones of which all `sensor/*` keys are read
-        # hand out what comes after its gate was taken, once, with the next: in realtime an old input is better than none
+        # hand out what comes after its gate was taken with the next, once: in realtime an old input is better than none
         keep_late: bool = False,
         # keys of which this is so in any case: they belong to no gate, such as what a detector finds in a picture
         uncounted: Sequence[str] = (),
@@ -62,9 +62,9 @@ class Inbox:
         self._closing = dict.fromkeys(gate_keys)
         # with the stamps of its last two messages; before any, they are before whatever was taken last
         self._sparse = dict.fromkeys(sparse, (ALWAYS_NS - 1, ALWAYS_NS - 1))
-        of_world = [key for key in gate_keys if keys.is_status(key) and key not in self._sparse]
+        of_world = dict.fromkeys(key for key in gate_keys if keys.is_status(key) and key not in self._sparse)
         self._not_of_world = {key: None for key in gate_keys if key not in of_world}  # not closed by GateMessages
-        self._pulse = of_world[0] if of_world else None  # whose numbers show a gap
+        self._pulse = next(iter(of_world), None)  # whose numbers show a gap
         self._waiting: dict[int, dict[tuple[str, int], Input]] = {}  # by stamp, then by key and number
         self._stamps: list[int] = []
         self._lacking: dict[int, dict[str, None]] = {}  # by gate, the closing keys that have not come
