@@ -172,12 +172,11 @@ class _Rehearsal:
         self._space = space
         self._share = limits.shape.share
         self._drones = [(name, scenario.drone(name).limits) for name in cluster.drones]
-        own = [each for _, each in self._drones]
-        asked = gains.limits
-        self._limits: RobotLimits = asked._replace(
-            speed_max_m_s=min(asked.speed_max_m_s, *(each.horizontal_speed_m_s for each in own)),
-            climb_max_m_s=min(asked.climb_max_m_s, *(each.vertical_speed_m_s for each in own)),
-            yaw_rate_max_rad_s=min(asked.yaw_rate_max_rad_s, *(math.radians(each.yaw_rate_deg_s) for each in own)),
+        of_drones = [each for _, each in self._drones]
+        self._limits: RobotLimits = gains.limits._replace(
+            speed_max_m_s=min(gains.speed_max_m_s, *(each.horizontal_speed_m_s for each in of_drones)),
+            climb_max_m_s=min(gains.climb_max_m_s, *(each.vertical_speed_m_s for each in of_drones)),
+            yaw_rate_max_rad_s=min(gains.yaw_rate_max_rad_s, *(math.radians(e.yaw_rate_deg_s) for e in of_drones)),
         )
         in_flight = limits.shape_in_flight
         wide = replace(gains, separation_min_m=NEAR_ROOM * gains.separation_min_m)
