@@ -19,7 +19,7 @@ from zsim_agents.formation.flight_check import (
     HELD_ON_REQUEST,
     READY_TO_ENGAGE,
     REJOINING,
-    EngagementLimits,
+    SHAPE,
     place_fault,
 )
 from zsim_agents.formation.spaces.scenario_space import scenario_space
@@ -542,7 +542,7 @@ def test_a_number_out_of_range_is_refused_and_its_limit_is_flown_when_it_is_type
 @pytest.mark.parametrize("side", ["p", "q"])
 def test_the_least_side_that_a_slider_offers_is_no_refusal_of_rounding(bench: Bench, side: str):
     low = next(each.low for each in slider_ranges(bench.space, bench.cluster, bench.scenario) if each.name == side)
-    gains, shape = gains_of(bench.cluster.gains), EngagementLimits().shape
+    gains, shape = gains_of(bench.cluster.gains), SHAPE
     c = bench.space.specimen(4.0)
     c[bench.space.index(side)], c[bench.space.index("z_c")] = low, 8.0
     refused = []
