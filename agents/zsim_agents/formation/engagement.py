@@ -88,7 +88,7 @@ class Engagement:
         self.gains = gains or FormationGains()
         self.law = law(space, self.gains)
         self.law.robots = self.drones
-        self.guidance = Guidance(space, self.gains, SHAPE)
+        self.guidance = Guidance(space, self.gains)
         self.plan = FlightPlan(space, plan)
         self.check = FlightCheck(space, self.drones, self.gains, limits or EngagementLimits())
         self._held_limits = self.gains.limits._replace(separation_min_m=self.gains.separation_min_m + HOLD_APART_M)
@@ -289,7 +289,7 @@ class Engagement:
             if gate.t_s - self._well_since_s < HEAL_S:
                 return
             try:
-                self.guidance.rejoin(self.check.value, gate.t_s, SHAPE_IN_FLIGHT)
+                self.guidance.rejoin(self.check.value, gate.t_s)
             except REFUSALS as refusal:
                 self._fault, self._well_since_s = f"cannot go on: {refusal}", gate.t_s
             else:

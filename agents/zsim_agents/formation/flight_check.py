@@ -193,9 +193,8 @@ class FlightCheck:
     def flight_fault(self, gate: GateInput) -> str | None:
         """Return why the loop of an engaged formation cannot be closed."""
         fault = self.state_fault(gate, AIRBORNE) or self.estimate_fault(gate) or self._no_frame
-        if fault or (
-            self._spread > SHAPE_IN_FLIGHT.spread_min_m and first_outside(self.value, self._bounds_in_flight) < 0
-        ):
+        is_wide = self._spread > SHAPE_IN_FLIGHT.spread_min_m
+        if fault or (is_wide and first_outside(self.value, self._bounds_in_flight) < 0):
             return fault
         return shape_fault(self.space, self.value, SHAPE_IN_FLIGHT, self._spread)
 
