@@ -173,16 +173,8 @@ class RunPage:
 
     Args:
         server: viser's; what another run has left on it is removed.
-        camera_follow: moves the page's cameras that follow the formation.
-        frustums: of the drones' cameras, on the pages where they are chosen.
         rate_hz: pictures a second; None: by the number of drones and the rate of the run.
         world: where the run is, in words.
-
-    Attributes:
-        record: what a replay plays.
-        flying: what pages may do with single drones.
-        orders: of the operators, until they are settled.
-        desk: which page is in control.
 
     Raises:
         RunError: a user's cluster space refuses its robots.

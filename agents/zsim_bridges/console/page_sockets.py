@@ -116,10 +116,8 @@ _ACTIONS = msgspec.json.Decoder(_Look | _Operate)
 class ActionSockets:
     """The sockets for actions of all pages.
 
-    Args:
-        client_id: returns viser's number of a page by its key, None if it is not open.
-        record: returns what a replay plays, None without a run.
-        flying: returns what pages may do with single drones, None without a run.
+    `client_id` returns viser's number of a page by its key, None if it is not open; `record` what a replay plays, and
+    `flying` what pages may do with single drones, None without a run.
     """
 
     def __init__(

@@ -64,14 +64,7 @@ CHOSEN = (25, 113, 194)
 
 
 class RunScene:
-    """The scene of one run; it replaces that of another run.
-
-    Attributes:
-        nodes: viser's.
-        drones: their newest poses, None before the first view.
-        shapes: the formations' true shapes by name; None where a drone of one is missing.
-        previews: ways (n, M, 3) [m] of formations, by name, that would be flown.
-    """
+    """The scene of one run; it replaces that of another run."""
 
     def __init__(
         self, server: viser.ViserServer, run: ShownRun, views: ViewBuffer, camera_follow: CameraFollow
@@ -81,9 +74,9 @@ class RunScene:
         self._camera_follow = camera_follow
         self._members = {name: [run.names.index(each) for each in drones] for name, drones in run.members.items()}
         self._drawn_ghosts: dict[str, Any] = {}
-        self.drones: DronePoses | None = None
-        self.shapes: dict[str, FormationShape | None] = {}
-        self.previews: dict[str, Array] = {}
+        self.drones: DronePoses | None = None  # their newest poses
+        self.shapes: dict[str, FormationShape | None] = {}  # true ones by formation; None where a drone is missing
+        self.previews: dict[str, Array] = {}  # ways (n, M, 3) [m] that formations would fly
         self.trails = CanvasTrails(len(run.names), around=run.is_replay)
         robots = sum(space.n for space in run.spaces.values())
         arms_m = [drone.arm_m for drone in run.scenario.drones]
@@ -154,16 +147,7 @@ class RunScene:
 
 
 class SceneNodes:
-    """The nodes of one run.
-
-    Args:
-        server: viser's; its scene is cleared.
-        arms_m: centre to rotor, of each.
-        robots: number of drones in formations, each with a ghost.
-
-    Attributes:
-        radii_m: (N,), how far each drone reaches from its centre.
-    """
+    """The nodes of one run, of N drones; `robots` is the number of those in formations, each of which has a ghost."""
 
     def __init__(
         self,
@@ -185,7 +169,7 @@ class SceneNodes:
         scene.add_label("/origin/e", "east", position=(1.1, 0.0, 0.0))
         scene.add_label("/origin/n", "north", position=(0.0, 1.1, 0.0))
         looks = [airframe.shape_of(*each) for each in zip(drones, arms_m, strict=True)]
-        self.radii_m: Array = np.array([look.reach_m for look in looks])
+        self.radii_m: Array = np.array([look.reach_m for look in looks])  # (N,), from the centre
 
         self._airframes: list[tuple[NDArray[np.int64], Any]] = []  # one node for all drones that look alike
         for k, look in enumerate(dict.fromkeys(looks)):

@@ -7,7 +7,7 @@ from typing import Any
 
 from aiohttp import ClientSession, web
 
-from zsim_bridges.web.web_server import BODY_BYTES_MAX, SMALL_BYTES, HttpConnections
+from zsim_bridges.web.web_server import BODY_BYTES_MAX, SMALL_BYTES, HttpConnection, HttpConnections
 
 HALF = b"GET / HTTP/1.1\r\nHost: localhost\r\n"  # the head never ends
 WHOLE = HALF + b"\r\n"
@@ -45,7 +45,9 @@ async def server(
     assert http is not None
     async with AsyncExitStack() as stack:
         stack.push_async_callback(runner.cleanup)
-        listener = await asyncio.get_running_loop().create_server(lambda: connections.protocol(http()), "127.0.0.1", 0)
+        listener = await asyncio.get_running_loop().create_server(
+            lambda: HttpConnection(http(), connections), "127.0.0.1", 0
+        )
         stack.callback(listener.close)
         port = listener.sockets[0].getsockname()[1]
 
