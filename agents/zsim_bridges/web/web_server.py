@@ -60,7 +60,10 @@ async def start_site(app: web.Application, host: str, ports: Sequence[int], shut
     await runner.setup()
     server = runner.server
     assert server is not None
-    protocol = lambda: HttpConnection(server(), connections)  # noqa: E731
+
+    def protocol() -> HttpConnection:
+        return HttpConnection(server(), connections)
+
     for port in ports:
         try:
             listener = await asyncio.get_running_loop().create_server(protocol, host, port, backlog=BACKLOG)
