@@ -20,7 +20,7 @@ from zsim.scenario.scenario import Obstacle
 from zsim.vehicles.vehicle import cross_layout
 from zsim_bridges.console import airframe
 from zsim_bridges.console.histories import CanvasTrails
-from zsim_bridges.console.page_cameras import CameraFollow
+from zsim_bridges.console.page_cameras import PageCameras
 from zsim_bridges.console.picture import (
     Array,
     DronePoses,
@@ -66,12 +66,10 @@ CHOSEN = (25, 113, 194)
 class RunScene:
     """The scene of one run; it replaces that of another run."""
 
-    def __init__(
-        self, server: viser.ViserServer, run: ShownRun, views: ViewBuffer, camera_follow: CameraFollow
-    ) -> None:
+    def __init__(self, server: viser.ViserServer, run: ShownRun, views: ViewBuffer, cameras: PageCameras) -> None:
         self._run = run
         self._views = views
-        self._camera_follow = camera_follow
+        self._cameras = cameras
         self._members = {name: [run.names.index(each) for each in drones] for name, drones in run.members.items()}
         self._drawn_ghosts: dict[str, Any] = {}
         self.drones: DronePoses | None = None  # their newest poses
@@ -82,7 +80,7 @@ class RunScene:
         arms_m = [drone.arm_m for drone in run.scenario.drones]
         self.nodes = SceneNodes(server, run.info.drones, arms_m, robots, len(run.spaces))
         self.nodes.obstacles(run.scenario.environment.obstacles)
-        camera_follow.restart()
+        cameras.restart()
 
     def clicked(self, event: viser.SceneClickEvent) -> str | None:
         if self.drones is None:
@@ -95,7 +93,7 @@ class RunScene:
         self.drones = drones
         self.trails.add(drones.t_ns / 1e9, drones.p_W)
         self.shapes = self.shapes_of(drones)
-        self._camera_follow.set_target(self._camera_targets(drones))
+        self._cameras.set_target(self._camera_targets(drones))
         return drones
 
     def draw(self, view: ViewDrones, longest_s: float, chosen: str) -> DronePoses:
@@ -116,7 +114,7 @@ class RunScene:
             poses = [ghosts(self._run.spaces[name], view) for name, view in self._views.clusters.items()]
             shown = [(np.zeros((0, 3)), np.zeros((0, 4))), *(each for each in poses if each is not None)]
             self.nodes.ghosts(np.concatenate([p_W for p_W, _ in shown]), np.concatenate([q for _, q in shown]))
-        self._camera_follow.follow(self._camera_targets(drones))
+        self._cameras.follow(self._camera_targets(drones))
         return drones
 
     def preview(self, cluster: str, shown: FlightPreview | None) -> None:
