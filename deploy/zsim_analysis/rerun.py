@@ -287,7 +287,15 @@ class RerunBus(Bus):
             AgentsWithRequests(hosted(info, scenario, process.members), dict(requests), hold_ns)
             for process in agents.processes
         ]
-        super().__init__(world, groups, lambda: 0, self._compare_output, self._keep_truth)
+
+        def compare_output(key: str, message: Any) -> None:
+            if isinstance(message, (*messages.RELAYED, flight_messages.Command)):
+                self.outputs.add(key, message)
+
+        def keep_truth(gate: GateMessages) -> None:
+            self.truth = {keys.thing(key): payload for key, payload in gate.pairs if keys.leaf(key) == "truth"}
+
+        super().__init__(world, groups, lambda: 0, compare_output, keep_truth)
         self._world = world
         self._rerun = agents.names
         self.truth: dict[str, bytes] = {}
@@ -335,13 +343,6 @@ class RerunBus(Bus):
     def _leave_failed(self, agent: Agent, inbox: Inbox) -> None:
         """Stop feeding an agent that failed; the world continues as far as it did on record."""
         inbox.start_after(NEVER_NS)
-
-    def _compare_output(self, key: str, message: Any) -> None:
-        if isinstance(message, (*messages.RELAYED, flight_messages.Command)):
-            self.outputs.add(key, message)
-
-    def _keep_truth(self, gate: GateMessages) -> None:
-        self.truth = {keys.thing(key): payload for key, payload in gate.pairs if keys.leaf(key) == "truth"}
 
     def _update_faults(self, faults: run_messages.Faults) -> None:
         if self._rerun:  # alone, the world receives the commands that resulted from them

@@ -1,6 +1,5 @@
 """Whether a formation may take off, be engaged, flown on, and where it may be led: every fault in words.
 
-Order of this file: limits, input and output of the phase machine at a gate, checks of a gate, checks of a reference.
 The data of a gate are Structs, which take a fifth of the time of a named tuple or dataclass.
 """
 
@@ -93,7 +92,6 @@ class GateInput(Struct, eq=False):
     """The newest estimates of n drones at a gate; its arrays may be overwritten for the next.
 
     Attributes:
-        t_s: simulated time.
         p_W, v_W: (n, 3) [m, m/s]; yaw: (n,) [rad]; non-finite where nothing is known.
         sigma_m: (n, 3) standard deviations of position; yaw_sigma: (n,) of the heading [rad].
         age_s: (n,) ages of the estimates; infinite where there is none.
@@ -110,16 +108,13 @@ class GateInput(Struct, eq=False):
     states: tuple[str, ...]
 
     @property
-    def down(self) -> bool:
-        """Whether no drone is in the air."""
+    def down(self) -> bool:  # no drone is in the air
         return DOWN.issuperset(self.states)
 
 
 class ModeCommand(NamedTuple):
-    """A mode command for one drone: takeoff or land."""
-
     drone: str
-    mode: str
+    mode: str  # takeoff or land
 
 
 class Setpoint(Struct, eq=False):
@@ -141,12 +136,10 @@ class GateOutput(Struct, eq=False):
     """Commands of a gate, and the fields of the cluster's state message.
 
     Attributes:
-        modes: mode commands to send.
         setpoints: (n,) velocity commands, None for no command.
         phase, value, desired, desired_rate, trajectory_t_s, margin, reason, plan_step: as in the message; value and
             desired with wrapped angles.
         factor: common factor of the saturation, 1 where nothing is saturated.
-        alarmed: pairs of drone indices that are nearer than the alarm threshold.
     """
 
     modes: tuple[ModeCommand, ...]
@@ -159,7 +152,6 @@ class GateOutput(Struct, eq=False):
     margin: float
     reason: str
     factor: float
-    alarmed: tuple[tuple[int, int], ...]
     plan_step: int
 
 
@@ -168,7 +160,7 @@ class FlightCheck:
 
     Attributes:
         value: (4n,) cluster of the newest estimates that had a frame, zero before any.
-        margin: its distance to singularity [m] (`ClusterSpace.margin`), 0 while the estimates have no frame.
+        margin: its `ClusterSpace.margin`, 0 while the estimates have no frame.
     """
 
     def __init__(
@@ -200,12 +192,11 @@ class FlightCheck:
 
     def take_off_fault(self, gate: GateInput) -> str | None:
         """Return why the drones may not take off; drones that fly already need not stand well."""
-        fault = self.state_fault(gate, AIRBORNE | {"landed"}) or self._start_fault(gate)
+        fault = self._start_fault(gate, AIRBORNE | {"landed"})
         return fault or (self.formation_fault(gate) if "landed" in gate.states else None)
 
     def engagement_fault(self, gate: GateInput) -> str | None:
-        fault = self.state_fault(gate, AIRBORNE) or self._start_fault(gate)
-        if fault:
+        if fault := self._start_fault(gate, AIRBORNE):
             return fault
         low = int(np.argmin(gate.p_W[:, 2]))
         least_m = self.limits.assembly_height_m - self.limits.assembly_within_m
@@ -243,8 +234,8 @@ class FlightCheck:
         drone, state = next(pair for pair in zip(self.drones, gate.states, strict=True) if pair[1] not in allowed)
         return f"{drone} is in state {state}; allowed: {', '.join(sorted(allowed))}"
 
-    def _start_fault(self, gate: GateInput) -> str | None:
-        return self._flaw_text(gate, _first_flaw(gate, *self._at_start))
+    def _start_fault(self, gate: GateInput, allowed: frozenset[str]) -> str | None:
+        return self.state_fault(gate, allowed) or self._flaw_text(gate, _first_flaw(gate, *self._at_start))
 
     def _flaw_text(self, gate: GateInput, flaw: tuple[int, int], factor: float = 1.0) -> str | None:
         kind, i = flaw
@@ -269,7 +260,7 @@ def _first_flaw(gate: GateInput, age_max_s: float, sigma_max_m: float, yaw_sigma
 
 @portable
 def all_near(p_W: Array, yaw: Array) -> bool:
-    """Return whether all positions (n, 3) and headings (n,) are finite and below FAR."""
+    """Tell whether all positions (n, 3) and headings (n,) are finite and below FAR."""
     fit = True
     for i in range(yaw.size):
         fit = fit and near(p_W, i) and abs(yaw[i]) < FAR
@@ -278,7 +269,7 @@ def all_near(p_W: Array, yaw: Array) -> bool:
 
 @portable
 def near(vectors: Array, i: int) -> bool:
-    """Return whether row i of (n, 3) is finite and below FAR; false for NaN."""
+    """Tell whether row i of (n, 3) is finite and below FAR."""
     return abs(vectors[i, 0]) < FAR and abs(vectors[i, 1]) < FAR and abs(vectors[i, 2]) < FAR
 
 
@@ -294,9 +285,9 @@ def estimate_flaw(
     sigma_max_m: float,
     yaw_sigma_max: float,
 ) -> tuple[int, int]:
-    """Return the flaw of the first unusable estimate (STALE, NOT_FINITE, UNCERTAIN, TURNED), and its drone; else VALID.
+    """Return the flaw of the first unusable estimate, and its drone; VALID if there is none.
 
-    UNCERTAIN: of the position; TURNED: of the heading.
+    UNCERTAIN is of the position, TURNED of the heading.
     """
     for i in range(yaw.size):
         if not age_s[i] <= age_max_s:
@@ -312,10 +303,7 @@ def estimate_flaw(
 
 
 def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits, spread: float | None = None) -> str | None:
-    """Return why c is no shape to engage in or to lead to, or None; names quantity, value and limit.
-
-    `spread` of c is passed where it is known.
-    """
+    """Return why c, whose spread may be known, is no shape to engage in or to lead to: quantity, value and limit."""
     outside = first_outside(c, space.bounds)
     if outside >= 0:
         name, value, (low, high) = space.names[outside], float(c[outside]), space.bounds[outside].tolist()
@@ -328,9 +316,8 @@ def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits, spread: floa
     for k in space.tilts:
         if abs(c[k]) >= limits.tilt_max_rad:
             tilt_deg, most_deg = math.degrees(c[k]), math.degrees(limits.tilt_max_rad)
-            return (
-                f"{space.names[k]} of the formation is {tilt_deg:.1f} deg; allowed: below {most_deg:g} deg either way"
-            )
+            tilt = f"{space.names[k]} of the formation is {tilt_deg:.1f} deg"
+            return f"{tilt}; allowed: below {most_deg:g} deg either way"
     condition = space.condition(c) if math.isfinite(limits.condition_max) else 0.0
     if not condition < limits.condition_max:
         return f"condition number of J^-1 is {condition:.1f}; allowed: below {limits.condition_max:g}"
@@ -361,7 +348,7 @@ def formation_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits
 
 
 def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
-    """Return why the robots may not be where c puts them (too near to each other, too low), or None."""
+    """Return why the robots may not be where c puts them: too near to each other, or too low."""
     p_W, _ = space.inverse(c)
     if well_placed(p_W, gains.separation_min_m, limits.height_min_m):
         return None
@@ -379,7 +366,6 @@ def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: Sh
 
 @portable
 def well_placed(p_W: Array, separation_min_m: float, height_min_m: float) -> bool:
-    """Return whether robots at p_W (n, 3) are neither too near to each other nor too low."""
     fit = closest_pair(p_W)[0] >= separation_min_m - ROUNDING_M
     for i in range(p_W.shape[0]):
         fit = fit and p_W[i, 2] >= height_min_m - ROUNDING_M

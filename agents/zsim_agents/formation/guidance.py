@@ -1,8 +1,4 @@
-"""Where a formation is to be at every instant: the reference, and the ramps by which requests change it smoothly.
-
-Order of this file: the reference in flight, ramps within the robots' limits and their checks, the places of robots that
-return one by one.
-"""
+"""Where a formation is to be at every instant: the reference, and the ramps by which requests change it smoothly."""
 
 from __future__ import annotations
 
@@ -46,9 +42,6 @@ class Guidance:
 
     Methods that change the reference raise TrajectoryError, ExpressionError or SingularClusterError where the way is
     not allowed, and change nothing then.
-
-    Attributes:
-        paused: the formation stands still on request.
     """
 
     def __init__(self, space: ClusterSpace, gains: FormationGains, shape: ShapeLimits) -> None:
@@ -173,11 +166,7 @@ class RampPlanner:
         return ramp
 
     def fastest(self, start: tuple[Array, Array], onto: Reference, start_s: float) -> Ramp:
-        """Return the ramp that uses the limits; its way is not checked.
-
-        Raises:
-            TrajectoryError: it would take longer than an hour.
-        """
+        """Return the ramp that uses the limits, its way unchecked; TrajectoryError: it would take over an hour."""
         over_s = RAMP_MIN_S
         while over_s <= RAMP_MAX_S:
             ramp = ramp_onto(self._space, *start, onto, start_s, over_s)
@@ -200,31 +189,21 @@ class RampPlanner:
         count = min(max(math.ceil((to_s - from_s) / SAMPLE_S) + 1, SAMPLES_MIN), SAMPLES_MAX)
         count = count if to_s > from_s else 1
         for t_s in np.linspace(from_s, to_s, count).tolist():
-            fault = self._fault_at(*reference.value(t_s))
+            c, c_dot = reference.value(t_s)
+            fault = formation_fault(self._space, c, self._gains, self._limits)
+            if not fault and (share := self._load(c, c_dot)) > self._limits.share * LOAD_TOLERANCE:
+                fault = f"a robot moves at {share:.2f} of its limits; allowed: {self._limits.share:g}"
             if fault:
                 return f"{t_s - from_s:.1f} s after its start {fault}" if t_s > from_s else fault
         return None
 
-    def _fault_at(self, c: Array, c_dot: Array) -> str | None:
-        if fault := formation_fault(self._space, c, self._gains, self._limits):
-            return fault
-        share = self._load(c, c_dot)
-        if share > self._limits.share * LOAD_TOLERANCE:
-            return f"a robot moves at {share:.2f} of its limits; allowed: {self._limits.share:g}"
-        return None
-
 
 class Places:
-    """The places of the robots of a held formation, and how each gets there by itself.
+    """The places p_W (n, 3) [m] of the robots of a held formation, and how each gets there by itself.
 
     A robot that is far out of step (landed, and flown low again) makes a shape in which no formation can be led. It
-    first flies horizontally, at its height and so below or above the others, then straight up or down.
-
-    Args:
-        p_W: (n, 3) m; the places.
-        gains: of the formation.
-        limits: of its robots.
-        share: of those limits that is used.
+    first flies horizontally, at its height and so below or above the others, then straight up or down, with a share of
+    the robots' limits.
     """
 
     def __init__(self, p_W: Array, gains: FormationGains, limits: RobotLimits, share: float) -> None:

@@ -35,7 +35,7 @@ from zsim_analysis.in_process import InProcessFlight
 from zsim_analysis.reading.formation import Formation, formations_of
 from zsim_analysis.reading.recorded_flight import FlightReader, RecordedFlight
 from zsim_analysis.reading.shortfall import CRASHES
-from zsim_analysis.report.summary import RunSummary, summarise
+from zsim_analysis.report.summary import summarise
 from zsim_analysis.sweep.design import METRICS
 
 METRIC = "metrics."  # prefix of the columns of the user's metrics
@@ -154,8 +154,16 @@ def fly(task: Task) -> Row:
         **where,
     )
     columns: dict[str, float | None] = {engaged_column(name): engaged.get(name) for name in clusters}
-    errors = {} if diverged else _errors(summary, engaged)
-    return make_row(result, task.varied, {**columns, **errors, **metrics})
+    for i, (name, cluster) in enumerate([] if diverged else summary.clusters.items()):
+        # Errors by their paths in summary.json. Those of a cluster that was not engaged are None, and all of a flight
+        # that was not as planned: drones that stay on the ground, or hover instead of following a trajectory, do not
+        # hold the requested formation, and a drone that fell errs for a shorter time.
+        prefix = "errors" if i == 0 else f"clusters.{name}.errors"
+        counts = summary.as_planned and engaged[name] is not None
+        for parameter, errors in cluster.errors.items():
+            for statistic, value in msgspec.structs.asdict(errors).items():
+                columns[f"{prefix}.{parameter}.{statistic}"] = value if counts else None
+    return make_row(result, task.varied, {**columns, **metrics})
 
 
 def fly_scenario(scenario: Scenario, writer: RecordWriter | None = None) -> tuple[RecordedFlight, Exception | None]:
@@ -203,22 +211,6 @@ def engaged_s(formations: list[Formation], window_s: tuple[float, float]) -> dic
     """Return the first instant [s] of a window at which each cluster was engaged, None if it never was."""
     rows = {each.name: np.flatnonzero(each.judged(window_s)) for each in formations}
     return {each.name: float(each.t_s[rows[each.name][0]]) if len(rows[each.name]) else None for each in formations}
-
-
-def _errors(summary: RunSummary, engaged: dict[str, float | None]) -> dict[str, float | None]:
-    """Return the errors of the formations by their paths in summary.json; `errors` is the first cluster.
-
-    Those of a cluster that was not engaged are None, and all of a flight that was not as planned: drones that stay on
-    the ground, or hover instead of following a trajectory, do not hold the requested formation, and a drone that fell
-    errs for a shorter time.
-    """
-    columns: dict[str, float | None] = {}
-    for i, (name, cluster) in enumerate(summary.clusters.items()):
-        prefix, counts = "errors" if i == 0 else f"clusters.{name}.errors", engaged[name] is not None
-        for parameter, errors in cluster.errors.items():
-            for statistic, value in msgspec.structs.asdict(errors).items():
-                columns[f"{prefix}.{parameter}.{statistic}"] = value if counts and summary.as_planned else None
-    return columns
 
 
 def metrics_of(scenario: Scenario, flight: RecordedFlight) -> tuple[dict[str, float | None], str | None]:
