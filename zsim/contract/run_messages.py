@@ -58,7 +58,6 @@ class Event(Message, frozen=True):
     data: dict[str, Any] = field(default_factory=dict)
 
     def fault(self) -> str | None:
-        """Return a fault that the types cannot express."""
         return _infinite_fault("data", self.data)
 
 
@@ -168,7 +167,6 @@ class ControlRequest(Struct, frozen=True):
     source: str = ""
 
     def fault(self) -> str | None:
-        """Return a fault that the types cannot express."""
         return _infinite_fault("args", self.args)
 
 
@@ -181,7 +179,6 @@ class ControlAnswer(Struct, frozen=True):
     more: Count | None = None
 
     def fault(self) -> str | None:
-        """Return a fault that the types cannot express."""
         return _infinite_fault("result", self.result)
 
 
@@ -200,7 +197,6 @@ class ClusterRequest(Message, frozen=True):
     controller: str = ""
 
     def fault(self) -> str | None:
-        """Return a fault that the types cannot express."""
         return _infinite_fault("args", self.args)
 
 

@@ -301,8 +301,9 @@ def test_pause_becomes_resume(bench: Bench):
         form.refresh(RunCondition(clock=clock))
         assert (bench.gui.at["Resume"].visible, bench.gui.at["Pause"].visible) == (paused, not paused)
         assert bench.gui.at["Step"].disabled is not paused
-    for run in ({"clock": "paused", "at_end": True}, {"clock": "stopped", "ended": "the record is over"}):
-        form.refresh(RunCondition(replayed=True, **run))  # a replay at its end is not offered to go on
+    at_end = RunCondition("paused", replayed=True, at_end=True)
+    for run in (at_end, at_end._replace(clock="stopped", ended="the record is over")):
+        form.refresh(run)  # a replay at its end is not offered to go on
         assert bench.gui.at["Step"].disabled
         assert all(bench.gui.at[label].disabled for label in ("Pause", "Resume") if bench.gui.at[label].visible)
         assert has_terms(bench.gui.at["Step"].hint, "record")

@@ -14,8 +14,7 @@ from zsim.errors import DecodeError
 
 
 @pytest.mark.parametrize(
-    "value",
-    [0, -(2**63), 0.1, -0.0, math.inf, "text", b"bytes", None, True, [1, [2.5, "x"]], {"a": {"b": 1}}],
+    "value", [0, -(2**63), 0.1, -0.0, math.inf, "text", b"bytes", None, True, [1, [2.5, "x"]], {"a": {"b": 1}}]
 )
 def test_plain_values_come_back_as_they_were(value: Any):
     assert repr(unpack(pack({"value": value}))) == repr({"value": value})
