@@ -31,21 +31,13 @@ FLOWN = ("world", "agents", "record")  # extras that a flight needs
 
 
 class Flight(NamedTuple):
-    """What both revisions fly.
+    """What both revisions fly."""
 
-    Attributes:
-        label: for people.
-        drones: number of drones.
-        options: of `zsim run`.
-        short_s: duration of the short flight, simulated; its processor time is taken from that of the long one.
-        long_s: duration of the long flight, simulated.
-    """
-
-    label: str
-    drones: int
-    options: tuple[str, ...]
-    short_s: float
-    long_s: float
+    label: str  # for people
+    drones: int  # number of drones
+    options: tuple[str, ...]  # of `zsim run`
+    short_s: float  # duration of the short flight, simulated; its processor time is taken from that of the long one
+    long_s: float  # duration of the long flight, simulated
 
 
 FLIGHTS = {

@@ -55,17 +55,11 @@ CAMERA = ViewerCamera(  # what a page says first; before it, viser heeds no cont
 
 
 class Share(NamedTuple):
-    """What was seen of a console meanwhile.
+    """What was seen of a console meanwhile."""
 
-    Attributes:
-        percent: of a core.
-        read_per_s: what was counted at the page.
-        factor: simulated by wall time.
-    """
-
-    percent: float
-    read_per_s: float
-    factor: float
+    percent: float  # of a core
+    read_per_s: float  # what was counted at the page
+    factor: float  # simulated by wall time
 
 
 class Reader:

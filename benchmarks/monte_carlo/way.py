@@ -10,17 +10,11 @@ GATE_S = 0.02  # between two points
 
 
 class Way(NamedTuple):
-    """Where three drones truly were, every gate from t = 0.
+    """Where three drones truly were, every gate from t = 0."""
 
-    Attributes:
-        p_W: (K, 3, 3) positions [m].
-        v_W: (K, 3, 3) velocities [m/s].
-        yaw: (K, 3) [rad].
-    """
-
-    p_W: NDArray[np.float64]
-    v_W: NDArray[np.float64]
-    yaw: NDArray[np.float64]
+    p_W: NDArray[np.float64]  # (K, 3, 3) positions [m]
+    v_W: NDArray[np.float64]  # (K, 3, 3) velocities [m/s]
+    yaw: NDArray[np.float64]  # (K, 3) [rad]
 
     @property
     def span_s(self) -> float:

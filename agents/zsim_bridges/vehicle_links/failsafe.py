@@ -47,12 +47,7 @@ class FlightLimits(NamedTuple):
     ceiling_m: float = math.inf
 
     def limited(self, velocity_m_s: Sequence[float], position_m: Sequence[float] | None) -> tuple[float, float, float]:
-        """Return a velocity [m/s; W] within the limits that does not lead through the fence.
-
-        Args:
-            velocity_m_s: that is asked for [W].
-            position_m: of the aircraft [W]; None if it is not known: then no fence acts.
-        """
+        """Return a velocity [m/s; W] within the limits that does not lead through the fence, if a position is known."""
         x, y, z = velocity_m_s
         speed = math.hypot(x, y)
         share = min(1.0, self.speed_m_s / speed) if speed else 1.0
@@ -68,7 +63,6 @@ class FlightLimits(NamedTuple):
         return x, y, min(z, _approach(self.ceiling_m - position_m[2]))
 
     def yaw_rate(self, yaw_rate_rad_s: float) -> float:
-        """Return a yaw rate [rad/s] within the limit."""
         return max(-self.yaw_rate_rad_s, min(self.yaw_rate_rad_s, yaw_rate_rad_s))
 
     def is_breached(self, position_m: Sequence[float]) -> bool:
@@ -85,14 +79,8 @@ def _approach(distance_m: float) -> float:
 class Failsafe:
     """The phases of a flight, by what is commanded and who is silent.
 
-    Args:
-        silence: of the scenario.
-        limits: that hold whatever is commanded.
-        armed: whether it begins armed.
-
     Attributes:
         armed: whether commands are obeyed.
-        phase: of the flight.
         commander: source of the last setpoint.
         reason: why it last left the commander's control; empty for never.
     """
@@ -146,7 +134,6 @@ class Failsafe:
     # The run
 
     def on_clock(self, now_ns: int) -> None:
-        """Note that the world is there."""
         self._clock_ns = now_ns
 
     def on_command(self, command: flight_messages.Command, now_ns: int, vehicle: AircraftState) -> str | None:
@@ -159,8 +146,11 @@ class Failsafe:
                 return self._reset(now_ns, vehicle)
             case _ if not self.armed:
                 return "its driver is not armed; an operator asks `arm` of it"
+            case flight_messages.Mode(mode="land"):
+                self._enter("landing", now_ns)
+                return None
             case flight_messages.Mode():
-                return self._on_mode(command.mode, now_ns, vehicle)
+                return self._take_off(now_ns, vehicle)
             case flight_messages.Velocity():
                 self._setpoint, self._setpoint_ns, self.commander = command, now_ns, command.source
                 return None
@@ -170,10 +160,7 @@ class Failsafe:
             case _:
                 return f"a driver does not take {type(command).__name__}; send velocity"
 
-    def _on_mode(self, mode: str, now_ns: int, vehicle: AircraftState) -> str | None:
-        if mode == "land":
-            self._enter("landing", now_ns)
-            return None
+    def _take_off(self, now_ns: int, vehicle: AircraftState) -> str | None:
         if vehicle.state != "landed":
             return f"the aircraft is {vehicle.state}; a take-off needs it landed"
         if self._is_outside(vehicle):
@@ -193,7 +180,6 @@ class Failsafe:
     # The aircraft
 
     def demand(self, now_ns: int, vehicle: AircraftState) -> Demand:
-        """Return what the aircraft is to do now."""
         self._advance(now_ns, vehicle)
         match self.phase:
             case "killed":

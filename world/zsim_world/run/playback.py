@@ -6,7 +6,7 @@ and can be paused, stepped and stopped. No drone can be flown.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -21,9 +21,7 @@ from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import DecodeError, RecordError
 from zsim.record import Recorded, RecordReader
 from zsim.runtime.agent import Output
-from zsim.scenario.roles import OnDeath
 from zsim.scenario.scenario import Scenario
-from zsim_world.run.barrier import Participant
 from zsim_world.run.coordinator import FLIGHT_REQUESTS, Coordinator
 from zsim_world.run.outbox import Refusal
 from zsim_world.run.recorded_gates import Gate, PlaybackViews, RecordedGates, author, is_played, without_kills
@@ -43,40 +41,40 @@ TEXT_MAX = 120  # characters
 
 
 class PlaybackRange(NamedTuple):
-    """What is played of a record.
+    """What is played of a record."""
 
-    Attributes:
-        from_ns, to_ns: first and last gate [ns]; None for the end.
-        keys: expressions; what matches none is not played.
-        paused: whether it stands still after its first gate.
-        holds: whether it stands still after its last one, so that one can go back, rather than end.
-    """
+    from_ns: int = 0  # first gate
+    to_ns: int | None = None  # last gate, None for the end
+    keys: tuple[str, ...] = ("**",)  # expressions; what matches none is not played
+    paused: bool = False  # stand still after the first gate
+    holds: bool = False  # stand still after the last one, so that one can go back, rather than end
 
-    from_ns: int = 0
-    to_ns: int | None = None
-    keys: tuple[str, ...] = ("**",)
-    paused: bool = False
-    holds: bool = False
+
+class _Live(NamedTuple):
+    """The processes that take part at a gate, whose outputs are not played, by all names whose work they do."""
+
+    names: set[str]
+    by_name: set[str]  # of those that declare no camera and no detector of a drone
 
 
 class Playback(Coordinator):
     """Plays a record.
 
-    Outputs that a participant publishes itself (recognised by its name, `estimator.drone1`; pictures and detections by
-    their drone) are not played.
+    Outputs that a participant publishes itself (recognised by its name, `estimator.drone1`) are not played. A camera or
+    detector is recognised by the drones that it declares, whatever its name is; one that declares none, as a program of
+    the user's own may, by its name.
 
     Args:
         reader: of the record; it stays open.
-        scenario: the one on record.
-        info: the one on record.
-        played: what is played of it.
+        scenario, info: the ones on record.
         rate: simulated per wall seconds; 0 = as fast as possible.
-        wall_ns: monotonic wall time.
         run_id: given by tests that compare.
 
     Raises:
         RecordError: there is nothing to play.
     """
+
+    needs_participants = False
 
     def __init__(
         self,
@@ -93,6 +91,7 @@ class Playback(Coordinator):
         self._played = played
         self._operations |= {"seek": self._seek, "timeline": self._timeline, "views": self._views_of_past}
         self.refused_queries = tuple(keys.cluster_control(cluster.name) for cluster in scenario.clusters)
+        self._cameras = {drone.name: drone.sensors.cameras() for drone in scenario.drones}
         self._table = run_key_table(info)
         self._kinds = len(self._table) // len(self.names)  # of messages about a drone
         self._place = {key: place for place, key in enumerate(self._table)}
@@ -103,8 +102,8 @@ class Playback(Coordinator):
         self._viewed = self._views.sources & wanted
         self._recounts = any(keys.is_sensor(key) and key not in wanted for key in topics)
         self._reader = reader
-        self._plays_faults = keys.FAULTS in wanted
-        self._camera_infos = frozenset(key for key in wanted if messages.type_of(key) is CameraInfo)
+        # published only when they change, so that the last ones before the first gate are played with it
+        self._standing = {key for key in wanted if key == keys.FAULTS or messages.type_of(key) is CameraInfo}
         gate_keys = wanted | ({keys.VIEW_DRONES} & topics.keys())
         self._recorded_gates = RecordedGates(reader, self.clock.gate_ns, self.clock.delay_ns, gate_keys)
         self._wind(played.from_ns)
@@ -127,19 +126,20 @@ class Playback(Coordinator):
     # Time
 
     def advance(self, wall_ns: int) -> None:
-        """Play the next gate."""
-        gate, over = self._coming, self._over()
-        if gate is None or over:
-            self._end(over)
-            return
-        if self.clock.state == "waiting":
-            self.clock.start(gate.t_ns, self._played.paused)
-        else:
-            self.clock.advance(gate.t_ns)
-        self._play(gate, wall_ns)
-        self._read_next()
+        """Play the next gate, if there is one; stand still or end after the last one."""
+        gate = self._coming
+        if gate is not None and not self._over():
+            if self.clock.state == "waiting":
+                self.clock.start(gate.t_ns, self._played.paused)
+            else:
+                self.clock.advance(gate.t_ns)
+            self._play(gate, wall_ns)
+            self._read_next()
         if over := self._over():
-            self._end(over)
+            if self._played.holds:
+                self.clock.hold()
+            else:
+                self.clock.stop(over)
 
     def _over(self) -> str:
         """Return why there is nothing more to play; empty while there is something."""
@@ -148,18 +148,158 @@ class Playback(Coordinator):
             return RECORD_OVER
         return f"played to {to_ns / 1e9:g} s" if to_ns is not None and self._coming.t_ns > to_ns else ""
 
-    def _end(self, reason: str) -> None:
-        if self._played.holds:
-            self.clock.hold()
-        else:
-            self.clock.stop(reason)
+    def _wind(self, from_ns: int) -> None:
+        """Continue with the first gate at or after a time."""
+        self._gates = self._recorded_gates.gates(from_ns)
+        self._read_next()
+        before: list[Recorded] = []
+        if self._standing and from_ns > 0:
+            before = [m for m in self._reader.messages(self._standing, by_time=False) if m.t_ns < from_ns]
+        self._pending = list({m.key: m for m in sorted(before, key=lambda m: m.t_ns)}.values())
+
+    def _read_next(self) -> None:
+        self._coming: Gate | None = next(self._gates, None)
+        if self._coming is not None:
+            self.clock.next_ns = self._coming.t_ns
+
+    # What is played
+
+    def _live(self) -> _Live:
+        served = [each.served_names for each in self.barrier.participants.values()]
+
+        def is_of_cameras(name: str) -> bool:
+            role, _, drone = name.partition(".")
+            return role in OF_CAMERAS.values() and drone in self._cameras
+
+        by_name = {name for names in served if not any(map(is_of_cameras, names)) for name in names}
+        return _Live({name for names in served for name in names}, by_name)
+
+    def _is_replaced(self, recorded: Recorded, live: _Live) -> bool:
+        """Tell whether a participant publishes a message in place of one on record."""
+        role = OF_CAMERAS.get(messages.type_of(recorded.key))
+        if role is None:
+            return bool(live.names) and author(recorded) in live.names
+        _, drone, what = keys.parts(recorded.key)
+        if f"{role}.{drone}" in live.names:  # of the cameras that the scenario has; where it has none, of any
+            cameras, camera = self._cameras.get(drone), what.removeprefix("camera/").removesuffix("/info")
+            if not cameras or camera == what or camera in cameras:
+                return True
+        return bool(live.by_name) and author(recorded) in live.by_name
+
+    def _play(self, gate: Gate, wall_ns: int) -> None:
+        live, played = self._live(), [*self._pending, *gate.messages]
+        self._pending = []
+        self._last.update((m.key, m.payload) for m in gate.messages if m.key in self._views.sources)
+        for recorded in played:
+            if recorded.key == keys.FAULTS:  # they are known before the gate
+                self._publish(recorded)
+        if of_drones := [m for m in gate.messages if m.key in self._place]:
+            self.outbox.put(keys.GATE, self._gate_messages(gate.t_ns, of_drones))
+        self.statistics.gate(gate.t_ns, wall_ns)
+        self.outbox.put(keys.CLOCK, self.clock_message(self.missed(wall_ns)))
+        for recorded in played:
+            if recorded.key in self._place or recorded.key == keys.FAULTS or self._is_replaced(recorded, live):
+                continue
+            self._publish(recorded)
+
+    def _publish(self, recorded: Recorded) -> None:
+        """Publish a message again, byte by byte, except events, which are numbered anew, and kills of processes."""
+        key, payload = recorded.key, recorded.payload
+        if key == keys.EVENT:
+            with suppress(DecodeError):
+                event: run_messages.Event = messages.decode(keys.EVENT, payload)
+                if event.kind != "end":  # the replay has an end of its own
+                    self.outbox.put(key, msgspec.structs.replace(event, seq=self.outbox.next_seq(key)))
+        elif key == keys.FAULTS:
+            self.outbox.put(key, msgspec.Raw(without_kills(payload)))
+        elif key != keys.VIEW_DRONES:
+            self.outbox.put(key, msgspec.Raw(payload))
+
+    def _gate_messages(self, t_ns: int, of_drones: list[Recorded]) -> GateMessages:
+        """Return the world's messages about its drones as the world published them: drone by drone, status last.
+
+        Each status counts the sensor messages that are played; agents would wait for the others.
+        """
+        of_drones.sort(key=lambda m: self._place[m.key] // self._kinds)
+        which = np.array([self._place[m.key] for m in of_drones])
+        first = np.searchsorted(which // self._kinds, np.arange(len(self.names) + 1)).tolist()
+        payloads = [m.payload for m in of_drones]
+        if self._recounts:
+            kinds, truth, status = (which % self._kinds).tolist(), KINDS.index("truth"), KINDS.index("status")
+            for begin, end in pairwise(first):
+                count = sum(kind != truth for kind in kinds[begin:end])
+                for m in range(begin, end):
+                    if kinds[m] == status:
+                        message = messages.decode_as(flight_messages.Status, payloads[m], "status")
+                        payloads[m] = messages.encode(msgspec.structs.replace(message, count=count))
+        pairs = list(zip([m.key for m in of_drones], payloads, strict=True))
+        stamps = [m.t_ns for m in of_drones]
+        return GateMessages.of(t_ns, t_ns // self.clock.gate_ns, self._table, pairs, stamps, first)
+
+    def views(self, seq: int) -> Sequence[Output]:
+        """Return the views but those that a participant publishes itself."""
+        live = self._live().names
+        own = {keys.estimates_view(name) for name in live}
+        own |= {keys.cluster_view(name.removeprefix("controller.")) for name in live if name.startswith("controller.")}
+        return [output for output in self._views.views(self._last, self.now_ns, seq) if output.key not in own]
+
+    def result(self) -> dict[str, Any]:
+        """Return the figures of the replay so far."""
+        statistics = self.statistics.result(self.barrier.participants.values())
+        about = {"replay_of": self._recorded.run_id, "refused": self.outbox.refusals.count}
+        return {"reason": self.ended, "last_ns": self.now_ns, **statistics, **about}
+
+    # Commands and requests
+
+    def _handle_command(self, drone: str, kind: str, message: Any) -> bool:
+        source = message.source if keys.PROCESS_NAME.fullmatch(message.source) else "somebody"
+        self.outbox.refuse(source, f"drone/{drone[:40]}/cmd/{kind}", NOT_FLYABLE)
+        return True
+
+    def refusal_at(self, key: str) -> str | None:
+        return None if f"controller.{keys.thing(key)}" in self._live().names else NOT_FLYABLE
+
+    def control(self, request: ControlRequest) -> ControlAnswer:
+        """Answer a request; `views` are asked for again and again, and are no event."""
+        return self._answer(request) if request.op == "views" else super().control(request)
+
+    def _answer(self, request: ControlRequest) -> ControlAnswer:
+        return ControlAnswer(False, NOT_FLYABLE) if request.op in FLIGHT_REQUESTS else super()._answer(request)
+
+    def _seek(self, request: ControlRequest) -> Refusal | None:
+        """Continue from another gate. Refused while anybody is waited for, who would miss what lies between."""
+        t_s = number(request.args.get("t_s"))
+        if t_s is None or not 0 <= t_s < SEEK_MAX_S:
+            return refused_argument(request, "t_s", "a time on record [s]")
+        gating = [p.name for p in self.barrier.participants.values() if p.gating]
+        if gating:
+            return Refusal(", ".join(gating), "in the lockstep", "seek needs nobody who is waited for")
+        former = self._gates, self._coming, self._pending
+        self._wind(round(t_s * 1e9))
+        if self._coming is None:
+            self._gates, self._coming, self._pending = former
+            return refused_argument(request, "t_s", "a time on record [s]")
+        self._last.clear()
+        self.statistics.rate.jump()
+        if keys.FAULTS in self._standing and not any(m.key == keys.FAULTS for m in self._pending):
+            t_ns = self._coming.t_ns
+            self._pending.append(Recorded(keys.FAULTS, messages.encode(run_messages.Faults(t_ns, 0, ())), t_ns, 0))
+        self.clock.jumps += 1
+        return None
 
     def _timeline(self, _: ControlRequest) -> ControlAnswer:
-        """Answer how far the record goes and what happened when [s]: of many events those of each kind thinned out."""
+        """Answer how far the record goes and what happened when [s]: the events but for commands, of many some."""
         last = self._reader.last(keys.CLOCK)
         first = next(self._reader.messages([keys.CLOCK]), last)
         span = {"from_s": first.t_ns / 1e9, "to_s": last.t_ns / 1e9} if first and last else {}
-        return ControlAnswer(True, result={**span, "marks": timeline_marks(self._reader)})
+        marks = []
+        for recorded in self._reader.messages([keys.EVENT]):
+            with suppress(DecodeError):
+                event: run_messages.Event = messages.decode(keys.EVENT, recorded.payload)
+                if event.kind not in LEFT_OUT:
+                    text = f"{event.subject}: {event.text}" if event.subject else event.text
+                    marks.append({"t_s": event.t_ns / 1e9, "kind": event.kind, "text": text[:TEXT_MAX]})
+        return ControlAnswer(True, result={**span, "marks": marks[:: -(-len(marks) // MARKS_MAX) or 1]})
 
     def _views_of_past(self, request: ControlRequest) -> Refusal | ControlAnswer:
         """Answer the views of instants on record, `every_s` apart, for curves and trails."""
@@ -179,201 +319,3 @@ class Playback(Coordinator):
             if any(key.endswith("/truth") for key in passed):  # else the record has a gap there, or has ended
                 found += [(view.key, messages.encode(view.message)) for view in self._views.views(last, t_ns, seq)]
         return ControlAnswer(True, result=found)
-
-    def control(self, request: ControlRequest) -> ControlAnswer:
-        """Answer a request; `views` are asked for again and again, and are no event."""
-        return self._answer(request) if request.op == "views" else super().control(request)
-
-    def _seek(self, request: ControlRequest) -> Refusal | None:
-        """Continue from another gate. Refused while anybody is waited for, who would miss what lies between."""
-        t_s = number(request.args.get("t_s"))
-        if t_s is None or not 0 <= t_s < SEEK_MAX_S:
-            return refused_argument(request, "t_s", "a time on record [s]")
-        gating = [p.name for p in self.barrier.participants.values() if p.gating]
-        if gating:
-            return Refusal(", ".join(gating), "in the lockstep", "seek needs nobody who is waited for")
-        former = self._gates, self._coming, self._pending_faults, self._pending_infos
-        self._wind(round(t_s * 1e9))
-        if self._coming is None:
-            self._gates, self._coming, self._pending_faults, self._pending_infos = former
-            return refused_argument(request, "t_s", "a time on record [s]")
-        self._forget(self._coming.t_ns)
-        self.clock.jumps += 1
-        return None
-
-    def _forget(self, t_ns: int) -> None:
-        """Forget what was played before a jump to the gate t_ns."""
-        self._last.clear()
-        self.statistics.rate.jump()
-        if self._plays_faults and self._pending_faults is None:
-            none = messages.encode(run_messages.Faults(t_ns, 0, ()))
-            self._pending_faults = Recorded(keys.FAULTS, none, t_ns, 0)
-
-    def _wind(self, from_ns: int) -> None:
-        self._gates = self._recorded_gates.gates(from_ns)
-        self._read_next()
-        # the last list of faults, and info of each camera, before: they are published only when they change
-        before = self._last_before(from_ns, {keys.FAULTS} if self._plays_faults else set())
-        self._pending_faults: Recorded | None = before[0] if before else None
-        self._pending_infos = self._last_before(from_ns, self._camera_infos)
-
-    def _read_next(self) -> None:
-        self._coming: Gate | None = next(self._gates, None)
-        if self._coming is not None:
-            self.clock.next_ns = self._coming.t_ns
-
-    def _last_before(self, t_ns: int, wanted: Collection[str]) -> list[Recorded]:
-        """Return the last message of each key before a time."""
-        if not wanted or t_ns <= 0:
-            return []
-        before = (m for m in self._reader.messages(wanted, by_time=False) if m.t_ns < t_ns)
-        return list({m.key: m for m in sorted(before, key=lambda m: m.t_ns)}.values())
-
-    # What is played
-
-    def _live(self) -> LiveProcesses:
-        return LiveProcesses(self.scenario, self.barrier.participants.values())
-
-    def _play(self, gate: Gate, wall_ns: int) -> None:
-        live = self._live()
-        self._last.update((m.key, m.payload) for m in gate.messages if m.key in self._views.sources)
-        of_drones = [m for m in gate.messages if m.key in self._place]
-        faults = [m for m in (self._pending_faults, *gate.messages) if m is not None and m.key == keys.FAULTS]
-        self._pending_faults = None
-        for recorded in faults:  # they are known before the gate
-            self._publish(recorded)
-        if of_drones:
-            self.outbox.put(keys.GATE, self._gate_messages(gate.t_ns, of_drones))
-        self.statistics.gate(gate.t_ns, wall_ns)
-        self.outbox.put(keys.CLOCK, self.clock_message(self.missed(wall_ns)))
-        infos, self._pending_infos = self._pending_infos, []
-        for recorded in (m for m in (*infos, *gate.messages) if m.key not in self._place and m.key != keys.FAULTS):
-            if not live.replace(recorded):
-                self._publish(recorded)
-
-    def _publish(self, recorded: Recorded) -> None:
-        """Publish a message again, byte by byte, except events, which are numbered anew, and kills of processes."""
-        key, payload = recorded.key, recorded.payload
-        if key == keys.EVENT:
-            with suppress(DecodeError):
-                event: run_messages.Event = messages.decode(keys.EVENT, payload)
-                if event.kind != "end":  # the replay has an end of its own
-                    self.outbox.put(key, msgspec.structs.replace(event, seq=self.outbox.next_seq(key)))
-        elif key == keys.FAULTS:
-            self.outbox.put(key, msgspec.Raw(without_kills(payload)))
-        elif key != keys.VIEW_DRONES:
-            self.outbox.put(key, msgspec.Raw(payload))
-
-    def _gate_messages(self, t_ns: int, of_drones: list[Recorded]) -> GateMessages:
-        """Return the world's messages about its drones as the world published them: drone by drone, status last."""
-        of_drones.sort(key=lambda m: self._place[m.key] // self._kinds)
-        which = np.array([self._place[m.key] for m in of_drones])
-        first = np.searchsorted(which // self._kinds, np.arange(len(self.names) + 1)).tolist()
-        payloads = [m.payload for m in of_drones]
-        if self._recounts:
-            _recount(payloads, (which % self._kinds).tolist(), first)
-        pairs = list(zip([m.key for m in of_drones], payloads, strict=True))
-        stamps = [m.t_ns for m in of_drones]
-        return GateMessages.of(t_ns, t_ns // self.clock.gate_ns, self._table, pairs, stamps, first)
-
-    def views(self, seq: int) -> Sequence[Output]:
-        live = self._live().names
-        views = self._views.views(self._last, self.now_ns, seq)
-        return [output for output in views if not _is_of(output.key, live)]
-
-    def result(self) -> dict[str, Any]:
-        """Return the figures of the replay so far."""
-        statistics = self.statistics.result(self.barrier.participants.values())
-        about = {"replay_of": self._recorded.run_id, "refused": self.outbox.refusals.count}
-        return {"reason": self.ended, "last_ns": self.now_ns, **statistics, **about}
-
-    # What is refused, and who leaves
-
-    def _handle_command(self, drone: str, kind: str, message: Any) -> bool:
-        source = message.source if keys.PROCESS_NAME.fullmatch(message.source) else "somebody"
-        self.outbox.refuse(source, f"drone/{drone[:40]}/cmd/{kind}", NOT_FLYABLE)
-        return True
-
-    def _perform(self, request: ControlRequest) -> Refusal | ControlAnswer | None:
-        return ControlAnswer(False, NOT_FLYABLE) if request.op in FLIGHT_REQUESTS else super()._perform(request)
-
-    def refusal_at(self, key: str) -> str | None:
-        return None if f"controller.{keys.thing(key)}" in self._live().names else NOT_FLYABLE
-
-    def _after_bye(self, participant: Participant, reason: str) -> None:
-        """Go on also without a recorder."""
-
-    def _is_missed_from_now(self, participant: Participant) -> bool:
-        return False
-
-    def on_death(self, participant: Participant) -> OnDeath:
-        return "drop"
-
-
-def _is_of(view: str, live: set[str]) -> bool:
-    """Tell whether a participant publishes a view itself."""
-    _, kind, whose = (*view.split("/", 2), "")[:3]
-    return (kind == "cluster" and f"controller.{whose}" in live) or (kind == "estimates" and whose in live)
-
-
-def _recount(payloads: list[bytes], kinds: list[int], first: list[int]) -> None:
-    """Let each status count the sensor messages that are played; agents would wait for the others."""
-    truth, status = KINDS.index("truth"), KINDS.index("status")
-    for begin, end in pairwise(first):
-        for m in range(begin, end):
-            if kinds[m] == status:
-                message = messages.decode_as(flight_messages.Status, payloads[m], "status")
-                count = sum(kind != truth for kind in kinds[begin:end])
-                payloads[m] = messages.encode(msgspec.structs.replace(message, count=count))
-
-
-class LiveProcesses:
-    """The processes that take part at a gate, whose outputs are not played.
-
-    A camera or detector is recognised by the drones that it declares, whatever its name is; one that declares none, as
-    a program of the user's own may, by its name.
-
-    Args:
-        scenario: of the record.
-        participants: alive.
-
-    Attributes:
-        names: of the processes whose work they do.
-    """
-
-    def __init__(self, scenario: Scenario, participants: Iterable[Participant]) -> None:
-        served = [each.served_names for each in participants]
-        self._cameras = {drone.name: drone.sensors.cameras() for drone in scenario.drones}
-        self._by_name = {name for names in served if not any(map(self._is_of_cameras, names)) for name in names}
-        self.names = {name for names in served for name in names}
-
-    def _is_of_cameras(self, name: str) -> bool:
-        role, _, drone = name.partition(".")
-        return role in OF_CAMERAS.values() and drone in self._cameras
-
-    def replace(self, recorded: Recorded) -> bool:
-        """Tell whether one of them publishes a message in place of one on record."""
-        role = OF_CAMERAS.get(messages.type_of(recorded.key))
-        if role is None:
-            return bool(self.names) and author(recorded) in self.names
-        if f"{role}.{keys.thing(recorded.key)}" in self.names and self._is_drawn(recorded.key):
-            return True
-        return bool(self._by_name) and author(recorded) in self._by_name
-
-    def _is_drawn(self, key: str) -> bool:
-        """Tell whether the scenario has a camera; where a drone has none there, any counts."""
-        _, drone, what = keys.parts(key)
-        cameras, camera = self._cameras.get(drone), what.removeprefix("camera/").removesuffix("/info")
-        return not cameras or camera == what or camera in cameras
-
-
-def timeline_marks(reader: RecordReader) -> list[dict[str, Any]]:
-    """Return the events on record, but for commands: t_s, kind and text of each; of many, evenly thinned out."""
-    marks = []
-    for recorded in reader.messages([keys.EVENT]):
-        with suppress(DecodeError):
-            event: run_messages.Event = messages.decode(keys.EVENT, recorded.payload)
-            if event.kind not in LEFT_OUT:
-                text = f"{event.subject}: {event.text}" if event.subject else event.text
-                marks.append({"t_s": event.t_ns / 1e9, "kind": event.kind, "text": text[:TEXT_MAX]})
-    return marks[:: -(-len(marks) // MARKS_MAX) or 1]

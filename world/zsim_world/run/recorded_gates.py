@@ -59,9 +59,7 @@ class RecordedGates:
     in realtime) is played where it was written.
 
     Args:
-        reader: of the record.
-        gate_ns: of the run.
-        delay_ns: of its commands, by which the world may be ahead.
+        delay_ns: of the run's commands, by which the world may be ahead.
         wanted: keys.
     """
 
@@ -76,6 +74,32 @@ class RecordedGates:
         for gate in self._all(from_ns):
             if gate.t_ns >= from_ns:
                 yield gate
+
+    def _all(self, from_ns: int) -> Iterator[Gate]:
+        held: dict[int, list[Recorded]] = {}
+        gates: deque[int] = deque()
+        newest = None
+
+        def take(t_ns: int) -> Gate:
+            """Return a gate, with the messages of gates before it that the record lacks."""
+            due = sorted(gate_ns for gate_ns in held if gate_ns <= t_ns)
+            return Gate(t_ns, [recorded for gate_ns in due for recorded in held.pop(gate_ns)])
+
+        # What answers the first gate, or was sampled for it, may stand in a chunk that begins before it.
+        for recorded in self._reader.messages(self._keys, by_time=False, from_ns=max(0, from_ns - self._slack_ns)):
+            if recorded.key != keys.CLOCK:
+                due_ns = -(-recorded.t_ns // self._gate_ns) * self._gate_ns
+                if newest is not None:
+                    writing_ns = newest + self._gate_ns
+                    due_ns = due_ns if newest - self._slack_ns < due_ns <= writing_ns else writing_ns
+                held.setdefault(due_ns, []).append(recorded)
+            elif (newest is None or recorded.t_ns > newest) and _is_gate(recorded.payload):
+                newest = recorded.t_ns
+                gates.append(newest)
+                while gates[0] + self._slack_ns <= newest:
+                    yield take(gates.popleft())
+        for t_ns in gates:
+            yield take(t_ns)
 
     def before(
         self, instants_ns: Sequence[int], wanted: Collection[str], back_ns: int
@@ -100,35 +124,6 @@ class RecordedGates:
         for t_ns, of_instant in zip(instants_ns, newest, strict=True):
             yield t_ns, {key: recorded.payload for key, recorded in of_instant.items()}
 
-    def _all(self, from_ns: int) -> Iterator[Gate]:
-        held: dict[int, list[Recorded]] = {}
-        gates: deque[int] = deque()
-        newest = None
-        # What answers the first gate, or was sampled for it, may stand in a chunk that begins before it.
-        for recorded in self._reader.messages(self._keys, by_time=False, from_ns=max(0, from_ns - self._slack_ns)):
-            if recorded.key != keys.CLOCK:
-                held.setdefault(self._gate_of(recorded.t_ns, newest), []).append(recorded)
-            elif (newest is None or recorded.t_ns > newest) and _is_gate(recorded.payload):
-                newest = recorded.t_ns
-                gates.append(newest)
-                while gates[0] + self._slack_ns <= newest:
-                    yield self._take(gates.popleft(), held)
-        for t_ns in gates:
-            yield self._take(t_ns, held)
-
-    def _gate_of(self, t_ns: int, newest: int | None) -> int:
-        """Return the gate at which a message is played that was written after the clock of gate `newest`."""
-        due_ns = -(-t_ns // self._gate_ns) * self._gate_ns
-        if newest is None:
-            return due_ns
-        writing_ns = newest + self._gate_ns
-        return due_ns if newest - self._slack_ns < due_ns <= writing_ns else writing_ns
-
-    def _take(self, t_ns: int, held: dict[int, list[Recorded]]) -> Gate:
-        """Return a gate, with the messages of gates before it that the record lacks."""
-        due = sorted(gate_ns for gate_ns in held if gate_ns <= t_ns)
-        return Gate(t_ns, [recorded for gate_ns in due for recorded in held.pop(gate_ns)])
-
 
 def _is_gate(payload: bytes) -> bool:
     """Tell whether a clock belongs to a gate: while a run waits for its start, it does not."""
@@ -139,12 +134,9 @@ def _is_gate(payload: bytes) -> bool:
 
 
 def is_played(key: str, expressions: Sequence[str]) -> bool:
-    """Return whether the messages of a key are played.
+    """Return whether the messages of a key are played, if they match what the user wants.
 
     A replay publishes its own info, clock and views; what is about the processes on record is left out.
-
-    Args:
-        expressions: that the user wants to be played.
     """
     anew = key in (keys.INFO, keys.CLOCK) or key.startswith("process/") or messages.type_of(key) in VIEWS
     return not anew and roles.permits(expressions, key)
@@ -178,17 +170,15 @@ def without_kills(payload: bytes) -> bytes:
 class PlaybackViews:
     """Makes `view/**` of what a record has.
 
-    Args:
-        drones, clusters: names.
+    Attributes:
+        sources: keys whose last values are needed.
     """
 
     def __init__(self, drones: Sequence[str], clusters: Sequence[str]) -> None:
         self._drones = tuple(drones)
         self._clusters = tuple(clusters)
-        self.sources = frozenset(
-            key for drone in drones for key in (keys.truth(drone), keys.status(drone), keys.estimate(drone))
-        ) | {keys.VIEW_DRONES, *map(keys.cluster_state, clusters)}
-        """Keys whose last values are needed."""
+        of_drones = (key for drone in drones for key in (keys.truth(drone), keys.status(drone), keys.estimate(drone)))
+        self.sources = frozenset((*of_drones, keys.VIEW_DRONES, *map(keys.cluster_state, clusters)))
 
     def views(self, last: Mapping[str, bytes], t_ns: int, seq: int) -> Iterator[Output]:
         """Yield the views of the gate t_ns, as far as the last values go."""

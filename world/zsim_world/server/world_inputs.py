@@ -2,7 +2,6 @@
 
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterator, Sequence
 
@@ -11,8 +10,7 @@ from zsim.contract.framing import Pairs
 from zsim.errors import DecodeError, SessionError
 from zsim.scenario.roles import WORLD
 from zsim.transport.session import ReceivedSample, Session, Subscription
-from zsim_world.run.barrier import Participant
-from zsim_world.run.inputs import GivenUp, Run, Taken
+from zsim_world.run.inputs import Run, Taken
 
 TICK_S = 0.1  # how often a world that waits looks at the wall clock
 RECOVERY_S = 1.0  # a publisher that lives answers a get for its outputs within milliseconds
@@ -20,30 +18,7 @@ REJOINED_NS = 10_000_000_000  # wall time after a rejoin in which it may take un
 PROCESSES, VIEWS = "process/", "view/"  # the world does not read the last
 
 
-class WorldInputs(ABC):
-    """The world's subscriptions: waited for with a limit or without, drained with the wall time of arrival."""
-
-    @abstractmethod
-    def wait(self, timeout_s: float | None) -> None:
-        """Return when something has arrived, or after timeout_s; without a limit, now and then to look at the clock."""
-
-    def wait_for(self, wanted: set[str]) -> None:
-        """Wait until something has arrived on each of the wanted keys, or anything that is not a done."""
-        self.wait(None)
-
-    @abstractmethod
-    def drain(self) -> Iterator[tuple[int, ReceivedSample]]:
-        """Yield what has arrived, with the monotonic wall time of its arrival [ns]."""
-
-    @abstractmethod
-    def wake(self) -> None:
-        """Let a `wait` of another thread return."""
-
-    def close(self) -> None:  # noqa: B027 - not every one reads on threads of its own
-        """Stop reading."""
-
-
-class DirectInputs(WorldInputs):
+class DirectInputs:
     """Reads on the loop's own thread, waiting for the last subscription: fastest without a wall clock."""
 
     def __init__(self, subscriptions: Sequence[Subscription]) -> None:
@@ -51,6 +26,7 @@ class DirectInputs(WorldInputs):
         self._received: list[ReceivedSample] = []
 
     def wait(self, timeout_s: float | None) -> None:
+        """Return when something has arrived, or after timeout_s; without a limit, now and then to look at the clock."""
         if timeout_s is not None and timeout_s < TICK_S:
             time.sleep(timeout_s)
             return
@@ -59,6 +35,7 @@ class DirectInputs(WorldInputs):
             self._received.append(sample)
 
     def wait_for(self, wanted: set[str]) -> None:
+        """Wait until something has arrived on each of the wanted keys, or anything that is not a done."""
         while True:
             sample = self._subscriptions[-1].receive()
             if sample is None:
@@ -69,6 +46,7 @@ class DirectInputs(WorldInputs):
                 return
 
     def drain(self) -> Iterator[tuple[int, ReceivedSample]]:
+        """Yield what has arrived, with the monotonic wall time of its arrival [ns]."""
         last, self._received = [*self._received, *self._subscriptions[-1].drain()], []
         wall_ns = time.monotonic_ns()
         for subscription in self._subscriptions[:-1]:
@@ -80,8 +58,11 @@ class DirectInputs(WorldInputs):
     def wake(self) -> None:
         self._subscriptions[-1].wake()
 
+    def close(self) -> None:
+        """Stop reading."""
 
-class TimedInputs(WorldInputs):
+
+class TimedInputs:
     """Reads on threads of their own, so that arrivals are stamped while the loop waits for its next gate."""
 
     def __init__(self, subscriptions: Sequence[Subscription]) -> None:
@@ -107,6 +88,9 @@ class TimedInputs(WorldInputs):
         self._fresh.wait(TICK_S if timeout_s is None else timeout_s)
         self._fresh.clear()
 
+    def wait_for(self, wanted: set[str]) -> None:
+        self.wait(None)
+
     def drain(self) -> Iterator[tuple[int, ReceivedSample]]:
         for _, arrived in self._arrived:
             while arrived:
@@ -121,7 +105,7 @@ class TimedInputs(WorldInputs):
             thread.join(timeout=2.0)
 
 
-def open_inputs(link: Session, realtime: bool) -> WorldInputs:
+def open_inputs(link: Session, realtime: bool) -> DirectInputs | TimedInputs:
     """Subscribe to what others publish.
 
     Outputs are drained first, dones last: who publishes a done has published its outputs before, on the same link.
@@ -139,21 +123,18 @@ def recover_lost(link: Session, run: Run) -> None:
         if world.clock.mode == "realtime":
             participant.lost_done = False
             continue
-        lost = _lost_outputs(link, run, participant)
+        lost: Pairs | None = None
+        key = keys.process(participant.name, "outputs")
+        try:
+            answer = link.request(key, "outputs", WORLD, timeout_s=RECOVERY_S)
+            if answer.ok:
+                lost = run.history.lost_outputs(answer.result, participant.done_ns)
+        except DecodeError as error:
+            run.refuse(participant.name, key, error)
+            lost = []
         age_ns = time.monotonic_ns() - participant.joined_wall_ns
         if lost is None and participant.rejoined and age_ns < REJOINED_NS:
-            continue
+            continue  # it cannot be asked yet
         for sample in lost or ():
             run.enter(Taken(time.monotonic_ns(), sample))
-        run.enter(GivenUp(participant.name))
-
-
-def _lost_outputs(link: Session, run: Run, participant: Participant) -> Pairs | None:
-    """Return the outputs kept by a participant that have not arrived; None if it does not answer."""
-    key = keys.process(participant.name, "outputs")
-    try:
-        answer = link.request(key, "outputs", WORLD, timeout_s=RECOVERY_S)
-        return run.history.lost_outputs(answer.result, participant.done_ns) if answer.ok else None
-    except DecodeError as error:
-        run.refuse(participant.name, key, error)
-        return []
+        run.call("give_up_outputs", participant.name)

@@ -16,8 +16,6 @@ class WorldOutputs:
     """Publishes the outbox of a world on its link.
 
     Args:
-        link: the listening session.
-        run: of the world.
         on_message: called with every key and message beside those of drones.
         journal: is written before anything is published.
     """
@@ -30,21 +28,22 @@ class WorldOutputs:
         self._unsent: Pairs = []
         self._gate_keys = [keys.gate(name) for name in run.world.names]
 
-    def flush(self) -> None:
-        """Publish the outbox."""
-        self.gather()
-        self.send()
-
     def gather(self) -> None:
-        """Encode the outbox and keep it."""
+        """Encode the outbox and keep it: the messages of a gate as one, as one of each drone that is read, and each."""
         outbox = self._run.world.take_outbox()
         if not outbox:
             return
         encoded: Pairs = []
-        passed = self._run.history.passed
+        passed, has_subscribers = self._run.history.passed, self._link.has_subscribers
         for key, message in outbox:
             if type(message) is GateMessages:
-                self._gather_gate(message)
+                whole = (keys.GATE, message.pack())
+                passed.append(whole)
+                if has_subscribers(keys.GATE):
+                    self._unsent.append(whole)
+                for gate_key, (first, last) in zip(self._gate_keys, pairwise(message.first), strict=True):
+                    if last > first and has_subscribers(gate_key):
+                        self._unsent.append((gate_key, message.pack(first, last)))
                 encoded += message.pairs
             else:
                 pair = (key, messages.encode(message))
@@ -59,22 +58,16 @@ class WorldOutputs:
             if type(message) is not GateMessages:
                 self._on_message(key, message)
 
-    def _gather_gate(self, gate: GateMessages) -> None:
-        """Keep the messages of a gate as one, of all drones and of each, where there is a subscriber to that."""
-        whole = (keys.GATE, gate.pack())
-        self._run.history.passed.append(whole)
-        if self._link.has_subscribers(keys.GATE):
-            self._unsent.append(whole)
-        for key, (first, last) in zip(self._gate_keys, pairwise(gate.first), strict=True):
-            if last > first and self._link.has_subscribers(key):
-                self._unsent.append((key, gate.pack(first, last)))
-
     def send(self) -> None:
         """Put what was gathered in one go: readers wake once, and the transport sends few packets."""
         self._journal.commit()
         unsent, self._unsent = self._unsent, []
         self._link.put_all(unsent)
         self.put_batch()
+
+    def flush(self) -> None:
+        self.gather()
+        self.send()
 
     def publish(self, output: Output) -> None:
         """Publish one message beside the outbox."""
@@ -86,10 +79,6 @@ class WorldOutputs:
         self.put_batch()
         self._on_message(output.key, message)
 
-    def forget(self) -> None:
-        """Drop what was gathered: the former process of the world has published it."""
-        self._unsent, self._run.history.passed = [], []
-
     def put_batch(self) -> None:
         """Send the recorders, if there are any, all messages since the last time."""
         history = self._run.history
@@ -97,3 +86,7 @@ class WorldOutputs:
         if self._link.has_subscribers(keys.BATCH):
             for first in range(0, len(passed), BATCH_MAX):
                 self._link.put_raw(keys.BATCH, encode_batch(passed[first : first + BATCH_MAX]))
+
+    def forget(self) -> None:
+        """Drop what was gathered: the former process of the world has published it."""
+        self._unsent, self._run.history.passed = [], []

@@ -7,9 +7,8 @@ import pytest
 from fake_aircraft import FIELD_UT, STEP_NS, FakeAircraft
 
 from zsim.math.frames import heading
-from zsim_bridges.ardrone.aircraft_session import AircraftSession, AircraftSettings, NavdataReadings
-from zsim_bridges.vehicle_links.aircraft_readings import AircraftPose
-from zsim_bridges.vehicle_links.vehicle_session import Demand
+from zsim_bridges.ardrone.aircraft_session import AircraftSession, NavdataReadings
+from zsim_bridges.vehicle_links.vehicle_session import AircraftPose, Demand
 
 ORIGIN = (-34.603, -58.368, 25.0)
 S = 1_000_000_000
@@ -20,8 +19,8 @@ class Loop:
 
     def __init__(self, delay_s: float = 0.0, yaw: float = 1.0, ultrasound: int = 8) -> None:
         self.aircraft = FakeAircraft(yaw)
-        readings, settings = NavdataReadings(ORIGIN, (0.0, 0.0, 0.0), FIELD_UT), AircraftSettings(ultrasound=ultrasound)
-        self.session = AircraftSession("127.0.0.2", readings, settings)
+        readings = NavdataReadings(ORIGIN, (0.0, 0.0, 0.0), FIELD_UT)
+        self.session = AircraftSession("127.0.0.2", readings, ultrasound)
         self.now_ns = 100 * S
         self._delay_ns = round(delay_s * S)
         self._under_way: list[tuple[int, int, bytes]] = []

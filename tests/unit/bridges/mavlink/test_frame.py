@@ -16,15 +16,11 @@ def test_the_checksum_is_mcrf4xx() -> None:
     assert checksum(b"123456789") == 0x6F91  # check value of CRC-16/MCRF4XX
 
 
-def test_a_stream_is_read_however_it_is_cut() -> None:
-    link = Link(1, 1)
+def test_all_frames_of_a_datagram_are_read() -> None:
+    link, parser = Link(1, 1), Parser()
     data = b"".join(link.pack(message) for message in MESSAGES) + Link(1, 1, version=1).pack(MESSAGES[0])
-    for size in (1, 3, 7, len(data)):
-        parser = Parser(datagrams=False)
-        parts = [data[start : start + size] for start in range(0, len(data), size)]
-        received = [each.message for part in parts for each in parser.feed(part)]
-        assert received == [*MESSAGES, MESSAGES[0]]
-        assert not +parser.refused
+    assert [each.message for each in parser.feed(data)] == [*MESSAGES, MESSAGES[0]]
+    assert not +parser.refused
 
 
 def test_sequence_numbers_wrap_after_255() -> None:
@@ -87,17 +83,14 @@ def test_a_value_out_of_range_is_refused() -> None:
 
 def test_garbage_yields_nothing_but_what_is_in_it() -> None:
     rng = random.Random(5)
-    parser, stream = Parser(), Parser(datagrams=False)
+    parser = Parser()
     for _ in range(2000):
-        data = rng.randbytes(rng.randint(0, 300))
-        assert parser.feed(data) == []
-        assert stream.feed(data) == []
+        assert parser.feed(rng.randbytes(rng.randint(0, 300))) == []
     assert sum(parser.refused.values()) > 0
 
 
 KEY, OTHER = b"k" * 32, b"o" * 32
 HEARTBEAT = dialect.Heartbeat(type=2)
-RADIO_STATUS = 109
 
 
 def test_a_key_has_32_bytes() -> None:
@@ -120,16 +113,14 @@ def test_a_frame_of_another_key_or_with_a_changed_signature_is_refused() -> None
     assert parser.refused["bad_signature"] == 2
 
 
-def test_unsigned_frames_are_taken_by_policy() -> None:
-    plain = Link(1, 1).pack(HEARTBEAT)
-    for policy, taken in ((False, 0), (True, 1), ({RADIO_STATUS}, 0), ({0}, 1)):
-        parser = Parser(Signing(KEY, accepts_unsigned=policy))
-        assert len(parser.feed(plain)) == taken
-        assert parser.refused["unsigned"] == 1 - taken
+def test_an_unsigned_frame_is_refused() -> None:
+    parser = Parser(Signing(KEY))
+    assert parser.feed(Link(1, 1).pack(HEARTBEAT)) == []
+    assert parser.refused["unsigned"] == 1
 
 
 def test_a_stream_that_begins_more_than_a_minute_ago_is_refused() -> None:
-    receiver, sender = Signing(KEY), Signing(KEY, link_id=3)
+    receiver, sender = Signing(KEY), Signing(KEY)
     receiver.advance(EPOCH_S + 3600.0)
     sender.timestamp = receiver.timestamp - BEHIND_MAX - 2
     parser, link = Parser(receiver), Link(1, 1, sender)
