@@ -22,6 +22,11 @@ IN_SIGHT = """() => ['land', 'emergency'].every(name => {
   const inside = box.left >= 0 && box.top >= 0 && box.right <= innerWidth && box.bottom <= innerHeight;
   return inside && document.elementFromPoint(box.x + box.width / 2, box.y + box.height / 2) === button;
 })"""
+SLOW_FRAMES_JS = """
+window.requestAnimationFrame = callback => setTimeout(() => callback(performance.now()), 200);
+window.cancelAnimationFrame = clearTimeout;
+"""
+"""Lets a page draw its scene five times a second: without a graphics card that takes most of the processor time."""
 POLL_MS = 100  # between two looks at what a page shows
 PATIENCE_MS = 1000 * PATIENCE_S
 HOLD_MS = 600  # of orders.html: as long a button of an emergency or a take-over is held down
@@ -35,6 +40,7 @@ class BrowserPage:
         self.requested: list[str] = []
         self.faults: list[str] = []
         page.set_default_timeout(PATIENCE_MS)
+        page.add_init_script(SLOW_FRAMES_JS)
         page.on("request", lambda request: self.requested.append(request.url))
         page.on("websocket", lambda socket: self.requested.append(socket.url))
         page.on("pageerror", lambda error: self.faults.append(str(error)))
