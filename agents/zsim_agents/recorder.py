@@ -64,18 +64,16 @@ class Recorder:
         link: Session,
         info: messages.Info,
         path: Path,
-        name: str = NAME,
         stopped: Callable[[], bool] = lambda: False,
         say: Callable[[str], None] = lambda text: None,
         deserted: Callable[[], bool] = lambda: False,
     ) -> None:
         self._link = link
         self._info = info
-        self._name = name
         self._stopped = stopped
         self._print = say
         self._deserted = deserted
-        self._part = Participant(link, info, name, slack_ns=SLACK_NS, calculates=False)
+        self._part = Participant(link, info, NAME, slack_ns=SLACK_NS, calculates=False)
         self.health = self._part.health
         self._joined_s = 0.0
         self._others: dict[str, int] = {}  # incarnations that have joined and not left, by name
@@ -108,13 +106,13 @@ class Recorder:
         """
         self._traffic = Traffic(self._link, run_key_table(self._info), self._on_refused)
         self._beside = [self._link.subscribe(expression) for expression in ("view/**", keys.camera("*", "*"))]
-        self._link.declare_process(self._name)
+        self._link.declare_process(NAME)
         self._link.on_link(self._on_link)
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
         try:
             if self._writer.has_former:
                 self._resume()
-                self._print(f"{self._name}: goes on with {self._writer.path} after t = {self._part.now_ns / 1e9:.2f} s")
+                self._print(f"{NAME}: goes on with {self._writer.path} after t = {self._part.now_ns / 1e9:.2f} s")
             else:  # which run this is, the newest faults, and how cameras see: a replay has them no longer
                 lasting = {keys.INFO: messages.encode(self._info)}
                 for key in (keys.INFO, keys.FAULTS, keys.camera_info("*", "*")):
@@ -135,12 +133,12 @@ class Recorder:
                 ticker.join()
         if self._left_out:
             why = f"a record holds {CHANNELS_MAX} keys, and theirs are further ones"
-            self._print(f"{self._name}: {self._left_out} messages are not on record: {why}")
+            self._print(f"{NAME}: {self._left_out} messages are not on record: {why}")
         if self._part.superseded:
             why = self._part.end_reason
-            raise SupersededError(f"{self._name}: {why}; this one ends, its record is {self._writer.path}")
+            raise SupersededError(f"{NAME}: {why}; this one ends, its record is {self._writer.path}")
         if reason == ANOTHER_RUN:
-            raise RunError(f"{self._name}: {reason}; the record {self._writer.path} is complete as far as it goes")
+            raise RunError(f"{NAME}: {reason}; the record {self._writer.path} is complete as far as it goes")
         if not self._deserted():
             self._part.leave(reason)
         return reason
@@ -227,7 +225,7 @@ class Recorder:
     def _replayed(self, before: Clock | None) -> Iterator[Message]:
         """Yield what the world replays, up to a clock that has arrived: what came after that is on its way as well."""
         held: list[Message] = []
-        for entry in replay(self._link, self._name, -1, ["**"], REPLAY_S):
+        for entry in replay(self._link, NAME, -1, ["**"], REPLAY_S):
             held.append(entry)
             clock = self._clock_in(entry[1]) if before is not None and entry[0] == keys.CLOCK else None
             if before is not None and clock is not None and clock.seq >= before.seq:
@@ -264,7 +262,7 @@ class Recorder:
         while self._links:
             up = self._links.popleft()
             if not up:
-                self._print(f"{self._name}: lost the link to the world; waiting for it to come back")
+                self._print(f"{NAME}: lost the link to the world; waiting for it to come back")
             self._must_look = up and self._link_lost
             self._link_lost = not up
         info = self._world_info() if self._must_look else None
@@ -344,7 +342,7 @@ class Recorder:
     def _note_process(self, key: str, payload: bytes) -> None:
         """Note which other processes have joined and not left."""
         name, kind = keys.thing(key), messages.type_of(key)
-        if name == self._name or kind not in (run_messages.Join, run_messages.Bye):
+        if name == NAME or kind not in (run_messages.Join, run_messages.Bye):
             return
         with contextlib.suppress(DecodeError):  # garbage of somebody else; recorded as it came
             passed = messages.decode(key, payload)
@@ -367,7 +365,7 @@ class Recorder:
         if clock is None:
             return
         if gap := self._gates.add(clock):
-            self._print(f"{self._name}: gates are missing on record, the world has them no longer: {gap}")
+            self._print(f"{NAME}: gates are missing on record, the world has them no longer: {gap}")
         if self._quiet_since_s is not None:
             self._quiet_since_s = time.monotonic()
         if clock.state == "stopped" and self._ended_s is None:

@@ -190,16 +190,11 @@ def difference(t_ns: int, drone: str, recorded: bytes, flown: bytes) -> Differen
 
 
 class TruthComparison:
-    """Compares the truth of two flights gate by gate.
-
-    Attributes:
-        instants: compared so far.
-        first, last: the first and the last difference.
-    """
+    """Compares the truth of two flights gate by gate."""
 
     def __init__(self, drones: Sequence[str]) -> None:
         self._drones = tuple(drones)
-        self.instants = 0
+        self.instants = 0  # compared so far
         self.first: Difference | None = None
         self.last: Difference | None = None
 
@@ -267,13 +262,7 @@ class AgentsWithRequests(AgentGroup):
 
 
 class RerunBus(Bus):
-    """Flies a run again in a new world, with the given agents; without any, all commands come from the record.
-
-    Attributes:
-        truth: payloads at the newest gate, by drone.
-        refused: requests that were carried out on record and are refused now, as text.
-        outputs: of the agents, compared with those on record.
-    """
+    """Flies a run again in a new world, with the given agents; without any, all commands come from the record."""
 
     def __init__(
         self, world: World, agents: recorded_run.RecordedAgents, info: messages.Info, scenario: Scenario
@@ -298,8 +287,8 @@ class RerunBus(Bus):
         super().__init__(world, groups, lambda: 0, compare_output, keep_truth)
         self._world = world
         self._rerun = agents.names
-        self.truth: dict[str, bytes] = {}
-        self.refused: list[str] = []
+        self.truth: dict[str, bytes] = {}  # payloads at the newest gate, by drone
+        self.refused: list[str] = []  # requests that were carried out on record and are refused now
         self._admitted: set[_Joined] | None = None  # in this gate; None before the start, when it does not matter
         self._withheld: dict[_Joined, run_messages.Join] = {}
         self.outputs = OutputComparison(world.clock.delay_ns + 2 * world.clock.gate_ns)

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from consistency import band, feed
+from fleet_samples import samples_of
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
@@ -76,7 +77,7 @@ def fly(scenario: Scenario) -> Runs:
         if gate:
             fleet.advance()
         t = gate * gate_s
-        for sample in fleet.samples():
+        for sample in samples_of(fleet):
             feed(bank, sample, fleet.gps_sigma_m[sample.drone])
         estimates = bank.estimate(t)
         steer(fleet, scenario, estimates, t, gate_s)
@@ -155,7 +156,7 @@ def test_a_fall_to_the_ground_is_owned_up_to(case: str):
     nees, heights = [], []
     for gate in range(round(12.0 / gate_s)):
         fleet.advance()
-        for sample in fleet.samples():
+        for sample in samples_of(fleet):
             feed(bank, sample, fleet.gps_sigma_m[sample.drone])
         error, P, _, _ = compare(fleet, bank.estimate(fleet.t_ns * 1e-9))
         if gate == round(1.0 / gate_s):

@@ -83,8 +83,8 @@ if njit is not None and hasattr(os, "getuid"):  # not on Windows
 
 
 def _compile(function: Function, options: dict[str, Any]) -> Function:
-    made: Any = function if njit is None else njit(**options)(function)
-    return made
+    dispatcher: Any = function if njit is None else njit(**options)(function)
+    return dispatcher
 
 
 def compiled(function: Function) -> Function:
@@ -239,5 +239,5 @@ def columns(name: str, fields: Iterable[Field]) -> Columns:
     """
     listed = tuple(fields)
     first = [0, *accumulate(field.width for field in listed)]
-    made: Any = namedtuple(name, [*(field.name for field in listed), "size"])  # type: ignore[misc]
-    return made(*first)
+    places: Any = namedtuple(name, [*(field.name for field in listed), "size"])  # type: ignore[misc]
+    return places(*first)

@@ -34,8 +34,7 @@ class GateGap(Struct, frozen=True):
 class GateCount:
     """Counts the gates of a run by its clocks, in the order in which the world published them.
 
-    Args:
-        after: the clock after which counting begins; the start of the run by default.
+    `after`: the clock after which counting begins; the start of the run by default.
     """
 
     def __init__(self, after: run_messages.Clock | None = None) -> None:

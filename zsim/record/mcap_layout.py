@@ -170,8 +170,7 @@ def is_cut(source: Source, at: int) -> bool:
 def groups(source: Source, found: Iterator[RecordSpan] | None = None) -> Iterator[RecordGroup]:
     """Yield schemas, channels and chunks of the data section in order.
 
-    Args:
-        found: the places of the records, if the caller iterates over them already.
+    `found`: the places of the records, if the caller iterates over them already.
     """
     last: RecordSpan | None = None  # whose message indexes may follow
     indexes: list[Index] = []

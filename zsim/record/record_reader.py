@@ -177,8 +177,7 @@ class RecordReader:
     def last_chunk(self, key: str, is_it: Callable[[bytes], bool]) -> tuple[int, list[Recorded]] | None:
         """Return where the chunk with the last message of a key begins, and what stands in it before that message.
 
-        Args:
-            is_it: tells by the payload whether it is the wanted one.
+        `is_it`: tells by the payload whether it is the wanted one.
         """
         channels = {number for number, name in self._keys.items() if name == key}
         for chunk in reversed([chunk for chunk in self._chunks if not chunk.channels.isdisjoint(channels)]):

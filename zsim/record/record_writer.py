@@ -302,8 +302,7 @@ class OpenChunk:
     def add_gate(self, channels: bytes, gate: GateMessages, wall_ns: int) -> None:
         """Take the messages of a gate, in whose buffer there is room before each for its head.
 
-        Args:
-            channels: number of each message's, int64.
+        `channels`: number of each message's, int64.
         """
         if not self.size:
             self.since_ns = wall_ns
@@ -341,8 +340,7 @@ class Content:
     def write_heads(self, counted: NDArray) -> NDArray:
         """Write the head of each message; return how many messages each channel has had by now.
 
-        Args:
-            counted: messages that channels have had before.
+        `counted`: messages that channels have had before.
         """
         heads = np.empty(len(self._ends), dtype=MESSAGE_HEAD)
         heads["opcode"], heads["channel"] = int(Opcode.MESSAGE), self._channels

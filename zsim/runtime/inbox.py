@@ -42,42 +42,29 @@ def canonical(entry: Input) -> tuple[int, str, int]:
 
 
 class Inbox:
-    """Collects messages until the gate that they belong to is complete.
-
-    Args:
-        gate_keys: keys of which one message with t_ns == t closes the gate t. For a drone's sensor/status its
-            `count` is checked too, when all of that drone's sensors are read (`counted`).
-        counted: drones of which all `sensor/*` keys are read.
-        keep_late: hand out what comes after its gate was taken, once, with the next gate: in realtime an old input
-            is better than none.
-        uncounted: keys of which everything that comes late is handed out with the next gate in any case, since it
-            belongs to no gate, such as what a detector finds in a picture.
-        sparse: closing keys whose publishers may skip gates, such as the driver of an external drone: a key is waited
-            for only as long as it comes at every gate.
-        hold_ns: after which an agent's output on a key that closes no gate is handed out, as if stamped so much later:
-            command delay and a gate, when it has come wherever the world may be, so that no order of arrival counts.
-
-    Attributes:
-        duplicates: messages that came again before their gate was taken.
-        late: messages that came when their gate had been taken.
-        taken_ns: the gate that was taken last, below 0 before the first.
-    """
+    """Collects messages until the gate that they belong to is complete."""
 
     def __init__(
         self,
+        # a message of each with t_ns == t closes the gate t; the `count` of a counted drone's sensor/status is checked
         gate_keys: Sequence[str],
-        counted: Sequence[str] = (),
+        counted: Sequence[str] = (),  # drones of which all `sensor/*` keys are read
+        # hand out what comes after its gate was taken with the next, once: in realtime an old input is better than none
         keep_late: bool = False,
+        # keys of which this is so in any case: they belong to no gate, such as what a detector finds in a picture
         uncounted: Sequence[str] = (),
+        # closing keys whose publishers may skip gates, as drivers of external drones: waited for while they skip none
         sparse: Sequence[str] = (),
+        # after which an agent's output on a key that closes no gate is handed out, as if stamped so much later: command
+        # delay and a gate, when it has come wherever the world may be, so that no order of arrival counts
         hold_ns: int = 0,
     ) -> None:
         self._closing = dict.fromkeys(gate_keys)
         # with the stamps of its last two messages; before any, they are before whatever was taken last
         self._sparse = dict.fromkeys(sparse, (ALWAYS_NS - 1, ALWAYS_NS - 1))
-        of_world = [key for key in gate_keys if keys.is_status(key) and key not in self._sparse]
+        of_world = dict.fromkeys(key for key in gate_keys if keys.is_status(key) and key not in self._sparse)
         self._not_of_world = {key: None for key in gate_keys if key not in of_world}  # not closed by GateMessages
-        self._pulse = of_world[0] if of_world else None  # whose numbers show a gap
+        self._pulse = next(iter(of_world), None)  # whose numbers show a gap
         self._waiting: dict[int, dict[tuple[str, int], Input]] = {}  # by stamp, then by key and number
         self._stamps: list[int] = []
         self._lacking: dict[int, dict[str, None]] = {}  # by gate, the closing keys that have not come
@@ -87,7 +74,7 @@ class Inbox:
         self._came_of: dict[str, list[int] | None] = {}
         self._beats: dict[int, int] = {}  # by gate, the number of the pulse
         self._last_beat: tuple[int, int] | None = None
-        self.taken_ns = self._former_ns = -1  # the gates that were taken last
+        self.taken_ns = self._former_ns = -1  # the gates that were taken last; below 0 before the first
         self.hold_ns = hold_ns
         self._hold_of: dict[str, int] = {}
         self._holds = False
@@ -97,7 +84,8 @@ class Inbox:
         self._newest: dict[str, int] = {}  # t_ns handed out per key, where late ones are kept
         # whether all closing keys are of publishers that may skip gates
         self.may_skip = len(self._sparse) == len(self._closing)
-        self.duplicates = self.late = 0
+        self.duplicates = 0  # messages that came again before their gate was taken
+        self.late = 0  # messages that came when their gate had been taken
 
     def put(self, key: str, message: Any) -> bool:
         """Keep one message, or GateMessages on `keys.GATE`; return False for a duplicate or one that is too late."""

@@ -66,8 +66,7 @@ def joins(fault: Fault, froms: Sequence[str], to: str) -> bool:
 def place_of(process: str, places: Mapping[str, Any], where: Callable[[str], Point | None]) -> Point | None:
     """Return where a process is [m; W]: where `places` has it, on its drone, or at the origin.
 
-    Args:
-        where: returns where a drone is in W [m], None where that is not known.
+    `where`: returns where a drone is in W [m], None where that is not known.
     """
     place = places.get(process)
     if place is None:
@@ -117,8 +116,7 @@ def distance_between(a: Point | None, b: Point | None) -> float | None:
 class LinkFaults:
     """Holds back, of the messages of a gate for one receiver, what its links deliver later or never.
 
-    Args:
-        names: of the receiver; an estimator of several drones has the name of each one's.
+    `names`: of the receiver; an estimator of several drones has the name of each one's.
     """
 
     def __init__(self, info: Info, names: Sequence[str]) -> None:
@@ -147,8 +145,7 @@ class LinkFaults:
     def delivered(self, t_ns: int, inputs: Sequence[Input]) -> list[Input]:
         """Return what the receiver is handed at the gate t_ns, in canonical order.
 
-        Args:
-            inputs: the messages that have come for that gate, one by one.
+        `inputs`: the messages that have come for that gate, one by one.
         """
         acting = [fault for fault in self._faults if fault_kinds.acts(fault, t_ns)]
         if acting:

@@ -47,8 +47,7 @@ SIGHTED_MAX = 12  # drones of a cluster: each of its estimators has the states o
 def cross_faults(scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
     """Yield every fault between fields of a scenario, or of the parts of one that `checker.sound` gives.
 
-    Args:
-        vehicles: by model; what depends on a vehicle that is not among them is left out.
+    `vehicles`: by model; what depends on a vehicle that is not among them is left out.
     """
     drones, clusters = _entries(scenario.drones), _entries(scenario.clusters)
     yield from _name_faults("drones", drones)

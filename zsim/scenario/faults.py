@@ -49,18 +49,14 @@ class FaultParameter(NamedTuple):
 
 
 class FaultKind(NamedTuple):
-    """One kind of fault.
+    """One kind of fault."""
 
-    Attributes:
-        strikes: what its target is: a drone; the world; a link "a/b" of two processes; the drones of a cluster, or of
-            the world, on the radio; a process.
-        description: what it does, for tables.
-        lasts: "ends" needs `for_s`, "once" takes none, "any" takes it or lasts until it is cleared.
-    """
-
+    # its target: a drone; the world; a link "a/b" of two processes; the drones of a cluster, or of the world, on the
+    # radio; a process
     strikes: Target
-    description: str
+    description: str  # what it does, for tables
     parameters: tuple[FaultParameter, ...] = ()
+    # "ends" needs `for_s`, "once" takes none, "any" takes it or lasts until it is cleared
     lasts: Literal["any", "ends", "once"] = "any"
 
 

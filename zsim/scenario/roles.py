@@ -82,8 +82,7 @@ def on_overdue(
 ) -> OnOverdue:
     """Return what is to be done when a process has not come back in its time; arguments as of `on_death`.
 
-    Args:
-        gating: roles for which the run waits beside the agents.
+    `gating`: roles for which the run waits beside the agents.
     """
     role = role or name.partition(".")[0]
     default = ROLES[role].on_overdue if role in ROLES and role not in gating else "end"
@@ -189,8 +188,7 @@ def rights_for(process: str, scenario: Scenario) -> Rights:
 def _granted(role: str, **names: Sequence[str]) -> Rights:
     """Return what the messages of the contract let a role do on the keys of some drones, clusters or processes.
 
-    Args:
-        names: of `drone`, `cluster`, `process`, and of the process itself as `estimates`.
+    `names`: of `drone`, `cluster`, `process`, and of the process itself as `estimates`.
     """
     reads, writes, asks, answers = [], [], [], []
     for key, topic in TOPICS.items():

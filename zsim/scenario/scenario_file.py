@@ -212,15 +212,18 @@ def apply_override(document: dict[str, Any], text: str, parse: Callable[[str], A
         parse: turns the text of a value into the value; its ValueError says what is wrong.
     """
     path, equals, value_text = text.partition("=")
+    fault: object = None
     if len(path) > PATH_MAX:
-        return f"{_shown_override(text)}: is a path of {len(path)} characters; must have at most {PATH_MAX}"
-    if not equals or not _PATH.fullmatch(path):
-        return f"{_shown_override(text)}: is no assignment; must be {SYNTAX}"
-    try:
-        _assign(document, steps_of(path, document), parse(value_text))
-    except ValueError as error:
-        return f"{_shown_override(text)}: {error}"
-    return None
+        fault = f"is a path of {len(path)} characters; must have at most {PATH_MAX}"
+    elif not equals or not _PATH.fullmatch(path):
+        fault = f"is no assignment; must be {SYNTAX}"
+    else:
+        try:
+            _assign(document, steps_of(path, document), parse(value_text))
+        except ValueError as error:
+            fault = error
+    shown = text if len(text) <= 80 and text.isprintable() else show(text)
+    return None if fault is None else f"--set {shown}: {fault}"
 
 
 def steps_of(path: str, document: Mapping[str, Any] = NOTHING) -> list[str]:
@@ -277,25 +280,20 @@ def _assign(document: dict[str, Any], steps: list[str], value: Any) -> None:
     for depth, step in enumerate(steps):
         if not isinstance(place, dict | list):
             raise ValueError(f"{'.'.join(steps[:depth])} is {show(place)}; must be a map or a list")
-        key: Any = _index(place, step, steps[:depth]) if isinstance(place, list) else step
+        key: Any = step
+        if isinstance(place, list):
+            names = [item.get("name") if isinstance(item, dict) else None for item in place]
+            if step in names:
+                key = names.index(step)
+            elif re.fullmatch(r"[0-9]{1,9}", step) and int(step) < len(place):
+                key = int(step)
+            else:
+                known = [name for name in names if isinstance(name, str)]
+                places = f"0 to {len(place) - 1}{' or ' if known else ''}{', '.join(known)}"
+                allowed = f"{suggestion(step, known)}allowed: {places if place else 'nothing, it is empty'}"
+                raise ValueError(f"{step[:40]} is not in {'.'.join(steps[:depth])}; {allowed}")
         if depth == len(steps) - 1:
             place[key] = value
         elif isinstance(place, dict) and place.get(key) is None:
             place[key] = {}
         place = place[key]
-
-
-def _index(place: list[Any], step: str, path: list[str]) -> int:
-    names = [item.get("name") if isinstance(item, dict) else None for item in place]
-    if step in names:
-        return names.index(step)
-    if re.fullmatch(r"[0-9]{1,9}", step) and int(step) < len(place):
-        return int(step)
-    texts = [name for name in names if isinstance(name, str)]
-    known = ", ".join(texts)
-    allowed = f"0 to {len(place) - 1}{' or ' if known else ''}{known}" if place else "nothing, it is empty"
-    raise ValueError(f"{step[:40]} is not in {'.'.join(path)}; {suggestion(step, texts)}allowed: {allowed}")
-
-
-def _shown_override(text: str) -> str:
-    return f"--set {text if len(text) <= 80 and text.isprintable() else show(text)}"

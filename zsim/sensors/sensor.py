@@ -260,8 +260,9 @@ def _message_type(name: str, fields: tuple[tuple[str, str], ...], sensor: str) -
         (field, tuple[(Number,) * int(word[7:-1])] if "[" in word else _TYPES[word])  # type: ignore[misc]
         for field, word in fields
     ]
-    made: Any = msgspec.defstruct(name, own, bases=(Sample,), namespace={"__sensor__": sensor}, frozen=True, gc=False)
-    return made
+    space = {"__sensor__": sensor}
+    message: Any = msgspec.defstruct(name, own, bases=(Sample,), namespace=space, frozen=True, gc=False)
+    return message
 
 
 def as_fields(numbers: Sequence[Any], fields: Mapping[str, str]) -> list[Any]:
@@ -273,14 +274,14 @@ def as_fields(numbers: Sequence[Any], fields: Mapping[str, str]) -> list[Any]:
     values, at = [], 0
     for word in fields.values():
         count = int(word[7:-1]) if word.startswith("number[") else 1
-        taken = numbers[at : at + count]
-        at += len(taken)
-        if len(taken) < count:
+        part = numbers[at : at + count]
+        at += len(part)
+        if len(part) < count:
             break
         if word in ("number", "whole", "flag"):
-            values.append({"number": float, "whole": int, "flag": bool}[word](taken[0]))
+            values.append({"number": float, "whole": int, "flag": bool}[word](part[0]))
         else:
-            values.append(tuple(map(float, taken)))
+            values.append(tuple(map(float, part)))
     if at != len(numbers) or len(values) < len(fields):
         raise ValueError(f"is given {len(numbers)} numbers; must be given those of {', '.join(fields)}")
     return values

@@ -8,7 +8,7 @@ import re
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 
 from zsim.contract import keys, messages
@@ -55,17 +55,15 @@ def listen(
         yield session
 
 
-@contextmanager
 def route(
     endpoint: str, upstream: str, federation: str, mode: Mode = "lockstep", identity: Identity | None = None
-) -> Iterator[Session]:
+) -> AbstractContextManager[Session]:
     """Open a router: it listens on an endpoint, and keeps trying to reach the world, or another router, upstream.
 
     Errors as of `listen`.
     """
     identity = identity or Identity()
-    with _listening([endpoint], federation, mode, identity, zenoh_settings.upstream(upstream, identity)) as session:
-        yield session
+    return _listening([endpoint], federation, mode, identity, zenoh_settings.upstream(upstream, identity))
 
 
 @contextmanager

@@ -179,8 +179,7 @@ def host_launcher_files(roles: int, hosts: int) -> int:
 def require_files(needed: int, what: str) -> None:
     """Raise the soft limit to the files needed at once; SessionError if the hard limit does not allow it.
 
-    Args:
-        what: what needs them, for the error: "12 processes".
+    `what`: what needs them, for the error: "12 processes".
     """
     allowed = allow_files(needed)
     if allowed is not None and allowed < needed:

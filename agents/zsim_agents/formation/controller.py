@@ -74,12 +74,12 @@ class Controller(Agent):
         output = self._engagement.step(self._gate(t_ns))
         source, outputs = self.source, []
         answered, self._answered = self._answered, []
-        for asked, answer in answered:  # since the last gate; a re-run of the record makes them before this one
-            number, answered_with = self.next_seq(self._request_key), (answer.ok, answer.error)
+        for request, answer in answered:  # since the last gate; a re-run of the record makes them before this one
+            key, of_request = self._request_key, (request.op, request.args, request.source)
             message = run_messages.ClusterRequest(
-                t_ns, number, asked.op, asked.args, asked.source, *answered_with, source
+                t_ns, self.next_seq(key), *of_request, answer.ok, answer.error, source
             )
-            outputs.append(Output(self._request_key, message))
+            outputs.append(Output(key, message))
         for drone, mode in output.modes:
             key = keys.command(drone, "mode")
             outputs.append(Output(key, flight_messages.Mode(t_ns, self.next_seq(key), source, mode)))  # type: ignore[arg-type]

@@ -23,11 +23,17 @@ from zsim_agents.formation.control_law import (
 )
 from zsim_agents.formation.flight_check import (
     AIRBORNE,
+    ASSEMBLY_CLIMB_M_S,
+    ASSEMBLY_HEIGHT_M,
     DOWN,
     GUARD_PARTS,
+    HEAL_S,
     HELD_ON_REQUEST,
     READY_TO_ENGAGE,
     REJOINING,
+    RESEND_S,
+    SHAPE,
+    SHAPE_IN_FLIGHT,
     TOO_NEAR,
     EngagementLimits,
     FlightCheck,
@@ -80,12 +86,11 @@ class Engagement:
         self.space = space
         self.drones = tuple(drones)
         self.gains = gains or FormationGains()
-        self.limits = limits or EngagementLimits()
         self.law = law(space, self.gains)
         self.law.robots = self.drones
-        self.guidance = Guidance(space, self.gains, self.limits.shape)
+        self.guidance = Guidance(space, self.gains)
         self.plan = FlightPlan(space, plan)
-        self.check = FlightCheck(space, self.drones, self.gains, self.limits)
+        self.check = FlightCheck(space, self.drones, self.gains, limits or EngagementLimits())
         self._held_limits = self.gains.limits._replace(separation_min_m=self.gains.separation_min_m + HOLD_APART_M)
         self._phase = "idle"
         self._gate: GateInput | None = None
@@ -119,7 +124,7 @@ class Engagement:
         if self._phase != "landing":
             return self._output(gate, "")
         # a take-off sent just before may still be on its way: idle only after a while on the ground
-        if gate.down and gate.t_s - self._landing_s >= self.limits.resend_s:
+        if gate.down and gate.t_s - self._landing_s >= RESEND_S:
             self._phase = "idle"
         modes = self._mode_commands(gate, "land", AIRBORNE | {"taking_off"})
         return self._output(gate, self.check.state_fault(gate, DOWN | {"landing"}) or "", modes=modes)
@@ -206,7 +211,7 @@ class Engagement:
             if fault := self._unflyable(gate):
                 raise RefusalError(fault)
             c = self._checked if self._checked.size else self.guidance.value(gate.t_s)[0]
-            if fault := formation_fault(self.space, c, self.gains, self.limits.shape_in_flight):
+            if fault := formation_fault(self.space, c, self.gains, SHAPE_IN_FLIGHT):
                 raise RefusalError(fault)
             self._places = self._places_at(self.space.inverse(c)[0])
         elif request is Order.PAUSE and self._places is not None:
@@ -237,17 +242,17 @@ class Engagement:
         self._phase = "engaged"
 
     def _places_at(self, p_W: Array) -> Places:
-        return Places(p_W, self.gains, self._held_limits, self.limits.shape.share)
+        return Places(p_W, self.gains, self._held_limits, SHAPE.share)
 
     def _unflyable(self, gate: GateInput) -> str | None:
         """Return why the drones cannot be led one by one."""
         return self.check.state_fault(gate, AIRBORNE) or self.check.estimate_fault(gate)
 
     def _mode_commands(self, gate: GateInput, mode: str, states: frozenset[str]) -> tuple[ModeCommand, ...]:
-        """Return a mode command for each drone in one of the states, once per resend_s."""
+        """Return a mode command for each drone in one of the states, once per RESEND_S."""
         due = []
         for drone, state in zip(self.drones, gate.states, strict=True):
-            if state in states and gate.t_s - self._modes.get(drone, -math.inf) >= self.limits.resend_s:
+            if state in states and gate.t_s - self._modes.get(drone, -math.inf) >= RESEND_S:
                 self._modes[drone] = gate.t_s
                 due.append(ModeCommand(drone, mode))
         return tuple(due)
@@ -261,8 +266,8 @@ class Engagement:
         else:
             self._phase = "assembling"
             reason = self.check.engagement_fault(gate) or READY_TO_ENGAGE
-        below_m = self.limits.assembly_height_m - gate.p_W[:, 2]
-        climb_m_s = np.minimum(np.maximum(CLIMB_GAIN_1_S * below_m, 0.0), self.limits.assembly_climb_m_s)
+        below_m = ASSEMBLY_HEIGHT_M - gate.p_W[:, 2]
+        climb_m_s = np.minimum(np.maximum(CLIMB_GAIN_1_S * below_m, 0.0), ASSEMBLY_CLIMB_M_S)
         return self._output(gate, reason, modes=modes, command=self._upright(gate, climb_m_s, self.gains.limits))
 
     def _judge(self, gate: GateInput) -> None:
@@ -272,7 +277,7 @@ class Engagement:
             try:
                 c_des = self.guidance.value(gate.t_s)[0]
                 if c_des is not self._checked:
-                    fault = place_fault(self.space, c_des, self.gains, self.limits.shape)
+                    fault = place_fault(self.space, c_des, self.gains, SHAPE)
                     self._checked = self._checked if fault else c_des
             except REFUSALS as error:
                 fault = str(error)
@@ -281,10 +286,10 @@ class Engagement:
             self._fault, self._well_since_s = fault, math.inf
         elif self._fault:
             self._well_since_s = min(self._well_since_s, gate.t_s)
-            if gate.t_s - self._well_since_s < self.limits.heal_s:
+            if gate.t_s - self._well_since_s < HEAL_S:
                 return
             try:
-                self.guidance.rejoin(self.check.value, gate.t_s, self.limits.shape_in_flight)
+                self.guidance.rejoin(self.check.value, gate.t_s)
             except REFUSALS as refusal:
                 self._fault, self._well_since_s = f"cannot go on: {refusal}", gate.t_s
             else:

@@ -29,6 +29,9 @@ from zsim_agents.formation.control_law import (
 )
 from zsim_agents.formation.engagement import Engagement
 from zsim_agents.formation.flight_check import (
+    ASSEMBLY_HEIGHT_M,
+    SHAPE,
+    SHAPE_IN_FLIGHT,
     EngagementLimits,
     GateInput,
     all_near,
@@ -141,12 +144,12 @@ def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, ga
         raise PlanError(f"plan.land_s is {plan.land_s:g}; must be later: {reason}")
     drones = [scenario.drone(name) for name in cluster.drones]
     p_W = np.array([drone.position_m for drone in drones], float)
-    p_W[:, 2] += EngagementLimits().assembly_height_m  # above their starting places
+    p_W[:, 2] += ASSEMBLY_HEIGHT_M  # above their starting places
     try:
         start = space.forward(p_W, np.radians([drone.yaw_deg for drone in drones]))
     except SingularClusterError:
         return
-    if shape_fault(space, start, EngagementLimits().shape):
+    if shape_fault(space, start, SHAPE):
         return
     rehearsal = _Rehearsal(scenario, cluster, space, gains)
     goal = start.copy()
@@ -168,22 +171,18 @@ class _Rehearsal:
     """Checks the ways of a plan against the limits of formation, controller and drones."""
 
     def __init__(self, scenario: Scenario, cluster: Cluster, space: ClusterSpace, gains: FormationGains) -> None:
-        limits = EngagementLimits()
-        self._space = space
-        self._share = limits.shape.share
+        self._space, self._share = space, SHAPE.share
         self._drones = [(name, scenario.drone(name).limits) for name in cluster.drones]
-        own = [each for _, each in self._drones]
-        asked = gains.limits
-        self._limits: RobotLimits = asked._replace(
-            speed_max_m_s=min(asked.speed_max_m_s, *(each.horizontal_speed_m_s for each in own)),
-            climb_max_m_s=min(asked.climb_max_m_s, *(each.vertical_speed_m_s for each in own)),
-            yaw_rate_max_rad_s=min(asked.yaw_rate_max_rad_s, *(math.radians(each.yaw_rate_deg_s) for each in own)),
+        of_drones = [each for _, each in self._drones]
+        self._limits: RobotLimits = gains.limits._replace(
+            speed_max_m_s=min(gains.speed_max_m_s, *(each.horizontal_speed_m_s for each in of_drones)),
+            climb_max_m_s=min(gains.climb_max_m_s, *(each.vertical_speed_m_s for each in of_drones)),
+            yaw_rate_max_rad_s=min(gains.yaw_rate_max_rad_s, *(math.radians(e.yaw_rate_deg_s) for e in of_drones)),
         )
-        in_flight = limits.shape_in_flight
         wide = replace(gains, separation_min_m=NEAR_ROOM * gains.separation_min_m)
-        self._wide = wide, replace(in_flight, height_min_m=NEAR_ROOM * in_flight.height_min_m)
-        self._exact = gains, limits.shape
-        self._planner = RampPlanner(space, gains, limits.shape)
+        self._wide = wide, replace(SHAPE_IN_FLIGHT, height_min_m=NEAR_ROOM * SHAPE.height_min_m)
+        self._exact = gains, SHAPE
+        self._planner = RampPlanner(space, gains, SHAPE)
 
     def check_target(self, start: Array, goal: Array, over_s: float | None) -> None:
         """Refuse a target that is not allowed, or too far for its time: PlanError, or TrajectoryError out of reach."""

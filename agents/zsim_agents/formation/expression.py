@@ -129,11 +129,11 @@ def checked_constants(constants: Mapping[str, float]) -> dict[str, float]:
     """Return the constants as floats; ExpressionError: too many, a name or value that is not allowed."""
     if len(constants) > CONSTANTS_MAX:
         raise ExpressionError(f"constants: found {len(constants)}; allowed: at most {CONSTANTS_MAX}")
-    taken = ["t", *CONSTANTS, *_FUNCTIONS]
+    reserved = ["t", *CONSTANTS, *_FUNCTIONS]
     for name, value in constants.items():
         is_name = isinstance(name, str) and len(name) <= NAME_MAX and name.isidentifier()
-        if not is_name or name in taken:
-            allowed = f"an identifier of at most {NAME_MAX} characters except {', '.join(taken)}"
+        if not is_name or name in reserved:
+            allowed = f"an identifier of at most {NAME_MAX} characters except {', '.join(reserved)}"
             raise ExpressionError(f"constant {str(name)[:40]!r}: not a free name; allowed: {allowed}")
         if finite_number(value) is None:
             raise ExpressionError(f"constant {name}: found {str(value)[:40]!r}; allowed: a finite number")

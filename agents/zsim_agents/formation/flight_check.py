@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -49,43 +49,30 @@ class ShapeLimits:
     share: float = 0.8  # chosen
 
 
+# All chosen, the shape's so that no formation comes near a singularity
+SHAPE = ShapeLimits()
+FLIGHT_SLACK = 1.5  # of spread and tilt in flight, so that noise at the limit does not hold the formation
+SHAPE_IN_FLIGHT = dataclasses.replace(  # beyond it a formation in flight is held
+    SHAPE,
+    spread_min_m=SHAPE.spread_min_m / FLIGHT_SLACK,
+    tilt_max_rad=SHAPE.tilt_max_rad * FLIGHT_SLACK,
+    condition_max=math.inf,
+)
+ASSEMBLY_HEIGHT_M = 1.5  # to which drones climb straight up before engagement: many rotor radii, and a fall withstood
+ASSEMBLY_WITHIN_M = 0.3  # three sigma of the barometer
+ASSEMBLY_CLIMB_M_S = 0.5  # greatest: half of what the firmware allows, so that all drones climb equally
+AGE_MAX_S = 0.5  # of an estimate that is flown on, as long as the firmware tolerates silence: 25 gates
+IN_FLIGHT_FACTOR = 2.0  # by which sigmas may be greater in flight; of a position: 2 m, as of a single GPS fix
+HEAL_S = 0.5  # without fault, after which a held formation goes on: 25 gates are no coincidence
+RESEND_S = 1.0  # after which a mode command without effect is sent again: ten times their delay in the paper's scenario
+
+
 @dataclass(frozen=True)
 class EngagementLimits:
-    """Limits and heights of the phase machine; all chosen, `shape` so that no formation comes near a singularity.
+    """Greatest standard deviations for take-off and engagement."""
 
-    Attributes:
-        shape: where a formation may be engaged and led.
-        flight_slack: in flight the spread may fall to its limit over this, the tilt grow to its limit times this.
-        assembly_height_m: height to which drones climb straight up before engagement, within assembly_within_m.
-        assembly_climb_m_s: greatest speed of that climb.
-        age_max_s: oldest estimate that is flown on.
-        sigma_max_m, yaw_sigma_max_rad: greatest sigma of position and heading for take-off and engagement.
-        in_flight_factor: by which both may be greater in flight.
-        heal_s: time without fault after which a held formation goes on.
-        resend_s: time after which a mode command without effect is sent again.
-    """
-
-    shape: ShapeLimits = field(default_factory=ShapeLimits)
-    flight_slack: float = 1.5  # so that noise at the limit does not hold the formation
-    assembly_height_m: float = 1.5  # many rotor radii over the ground, and a fall that the hull withstands
-    assembly_within_m: float = 0.3  # three sigma of the barometer
-    assembly_climb_m_s: float = 0.5  # half of what the firmware allows: all drones climb equally
-    age_max_s: float = 0.5  # as long as the firmware tolerates silence: 25 gates
     sigma_max_m: float = 1.0  # half of the least separation of 2 m
     yaw_sigma_max_rad: float = math.radians(15.0)  # half of the 30 deg at which three sigma turn a velocity by 90 deg
-    in_flight_factor: float = 2.0  # of a position: 2 m, as of a single GPS fix
-    heal_s: float = 0.5  # 25 gates without a fault are no coincidence
-    resend_s: float = 1.0  # ten times the delay of commands in the paper's scenario, 100 ms
-
-    @property
-    def shape_in_flight(self) -> ShapeLimits:
-        """Wider limits beyond which a formation in flight is held."""
-        return dataclasses.replace(
-            self.shape,
-            spread_min_m=self.shape.spread_min_m / self.flight_slack,
-            tilt_max_rad=self.shape.tilt_max_rad * self.flight_slack,
-            condition_max=math.inf,
-        )
 
 
 class GateInput(Struct, eq=False):
@@ -167,16 +154,15 @@ class FlightCheck:
         self, space: ClusterSpace, drones: tuple[str, ...], gains: FormationGains, limits: EngagementLimits
     ) -> None:
         self.space, self.drones, self.gains, self.limits = space, drones, gains, limits
-        self._shape_in_flight = limits.shape_in_flight
-        self._bounds_in_flight = bounds_of(space, self._shape_in_flight)
+        self._bounds_in_flight = bounds_of(space, SHAPE_IN_FLIGHT)
         self.value: Array = np.zeros(space.size)
         self.margin = 0.0
         self._spread = 0.0
         self._no_frame: str | None = "nothing was observed yet"
         self._flaw = (VALID, 0)  # of the estimates of the gate that was observed, by the limits in flight
         sigmas = limits.sigma_max_m, limits.yaw_sigma_max_rad
-        self._at_start = (limits.age_max_s, *sigmas)
-        self._in_flight = (limits.age_max_s, *(limits.in_flight_factor * sigma for sigma in sigmas))
+        self._at_start = (AGE_MAX_S, *sigmas)
+        self._in_flight = (AGE_MAX_S, *(IN_FLIGHT_FACTOR * sigma for sigma in sigmas))
 
     def observe(self, gate: GateInput) -> None:
         self.margin, self._no_frame = 0.0, "an estimate is not finite"
@@ -199,7 +185,7 @@ class FlightCheck:
         if fault := self._start_fault(gate, AIRBORNE):
             return fault
         low = int(np.argmin(gate.p_W[:, 2]))
-        least_m = self.limits.assembly_height_m - self.limits.assembly_within_m
+        least_m = ASSEMBLY_HEIGHT_M - ASSEMBLY_WITHIN_M
         if gate.p_W[low, 2] < least_m:
             return f"{self.drones[low]} is at z = {gate.p_W[low, 2]:.2f} m; allowed: {least_m:.2f} m or more"
         return self.formation_fault(gate)
@@ -207,14 +193,14 @@ class FlightCheck:
     def flight_fault(self, gate: GateInput) -> str | None:
         """Return why the loop of an engaged formation cannot be closed."""
         fault = self.state_fault(gate, AIRBORNE) or self.estimate_fault(gate) or self._no_frame
-        shape = self._shape_in_flight
-        if fault or (self._spread > shape.spread_min_m and first_outside(self.value, self._bounds_in_flight) < 0):
+        is_wide = self._spread > SHAPE_IN_FLIGHT.spread_min_m
+        if fault or (is_wide and first_outside(self.value, self._bounds_in_flight) < 0):
             return fault
-        return shape_fault(self.space, self.value, shape, self._spread)
+        return shape_fault(self.space, self.value, SHAPE_IN_FLIGHT, self._spread)
 
     def formation_fault(self, gate: GateInput) -> str | None:
         """Return why the robots, where they are, are no formation to start from."""
-        fault = self._no_frame or shape_fault(self.space, self.value, self.limits.shape, self._spread)
+        fault = self._no_frame or shape_fault(self.space, self.value, SHAPE, self._spread)
         if fault:
             return fault
         distance, i, j = closest_pair(gate.p_W)
@@ -225,7 +211,7 @@ class FlightCheck:
 
     def estimate_fault(self, gate: GateInput) -> str | None:
         """Return why the estimates of drones in flight, at the observed gate, cannot be flown on."""
-        return self._flaw_text(gate, self._flaw, self.limits.in_flight_factor)
+        return self._flaw_text(gate, self._flaw, IN_FLIGHT_FACTOR)
 
     def state_fault(self, gate: GateInput, allowed: frozenset[str]) -> str | None:
         """Return which drone is in another state than those allowed."""
@@ -241,9 +227,9 @@ class FlightCheck:
         kind, i = flaw
         if kind == VALID:
             return None
-        drone, age_max_s = self.drones[i], self.limits.age_max_s
+        drone = self.drones[i]
         if kind == STALE:
-            return f"the estimate of {drone} is {gate.age_s[i]:.2f} s old; allowed: {age_max_s:g} s"
+            return f"the estimate of {drone} is {gate.age_s[i]:.2f} s old; allowed: {AGE_MAX_S:g} s"
         if kind == NOT_FINITE:
             return f"the estimate of {drone} is not finite; allowed: up to {FAR:g} m, m/s or rad"
         if kind == TURNED:

@@ -8,7 +8,7 @@ import numpy as np
 
 from zsim.contract.snapshot import State
 from zsim_agents.formation.control_law import FormationGains, RobotLimits, load
-from zsim_agents.formation.flight_check import ShapeLimits, formation_fault
+from zsim_agents.formation.flight_check import SHAPE, SHAPE_IN_FLIGHT, ShapeLimits, formation_fault
 from zsim_agents.formation.flight_plan import Follow, MoveTo
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, robot_rates
 from zsim_agents.formation.trajectory import (
@@ -44,11 +44,11 @@ class Guidance:
     not allowed, and change nothing then.
     """
 
-    def __init__(self, space: ClusterSpace, gains: FormationGains, shape: ShapeLimits) -> None:
+    def __init__(self, space: ClusterSpace, gains: FormationGains) -> None:
         self.space = space
         self.paused = False
         self._gains = gains
-        self._planner = RampPlanner(space, gains, shape)
+        self._planner = RampPlanner(space, gains, SHAPE)
         self._home: Reference = Hold(np.zeros(space.size))
         self._flown: Reference = self._home
         self._goal = np.zeros(space.size)
@@ -105,14 +105,14 @@ class Guidance:
         self._flown = self._planner.ramp(self.value(t_s), self._home, t_s)
         self.paused = False
 
-    def rejoin(self, c: Array, t_s: float, shape: ShapeLimits) -> None:
+    def rejoin(self, c: Array, t_s: float) -> None:
         """Go on after a fault from the estimate c (4n,), at rest; a paused formation stays there.
 
-        The way back keeps the limits of shape: a formation recovers from where it may just be flown.
+        The way back keeps the limits in flight: a formation recovers from where it may just be flown.
         """
         home = Hold(c) if self.paused else self._home
         start = (c, np.zeros_like(c))
-        self._flown = RampPlanner(self.space, self._gains, shape).ramp(start, home, t_s)
+        self._flown = RampPlanner(self.space, self._gains, SHAPE_IN_FLIGHT).ramp(start, home, t_s)
 
     def snapshot(self) -> State:
         return {

@@ -245,8 +245,8 @@ _KINDS: dict[str, Any] = {
 
 def state_of(reference: Reference) -> State:
     """Return a reference of this module as plain values; TypeError: it is another."""
-    for kind, made in _KINDS.items():
-        if type(reference) is made:
+    for kind, known in _KINDS.items():
+        if type(reference) is known:
             arguments = getattr(reference, "arguments", None) or vars(reference)
             own = {name: state_of(value) if name in ("of", "onto") else value for name, value in arguments.items()}
             return {"kind": kind, **own}

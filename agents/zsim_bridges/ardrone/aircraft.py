@@ -112,7 +112,7 @@ class Aircraft:
             return
         if not self._is_lost:
             self._is_lost = True
-            self._navdata.drop_clients()
+            self._navdata.clients.clear()
             self.pilot.on_lost()
         elif silent_ns > lost_ns + LAND_AFTER_NS:
             self.pilot.land()

@@ -72,7 +72,7 @@ class ArdroneServer(VehicleServer):
             self.say(f"{name} is an AR.Drone 2.0 at {drone.address}")
         stack.callback(self._pictures.follow, ())
 
-    async def take_in(self, intake: TrafficIntake) -> None:
+    async def on_arrivals(self, intake: TrafficIntake) -> None:
         for arrived in intake.arrivals():
             for key, payload in arrived:
                 self.forward(key, payload)

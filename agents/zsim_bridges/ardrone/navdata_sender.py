@@ -51,6 +51,7 @@ class NavdataSender:
         refuse: counts what cannot be sent, with the reason.
 
     Attributes:
+        clients: addresses to which navdata is sent, the first that asked first.
         is_bootstrap: whether packets have no options yet.
     """
 
@@ -70,7 +71,7 @@ class NavdataSender:
         self._ctrl_state = ctrl_state
         self._refuse = refuse
         self._last: tuple[int, int] | None = None  # rate [Hz], and number of the packet within the simulated time
-        self._clients: dict[Hashable, None] = {}
+        self.clients: dict[Hashable, None] = {}
         self._sequence = 0
         self._prepare(())
         self.is_bootstrap = True
@@ -79,25 +80,22 @@ class NavdataSender:
         """Send navdata to an address from now on; return False for a datagram that does not ask for it."""
         if not datagram.startswith(REQUESTS):
             return False
-        if address not in self._clients:
-            while len(self._clients) >= CLIENTS_MAX:
-                del self._clients[next(iter(self._clients))]
-            self._clients[address] = None
+        if address not in self.clients:
+            while len(self.clients) >= CLIENTS_MAX:
+                del self.clients[next(iter(self.clients))]
+            self.clients[address] = None
             self._send(self._packet(t_ns), address)
         return True
-
-    def drop_clients(self) -> None:
-        self._clients.clear()
 
     def on_instant(self, t_ns: int) -> None:
         """Send the packet that is due: a fixed number in each simulated second, without drift."""
         is_full = not (self.is_bootstrap or self._configuration.flag("general:navdata_demo"))
         rate_hz = navdata.FULL_RATE_HZ if is_full else navdata.DEMO_RATE_HZ
         number = rate_hz, t_ns * rate_hz // SECOND_NS
-        if self._clients and number != self._last:
+        if self.clients and number != self._last:
             self._last = number
             packet = self._packet(t_ns)
-            for address in tuple(self._clients):
+            for address in tuple(self.clients):
                 self._send(packet, address)
 
     def on_gate(self) -> None:

@@ -65,14 +65,7 @@ class _Watched:
 class CameraFeed:
     """The cameras of one run, each named `DRONE/CAMERA`; only those that a page watches are subscribed to.
 
-    Args:
-        observer: of the console in the run; counts what is received and refused.
-        drones: of the run; cameras of others are ignored.
-        hat_m: diameter of a hat [m].
-
-    Attributes:
-        refused: number of refused pictures by camera.
-        reasons: why the last of them was refused.
+    Cameras of drones that are not in the run are ignored; `hat_m` is the diameter of a hat [m].
     """
 
     def __init__(
@@ -94,8 +87,8 @@ class CameraFeed:
         self._watched: dict[str, _Watched] = {}
         self._undeclare: dict[str, Callable[[], None]] = {}  # by key
         self._number = 0
-        self.refused: Counter[str] = Counter()
-        self.reasons: dict[str, str] = {}
+        self.refused: Counter[str] = Counter()  # number of refused pictures by camera
+        self.reasons: dict[str, str] = {}  # why the last of them was refused
 
     def open(self) -> None:
         """Learn which cameras exist, and of those that appear later."""

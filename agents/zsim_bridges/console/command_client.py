@@ -54,11 +54,8 @@ class PastInstant(NamedTuple):
 class CommandClient:
     """Sends requests in the console's name.
 
-    Args:
-        name: of the console's process.
-        views: know which commands have been answered.
-        now_ns: simulated time for a stamp; may poll the world.
-        report: called with the outcome of each request, in any thread.
+    `views` know which commands have been answered, `now_ns` gives the time of a stamp and may poll the world, and
+    `report` is called with the outcome of each request, in any thread.
     """
 
     def __init__(

@@ -32,7 +32,7 @@ from zsim_bridges.console.console_page import ConsolePage, PageForms
 from zsim_bridges.console.console_tables import TableRows
 from zsim_bridges.console.control_desk import OPERATOR, RUN, VIEWER, ControlDesk
 from zsim_bridges.console.orders import OrderBook, OrderRequest
-from zsim_bridges.console.page_cameras import CameraFollow, CameraFrustums
+from zsim_bridges.console.page_cameras import PageCameras
 from zsim_bridges.console.page_flying import PageFlying
 from zsim_bridges.console.page_server import HttpProxy, ListenAddress, RunFiles, ViserBackend
 from zsim_bridges.console.page_sockets import ActionSockets, CameraSockets
@@ -89,16 +89,14 @@ class Console:
         self._run_page: RunPage | None = None
         self._viser = PrivateViser(lambda *use: self._run_page is None or self._run_page.permits(*use))
         server = self._viser.server
-        self._camera_follow = CameraFollow(server)
-        self._frustums = CameraFrustums(server)
+        self._cameras = PageCameras(server)
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.gui.set_panel_label("zsim")
         server.gui.add_markdown(f"Waiting for a world: {world}" if world else "Waiting for a world")
         controls = PageControls(server.gui, lambda: [page.gui for page in server.get_clients().values()])
-        cameras = CameraSockets(lambda: self._run_page and self._run_page.cameras, self._frustums)
+        cameras = CameraSockets(lambda: self._run_page and self._run_page.cameras, self._cameras)
         actions = ActionSockets(
-            self._frustums.client_id,
-            self._camera_follow,
+            self._cameras,
             lambda: self._run_page and self._run_page.record,
             lambda: self._run_page and self._run_page.flying,
         )
@@ -136,7 +134,7 @@ class Console:
         say: Callable[[str], None],
     ) -> None:
         """Show a run until it is over or `stopped` returns true."""
-        shown_by = self._camera_follow, self._frustums, self._rate_hz, self._world
+        shown_by = self._cameras, self._rate_hz, self._world
         self._run_page = page = RunPage(self._viser.server, link, info, observer, *shown_by)
         try:
             page.run(stopped)
@@ -158,7 +156,7 @@ class Console:
         self._files.offer(OFFER_S, deserted)
 
     def _on_look(self, key: str, role: str, address: str) -> None:
-        client_id = self._frustums.client_id(key)
+        client_id = self._cameras.client_id(key)
         if self._run_page and client_id is not None:
             self._run_page.desk.look(client_id, role, address)
 
@@ -173,16 +171,8 @@ class RunPage:
 
     Args:
         server: viser's; what another run has left on it is removed.
-        camera_follow: moves the page's cameras that follow the formation.
-        frustums: of the drones' cameras, on the pages where they are chosen.
         rate_hz: pictures a second; None: by the number of drones and the rate of the run.
         world: where the run is, in words.
-
-    Attributes:
-        record: what a replay plays.
-        flying: what pages may do with single drones.
-        orders: of the operators, until they are settled.
-        desk: which page is in control.
 
     Raises:
         RunError: a user's cluster space refuses its robots.
@@ -194,8 +184,7 @@ class RunPage:
         link: Session,
         info: Info,
         observer: Participant,
-        camera_follow: CameraFollow,
-        frustums: CameraFrustums,
+        page_cameras: PageCameras,
         rate_hz: float | None,
         world: str = "",
     ) -> None:
@@ -207,7 +196,7 @@ class RunPage:
         self._run = run = ShownRun(info, scenario, spaces)
         self._server = server
         self._observer = observer
-        self._frustums = frustums
+        self._page_cameras = page_cameras
         self._rate_hz = rate_hz
         self._names, self._members = run.names, run.members
         self._table_s = self._monitor_s = 0.0
@@ -233,7 +222,7 @@ class RunPage:
         self.views.on_own_event = self.orders.on_event
         self.record = RecordPlayer(self._client, self._time_monitor, run.is_replay, len(self._names))
 
-        self._scene = RunScene(server, run, self.views, camera_follow)
+        self._scene = RunScene(server, run, self.views, page_cameras)
         self._scene.nodes.on_click(self._on_click)
         self._page = ConsolePage(
             server.gui, run, self._client, self._on_outcome, self._scene.nodes.show,
@@ -255,7 +244,7 @@ class RunPage:
         self._client.close()
         self._page_forms.close()
         self.cameras.close()
-        self._frustums.clear()
+        self._page_cameras.clear_frusta()
         self._scene.nodes.close()
 
     def run(self, stopped: Callable[[], bool]) -> None:
@@ -350,7 +339,7 @@ class RunPage:
         with self._server.atomic():
             if view is not None:
                 self._draw(view)
-            self._frustums.draw(self._scene.drones, self.cameras.shown)
+            self._page_cameras.draw_frusta(self._scene.drones, self.cameras.shown)
             if wall_s - self._table_s >= TABLE_S:
                 self._table_s = wall_s
                 self._update_tables(wall_s)
@@ -369,7 +358,7 @@ class RunPage:
         drone = self._scene.clicked(event)
         if drone is not None:
             self._page_forms.choose(event.client_id, drone)
-            self._frustums.click(event.client_id, drone)
+            self._page_cameras.click(event.client_id, drone)
 
     # Trails and plots
 

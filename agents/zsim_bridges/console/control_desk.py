@@ -189,11 +189,9 @@ def words(part: str) -> str:
 
 
 class ControlForm:
-    """Who is in control, on one page, with buttons to ask for control, grant it and give it up.
+    """Who is in control, on one page (viser's number), with buttons to ask for control, grant it and give it up.
 
-    Args:
-        page: viser's number of this one.
-        part_of: part of each shared control by its id, which its element on the page has, too.
+    `part_of` has the part of each shared control by its id, which its element on the page has, too.
     """
 
     def __init__(self, gui: viser.GuiApi, desk: ControlDesk, page: int, part_of: Mapping[str, str]) -> None:

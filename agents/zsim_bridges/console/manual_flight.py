@@ -172,11 +172,7 @@ class _Flight:
 class ManualFlight:
     """Flies drones for pages, each identified by any hashable value; thread-safe.
 
-    Args:
-        name: of the console's process.
-        gate_s: simulated seconds of a gate, for which one command is sent at most.
-        sight_of: returns what is known of a drone.
-        run_sight: returns what is known of the run.
+    `gate_s` is the simulated time of a gate, for which one command is sent at most.
     """
 
     def __init__(

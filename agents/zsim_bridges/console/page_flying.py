@@ -45,14 +45,7 @@ Place = tuple[float, float]
 class PageFlying:
     """Single drones for the pages of one run, which viser's number identifies.
 
-    Args:
-        name: of the console's process.
-        note: called with a drone or formation whose return is over, and why.
-
-    Attributes:
-        pages: their own forms.
-        control: of the drones that are flown from pages.
-        returns: of drones and formations.
+    `note` is called with a drone or formation whose return is over, and why.
     """
 
     def __init__(
@@ -186,14 +179,7 @@ class _ReturningFormation:
 
 
 class ReturnFlights:
-    """Returns of the drones and formations of a run; thread-safe.
-
-    Args:
-        control: flies drones to places.
-        sight_of: returns what is known of a drone.
-        clusters: returns the newest view of each formation.
-        note: called with a drone or formation, and why its return is over.
-    """
+    """Returns of the drones and formations of a run; thread-safe. `control` flies drones to places."""
 
     def __init__(
         self,

@@ -149,14 +149,7 @@ class ViserBackend(NamedTuple):
 
 
 class HttpProxy:
-    """One server of pages.
-
-    Args:
-        token: of operators; None where only this machine can connect.
-
-    Raises:
-        RunError: others could reach it, and there is no token.
-    """
+    """One server of pages; `token` is that of operators, None where only this machine can connect."""
 
     def __init__(self, address: ListenAddress, token: str | None, backend: ViserBackend) -> None:
         self._address = address

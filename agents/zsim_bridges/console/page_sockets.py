@@ -14,7 +14,7 @@ from msgspec import Meta, Struct
 
 from zsim_bridges.console.camera_feed import CameraFeed
 from zsim_bridges.console.manual_flight import FlightAnswer, Stick
-from zsim_bridges.console.page_cameras import CameraFollow, CameraFrustums
+from zsim_bridges.console.page_cameras import PageCameras
 from zsim_bridges.console.page_flying import PageFlying
 from zsim_bridges.console.page_server import HEARTBEAT_S, OPERATOR
 from zsim_bridges.console.time_monitor import RecordPlayer
@@ -116,20 +116,15 @@ _ACTIONS = msgspec.json.Decoder(_Look | _Operate)
 class ActionSockets:
     """The sockets for actions of all pages.
 
-    Args:
-        client_id: returns viser's number of a page by its key, None if it is not open.
-        record: returns what a replay plays, None without a run.
-        flying: returns what pages may do with single drones, None without a run.
+    `record` returns what a replay plays, and `flying` what pages may do with single drones, None without a run.
     """
 
     def __init__(
         self,
-        client_id: Callable[[str], int | None],
-        cameras: CameraFollow,
+        cameras: PageCameras,
         record: Callable[[], RecordPlayer | None],
         flying: Callable[[], PageFlying | None] = lambda: None,
     ) -> None:
-        self._client_id = client_id
         self._cameras = cameras
         self._record = record
         self._flying = flying
@@ -172,12 +167,12 @@ class ActionSockets:
         flying = self._flying()
         if isinstance(action, _Operate):
             return self._operate(action, page, flying) if role == OPERATOR else None
-        client_id = self._client_id(action.page)
+        client_id = self._cameras.client_id(action.page)
         if isinstance(action, LookAtPlan) and page is not None:
             self._keys[page] = action.page
         if isinstance(action, LookFrom):
             if client_id is not None:
-                self._cameras.choose(client_id, action.follows, action.fits, action.direction)
+                self._cameras.look(client_id, action.follows, action.fits, action.direction)
         elif flying is None:
             return {}
         elif isinstance(action, LookAtPlan):
@@ -197,7 +192,7 @@ class ActionSockets:
         if flying is None:
             return {}
         if isinstance(action, TakeDrone):
-            client_id = self._client_id(self._keys.get(page, "")) if page is not None else None
+            client_id = self._cameras.client_id(self._keys.get(page, "")) if page is not None else None
             refusal = flying.pages.use(client_id, action.drone)
             if refusal:
                 answer = FlightAnswer(action.drone, text=refusal)
@@ -269,9 +264,9 @@ class PageBatches:
 class CameraSockets:
     """The sockets for pictures of all pages; `feed` returns the cameras of the run that is shown, None without one."""
 
-    def __init__(self, feed: Callable[[], CameraFeed | None], frustums: CameraFrustums) -> None:
+    def __init__(self, feed: Callable[[], CameraFeed | None], cameras: PageCameras) -> None:
         self._feed = feed
-        self._frustums = frustums
+        self._cameras = cameras
 
     async def respond(self, request: web.Request) -> web.StreamResponse:
         """Answer a request for a socket; return when it is closed."""
@@ -295,7 +290,7 @@ class CameraSockets:
                 feed, want = self._feed(), wanted.want
                 if feed is not None:
                     feed.ask(socket, (*want, wanted.frustum) if wanted.frustum else want)
-                batch = batches.next(feed, want, self._frustums.take_click(wanted.page))
+                batch = batches.next(feed, want, self._cameras.take_click(wanted.page))
                 if batch is not None:
                     ready.clear()
                     await socket.send_bytes(batch)
@@ -310,12 +305,12 @@ class CameraSockets:
                     wanted = _PICTURES.decode(message.data)
                 except (msgspec.MsgspecError, ValueError, RecursionError):
                     break
-                self._frustums.choose(wanted.page, wanted.frustum)
+                self._cameras.show_frustum(wanted.page, wanted.frustum)
                 ready.set()
         finally:
             sending.cancel()
             await asyncio.gather(sending, return_exceptions=True)
-            self._frustums.choose(wanted.page, "")
+            self._cameras.show_frustum(wanted.page, "")
             feed = self._feed()
             if feed is not None:
                 feed.release(socket)

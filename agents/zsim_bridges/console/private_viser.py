@@ -66,14 +66,9 @@ viser.infra._infra.AsyncMessageBuffer = _Buffer  # type: ignore[misc]
 
 
 class PrivateViser:
-    """A viser server on a port of loopback that refuses connections without a secret.
+    """A viser server on a port of loopback that refuses connections without a secret in SECRET_HEADER.
 
-    Args:
-        permits: a use that it does not permit changes nothing, and its page shows the previous value again.
-
-    Attributes:
-        server: viser's.
-        secret: to be sent in SECRET_HEADER.
+    A use that is not permitted changes nothing, and its page shows the previous value again.
     """
 
     def __init__(self, permits: Permits = lambda *_: True) -> None:

@@ -57,8 +57,11 @@ class RunForm:
         gui.add_html(limits_line(f"gates: 1 to {GATES_MAX}"))
         step = gui.add_button("Step", icon=viser.Icon.PLAYER_TRACK_NEXT)
 
-        whole = lambda count: int(count) if count == int(count) else count  # noqa: E731  (the world refuses fractions)
-        step.on_click(lambda _: client.request_world("step", gates=whole(gates.value)))
+        def request_step() -> None:
+            count = gates.value  # a fraction is sent as it is, and refused by the world
+            client.request_world("step", gates=int(count) if count == int(count) else count)
+
+        step.on_click(lambda _: request_step())
         wanted = gui.add_number(
             "rate", rate, min=0.0, max=RATE_MAX, step=0.5, hint="Real time is 1; 0: as fast as it goes"
         )
@@ -94,8 +97,7 @@ class FleetForm:
         takeoff = gui.add_button("Take off all", icon=viser.Icon.PLANE_DEPARTURE, color="gray")
         takeoff.on_click(lambda _: self._take_off())
         reset = gui.add_button("Reset all", icon=viser.Icon.REFRESH, color="gray")
-        stopped = lambda: [d for d in self._drones if self._run.drones.get(d) == "emergency"]  # noqa: E731
-        reset.on_click(lambda _: client.send_mode(stopped(), "reset"))
+        reset.on_click(lambda _: self._reset())
         self._controls: dict[str, Any] = {"takeoff": takeoff, "reset": reset}
         self._reasons = gui.add_html("")
 
@@ -114,6 +116,9 @@ class FleetForm:
         single = [drone for drone in self._single if not preflight_refusal(self._run, [drone])]
         if single:
             self._client.send_mode(single, "takeoff")
+
+    def _reset(self) -> None:
+        self._client.send_mode([d for d in self._drones if self._run.drones.get(d) == "emergency"], "reset")
 
 
 class FaultForm:

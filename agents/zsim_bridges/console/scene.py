@@ -20,7 +20,7 @@ from zsim.scenario.scenario import Obstacle
 from zsim.vehicles.vehicle import cross_layout
 from zsim_bridges.console import airframe
 from zsim_bridges.console.histories import CanvasTrails
-from zsim_bridges.console.page_cameras import CameraFollow
+from zsim_bridges.console.page_cameras import PageCameras
 from zsim_bridges.console.picture import (
     Array,
     DronePoses,
@@ -64,32 +64,23 @@ CHOSEN = (25, 113, 194)
 
 
 class RunScene:
-    """The scene of one run; it replaces that of another run.
+    """The scene of one run; it replaces that of another run."""
 
-    Attributes:
-        nodes: viser's.
-        drones: their newest poses, None before the first view.
-        shapes: the formations' true shapes by name; None where a drone of one is missing.
-        previews: ways (n, M, 3) [m] of formations, by name, that would be flown.
-    """
-
-    def __init__(
-        self, server: viser.ViserServer, run: ShownRun, views: ViewBuffer, camera_follow: CameraFollow
-    ) -> None:
+    def __init__(self, server: viser.ViserServer, run: ShownRun, views: ViewBuffer, cameras: PageCameras) -> None:
         self._run = run
         self._views = views
-        self._camera_follow = camera_follow
+        self._cameras = cameras
         self._members = {name: [run.names.index(each) for each in drones] for name, drones in run.members.items()}
         self._drawn_ghosts: dict[str, Any] = {}
-        self.drones: DronePoses | None = None
-        self.shapes: dict[str, FormationShape | None] = {}
-        self.previews: dict[str, Array] = {}
+        self.drones: DronePoses | None = None  # their newest poses
+        self.shapes: dict[str, FormationShape | None] = {}  # true ones by formation; None where a drone is missing
+        self.previews: dict[str, Array] = {}  # ways (n, M, 3) [m] that formations would fly
         self.trails = CanvasTrails(len(run.names), around=run.is_replay)
         robots = sum(space.n for space in run.spaces.values())
         arms_m = [drone.arm_m for drone in run.scenario.drones]
         self.nodes = SceneNodes(server, run.info.drones, arms_m, robots, len(run.spaces))
         self.nodes.obstacles(run.scenario.environment.obstacles)
-        camera_follow.restart()
+        cameras.restart()
 
     def clicked(self, event: viser.SceneClickEvent) -> str | None:
         if self.drones is None:
@@ -102,7 +93,7 @@ class RunScene:
         self.drones = drones
         self.trails.add(drones.t_ns / 1e9, drones.p_W)
         self.shapes = self.shapes_of(drones)
-        self._camera_follow.set_target(self._camera_targets(drones))
+        self._cameras.set_target(self._camera_targets(drones))
         return drones
 
     def draw(self, view: ViewDrones, longest_s: float, chosen: str) -> DronePoses:
@@ -123,7 +114,7 @@ class RunScene:
             poses = [ghosts(self._run.spaces[name], view) for name, view in self._views.clusters.items()]
             shown = [(np.zeros((0, 3)), np.zeros((0, 4))), *(each for each in poses if each is not None)]
             self.nodes.ghosts(np.concatenate([p_W for p_W, _ in shown]), np.concatenate([q for _, q in shown]))
-        self._camera_follow.follow(self._camera_targets(drones))
+        self._cameras.follow(self._camera_targets(drones))
         return drones
 
     def preview(self, cluster: str, shown: FlightPreview | None) -> None:
@@ -154,16 +145,7 @@ class RunScene:
 
 
 class SceneNodes:
-    """The nodes of one run.
-
-    Args:
-        server: viser's; its scene is cleared.
-        arms_m: centre to rotor, of each.
-        robots: number of drones in formations, each with a ghost.
-
-    Attributes:
-        radii_m: (N,), how far each drone reaches from its centre.
-    """
+    """The nodes of one run, of N drones; `robots` is the number of those in formations, each of which has a ghost."""
 
     def __init__(
         self,
@@ -185,7 +167,7 @@ class SceneNodes:
         scene.add_label("/origin/e", "east", position=(1.1, 0.0, 0.0))
         scene.add_label("/origin/n", "north", position=(0.0, 1.1, 0.0))
         looks = [airframe.shape_of(*each) for each in zip(drones, arms_m, strict=True)]
-        self.radii_m: Array = np.array([look.reach_m for look in looks])
+        self.radii_m: Array = np.array([look.reach_m for look in looks])  # (N,), from the centre
 
         self._airframes: list[tuple[NDArray[np.int64], Any]] = []  # one node for all drones that look alike
         for k, look in enumerate(dict.fromkeys(looks)):

@@ -66,12 +66,8 @@ class AwakeClock:
 class TimeMonitor:
     """Polls the run's clock in a thread of its own, so that drawing waits for no answer.
 
-    Args:
-        observer: of the console in the run; it follows the run's clock.
-        stamp_age_s: simulated; how old the time of a stamp may be.
-
-    Attributes:
-        clock: the newest answer.
+    The observer of the console in the run follows it, too; `stamp_age_s` is how old the time of a stamp may be
+    [simulated].
     """
 
     def __init__(
@@ -90,7 +86,7 @@ class TimeMonitor:
         self._awake = AwakeClock(wall_s)
         self._answered_s = self._awake.now_s()
         self._known_s = -math.inf
-        self.clock: run_messages.Clock | None = None
+        self.clock: run_messages.Clock | None = None  # the newest answer
 
     @contextmanager
     def polling(self) -> Iterator[None]:

@@ -74,11 +74,7 @@ class FlightHistory:
 class VariablePlots:
     """Plots of one formation and of its drones, three variables at a time.
 
-    Args:
-        replayed: whether it is a replay, whose curves extend beyond the shown instant.
-
-    Attributes:
-        history: of the formation's variables.
+    The curves of a record that is replayed extend beyond the shown instant.
     """
 
     def __init__(

@@ -75,14 +75,6 @@ class ViewBuffer:
         variables: names of each formation's variables; views of other formations or variables are refused.
         refused: called with the event of each of the console's commands that the world refuses.
         asked: called with a formation and a description of each request that somebody else makes of it.
-
-    Attributes:
-        external: names of the drones whose bodies are external.
-        faults: injected ones, planned and active.
-        begun: the last injected faults that have begun.
-        failsafes: the event of each drone's automatic landing or stop, until it is commanded another mode.
-        end: why the run ended, by its last event; empty while it goes on.
-        on_own_event: called with each event that a command of this console causes.
     """
 
     def __init__(
@@ -110,15 +102,16 @@ class ViewBuffer:
         self.clusters: dict[str, ViewCluster] = {}
         self.estimators: dict[str, ViewEstimates] = {}  # by process
         self.healths: dict[str, Health] = {}
+        # whose bodies are external
         self.external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
         self._links: dict[str, LinkState] = {}
-        self.faults: tuple[Fault, ...] = ()
+        self.faults: tuple[Fault, ...] = ()  # injected ones, planned and active
         self.log = EventLog(observer.name)
         self.losses = Losses()
-        self.failsafes: dict[str, Event] = {}
-        self.begun: deque[Fault] = deque(maxlen=FAULTS_KEPT)
-        self.end = ""
-        self.on_own_event: Callable[[Event], None] = lambda _: None
+        self.failsafes: dict[str, Event] = {}  # automatic landing or stop of drones that had no other mode since
+        self.begun: deque[Fault] = deque(maxlen=FAULTS_KEPT)  # the last injected faults that have begun
+        self.end = ""  # why the run ended, by its last event; empty while it goes on
+        self.on_own_event: Callable[[Event], None] = lambda _: None  # called with events that a command of ours causes
 
     def open(self) -> None:
         """Subscribe, and read the values published last."""
@@ -302,18 +295,14 @@ class EventRow(NamedTuple):
 class EventLog:
     """Keeps the newest events, and a row for all that are equal but for their figures; thread-safe.
 
-    Args:
-        name: of the console's process; rows of its own events are kept apart from others.
-
-    Attributes:
-        newest: single events, newest first.
+    Rows of events of the console's own process, of this name, are kept apart from others.
     """
 
     def __init__(self, name: str) -> None:
         self._name = name
         self._lock = threading.Lock()
         self._rows: dict[tuple[str, ...], EventRow] = {}
-        self.newest: deque[Event] = deque(maxlen=EVENTS_KEPT)
+        self.newest: deque[Event] = deque(maxlen=EVENTS_KEPT)  # single ones, newest first
 
     def add(self, event: Event) -> None:
         key = (event.kind, event.source, event.subject, _FIGURE.sub("#", event.text))

@@ -73,8 +73,6 @@ class Gateway:
     """One gateway.
 
     Args:
-        ports: where it listens.
-        name: process name.
         token: that clients must show; None on this machine alone.
         dial: opens a session to the world for a process of a name.
         say: prints a line.

@@ -29,14 +29,10 @@ class LockstepSession(Agent):
 
     Args:
         name: process name of the participant, role.thing.
-        request: with which it joined.
-        run: that it joined.
         loop: of the client.
         send: sends the line of a gate; called on the loop.
 
     Attributes:
-        defaults: of its messages.
-        has_left: whether it has ended.
         connection_lost: whether its client went without leaving, so that its process counts as dead.
 
     Raises:

@@ -16,23 +16,7 @@ from zsim.math.rotation import LEVEL, Vector
 from zsim.scenario.scenario import Scenario
 from zsim.schema.quantities import G_M_S2
 from zsim_bridges.mavlink import dialect
-from zsim_bridges.mavlink.dialect import (
-    FORCE,
-    LAYOUTS,
-    TYPE_ONBOARD_CONTROLLER,
-    UINT16_UNKNOWN,
-    Autopilot,
-    BaseMode,
-    Cmd,
-    LandedState,
-    MavFrame,
-    Result,
-    SystemStatus,
-    TypeMask,
-    attitude_ned,
-    frd,
-    ned,
-)
+from zsim_bridges.mavlink.dialect import Autopilot, Cmd, LandedState, TypeMask, frd, ned
 from zsim_bridges.mavlink.frame import Link, Parser, Received, Signing
 from zsim_bridges.mavlink.personality import COPTER_MODES, PX4_MODES, FlightMode
 from zsim_bridges.vehicle_links.driver import DriverOptions
@@ -209,7 +193,7 @@ class AutopilotSession(VehicleSession):
                     self._telemetry.add_round_trip(now_ns - message.ts1, now_ns)
             case dialect.Statustext():
                 self.texts.append(f"the vehicle reports: {message.text}")
-            case dialect.CommandAck() if message.result not in (Result.ACCEPTED, Result.IN_PROGRESS):
+            case dialect.CommandAck() if message.result not in (dialect.Result.ACCEPTED, dialect.Result.IN_PROGRESS):
                 self.texts.append(f"the vehicle answers command {message.command} with MAV_RESULT {message.result}")
             case _:
                 self._autopilot.receive(message)
@@ -234,7 +218,9 @@ class AutopilotSession(VehicleSession):
             self._heartbeat_ns = now_ns
             if self._signing:
                 self._signing.advance(self._unix_s())
-            yield dialect.Heartbeat(TYPE_ONBOARD_CONTROLLER, Autopilot.INVALID, 0, 0, SystemStatus.ACTIVE, 3)
+            yield dialect.Heartbeat(
+                dialect.TYPE_ONBOARD_CONTROLLER, Autopilot.INVALID, 0, 0, dialect.SystemStatus.ACTIVE, 3
+            )
         autopilot = self._autopilot
         if autopilot is None:
             return
@@ -244,11 +230,11 @@ class AutopilotSession(VehicleSession):
         for kind, rate_hz in autopilot.control.rates_hz.items():
             if now_ns - max(self._newest_ns.get(kind, 0), self._requested_ns.get(kind, 0)) > REQUEST_NS:
                 self._requested_ns[kind] = now_ns
-                yield autopilot.command(Cmd.SET_MESSAGE_INTERVAL, LAYOUTS[kind].id, 1e6 / rate_hz)
+                yield autopilot.command(Cmd.SET_MESSAGE_INTERVAL, dialect.LAYOUTS[kind].id, 1e6 / rate_hz)
         kind = dialect.GpsGlobalOrigin
         if not self._telemetry.has_origin and now_ns - self._requested_ns.get(kind, 0) > REQUEST_NS:
             self._requested_ns[kind] = now_ns
-            yield autopilot.command(Cmd.REQUEST_MESSAGE, LAYOUTS[kind].id)
+            yield autopilot.command(Cmd.REQUEST_MESSAGE, dialect.LAYOUTS[kind].id)
         yield from self._sequence.advance(now_ns, demand, autopilot)
 
     # What is known
@@ -294,9 +280,9 @@ class AutopilotState:
     def receive(self, message: Any) -> None:
         match message:
             case dialect.Heartbeat():
-                self.armed = bool(message.base_mode & BaseMode.ARMED)
+                self.armed = bool(message.base_mode & dialect.BaseMode.ARMED)
                 self.custom_mode = message.custom_mode
-                self._terminated = message.system_status == SystemStatus.TERMINATED
+                self._terminated = message.system_status == dialect.SystemStatus.TERMINATED
             case dialect.ExtendedSysState():
                 self.landed = message.landed_state
             case dialect.GlobalPositionInt():
@@ -366,7 +352,7 @@ class DemandSequence:
             case "land" if autopilot.landed not in (LandedState.LANDING, LandedState.ON_GROUND):
                 yield from self._repeat("land", now_ns, autopilot.command(Cmd.NAV_LAND, *HERE, 0.0))
             case "kill":
-                kill = autopilot.command(Cmd.COMPONENT_ARM_DISARM, 0, FORCE)
+                kill = autopilot.command(Cmd.COMPONENT_ARM_DISARM, 0, dialect.FORCE)
                 yield from self._repeat("kill", now_ns, kill, KILL_REPEAT_NS if autopilot.armed else REPEAT_NS)
 
     def _take_off(self, now_ns: int, autopilot: AutopilotState) -> Iterator[Any]:
@@ -393,7 +379,7 @@ class DemandSequence:
             yield dialect.SetPositionTargetLocalNed(
                 0,
                 *autopilot.address,
-                MavFrame.LOCAL_NED,
+                dialect.MavFrame.LOCAL_NED,
                 VELOCITY_AND_YAW_RATE,
                 vx=vx,
                 vy=vy,
@@ -405,7 +391,7 @@ class DemandSequence:
             yield from self._enter_mode(now_ns, autopilot)
 
     def _enter_mode(self, now_ns: int, autopilot: AutopilotState) -> Iterator[Any]:
-        enter = autopilot.command(Cmd.DO_SET_MODE, BaseMode.CUSTOM, *autopilot.control.parameters)
+        enter = autopilot.command(Cmd.DO_SET_MODE, dialect.BaseMode.CUSTOM, *autopilot.control.parameters)
         return self._repeat("mode", now_ns, enter)
 
     def _repeat(self, name: str, now_ns: int, message: Any, period_ns: int = REPEAT_NS) -> Iterator[Any]:
@@ -447,7 +433,7 @@ class TelemetryReadings(AircraftReadings):
             return
         match m:
             case dialect.AttitudeQuaternion():
-                q = attitude_ned((m.q1, m.q2, m.q3, m.q4))
+                q = dialect.attitude_ned((m.q1, m.q2, m.q3, m.q4))
                 length = math.hypot(*q)
                 if length > 0.5:  # else it is no attitude at all
                     w, x, y, z = (part / length for part in q)
@@ -517,7 +503,7 @@ class TelemetryReadings(AircraftReadings):
         if (place, m.time_usec) == self._fix:
             return
         self._fix = place, m.time_usec
-        sigma_m = m.h_acc / 1e3 or (DOP_M * m.eph / 100.0 if m.eph != UINT16_UNKNOWN else 0.0)
+        sigma_m = m.h_acc / 1e3 or (DOP_M * m.eph / 100.0 if m.eph != dialect.UINT16_UNKNOWN else 0.0)
         course = math.radians(m.cog / 100.0)
         values = self.gps_values(place, m.vel / 100.0, course, sigma_m, min(m.fix_type, 3), m.satellites_visible)
         self.read("gps", self._since_1970(m, now_ns), *values)

@@ -144,7 +144,7 @@ class MavlinkServer(VehicleServer):
             self.say(f"{what}: UDP {host}:{to}, from {options.listen}:{own}")
         stack.callback(loop.create_task(self._tick_always()).cancel)
 
-    async def take_in(self, intake: TrafficIntake) -> None:
+    async def on_arrivals(self, intake: TrafficIntake) -> None:
         """Read what has arrived; of a drone's messages the newest of each."""
         newest: dict[str, bytes] = {}
         for arrived in intake.arrivals():

@@ -15,26 +15,15 @@ from zsim.scenario.scenario import Drone
 from zsim.schema.quantities import G_M_S2
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import (
-    COMPONENT_AUTOPILOT,
     DEGREES,
-    FENCE,
-    FORCE,
-    LAYOUTS,
-    LOCAL_M,
-    MISSION,
     AttitudeMask,
-    Capability,
     Cmd,
     MavFrame,
     Result,
-    Severity,
     TypeMask,
     WireMessage,
-    attitude_ned,
-    frd,
     from_int,
     ned,
-    wrapped,
     yaw_ned,
 )
 from zsim_bridges.mavlink.drone_watch import DroneWatch
@@ -70,7 +59,8 @@ HEARTBEAT_NS = 1_000_000_000  # ns of wall time
 STICK = 1000.0  # full deflection in MANUAL_CONTROL
 STICKS_UNUSED = 32767
 NO_SUCH_PARAMETER = 1  # MAV_PARAM_ERROR_DOES_NOT_EXIST
-AUTOPILOT_VERSION, HOME_POSITION = LAYOUTS[dialect.AutopilotVersion].id, LAYOUTS[dialect.HomePosition].id
+AUTOPILOT_VERSION = dialect.LAYOUTS[dialect.AutopilotVersion].id
+HOME_POSITION = dialect.LAYOUTS[dialect.HomePosition].id
 SPEEDS: dict[int, Setting] = {2: "up_m_s", 3: "down_m_s"}  # SPEED_TYPE; else the horizontal one
 
 
@@ -98,7 +88,7 @@ class Request(NamedTuple):
         if isinstance(m, dialect.CommandLong):
             place = m.param5, m.param6, m.param7
         else:
-            frame, unit = m.frame, LOCAL_M if m.frame in LOCAL else DEGREES
+            frame, unit = m.frame, dialect.LOCAL_M if m.frame in LOCAL else DEGREES
             place = from_int(m.x, unit), from_int(m.y, unit), m.z
         return cls(m.command, (m.param1, m.param2, m.param3, m.param4, *place), frame)
 
@@ -141,7 +131,7 @@ class MavlinkVehicle:
         """Send a message to all clients; `take` replaces the outbox."""
         self.outbox.append(message)
 
-    def report(self, severity: Severity, text: str) -> None:
+    def report(self, severity: dialect.Severity, text: str) -> None:
         self._send(dialect.Statustext(severity, text[:TEXT_MAX]))
 
     def take(self) -> list[WireMessage]:
@@ -172,7 +162,7 @@ class MavlinkVehicle:
         message: Any = received.message
         sender = received.system_id, received.component_id
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
-        if system not in (0, self._options.system_id) or component not in (0, COMPONENT_AUTOPILOT):
+        if system not in (0, self._options.system_id) or component not in (0, dialect.COMPONENT_AUTOPILOT):
             return
         if isinstance(message, dialect.MissionItem | dialect.MissionItemInt) and message.current == DO_GO_TO:
             self._go_to(message, sender)
@@ -236,7 +226,7 @@ class MavlinkVehicle:
                 if first not in (0.0, 1.0):
                     return f"arm or disarm? {first:g}"
                 arm = flight.arm if first else flight.disarm
-                return arm(second == FORCE)
+                return arm(second == dialect.FORCE)
             case Cmd.NAV_TAKEOFF:
                 return self._take_off(request.params[6])
             case Cmd.NAV_LAND:
@@ -323,7 +313,7 @@ class MavlinkVehicle:
         if not math.isfinite(angle) or not state.is_steerable:
             return "not flying" if math.isfinite(angle) else "no angle"
         turn = math.radians(angle) * (-1.0 if direction >= 0 else 1.0)
-        yaw = wrapped(state.yaw_rad + turn) if relative == 1.0 else yaw_ned(math.radians(angle))
+        yaw = dialect.wrapped(state.yaw_rad + turn) if relative == 1.0 else yaw_ned(math.radians(angle))
         return self.flight.go_to(Target(state.position_m, yaw_rad=yaw))
 
     def _send_message(self, message_id: int) -> Result | None:
@@ -336,7 +326,7 @@ class MavlinkVehicle:
     def _deny(self, reason: str | None) -> None:
         """Tell the operator why something was not done; no reason: it was."""
         if reason:
-            self.report(Severity.WARNING, f"Denied: {reason}")
+            self.report(dialect.Severity.WARNING, f"Denied: {reason}")
 
     def _set_point(self, setpoint: Setpoint | str) -> None:
         reason = setpoint if isinstance(setpoint, str) else self.flight.set_point(setpoint)
@@ -363,23 +353,23 @@ class MavlinkVehicle:
 
     def _go_to(self, message: dialect.MissionItem | dialect.MissionItemInt, sender: Address) -> None:
         item = item_of(message)
-        fault = item_fault(item, MISSION)
+        fault = item_fault(item, dialect.MISSION)
         reason = "no place to go to" if fault else self.flight.go_to(Target(place_of(item, self.state)))
         self._deny(reason)
         self._send(dialect.MissionAck(*sender, type=fault or (1 if reason else 0)))
 
     def _on_mission(self, type_: int, items: list[PlanItem]) -> None:
-        if type_ == MISSION:
+        if type_ == dialect.MISSION:
             self.flight.mission.abort("a client replaced it", failsafe=False)
             self.flight.mission.load(items)
-        elif type_ == FENCE:
+        elif type_ == dialect.FENCE:
             self.watch.load_fence(items)
 
     def _version(self) -> WireMessage:
         major, minor, patch, type_ = self._personality.version
-        capabilities = sum(capability.value for capability in Capability)
+        capabilities = sum(capability.value for capability in dialect.Capability)
         if not self._personality.is_px4:
-            capabilities &= ~Capability.PARAM_ENCODE_BYTEWISE
+            capabilities &= ~dialect.Capability.PARAM_ENCODE_BYTEWISE
         return dialect.AutopilotVersion(
             capabilities=capabilities,
             flight_sw_version=major << 24 | minor << 16 | patch << 8 | type_,
@@ -410,7 +400,7 @@ def from_local(message: dialect.SetPositionTargetLocalNed, state: VehicleState) 
     if frame not in FROM_HERE:
         return f"frame {frame} of a local setpoint is not flown"
     along_heading = frame in ALONG_HEADING
-    x, y, z = frd(place) if along_heading else ned(place)
+    x, y, z = dialect.frd(place) if along_heading else ned(place)
     if along_heading:
         c, s = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
         x, y = c * x - s * y, s * x + c * y
@@ -451,7 +441,7 @@ def _target(
     velocity_m_s: Vector = (0.0, 0.0, 0.0)
     if any(known):
         vx, vy, vz = (v if is_known else 0.0 for v, is_known in zip(given, known, strict=True))
-        velocity_m_s = frd((vx, vy, vz)) if along_heading else ned((vx, vy, vz))
+        velocity_m_s = dialect.frd((vx, vy, vz)) if along_heading else ned((vx, vy, vz))
     if not is_place(position) or not all(abs(v) < SPEED_MAX_M_S for v in velocity_m_s):
         return "a setpoint is beyond all bounds"
     along = along_heading and position == NOWHERE
@@ -467,7 +457,7 @@ def _yaw(mask: TypeMask, yaw: float, yaw_rate: float, frame: int, state: Vehicle
         is_given = not mask & TypeMask.YAW_RATE and math.isfinite(yaw_rate)
         return None, -max(-100.0, min(100.0, yaw_rate)) if is_given else 0.0
     if frame in (MavFrame.BODY_OFFSET_NED, MavFrame.BODY_FRD):
-        return wrapped(state.yaw_rad - yaw), 0.0
+        return dialect.wrapped(state.yaw_rad - yaw), 0.0
     return yaw_ned(yaw), 0.0
 
 
@@ -480,7 +470,7 @@ def from_attitude(message: dialect.SetAttitudeTarget, weight_n: float) -> Setpoi
     length = math.hypot(*message.q)
     if not all(map(math.isfinite, values)) or not 0.5 < length < 2.0:
         return "the attitude of a setpoint is no quaternion"
-    w, x, y, z = attitude_ned((message.q[0], message.q[1], message.q[2], message.q[3]))
+    w, x, y, z = dialect.attitude_ned((message.q[0], message.q[1], message.q[2], message.q[3]))
     q_WB = w / length, x / length, y / length, z / length
     thrust = HOVER_THRUST if mask & AttitudeMask.THRUST else max(0.0, min(1.0, message.thrust))
     rate = 0.0 if mask & AttitudeMask.YAW_RATE else -max(-10.0, min(10.0, message.body_yaw_rate))

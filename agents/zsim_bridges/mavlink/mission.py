@@ -11,21 +11,7 @@ from typing import Any, Literal, NamedTuple
 
 from zsim.math.rotation import Vector
 from zsim_bridges.mavlink import dialect
-from zsim_bridges.mavlink.dialect import (
-    ALL_MISSION_TYPES,
-    DEGREES,
-    FENCE,
-    LOCAL_M,
-    MISSION,
-    Cmd,
-    MavFrame,
-    MissionResult,
-    WireMessage,
-    from_int,
-    ned,
-    to_int,
-    yaw_ned,
-)
+from zsim_bridges.mavlink.dialect import FENCE, MISSION, Cmd, MavFrame, MissionResult
 from zsim_bridges.mavlink.flight_control import Target, is_place
 from zsim_bridges.mavlink.personality import Parameters
 from zsim_bridges.mavlink.vehicle_state import VehicleState
@@ -100,7 +86,7 @@ def place_of(item: PlanItem, state: VehicleState) -> Vector:
     own_x, own_y, _ = state.position_m
     z = item.z if math.isfinite(item.z) else 0.0
     if item.frame in LOCAL:
-        x, y, up = ned((item.x, item.y, z)) if item.frame == MavFrame.LOCAL_NED else (item.x, item.y, z)
+        x, y, up = dialect.ned((item.x, item.y, z)) if item.frame == MavFrame.LOCAL_NED else (item.x, item.y, z)
         return x if math.isfinite(x) else own_x, y if math.isfinite(y) else own_y, up
     height_m = z if item.frame in ABSOLUTE else state.to_global(state.home_or_here_m)[2] + z
     latitude_deg, longitude_deg, _ = state.to_global(state.position_m)
@@ -251,7 +237,7 @@ class Mission:
 
     def _visit(self, item: PlanItem, state: VehicleState, parameters: Parameters) -> MissionStep | None:
         yaw_deg = item.params[3]
-        yaw = yaw_ned(math.radians(yaw_deg)) if self._turns and math.isfinite(yaw_deg) else None
+        yaw = dialect.yaw_ned(math.radians(yaw_deg)) if self._turns and math.isfinite(yaw_deg) else None
         target = Target(place_of(item, state), yaw_rad=yaw, speed_m_s=self._speed_m_s)
         if self._since_ns is None:
             radius_m = item.params[1] if item.command == Cmd.NAV_WAYPOINT and item.params[1] > 0 else None
@@ -295,7 +281,7 @@ class MissionProtocol:
 
     def __init__(
         self,
-        send: Callable[[WireMessage], None],
+        send: Callable[[dialect.WireMessage], None],
         loaded: Callable[[int, list[PlanItem]], None],
         home: Callable[[], PlanItem] | None,
     ) -> None:
@@ -305,7 +291,7 @@ class MissionProtocol:
         self._items: dict[int, list[PlanItem]] = {}
         self._upload: _Upload | None = None
 
-    def on_message(self, message: WireMessage, sender: Address, wall_ns: int) -> bool:
+    def on_message(self, message: dialect.WireMessage, sender: Address, wall_ns: int) -> bool:
         """Do what a message of the protocol asks for; False for any other. `wall_ns` is wall time, of any zero."""
         match message:
             case dialect.MissionCount():
@@ -333,12 +319,12 @@ class MissionProtocol:
                 item, kind = items[message.seq], dialect.MissionItem
                 x, y = item.x, item.y
                 if isinstance(message, dialect.MissionRequestInt):
-                    unit = LOCAL_M if item.frame in LOCAL else DEGREES
-                    kind, x, y = dialect.MissionItemInt, to_int(item.x, unit), to_int(item.y, unit)
+                    unit = dialect.LOCAL_M if item.frame in LOCAL else dialect.DEGREES
+                    kind, x, y = dialect.MissionItemInt, dialect.to_int(item.x, unit), dialect.to_int(item.y, unit)
                 begin = *sender, message.seq, item.frame, item.command, 0, int(item.autocontinue)
                 self._send(kind(*begin, *item.params, x, y, item.z, message.mission_type))
             case dialect.MissionClearAll(mission_type=type_):
-                for each in (MISSION, FENCE) if type_ == ALL_MISSION_TYPES else (type_,):
+                for each in (MISSION, FENCE) if type_ == dialect.ALL_MISSION_TYPES else (type_,):
                     self._items[each] = []
                     self._loaded(each, [])
                 self._acknowledge(sender, type_, MissionResult.ACCEPTED)
@@ -401,8 +387,8 @@ class MissionProtocol:
 def item_of(message: dialect.MissionItemInt | dialect.MissionItem) -> PlanItem:
     x, y = message.x, message.y
     if isinstance(message, dialect.MissionItemInt):
-        unit = LOCAL_M if message.frame in LOCAL else DEGREES
-        x, y = from_int(message.x, unit), from_int(message.y, unit)
+        unit = dialect.LOCAL_M if message.frame in LOCAL else dialect.DEGREES
+        x, y = dialect.from_int(message.x, unit), dialect.from_int(message.y, unit)
     params = message.param1, message.param2, message.param3, message.param4
     return PlanItem(message.frame, message.command, params, x, y, message.z, bool(message.autocontinue))
 

@@ -16,13 +16,6 @@ from zsim.schema.quantities import G_M_S2
 from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import (
-    ALL_ESTIMATED,
-    LAYOUTS,
-    NO_FIX,
-    NO_GPS,
-    POS_HORIZ_ABS,
-    PRED_POS_HORIZ_ABS,
-    TYPE_QUADROTOR,
     UINT16_UNKNOWN,
     BaseMode,
     LandedState,
@@ -30,12 +23,10 @@ from zsim_bridges.mavlink.dialect import (
     SystemStatus,
     TypeMask,
     WireMessage,
-    attitude_ned,
     frd,
     global_ints,
     int16,
     ned,
-    yaw_ned,
 )
 from zsim_bridges.mavlink.flight_control import Target
 from zsim_bridges.mavlink.personality import BY_STICKS, FlightMode, Personality
@@ -132,7 +123,7 @@ def heartbeat(s: TelemetrySource) -> WireMessage:
     elif s.state.is_airborne and (s.state.is_battery_low or s.breach):
         status = SystemStatus.CRITICAL
     custom = modes[FlightMode.MISSION if flight.foreign_commander else flight.mode]
-    return dialect.Heartbeat(TYPE_QUADROTOR, s.personality.autopilot, base, custom, status, MAVLINK_VERSION)
+    return dialect.Heartbeat(dialect.TYPE_QUADROTOR, s.personality.autopilot, base, custom, status, MAVLINK_VERSION)
 
 
 def sys_status(s: TelemetrySource) -> WireMessage:
@@ -156,7 +147,7 @@ def global_position_int(s: TelemetrySource) -> WireMessage:
 def gps_raw_int(s: TelemetrySource) -> WireMessage:
     gps = s.sample("gps")
     if gps is None:
-        return dialect.GpsRawInt(s.boot_us, NO_FIX if "gps" in s.state.samples else NO_GPS)
+        return dialect.GpsRawInt(s.boot_us, dialect.NO_FIX if "gps" in s.state.samples else dialect.NO_GPS)
     vx, vy, _ = gps.velocity_m_s
     course = math.degrees(math.atan2(vx, vy)) % 360.0
     latitude, longitude, altitude = global_ints((gps.latitude_deg, gps.longitude_deg, gps.altitude_m))
@@ -215,7 +206,7 @@ def position_target_local_ned(s: TelemetrySource) -> WireMessage | None:
     mask |= TypeMask.YAW_RATE if target.yaw_rad is not None else TypeMask.YAW
     frame, axes = (MavFrame.BODY_NED, frd) if target.along_heading else (MavFrame.LOCAL_NED, ned)
     position = ned((0.0 if x is None else x, 0.0 if y is None else y, 0.0 if z is None else z))
-    yaw = yaw_ned(target.yaw_rad) if target.yaw_rad is not None else 0.0
+    yaw = dialect.yaw_ned(target.yaw_rad) if target.yaw_rad is not None else 0.0
     return dialect.PositionTargetLocalNed(
         s.boot_ms, frame, mask, *position, *axes(target.velocity_m_s), 0.0, 0.0, 0.0, yaw, -target.yaw_rate_rad_s
     )
@@ -249,7 +240,7 @@ def odometry(s: TelemetrySource) -> WireMessage:
         MavFrame.LOCAL_NED,
         MavFrame.BODY_FRD,
         *s.position_ned_m,
-        attitude_ned(s.state.q_WB),
+        dialect.attitude_ned(s.state.q_WB),
         *frd((forward, left, up)),
         *frd(s.state.rate_rad_s),
         (level, *(0.0,) * 5, level, *(0.0,) * 4, height, *(0.0,) * 3, NAN, 0.0, 0.0, NAN, 0.0, NAN),
@@ -290,8 +281,8 @@ def altitude(s: TelemetrySource) -> WireMessage:
 def _estimator_flags(s: TelemetrySource) -> int:
     """Return the flags of a complete estimate, without the absolute position if the GPS has failed."""
     if s.state.is_estimated and s.state.has_failed("gps"):
-        return ALL_ESTIMATED & ~(POS_HORIZ_ABS | PRED_POS_HORIZ_ABS)
-    return ALL_ESTIMATED
+        return dialect.ALL_ESTIMATED & ~(dialect.POS_HORIZ_ABS | dialect.PRED_POS_HORIZ_ABS)
+    return dialect.ALL_ESTIMATED
 
 
 def estimator_status(s: TelemetrySource) -> WireMessage:
@@ -377,7 +368,7 @@ ROWS: dict[type[WireMessage], Row] = {
     dialect.DistanceSensor: Row(distance_sensor, (2.0, 10.0), (2.0, 10.0), "sonar"),
     dialect.Vibration: Row(lambda s: dialect.Vibration(s.boot_us), (0.1, 1.0), (0.1, 1.0)),
     dialect.AttitudeQuaternion: Row(
-        lambda s: dialect.AttitudeQuaternion(s.boot_ms, *attitude_ned(s.state.q_WB), *frd(s.state.rate_rad_s)),
+        lambda s: dialect.AttitudeQuaternion(s.boot_ms, *dialect.attitude_ned(s.state.q_WB), *frd(s.state.rate_rad_s)),
         (10.0, 50.0),
     ),
     dialect.Odometry: Row(odometry, (0.0, 30.0)),
@@ -404,7 +395,7 @@ STREAMS: dict[int, tuple[type[WireMessage], ...]] = {  # MAV_DATA_STREAM, as Ard
     12: (dialect.SystemTime, dialect.EkfStatusReport, dialect.DistanceSensor, dialect.BatteryStatus, dialect.Vibration),
 }
 ALL_STREAMS = 0
-BY_ID = {LAYOUTS[kind].id: kind for kind in ROWS}
+BY_ID = {dialect.LAYOUTS[kind].id: kind for kind in ROWS}
 
 
 class Telemetry:

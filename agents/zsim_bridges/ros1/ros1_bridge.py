@@ -79,7 +79,7 @@ class Ros1Bridge(VehicleServer):
         stack.callback(self._pictures.follow, ())
         await stack.enter_async_context(self._node.running())
 
-    async def take_in(self, intake: TrafficIntake) -> None:
+    async def on_arrivals(self, intake: TrafficIntake) -> None:
         for arrived in intake.arrivals():
             for key, payload in arrived:
                 self.forward(key, payload)

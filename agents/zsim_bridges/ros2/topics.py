@@ -254,7 +254,7 @@ class OnChange:
 
 
 class NavdataSummary:
-    """A drone's newest samples as ardrone_autonomy's navdata, in that driver's units, at each status, last of gates."""
+    """A drone's newest samples as ardrone_autonomy's navdata, in that driver's units, with each status."""
 
     def __init__(self, frame: str) -> None:
         self._kind = ros_types.message_class("zsim_msgs/msg/Navdata")

@@ -149,7 +149,7 @@ class DriverProcess:
 
     def _receive(self, channel: int, datagram: bytes) -> None:
         self._session.receive(channel, datagram, self._clock.now_ns())
-        self._external.readings.extend(self._session.take_readings())
+        self._external.readings.extend(self._session.readings.take())
 
     def _on_clock(self, sample: RawSample) -> None:
         """Publish the gate that the world has reached."""

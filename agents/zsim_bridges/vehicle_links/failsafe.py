@@ -200,6 +200,7 @@ class Failsafe:
     def _advance(self, now_ns: int, vehicle: AircraftState) -> None:
         """Enter the next phase once the aircraft has reached it, or somebody is silent."""
         airborne = vehicle.state in AIRBORNE
+        has_had_time = now_ns - self._began_ns > LINK_LOST_S * 1e9  # to show that it obeys
         if self.phase in ("taking_off", "airborne") and vehicle.state == "emergency":
             self.reason, self._uncommanded = "the aircraft is in an emergency", True
             self._settle(now_ns)
@@ -207,44 +208,29 @@ class Failsafe:
             self._enter("airborne", now_ns)
         elif self.phase == "taking_off" and now_ns - self._began_ns > TAKEOFF_S * 1e9:
             self.land(f"the take-off took longer than {TAKEOFF_S:g} s", now_ns)
-        elif self.phase == "taking_off":
-            self._watch_bounds(now_ns, vehicle)
-        elif self.phase == "landing" and vehicle.state in STANDING and self._settled(now_ns):
+        elif self.phase == "landing" and vehicle.state in STANDING and has_had_time:
             self._settle(now_ns)
         elif self.phase == "resetting" and (vehicle.state != "emergency" or now_ns - self._began_ns > RESET_S * 1e9):
             self._enter("idle", now_ns)
         elif self.phase == "idle" and self.armed and airborne:
             self._enter("airborne", now_ns)  # a driver that is started again in flight
-        elif self.phase == "airborne":
-            self._watch(now_ns, vehicle)
-
-    def _settled(self, now_ns: int) -> bool:
-        """Return whether the aircraft has had the time to show that it obeys."""
-        return now_ns - self._began_ns > LINK_LOST_S * 1e9
+        elif self.phase == "airborne" and vehicle.state == "landed" and has_had_time:
+            self.reason, self._uncommanded = "the aircraft landed without a command", True
+            self._settle(now_ns)
+        elif self.phase == "airborne" and vehicle.state == "landing":
+            self.land("the aircraft lands by itself", now_ns)
+        elif self.phase == "airborne" and self._setpoint is not None and now_ns - self._setpoint_ns > self._land_ns:
+            self.land(f"{self.commander} is silent", now_ns)
+        elif self.phase in ("taking_off", "airborne") and self._is_outside(vehicle):
+            self.land("it is outside the fence", now_ns)
+        elif self.phase in ("taking_off", "airborne") and now_ns - max(self._clock_ns, self._began_ns) > self._land_ns:
+            self.land("the world is silent", now_ns)
 
     def _settle(self, now_ns: int) -> None:
         """Note that it is down: after a landing that nobody commanded, only an operator lets it fly again."""
         self._enter("idle", now_ns)
         if self._uncommanded:
             self.armed, self._uncommanded = False, False
-
-    def _watch(self, now_ns: int, vehicle: AircraftState) -> None:
-        if vehicle.state == "landed" and self._settled(now_ns):
-            self.reason, self._uncommanded = "the aircraft landed without a command", True
-            self._settle(now_ns)
-        elif vehicle.state == "landing":
-            self.land("the aircraft lands by itself", now_ns)
-        elif self._setpoint is not None and now_ns - self._setpoint_ns > self._land_ns:
-            self.land(f"{self.commander} is silent", now_ns)
-        else:
-            self._watch_bounds(now_ns, vehicle)
-
-    def _watch_bounds(self, now_ns: int, vehicle: AircraftState) -> None:
-        """Land outside the fence and without the world, also during a take-off."""
-        if self._is_outside(vehicle):
-            self.land("it is outside the fence", now_ns)
-        elif now_ns - max(self._clock_ns, self._began_ns) > self._land_ns:
-            self.land("the world is silent", now_ns)
 
     def _is_outside(self, vehicle: AircraftState) -> bool:
         return vehicle.pose is not None and self._limits.is_breached(vehicle.pose.position_m)

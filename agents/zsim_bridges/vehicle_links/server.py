@@ -146,7 +146,7 @@ class VehicleServer(ABC):
             while not (stopped() or self.observer.end_reason):
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(intake.news.wait(), POLL_S)
-                await self.take_in(intake)
+                await self.on_arrivals(intake)
                 self.observer.tick()
 
     @abstractmethod
@@ -154,7 +154,7 @@ class VehicleServer(ABC):
         """Open the ports, and have the stack close them."""
 
     @abstractmethod
-    async def take_in(self, intake: TrafficIntake) -> None:
+    async def on_arrivals(self, intake: TrafficIntake) -> None:
         """Hand on the messages that have arrived."""
 
     @abstractmethod

@@ -231,7 +231,7 @@ class VehicleSession(ABC):
     def __init__(self, channels: tuple[UdpChannel, ...], readings: AircraftReadings, modulus: int) -> None:
         self.channels = channels
         self.texts: list[str] = []
-        self._readings = readings
+        self.readings = readings
         self._loss = StreamLoss(modulus)
         self._received_ns: int | None = None
         self._refused = 0
@@ -249,12 +249,8 @@ class VehicleSession(ABC):
     def advance(self, now_ns: int, demand: Demand) -> Iterable[tuple[int, bytes]]:
         """Return the datagrams that are due, with the channel of each; called at least every 20 ms."""
 
-    def take_readings(self) -> list[Reading]:
-        """Return what has been measured since the last call."""
-        return self._readings.take()
-
     def figures(self, now_ns: int) -> LinkFigures:
-        clock = self._readings.clock
+        clock = self.readings.clock
         return LinkFigures(self._loss.percent, clock.round_trip_ms, clock.ahead_ms, self._refused)
 
 

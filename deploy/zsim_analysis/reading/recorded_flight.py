@@ -155,15 +155,10 @@ class RecordedFlight:
 
 
 def read_flight(path: Path, answers: bool = False, motion: bool = True) -> RecordedFlight:
-    """Return the flight of a record.
+    """Return the flight of a record; raises RecordError if there is none.
 
-    Args:
-        path: of the record.
-        answers: include the drones' estimates and velocity commands.
-        motion: include all truth and status messages; otherwise those of one instant per second.
-
-    Raises:
-        RecordError: no such record.
+    With `answers` it includes the drones' estimates and velocity commands; without `motion`, the truth and status
+    messages of one instant per second only.
     """
     with RecordReader(path) as reader:
         flight = FlightReader(answers)

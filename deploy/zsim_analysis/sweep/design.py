@@ -207,9 +207,7 @@ def _cut(text: str) -> str:
 def field_path(document: dict[str, Any], path: str) -> FieldPath:
     """Return the steps to a field from the top; list entries count from 0, whether given by index or by name.
 
-    Args:
-        document: raw, not changed; steps to fields that it does not have are kept as text.
-        path: as `--set` takes it.
+    Steps to fields that the raw document does not have are kept as text.
     """
     steps: list[str | int] = []
     value: Any = document
@@ -236,13 +234,10 @@ def is_inside(one: FieldPath, other: FieldPath) -> bool:
 
 
 class SweepDesign:
-    """The runs of a plan; runs and points count from 0.
+    """The runs of a plan; runs and points, which are combinations of the grid's values, count from 0.
 
-    Attributes:
-        axes: what varies.
-        points: number of combinations of the grid's values; run i flies the i-th, then the first again.
-        seeds: how they vary, None if all runs have the scenario's own.
-        paired: the n-th runs of all combinations have the same seed.
+    Run i flies the i-th point, then the first again. `seeds` says how they vary, None: all are the scenario's own;
+    `paired`: the n-th runs of all points have the same seed.
     """
 
     def __init__(self, plan: SweepPlan) -> None:
@@ -428,10 +423,7 @@ def _count_faults(design: SweepDesign, all_known: bool) -> list[str]:
 def read_document(path: Path, set_texts: list[str], **values: Any) -> tuple[dict[str, Any], list[str]]:
     """Return the raw document, as `scenario_file.load` takes it, and the faults of the overrides.
 
-    Args:
-        path: the file.
-        set_texts: texts `a.b.c=value` as given to `--set`, applied in order.
-        values: top-level fields that replace the file's, None being ignored.
+    `set_texts` are texts `a.b.c=value` of `--set`; `values` replace top-level fields of the file, unless None.
 
     Raises:
         ScenarioError: the file holds no map.

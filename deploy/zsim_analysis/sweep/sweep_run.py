@@ -89,6 +89,9 @@ class RunResult(Struct, frozen=True, kw_only=True):
     fingerprint: str = ""  # numeric; equal ones promise equal bits
 
 
+# columns with the value of the same name in the run's summary
+OF_SUMMARY = ("ended", "truth_sha256", "sim_s", "wall_s", "real_time_factor", "min_separation_m", "as_planned",
+              "window_note", "date")  # fmt: skip
 FIXED = {field.name: field.type for field in msgspec.structs.fields(RunResult)}
 
 
@@ -134,23 +137,15 @@ def fly(task: Task) -> Row:
         point=task.point,
         seed=task.scenario.seed,
         failure=reason_of(diverged) if diverged else None,
-        ended=summary.ended,
-        truth_sha256=summary.truth_sha256,
-        sim_s=summary.sim_s,
-        wall_s=summary.wall_s,
-        real_time_factor=summary.real_time_factor,
-        min_separation_m=summary.min_separation_m,
         collisions=sum(event.kind == "collision" for event in flight.events),
         crashed=any(event.kind in CRASHES for event in flight.events),
         engaged=all(engaged.get(name) is not None for name in clusters) if clusters else None,
         engaged_throughout=all(shares.get(name) == 1.0 for name in clusters) if clusters else None,
-        as_planned=summary.as_planned,
         shortfall=next((each.text for each in summary.shortfalls if each.fails), None),
         metrics_failure=metrics_failure,
         window_from_s=summary.window_s[0],
         window_to_s=summary.window_s[1],
-        window_note=summary.window_note,
-        date=summary.date,
+        **{name: getattr(summary, name) for name in OF_SUMMARY},
         **where,
     )
     columns: dict[str, float | None] = {engaged_column(name): engaged.get(name) for name in clusters}

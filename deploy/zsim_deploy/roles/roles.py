@@ -169,13 +169,7 @@ def make_folder(folder: Path) -> None:
 
 
 def router(
-    name: str,
-    endpoint: str,
-    upstream: str,
-    federation: str,
-    mode: Mode,
-    launched: str | None,
-    identity: Identity,
+    name: str, endpoint: str, upstream: str, federation: str, mode: Mode, launched: str | None, identity: Identity
 ) -> None:
     """Run a router on an endpoint until it is stopped; SessionError if port or certificate cannot be used."""
     identity = identity._replace(process=f"{ROUTER}.{name}")
@@ -201,9 +195,6 @@ class RouterLinks:
 
     A router does not know the run. A process that nobody waits for has said so in its join, or shows no token of its
     session.
-
-    Attributes:
-        watch: closes the links.
     """
 
     def __init__(self, link: Session, say: Say) -> None:

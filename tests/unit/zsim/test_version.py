@@ -23,6 +23,10 @@ def git(folder: Path, *words: str) -> str:
     return done.stdout.strip()
 
 
+def head(checkout: Path) -> str:
+    return git(checkout, "rev-parse", "HEAD")
+
+
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
     (tmp_path / "checkout" / "zsim").mkdir(parents=True)
@@ -31,31 +35,21 @@ def checkout(tmp_path: Path) -> Path:
     return tmp_path / "checkout"
 
 
-def head(checkout: Path) -> str:
-    return git(checkout, "rev-parse", "HEAD")
-
-
-def test_a_checkout_has_the_commit_of_its_branch(checkout: Path) -> None:
+def test_a_checkout_and_a_worktree_have_the_commits_of_their_branches_which_may_be_packed_or_none(checkout: Path):
     first = head(checkout)
     assert zsim.commit(checkout / "zsim") == first
     git(checkout, "commit", "-q", "--allow-empty", "-m", "second")
     assert zsim.commit(checkout / "zsim") == head(checkout) != first
-
-
-def test_a_branch_may_be_packed_and_a_commit_checked_out_without_one(checkout: Path) -> None:
+    worktree = checkout.parent / "worktree"
+    git(checkout, "worktree", "add", "-q", "-b", "other", str(worktree))
+    git(worktree, "commit", "-q", "--allow-empty", "-m", "third")
+    assert zsim.commit(worktree / "zsim") == head(worktree) != head(checkout)
     git(checkout, "branch", "n/main")  # ends as the other one does
     git(checkout, "pack-refs", "--all")
     assert not (checkout / ".git" / "refs" / "heads" / "main").exists()
     assert zsim.commit(checkout / "zsim") == head(checkout)
     git(checkout, "checkout", "-q", "--detach")
     assert zsim.commit(checkout / "zsim") == head(checkout)
-
-
-def test_a_worktree_has_a_commit_of_its_own(checkout: Path) -> None:
-    worktree = checkout.parent / "worktree"
-    git(checkout, "worktree", "add", "-q", "-b", "other", str(worktree))
-    git(worktree, "commit", "-q", "--allow-empty", "-m", "second")
-    assert zsim.commit(worktree / "zsim") == head(worktree) != head(checkout)
 
 
 def test_what_was_built_has_the_commit_of_the_build_and_else_the_release_alone(tmp_path: Path) -> None:

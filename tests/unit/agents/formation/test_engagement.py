@@ -14,7 +14,7 @@ from zsim.contract.snapshot import pack, unpack
 from zsim_agents.formation import guidance
 from zsim_agents.formation.control_law import ProportionalLaw
 from zsim_agents.formation.engagement import Engagement
-from zsim_agents.formation.flight_check import EngagementLimits, GateInput, GateOutput
+from zsim_agents.formation.flight_check import GateInput, GateOutput
 from zsim_agents.formation.flight_plan import Follow, MoveTo, Order, RequestError, Scheduled, read_request
 from zsim_agents.formation.spaces.cluster_space import closest_pair
 from zsim_agents.formation.spaces.scenario_space import cluster_space
@@ -109,9 +109,9 @@ class Fleet:
             self.closest_m = min(self.closest_m, closest_pair(self.p_W)[0])
 
 
-def rising_fleet(noise_m=0.0, **limits):
+def rising_fleet(noise_m=0.0):
     """Return a fleet that was just told to take off."""
-    fleet = Fleet(Engagement(SPACE, DRONES, limits=EngagementLimits(**limits)), noise_m)
+    fleet = Fleet(Engagement(SPACE, DRONES), noise_m)
     fleet.fly(0.1)
     assert fleet.engagement.request(Order.TAKE_OFF) is None
     return fleet
@@ -159,9 +159,8 @@ def test_the_paper_s_first_test_is_flown_from_the_ground_triangle():
     assert fleet.output.reason == ""
 
 
-@pytest.mark.parametrize(("limits", "height_m"), [({}, 1.5), ({"assembly_height_m": 2.0}, 2.0)])
-def test_drones_climb_straight_up_until_they_are_engaged(limits, height_m):
-    fleet = rising_fleet(**limits)
+def test_drones_climb_straight_up_until_they_are_engaged():
+    fleet = rising_fleet()
     while fleet.engagement.phase != "assembling":
         states = tuple(fleet.states)
         for state, setpoint in zip(states, fleet.step().setpoints, strict=True):
@@ -170,7 +169,7 @@ def test_drones_climb_straight_up_until_they_are_engaged(limits, height_m):
     assert fleet.output.phase == "assembling"
     assert has_terms(fleet.output.reason, "ready")
     assert np.array_equal(fleet.p_W[:, :2], GROUND[:, :2])
-    assert fleet.p_W[:, 2] == pytest.approx(np.full(3, height_m), abs=0.01)
+    assert fleet.p_W[:, 2] == pytest.approx(np.full(3, 1.5), abs=0.01)
 
 
 def test_engagement_and_every_request_in_flight_start_without_a_bump():

@@ -19,7 +19,7 @@ from zsim_agents.formation.flight_check import (
     HELD_ON_REQUEST,
     READY_TO_ENGAGE,
     REJOINING,
-    EngagementLimits,
+    SHAPE,
     place_fault,
 )
 from zsim_agents.formation.spaces.scenario_space import scenario_space
@@ -301,8 +301,9 @@ def test_pause_becomes_resume(bench: Bench):
         form.refresh(RunCondition(clock=clock))
         assert (bench.gui.at["Resume"].visible, bench.gui.at["Pause"].visible) == (paused, not paused)
         assert bench.gui.at["Step"].disabled is not paused
-    for run in ({"clock": "paused", "at_end": True}, {"clock": "stopped", "ended": "the record is over"}):
-        form.refresh(RunCondition(replayed=True, **run))  # a replay at its end is not offered to go on
+    at_end = RunCondition("paused", replayed=True, at_end=True)
+    for run in (at_end, at_end._replace(clock="stopped", ended="the record is over")):
+        form.refresh(run)  # a replay at its end is not offered to go on
         assert bench.gui.at["Step"].disabled
         assert all(bench.gui.at[label].disabled for label in ("Pause", "Resume") if bench.gui.at[label].visible)
         assert has_terms(bench.gui.at["Step"].hint, "record")
@@ -542,7 +543,7 @@ def test_a_number_out_of_range_is_refused_and_its_limit_is_flown_when_it_is_type
 @pytest.mark.parametrize("side", ["p", "q"])
 def test_the_least_side_that_a_slider_offers_is_no_refusal_of_rounding(bench: Bench, side: str):
     low = next(each.low for each in slider_ranges(bench.space, bench.cluster, bench.scenario) if each.name == side)
-    gains, shape = gains_of(bench.cluster.gains), EngagementLimits().shape
+    gains, shape = gains_of(bench.cluster.gains), SHAPE
     c = bench.space.specimen(4.0)
     c[bench.space.index(side)], c[bench.space.index("z_c")] = low, 8.0
     refused = []

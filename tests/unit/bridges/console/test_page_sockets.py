@@ -25,10 +25,10 @@ class Actions:
 
     def __init__(self) -> None:
         self.looked: list[tuple[Any, ...]] = []
-        cameras: Any = SimpleNamespace(choose=lambda *args: self.looked.append(args))
+        cameras: Any = SimpleNamespace(look=lambda *args: self.looked.append(args), client_id={"key": 7}.get)
         self.played: list[tuple[str, float]] = []
         self.record: Any = SimpleNamespace(play=lambda *args: self.played.append(args))
-        self._sockets = ActionSockets({"key": 7}.get, cameras, lambda: self.record)
+        self._sockets = ActionSockets(cameras, lambda: self.record)
 
     def act(self, role: str, **action: Any) -> bool:
         return self._sockets.act(json.dumps(action), role) is not None
@@ -104,8 +104,8 @@ FLYING = (
 
 def flying_sockets() -> tuple[FakeFlying, ActionSockets]:
     flying: Any = FakeFlying()
-    cameras: Any = SimpleNamespace()
-    return flying, ActionSockets({"key": 7}.get, cameras, lambda: None, lambda: flying)
+    cameras: Any = SimpleNamespace(client_id={"key": 7}.get)
+    return flying, ActionSockets(cameras, lambda: None, lambda: flying)
 
 
 def test_an_operator_flies_a_drone_and_is_answered():
@@ -225,7 +225,7 @@ class Page:
         self.chosen: list[tuple[str, str]] = []
         self.clicked = [""]
         frustums: Any = SimpleNamespace(
-            choose=lambda *chosen: self.chosen.append(chosen),
+            show_frustum=lambda *chosen: self.chosen.append(chosen),
             take_click=lambda _: self.clicked.pop() if self.clicked else "",
         )
         self.sockets = CameraSockets(lambda: self.feed, frustums)

@@ -22,7 +22,7 @@ from zsim_bridges.console import scene as stages
 from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.console_server import RunPage, picture_rate_hz
 from zsim_bridges.console.orders import OrderRequest
-from zsim_bridges.console.page_cameras import CameraFollow, CameraFrustums
+from zsim_bridges.console.page_cameras import PageCameras
 from zsim_bridges.console.picture import drone_poses
 from zsim_bridges.console.private_viser import PrivateViser
 from zsim_bridges.console.run_condition import drone_refusals
@@ -93,9 +93,7 @@ class Seen:
             run_id="r1", rate=1.0, mode="lockstep", drones=drones, scenario=scenario, replay_of="", gate_ns=20_000_000
         )
         server.get_clients = lambda: {0: None} if watched else {}
-        self.show = RunPage(
-            server, self.link, info, self.observer, CameraFollow(server), CameraFrustums(server), 1000.0
-        )
+        self.show = RunPage(server, self.link, info, self.observer, PageCameras(server), 1000.0)
 
     def draw(self, *samples: tuple[str, Any]) -> dict[str, Any]:
         """Say something, draw a picture, and return what is shown."""

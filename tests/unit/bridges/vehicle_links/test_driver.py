@@ -66,7 +66,7 @@ class Session(VehicleSession):
 
     def receive(self, channel: int, datagram: bytes, now_ns: int) -> None:
         self.state = AircraftState(datagram.decode(), 50.0, AircraftPose(now_ns, (1.0, 2.0, 3.0)), now_ns)  # type: ignore[arg-type]
-        self._readings.readings.append(Reading("sonar", now_ns, (3.0, True)))
+        self.readings.readings.append(Reading("sonar", now_ns, (3.0, True)))
 
     def advance(self, now_ns: int, demand: Demand) -> Iterator[tuple[int, bytes]]:
         yield 0, demand.action.encode()

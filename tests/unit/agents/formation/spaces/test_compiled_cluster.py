@@ -86,7 +86,7 @@ def test_kinematics_and_law_are_the_same_with_saturation_guard_and_integral(both
         c = spaces[0].forward(p_W, yaw)
         assert same(c, spaces[1].forward(p_W, yaw), most)
         for name in ("inverse_jacobian", "margin", "spread", "wrapped", *(() if is_small else ("condition",))):
-            assert same(*(getattr(space, name)(c) for space in spaces), most), name
+            assert same(*(getattr(space, name)(c) for space in spaces), most=most), name
         for one, other in zip(*(space.inverse(c) for space in spaces), strict=True):
             assert same(one, other, most)
         assert [type(space.margin(c)) for space in spaces] == [float, float]  # it goes into a message
@@ -95,7 +95,7 @@ def test_kinematics_and_law_are_the_same_with_saturation_guard_and_integral(both
         a, b = (law.command(c, p_W, v_W, c_des, np.zeros(4 * n), DT_S) for law in laws)
         assert same([*a.v_W.ravel(), *a.yaw_rate, a.factor], [*b.v_W.ravel(), *b.yaw_rate, b.factor], most)
         assert (a.guarded, a.alarmed) == (b.guarded, b.alarmed)
-        assert same(*(law.integral for law in laws), most)
+        assert same(*(law.integral for law in laws), most=most)
         cases = {"saturated": a.factor < 1.0, "free": a.factor == 1.0, "guarded": a.guarded, "alarmed": a.alarmed}
         seen |= {case for case, is_so in cases.items() if is_so}
     assert not is_small or seen >= {"saturated", "free", "guarded", *(["alarmed"] if scale_m == 1.0 else [])}
