@@ -126,7 +126,6 @@ OURS = ("eclipse-zenoh", "filterpy", "llvmlite", "msgspec", "numba", "numpy", "s
 
 
 def describe() -> dict[str, Any]:
-    """Return processor, cores, load, Python, packages, and the time of asking."""
     versions = {found.name.lower(): found.version for found in distributions()}
     return {
         "utc": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -141,7 +140,6 @@ def describe() -> dict[str, Any]:
 
 
 def line(machine: dict[str, Any]) -> str:
-    """Return it as a line of text."""
     packages = ", ".join(f"{name} {version}" for name, version in machine["packages"].items())
     load = " / ".join(f"{value:g}" for value in machine["load_average"])
     return (

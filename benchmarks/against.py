@@ -31,21 +31,13 @@ FLOWN = ("world", "agents", "record")  # extras that a flight needs
 
 
 class Flight(NamedTuple):
-    """What both revisions fly.
+    """What both revisions fly."""
 
-    Attributes:
-        label: for people.
-        drones: number of drones.
-        options: of `zsim run`.
-        short_s: duration of the short flight, simulated; its processor time is taken from that of the long one.
-        long_s: duration of the long flight, simulated.
-    """
-
-    label: str
-    drones: int
-    options: tuple[str, ...]
-    short_s: float
-    long_s: float
+    label: str  # for people
+    drones: int  # number of drones
+    options: tuple[str, ...]  # of `zsim run`
+    short_s: float  # duration of the short flight, simulated; its processor time is taken from that of the long one
+    long_s: float  # duration of the long flight, simulated
 
 
 FLIGHTS = {
@@ -178,7 +170,6 @@ def _flown(side: Side, flight: Flight, seconds: float, path: Path) -> tuple[floa
 
 
 def page(sheet: Sheet) -> str:
-    """Return the measured section."""
     here, there = sheet.notes["here"], sheet.notes["against"]
     rows = []
     for name, flight in FLIGHTS.items():
@@ -193,6 +184,5 @@ def page(sheet: Sheet) -> str:
 
 
 def _cell(sheet: Sheet, contender: str, size: int) -> str:
-    """Return the spread, or why there is none."""
     found = sheet.spread(contender, size)
     return spread(found) if found else sheet.refused.get(f"{contender.rsplit('.', 1)[0]}@{size}", "–")

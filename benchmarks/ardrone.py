@@ -34,7 +34,6 @@ INDOOR_RAD = 0.20944  # control:euler_angle_max
 
 
 def scenario(drones: int) -> str:
-    """Return a scenario of drones that stand apart."""
     rows = "".join(f"  - {{name: drone{i + 1}, position_m: [{20 * i}, 0, 0]}}\n" for i in range(drones))
     return f"name: ardrones\nduration_s: 3600\ndrones:\n{rows}processes: {{expect: []}}\n"
 
@@ -55,7 +54,6 @@ class Pilots:
         self.states: dict[str, int] = {}
 
     def begin(self) -> None:
-        """Ask for full navdata."""
         for address in self.addresses:
             self._socket.sendto(navdata.REQUEST_UNICAST, (address, navdata.PORT))
             self._send(address, at_commands.Config(0, "general:navdata_demo", "FALSE"))
@@ -74,7 +72,6 @@ class Pilots:
             self._send(address, at_commands.ref(0, self.flies), pcmd)
 
     def read(self, until_s: float) -> None:
-        """Take in navdata until a wall time."""
         while (left_s := until_s - time.monotonic()) > 0:
             for _ in self._selector.select(left_s):
                 self._drain()
@@ -90,7 +87,6 @@ class Pilots:
             return
 
     def hover_all(self) -> None:
-        """Take off, and wait until all hover."""
         self.flies = True
         until_s = time.monotonic() + READY_S
         while any(self.states.get(address) != navdata.ControlState.HOVERING for address in self.addresses):
@@ -101,7 +97,6 @@ class Pilots:
 
 
 def measure(drones: int, seconds: float) -> dict[str, float]:
-    """Return the figures."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     zsim = (sys.executable, "-m", "zsim_deploy.cli")
     with tempfile.TemporaryDirectory() as folder:

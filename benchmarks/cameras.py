@@ -45,7 +45,6 @@ def formation() -> DroneStates:
 
 
 def cpu_ms(call: Callable[[], object]) -> float:
-    """Return the CPU time of a call [ms]."""
     call()
     means = []
     for _ in range(REPEATS):
@@ -62,7 +61,6 @@ def renderer(camera: Camera, drones: int) -> Renderer:
 
 
 def measure() -> None:
-    """Print a line for each of them."""
     camera = FrontCamera()
     drawn = renderer(camera, DRONES)
     detector = HatDetector(lens_of(camera), camera_pose(camera), Hats().diameter_m)
@@ -80,7 +78,6 @@ def measure() -> None:
 
 
 def write_pictures(folder: Path) -> None:
-    """Write the pictures of the documentation."""
     for name, camera in (("front", FrontCamera()), ("bottom", BottomCamera())):
         picture = renderer(camera, 3).picture(0, 1.0, formation())
         cv2.imwrite(str(folder / f"camera_{name}.png"), picture)

@@ -70,7 +70,6 @@ class Server:
         return answer
 
     def close(self) -> None:
-        """End it."""
         _end(self._process)
         self._errors.close()
 

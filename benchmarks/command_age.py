@@ -51,7 +51,6 @@ def _measured(sheet: Sheet, name: str, size: int, folder: Path) -> str:
 
 
 def _realtime(size: int, folder: Path, options: tuple[str, ...]) -> dict[str, float]:
-    """Fly one cluster of that many drones."""
     path = folder / f"realtime{size}.yaml"
     grid.write(path, size, SECONDS, cluster=size)
     found, _ = fly(path, SECONDS, "--realtime", *options)
@@ -69,7 +68,6 @@ def _bare(path: str, size: int) -> dict[str, float]:
 
 
 def page(sheet: Sheet) -> str:
-    """Return the measured section."""
     rows = []
     for size in SIZES:
         for name, label in LABELS.items():

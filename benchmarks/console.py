@@ -55,17 +55,11 @@ CAMERA = ViewerCamera(  # what a page says first; before it, viser heeds no cont
 
 
 class Share(NamedTuple):
-    """What was seen of a console meanwhile.
+    """What was seen of a console meanwhile."""
 
-    Attributes:
-        percent: of a core.
-        read_per_s: what was counted at the page.
-        factor: simulated by wall time.
-    """
-
-    percent: float
-    read_per_s: float
-    factor: float
+    percent: float  # of a core
+    read_per_s: float  # what was counted at the page
+    factor: float  # simulated by wall time
 
 
 class Reader:
@@ -97,7 +91,6 @@ class Reader:
                 self.pictures += _has_drones(said)
 
     def close(self) -> None:
-        """Hang up."""
         self._socket.close()
         self._thread.join()
 
@@ -112,7 +105,6 @@ def _has_drones(said: str | bytes) -> bool:
 
 @contextmanager
 def _started(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
-    """Start a `zsim` command, and end it."""
     quiet = subprocess.DEVNULL
     process = subprocess.Popen([*CLI, *arguments], stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
     try:
@@ -163,7 +155,6 @@ def _share(console: psutil.Process, port: int, read: Callable[[], int] = lambda:
 
 
 def _shown_s(port: int) -> float:
-    """Return the simulated time that a console shows."""
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/state", timeout=5.0) as answer:
         return float(json.load(answer)["t_s"])
 
@@ -224,7 +215,6 @@ def _looked_at(endpoint: str) -> Iterator[None]:
 
 
 def _factor(link: Session) -> float:
-    """Return the real-time factor over WINDOW_S."""
     time.sleep(SETTLE_S)
     simulated_s, start_s = _now_s(link), time.monotonic()
     time.sleep(WINDOW_S)
@@ -238,7 +228,6 @@ def _now_s(link: Session) -> float:
 
 
 def measure(repeats: int) -> Sheet:
-    """Measure everything in turn, so often."""
     sheet = Sheet("h", "% of a core, and × real time")
     progress = Progress("h", 2 * repeats * len(SIZES))
     with tempfile.TemporaryDirectory() as temporary:
@@ -250,7 +239,6 @@ def measure(repeats: int) -> Sheet:
 
 
 def page(sheet: Sheet) -> str:
-    """Return the measured section."""
     rows = [
         ["nobody looks [% of a core]", *_cells(sheet, "alone")],
         ["one page, read whole [% of a core]", *_cells(sheet, "read")],

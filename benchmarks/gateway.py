@@ -39,8 +39,6 @@ COMPARED = (("get", "bare_get"), ("put", "bare_put"), ("lines", "zenoh"))
 
 
 class Ports(NamedTuple):
-    """Where everybody listens."""
-
     world: int
     http: int
     lines: int
@@ -48,7 +46,6 @@ class Ports(NamedTuple):
 
 
 def measure(repeats: int) -> Sheet:
-    """Measure everything in turn, so often."""
     sheet = Sheet("g", "messages/s and ms")
     progress = Progress("g", repeats * len(LABELS))
     with _standing() as ports:
@@ -103,7 +100,6 @@ def _standing() -> Iterator[Ports]:
 
 
 def _await(url: str) -> None:
-    """Wait until a server answers."""
     until_s = time.monotonic() + TIMEOUT_S
     while True:
         try:
@@ -117,7 +113,6 @@ def _await(url: str) -> None:
 
 
 def page(sheet: Sheet) -> str:
-    """Return the measured section."""
     fields = ("rate", *QUANTILES)
     rows = [
         [label, *(spread(sheet.spread(f"{name}_{field}", SIZE)) for field in fields)] for name, label in LABELS.items()

@@ -82,7 +82,6 @@ def _onboard(sheet: Sheet, variant: str, python: Path | None, folder: Path) -> s
 
 
 def page(sheet: Sheet) -> str:
-    """Return the measured section, and draw its picture."""
     lines(
         sheet, {"in_process": "everything in one process"}, PICTURES / "bench_e.svg", "Cost of a drone", "drones", "in"
     )

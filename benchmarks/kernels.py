@@ -94,7 +94,6 @@ def _measured(sheet: Sheet, name: str, server: Server, size: int, cpu_s: float) 
 
 
 def page(sheet: Sheet) -> str:
-    """Return the measured section, and draw its picture."""
     lines(sheet, LABELS, PICTURES / "bench_b.svg", "Drones in the air, no messages", "drones")
     steps = table(["", "step", "leaves out"], [[c.label, c.step, c.lacks] for c in CONTENDERS.values()])
     picture = "![drone-seconds per CPU second](results/bench_b.svg)"

@@ -45,7 +45,6 @@ LABELS = {name: contender.label for name, contender in CONTENDERS.items()}
 
 
 def measure(repeats: int, sizes: tuple[int, ...] = SIZES, seconds: float = SECONDS) -> Sheet:
-    """Run every contender at every size, in turn, so often."""
     sheet = Sheet("a", "steps/s")
     sheet.refused = {name: why for name, c in CONTENDERS.items() if c.peer and (why := peers.missing(c.peer))}
     running = [name for name in CONTENDERS if name not in sheet.refused]
@@ -67,14 +66,12 @@ def _measured(sheet: Sheet, name: str, size: int, seconds: float) -> str:
 
 
 def command(contender: Contender, size: int, seconds: float) -> list[str]:
-    """Return how a contender is run."""
     python = str(peers.PYTHON) if contender.peer else sys.executable
     module = f"benchmarks.exchange.{contender.module}"
     return [python, "-m", module, "--agents", str(size), "--seconds", str(seconds), *contender.options]
 
 
 def page(sheet: Sheet) -> str:
-    """Return the measured section, and draw its picture."""
     lines(sheet, LABELS, PICTURES / "bench_a.svg", "Lockstep with nothing to compute", "agents")
     return "\n\n".join([ratios(sheet, LABELS, "zsim"), _goals(sheet), "![steps per second](results/bench_a.svg)"])
 

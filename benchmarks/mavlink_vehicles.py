@@ -35,8 +35,6 @@ TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 
 
 class Ports(NamedTuple):
-    """Where everybody listens."""
-
     world: int
     gcs: int
     api: int
@@ -55,7 +53,6 @@ class Figures(NamedTuple):
 
 
 def scenario(drones: int) -> str:
-    """Return a scenario of drones that stand apart."""
     places = "\n".join(f"  - {{name: drone{i + 1}, position_m: [{4 * i}, 0, 0]}}" for i in range(drones))
     return (
         f"name: vehicles\nduration_s: 3600\nsensors: {{preset: paper}}\ndrones:\n{places}\nprocesses: {{expect: []}}\n"
@@ -63,8 +60,6 @@ def scenario(drones: int) -> str:
 
 
 class Program:
-    """A program that flies one vehicle."""
-
     def __init__(self, ports: Ports, index: int) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind(("127.0.0.1", ports.api + index))
@@ -82,7 +77,6 @@ class Program:
         self.until(lambda message: isinstance(message, dialect.LocalPositionNed) and message.z < 0.3 - HEIGHT_M)
 
     def steer(self, speed_m_s: float) -> None:
-        """Send a setpoint."""
         self.send(dialect.SetPositionTargetLocalNed(0, self._system, 1, 1, VELOCITY_ONLY, vz=speed_m_s))
 
     def send(self, message: dialect.CommandLong | dialect.SetPositionTargetLocalNed) -> None:
@@ -125,7 +119,6 @@ def served(drones: int) -> Iterator[tuple[Ports, int]]:
 
 
 def cpu_s(pid: int) -> float:
-    """Return the CPU time that a process has used so far."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) * TICK_S
 
@@ -174,7 +167,6 @@ def ages_ms(program: Program, ports: Ports, count: int) -> tuple[list[float], li
 
 
 def measure(drones: int, seconds: float) -> Figures:
-    """Fly all drones, and measure."""
     with served(drones) as (ports, pid):
         programs = [Program(ports, i) for i in range(drones)]
         threads = [threading.Thread(target=program.take_off) for program in programs]
@@ -196,7 +188,6 @@ def quantile(values: list[float], share: float) -> float:
 
 
 def main() -> None:
-    """Print the figures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--drones", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=10.0)

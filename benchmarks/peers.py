@@ -42,7 +42,6 @@ def missing(peer: str) -> str | None:
 
 
 def versions() -> dict[str, str]:
-    """Return what is installed for the peers, by package."""
     names = [argument for arguments, _ in PEERS.values() for argument in arguments if argument.isidentifier()]
     code = (
         "import importlib.metadata as m, json; "

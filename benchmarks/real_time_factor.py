@@ -69,7 +69,6 @@ def _medians(by_role: list[dict[str, float]], simulated_s: float) -> dict[str, f
 
 
 def page(sheet: Sheet) -> str:
-    """Return the measured section."""
     roles = sheet.notes["cpu_ms_per_simulated_s_with_start"]
     spent = table(
         ["role", "CPU ms per simulated second, start-up included"], [[r, figure(v)] for r, v in roles.items()]

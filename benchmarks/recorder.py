@@ -173,7 +173,6 @@ def _measured(sheet: Sheet, name: str) -> str:
 
 
 def page(sheet: Sheet) -> str:
-    """Return the measured section."""
     head = [f"{DRONES} drones", "share of a core, %", "messages/s", "MB/s on disk", "missing", "broken keys"]
     rows = []
     for name, label in LABELS.items():

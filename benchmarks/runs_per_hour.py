@@ -77,7 +77,6 @@ def measure(repeats: int) -> Sheet:
 
 
 def _crew(stack: ExitStack, contender: Contender, path: Path) -> list[Server]:
-    """Return a contender's processes, started."""
     python = str(peers.PYTHON) if contender.peer else sys.executable
     command = [python, "-m", f"benchmarks.monte_carlo.{contender.module}", str(path)]
     crew = [Server([*command, str(worker), *contender.options]) for worker in range(WORKERS)]
@@ -120,7 +119,6 @@ def _noted(sheet: Sheet, name: str, flights: float, wall_s: float, cpu_s: float)
 
 
 def page(sheet: Sheet) -> str:
-    """Return the measured section."""
     sweep = f"{sheet.notes['sweep_runs']} runs, start-up included"
     rows = [_row(sheet, "zsim", "`zsim sweep`, all of Test 1", sweep)]
     rows += [_row(sheet, name, contender.label, contender.flown) for name, contender in CONTENDERS.items()]

@@ -52,7 +52,6 @@ class Sheet:
         return reason
 
     def sizes(self) -> list[int]:
-        """Return all sizes that were measured, in order."""
         return sorted({size for by_size in self.values.values() for size in by_size})
 
     def spread(self, contender: str, size: int) -> Spread | None:
@@ -71,13 +70,11 @@ class Sheet:
         return max(found, key=lambda name: found[name]) if found else None
 
     def write(self, path: Path) -> None:
-        """Write it as JSON."""
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(asdict(self), indent=1) + "\n")
 
 
 def read(path: Path) -> Sheet:
-    """Return what `Sheet.write` wrote."""
     content = json.loads(path.read_text())
     values = {name: {int(size): v for size, v in by_size.items()} for name, by_size in content.pop("values").items()}
     return Sheet(values=values, **content)
@@ -113,7 +110,6 @@ class Progress:
         self._start_s = time.monotonic()
 
     def tell(self, text: str) -> None:
-        """Say what the next measurement gave."""
         self._done += 1
         spent_s = time.monotonic() - self._start_s
         left_s = spent_s / self._done * max(0, self._total - self._done)

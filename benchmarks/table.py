@@ -22,7 +22,6 @@ def spread(found: Spread | None) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table."""
     lines = [f"| {' | '.join(row)} |" for row in (head, *rows)]
     return "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:]])
 
@@ -92,5 +91,4 @@ def replaced(text: str, part: str, content: str) -> str:
 
 
 def update(part: str, content: str, page: Path = PAGE) -> None:
-    """Replace the section of a part in the page."""
     page.write_text(replaced(page.read_text(), part, content))

@@ -1,9 +1,10 @@
-"""How tests are shared among workers: the last of three or more is a quiet one.
+"""How tests are shared among workers: the last of three or more is a quiet one; what shares a run shares a worker.
 
-It runs what is pure, and only in the time that the others, whose tests start processes and wait for them, leave over.
-When the others have nothing else left to do, they run what is pure, too.
+The quiet one runs what is pure, and only in the time that the others, whose tests start processes and wait for them,
+leave over. When the others have nothing else left to do, they run what is pure, too.
 """
 
+import gc
 import os
 import sys
 from typing import Any
@@ -40,6 +41,25 @@ class QuietScheduling(LoadGroupScheduling):
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> QuietScheduling | None:
     return QuietScheduling(config, log) if config.getoption("dist") == "loadgroup" else None
+
+
+@pytest.hookimpl(tryfirst=True)  # before xdist puts the groups into the names of tests
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Let one worker have all tests of a file that share a fixture of that file, such as a run."""
+    for item in items:
+        file = item.nodeid.partition("::")[0]
+        fixtures = item._fixtureinfo.name2fixturedefs.values() if isinstance(item, pytest.Function) else ()
+        if any(found[-1].baseid == file and found[-1].scope in ("module", "session") for found in fixtures):
+            item.add_marker(pytest.mark.xdist_group(file))
+
+
+def pytest_collection_finish() -> None:
+    """Take what is there now for good: the modules that tests have imported, and the variables that these have set."""
+    gc.collect()
+    gc.freeze()  # else each search for cycles looks at all tests, for a third of a second
+    gc.unfreeze = lambda: None  # which a run in this process does when it is over
+    if commands := sys.modules.get("forked_commands"):
+        commands.FIRST = commands.inherited()
 
 
 def pytest_configure(config: pytest.Config) -> None:

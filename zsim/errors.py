@@ -1,23 +1,4 @@
-"""The errors of zsim, each one line: where, what was found, what is allowed, what to do; and texts made of errors.
-
-ZsimError
-├── DocumentError      a file that a person wrote; carries every fault found, a line each
-│   ├── ScenarioError     a scenario file or an override
-│   └── InventoryError    an inventory of hosts
-├── DecodeError        a payload that is not the message it claims to be
-├── BadNameError       a name of a federation, drone, cluster or process outside the contract
-├── SessionError       no session: port in use, nobody listens, wrong endpoint
-│   └── NoWorldError   the session is open, but no world answers
-├── RunError           a run that could not start or did not end well
-│   ├── SupersededError   another process of the same name has taken over
-│   ├── BehindError       a participant that cannot catch up any more
-│   ├── RequestRefusedError   a request that the world, or whoever else was asked, refuses
-│   └── RunFailedError    a run that a failure ended before its time
-│       └── UserCodeError    a class of a user's own raised, or returned what cannot be used
-├── HostsError         a host that cannot be reached, or lacks what it needs; a line per host
-├── RecordError        a record that cannot be written or read: disk full, no MCAP file
-└── ReportError        a report that cannot be made or written
-"""
+"""The errors of zsim, each one line: where, what was found, what is allowed, what to do; and texts made of errors."""
 
 import os
 import re
@@ -115,8 +96,6 @@ class ReportError(ZsimError):
     """A report that cannot be made or written."""
 
 
-# Texts of errors
-
 # C0, C1, bidirectional
 CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 
@@ -140,8 +119,6 @@ def without_figures(text: str) -> str:
     """Return a reason without its numbers, so that reasons that differ in a length alone are one; names keep theirs."""
     return _FIGURE.sub("#", text)
 
-
-# Modules that are missing
 
 # Extra of pyproject.toml that brings a module, by the name that is imported; of several the smallest.
 EXTRA_OF = {
@@ -173,7 +150,9 @@ def install_command(extras: Iterable[str]) -> str:
     checkout = Path(__file__).parents[1]
     if not (checkout / "pyproject.toml").exists():
         return f"pip install '.[{names}]' in a checkout of zsim"
-    return f"{_shortest(sys.executable)} -m pip install -e '{_shortest(str(checkout))}[{names}]'"
+    inside = {path: os.path.relpath(path) for path in (sys.executable, str(checkout))}
+    python, folder = (path if near.startswith("..") else near for path, near in inside.items())
+    return f"{python} -m pip install -e '{folder}[{names}]'"
 
 
 def missing(error: ModuleNotFoundError) -> str | None:
@@ -181,9 +160,3 @@ def missing(error: ModuleNotFoundError) -> str | None:
     module = (error.name or "").partition(".")[0]
     extra = EXTRA_OF.get(module)
     return f"{module} is not installed; {install_command([extra])}" if extra else None
-
-
-def _shortest(path: str) -> str:
-    """Return a path inside the current folder relative to it, any other as it is."""
-    inside = os.path.relpath(path)
-    return path if inside.startswith("..") else inside

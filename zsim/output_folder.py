@@ -51,7 +51,6 @@ def refuse_others(folder: Path, own: Collection[str], force: bool, use: str) -> 
     """Refuse a folder that contains files other than the command's own.
 
     Args:
-        folder: that is there.
         own: names that the command may overwrite.
         force: take it nevertheless; the files stay as they are.
         use: what the command does with it, for the error: "fly into".
@@ -82,9 +81,5 @@ def record_in(folder: Path) -> Path:
 
 
 def record_at(place: Path) -> Path:
-    """Return the record that is a file, or in a run's folder.
-
-    Raises:
-        RunError: there is none.
-    """
+    """Return the record that is a file, or in a run's folder (see `record_in`)."""
     return place if place.is_file() else record_in(place)

@@ -9,7 +9,6 @@ scenario to the last, without its yellow, which is hard to see on white paper.
 import os
 from collections.abc import Collection, Sequence
 from functools import lru_cache
-from itertools import pairwise
 from typing import Literal, NamedTuple
 
 from rich import box
@@ -45,19 +44,13 @@ class Column(NamedTuple):
 
 
 class FittedTable:
-    """Rows of text under columns.
+    """Rows of text under columns; codes that a terminal acts on are written out.
 
     Args:
-        columns: in the order in which they are shown.
-        rows: of each, a cell for each column; codes that a terminal acts on are written out.
-        title: above the table.
-        caption: below it.
+        rows: of each, a cell for each column.
+        title, caption: above and below the table.
         one_line: a row is never more than one line; what does not fit is cut.
-        lines: around the cells; none if not given.
-
-    Attributes:
-        columns: all of them.
-        title: as given.
+        lines: around the cells.
     """
 
     def __init__(
@@ -89,41 +82,39 @@ class FittedTable:
         """Return the places of the columns that a width has room for."""
         shown = list(range(len(self.columns)))
         wide = console.options.update(width=UNLIMITED)
-        while Measurement.get(console, wide, self._narrowest(shown)).minimum > width:
+        while True:
+            narrowest = self._empty()
+            for place in shown:
+                narrowest.add_column(width=self._least(place))
             spare = [place for place in shown if self.columns[place].worth is not None]
-            if not spare:
-                break
+            if not spare or Measurement.get(console, wide, narrowest).minimum <= width:
+                return shown
             shown.remove(min(spare, key=lambda place: (self.columns[place].worth, -place)))
-        return shown
-
-    def _narrowest(self, shown: Sequence[int]) -> Table:
-        """Return a table in whose width one more column would be left out."""
-        table = self._empty()
-        for place in shown:
-            table.add_column(width=self._least(place))
-        return table
 
     def _table(self, shown: Sequence[int]) -> Table:
-        made = self._empty()
+        table = self._empty()
         for place in shown:
             column = self.columns[place]
             is_figure = column.kind == "figure"
-            made.add_column(
+            table.add_column(
                 Text(printable(column.header), no_wrap=True),
                 justify="right" if column.right else "left",
                 no_wrap=is_figure,
                 min_width=self._least(place) if is_figure else None,
             )
         for row in self._rows:
-            made.add_row(*(self._cell(place, row[place]) for place in shown))
-        return made
+            cells: list[RenderableType] = []
+            for place in shown:
+                kind, text = self.columns[place].kind, printable(row[place])
+                is_cut = self._one_line or kind == "figure"
+                plain = Text(text, no_wrap=is_cut, overflow="ellipsis" if is_cut else "fold")
+                cells.append(NameCell(text) if kind == "name" else plain)
+            table.add_row(*cells)
+        return table
 
     def _empty(self) -> Table:
-        return Table(
-            box=self._lines,
-            pad_edge=self._lines is not None,
-            show_header=any(column.header for column in self.columns),
-        )
+        has_head = any(column.header for column in self.columns)
+        return Table(box=self._lines, pad_edge=self._lines is not None, show_header=has_head)
 
     def _least(self, place: int) -> int:
         """Return the width of a column below which others are left out."""
@@ -135,13 +126,6 @@ class FittedTable:
         most = {"name": NAME_WHOLE, "text": max(TEXT_LEAST, min(word, WORD_WHOLE)), "figure": longest}[column.kind]
         return max(header, min(longest, most))
 
-    def _cell(self, place: int, text: str) -> RenderableType:
-        kind = self.columns[place].kind
-        if kind == "name":
-            return NameCell(printable(text))
-        is_cut = self._one_line or kind == "figure"
-        return Text(printable(text), no_wrap=is_cut, overflow="ellipsis" if is_cut else "fold")
-
 
 def print_table(table: FittedTable) -> None:
     """Print a table on the terminal; into a file or pipe one row per line, with all columns."""
@@ -152,7 +136,7 @@ def print_table(table: FittedTable) -> None:
 
 
 def shortened(name: str, width: int) -> str:
-    """Return a name shortened to a width; its beginning is left out."""
+    """Return a name of at most `width` characters; its beginning is left out."""
     return name if len(name) <= width else f"…{name[len(name) - width + 1 :]}"
 
 
@@ -171,8 +155,6 @@ class NameCell(NamedTuple):
         yield Text(printable(shortened(self.name, options.max_width)), no_wrap=True, overflow="crop")
 
 
-# Colours of drones
-
 FEW = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 MANY = ("#440154", "#482475", "#414487", "#355f8d", "#2a788e", "#21918c", "#22a884", "#44bf70", "#7ad151")  # 0 to 0.8
 
@@ -182,20 +164,18 @@ def drone_colours(count: int) -> tuple[str, ...]:
     """Return the colours `#rrggbb` of so many drones, in the order of the scenario."""
     if count <= len(FEW):
         return FEW[:count]
-    return tuple(_between(i / (count - 1)) for i in range(count))
+    colours = []
+    for i in range(count):
+        place = i / (count - 1) * (len(MANY) - 1)
+        before = min(int(place), len(MANY) - 2)
+        mixed = (a + (place - before) * (b - a) for a, b in zip(rgb(MANY[before]), rgb(MANY[before + 1]), strict=True))
+        colours.append("#" + "".join(f"{round(part):02x}" for part in mixed))
+    return tuple(colours)
 
 
 def colours_of(drones: Collection[str]) -> dict[str, str]:
     """Return the colour of each drone by its name; they are in the order of the scenario."""
     return dict(zip(drones, drone_colours(len(drones)), strict=True))
-
-
-def _between(share: float) -> str:
-    """Return a colour of MANY, 0 the first one and 1 the last one."""
-    place = min(int(share * (len(MANY) - 1)), len(MANY) - 2)
-    low, high = list(pairwise(MANY))[place]
-    part = share * (len(MANY) - 1) - place
-    return "#" + "".join(f"{round(a + part * (b - a)):02x}" for a, b in zip(rgb(low), rgb(high), strict=True))
 
 
 def rgb(colour: str) -> tuple[int, int, int]:

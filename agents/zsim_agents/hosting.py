@@ -1,6 +1,6 @@
 """Makes the agents of a process from names and patterns, and checks the classes and plans of a scenario."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
 from typing import Any
@@ -32,11 +32,7 @@ def chosen(what: str, patterns: Sequence[str], known: Sequence[str]) -> list[str
 
 
 def agents_of(scenario: Scenario, patterns: Sequence[str] = ("*",)) -> list[str]:
-    """Return the process names of the agents that match, role by role: estimators first.
-
-    Raises:
-        RunError: a pattern matches none.
-    """
+    """Return the process names of the agents that match, role by role: estimators first; RunError: a pattern misses."""
     return chosen("host: process", patterns, agent_names(scenario))
 
 
@@ -44,8 +40,7 @@ def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> N
     """Check that the classes that a scenario names can be loaded here.
 
     Args:
-        scenario: resolved.
-        source: name of its file, with which each fault begins.
+        source: name of the scenario's file, with which each fault begins.
         elsewhere: whether the controllers run on other hosts, where alone spaces and laws are needed.
 
     Raises:
@@ -53,9 +48,22 @@ def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> N
     """
     from zsim_agents.estimation.drone_estimator import estimator_class
 
-    loads = [partial(estimator_class, scenario.estimation.chosen(), f"{source}: estimation.algorithm")]
+    loads: list[Callable[[], Any]] = [
+        partial(estimator_class, scenario.estimation.chosen(), f"{source}: estimation.algorithm")
+    ]
+    for cluster in () if elsewhere else scenario.clusters:
+        where = f"{source}: cluster {cluster.name!r}"
+        for part, space in [(where, cluster.space), *((f"{where}, group {g.name!r}", g.space) for g in cluster.groups)]:
+            if space and ":" in space:
+                from zsim_agents.formation.spaces.cluster_space import ClusterSpace
+
+                loads.append(partial(plugin.load, space, f"{part}: space", ClusterSpace))
+        if cluster.law and ":" in cluster.law:
+            from zsim_agents.formation.control_law import ControlLaw
+
+            loads.append(partial(plugin.load, cluster.law, f"{where}: law", ControlLaw))
     faults = []
-    for load in [*loads, *(() if elsewhere else _formation_classes(scenario, source))]:
+    for load in loads:
         try:
             load()
         except NotTrustedError:
@@ -88,27 +96,8 @@ def check_plans(scenario: Scenario, source: str) -> None:
         raise ScenarioError(faults)
 
 
-def _formation_classes(scenario: Scenario, source: str) -> Iterator[Callable[[], Any]]:
-    """Yield a function that loads each cluster space and control law that is a user's class."""
-    for cluster in scenario.clusters:
-        where = f"{source}: cluster {cluster.name!r}"
-        for part, space in [(where, cluster.space), *((f"{where}, group {g.name!r}", g.space) for g in cluster.groups)]:
-            if space and ":" in space:
-                from zsim_agents.formation.spaces.cluster_space import ClusterSpace
-
-                yield partial(plugin.load, space, f"{part}: space", ClusterSpace)
-        if cluster.law and ":" in cluster.law:
-            from zsim_agents.formation.control_law import ControlLaw
-
-            yield partial(plugin.load, cluster.law, f"{where}: law", ControlLaw)
-
-
 def hosted(info: Info, scenario: Scenario, patterns: Sequence[str]) -> Agent:
-    """Return the agents that match, of all roles, as one.
-
-    Raises:
-        RunError: a pattern matches none, or the scenario cannot be flown.
-    """
+    """Return the agents that match, of all roles, as one; RunError: none match, or the scenario cannot be flown."""
     split = [name.partition(".") for name in agents_of(scenario, patterns)]
     by_role = {role: [thing for each, _, thing in split if each == role] for role in AGENTS}
     members = [agent for role, names in by_role.items() if names for agent in make_agents(role, info, scenario, names)]

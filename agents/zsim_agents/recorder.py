@@ -49,54 +49,31 @@ class _Head(msgspec.Struct):
     t_ns: int
 
 
-def record(
-    link: Session,
-    info: messages.Info,
-    path: Path,
-    name: str = NAME,
-    stopped: Callable[[], bool] = lambda: False,
-    say: Callable[[str], None] = lambda text: None,
-    deserted: Callable[[], bool] = lambda: False,
-) -> str:
-    """Record a run until it ends; return why it ended.
+class Recorder:
+    """Records a run until it ends.
 
     Args:
-        link: an open session.
-        info: of the run.
         path: of the record, which may exist already.
-        name: of the process.
         stopped: tells whether the process is to end.
         say: called with lines for the user.
         deserted: asked at the end; True leaves without a bye, as a process that dies.
-
-    Raises:
-        RunError: the world has begun another run; the record is complete as far as it goes.
-        RecordError: the disk is full or the file cannot be written; what was written before is readable.
-        SupersededError: another recorder of this name has taken over.
     """
-    return Recorder(link, info, path, name, stopped, say, deserted).run()
-
-
-class Recorder:
-    """Writes everything that passes the hub; see `record`."""
 
     def __init__(
         self,
         link: Session,
         info: messages.Info,
         path: Path,
-        name: str,
-        stopped: Callable[[], bool],
+        stopped: Callable[[], bool] = lambda: False,
         say: Callable[[str], None] = lambda text: None,
         deserted: Callable[[], bool] = lambda: False,
     ) -> None:
         self._link = link
         self._info = info
-        self._name = name
         self._stopped = stopped
         self._print = say
         self._deserted = deserted
-        self._part = Participant(link, info, name, slack_ns=SLACK_NS, calculates=False)
+        self._part = Participant(link, info, NAME, slack_ns=SLACK_NS, calculates=False)
         self.health = self._part.health
         self._joined_s = 0.0
         self._others: dict[str, int] = {}  # incarnations that have joined and not left, by name
@@ -120,18 +97,27 @@ class Recorder:
         self._left_out = 0
 
     def run(self) -> str:
-        """Record until the run ends; return why it ended."""
-        self._traffic = Traffic(self._link, run_key_table(self._info), self._refuse)
+        """Record until the run ends; return why it ended.
+
+        Raises:
+            RunError: the world has begun another run; the record is complete as far as it goes.
+            RecordError: the disk is full or the file cannot be written; what was written before is readable.
+            SupersededError: another recorder of this name has taken over.
+        """
+        self._traffic = Traffic(self._link, run_key_table(self._info), self._on_refused)
         self._beside = [self._link.subscribe(expression) for expression in ("view/**", keys.camera("*", "*"))]
-        self._link.declare_process(self._name)
+        self._link.declare_process(NAME)
         self._link.on_link(self._on_link)
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
         try:
             if self._writer.has_former:
                 self._resume()
-                self._print(f"{self._name}: goes on with {self._writer.path} after t = {self._part.now_ns / 1e9:.2f} s")
-            else:
-                self._write_lasting()
+                self._print(f"{NAME}: goes on with {self._writer.path} after t = {self._part.now_ns / 1e9:.2f} s")
+            else:  # which run this is, the newest faults, and how cameras see: a replay has them no longer
+                lasting = {keys.INFO: messages.encode(self._info)}
+                for key in (keys.INFO, keys.FAULTS, keys.camera_info("*", "*")):
+                    lasting |= {sample.key: sample.payload for sample in self._link.get(key)}
+                self._write_known(lasting.items())
             self._catch_up()
             self._join()
             ticker.start()
@@ -147,13 +133,12 @@ class Recorder:
                 ticker.join()
         if self._left_out:
             why = f"a record holds {CHANNELS_MAX} keys, and theirs are further ones"
-            self._print(f"{self._name}: {self._left_out} messages are not on record: {why}")
+            self._print(f"{NAME}: {self._left_out} messages are not on record: {why}")
         if self._part.superseded:
-            raise SupersededError(
-                f"{self._name}: {self._part.end_reason}; this one ends, its record is {self._writer.path}"
-            )
+            why = self._part.end_reason
+            raise SupersededError(f"{NAME}: {why}; this one ends, its record is {self._writer.path}")
         if reason == ANOTHER_RUN:
-            raise RunError(f"{self._name}: {reason}; the record {self._writer.path} is complete as far as it goes")
+            raise RunError(f"{NAME}: {reason}; the record {self._writer.path} is complete as far as it goes")
         if not self._deserted():
             self._part.leave(reason)
         return reason
@@ -166,7 +151,11 @@ class Recorder:
             if self._is_another_run():  # before what has arrived: it may have passed after what was missed
                 return ANOTHER_RUN
             self._write_arrived(arrived)
-            self._fetch_when_quiet()
+            if self._quiet_since_s is not None and time.monotonic() - self._quiet_since_s > QUIET_S:
+                # what nothing comes after, such as the end of the run, has passed before the link was back
+                self._quiet_since_s, self._is_back = None, False
+                self._fetch_missed()
+                self._write_held()
             for sample in chain.from_iterable(subscription.drain() for subscription in self._beside):
                 self._write(sample.key, sample.payload)
             self._writer.tick(time.monotonic_ns())
@@ -178,20 +167,14 @@ class Recorder:
                 self._join()
             if self._part.superseded:
                 return "superseded"
-            if self._may_stop():
-                return "stopped"
+            if self._ended_s is None and self._stopped():
+                self._stopped_s = self._stopped_s or time.monotonic()
+                if time.monotonic() - self._stopped_s > STOP_DRAIN_S:  # and the run has not ended meanwhile
+                    return "stopped"
             if self._ended_s is not None and (not self._others or time.monotonic() - self._ended_s > DRAIN_S):
                 return run_messages.RUN_ENDED
 
-    def _may_stop(self) -> bool:
-        """Tell whether a stop was requested and the run does not end meanwhile."""
-        if not self._stopped() or self._ended_s is not None:
-            return False
-        self._stopped_s = self._stopped_s or time.monotonic()
-        return time.monotonic() - self._stopped_s > STOP_DRAIN_S
-
     def _put_on_disk(self) -> None:
-        """Write out all that was taken, and let the world go on as far as its history then reaches back to it."""
         self._writer.flush()
         self._on_disk_ns = t_ns = self._part.now_ns
         self._part.done(t_ns)
@@ -207,10 +190,8 @@ class Recorder:
             self._traffic.wake()
             self._part.publish_health()
 
-    def _refuse(self) -> None:
+    def _on_refused(self) -> None:
         self.health.refused += 1
-
-    # Catching up
 
     def _resume(self) -> None:
         """Learn what the record of a predecessor has at its end, which may be that of the run."""
@@ -220,13 +201,6 @@ class Recorder:
             self._gates = GateCount(clock)
             if clock is not None and clock.state == "stopped":
                 self._ended_s = time.monotonic()
-
-    def _write_lasting(self) -> None:
-        """Write which run this is, the newest faults, and how cameras see: a replay has them no longer."""
-        lasting = {keys.INFO: messages.encode(self._info)}
-        for key in (keys.INFO, keys.FAULTS, keys.camera_info("*", "*")):
-            lasting |= {sample.key: sample.payload for sample in self._link.get(key)}
-        self._write_known(lasting.items())
 
     def _catch_up(self, before: Clock | None = None) -> None:
         """Write what was published while this process was not there: the world keeps it for a while.
@@ -244,7 +218,6 @@ class Recorder:
         self._caught_up, self._known_until_ns = True, self._part.now_ns + REPEATED_NS
 
     def _write_known(self, written: Iterable[Message]) -> None:
-        """Write messages, and remember them."""
         for key, payload in written:
             self._write(key, payload)
             self._known.add(key, payload)
@@ -252,7 +225,7 @@ class Recorder:
     def _replayed(self, before: Clock | None) -> Iterator[Message]:
         """Yield what the world replays, up to a clock that has arrived: what came after that is on its way as well."""
         held: list[Message] = []
-        for entry in replay(self._link, self._name, -1, ["**"], REPLAY_S):
+        for entry in replay(self._link, NAME, -1, ["**"], REPLAY_S):
             held.append(entry)
             clock = self._clock_in(entry[1]) if before is not None and entry[0] == keys.CLOCK else None
             if before is not None and clock is not None and clock.seq >= before.seq:
@@ -289,7 +262,7 @@ class Recorder:
         while self._links:
             up = self._links.popleft()
             if not up:
-                self._print(f"{self._name}: lost the link to the world; waiting for it to come back")
+                self._print(f"{NAME}: lost the link to the world; waiting for it to come back")
             self._must_look = up and self._link_lost
             self._link_lost = not up
         info = self._world_info() if self._must_look else None
@@ -307,16 +280,6 @@ class Recorder:
             self._join(again=True)
         return False
 
-    def _fetch_when_quiet(self) -> None:
-        """Fetch what nothing comes after, such as the end of the run, when no clock has come since a link is back."""
-        if self._quiet_since_s is not None and time.monotonic() - self._quiet_since_s > QUIET_S:
-            self._quiet_since_s = None
-            self._is_back = False
-            self._fetch_missed()
-            self._write_held()
-
-    # What arrives
-
     def _write_arrived(self, arrived: Iterable[Passed]) -> None:
         """Write what has arrived; where clocks are missing before it, what the world still has since comes first.
 
@@ -328,7 +291,7 @@ class Recorder:
             self._held.append(passed)
             if isinstance(passed, ReceivedSample) and passed.key == keys.CLOCK:
                 clock = self._clock_in(passed.payload)
-                if clock is not None and (self._gates.misses(clock) or self._has_joined()):
+                if clock is not None and (self._gates.misses(clock) or (self._is_back and self._holds_own_join())):
                     info = self._world_info()
                     if info is not None and info.run_id == self._info.run_id:
                         self._is_back = False
@@ -337,11 +300,10 @@ class Recorder:
         if not self._is_back:
             self._write_held()
 
-    def _has_joined(self) -> bool:
-        """Tell whether the join that follows a lost link in realtime is among what is held."""
+    def _holds_own_join(self) -> bool:
         events = (each for each in self._held if isinstance(each, ReceivedSample) and each.key == keys.EVENT)
         entries = (self._part.entry_in(event.payload) for event in events)
-        return self._is_back and any(entry is not None and self._part.is_own(entry) for entry in entries)
+        return any(entry is not None and self._part.is_own(entry) for entry in entries)
 
     def _write_held(self) -> None:
         for passed in self._held:
@@ -380,7 +342,7 @@ class Recorder:
     def _note_process(self, key: str, payload: bytes) -> None:
         """Note which other processes have joined and not left."""
         name, kind = keys.thing(key), messages.type_of(key)
-        if name == self._name or kind not in (run_messages.Join, run_messages.Bye):
+        if name == NAME or kind not in (run_messages.Join, run_messages.Bye):
             return
         with contextlib.suppress(DecodeError):  # garbage of somebody else; recorded as it came
             passed = messages.decode(key, payload)
@@ -390,7 +352,7 @@ class Recorder:
                 self._others.pop(name, None)
 
     def _clock_in(self, payload: bytes) -> Clock | None:
-        """Return the clock of this run; None for garbage of somebody else on `clock`."""
+        """Return the clock of this run; None for a stranger's garbage."""
         try:
             clock = self._clock.decode(payload)
         except messages.REFUSALS:
@@ -403,7 +365,7 @@ class Recorder:
         if clock is None:
             return
         if gap := self._gates.add(clock):
-            self._print(f"{self._name}: gates are missing on record, the world has them no longer: {gap}")
+            self._print(f"{NAME}: gates are missing on record, the world has them no longer: {gap}")
         if self._quiet_since_s is not None:
             self._quiet_since_s = time.monotonic()
         if clock.state == "stopped" and self._ended_s is None:
@@ -428,7 +390,6 @@ class KnownMessages:
         return entry in self._known
 
     def add(self, key: str, payload: bytes) -> None:
-        """Remember a message."""
         self._known[key, payload] = None
         self._outputs_only = False
         if len(self._known) > KNOWN_MAX:
@@ -446,23 +407,19 @@ class KnownMessages:
     def keep_outputs(self) -> None:
         """Forget all but outputs of participants, who repeat them after a rejoin; anything else that comes is new."""
         if not self._outputs_only:
-            self._known = {entry: None for entry in self._known if _is_output(*entry)}
+            self._known = {entry: None for entry in self._known if is_output(*entry)}
             self._outputs_only = True
 
     def clear(self) -> None:
-        """Forget all of them: what passes from now on is new."""
         self._known.clear()
 
 
-def _is_output(key: str, payload: bytes) -> bool:
+def is_output(key: str, payload: bytes) -> bool:
     kind = messages.type_of(key)
-    if kind is None or not issubclass(kind, OUTPUTS):
-        return False
     try:
-        messages.decode(key, payload)
+        return kind is not None and issubclass(kind, OUTPUTS) and messages.decode(key, payload) is not None
     except DecodeError:
         return False
-    return True
 
 
 def is_of_run(path: Path, run_id: str) -> bool:

@@ -24,7 +24,6 @@ PACE_S = 0.002  # between two messages whose latency is taken: nothing waits for
 
 
 def quantiles(took_s: list[float]) -> dict[str, float]:
-    """Return p50 and p99 [ms]."""
     took_s.sort()
     return {"p50": 1e3 * took_s[len(took_s) // 2], "p99": 1e3 * took_s[int(0.99 * len(took_s))]}
 
@@ -91,8 +90,6 @@ def _flow(sender: zenoh.Session, taker: "Taker", seconds: float) -> dict[str, fl
 
 
 class Taker:
-    """Notes when each message came."""
-
     def __init__(self) -> None:
         self.came_s: dict[int, float] = {}
 
@@ -103,7 +100,6 @@ class Taker:
         self.came_s[json.loads(line)["value"]["seq"]] = time.perf_counter()
 
     def until(self, count: int, timeout_s: float = 60.0) -> None:
-        """Wait until so many have come."""
         until_s = time.perf_counter() + timeout_s
         while len(self.came_s) < count:
             assert time.perf_counter() < until_s, f"{len(self.came_s)} of {count} came"
@@ -111,8 +107,6 @@ class Taker:
 
 
 class Lines:
-    """A connection to the lines door."""
-
     def __init__(self, port: int) -> None:
         self._socket = socket.create_connection(("127.0.0.1", port))
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -26,7 +26,6 @@ def main() -> None:
 
 
 def world(count: int, seconds: float, receive: str, express: bool, low_latency: bool) -> None:
-    """Put to every agent, wait for every agent."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     options = ["--at", endpoint, *["--express"] * express, *["--low-latency"] * low_latency]
     chosen = zenoh_settings.common("router", "lockstep") | zenoh_settings.listening([endpoint], Identity())
@@ -76,7 +75,6 @@ def _publisher(link: zenoh.Session, key: str, express: bool) -> zenoh.Publisher:
 
 
 def config(chosen: zenoh_settings.Settings, low_latency: bool) -> zenoh.Config:
-    """Return Zenoh's configuration."""
     config = zenoh.Config()
     for path, value in (chosen | (LOW_LATENCY if low_latency else {})).items():
         config.insert_json5(path, value)

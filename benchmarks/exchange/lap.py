@@ -43,7 +43,6 @@ class Lap:
 
     @property
     def steps_per_s(self) -> float:
-        """Return the rate of the steps counted."""
         assert self._start_s is not None, "no step was counted"
         return self.steps / (self._last_s - self._start_s)
 
@@ -53,7 +52,6 @@ class Lap:
 
 
 def parser(text: str | None) -> argparse.ArgumentParser:
-    """Return the options that every contender has."""
     made = argparse.ArgumentParser(description=(text or "").splitlines()[0])
     made.add_argument("--agents", type=int, default=1, help="number of agent processes")
     made.add_argument("--seconds", type=float, default=1.0, help="wall time counted")

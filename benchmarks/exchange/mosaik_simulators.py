@@ -70,7 +70,6 @@ def main() -> None:
 
 
 def run(count: int, steps: int) -> None:
-    """Run a scenario of so many steps."""
     module = "benchmarks.exchange.mosaik_simulators"
     config: Any = {
         "World": {"python": f"{module}:Stopwatch"},

@@ -34,14 +34,12 @@ def world(count: int, seconds: float, lookahead: bool) -> None:
 
 
 def agent(port: int) -> None:
-    """Answer everything until the stop."""
     with _undelayed(socket.create_connection(("127.0.0.1", port))) as link:
         while take(link) != STOP:
             link.sendall(PAYLOAD)
 
 
 def take(link: socket.socket) -> bytes:
-    """Return one message."""
     message = link.recv(len(PAYLOAD), socket.MSG_WAITALL)
     if len(message) < len(PAYLOAD):
         raise ConnectionError("the other side has left")

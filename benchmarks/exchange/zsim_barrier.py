@@ -68,24 +68,19 @@ def run_agent(number: int, endpoint: str) -> None:
 
 
 class NullAgent(Agent):
-    """Reads the status of a drone and says nothing but done."""
-
     def __init__(self, drone: str) -> None:
         super().__init__()
         self.name = f"null.{drone}"
         self.period_ns = GATE_NS
         self.gate_keys = self.reads = (keys.status(drone),)
 
-    def receive(self, key: str, message: Any) -> None:
-        """Take the status."""
+    def receive(self, key: str, message: Any) -> None: ...
 
     def step(self, t_ns: int) -> list[Output]:
         return []
 
 
 class NullFleet(Fleet):
-    """A fleet that stands still and has no sensors."""
-
     def __init__(self, scenario: Any) -> None:
         super().__init__(scenario)
         self.sampled = NONE

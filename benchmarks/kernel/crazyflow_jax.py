@@ -39,7 +39,6 @@ def simulator(worlds: int, drones: int, **options: Any) -> Any:
 
 
 def flight(count: int, rk4: bool, steps: int) -> Flight:
-    """Return drones that hover."""
     import jax
     import numpy as np
     from crazyflow.control import Control

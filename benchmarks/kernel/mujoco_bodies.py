@@ -38,7 +38,6 @@ def separate(count: int) -> Flight:
 
 
 def together(count: int) -> Flight:
-    """Return bodies that hover in one world."""
     model = mujoco.MjModel.from_xml_string(_mjcf(count))
     data = mujoco.MjData(model)
 

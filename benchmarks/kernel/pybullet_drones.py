@@ -22,7 +22,6 @@ ROTORS_M = ((0.028, -0.028), (-0.028, -0.028), (-0.028, 0.028), (0.028, 0.028)) 
 
 
 def flight(count: int) -> Flight:
-    """Return drones that hover."""
     client = pybullet.connect(pybullet.DIRECT)
     pybullet.setGravity(0, 0, -GRAVITY_M_S2, physicsClientId=client)
     pybullet.setRealTimeSimulation(0, physicsClientId=client)

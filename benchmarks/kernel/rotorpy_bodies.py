@@ -33,7 +33,6 @@ def main() -> None:
 
 
 def objects(count: int) -> Flight:
-    """Return a vehicle object per drone."""
     vehicle = Multirotor(quad_params)
     states = [_state(k) for k in range(count)]
     command = {"cmd_motor_speeds": np.full(4, HOVER_RAD_S)}
@@ -46,7 +45,6 @@ def objects(count: int) -> Flight:
 
 
 def batch(count: int) -> Flight:
-    """Return all drones as one batch."""
     device = torch.device("cpu")
     each = [_state(k) for k in range(count)]
     state: Any = {name: torch.from_numpy(np.stack([s[name] for s in each])) for name in each[0]}

@@ -11,15 +11,10 @@ WARM_CALLS = 3
 
 
 class Flight(NamedTuple):
-    """Drones ready to be flown.
+    """Drones ready to be flown."""
 
-    Attributes:
-        advance: flies on; called again and again.
-        span_s: simulated seconds per call.
-    """
-
-    advance: Callable[[], object]
-    span_s: float
+    advance: Callable[[], object]  # flies on; called again and again
+    span_s: float  # simulated seconds per call
 
 
 def answer(find: Callable[[dict[str, Any]], dict[str, Any]]) -> None:

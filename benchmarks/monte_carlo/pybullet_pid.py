@@ -79,8 +79,6 @@ def _follow(way: Way, drones: list[int], client: int, steps: int) -> tuple[float
 
 
 class Control:
-    """DSLPIDControl of one drone."""
-
     def __init__(self, yaw: float) -> None:
         self._rpy = np.array([0.0, 0.0, yaw])
         self._p_sum, self._turn_sum = np.zeros(3), np.zeros(3)

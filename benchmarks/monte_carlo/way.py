@@ -10,21 +10,14 @@ GATE_S = 0.02  # between two points
 
 
 class Way(NamedTuple):
-    """Where three drones truly were, every gate from t = 0.
+    """Where three drones truly were, every gate from t = 0."""
 
-    Attributes:
-        p_W: (K, 3, 3) positions [m].
-        v_W: (K, 3, 3) velocities [m/s].
-        yaw: (K, 3) [rad].
-    """
-
-    p_W: NDArray[np.float64]
-    v_W: NDArray[np.float64]
-    yaw: NDArray[np.float64]
+    p_W: NDArray[np.float64]  # (K, 3, 3) positions [m]
+    v_W: NDArray[np.float64]  # (K, 3, 3) velocities [m/s]
+    yaw: NDArray[np.float64]  # (K, 3) [rad]
 
     @property
     def span_s(self) -> float:
-        """Return how long it takes."""
         return (len(self.p_W) - 1) * GATE_S
 
     def at(self, t_s: float) -> int:
@@ -33,11 +26,9 @@ class Way(NamedTuple):
 
 
 def write(way: Way, path: Path) -> None:
-    """Write it for another process."""
     np.savez(path, **way._asdict())
 
 
 def read(path: Path) -> Way:
-    """Return what `write` wrote."""
     with np.load(path) as found:
         return Way(found["p_W"], found["v_W"], found["yaw"])

@@ -16,17 +16,11 @@ from benchmarks.monte_carlo.way import Way, read
 
 
 class Flown(NamedTuple):
-    """What came of flights.
+    """What came of flights."""
 
-    Attributes:
-        flights: whole flights of three drones, or fractions.
-        rms_m: root of the mean square distance from the ways, over all flights.
-        closest_m: least distance of two drones in any of them.
-    """
-
-    flights: float
-    rms_m: float
-    closest_m: float
+    flights: float  # whole flights of three drones, or fractions
+    rms_m: float  # root of the mean square distance from the ways, over all flights
+    closest_m: float  # least distance of two drones in any of them
 
 
 Fly = Callable[[int], Flown]  # from a seed

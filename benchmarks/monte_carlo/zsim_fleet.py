@@ -44,7 +44,7 @@ def _follow(way: Way, fleet: Fleet) -> Flown:
     for p_W, v_W, yaw in zip(way.p_W[1:], way.v_W[1:], way.yaw[1:], strict=True):
         _command(fleet, p_W, v_W, yaw)
         fleet.advance()
-        closest = min(closest, fleet.closest_m())
+        closest = min(closest, fleet.closest_m)
         squares += float(np.sum((fleet.truth().position_m - p_W) ** 2))
     return Flown(1.0, math.sqrt(squares / (3 * (len(way.p_W) - 1))), closest)
 

@@ -190,16 +190,11 @@ def difference(t_ns: int, drone: str, recorded: bytes, flown: bytes) -> Differen
 
 
 class TruthComparison:
-    """Compares the truth of two flights gate by gate.
-
-    Attributes:
-        instants: compared so far.
-        first, last: the first and the last difference.
-    """
+    """Compares the truth of two flights gate by gate."""
 
     def __init__(self, drones: Sequence[str]) -> None:
         self._drones = tuple(drones)
-        self.instants = 0
+        self.instants = 0  # compared so far
         self.first: Difference | None = None
         self.last: Difference | None = None
 
@@ -267,13 +262,7 @@ class AgentsWithRequests(AgentGroup):
 
 
 class RerunBus(Bus):
-    """Flies a run again in a new world, with the given agents; without any, all commands come from the record.
-
-    Attributes:
-        truth: payloads at the newest gate, by drone.
-        refused: requests that were carried out on record and are refused now, as text.
-        outputs: of the agents, compared with those on record.
-    """
+    """Flies a run again in a new world, with the given agents; without any, all commands come from the record."""
 
     def __init__(
         self, world: World, agents: recorded_run.RecordedAgents, info: messages.Info, scenario: Scenario
@@ -287,11 +276,19 @@ class RerunBus(Bus):
             AgentsWithRequests(hosted(info, scenario, process.members), dict(requests), hold_ns)
             for process in agents.processes
         ]
-        super().__init__(world, groups, lambda: 0, self._compare_output, self._keep_truth)
+
+        def compare_output(key: str, message: Any) -> None:
+            if isinstance(message, (*messages.RELAYED, flight_messages.Command)):
+                self.outputs.add(key, message)
+
+        def keep_truth(gate: GateMessages) -> None:
+            self.truth = {keys.thing(key): payload for key, payload in gate.pairs if keys.leaf(key) == "truth"}
+
+        super().__init__(world, groups, lambda: 0, compare_output, keep_truth)
         self._world = world
         self._rerun = agents.names
-        self.truth: dict[str, bytes] = {}
-        self.refused: list[str] = []
+        self.truth: dict[str, bytes] = {}  # payloads at the newest gate, by drone
+        self.refused: list[str] = []  # requests that were carried out on record and are refused now
         self._admitted: set[_Joined] | None = None  # in this gate; None before the start, when it does not matter
         self._withheld: dict[_Joined, run_messages.Join] = {}
         self.outputs = OutputComparison(world.clock.delay_ns + 2 * world.clock.gate_ns)
@@ -335,13 +332,6 @@ class RerunBus(Bus):
     def _leave_failed(self, agent: Agent, inbox: Inbox) -> None:
         """Stop feeding an agent that failed; the world continues as far as it did on record."""
         inbox.start_after(NEVER_NS)
-
-    def _compare_output(self, key: str, message: Any) -> None:
-        if isinstance(message, (*messages.RELAYED, flight_messages.Command)):
-            self.outputs.add(key, message)
-
-    def _keep_truth(self, gate: GateMessages) -> None:
-        self.truth = {keys.thing(key): payload for key, payload in gate.pairs if keys.leaf(key) == "truth"}
 
     def _update_faults(self, faults: run_messages.Faults) -> None:
         if self._rerun:  # alone, the world receives the commands that resulted from them

@@ -175,11 +175,9 @@ def load_scenario(
     elsewhere: bool = False,
     modules: Iterable[Path] = (),
 ) -> Any:
-    """Return the scenario of a file with the overrides of the command line.
+    """Return the scenario of a file with the overrides of the command line; `elsewhere`: it flies on other hosts.
 
-    Args:
-        elsewhere: it flies on other hosts.
-        modules: folders in which modules that it names may stand, beside its own.
+    `modules`: folders in which modules that it names may stand, beside its own.
     """
     from zsim.scenario import scenario_file
     from zsim_agents.hosting import check_classes
@@ -235,23 +233,15 @@ class FlightOptions(NamedTuple):
 
 
 class WorldAccess(NamedTuple):
-    """How to reach a world, and the identity of the process that connects.
+    """How to reach a world, and the identity of the process that connects."""
 
-    Attributes:
-        endpoint: on which the world or a router listens.
-        wait_s: for a world; None waits indefinitely.
-        tls: folder of the process's certificate.
-        host: its name, as others see it.
-        launched: run of which it is a part, of processes that a launcher starts.
-    """
-
-    endpoint: str
+    endpoint: str  # on which the world or a router listens
     federation: str
-    wait_s: float | None
-    tls: Path | None
+    wait_s: float | None  # for a world; None waits indefinitely
+    tls: Path | None  # folder of the process's certificate
     insecure: bool
-    host: str | None
-    launched: str | None = None
+    host: str | None  # its name, as others see it
+    launched: str | None = None  # run of which it is a part, of processes that a launcher starts
 
     @property
     def who(self) -> "Identity":
@@ -259,11 +249,9 @@ class WorldAccess(NamedTuple):
 
 
 def option_group(argument: str, make: Callable[..., Any], options: Mapping[str, tuple[Any, Any]]) -> Callable[..., Any]:
-    """Return a decorator that gives a command some options in place of the argument that is made of them.
+    """Return a decorator that gives a command some options, by annotation and default, in place of one argument.
 
-    Args:
-        make: makes it of the values, in the order of the options.
-        options: annotation and default of each.
+    `make` makes that argument of their values, in the order of the options.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:

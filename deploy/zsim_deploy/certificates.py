@@ -49,17 +49,11 @@ Root = x509.Certificate
 
 
 class CertificateRequest(NamedTuple):
-    """A certificate that is to be there.
+    """A certificate that is to be there."""
 
-    Attributes:
-        host: name of the host in the inventory; a folder.
-        process: name of the process; the common name.
-        addresses: of the host, IP or DNS.
-    """
-
-    host: str
-    process: str
-    addresses: tuple[str, ...] = ()
+    host: str  # name in the inventory; a folder
+    process: str  # its name; the common name
+    addresses: tuple[str, ...] = ()  # of the host, IP or DNS
 
 
 class CertificateStatus(NamedTuple):
@@ -102,8 +96,10 @@ def authority(folder: Path, now: datetime, force: bool = False) -> Authority:
             key = serialization.load_pem_private_key(key_place.read_bytes(), password=None)
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
         raise RunError(f"{key_place}: is no private key; --force makes a new authority") from error
-    certificate = root(folder) if isinstance(key, ec.EllipticCurvePrivateKey) else None
-    if certificate is None or certificate.public_key() != key.public_key():
+    if (
+        not isinstance(key, ec.EllipticCurvePrivateKey)
+        or (certificate := root(folder)).public_key() != key.public_key()
+    ):
         raise RunError(f"{key_place}: is not the key of {place.name}; --force makes a new authority")
     if now >= certificate.not_valid_after_utc:
         day = certificate.not_valid_after_utc.date()
@@ -260,8 +256,7 @@ def _addresses(certificate: x509.Certificate) -> tuple[str, ...]:
 def certificate_faults(placed: InventoryFile, places: Mapping[str, str] | None, now: datetime) -> list[str]:
     """Return a line for each fault of a run's certificates and access control.
 
-    Args:
-        places: host of each process that is to be started; its routers need not be among them. None takes the world.
+    `places`: host of each process that is to be started, with or without its routers. None takes the world.
     """
     if placed.inventory.security.insecure:
         return []
@@ -403,7 +398,6 @@ def access_control(
     Everything is denied that is not in it. A process that is not named may ask what it may do, and nothing else.
 
     Args:
-        scenario: whose drones and clusters the rights are about.
         clients: names of the processes that connect to it.
         routers: names of the routers that connect to it, with the processes behind each.
         above: what it connects to itself, the world or another router.

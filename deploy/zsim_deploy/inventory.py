@@ -4,7 +4,6 @@ Pure: reads a file and answers questions; nothing here opens a connection. docs/
 """
 
 import fnmatch
-import importlib.metadata
 import shlex
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -29,7 +28,6 @@ SSH_PORT = 22  # IANA
 HOSTS_MAX = DRONES_MAX  # with more, some have no drone
 ROLES_MAX = PROCESSES_MAX  # each a process at least
 ROUTER_PORT = 7448  # beside a world on the same host
-PROJECT = "zsim"
 MODULE = (SAFE_PATH, "-m", "zsim_deploy.cli")  # after the interpreter
 NAMED = {name: ROLES[name].extra for name in (WORLD, RECORDER)}  # there is one of each; in the order of placement
 OF_CAMERAS = ("camera", "detector")  # roles that no run waits for, unless the scenario names them
@@ -257,18 +255,12 @@ def python(host: Host) -> str:
 
 
 class PlannedProcess(NamedTuple):
-    """One process of a run.
+    """One process of a run."""
 
-    Attributes:
-        name: `role.thing`.
-        words: of the command, without what depends on where its files are, and without the name that it is given.
-        thing: that name, of a drone, a cluster or a router; None where the command takes none.
-    """
-
-    name: str
+    name: str  # `role.thing`
     host: str
-    words: tuple[str, ...]
-    thing: str | None
+    words: tuple[str, ...]  # of the command, without what depends on where its files are, and without `thing`
+    thing: str | None  # name of a drone, a cluster or a router that it is given; None where it takes none
     port: int | None
     secure: bool
     on_death: OnDeath
@@ -288,14 +280,10 @@ class PlannedProcess(NamedTuple):
 
 
 class ProcessFiles(NamedTuple):
-    """Where a process finds its files, as its command line has them.
-
-    Attributes:
-        identity: folder with ca.pem, certificate.pem and key.pem.
-    """
+    """Where a process finds its files, as its command line has them."""
 
     scenario: str
-    identity: str
+    identity: str  # folder with ca.pem, certificate.pem and key.pem
     access: str
     out: str
 
@@ -380,10 +368,6 @@ def used_hosts(planned: Sequence[PlannedProcess]) -> list[str]:
 def extras(names: Sequence[str]) -> list[str]:
     named = {NAMED[name] for name in names if name in NAMED}
     return sorted(named | {extra for name in names for kind, extra in KINDS.items() if name.startswith(kind)})
-
-
-def known_extras() -> list[str]:
-    return sorted(importlib.metadata.metadata(PROJECT).get_all("Provides-Extra") or [])
 
 
 def needed_extras(inventory: Inventory, more: Iterable[str] = ()) -> dict[str, frozenset[str]]:

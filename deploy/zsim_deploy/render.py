@@ -368,15 +368,8 @@ def write(out: Path, target: str, texts: Mapping[str, str], force: bool = False)
     """Write the texts into a folder; return the files of an earlier rendering for this target that were removed.
 
     A list beside the files holds their digests, as `sha256sum` prints them: a later rendering removes what an earlier
-    one wrote, and never a file of another origin or one changed since.
-
-    Args:
-        out: the folder, made if it is not there.
-        target: what it is rendered for; each target has a list of its own.
-        texts: by path inside the folder, HOST/FILE or FILE; a host named `..` does not lead out of it.
-        force: overwrite what no rendering wrote, or what was changed since.
-
-    RunError if it cannot be written, a path leads out of it, or a file in the way was not rendered.
+    one for its target wrote, and never a file of another origin or one changed since. `force` overwrites these.
+    RunError if a file cannot be written, a path leads out of the folder, or a file in the way was not rendered.
     """
     root, record = out.resolve(), out / f".zsim-render-{target}.sha256"
 

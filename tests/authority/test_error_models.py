@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fleet_samples import samples_of
 from numpy.typing import NDArray
 
 from zsim.math.random_streams import stream
@@ -81,7 +82,7 @@ def test_in_the_world_it_is_stationary_from_the_first_sample():
     fleet, fixes = Fleet(of), []
     for _ in range(200):
         fleet.advance()
-        fixes += [(s.drone, s.values[3:6]) for s in fleet.samples() if s.sensor == "gps"]
+        fixes += [(s.drone, s.values[3:6]) for s in samples_of(fleet) if s.sensor == "gps"]
     truth = fleet.truth().position_m
     by_drone = np.array([[p - truth[i] for drone, p in fixes if drone == i] for i in range(40)])  # (40, samples, 3)
     bound = 4.0 * math.sqrt(2.0 / 120)  # of 40 drones' three axes
@@ -100,7 +101,7 @@ def test_who_else_flies_with_correlated_errors_changes_no_other_drones_noise():
     for _ in range(50):
         plain.advance()
         other.advance()
-        of_first = [[s for s in fleet.samples() if s.drone == 0] for fleet in (plain, other)]
+        of_first = [[s for s in samples_of(fleet) if s.drone == 0] for fleet in (plain, other)]
         assert of_first[0] == of_first[1]
 
 
@@ -111,7 +112,7 @@ def test_a_density_of_the_imu_counts_at_its_own_rate(rate_hz: float):
     fleet, found = Fleet(of), []
     for _ in range(150):
         fleet.advance()
-        found += [s.values for s in fleet.samples() if s.sensor == "imu" and s.t_sample_ns > 10**9]
+        found += [s.values for s in samples_of(fleet) if s.sensor == "imu" and s.t_sample_ns > 10**9]
     sigma = np.std(found, axis=0)
     bound = 4.0 * math.sqrt(0.5 / len(found))
     assert sigma[:3] == pytest.approx(0.004 * math.sqrt(rate_hz), rel=bound)

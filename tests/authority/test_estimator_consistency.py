@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from consistency import band, feed
+from fleet_samples import samples_of
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
@@ -32,7 +33,6 @@ HEIGHT_M, CIRCLE_M, CIRCLE_RAD_S = 4.0, 2.0, 0.4  # a circle beside the start, s
 GAIN_1_S, SPEED_M_S = 0.6, 1.0
 
 Array = NDArray[np.float64]
-pytestmark = pytest.mark.xdist_group("consistency")  # the flights of a case are flown once
 
 
 class Runs(NamedTuple):
@@ -77,7 +77,7 @@ def fly(scenario: Scenario) -> Runs:
         if gate:
             fleet.advance()
         t = gate * gate_s
-        for sample in fleet.samples():
+        for sample in samples_of(fleet):
             feed(bank, sample, fleet.gps_sigma_m[sample.drone])
         estimates = bank.estimate(t)
         steer(fleet, scenario, estimates, t, gate_s)
@@ -156,7 +156,7 @@ def test_a_fall_to_the_ground_is_owned_up_to(case: str):
     nees, heights = [], []
     for gate in range(round(12.0 / gate_s)):
         fleet.advance()
-        for sample in fleet.samples():
+        for sample in samples_of(fleet):
             feed(bank, sample, fleet.gps_sigma_m[sample.drone])
         error, P, _, _ = compare(fleet, bank.estimate(fleet.t_ns * 1e-9))
         if gate == round(1.0 / gate_s):

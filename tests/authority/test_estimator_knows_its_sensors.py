@@ -15,6 +15,7 @@ from synthetic_flight import Circle, Flight, estimator, fly, readings, scenario
 from zsim.math.frames import wrap_angle
 
 SEEDS = range(8)
+FLYING_S, STANDING_S = 10.0, 1000.0  # instant of the start: within the flight, or after it
 PRECISE = {"position_m": {"noise": 0.02}, "velocity_m_s": {"noise": 0.43}}
 LATE = {
     "fixes at once": {"gps": {**PRECISE}},
@@ -56,23 +57,42 @@ def mean_nees(sensors: dict[str, Any], end_s: float, after_s: float) -> float:
     return float(np.mean(means))
 
 
+def cases(of: dict[str, Any], *others: str) -> list[Any]:
+    """Return the names of cases; those of others, which need no code of their own, are for the soak."""
+    return [pytest.param(name, marks=[pytest.mark.soak] if name in others else []) for name in of]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("case", LATE)
+@pytest.mark.parametrize("case", cases(LATE, "fixes at once", "fixes at 0.5 s", "fixes at 2 s"))
 def test_late_readings_are_worth_what_they_are(case: str):
     low, high = band(6, len(SEEDS))
     assert low < mean_nees(LATE[case], 30.0, 15.0) < high
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CORRELATED)
+@pytest.mark.parametrize("case", cases(CORRELATED, "position, quickly", "accelerometer"))
 def test_correlated_errors_are_not_averaged_away(case: str):
     low, high = band(6, len(SEEDS))
     assert low < mean_nees(CORRELATED[case], 40.0, 10.0) < high
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("start_s", [10.0, 1000.0], ids=["flying", "standing"])
-@pytest.mark.parametrize("field", [(0.0, 0.0, 0.0), (0.0, 0.0, -45.0), (0.0, 1.0, -45.0)], ids=str)
+@pytest.mark.parametrize(
+    ("field", "start_s"),
+    [
+        ((0.0, 0.0, 0.0), STANDING_S),
+        ((0.0, 1.0, -45.0), FLYING_S),
+        *(
+            pytest.param(*case, marks=pytest.mark.soak)
+            for case in (
+                ((0.0, 0.0, 0.0), FLYING_S),
+                ((0.0, 0.0, -45.0), FLYING_S),
+                ((0.0, 0.0, -45.0), STANDING_S),
+                ((0.0, 1.0, -45.0), STANDING_S),
+            )
+        ),
+    ],
+)
 def test_where_the_field_tells_no_heading_it_is_that_of_the_set_down(field: tuple[float, ...], start_s: float):
     end_s, errors, sigmas = 30.0, [], []
     of = scenario(environment={"magnetic_field_ut": list(field)}, yaw_deg=30.0)

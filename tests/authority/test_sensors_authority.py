@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from fleet_samples import samples_of
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
@@ -126,7 +127,7 @@ def readings(fleet, seconds, sensor):
     rows = [[] for _ in range(fleet.count)]
     for _ in range(round(seconds / 0.02)):
         fleet.advance()
-        for sample in fleet.samples():
+        for sample in samples_of(fleet):
             if sample.sensor == sensor:
                 rows[sample.drone].append(sample.values)
     return np.array([row[: min(map(len, rows))] for row in rows])
@@ -195,7 +196,7 @@ def test_dropout_loses_the_share_asked_and_independently():
     times = []
     for _ in range(2500):
         fleet.advance()
-        times += [s.t_ns for s in fleet.samples() if s.sensor == "imu"]
+        times += [s.t_ns for s in samples_of(fleet) if s.sensor == "imu"]
     n = 2500 * 4
     assert abs(len(times) - 0.8 * n) < 4 * math.sqrt(n * 0.16)
     lost = np.ones(n, bool)
@@ -215,7 +216,7 @@ def test_streams_of_drones_axes_and_sensors_are_unrelated():
     rows = []
     for _ in range(1500):
         fleet.advance()
-        flow = [s.values[:3] for s in fleet.samples() if s.sensor == "imu"][:8]
+        flow = [s.values[:3] for s in samples_of(fleet) if s.sensor == "imu"][:8]
         rows.append(np.ravel(flow[:2] + flow[4:6]))
     correlation = np.corrcoef(np.array(rows[100:]).T) - np.eye(12)
     assert np.abs(correlation).max() < 5 / math.sqrt(1400)
@@ -234,7 +235,7 @@ def test_in_flight_the_imu_of_a_turned_mount_agrees_with_truth():
     for _ in range(600):
         fleet.advance()
         truth = fleet.truth()
-        imu = next(s for s in fleet.samples() if s.sensor == "imu" and s.t_sample_ns == fleet.t_ns)
+        imu = next(s for s in samples_of(fleet) if s.sensor == "imu" and s.t_sample_ns == fleet.t_ns)
         rates.append(truth.angular_velocity_rad_s[0])
         attitude = Rotation.from_quat(truth.orientation_wxyz[0], scalar_first=True)
         np.testing.assert_allclose(mount().apply(imu.values[3:]), rates[-1], atol=1e-12)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from consistency import band, feed
+from fleet_samples import samples_of
 from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import Sightings
@@ -68,7 +69,7 @@ def fly(scenario: Scenario) -> Relative:
         t_s = gate * GATE_S
         if gate:
             fleet.advance()
-        for sample in fleet.samples():
+        for sample in samples_of(fleet):
             feed(bank, sample, fleet.gps_sigma_m[sample.drone])
         for each in fleet.sightings.values():
             message = Sightings(t_ns=each.t_ns, seq=0, t_sample_ns=each.t_sample_ns, camera=each.camera, seen=each.seen)

@@ -356,12 +356,11 @@ def test_floats_of_32_bits_are_taken(shape: str):
 
 
 @every_message
-@pytest.mark.parametrize("extra", [1, None, "x", [1, [2]], {"a": {"b": math.nan}}, b"\xff", 1e300])
-def test_unknown_fields_are_ignored(shape: str, extra: Any):
-    plain = example(shape)
-    key = key_of(shape)
-    with_more = {"aa_new": extra, **plain, "zz_new": extra}
-    assert messages.decode(key, pack(with_more)) == messages.decode(key, pack(plain))
+def test_unknown_fields_are_ignored(shape: str):
+    plain, key = example(shape), key_of(shape)
+    for extra in (1, None, "x", [1, [2]], {"a": {"b": math.nan}}, b"\xff", 1e300):
+        with_more = {"aa_new": extra, **plain, "zz_new": extra}
+        assert messages.decode(key, pack(with_more)) == messages.decode(key, pack(plain))
 
 
 def test_the_frame_of_a_velocity_is_heading_by_default():

@@ -52,6 +52,7 @@ MATRIX: dict[str, Document] = {
     "link_cut": {"target": "world/estimator.drone1"},
     "radio": {"target": "main", "range_m": 2, "spread_m": 1},
 }
+CHANCE = {"noise", "jitter", "loss", "radio"}  # in the names of kinds that draw numbers
 SEVERAL: list[Document] = [
     {"kind": "link_loss", "target": "world/estimator.drone2", "probability": 0.3, "at_s": 4},
     {"kind": "link_jitter", "target": LINK, "jitter_ms": 70, "at_s": 5, "for_s": 4},
@@ -140,12 +141,14 @@ def test_every_kind_is_in_the_matrix() -> None:
 def test_the_same_bits_twice_and_others_than_without(kind: str, undisturbed: Flight) -> None:
     """The fault from 6 s on for 2 s, unless it says otherwise.
 
-    Expected: the same hash twice, and another one than without it; an event at its start and at its end; the flight
-    goes on to the end.
+    Expected: another hash than without it, and the same twice where chance has a part in it; an event at its start and
+    at its end; the flight goes on to the end.
     """
     fault = {"kind": kind, "at_s": AT_S, "for_s": FOR_S, **MATRIX[kind]}
-    first, second = fly([fault]), fly([fault])
-    assert first.sha256 == second.sha256 != undisturbed.sha256
+    first = fly([fault])
+    assert first.sha256 != undisturbed.sha256
+    if CHANCE & set(kind.split("_")) or "probability" in fault:
+        assert first.sha256 == fly([fault]).sha256
     times = [(event.kind, event.t_ns / 1e9) for event in first.events_of("fault", "fault_end")]
     assert times == [("fault", AT_S), ("fault_end", AT_S + fault["for_s"])]
     assert first.events_of("end")[0].data["last_ns"] == 9_000_000_000

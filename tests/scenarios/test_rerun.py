@@ -8,8 +8,8 @@ from pathlib import Path
 
 import msgpack
 import pytest
-from federation import ONE, PAIR, Federation, Role
-from forked_commands import ROOT
+from federation import ONE, PAIR, Federation
+from forked_commands import ROOT, run_here
 from mcap.opcode import Opcode
 from wire import PATIENCE_S
 
@@ -20,15 +20,22 @@ PILOT = "operator.pilot"
 PLAIN = ROOT / "examples" / "plain_client.py"
 
 
-def rerun(federation: Federation, *options: str, code: int = 0, of: Path | None = None) -> Role:
-    """Fly the recorded run again, and wait for the end of that."""
-    role = federation.start("rerun", str(of or federation.out), *options)
-    role.ends(with_code=code)
-    return role
+class Printed(str):
+    """What a command has printed."""
+
+    def line(self, pattern: str) -> None:
+        assert re.search(pattern, self, re.MULTILINE), self
 
 
-def same(role: Role, sha256: str) -> None:
-    role.line(f"truth_sha256 is the same: {sha256}$")
+def rerun(federation: Federation, *options: str, code: int = 0, of: Path | None = None) -> Printed:
+    """Fly the recorded run again; return what that prints."""
+    done = run_here("rerun", str(of or federation.out), *options)
+    assert done.code == code, done
+    return Printed(done.stdout + done.stderr)
+
+
+def same(printed: Printed, sha256: str) -> None:
+    printed.line(f"truth_sha256 is the same: {sha256}$")
 
 
 def doctored(record: Path, into: Path, change: Callable[[str, bytes], bytes | None]) -> Path:
@@ -110,7 +117,7 @@ def test_a_run_that_was_steered(steered: Federation, pair_sha256: str) -> None:
     cut.mkdir()
     whole = (steered.out / "run.mcap").read_bytes()
     (cut / "run.mcap").write_bytes(whole[: len(whole) * 3 // 4])
-    text = rerun(steered, of=cut).text()
+    text = rerun(steered, of=cut)
     found = re.search(r"the record was cut and has no truth_sha256; truth is the same at all (\d+) instants", text)
     assert found
     assert 350 < int(found[1]) <= len(steered.record().all("drone/drone1/truth"))
@@ -250,7 +257,7 @@ def test_a_damaged_record(federation: Federation) -> None:
         ("last and cut", 1.0, 9, "the record is damaged and has no truth_sha256"),
         ("middle", 0.5, 0, r"the record has nothing of \d+\.\d+ s, for it is damaged"),
     ):
-        printed = rerun(federation, code=1, of=damaged(federation.out, federation.folder / name, part, cut)).text()
+        printed = rerun(federation, code=1, of=damaged(federation.out, federation.folder / name, part, cut))
         match = re.search(text + alike, printed)
         assert match, printed
         assert 20 < int(match[1]) < 101

@@ -2,11 +2,12 @@
 
 from typing import Any
 
+from fleet_samples import SensorSample
 from scipy.stats import chi2
 
 from zsim.contract import messages
 from zsim_agents.estimation.estimator_bank import EstimatorBank
-from zsim_world.fleet.fleet import GPS_FIX, SensorSample
+from zsim_world.fleet.fleet import GPS_FIX
 
 
 def feed(bank: EstimatorBank, sample: SensorSample, gps_sigma_m: float) -> None:

@@ -28,7 +28,7 @@ class Subscriber:
     """A subscriber that keeps what is published, as messages."""
 
     def __init__(self, node: Ros1Node, topic: str) -> None:
-        published = node._published[topic]
+        published = node.published[topic]
         self._kind = published.topic_type.type
         self.ros_messages: list[Any] = []
         published.links.append(cast(Any, self))

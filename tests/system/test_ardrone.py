@@ -18,8 +18,6 @@ from zsim_bridges.ardrone.navdata import StateBit
 
 __all__ = ["node_modules"]
 
-pytestmark = pytest.mark.xdist_group("ardrone")
-
 FLEET = """
 name: fleet
 seed: 3

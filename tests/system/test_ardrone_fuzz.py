@@ -11,8 +11,6 @@ from wire import PATIENCE_S
 
 from zsim_bridges.ardrone import at_commands, configuration, navdata
 
-pytestmark = pytest.mark.xdist_group("ardrone_fuzz")
-
 BURST = 64  # datagrams that a socket's buffer surely holds
 AUTHENTICATION_PORT, FTP_PORT, VIDEO_PORT = 5552, 5551, 5555
 FORMED = (

@@ -2,15 +2,12 @@
 
 import socket
 
-import pytest
 from ardrone_clients import PlainPilot
 from federation import ONE, Federation
 from lab import Lab
 from wire import PATIENCE_S
 
 from zsim_bridges.ardrone import at_commands, navdata
-
-pytestmark = pytest.mark.xdist_group("ardrone_peers")
 
 PORTS = (5559, 5551, 5555)  # TCP
 

@@ -45,9 +45,6 @@ class Flown:
         self.record, self.without = record, without
 
 
-pytestmark = pytest.mark.xdist_group("cameras")  # one flight for all
-
-
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Any:
     """A flight whose camera is killed in the air, and on whose camera key a stranger publishes garbage."""

@@ -4,33 +4,20 @@ import json
 import re
 from pathlib import Path
 
-import forked_commands
 import pytest
-from federation import ONE, PAIR, Federation, Role
-from forked_commands import Completed, refusal
+from federation import ONE, PAIR, Federation
+from forked_commands import Completed, refusal, run_here
 from refused import has_terms
 
 COMMANDS = (
-    "run",
-    "validate",
-    "report",
-    "sweep",
-    "world",
-    "estimator",
-    "controller",
-    "host",
-    "record",
-    "keys",
-    "echo",
-    "hz",
-    "pub",
-    "ask",
+    *("run", "validate", "report", "sweep", "world", "estimator", "controller", "host", "record"),
+    *("keys", "echo", "hz", "pub", "ask"),
 )
 
 
 def zsim(*arguments: str, code: int = 0) -> Completed:
     """Run a command to its end."""
-    done = forked_commands.run(*arguments)
+    done = run_here(*arguments)
     assert done.code == code, done
     return done
 
@@ -46,15 +33,10 @@ class Terminal:
         return done.stdout if code == 0 else done.stderr
 
 
-@pytest.fixture
-def flying(federation: Federation) -> Role:
-    """PAIR at real time for as long as the test takes."""
+def test_looking_at_a_run_and_asking_its_controller(federation: Federation) -> None:
     run = federation.run(PAIR, "--rate", "3", "--duration", "1000")
-    federation.client().subscribe("clock").until(lambda m: m["t_ns"] > 5.5e9)
-    return run
-
-
-def test_looking_at_a_run(federation: Federation, flying: Role) -> None:
+    client = federation.client()
+    client.subscribe("clock").until(lambda m: m["t_ns"] > 5.5e9)
     terminal = Terminal(federation)
     keys = terminal("keys")
     for key, message in (
@@ -70,38 +52,8 @@ def test_looking_at_a_run(federation: Federation, flying: Role) -> None:
     assert bytes.fromhex(json.loads(raw)["message"]).startswith(b"\x87")  # a msgpack map of seven fields
     assert "50.0 Hz" in terminal("hz", "clock", "--seconds", "2.5")
     assert "nothing/here" in terminal("hz", "nothing/here", "--seconds", "0.1", code=1)
-    assert terminal("ask", "world/control", "stop") == "ok\n"
-    flying.ends(with_code=0)
 
-
-def test_asking_the_world(federation: Federation) -> None:
-    world = federation.world(ONE, "--rate", "4", "--duration", "1000")
-    client = federation.client()
-    clock = client.subscribe("clock")
-    clock.until(lambda m: m["t_ns"] > 0)
-    terminal = Terminal(federation)
-    assert terminal("ask", "world/control", "pause") == "ok\n"
-    paused = clock.until(lambda m: m["state"] == "paused").message["t_ns"]
-    assert terminal("ask", "world/control", "step", '{"gates": 5}') == "ok\n"
-    clock.until(lambda m: m["state"] == "paused" and m["t_ns"] == paused + 100_000_000)
-    assert terminal("ask", "world/control", "resume") == "ok\n"
-    clock.until(lambda m: m["state"] == "running")
-    assert terminal("ask", "world/control", "rate", '{"value": 20}') == "ok\n"
-    clock.until(lambda m: m["rate"] > 15)
-    assert re.search(r"\b1\b", terminal("pub", "drone/drone1/cmd/mode", '{"mode": "takeoff"}'))
-    states = client.subscribe("drone/drone1/sensor/status")
-    states.until(lambda m: m["state"] == "hovering")
-    velocity = '{"velocity_m_s": [0, 0, 0.5], "yaw_rate_rad_s": 0}'
-    assert re.search(r"\b3\b", terminal("pub", "drone/drone1/cmd/velocity", velocity, "-n", "3", "--rate-hz", "100"))
-    assert states.until(lambda m: m["state"] == "flying").message["commander"] == "zsim.pub"
-    assert terminal("ask", "world/control", "stop", '{"reason": "enough"}') == "ok\n"
-    world.line("stopped by zsim.ask: enough")
-    world.ends(with_code=0)
-
-
-def test_asking_a_controller(federation: Federation, flying: Role) -> None:
-    terminal = Terminal(federation)
-    state = federation.client().subscribe("cluster/main/state")
+    state = client.subscribe("cluster/main/state")
     state.until(lambda m: m["phase"] == "engaged")
     assert terminal("ask", "cluster/main/control", "hold") == "ok\n"
     state.until(lambda m: m["phase"] == "held")
@@ -114,8 +66,8 @@ def test_asking_a_controller(federation: Federation, flying: Role) -> None:
     assert "nothing" in terminal("ask", "cluster/main/control", "target", '{"values": {"nothing": 1}}', code=1)
     assert terminal("ask", "cluster/main/control", "land") == "ok\n"
     state.until(lambda m: m["phase"] == "idle")
-    terminal("ask", "world/control", "stop")
-    flying.ends(with_code=0)
+    assert terminal("ask", "world/control", "stop") == "ok\n"
+    run.ends(with_code=0)
 
 
 BAD_COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -150,30 +102,43 @@ REFUSED: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 
-def test_bad_commands(federation: Federation) -> None:
-    world = federation.world(ONE, "--rate", "1", "--duration", "1000")
-    federation.client().subscribe("clock").until(lambda m: m["t_ns"] > 0)
+def test_asking_the_world(federation: Federation) -> None:
+    world = federation.world(ONE, "--rate", "4", "--duration", "1000")
+    client = federation.client()
+    clock = client.subscribe("clock")
+    clock.until(lambda m: m["t_ns"] > 0)
+    terminal = Terminal(federation)
     for name, (arguments, tokens) in BAD_COMMANDS.items():
-        line = refusal(*arguments, "--connect", federation.endpoint)
+        line = refusal(*arguments, *terminal.reach)
         assert has_terms(line, *tokens), (name, line)
     for name, (arguments, tokens) in REFUSED.items():
-        done = zsim(*arguments, "--connect", federation.endpoint, code=1)
-        assert has_terms(done.stderr.splitlines()[-1], *tokens), (name, done)
-    federation.client().request("world/control", "stop")
+        assert has_terms(terminal(*arguments, code=1).splitlines()[-1], *tokens), name
+    assert terminal("ask", "world/control", "pause") == "ok\n"
+    paused = clock.until(lambda m: m["state"] == "paused").message["t_ns"]
+    assert terminal("ask", "world/control", "step", '{"gates": 5}') == "ok\n"
+    clock.until(lambda m: m["state"] == "paused" and m["t_ns"] == paused + 100_000_000)
+    assert terminal("ask", "world/control", "resume") == "ok\n"
+    clock.until(lambda m: m["state"] == "running")
+    assert terminal("ask", "world/control", "rate", '{"value": 20}') == "ok\n"
+    clock.until(lambda m: m["rate"] > 15)
+    assert re.search(r"\b1\b", terminal("pub", "drone/drone1/cmd/mode", '{"mode": "takeoff"}'))
+    states = client.subscribe("drone/drone1/sensor/status")
+    states.until(lambda m: m["state"] == "hovering")
+    velocity = '{"velocity_m_s": [0, 0, 0.5], "yaw_rate_rad_s": 0}'
+    assert re.search(r"\b3\b", terminal("pub", "drone/drone1/cmd/velocity", velocity, "-n", "3", "--rate-hz", "100"))
+    assert states.until(lambda m: m["state"] == "flying").message["commander"] == "zsim.pub"
+    assert terminal("ask", "world/control", "stop", '{"reason": "enough"}') == "ok\n"
+    world.line("stopped by zsim.ask: enough")
     world.ends(with_code=0)
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help(command: str) -> None:
-    text = zsim(command, "--help").stdout
-    assert f"zsim_deploy.cli {command}" in text or f"zsim {command}" in text
-    assert "--launched" not in text
-
-
-def test_help_of_all() -> None:
+def test_help() -> None:
     text = zsim("--help").stdout
     for command in COMMANDS:
         assert re.search(rf"\b{command}\b", text)
+        own = zsim(command, "--help").stdout
+        assert f"zsim {command}" in own
+        assert "--launched" not in own
     assert zsim("--version").stdout.startswith("zsim 0.")
 
 
@@ -187,7 +152,7 @@ def test_validate_prints_what_a_scenario_resolves_to(tmp_path: Path) -> None:
 
 
 def test_report_of_a_run(federation: Federation) -> None:
-    federation.run(PAIR, "--in-process", "--duration", "8").ends(with_code=0)
+    zsim("run", federation.write(PAIR), "--in-process", "--duration", "8", "--no-report", "--out", str(federation.out))
     output = zsim("report", str(federation.out)).stdout
     assert f"report: {federation.out / 'report.html'}" in output
     summary = json.loads((federation.out / "summary.json").read_text())

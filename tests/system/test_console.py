@@ -399,7 +399,8 @@ def waiting(federation: Federation) -> Iterator[Role]:
 
 
 @pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 0), (signal.SIGKILL, -signal.SIGKILL)]
+    ("number", "code"),
+    [(signal.SIGINT, 0), pytest.param(signal.SIGTERM, 0, marks=pytest.mark.soak), (signal.SIGKILL, -signal.SIGKILL)],
 )
 def test_who_waits_for_pages_is_ended_by_a_signal(
     federation: Federation, waiting: Role, number: int, code: int

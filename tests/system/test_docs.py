@@ -111,9 +111,8 @@ def pages_with(*kinds: str, long: tuple[str, ...] = ()) -> list[Any]:
     return [pytest.param(p, id=p.name, marks=[pytest.mark.soak] if p.name in long else []) for p in pages]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_block_is_of_a_known_kind(page: Path) -> None:
-    unknown = [f"{page.name}:{b.line}: {b.kind}" for b in blocks(page) if b.kind not in KINDS]
+def test_every_block_is_of_a_known_kind() -> None:
+    unknown = [f"{page.name}:{b.line}: {b.kind}" for page in PAGES for b in blocks(page) if b.kind not in KINDS]
     assert unknown == []
 
 
@@ -289,26 +288,25 @@ def adapted(line: str, ports: tuple[int, ...], longest_s: float | None) -> str:
     return re.sub(r"\bmake (\w+)", rf"make -n -C {ROOT} \1 >/dev/null", line)  # last: ROOT may end with zsim
 
 
-@pytest.mark.parametrize("page", pages_with("bash run", "bash terminals"))
-def test_commands_are_ones_that_exist(page: Path) -> None:
-    for block in blocks(page):
-        for line in lines(block) if block.kind in ("bash run", "bash terminals") else ():
-            words = [word for word in shlex.split(line) if not re.match(r"[A-Z_]+=", word)]
-            if words[:1] == ["zsim"]:
-                ends = [place for place, word in enumerate(words) if word in ("|", ">", "&&", "||", "&")]
-                assert parses(words[1 : min(ends, default=len(words))]), f"{page.name}:{block.line}: {line}"
+def lines_of(*kinds: str) -> Iterator[tuple[str, str]]:
+    """Yield place and text of the commands in blocks of some kinds on all pages."""
+    for page in PAGES:
+        for block in blocks(page):
+            for line in lines(block) if block.kind in kinds else ():
+                yield f"{page.name}:{block.line}: {line}", line
 
 
-@pytest.mark.parametrize("page", pages_with("bash elsewhere"))
-def test_commands_for_other_machines_are_ones_that_exist(page: Path) -> None:
-    for block in blocks(page):
-        if block.kind == "bash elsewhere":
-            for line in lines(block):
-                where = f"{page.name}:{block.line}: {line}"
-                if re.match(r"(\S*/)?zsim ", line):
-                    assert parses(shlex.split(line)[1:]), where
-                else:
-                    assert line.startswith(ELSEWHERE), f"{where}: add its command to ELSEWHERE"
+def test_commands_are_ones_that_exist() -> None:
+    for where, line in lines_of("bash run", "bash terminals"):
+        words = [word for word in shlex.split(line) if not re.match(r"[A-Z_]+=", word)]
+        if words[:1] == ["zsim"]:
+            ends = [place for place, word in enumerate(words) if word in ("|", ">", "&&", "||", "&")]
+            assert parses(words[1 : min(ends, default=len(words))]), where
+    for where, line in lines_of("bash elsewhere"):
+        if re.match(r"(\S*/)?zsim ", line):
+            assert parses(shlex.split(line)[1:]), where
+        else:
+            assert line.startswith(ELSEWHERE), f"{where}: add its command to ELSEWHERE"
 
 
 def parses(arguments: list[str]) -> bool:
@@ -341,15 +339,6 @@ def test_every_command_of_the_command_line_is_shown() -> None:
 # Scenarios
 
 
-def scenario_blocks() -> list[Any]:
-    return [
-        pytest.param(block, id=f"{page.name}:{block.line}")
-        for page in PAGES
-        for block in blocks(page)
-        if block.kind in ("yaml", "yaml part")
-    ]
-
-
 def test_inventories_are_valid(tmp_path: Path) -> None:
     step = scenario_file.load(ROOT / "scenarios/step.yaml")
     found = [block for page in PAGES for block in blocks(page) if block.kind == "yaml inventory"]
@@ -359,17 +348,19 @@ def test_inventories_are_valid(tmp_path: Path) -> None:
     assert found
 
 
-@pytest.mark.parametrize("block", scenario_blocks())
-def test_scenarios_are_valid(block: Block) -> None:
+@pytest.mark.parametrize("page", pages_with("yaml", "yaml part"))
+def test_scenarios_are_valid(page: Path) -> None:
     from zsim.contract.messages import Info
     from zsim_agents.formation.controller import Controller
 
-    given = yaml.safe_load(block.text)
-    base = yaml.safe_load((ROOT / "scenarios/step.yaml").read_text()) if block.kind == "yaml part" else {}
-    resolved = scenario_file.resolve({**base, **given})
-    info = msgspec.convert({**_INFO, "seed": resolved.seed}, Info)
-    for cluster in resolved.clusters:
-        Controller(info, resolved, cluster.name)  # checks the names and expressions of the plan
+    for block in blocks(page):
+        if block.kind in ("yaml", "yaml part"):
+            given = yaml.safe_load(block.text)
+            base = yaml.safe_load((ROOT / "scenarios/step.yaml").read_text()) if block.kind == "yaml part" else {}
+            resolved = scenario_file.resolve({**base, **given})
+            info = msgspec.convert({**_INFO, "seed": resolved.seed}, Info)
+            for cluster in resolved.clusters:
+                Controller(info, resolved, cluster.name)  # checks the names and expressions of the plan
 
 
 _INFO: dict[str, Any] = {
@@ -440,11 +431,12 @@ def test_every_section_of_a_scenario_has_its_table() -> None:
     assert sorted(reference()) == sorted(set(SECTIONS) - {"Document"})
 
 
-@pytest.mark.parametrize("name", sorted(set(SECTIONS) - {"Document"}))
-def test_the_table_of_a_section_says_what_the_code_says(name: str) -> None:
-    written = [row[:4] for row in reference()[name]]
-    assert written == list(rows(name))
-    assert all(row[4] for row in reference()[name]), "a field without a word about it"
+def test_the_table_of_a_section_says_what_the_code_says() -> None:
+    written = reference()
+    assert {name: [row[:4] for row in table] for name, table in written.items()} == {
+        name: list(rows(name)) for name in written
+    }
+    assert all(row[4] for table in written.values() for row in table), "a field without a word about it"
 
 
 def rows(name: str) -> Iterator[list[str]]:
@@ -579,21 +571,17 @@ def protocol_row(shape: str) -> str:
     return next(line for line in text.splitlines() if line.startswith(f"| `{key}` |"))
 
 
-@pytest.mark.parametrize("shape", sorted(messages.types_by_shape()))
-def test_the_protocol_names_every_message_and_field(shape: str) -> None:
-    """The row of a key holds the message's name and those of all its fields, nested ones too."""
-    kind, row = messages.types_by_shape()[shape], protocol_row(shape)
-    wanted = [kind.__name__, *(f for f in messages.fields(kind) if f not in ("t_ns", "seq"))]
-    assert [word for word in wanted if not re.search(rf"\b{word}\b", row)] == []
-
-
-@pytest.mark.parametrize(
-    "shape", [shape for shape, topic in messages.TOPICS.items() if topic.message and topic.writers]
-)
-def test_the_protocol_names_a_writer_that_the_message_declares(shape: str) -> None:
-    writers = messages.TOPICS[shape].writers
-    words = [word for role in writers for word in (("each", "participant") if role == "each" else (role,))]
-    assert any(word in protocol_row(shape).split("|")[2] for word in words), words
+def test_the_protocol_names_every_message_its_fields_and_a_writer() -> None:
+    """The row of a key holds the message's name, those of all its fields, nested ones too, and who publishes it."""
+    lacking = {}
+    for shape, kind in messages.types_by_shape().items():
+        row, writers = protocol_row(shape), messages.TOPICS[shape].writers if shape in messages.TOPICS else ()
+        wanted = [kind.__name__, *(f for f in messages.fields(kind) if f not in ("t_ns", "seq"))]
+        lacking[shape] = [word for word in wanted if not re.search(rf"\b{word}\b", row)]
+        words = [word for role in writers for word in (("each", "participant") if role == "each" else (role,))]
+        if writers and not any(word in row.split("|")[2] for word in words):
+            lacking[shape].append(f"a writer of {words}")
+    assert {shape: words for shape, words in lacking.items() if words} == {}
 
 
 def test_the_protocol_names_every_event() -> None:
@@ -610,23 +598,23 @@ def test_the_protocol_names_every_event() -> None:
 # Links, files and names
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_lead_somewhere() -> None:
     """Links to files and headings exist; a link whose text is a name in code leads to a file that defines it."""
-    prose = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
     faults = []
-    pictures = [("", source) for source in re.findall(r'<img src="([^"]+)"', prose)]
-    for text, link in [*re.findall(r"!?\[([^\]]*)\]\(([^)\s]+)\)", prose), *pictures]:
-        if re.match(r"[a-z]+:", link):
-            continue
-        path, _, anchor = link.partition("#")
-        target = (page.parent / path).resolve() if path else page
-        if not target.exists():
-            faults.append(f"{link}: no such file")
-        elif anchor and anchor not in anchors(target):
-            faults.append(f"{link}: no such heading")
-        elif target.suffix == ".py" and text.startswith("`") and not defines(target, text.strip("`")):
-            faults.append(f"{link}: does not define {text}")
+    for page in PAGES:
+        prose = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+        pictures = [("", source) for source in re.findall(r'<img src="([^"]+)"', prose)]
+        for text, link in [*re.findall(r"!?\[([^\]]*)\]\(([^)\s]+)\)", prose), *pictures]:
+            if re.match(r"[a-z]+:", link):
+                continue
+            path, _, anchor = link.partition("#")
+            target = (page.parent / path).resolve() if path else page
+            if not target.exists():
+                faults.append(f"{page.name}: {link}: no such file")
+            elif anchor and anchor not in anchors(target):
+                faults.append(f"{page.name}: {link}: no such heading")
+            elif target.suffix == ".py" and text.startswith("`") and not defines(target, text.strip("`")):
+                faults.append(f"{page.name}: {link}: does not define {text}")
     assert faults == []
 
 
@@ -646,17 +634,16 @@ def defines(file: Path, name: str) -> bool:
 FOLDERS = "zsim|world|agents|deploy|examples|scenarios|docs|tests|benchmarks"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_files_that_are_named_exist(page: Path) -> None:
-    named = re.findall(rf"`((?:{FOLDERS})/[\w/.-]+\.\w+)`", page.read_text())
-    assert [name for name in named if not (ROOT / name).exists()] == []
+def test_files_that_are_named_exist() -> None:
+    named = {name for page in PAGES for name in re.findall(rf"`((?:{FOLDERS})/[\w/.-]+\.\w+)`", page.read_text())}
+    assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
 
 
-@pytest.mark.parametrize("page", pages_with("python"))
-def test_python_compiles(page: Path) -> None:
-    for block in blocks(page):
-        if block.kind == "python":
-            compile(block.text, f"{page.name}:{block.line}", "exec")
+def test_python_compiles() -> None:
+    for page in PAGES:
+        for block in blocks(page):
+            if block.kind == "python":
+                compile(block.text, f"{page.name}:{block.line}", "exec")
 
 
 def test_the_readme_is_short() -> None:

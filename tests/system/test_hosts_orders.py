@@ -103,6 +103,7 @@ def test_a_closed_terminal_ends_the_run_as_ctrl_c_does(lab: Lab) -> None:
         follower.ends(with_code=0, within_s=START_S)
 
 
+@pytest.mark.soak  # test_kill has it on one host
 def test_a_pipe_that_nobody_reads_any_more_ends_the_run_and_fetches_its_record(lab: Lab) -> None:
     """As in `zsim up … 2>&1 | head`."""
     with closing(Deployment(lab, ROLES, secure=False)) as deployment:

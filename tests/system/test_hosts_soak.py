@@ -1,7 +1,10 @@
 """Faults at random simulated times on three hosts, many of each kind: `make soak`; a table of them at the end."""
 
+import errno
 import functools
+import os
 import random
+import re
 import signal
 import tempfile
 import threading
@@ -131,10 +134,15 @@ def strike(deployment: Deployment, run: Role, kind: str, chance: random.Random) 
 def cut_off(deployment: Deployment, run: Role, host: str, for_s: float) -> float | None:
     """Cut a host off for so long; return the wall time [s] until its line."""
     at_s = deployment.cut(host)
-    output = run.line(f"host {host} does not answer", START_S).wall_s - at_s if for_s > NAMED_AFTER_S else None
+    is_named, named_after_s = for_s > NAMED_AFTER_S, None
+    if is_named:
+        named_after_s = run.line(f"host {host} does not answer", START_S).wall_s - at_s
+        run.line(f"waiting for .* on {host}", START_S)
     threading.Event().wait(at_s + for_s - time.monotonic())
     deployment.heal(host)
-    return output
+    if is_named:
+        run.line(f"host {host} answers again", START_S)
+    return named_after_s
 
 
 def judge(deployment: Deployment, run: Role, kind: str) -> None:
@@ -144,5 +152,11 @@ def judge(deployment: Deployment, run: Role, kind: str) -> None:
     assert record.keys()["clock"] > 1
     if kind in (*LOSING, RECORDER):
         assert [event["subject"] for event in record.events("restart")] == [kind]
-    if kind != DISK:
+    if kind == WORLD:
+        assert record.events("death") == []
+    if kind == CLOCK:
+        assert re.search(r"warning: h3: its clock is -?3[56]\d\d\.\d s off", run.text())
+    if kind == DISK:
+        assert os.strerror(errno.ENOSPC) in run.text()
+    else:
         assert record.sha256() == undisturbed()

@@ -288,38 +288,6 @@ def test_gates_that_nobody_has_any_more_are_missed_aloud(federation: Federation,
 
 
 @pytest.mark.soak
-def test_a_stopped_recorder(federation: Federation) -> None:
-    """Time stands still for it, before the world has forgotten what it lacks."""
-    flight = Flight(federation, "--rate", "1000")
-    federation.kill("recorder", signal.SIGSTOP)
-    flight.stands_for("recorder")
-    federation.kill("recorder", signal.SIGCONT)
-    flight.clock.until(lambda m: not m["waiting_for"])
-    flight.finish()
-    check_whole(check_end(federation, whole=True))
-
-
-@pytest.mark.soak
-@pytest.mark.parametrize("options", [(), ("--hosted",)])
-def test_a_world_that_is_killed_again_and_again_costs_no_bit(
-    federation: Federation, undisturbed: dict[str, np.ndarray], options: tuple[str, ...]
-) -> None:
-    flight = Flight(federation, *options)
-    for kills in range(1, 4):
-        federation.kill("world")
-        flight.run.line(r"world .*ended: killed by signal 9; on_death: restart", number=kills)
-        flight.run.line(r"world: goes on at t = ", number=kills)
-        assert flight.clock.until(lambda m: not m["waiting_for"]), kills
-    flight.finish()
-    record = check_end(federation, whole=True)
-    check_whole(record)
-    assert record.events("death") == []
-    for drone, wanted in undisturbed.items():
-        assert np.array_equal(record.positions(drone)[: len(wanted)], wanted)
-    assert (federation.out / "journal").exists()  # it was stopped, and can go on
-
-
-@pytest.mark.soak
 def test_a_world_that_was_restarted_in_realtime_counts_only_its_own_time(federation: Federation) -> None:
     """What was lost with the former one is a miss or two of each agent, not one at every gate after it."""
     run = federation.run(PAIR, "--realtime", "--rate", "2", "--duration", "16")

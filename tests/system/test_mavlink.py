@@ -15,8 +15,6 @@ from wire import Client
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.frame import Link, Parser, Signing
 
-pytestmark = pytest.mark.xdist_group("mavlink")
-
 DRONES = 6
 FLEET = f"""
 name: fleet

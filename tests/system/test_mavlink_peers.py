@@ -16,8 +16,6 @@ from wire import PATIENCE_S
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.frame import Link, Parser, Received
 
-pytestmark = pytest.mark.xdist_group("mavlink_peers")
-
 PROGRAM, VEHICLE = 14540, 14580  # ports of the first program, and of the first vehicle
 ARM, TAKE_OFF = 400, 22
 ACCEPTED = 0

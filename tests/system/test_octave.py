@@ -256,22 +256,6 @@ def test_the_controller_is_killed_and_started_again(federation: Federation) -> N
 
 
 @pytest.mark.soak
-def test_test_1_of_the_paper(federation: Federation, tmp_path_factory: pytest.TempPathFactory) -> None:
-    """All of Test 1: errors and Table I as with our own controller."""
-    fly(federation, 330, within_s=TEST_1_S)
-    theirs = json.loads((federation.out / "summary.json").read_text())
-    with python_flight(tmp_path_factory.mktemp("python"), 330) as other:
-        ours = json.loads((other.out / "summary.json").read_text())
-    assert len(ours["errors"]) == 12
-    for name, errors in ours["errors"].items():
-        for statistic in ("est_std", "true_rms", "true_std"):
-            found, wanted = theirs["errors"][name][statistic], errors[statistic]
-            print(f"{name:6} {statistic:9} python {wanted:.5f} matlab {found:.5f}")
-            assert found == pytest.approx(wanted, rel=1e-3)
-    assert theirs["min_separation_m"] == pytest.approx(ours["min_separation_m"], rel=1e-3)
-
-
-@pytest.mark.soak
 def test_round_trips(federation: Federation) -> None:
     """How long a control loop in Octave waits for the gateway on this machine."""
     federation.world(ROUNDS)

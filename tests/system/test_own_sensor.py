@@ -4,7 +4,6 @@ import csv
 import shutil
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from federation import PAIR, Federation, Record
 from forked_commands import ROOT
@@ -103,17 +102,6 @@ def test_a_record_is_flown_again(federation: Federation) -> None:
     path = federation.write(PAIR)
     federation.start("run", path, *options(), "--in-process", "--no-report", "--out", str(out)).ends(with_code=0)
     federation.start("rerun", str(out), "--trust").ends(with_code=0)
-
-
-@pytest.mark.usefixtures("examples")
-@pytest.mark.soak
-def test_a_sweep_varies_it_and_no_truth_changes(federation: Federation) -> None:
-    path, out = federation.write(PAIR, "pair.yaml"), federation.folder / "sweep"
-    plan = ("--vary", "sensors.my_uwb.range_m.noise=0.1,0.5", "--workers", "1", "--no-report")
-    federation.start("sweep", path, *plan, "--out", str(out), *options()).ends(with_code=0)
-    rows = pq.read_table(out / "sweep.parquet").to_pylist()
-    assert [row["failure"] for row in rows] == [None, None]
-    assert len({row["truth_sha256"] for row in rows}) == 1
 
 
 @pytest.mark.parametrize(

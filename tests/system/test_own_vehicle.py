@@ -1,9 +1,7 @@
 """Vehicles by their model: a user's own out of examples/, and the Crazyflie, however a scenario is flown."""
 
 import json
-from typing import Any
 
-import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from federation import PAIR, Federation
@@ -12,9 +10,6 @@ from forked_commands import ROOT
 from zsim.vehicles import vehicle_catalogue
 
 EXAMPLES = str(ROOT / "examples")
-MODEL = "drones.drone1.model=larger_battery"
-TAKEOFF = "clusters.main.plan.takeoff_s=1"
-DURATION_S = 10.0
 
 
 @pytest.fixture
@@ -22,26 +17,6 @@ def examples(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let modules of examples/ be found, here and in what is started from here."""
     monkeypatch.setenv("PYTHONPATH", EXAMPLES)
     monkeypatch.syspath_prepend(EXAMPLES)
-
-
-def hover_squares(record: Any, drone: str) -> float:
-    """Return the mean of the squares of a drone's rotor speeds in the last two seconds [rad^2/s^2]."""
-    last = record.all(f"drone/{drone}/truth")[-100:]
-    return float(np.mean(np.square([truth["rotor_rad_s"] for truth in last])))
-
-
-@pytest.mark.soak  # on hosts it flies with other parts of a user's own: test_own_parts_on_hosts.py
-@pytest.mark.usefixtures("examples")
-def test_processes_give_the_bits_of_one_process(federation: Federation) -> None:
-    """The heavier aircraft hovers on more thrust, by its weight."""
-    federation.run(PAIR, "--set", MODEL).ends(with_code=0)
-    record = federation.record()
-    ratio = hover_squares(record, "drone1") / hover_squares(record, "drone2")
-    assert ratio == pytest.approx(0.48 / 0.429, rel=0.05)
-    one = federation.folder / "one"
-    options = ("--set", MODEL, "--in-process", "--out", str(one))
-    federation.start("run", federation.write(PAIR), *options).ends(with_code=0)
-    assert json.loads((one / "summary.json").read_text())["truth_sha256"] == record.sha256()
 
 
 @pytest.mark.usefixtures("examples")

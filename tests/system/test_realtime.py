@@ -59,7 +59,7 @@ def test_nobody_is_waited_for(federation: Federation) -> None:
 
 def test_a_run_that_is_frozen_goes_on_where_it_stood(federation: Federation) -> None:
     """As by a machine that is suspended: no time is made up for in a burst that nobody could follow or record."""
-    rate, duration_s, frozen_s = 5, 40, 4.0
+    rate, duration_s, frozen_s = 5, 30, 4.0
     run = federation.run(PAIR, "--realtime", "--rate", str(rate), "--duration", str(duration_s))
     federation.client().subscribe("clock").until(lambda m: m["t_ns"] > 6e9)
     pids = {run.process.pid, *(pid for pid, _ in federation._processes())}

@@ -237,8 +237,9 @@ def started(process: "subprocess.Popen[str]") -> Iterator["subprocess.Popen[str]
             process.kill()
 
 
-@SECURITY
-@pytest.mark.parametrize("name", ["estimator.drone1", "controller.main", "recorder"])
+@pytest.mark.parametrize(
+    ("name", "insecure"), [("estimator.drone1", False), ("controller.main", True), ("recorder", False)]
+)
 def test_a_unit_s_command_is_one_that_the_role_takes(tmp_path: Path, name: str, insecure: bool) -> None:
     """Nobody listens there, and the role says so, which it does when it is content with its options."""
     unit = laid_out(tmp_path, PAIR, insecure)[name]

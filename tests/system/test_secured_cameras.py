@@ -1,6 +1,6 @@
 """Cameras and detectors over TLS: with the rights of their role they do their work, without them they are told so."""
 
-from pathlib import Path
+from collections.abc import Iterator
 
 import forked_commands
 import pytest
@@ -17,19 +17,20 @@ LET_IN = ("camera.drone1", "detector.drone1", "operator.main")
 INFO, PICTURES, SEEN = "drone/drone1/camera/front/info", "drone/drone1/camera/front", "drone/drone1/sightings"
 
 
-@pytest.fixture
-def made(tmp_path: Path) -> Certificates:
-    return Certificates(tmp_path / "certs")
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Certificates:
+    return Certificates(tmp_path_factory.mktemp("certs"))
 
 
-@pytest.fixture
-def endpoint(federation: Federation, made: Certificates) -> str:
+@pytest.fixture(scope="module")
+def endpoint(tmp_path_factory: pytest.TempPathFactory, made: Certificates, compiled: None) -> Iterator[str]:
     """Where a world listens that lets in a camera, a detector and an operator."""
     world = made.identity("world", access_control(scenario_file.from_text(EYES), LET_IN, {}))
     at = tls_endpoint()
     secured = ("--listen", at, "--tls", str(world.tls), "--access", str(world.access))
-    federation.start("world", federation.write(EYES), "--rate", "1", "--duration", "600", *secured)
-    return at
+    with Federation(tmp_path_factory.mktemp("world")) as federation:
+        federation.start("world", federation.write(EYES), "--rate", "1", "--duration", "600", *secured)
+        yield at
 
 
 def test_a_camera_and_a_detector_do_their_work_with_no_more_than_their_rights(

@@ -1,5 +1,6 @@
 """Time is stopped by nobody who does not take part, and who stops it is named."""
 
+import itertools
 import re
 import signal
 import subprocess
@@ -21,7 +22,10 @@ class Watched:
     """PAIR under way, and what a stranger sees of it."""
 
     def __init__(self, federation: Federation, *pace: str) -> None:
-        self._federation = federation
+        self.federation = federation
+        self.tokens: list[object] = []  # that live as long as this
+        self.incarnation = 0  # of the last join that was made up
+        self._incarnations = itertools.count(2**40)
         self.run = federation.run(PAIR, *(pace or ("--rate", "4")), "--duration", "100000")
         self.client: Client = federation.client()
         self.clock: Subscription = self.client.subscribe("clock")
@@ -32,20 +36,96 @@ class Watched:
     def stop(self, name: str) -> None:
         """Stop a process that has shown a sign of life."""
         self.client.subscribe(f"process/{name}/health").until(lambda m: True)
-        self._federation.kill(name, signal.SIGSTOP)
+        self.federation.kill(name, signal.SIGSTOP)
 
     def join_as(self, name: str, **about: object) -> None:
         """Publish a join, and nothing else: no token, no done."""
-        role, run_id = name.split(".")[0], self.info["run_id"]
-        fields = {"t_ns": 0, "run_id": run_id, "incarnation": 2**40, "role": role, "host": "nowhere", "pid": 1}
+        role, run_id, self.incarnation = name.split(".")[0], self.info["run_id"], next(self._incarnations)
+        fields = {"t_ns": 0, "run_id": run_id, "incarnation": self.incarnation, "role": role}
+        fields |= {"host": "nowhere", "pid": 1}
         self.client.put(f"process/{name}/join", **{**fields, "period_ns": GATE_NS, **about})
+
+    def goes_on(self) -> None:
+        """Wait until simulated time has gone on."""
+        self.clock.now()
+        t_ns = self.clock.until(lambda m: not m["waiting_for"]).message["t_ns"]
+        self.clock.until(lambda m: m["t_ns"] > t_ns + 5e8)
 
     def flies_on(self) -> None:
         """Wait until simulated time has gone on, and end the run."""
-        t_ns = self.clock.until(lambda m: not m["waiting_for"]).message["t_ns"]
-        self.clock.until(lambda m: m["t_ns"] > t_ns + 2e9)
+        self.goes_on()
         assert self.client.request("world/control", "stop")["ok"]
         self.run.ends(with_code=0)
+
+
+@pytest.fixture(scope="module")
+def watched(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Iterator[Watched]:
+    """A run that the tests of this file share: each lets it go on."""
+    with Federation(tmp_path_factory.mktemp("watched")) as federation:
+        made = Watched(federation)
+        yield made
+        made.flies_on()
+
+
+def test_strangers_without_tokens_stop_no_time(watched: Watched) -> None:
+    watched.join_as(VISITOR)
+    watched.events.until(lambda m: (m["kind"], m["subject"]) == ("no_show", VISITOR))
+    watched.run.line(f"no_show: {VISITOR} on nowhere")
+    for number in range(20):
+        watched.join_as(f"{VISITOR}.{number}")
+    watched.goes_on()
+    told = [event.message for event in watched.events.now() if event.message["subject"].startswith(VISITOR)]
+    assert {event["kind"] for event in told} == {"no_show"}
+
+
+def test_a_join_of_another_s_process_is_answered_by_a_newer_one(watched: Watched) -> None:
+    health = watched.client.subscribe(f"process/{CONTROLLER}/health").until(lambda m: m).message
+    watched.join_as(CONTROLLER, host=health["host"], pid=health["pid"])
+    made_up = watched.incarnation
+    watched.events.until(lambda m: m["kind"] == "superseded" and m["data"]["incarnation"] == made_up)
+    watched.events.until(lambda m: m["kind"] == "superseded" and m["data"]["incarnation"] != made_up)
+    watched.goes_on()
+
+
+def test_a_stopped_estimator_is_named_and_not_the_controller_that_waits_for_it(watched: Watched) -> None:
+    watched.stop(ESTIMATOR)
+    watched.events.until(lambda m: (m["kind"], m["subject"]) == ("silent", ESTIMATOR))
+    wanted = {ESTIMATOR: [], CONTROLLER: [ESTIMATOR]}
+    watched.clock.until(lambda m: {w["name"]: w["held_by"] for w in m["waiting_for"]} == wanted)
+    watched.run.line(f"waiting for {ESTIMATOR} on [^,]*$")
+    watched.federation.kill(ESTIMATOR, signal.SIGCONT)
+    watched.events.until(lambda m: (m["kind"], m["subject"]) == ("silent_end", ESTIMATOR))
+    watched.goes_on()
+
+
+def test_a_stopped_world_is_named(watched: Watched) -> None:
+    watched.stop("world")
+    watched.run.line(f"world .pid {watched.federation.pid('world')}. shows no sign of life")
+    watched.federation.kill("world", signal.SIGCONT)
+    watched.run.line("world .* is back")
+    watched.goes_on()
+
+
+def test_who_takes_a_place_and_does_nothing_gives_it_back(watched: Watched) -> None:
+    """The last one: its tokens stay, so that nobody takes their end for that of the controller in its place."""
+    takes_a_place(watched, ("superseded", "death", "restart"))
+    watched.goes_on()
+
+
+def takes_a_place(watched: Watched, kinds: tuple[str, ...]) -> None:
+    """Join as the controller, with all its tokens, and wait until the world has noticed that it does nothing."""
+    client = watched.client
+    watched.tokens = [client.token(CONTROLLER), client.token(f"{CONTROLLER}/session/{client.session.info.zid()}")]
+    watched.join_as(CONTROLLER)
+    for kind in kinds:
+        watched.events.until(lambda m, kind=kind: (m["kind"], m["subject"]) == (kind, CONTROLLER))
+
+
+@pytest.mark.soak
+def test_in_realtime_too(federation: Federation) -> None:
+    watched = Watched(federation, "--realtime")
+    takes_a_place(watched, ("superseded", "no_show", "restart"))
+    watched.flies_on()
 
 
 @pytest.mark.soak
@@ -62,67 +142,6 @@ def test_a_join_in_another_s_name_takes_no_place(federation: Federation, has_tok
     assert federation.record().events("superseded", "death") == []
 
 
-def test_a_join_of_another_s_process_is_answered_by_a_newer_one(federation: Federation) -> None:
-    watched = Watched(federation)
-    health = watched.client.subscribe(f"process/{CONTROLLER}/health").until(lambda m: m).message
-    watched.join_as(CONTROLLER, host=health["host"], pid=health["pid"])
-    watched.events.until(lambda m: m["kind"] == "superseded" and m["data"]["incarnation"] == 2**40)
-    watched.events.until(lambda m: m["kind"] == "superseded" and m["data"]["incarnation"] != 2**40)
-    watched.flies_on()
-
-
-def test_strangers_without_tokens_stop_no_time(federation: Federation) -> None:
-    watched = Watched(federation)
-    watched.join_as(VISITOR)
-    watched.events.until(lambda m: (m["kind"], m["subject"]) == ("no_show", VISITOR))
-    watched.run.line(f"no_show: {VISITOR} on nowhere")
-    for number in range(20):
-        watched.join_as(f"{VISITOR}.{number}")
-    watched.flies_on()
-    assert not [event for event in federation.record().events("join", "drop") if event["subject"].startswith(VISITOR)]
-
-
-def test_who_takes_a_place_and_does_nothing_gives_it_back(federation: Federation) -> None:
-    watched = Watched(federation)
-    client = watched.client
-    tokens = [client.token(CONTROLLER), client.token(f"{CONTROLLER}/session/{client.session.info.zid()}")]
-    watched.join_as(CONTROLLER)
-    watched.events.until(lambda m: (m["kind"], m["subject"]) == ("superseded", CONTROLLER))
-    watched.events.until(lambda m: (m["kind"], m["subject"]) == ("death", CONTROLLER))
-    watched.events.until(lambda m: (m["kind"], m["subject"]) == ("restart", CONTROLLER))
-    watched.flies_on()
-    for token in tokens:
-        token.undeclare()
-
-
-@pytest.mark.soak
-def test_in_realtime_too(federation: Federation) -> None:
-    watched = Watched(federation, "--realtime")
-    client = watched.client
-    tokens = [client.token(CONTROLLER), client.token(f"{CONTROLLER}/session/{client.session.info.zid()}")]
-    watched.join_as(CONTROLLER)
-    for kind in ("superseded", "no_show", "restart"):
-        watched.events.until(lambda m, kind=kind: (m["kind"], m["subject"]) == (kind, CONTROLLER))
-    watched.flies_on()
-    for token in tokens:
-        token.undeclare()
-
-
-# Who is stopped
-
-
-def test_a_stopped_estimator_is_named_and_not_the_controller_that_waits_for_it(federation: Federation) -> None:
-    watched = Watched(federation)
-    watched.stop(ESTIMATOR)
-    watched.events.until(lambda m: (m["kind"], m["subject"]) == ("silent", ESTIMATOR))
-    wanted = {ESTIMATOR: [], CONTROLLER: [ESTIMATOR]}
-    watched.clock.until(lambda m: {w["name"]: w["held_by"] for w in m["waiting_for"]} == wanted)
-    watched.run.line(f"waiting for {ESTIMATOR} on [^,]*$")
-    federation.kill(ESTIMATOR, signal.SIGCONT)
-    watched.events.until(lambda m: (m["kind"], m["subject"]) == ("silent_end", ESTIMATOR))
-    watched.flies_on()
-
-
 @pytest.mark.soak
 def test_a_stopped_recorder_is_named_in_realtime(federation: Federation) -> None:
     watched = Watched(federation, "--realtime")
@@ -131,15 +150,6 @@ def test_a_stopped_recorder_is_named_in_realtime(federation: Federation) -> None
     watched.run.line("silent: recorder")
     federation.kill("recorder", signal.SIGCONT)
     watched.events.until(lambda m: (m["kind"], m["subject"]) == ("silent_end", "recorder"))
-    watched.flies_on()
-
-
-def test_a_stopped_world_is_named(federation: Federation) -> None:
-    watched = Watched(federation)
-    watched.stop("world")
-    watched.run.line(f"world .pid {federation.pid('world')}. shows no sign of life")
-    federation.kill("world", signal.SIGCONT)
-    watched.run.line("world .* is back")
     watched.flies_on()
 
 

@@ -22,8 +22,6 @@ from wire import PATIENCE_S
 
 from zsim_analysis.sweep.sweep import load, locked
 
-pytestmark = pytest.mark.xdist_group("sweep")  # the undisturbed one is flown once
-
 GUST = "environment.wind.gust_m_s"
 DURATION_S = 40.0  # s: a run takes so long on the wall that a signal reaches it before it is over
 FLIGHT = ("--duration", str(DURATION_S), "--set", "drones.drone1.mass_kg=0.45")

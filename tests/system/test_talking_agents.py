@@ -119,7 +119,14 @@ def test_in_one_process_in_any_order(federation: Federation, names: Sequence[str
 
 
 @pytest.mark.parametrize(
-    "processes", [["abc"], ["cba"], ["a", "b", "c"], ["bc", "a"], ["ca", "b"]], ids=lambda names: "-".join(names)
+    "processes",
+    [
+        ["abc"],
+        ["a", "b", "c"],
+        ["bc", "a"],
+        *(pytest.param(each, marks=pytest.mark.soak) for each in (["cba"], ["ca", "b"])),
+    ],
+    ids=lambda names: "-".join(names),
 )
 def test_on_zenoh_together_or_each_as_a_process(federation: Federation, processes: Sequence[str]) -> None:
     assert on_zenoh(federation, processes) == expected()

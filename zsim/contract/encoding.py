@@ -68,11 +68,10 @@ class Layouts:
         self._literals = bytearray()
         self._ops: list[tuple[int, int, int]] = []
         self.ints = self.floats = self._int = self._float = 0
-        first = []
+        first = [0]
         for kind in kinds:
-            first.append(len(self._ops))
             self._add(*kind) if isinstance(kind, tuple) else self._add(kind)
-        first.append(len(self._ops))
+            first.append(len(self._ops))
         ops, literals = np.array(self._ops, dtype=np.int64), np.frombuffer(bytes(self._literals), dtype=np.uint8)
         self.program = Program(ops, np.array(first), literals)
 
@@ -89,27 +88,20 @@ class Layouts:
         self._literal(bytes([MAP | len(fields.fields)]))
         for field in fields.fields:
             self._literal(packed(field.encode_name))
-            self._value(field.type, f"{kind.__name__}: {field.encode_name}", length)
+            own = field.type
+            if type(own) in _WHOLE:
+                self._ops.append((_WHOLE[type(own)], self._int, 0))
+                self._int += 1
+                continue
+            count = 1
+            if isinstance(own, kinds_of.TupleType) or (isinstance(own, kinds_of.VarTupleType) and length):
+                count = len(own.item_types) if isinstance(own, kinds_of.TupleType) else length
+                self._literal(array_head(count))
+            elif not isinstance(own, kinds_of.FloatType):
+                raise TypeError(f"{kind.__name__}: {field.encode_name} is of a type that has no fixed place in a row")
+            self._ops.append((FLOATS, self._float, count))
+            self._float += count
         self.ints, self.floats = max(self.ints, self._int), max(self.floats, self._float)
-
-    def _value(self, kind: Any, where: str, length: int) -> None:
-        if isinstance(kind, kinds_of.FloatType):
-            self._take_floats(1)
-        elif isinstance(kind, kinds_of.TupleType):
-            self._literal(array_head(len(kind.item_types)))
-            self._take_floats(len(kind.item_types))
-        elif isinstance(kind, kinds_of.VarTupleType) and length:
-            self._literal(array_head(length))
-            self._take_floats(length)
-        elif type(kind) in _WHOLE:
-            self._ops.append((_WHOLE[type(kind)], self._int, 0))
-            self._int += 1
-        else:
-            raise TypeError(f"{where} is of a type that has no fixed place in a row")
-
-    def _take_floats(self, count: int) -> None:
-        self._ops.append((FLOATS, self._float, count))
-        self._float += count
 
     def _literal(self, data: bytes) -> None:
         op, place, size = self._ops[-1]
@@ -121,7 +113,6 @@ class Layouts:
 
 
 def array_head(size: int) -> bytes:
-    """Return msgpack's header of an array."""
     return packed([0] * size)[:-size]
 
 
@@ -136,7 +127,6 @@ def write(program: Program, words: TextTable, kind: int, ints: NDArray, bits: ND
 
     Args:
         program, words: see Layouts.
-        kind: of the message.
         ints: its whole numbers (I,); bits: its floats (F,) as uint64.
         out: uint8, with room enough.
     """
@@ -183,7 +173,6 @@ def read(program: Program, kind: int, data: NDArray, start: int, end: int, ints:
 
     Args:
         program: see Layouts.
-        kind: of the message.
         data: uint8; the message is what stands in [start, end).
         ints: takes its whole numbers (I,); bits: its floats (F,) as uint64.
     """

@@ -1,4 +1,4 @@
-"""Same bits: the fingerprint of what a process computes with, its `join`, and the hash of a flight's truth.
+"""Same bits: the fingerprint of what a process computes with, which its join states; the hash of a flight's truth.
 
 A fingerprint covers what the last bit of a number depends on: CPU feature level, libm, versions of the numeric
 packages, and for which processor BLAS computes: its own, unless OPENBLAS_CORETYPE or the like chooses another.
@@ -14,10 +14,11 @@ from pathlib import Path
 
 import numpy as np
 import threadpoolctl
+from msgspec import UNSET
 from numpy.typing import ArrayLike, NDArray
 
 from zsim import __version__
-from zsim.contract.run_messages import Join
+from zsim.contract.run_messages import Bye, Done, Join
 
 PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "filterpy")
 COLUMNS = 13  # position, velocity, orientation, angular velocity of a drone
@@ -26,7 +27,6 @@ HELD_BYTES = 16_384  # hashed in one go, which takes as long as a few instants
 
 @cache
 def parts() -> dict[str, str]:
-    """Return the parts of the fingerprint by name."""
     versions = {package: _version(package) for package in PACKAGES}
     return {
         "zsim": __version__,
@@ -46,41 +46,47 @@ def fingerprint() -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def join_of(
-    name: str,
-    host: str,
-    run_id: str,
-    incarnation: int,
-    seq: int,
-    t_ns: int = 0,
-    period_ns: int = 0,
-    serves: tuple[str, ...] = (),
-    calculates: bool = True,
-    slack_ns: int = 0,
-) -> Join:
-    """Return the message with which this process takes part in a run.
+class Membership:
+    """What a process says of itself in a run: its join, dones and bye."""
 
-    Args:
-        name: of the process, role.thing.
-        period_ns: how often it says done; 0 for never.
-        serves: names of processes whose work it does.
-        calculates: whether its results depend on its arithmetic; else it states no fingerprint.
-        slack_ns: by how much the world may be ahead of the dones of one without a period; 0 for any.
-    """
-    return Join(
-        t_ns=t_ns,
-        seq=seq,
-        run_id=run_id,
-        incarnation=incarnation,
-        role=name.partition(".")[0],
-        host=host,
-        pid=os.getpid(),
-        period_ns=period_ns,
-        version=__version__,
-        fingerprint=fingerprint() if calculates else "",
-        serves=serves,
-        slack_ns=slack_ns,
-    )
+    def __init__(
+        self,
+        name: str,  # of the process, role.thing
+        host: str,  # that it runs on
+        run_id: str,  # of the run
+        next_seq: Callable[[str], int],  # returns the number of its next message of a kind, from 0
+        serves: tuple[str, ...] = (),  # names of processes whose work it does
+        period_ns: int = 0,  # how often it says done; 0 for never
+        slack_ns: int = 0,  # by how much the world may be ahead of the dones of one without a period; 0 for any
+        calculates: bool = True,  # whether its results depend on its arithmetic; else it states no fingerprint
+    ) -> None:
+        self._name, self._host, self._run_id, self._next_seq = name, host, run_id, next_seq
+        self._serves, self._period_ns, self._slack_ns = serves, period_ns, slack_ns
+        self._calculates = calculates
+        self.incarnation = 0  # a random number of the process; 0 where none is ever restarted
+
+    def join(self, t_ns: int = 0) -> Join:
+        return Join(
+            t_ns=t_ns,
+            seq=self._next_seq("join"),
+            run_id=self._run_id,
+            incarnation=self.incarnation,
+            role=self._name.partition(".")[0],
+            host=self._host,
+            pid=os.getpid(),
+            period_ns=self._period_ns,
+            version=__version__,
+            fingerprint=fingerprint() if self._calculates else "",
+            serves=self._serves,
+            slack_ns=self._slack_ns,
+        )
+
+    def done(self, t_ns: int, sent: int) -> Done:
+        """Return what says that a gate is done, and how many outputs were sent since the last."""
+        return Done(t_ns, self._next_seq("done"), self._run_id, self.incarnation, t_ns, sent)
+
+    def bye(self, t_ns: int, reason: str, failed: bool = False) -> Bye:
+        return Bye(t_ns, self._next_seq("bye"), reason, failed or UNSET, self._run_id, self.incarnation)
 
 
 def _version(package: str) -> str:
@@ -101,21 +107,21 @@ def _cpu_features() -> str:
 
 
 def _blas() -> str:
-    """Return the BLAS libraries of the numeric packages, each with the processor that it computes for."""
-    loaded = (each for each in threadpoolctl.threadpool_info() if each["user_api"] == "blas")
-    used = (each for each in loaded if _bundled_with(Path(each["filepath"])) in (None, *PACKAGES))
-    return " ".join(sorted({f"{each['internal_api']}-{each.get('architecture', '')}" for each in used})) or "none"
-
-
-def _bundled_with(library: Path) -> str | None:
-    """Return the package whose wheel contains a library; None for a library of the system.
+    """Return the BLAS libraries of the system and of the numeric packages, with the processor that each computes for.
 
     OpenCV brings a BLAS of its own, with which nothing here computes, and which may choose another processor.
     """
-    folder = library.parent
-    if folder.suffix == ".libs":  # as auditwheel and delvewheel name it
-        return folder.stem
-    return folder.parent.name if folder.name == ".dylibs" else None  # as delocate does
+    found = set()
+    for each in threadpoolctl.threadpool_info():
+        folder = Path(each["filepath"]).parent
+        package = None  # whose wheel contains it
+        if folder.suffix == ".libs":  # as auditwheel and delvewheel name it
+            package = folder.stem
+        elif folder.name == ".dylibs":  # as delocate does
+            package = folder.parent.name
+        if each["user_api"] == "blas" and package in (None, *PACKAGES):
+            found.add(f"{each['internal_api']}-{each.get('architecture', '')}")
+    return " ".join(sorted(found)) or "none"
 
 
 class TruthHash:
@@ -157,7 +163,6 @@ class TruthHash:
             self.flush()
 
     def flush(self) -> None:
-        """Hash the rows that were added."""
         if not self._held or not self._rows.size:  # of a run whose drones are all external there is nothing
             self._held = 0
             return
@@ -167,6 +172,5 @@ class TruthHash:
         self._held = 0
 
     def hexdigest(self) -> str:
-        """Return the hash of all rows, as hexadecimal digits."""
         self.flush()
         return self._hash.hexdigest()

@@ -182,7 +182,6 @@ class ClusterState(Message, frozen=True):
     plan_step: Count = 0
 
     def fault(self) -> str | None:
-        """Return a fault that the types cannot express."""
         return length_fault(self, ("names", "value", "desired", "desired_rate"), 4 * len(self.drones))
 
 
@@ -203,7 +202,6 @@ class CameraImage(Message, frozen=True, kw_only=True):
     data: Annotated[bytes, Meta(max_length=PICTURE_MAX)]
 
     def fault(self) -> str | None:
-        """Return a fault that the types cannot express."""
         if self.data.startswith(JPEG_BEGINS):
             return None
         return f"data begins with {self.data[:8].hex(' ') or 'nothing'}; must be a JPEG, which begins with ff d8 ff"
@@ -310,7 +308,6 @@ class ViewCluster(Message, frozen=True):
     reason: str
 
     def fault(self) -> str | None:
-        """Return a fault that the types cannot express."""
         return length_fault(self, ("value", "desired"), len(self.names))
 
 
@@ -318,13 +315,11 @@ _triangle = itemgetter(0, 1, 2, 7, 8, 14)  # of the position, in the 6 x 6 covar
 
 
 def estimate_view(drone: str, estimate: Any) -> EstimateView:
-    """Return a drone's estimate, a message Estimate or an object with its fields, for displays."""
     e = estimate
     return EstimateView(drone, e.position_m, _triangle(e.covariance), e.yaw_rad, e.yaw_sigma_rad, e.sensors)
 
 
 def cluster_view(state: ClusterState, t_ns: int, seq: int) -> ViewCluster:
-    """Return a formation's state for displays, as message number `seq` of the view."""
     return ViewCluster(t_ns, seq, state.phase, state.names, state.value, state.desired, state.reason)
 
 

@@ -36,16 +36,13 @@ T = TypeVar("T")
 def key_table(drones: Sequence[str], own: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the keys of the world's messages about some drones, drone by drone in the order of KINDS.
 
-    Args:
-        drones: their names.
-        own: names of the users' sensors of the run, and that of the sightings; their keys follow those of KINDS.
+    `own` names the users' sensors of the run, and the sightings; their keys follow those of KINDS.
     """
     kinds = (*KINDS, *own)
     return tuple(keys.truth(d) if kind == "truth" else keys.sensor(d, kind) for d in drones for kind in kinds)
 
 
 def run_key_table(info: messages.Info) -> tuple[str, ...]:
-    """Return the keys of the world's messages about the drones of a run."""
     beside = [sensor.name for sensor in info.own_sensors] + [keys.SIGHTINGS] * (info.sightings is True)
     return key_table([drone.name for drone in info.drones], beside)
 
@@ -95,16 +92,11 @@ class GateMessages:
         t_ns: int,
         seq: int,
         table: tuple[str, ...],
-        pairs: Sequence[tuple[str, bytes]],
-        stamps: Sequence[int] | None = None,
+        pairs: Sequence[tuple[str, bytes]],  # keys, which are in the table, and payloads
+        stamps: Sequence[int] | None = None,  # t_ns of each [ns]; None stamps all with the gate
         first: Sequence[int] = (),
     ) -> "GateMessages":
-        """Return encoded messages as one object.
-
-        Args:
-            pairs: keys, which are in the table, and payloads.
-            stamps: t_ns of each [ns]; None stamps all with the gate.
-        """
+        """Return encoded messages as one object."""
         places = _places(table)
         which = np.array([places[key] for key, _ in pairs], dtype=np.int64)
         ends = np.cumsum([GAP + len(payload) for _, payload in pairs])
@@ -114,11 +106,7 @@ class GateMessages:
 
     @classmethod
     def unpack(cls, payload: bytes, table: tuple[str, ...]) -> "GateMessages":
-        """Return what `pack` has packed; not checked yet.
-
-        Raises:
-            DecodeError: the payload is anything else.
-        """
+        """Return what `pack` has packed; not checked yet; DecodeError if the payload is anything else."""
         try:
             p = _decode_gate(payload)
         except REFUSALS as error:
@@ -140,11 +128,7 @@ class GateMessages:
         return len(self.which)
 
     def check(self) -> None:
-        """Refuse columns that point outside of table or buffer, and stamps that are no times.
-
-        Raises:
-            DecodeError: with what is wrong.
-        """
+        """Raise DecodeError for columns that point outside of table or buffer, and for stamps that are no times."""
         which, stamps, ends = self.which.tolist(), self.stamps.tolist(), self.ends.tolist()
         if not ends or ends[-1] != len(self.buffer) or min(map(sub, ends, [0, *ends])) < GAP:
             _refuse("its payloads are not one behind the other")
@@ -155,33 +139,23 @@ class GateMessages:
 
     @cached_property
     def pairs(self) -> Pairs:
-        """Keys and payloads, as on the wire."""
         data, table = bytes(self.buffer), self.table
         places: list[int] = self.which.tolist()
         bounds = pairwise([0, *self.ends.tolist()])
         return [(table[p], data[start + GAP : end]) for p, (start, end) in zip(places, bounds, strict=True)]
 
     def decoded(self) -> Iterator[tuple[str, Any]]:
-        """Yield keys and messages.
-
-        Raises:
-            DecodeError: one is no message of its key.
-        """
+        """Yield keys and messages; DecodeError if one is no message of its key."""
         for key, payload in self.pairs:
             yield key, messages.decode(key, payload)
 
     def payload(self, m: int) -> bytes:
-        """Return the payload of one message."""
         start: int = self.ends.item(m - 1) if m else 0
         return bytes(self.buffer[start + GAP : self.ends.item(m)])
 
 
 class PerPattern(Generic[T]):
-    """A cache of what a reader derives from the keys of a gate, since the same keys come again and again.
-
-    Args:
-        learn: derives it.
-    """
+    """A cache of what a reader derives, by `learn`, from the keys of a gate: the same keys come again and again."""
 
     def __init__(self, learn: Callable[[GateMessages], T]) -> None:
         self._learn = learn
@@ -189,7 +163,6 @@ class PerPattern(Generic[T]):
         self._known: dict[bytes, T] = {}
 
     def of(self, gate: GateMessages) -> T:
-        """Return what `learn` returned for a gate with this table and these keys."""
         if gate.table is not self._table:
             self._table = gate.table
             self._known.clear()
@@ -207,16 +180,11 @@ def _refuse(reason: str) -> NoReturn:
 
 
 def encode_batch(passed: Pairs) -> bytes:
-    """Return the payload that carries (key, payload) in the order in which they passed."""
     return _encode(passed)
 
 
 def decode_batch(payload: bytes) -> Pairs:
-    """Return the [key, payload] pairs of a batch.
-
-    Raises:
-        DecodeError: it is no batch.
-    """
+    """Return the [key, payload] pairs of a batch; DecodeError if it is no batch."""
     try:
         return _decode_batch(payload)
     except REFUSALS as error:
@@ -224,11 +192,7 @@ def decode_batch(payload: bytes) -> Pairs:
 
 
 def pairs_of(result: Any) -> Pairs:
-    """Return the [key, payload] pairs in the result of an answer.
-
-    Raises:
-        DecodeError: the payload is anything else.
-    """
+    """Return the [key, payload] pairs in the result of an answer; DecodeError if the payload is anything else."""
     try:
         return msgspec.convert(result, Pairs, builtin_types=(bytes,))  # or texts would pass as base64
     except REFUSALS as error:

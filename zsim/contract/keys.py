@@ -35,21 +35,13 @@ AnyMessage = TypeVar("AnyMessage", bound=type[Struct])
 
 
 class Topic(NamedTuple):
-    """What the contract says about a key.
+    """What the contract says about a key."""
 
-    Attributes:
-        message: type of its messages; None for a family of keys whose members declare theirs.
-        writers: roles that publish it; "each" stands for every process, on the keys of its own name.
-        readers: roles that subscribe to it, besides recorders and operators, who read everything.
-        last: who answers a get with the last message: "world", "writer", or nobody ("").
-        is_output: whether the world counts its messages among those that a process announces with its done.
-    """
-
-    message: Any
-    writers: tuple[str, ...]
-    readers: tuple[str, ...]
-    last: str
-    is_output: bool
+    message: Any  # type of its messages; None for a family of keys whose members declare theirs
+    writers: tuple[str, ...]  # roles that publish it; "each" stands for every process, on the keys of its own name
+    readers: tuple[str, ...]  # roles that subscribe to it, besides recorders and operators, who read everything
+    last: str  # who answers a get with the last message: "world", "writer", or nobody ("")
+    is_output: bool  # whether the world counts its messages among those that a process announces with its done
 
 
 TOPICS: dict[str, Topic] = {}  # topics by key, `*` in place of a name
@@ -74,11 +66,7 @@ def on(
 
 
 def name(text: str, what: str = "name") -> str:
-    """Return `text` if it is a name of the contract.
-
-    Raises:
-        BadNameError: with what was found and what is allowed.
-    """
+    """Return `text` if it is a name of the contract; BadNameError with what was found and what is allowed."""
     if not isinstance(text, str) or not NAME.fullmatch(text):
         raise BadNameError(f"{what} is {text!r}; must be 1 to 32 of a-z 0-9 _ . -")
     return text
@@ -112,17 +100,14 @@ def command(drone: str, kind: str) -> str:
 
 
 def accepted(drone: str, kind: str) -> str:
-    """Return the key on which the world repeats a command to an external drone that it accepts."""
     return f"drone/{drone}/accepted/{kind}"
 
 
 def link(drone: str) -> str:
-    """Return the key on which a driver publishes the state of its link to an external drone."""
     return f"drone/{drone}/link"
 
 
 def driver(drone: str) -> str:
-    """Return the key on which the driver of an external drone answers requests."""
     return f"drone/{drone}/driver"
 
 
@@ -140,7 +125,6 @@ def detections(drone: str) -> str:
 
 
 def gate(drone: str) -> str:
-    """Return the key of the world's messages about one drone at a gate."""
     return f"{GATE}/{drone}"
 
 
@@ -153,7 +137,6 @@ def cluster_control(cluster: str) -> str:
 
 
 def cluster_request(cluster: str) -> str:
-    """Return the key on which a controller publishes the requests that it took."""
     return f"cluster/{cluster}/request"
 
 
@@ -162,7 +145,6 @@ def cluster_view(cluster: str) -> str:
 
 
 def estimates_view(process_name: str) -> str:
-    """Return the key on which an estimator publishes its estimates for displays."""
     return f"view/estimates/{process_name}"
 
 
@@ -191,7 +173,6 @@ def session_token(process: str, session: str) -> str:
 
 
 def session_of(token_key: str) -> str:
-    """Return the session that a token is about, empty if it is about none."""
     head, _, session = token_key.rpartition("/session/")
     return session if head else ""
 
@@ -207,22 +188,18 @@ def parts(key: str) -> tuple[str, str, str]:
 
 
 def thing(key: str) -> str:
-    """Return the second part of a key: the drone, cluster or process that it is about."""
     return key.split("/", 2)[1]
 
 
 def leaf(key: str) -> str:
-    """Return the last part of a key."""
     return key.rsplit("/", 1)[-1]
 
 
 def is_command(key: str) -> bool:
-    """Tell whether a key is that of commands to a drone."""
     return key.startswith("drone/") and "/cmd/" in key
 
 
 def is_accepted(key: str) -> bool:
-    """Tell whether a key carries the commands to an external drone that the world has accepted."""
     kind, _, what = parts(key)
     return kind == "drone" and what.startswith("accepted/")
 
@@ -234,7 +211,6 @@ def is_sensor(expression: str) -> bool:
 
 
 def is_status(key: str) -> bool:
-    """Tell whether a key is a drone's status."""
     return key.endswith("/sensor/status")
 
 

@@ -119,7 +119,6 @@ class Info(Message, frozen=True):
 
     @property
     def own_sensors(self) -> tuple[SensorInfo, ...]:
-        """The sensors beside the contract's, in the order of their messages."""
         return () if self.user_sensors is UNSET else self.user_sensors
 
 
@@ -137,7 +136,6 @@ _OWN_SENSORS: dict[str, type[Sample]] = {}  # of users, by name, as the newest I
 
 
 def _plain(value: Any) -> Any:
-    """Return a number or array of numpy as plain numbers, which msgspec can encode."""
     to_plain = getattr(value, "tolist", None)
     if to_plain is None:
         raise TypeError(f"a value is of type {type(value).__name__}; must be a number, text, list or map")
@@ -179,7 +177,6 @@ def register_sensors(sensors: Iterable[SensorInfo]) -> None:
 
 
 def types_by_shape() -> dict[str, type[Struct]]:
-    """Return the contract's message types by the shape of their key, for documentation and for tests."""
     return {shape: topic.message for shape, topic in TOPICS.items() if topic.message}
 
 
@@ -191,11 +188,7 @@ def is_output(key: str) -> bool:
 
 
 def output_type(key: str) -> type[Struct]:
-    """Return the message that an agent may return on a key from a step.
-
-    Raises:
-        DecodeError: none; one line.
-    """
+    """Return the message that an agent may return on a key from a step; DecodeError if there is none."""
     kind = type_of(key)
     if kind is None:
         raise DecodeError(f"{key:.80}: is no key of the contract; see docs/protocol.md")
@@ -206,23 +199,17 @@ def output_type(key: str) -> type[Struct]:
 
 
 def fields(kind: type[Struct]) -> Iterable[str]:
-    """Return the names of a message's fields in order."""
     return kind.__struct_fields__
 
 
 @lru_cache(maxsize=KEYS_KEPT)
 def encoding(key: str) -> str:
-    """Return the Zenoh encoding of a key's messages."""
     kind = type_of(key)
     return f"application/msgpack;{kind.__name__}" if kind else "application/msgpack"
 
 
 def decode(key: str, payload: bytes) -> Any:
-    """Return the message on `key`, checked for type, shape and finiteness.
-
-    Raises:
-        DecodeError: names key, field, found and allowed.
-    """
+    """Return the message on `key`; a DecodeError for type, shape or infinity names key, field, found and allowed."""
     kind, read = _reader_of(key)
     if kind is None:
         raise DecodeError(f"{key:.80}: is no key of the contract; see docs/protocol.md")
@@ -242,10 +229,8 @@ def decode_as(kind: type[Struct], payload: bytes, where: str) -> Any:
 
 def fault_at(key: str, error: Exception) -> str:
     """Return the text of a refusal without the key with which it opens."""
-    text = str(error)
-    return next(
-        (text.removeprefix(where) for where in (f"{key}: ", f"{_shown(key)}: ") if text.startswith(where)), text
-    )
+    text, where = str(error), key if len(key) <= 80 or str(error).startswith(key) else _shown(key)
+    return text.removeprefix(f"{where}: ")
 
 
 def _shown(where: str) -> str:
@@ -307,20 +292,14 @@ class RunEnd(Struct, frozen=True):
 
 
 class ProcessEntry(Struct, frozen=True):
-    """A process has joined.
-
-    Attributes:
-        from_ns: first gate that it is waited for.
-        done_ns: newest gate that it, or its former incarnation, is through with; -1 for none.
-        former_pid: of the incarnation whose place it takes.
-    """
+    """A process has joined."""
 
     incarnation: int
     host: str
     pid: int
-    from_ns: Count
-    done_ns: Whole = -1
-    former_pid: int | None = None
+    from_ns: Count  # first gate that it is waited for
+    done_ns: Whole = -1  # newest gate that it, or its former incarnation, is through with; -1 for none
+    former_pid: int | None = None  # of the incarnation whose place it takes
 
 
 class WorldEvent(NamedTuple):
@@ -344,8 +323,7 @@ _EVENT_DATA: dict[str, type[Struct]] = {
 def read_event(payload: bytes) -> WorldEvent | None:
     """Return an event of a kind that processes act on, its data checked; None for an event of another kind.
 
-    Raises:
-        DecodeError: it is no event, or its data is not what its kind has.
+    DecodeError if it is no event, or its data is not what its kind has.
     """
     event: run_messages.Event = decode(keys.EVENT, payload)
     kind = _EVENT_DATA.get(event.kind)

@@ -1,7 +1,7 @@
 """Messages about the run: time, events, who takes part, injected faults, and requests. The contract, version 1."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 from msgspec import UNSET, Struct, UnsetType, field
@@ -12,6 +12,7 @@ from zsim.schema.message import Count, Message, Number, Whole
 GATES_MAX = 1_000_000  # of one `step`: 5.5 hours at 20 ms
 RATE_MAX = 1000.0  # simulated per wall second; beyond it nothing paces
 PRIORITY_MAX = 100  # programs have 0, operators 10
+SOON_S = 0.5  # wall
 
 
 class Waiting(Struct, frozen=True):
@@ -24,6 +25,15 @@ class Waiting(Struct, frozen=True):
     host: str
     since_wall_s: Number
     held_by: tuple[str, ...] = ()
+
+
+def holding_up(state: str, waiting: Sequence[Waiting]) -> Sequence[Waiting]:
+    """Return those of the processes waited for that hold up a run, in a state of its clock: causes alone, if known.
+
+    A running world waits for SOON_S now and then.
+    """
+    late = [each for each in waiting if state == "waiting" or each.since_wall_s > SOON_S]
+    return [each for each in late if not each.held_by] or late
 
 
 @on("clock", writers="world", readers="each", last="world")
@@ -48,7 +58,6 @@ class Event(Message, frozen=True):
     data: dict[str, Any] = field(default_factory=dict)
 
     def fault(self) -> str | None:
-        """Return a fault that the types cannot express."""
         return _infinite_fault("data", self.data)
 
 
@@ -158,7 +167,6 @@ class ControlRequest(Struct, frozen=True):
     source: str = ""
 
     def fault(self) -> str | None:
-        """Return a fault that the types cannot express."""
         return _infinite_fault("args", self.args)
 
 
@@ -171,7 +179,6 @@ class ControlAnswer(Struct, frozen=True):
     more: Count | None = None
 
     def fault(self) -> str | None:
-        """Return a fault that the types cannot express."""
         return _infinite_fault("result", self.result)
 
 
@@ -190,7 +197,6 @@ class ClusterRequest(Message, frozen=True):
     controller: str = ""
 
     def fault(self) -> str | None:
-        """Return a fault that the types cannot express."""
         return _infinite_fault("args", self.args)
 
 

@@ -23,20 +23,12 @@ class _Array(msgspec.Struct, array_like=True):
 
 
 def pack(state: State) -> bytes:
-    """Return a state as bytes; the same for the same state.
-
-    Raises:
-        TypeError: it holds something else than a State may.
-    """
+    """Return a state as bytes; the same for the same state; TypeError if it holds something else than a State may."""
     return _ENCODER.encode(state)
 
 
 def unpack(payload: bytes) -> State:
-    """Return the state that was packed.
-
-    Raises:
-        DecodeError: the payload is not one that `pack` writes.
-    """
+    """Return the state that was packed; DecodeError if the payload is not one that `pack` writes."""
     try:
         return _DECODER.decode(payload)
     except REFUSALS as error:

@@ -1,9 +1,5 @@
-"""Mathematics that several packages share.
+"""Mathematics that several packages share; imports errors at most.
 
-    compiled         compiling with numba; columns of rows
-    rotation         vectors, quaternions and poses as tuples of floats, for compiled code
-    frames           the same as arrays; the Earth
-    random_streams   random streams by name
-
-Imports errors at most.
+compiled: compiling with numba, columns of rows; rotation: vectors, quaternions and poses as tuples of floats, for
+compiled code; frames: the same as arrays, and the Earth; random_streams: random streams by name.
 """

@@ -36,7 +36,6 @@ except ImportError:
     njit = None
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-
 COMPILES = njit is not None  # whether anything is compiled here
 _EXACT: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
 _UNCOUNTED: dict[str, Any] = {"_nrt": False}  # numba's name for doing without its counts; making an array is refused
@@ -83,50 +82,43 @@ if njit is not None and hasattr(os, "getuid"):  # not on Windows
     numba.config.CACHE_DIR = numba.config.CACHE_DIR or cache_folder()  # type: ignore[attr-defined]
 
 
+def _compile(function: Function, options: dict[str, Any]) -> Function:
+    dispatcher: Any = function if njit is None else njit(**options)(function)
+    return dispatcher
+
+
 def compiled(function: Function) -> Function:
-    """Return a part of kernels."""
     return _compile(function, _EXACT)
 
 
 def inlined(function: Function) -> Function:
-    """Return a part of kernels that is inlined into its caller, and makes no array."""
     return _compile(function, {**_EXACT, **_UNCOUNTED, "forceinline": True})
 
 
 def noinline(function: Function) -> Function:
-    """Return a part of kernels that makes no array and is rarely run: it is not inlined."""
     return _compile(function, {**_EXACT, **_UNCOUNTED})
 
 
-def kernel(makes_arrays: bool = True) -> Callable[[Function], Function]:
-    """Return the decorator of a function that is compiled once per machine.
+def _kept(function: Function, options: dict[str, Any]) -> Function:
+    """Return a function whose compilation is kept on disk, under a name that changes with any of its sources."""
+    if njit is None:
+        return function
+    version = _digest_of_module(function.__module__)
+    function.__qualname__ = f"{function.__qualname__}_{version}"
+    try:
+        return _compile(function, {**options, "cache": True})
+    except RuntimeError:  # neither beside its file nor in the user's cache may anything be written
+        return _compile(function, options)
 
-    Args:
-        makes_arrays: False for one that, as all that it calls, only works on the arrays that it is given.
-    """
+
+def kernel(makes_arrays: bool = True) -> Callable[[Function], Function]:
+    """Return the decorator; `makes_arrays` is False where it and all that it calls work on the arrays given to it."""
     options = _EXACT if makes_arrays else {**_EXACT, **_UNCOUNTED}
     return lambda function: _kept(function, options)
 
 
 def portable(function: Function) -> Function:
-    """Return a function that is compiled once per machine, and that divides as Python does."""
     return _kept(function, {})
-
-
-def _compile(function: Function, options: dict[str, Any]) -> Function:
-    made: Any = function if njit is None else njit(**options)(function)
-    return made
-
-
-def _kept(function: Function, options: dict[str, Any]) -> Function:
-    if njit is None:
-        return function
-    function.__qualname__ = f"{function.__qualname__}_{_version(function.__module__)}"
-    try:
-        made: Any = njit(**options, cache=True)(function)
-    except RuntimeError:  # neither beside its file nor in the user's cache may anything be written
-        made = njit(**options)(function)
-    return made
 
 
 def is_kept(function: Callable[..., Any]) -> bool:
@@ -137,8 +129,7 @@ def is_kept(function: Callable[..., Any]) -> bool:
 
 
 @cache
-def _version(module: str) -> str:
-    """Return what changes with the text of a module, or of one that it imports; asked when these are loaded."""
+def _digest_of_module(module: str) -> str:
     return digest(sources(module))
 
 
@@ -164,7 +155,7 @@ def _imported(module: str) -> tuple[str, ...]:
 
 
 def digest(files: Iterable[Path]) -> str:
-    """Return what changes with the text of any of the files, and not with the folders that they lie in."""
+    """Return a hash of the files' texts, whatever folders they lie in."""
     return hashlib.sha256(b"".join(sorted(map(_text, files)))).hexdigest()[:12]
 
 
@@ -192,10 +183,9 @@ if njit is not None:
             return tuple((name, types.unliteral(kind)) for name, kind in fields)
 
     class _CompiledHeld(structref.StructRefProxy):
-        """A Held of compiled code."""
+        """A Held of compiled code, whose type, read twice a call, is the slot behind the property of numba."""
 
         __slots__ = ()
-        # read twice a call: the slot behind numba's own, which is a property in Python
         _numba_type_: Any = structref.StructRefProxy.__dict__["_type"]
 
     structref.define_proxy(_CompiledHeld, _HeldType, ["content"])
@@ -249,5 +239,5 @@ def columns(name: str, fields: Iterable[Field]) -> Columns:
     """
     listed = tuple(fields)
     first = [0, *accumulate(field.width for field in listed)]
-    made: Any = namedtuple(name, [*(field.name for field in listed), "size"])  # type: ignore[misc]
-    return made(*first)
+    places: Any = namedtuple(name, [*(field.name for field in listed), "size"])  # type: ignore[misc]
+    return places(*first)

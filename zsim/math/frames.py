@@ -29,8 +29,8 @@ def geodetic_to_enu(geodetic: ArrayLike, origin: tuple[float, float, float]) -> 
 
 def geodetic_to_ecef(geodetic: ArrayLike) -> Array:
     """Return Earth-centred, Earth-fixed coordinates [m] of (latitude_deg, longitude_deg, height_m)."""
-    g = np.asarray(geodetic, dtype=float)
-    lat, lon, height = np.radians(g[..., 0]), np.radians(g[..., 1]), g[..., 2]
+    lat_deg, lon_deg, height = np.moveaxis(np.asarray(geodetic, dtype=float), -1, 0)
+    lat, lon = np.radians(lat_deg), np.radians(lon_deg)
     normal = WGS84_A_M / np.sqrt(1.0 - _E2 * np.sin(lat) ** 2)
     level = (normal + height) * np.cos(lat)
     up = (normal * (1.0 - _E2) + height) * np.sin(lat)
@@ -105,7 +105,6 @@ def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Array:
 
 
 def quaternion_conjugate(q: ArrayLike) -> Array:
-    """Return the inverse of unit quaternions."""
     return np.asarray(q, dtype=float) * np.array([1.0, -1.0, -1.0, -1.0])
 
 

@@ -1,8 +1,4 @@
-"""Random streams that do not know of each other.
-
-A stream belongs to a name such as "drone1/imu". Its seed is SeedSequence(seed, spawn_key = hash of the name),
-so that adding a drone or a sensor changes no other stream.
-"""
+"""Random streams by name, such as "drone1/imu": adding a drone or a sensor changes no other stream."""
 
 import hashlib
 
@@ -10,9 +6,9 @@ import numpy as np
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
-    """Return the generator of `name` for a scenario's seed.
+    """Return the generator with SeedSequence(seed, spawn_key = first 16 bytes of SHA-256(name)).
 
-    The key is the first 16 bytes of SHA-256(name): stable over processes and versions, unlike `hash()`.
+    That key is stable over processes and versions, unlike `hash()`.
     """
     digest = hashlib.sha256(name.encode()).digest()[:16]
     key = tuple(int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4))

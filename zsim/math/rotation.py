@@ -11,21 +11,18 @@ from zsim.math.compiled import inlined, portable
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
-
 LEVEL: Quaternion = (1.0, 0.0, 0.0, 0.0)  # no turn at all
-
 _SMALL_ANGLE = 1e-8  # rad; below it sin(x)/x is 1 to the last bit
+COSINE_MAX = 0.9995  # of half the angle between two attitudes; nearer ones are mixed, which errs by 1e-7 rad at most
 
 
 @inlined
 def add(a: Vector, b: Vector) -> Vector:
-    """Return a + b."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
 @inlined
 def subtract(a: Vector, b: Vector) -> Vector:
-    """Return a - b."""
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
 
 
@@ -43,19 +40,16 @@ def axpy(a: Vector, s: float, b: Vector) -> Vector:
 
 @inlined
 def cross(a: Vector, b: Vector) -> Vector:
-    """Return a × b."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 @inlined
 def dot(a: Vector, b: Vector) -> float:
-    """Return a · b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @inlined
 def norm(a: Vector) -> float:
-    """Return |a|."""
     return math.sqrt(dot(a, a))
 
 
@@ -92,7 +86,6 @@ def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
 
 @inlined
 def normalised(q: Quaternion) -> Quaternion:
-    """Return q / |q|."""
     s = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     return (q[0] * s, q[1] * s, q[2] * s, q[3] * s)
 
@@ -136,7 +129,6 @@ def forwards(q: Quaternion) -> tuple[float, float]:
 
 @inlined
 def about_z(angle: float) -> Quaternion:
-    """Return the quaternion of a turn about z."""
     return (math.cos(0.5 * angle), 0.0, 0.0, math.sin(0.5 * angle))
 
 
@@ -161,7 +153,6 @@ def wrapped(angle: float) -> float:
 
 @inlined
 def matrix(q: Quaternion) -> Matrix:
-    """Return R(q)."""
     w, x, y, z = q
     return (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
@@ -185,7 +176,6 @@ def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Matrix:
 
 @inlined
 def product(R: Matrix, a: Vector) -> Vector:
-    """Return R a."""
     return (dot(R[0], a), dot(R[1], a), dot(R[2], a))
 
 
@@ -197,7 +187,6 @@ def column(R: Matrix, k: int) -> Vector:
 
 @inlined
 def transposed(R: Matrix) -> Matrix:
-    """Return R^T, the inverse of a rotation."""
     return (column(R, 0), column(R, 1), column(R, 2))
 
 
@@ -210,11 +199,6 @@ def composed(A: Matrix, B: Matrix) -> Matrix:
         (dot(A[1], x), dot(A[1], y), dot(A[1], z)),
         (dot(A[2], x), dot(A[2], y), dot(A[2], z)),
     )
-
-
-# Poses between two instants at which position, velocity and attitude are known
-
-COSINE_MAX = 0.9995  # of half the angle between two attitudes; nearer ones are mixed, which errs by 1e-7 rad at most
 
 
 @portable
@@ -255,15 +239,7 @@ def attitude_between(s: float, q0: Quaternion, q1: Quaternion) -> Quaternion:
 
 @portable
 def pose_between(
-    t: float,
-    t0: float,
-    p0: Vector,
-    v0: Vector,
-    q0: Quaternion,
-    t1: float,
-    p1: Vector,
-    v1: Vector,
-    q1: Quaternion,
+    t: float, t0: float, p0: Vector, v0: Vector, q0: Quaternion, t1: float, p1: Vector, v1: Vector, q1: Quaternion
 ) -> tuple[Vector, Vector, Quaternion]:
     """Return position, velocity and attitude at an instant t in [t0, t1] [s]."""
     s = (t - t0) / (t1 - t0) if t1 > t0 else 1.0

@@ -34,25 +34,24 @@ class GateGap(Struct, frozen=True):
 class GateCount:
     """Counts the gates of a run by its clocks, in the order in which the world published them.
 
-    Args:
-        after: the clock after which counting begins; the start of the run by default.
-
-    Attributes:
-        gates: number of gates so far.
-        gaps: gaps so far.
-        ended: whether the clock has stopped.
+    `after`: the clock after which counting begins; the start of the run by default.
     """
 
     def __init__(self, after: run_messages.Clock | None = None) -> None:
-        self.gates = 0
-        self.gaps: list[GateGap] = []
-        self.ended = False
+        self.gates = 0  # number of gates so far
+        self.gaps: list[GateGap] = []  # gaps so far
+        self.ended = False  # whether the clock has stopped
         self._step, self._seq = (after.step, after.seq) if after else (-1, -1)
 
     def add(self, clock: run_messages.Clock) -> GateGap | None:
-        """Count the gate of a clock; return what is missing before it."""
-        gap = self.gap_before(clock)
-        if gap is not None:
+        """Count the gate of a clock; return the gates that are missing between the last one and this.
+
+        Nothing is missing before a clock with the next number, however far a replay has moved the time.
+        """
+        gap, missing = None, clock.step - self._step - 1
+        if missing > 0 and clock.seq != self._seq + 1:
+            gate_ns = clock.t_ns // clock.step
+            gap = GateGap(missing, clock.t_ns - missing * gate_ns, clock.t_ns - gate_ns)
             self.gaps.append(gap)
         self.gates += clock.step != self._step
         self.ended = clock.state == "stopped"
@@ -60,45 +59,22 @@ class GateCount:
         return gap
 
     def misses(self, clock: run_messages.Clock) -> bool:
-        """Tell whether a clock is missing before this one, of a gate or of a pause."""
         return clock.seq > self._seq + 1
-
-    def gap_before(self, clock: run_messages.Clock) -> GateGap | None:
-        """Return the gates that are missing between the clock that was added last and this one.
-
-        Nothing is missing before a clock with the next number, however far a replay has moved the time.
-        """
-        missing = clock.step - self._step - 1
-        if missing <= 0 or clock.seq == self._seq + 1:
-            return None
-        gate_ns = clock.t_ns // clock.step
-        return GateGap(missing, clock.t_ns - missing * gate_ns, clock.t_ns - gate_ns)
 
 
 class Completeness(Struct, frozen=True):
-    """What a record contains, and what is missing.
+    """What a record contains, and what is missing."""
 
-    Attributes:
-        gates: on record.
-        gaps: gates that are missing.
-        messages_missing: of the world, by their numbers; those of missing gates among them.
-        ended: the end of the run is on record.
-        closed: its writer has closed it; it was not cut.
-        last_ns: its last gate [ns].
-        damaged: what cannot be read of it, each with its place.
-    """
-
-    gates: int = 0
-    gaps: tuple[GateGap, ...] = ()
-    messages_missing: int = 0
-    ended: bool = True
-    closed: bool = True
-    last_ns: int = 0
-    damaged: tuple[str, ...] = ()
+    gates: int = 0  # on record
+    gaps: tuple[GateGap, ...] = ()  # gates that are missing
+    messages_missing: int = 0  # of the world, by their numbers; those of missing gates among them
+    ended: bool = True  # the end of the run is on record
+    closed: bool = True  # its writer has closed it; it was not cut
+    last_ns: int = 0  # its last gate [ns]
+    damaged: tuple[str, ...] = ()  # what cannot be read of it, each with its place
 
     @property
     def complete(self) -> bool:
-        """Tell whether nothing is missing."""
         return not self.faults()
 
     @property
@@ -106,7 +82,6 @@ class Completeness(Struct, frozen=True):
         return sum(gap.gates for gap in self.gaps)
 
     def faults(self) -> list[str]:
-        """Return what is missing, a text each; empty if the record is complete."""
         faults = []
         if self.gaps:
             of = self.gates + self.gates_missing
@@ -129,7 +104,6 @@ class _Numbered(Struct):
     seq: int
 
 
-_decode_numbered = msgspec.msgpack.Decoder(_Numbered).decode
 UNREAD = -1  # in place of a number that stands otherwise than our own encoder writes it
 _WIDTH = np.full(256, -1, dtype=np.int64)  # bytes of an unsigned integer behind its first byte, by that (MessagePack)
 _WIDTH[:0x80] = 0
@@ -167,13 +141,13 @@ class _Numbers:
     def __init__(self) -> None:
         self._channels: list[NDArray[np.int64]] = []
         self._numbers: list[NDArray[np.int64]] = []
+        self._decode = msgspec.msgpack.Decoder(_Numbered).decode
 
     def add(self, spans: MessageSpans, rows: NDArray[np.bool_]) -> None:
-        """Add the numbers of some messages of a chunk."""
         read = np.where(rows, sequence_numbers(spans), 0)
         for m in np.flatnonzero(read < 0).tolist():  # by another encoder, or garbage, which has no number
             with suppress(*messages.REFUSALS, OverflowError):
-                read[m] = _decode_numbered(spans.content[spans.start[m] : spans.end[m]]).seq
+                read[m] = self._decode(spans.content[spans.start[m] : spans.end[m]]).seq
         rows = rows & (read >= 0)
         self._channels.append(spans.channel[rows])
         self._numbers.append(read[rows])
@@ -193,19 +167,17 @@ class _Numbers:
 
 def completeness(
     reader: RecordReader,
-    keys_beside: Container[str] = (),
+    keys_beside: Container[str] = (),  # of messages that are wanted as well, which saves reading the record twice
+    # of messages of which the first in every simulated second and the last are wanted; there may be more
     keys_sampled: Container[str] = (),
+    # called with key and payload of each of these, in the order in which they were written
     take: Callable[[str, bytes], None] = lambda key, payload: None,
 ) -> Completeness:
-    """Return what is missing from a record; all of it is read, and every checksum compared.
-
-    Args:
-        keys_beside: of messages that are wanted as well, which saves reading the record twice.
-        keys_sampled: of messages of which the first in every simulated second and the last are wanted; there may be
-            more.
-        take: called with key and payload of each of these, in the order in which they were written.
-    """
-    info = _info(reader)
+    """Return what is missing from a record; all of it is read, and every checksum compared."""
+    info: messages.Info | None = None
+    with suppress(DecodeError):
+        info = messages.decode(keys.INFO, last.payload) if (last := reader.last(keys.INFO)) else None
+    # a replay has clocks of its own, and numbers of the run that it played
     is_replay = info is not None and bool(info.replay_of)
     external = {drone.name for drone in (info.drones if info else ()) if drone.body is not msgspec.UNSET}
     names = reader.channels()
@@ -250,22 +222,9 @@ def _one_each_second(spans: MessageSpans, channels: set[int]) -> NDArray[np.bool
 
 
 def record_completeness(path: Path) -> Completeness:
-    """Return what is missing from the record at a path.
-
-    Raises:
-        RecordError: there is none, or it cannot be read.
-    """
+    """Return what is missing from the record at a path; RecordError if there is none, or it cannot be read."""
     with RecordReader(path) as reader:
         return completeness(reader)
-
-
-def _info(reader: RecordReader) -> messages.Info | None:
-    """Return the `world/info` of a record: a replay has clocks of its own, and numbers of the run that it played."""
-    info = reader.last(keys.INFO)
-    try:
-        return messages.decode(keys.INFO, info.payload) if info else None
-    except DecodeError:
-        return None
 
 
 def _is_numbered(key: str, external: Container[str]) -> bool:

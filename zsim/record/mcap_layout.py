@@ -10,9 +10,10 @@ import struct
 import threading
 import zlib
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from io import BytesIO
 from mmap import mmap
+from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -57,21 +58,19 @@ PIECE_BYTES = 1 << 24  # of a file that are mapped at most while all of it is re
 Source = bytes | mmap
 Known = TypeVar("Known", Schema, Channel)
 
-_own = threading.local()  # zstandard's objects crash when two threads use one at a time
 _STANDARD = frozenset(range(Opcode.HEADER, Opcode.DATA_END + 1))
 _ANY_SIZE = frozenset({Opcode.MESSAGE, Opcode.ATTACHMENT})  # of other tools, outside of chunks
 
 
-def _compressor() -> zstandard.ZstdCompressor:
-    if not hasattr(_own, "compressor"):
-        _own.compressor = zstandard.ZstdCompressor(level=-1)
-    return _own.compressor
+class _Zstd(threading.local):
+    """Each thread has its own: zstandard's objects crash when two threads use one at a time."""
+
+    def __init__(self) -> None:
+        self.compress = zstandard.ZstdCompressor(level=-1).compress
+        self.decompress = zstandard.ZstdDecompressor().decompress
 
 
-def _decompressor() -> zstandard.ZstdDecompressor:
-    if not hasattr(_own, "decompressor"):
-        _own.decompressor = zstandard.ZstdDecompressor()
-    return _own.decompressor
+_zstd = _Zstd()
 
 
 class RecordSpan(NamedTuple):
@@ -114,23 +113,17 @@ class RecordGroup(NamedTuple):
 
 
 def opening() -> bytes:
-    """Return the bytes with which every record begins."""
     return MAGIC + packed(Header(profile="", library=f"{OURS.decode()}{__version__}"))
 
 
 def packed(record: McapRecord) -> bytes:
-    """Return a record as it stands in the file."""
     builder = RecordBuilder()
     record.write(builder)
     return builder.end()
 
 
 def unpacked(kind: type[Known], source: Source, place: RecordSpan) -> Known:
-    """Return the schema or channel at a place.
-
-    Raises:
-        RecordError: it is damaged.
-    """
+    """Return the schema or channel at a place; RecordError if it is damaged."""
     try:
         return kind.read(ReadDataStream(BytesIO(source[place.body : place.end])))
     except (struct.error, McapError, UnicodeDecodeError) as error:
@@ -165,43 +158,36 @@ def is_cut(source: Source, at: int) -> bool:
         return False
     if opcode not in LEAST:
         return opcode in _ANY_SIZE or length <= SMALL_MAX
-    return left < CUT_HEAD or length == _length_inside(source, RecordSpan(opcode, at, len(source)))
-
-
-def _length_inside(source: Source, place: RecordSpan) -> int | None:
-    """Return the length of a chunk or message index as it follows from the sizes inside it."""
-    if place.opcode == Opcode.MESSAGE_INDEX:
-        return INDEX_HEAD.size + INDEX_HEAD.unpack_from(source, place.body)[1]
+    if left < CUT_HEAD:
+        return True
+    place = RecordSpan(opcode, at, len(source))  # of a chunk or message index, whose length follows from sizes inside
+    if opcode == Opcode.MESSAGE_INDEX:
+        return length == INDEX_HEAD.size + INDEX_HEAD.unpack_from(source, place.body)[1]
     content = chunk_head(source, place).content
-    if content > len(source):
-        return None
-    return content - place.body + SIZE.unpack_from(source, content - SIZE.size)[0]
+    return content <= len(source) and length == content - place.body + SIZE.unpack_from(source, content - SIZE.size)[0]
 
 
 def groups(source: Source, found: Iterator[RecordSpan] | None = None) -> Iterator[RecordGroup]:
     """Yield schemas, channels and chunks of the data section in order.
 
-    Args:
-        found: the places of the records, if the caller iterates over them already.
+    `found`: the places of the records, if the caller iterates over them already.
     """
-    pending: list[RecordSpan] = []
+    last: RecordSpan | None = None  # whose message indexes may follow
+    indexes: list[Index] = []
+    end = 0
     for place in found or places(source):
         if place.opcode == Opcode.DATA_END:
             break
         if place.opcode == Opcode.MESSAGE_INDEX:
-            pending.append(place)
-            continue
-        yield from _group(source, pending)
-        pending = [place] if place.opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK) else []
-    yield from _group(source, pending)
-
-
-def _group(source: Source, pending: list[RecordSpan]) -> Iterator[RecordGroup]:
-    if pending:
-        place, *rest = pending
-        heads = ((INDEX_HEAD.unpack_from(source, index.body), index.start) for index in rest)
-        indexes = tuple(Index(channel, size // INDEX_ENTRY, start) for (channel, size), start in heads)
-        yield RecordGroup(place, indexes, pending[-1].end)
+            channel, size = INDEX_HEAD.unpack_from(source, place.body)
+            indexes.append(Index(channel, size // INDEX_ENTRY, place.start))
+        else:
+            if last is not None:
+                yield RecordGroup(last, tuple(indexes), end)
+            last, indexes = place if place.opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK) else None, []
+        end = place.end
+    if last is not None:
+        yield RecordGroup(last, tuple(indexes), end)
 
 
 def is_complete(source: Source) -> bool:
@@ -212,14 +198,13 @@ def is_complete(source: Source) -> bool:
 
 def chunk(content: bytes | memoryview, first_ns: int, last_ns: int) -> list[bytes]:
     """Return the parts of a chunk record that holds a run of message records, given their first and last log time."""
-    data = _compressor().compress(content)
+    data = _zstd.compress(content)
     head = CHUNK_HEAD.pack(first_ns, last_ns, len(content), zlib.crc32(content), len(ZSTD))
     length = len(head) + len(ZSTD) + SIZE.size + len(data)
     return [HEAD.pack(Opcode.CHUNK, length), head, ZSTD, SIZE.pack(len(data)), data]
 
 
 def chunk_head(source: Source, place: RecordSpan) -> ChunkHead:
-    """Return the head of the chunk at a place."""
     first, last, size, crc, name = CHUNK_HEAD.unpack_from(source, place.body)
     at = place.body + CHUNK_HEAD.size
     return ChunkHead(first, last, size, crc, source[at : at + name].decode("utf-8", "replace"), at + name + SIZE.size)
@@ -228,8 +213,7 @@ def chunk_head(source: Source, place: RecordSpan) -> ChunkHead:
 def content_of(source: Source, place: RecordSpan) -> bytes | None:
     """Return the message records inside the chunk at a place, None if it is damaged, or larger than any of ours.
 
-    Raises:
-        RecordError: compressed in a way that is not ours.
+    RecordError if compressed in a way that is not ours.
     """
     head = chunk_head(source, place)
     if head.content > place.end or head.size > CHUNK_MAX:
@@ -241,7 +225,7 @@ def content_of(source: Source, place: RecordSpan) -> bytes | None:
         try:
             if zstandard.frame_content_size(content) not in (SIZE_UNSTATED, head.size):
                 return None  # whatever limit is given, the frame's own size would be made room for
-            content = _decompressor().decompress(content, max_output_size=head.size)
+            content = _zstd.decompress(content, max_output_size=head.size)
         except (zstandard.ZstdError, MemoryError, OverflowError):  # the latter two of a damaged size
             return None
     unchecked = head.crc == 0 and not is_ours(source)  # MCAP has 0 where a tool computes none
@@ -249,7 +233,6 @@ def content_of(source: Source, place: RecordSpan) -> bytes | None:
 
 
 def crc_until(source: Source, end: int) -> int:
-    """Return the check sum of the first bytes of a file."""
     crc = 0
     for start in range(0, end, PIECE_BYTES):
         with memoryview(source) as whole, whole[start : min(end, start + PIECE_BYTES)] as piece:
@@ -288,9 +271,14 @@ def heads_at(content: bytes, places: NDArray[np.int64]) -> NDArray:
     return np.ndarray(max(0, len(content) - MESSAGE.size + 1), MESSAGE_HEAD, content, strides=(1,))[places]
 
 
-def packed_indexes(indexes: dict[int, list[int]]) -> Iterable[bytes]:
-    """Yield the message index records of a chunk."""
-    for channel, entries in indexes.items():
-        size = 8 * len(entries)
-        yield HEAD.pack(Opcode.MESSAGE_INDEX, INDEX_HEAD.size + size) + INDEX_HEAD.pack(channel, size)
-        yield struct.pack(f"<{len(entries)}Q", *entries)
+def index_record(channel: int, entries: bytes) -> bytes:
+    """Return a message index record; its entries are log times and places."""
+    size = len(entries)
+    return HEAD.pack(Opcode.MESSAGE_INDEX, INDEX_HEAD.size + size) + INDEX_HEAD.pack(channel, size) + entries
+
+
+def check_magic(source: Source, path: Path) -> None:
+    """Raise RecordError for what is not the beginning of an MCAP file."""
+    beginning = source[: len(MAGIC)]
+    if not MAGIC.startswith(beginning):
+        raise RecordError(f"{path}: begins with {beginning!r}; is no MCAP record")

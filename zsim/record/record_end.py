@@ -11,67 +11,49 @@ from io import FileIO
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
+import numpy as np
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Schema, Statistics, SummaryOffset
 
 from zsim.errors import RecordError
-from zsim.record.mcap_layout import (
-    MAGIC,
-    RecordSpan,
-    Source,
-    chunk_head,
-    content_of,
-    crc_until,
-    groups,
-    indexes_of,
-    is_complete,
-    opening,
-    packed,
-    packed_indexes,
-    places,
-    unpacked,
-)
+from zsim.record import mcap_layout as layout
 
 _FOOTER_CRC = struct.Struct("<BQQQ")  # the part of the footer that its check sum covers
 _FOOTER_LENGTH = 20
 
 
 def finish(file: FileIO) -> None:
-    """Write summary and footer at the end of a file opened for reading and writing, unbuffered.
-
-    Raises:
-        OSError: no room.
-    """
+    """Write summary and footer at the end of a file opened for reading and writing, unbuffered; OSError if no room."""
     with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
         summary = _summary(source)
-        data_end = packed(DataEnd(crc_until(source, len(source))))
+        data_end = layout.packed(DataEnd(layout.crc_until(source, len(source))))
     start = file.seek(0, 2) + len(data_end)
     at, offsets = start, b""
     for opcode, records in summary.items():
         if records:
-            offsets += packed(SummaryOffset(opcode, at, len(records)))
+            offsets += layout.packed(SummaryOffset(opcode, at, len(records)))
         at += len(records)
     body = b"".join(summary.values()) + offsets
     covered = _FOOTER_CRC.pack(Opcode.FOOTER, _FOOTER_LENGTH, start, at)
-    footer = packed(Footer(start, at, zlib.crc32(covered, zlib.crc32(body))))
-    write_all(file, data_end + body + footer + MAGIC)
+    footer = layout.packed(Footer(start, at, zlib.crc32(covered, zlib.crc32(body))))
+    write_all(file, data_end + body + footer + layout.MAGIC)
 
 
-def _summary(source: Source) -> dict[Opcode, bytes]:
+def _summary(source: layout.Source) -> dict[Opcode, bytes]:
     """Return the records of the summary of a data section, by their kind, in the order in which they stand there."""
     schemas, channels, chunks = RecordBuilder(), RecordBuilder(), RecordBuilder()
     numbers: Counter[Opcode] = Counter()
     messages: Counter[int] = Counter()
     first_ns, last_ns = 2**64 - 1, 0
-    for group in groups(source):
+    for group in layout.groups(source):
         place, opcode = group.place, Opcode(group.place.opcode)
         if opcode == Opcode.SCHEMA:
-            unpacked(Schema, source, place).write(schemas)
+            layout.unpacked(Schema, source, place).write(schemas)
         elif opcode == Opcode.CHANNEL:
-            unpacked(Channel, source, place).write(channels)
+            layout.unpacked(Channel, source, place).write(channels)
         else:
-            head = chunk_head(source, place)
+            head = layout.chunk_head(source, place)
             if head.content > place.end:
                 continue  # readers of the summary would be sent to what they cannot read
             for index in group.indexes:
@@ -103,19 +85,15 @@ def _summary(source: Source) -> dict[Opcode, bytes]:
     return {
         Opcode.SCHEMA: schemas.end(),
         Opcode.CHANNEL: channels.end(),
-        Opcode.STATISTICS: packed(statistics),
+        Opcode.STATISTICS: layout.packed(statistics),
         Opcode.CHUNK_INDEX: chunks.end(),
     }
 
 
 def finish_bare(file: FileIO) -> None:
-    """Write the shortest end that MCAP allows, 50 bytes without a summary.
-
-    Raises:
-        OSError: no room.
-    """
+    """Write the shortest end that MCAP allows, 50 bytes without a summary; OSError if there is no room."""
     file.seek(0, 2)
-    write_all(file, packed(DataEnd(0)) + packed(Footer(0, 0, 0)) + MAGIC)
+    write_all(file, layout.packed(DataEnd(0)) + layout.packed(Footer(0, 0, 0)) + layout.MAGIC)
 
 
 def write_all(file: FileIO, data: bytes) -> None:
@@ -139,7 +117,7 @@ def repair(path: str | Path) -> bool:
         with open(path, "r+b", buffering=0) as file:
             if file.seek(0, 2):
                 with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
-                    if is_complete(source):
+                    if layout.is_complete(source):
                         return False
             cut_off(file, path)
             finish(file)
@@ -149,45 +127,25 @@ def repair(path: str | Path) -> bool:
 
 
 def cut_off(file: FileIO, path: Path) -> None:
-    """Cut a record behind its last whole chunk, so that it can be continued from there.
+    """Cut a record behind its last whole chunk, or else its header, so that it can be continued from there.
 
-    Raises:
-        RecordError: no record.
-        OSError: it cannot be written.
+    RecordError if no record; OSError if it cannot be written.
     """
-    end, indexes = 0, b""
+    end, tail = 0, layout.opening()
     if file.seek(0, 2):
         with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
-            check_magic(source, path)
-            end, indexes = _last_whole(source)
+            layout.check_magic(source, path)
+            last: layout.RecordSpan | None = None
+            for place in layout.places(source):
+                if place.opcode == Opcode.DATA_END:
+                    break
+                if last is None or place.opcode == Opcode.CHUNK:
+                    last = place
+            if last is not None:  # the cut may have taken the indexes of its chunk
+                content = layout.content_of(source, last) if last.opcode == Opcode.CHUNK else None
+                found = layout.indexes_of(content or b"").items()
+                end = last.end
+                tail = b"".join(layout.index_record(channel, np.array(own, "<u8").tobytes()) for channel, own in found)
     file.truncate(end)
     file.seek(end)
-    write_all(file, indexes if end else opening())
-
-
-def _last_whole(source: Source) -> tuple[int, bytes]:
-    """Return where the last whole chunk ends, and its message indexes, which the cut may have taken.
-
-    A file cut before its first chunk ends after its header, and at 0 when even that is not whole.
-    """
-    last: RecordSpan | None = None
-    for place in places(source):
-        if place.opcode == Opcode.DATA_END:
-            break
-        if last is None or place.opcode == Opcode.CHUNK:
-            last = place
-    if last is None:
-        return 0, b""
-    content = content_of(source, last) if last.opcode == Opcode.CHUNK else None
-    return last.end, b"".join(packed_indexes(indexes_of(content or b"")))
-
-
-def check_magic(source: Source, path: Path) -> None:
-    """Refuse what is not the beginning of an MCAP file.
-
-    Raises:
-        RecordError: with what was found.
-    """
-    beginning = source[: len(MAGIC)]
-    if not MAGIC.startswith(beginning):
-        raise RecordError(f"{path}: begins with {beginning!r}; is no MCAP record")
+    write_all(file, tail)

@@ -14,30 +14,7 @@ from mcap.records import Channel
 from numpy.typing import NDArray
 
 from zsim.errors import RecordError
-from zsim.record.mcap_layout import (
-    HEAD,
-    INDEX_ENTRY,
-    INDEX_HEAD,
-    MAGIC,
-    MESSAGE,
-    PIECE_BYTES,
-    Index,
-    RecordGroup,
-    RecordSpan,
-    Source,
-    chunk_head,
-    content_of,
-    crc_until,
-    groups,
-    heads_at,
-    indexes_of,
-    is_complete,
-    is_cut,
-    places,
-    unmap,
-    unpacked,
-)
-from zsim.record.record_end import check_magic
+from zsim.record import mcap_layout as layout
 
 SHOWN = 3  # gaps, or damaged chunks, in one line; how many more there are is shown
 CRC = struct.Struct("<I")  # of all that stands before the data's end; MCAP has 0 where none was computed
@@ -64,11 +41,11 @@ class MessageSpans(NamedTuple):
 
 
 class _Chunk(NamedTuple):
-    place: RecordSpan
+    place: layout.RecordSpan
     first_ns: int
     last_ns: int
     channels: frozenset[int]
-    indexes: tuple[Index, ...]
+    indexes: tuple[layout.Index, ...]
 
 
 _Held = tuple[int, int, Recorded]  # simulated time, number of its chunk, message
@@ -77,8 +54,9 @@ _Held = tuple[int, int, Recorded]  # simulated time, number of its chunk, messag
 class RecordReader:
     """A record as it is on disk when it is opened; a writer may be appending to it.
 
+    Reading raises RecordError for chunks that another tool has compressed in a way that is not ours.
+
     Attributes:
-        complete: the record was closed, not cut.
         damaged: what was skipped so far, each with its place: chunks whose checksum differs, and, as one, everything
             behind an invalid length.
     """
@@ -86,18 +64,22 @@ class RecordReader:
     def __init__(self, path: str | Path) -> None:
         """Open a record and look through its chunks, without decompressing them.
 
-        Raises:
-            RecordError: no such file, no MCAP file, or the name of a channel is damaged.
+        RecordError if no such file, no MCAP file, or the name of a channel is damaged.
         """
         self.path = Path(path)
         self._counts: Counter[int] = Counter()
-        self._source = _mapped(self.path)
-        check_magic(self._source, self.path)
-        self.complete = is_complete(self._source)
+        try:
+            with open(path, "rb") as file:
+                empty = not self.path.stat().st_size
+                self._source: layout.Source = b"" if empty else mmap(file.fileno(), 0, access=ACCESS_READ)
+        except OSError as error:
+            raise RecordError(f"{path}: cannot be read ({error.strerror})") from error
+        layout.check_magic(self._source, self.path)
+        self.complete = layout.is_complete(self._source)  # the record was closed, not cut
         self._keys: dict[int, str] = {}
-        self._data_end: RecordSpan | None = None
+        self._data_end: layout.RecordSpan | None = None
         self._rest: int | None = None  # from where on nothing can be read, if so
-        self._damaged: set[RecordSpan] = set()  # chunks
+        self._damaged: set[layout.RecordSpan] = set()  # chunks
         self._chunks = list(self._scan())
 
     def topics(self) -> dict[str, int]:
@@ -114,9 +96,6 @@ class RecordReader:
             by_time: in order of simulated time, messages of one time as they were written; otherwise all as
                 they were written. In memory are the chunks that overlap in time, and stragglers one by one.
             from_ns: chunks with older messages only are skipped; a chunk spans a quarter of a wall second.
-
-        Raises:
-            RecordError: compressed by another tool in a way that is not ours.
         """
         wanted = {number: key for number, key in self._keys.items() if keys is None or key in keys}
         late = (chunk for chunk in self._chunks if chunk.last_ns >= from_ns)
@@ -127,47 +106,44 @@ class RecordReader:
         return self.messages()
 
     def channels(self) -> dict[int, str]:
-        """Return the key of each channel, by its number."""
         return dict(self._keys)
 
     def spans(self, wanted: Collection[int]) -> Iterator[MessageSpans]:
-        """Yield where the payloads of some channels are, a chunk at a time: for reading many messages as arrays.
-
-        Raises:
-            RecordError: compressed by another tool in a way that is not ours.
-        """
+        """Yield where the payloads of some channels are, a chunk at a time: for reading many messages as arrays."""
         mapped = 0
         for chunk in self._chunks:
             if chunk.channels.isdisjoint(wanted):
                 continue
-            content = content_of(self._source, chunk.place)
+            content = layout.content_of(self._source, chunk.place)
             if content is None:
                 self._damaged.add(chunk.place)
                 continue
             channel, places = self._indexed(chunk, content)
             mapped += chunk.place.end - chunk.place.start
-            if mapped > PIECE_BYTES:
-                unmap(self._source)
+            if mapped > layout.PIECE_BYTES:
+                layout.unmap(self._source)
                 mapped = 0
             rows = np.isin(channel, list(wanted))
             starts = places[rows]
-            heads = heads_at(content, starts)
-            ends = starts + HEAD.size + heads["length"].astype(np.int64)
-            yield MessageSpans(content, channel[rows], starts + MESSAGE.size, ends, heads["log_time"].astype(np.int64))
+            heads = layout.heads_at(content, starts)
+            ends = starts + layout.HEAD.size + heads["length"].astype(np.int64)
+            times = heads["log_time"].astype(np.int64)
+            yield MessageSpans(content, channel[rows], starts + layout.MESSAGE.size, ends, times)
 
     def _indexed(self, chunk: _Chunk, content: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return channel and place of every message of a chunk: by its indexes, if they lead to all of its content."""
-        at = [(index.start + HEAD.size + INDEX_HEAD.size, INDEX_ENTRY * index.messages) for index in chunk.indexes]
+        head = layout.HEAD.size + layout.INDEX_HEAD.size
+        at = [(index.start + head, layout.INDEX_ENTRY * index.messages) for index in chunk.indexes]
         data = b"".join([self._source[start : start + size] for start, size in at])
         if data and len(data) == sum(size for _, size in at):  # a damaged size may lead beyond the end of the file
             places = np.frombuffer(data, "<u8")[1::2].astype(np.int64)
             channel = np.repeat([index.channel for index in chunk.indexes], [index.messages for index in chunk.indexes])
-            if places.min() >= 0 and places.max() <= len(content) - MESSAGE.size:
-                heads = heads_at(content, places)
-                is_whole = int(heads["length"].sum()) + HEAD.size * len(places) == len(content)
+            if places.min() >= 0 and places.max() <= len(content) - layout.MESSAGE.size:
+                heads = layout.heads_at(content, places)
+                is_whole = int(heads["length"].sum()) + layout.HEAD.size * len(places) == len(content)
                 if is_whole and (heads["opcode"] == Opcode.MESSAGE).all() and (heads["channel"] == channel).all():
                     return channel.astype(np.int64), places
-        found = indexes_of(content)
+        found = layout.indexes_of(content)
         channel = np.repeat(list(found), [len(each) // 2 for each in found.values()])
         places = [place for each in found.values() for place in each[1::2]]
         return channel.astype(np.int64), np.array(places, dtype=np.int64)
@@ -175,10 +151,9 @@ class RecordReader:
     @property
     def damaged(self) -> tuple[str, ...]:
         """Return the damage found so far; everything behind unreadable records is one entry."""
-        heads = [(place.start, chunk_head(self._source, place)) for place in sorted(self._damaged)]
-        chunks = [
-            f"the chunk at byte {at}, {head.first_ns / 1e9:.2f} to {head.last_ns / 1e9:.2f} s" for at, head in heads
-        ]
+        heads = [(place.start, layout.chunk_head(self._source, place)) for place in sorted(self._damaged)]
+        span = "the chunk at byte {}, {:.2f} to {:.2f} s"
+        chunks = [span.format(at, head.first_ns / 1e9, head.last_ns / 1e9) for at, head in heads]
         return tuple(chunks if self._rest is None else [*chunks, f"everything from byte {self._rest} on"])
 
     def differs(self) -> bool:
@@ -189,7 +164,7 @@ class RecordReader:
         if not self.complete or self._data_end is None:
             return False
         stated = CRC.unpack_from(self._source, self._data_end.body)[0]
-        return stated not in (0, crc_until(self._source, self._data_end.start))
+        return stated not in (0, layout.crc_until(self._source, self._data_end.start))
 
     def last(self, key: str) -> Recorded | None:
         """Return the message of a key that was written last, None if there is none."""
@@ -202,8 +177,7 @@ class RecordReader:
     def last_chunk(self, key: str, is_it: Callable[[bytes], bool]) -> tuple[int, list[Recorded]] | None:
         """Return where the chunk with the last message of a key begins, and what stands in it before that message.
 
-        Args:
-            is_it: tells by the payload whether it is the wanted one.
+        `is_it`: tells by the payload whether it is the wanted one.
         """
         channels = {number for number, name in self._keys.items() if name == key}
         for chunk in reversed([chunk for chunk in self._chunks if not chunk.channels.isdisjoint(channels)]):
@@ -214,7 +188,6 @@ class RecordReader:
         return None
 
     def close(self) -> None:
-        """Close the file."""
         if isinstance(self._source, mmap):
             self._source.close()
 
@@ -224,56 +197,58 @@ class RecordReader:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _places(self) -> Iterator[RecordSpan]:
+    def _places(self) -> Iterator[layout.RecordSpan]:
         """Yield all records, and note the channels, which may be in the summary only, and where the data ends."""
-        opcode, end = 0, len(MAGIC)
-        for place in places(self._source):
+        opcode, end = 0, len(layout.MAGIC)
+        for place in layout.places(self._source):
             opcode, end = place.opcode, place.end
             if opcode == Opcode.CHANNEL:
-                channel = unpacked(Channel, self._source, place)
+                channel = layout.unpacked(Channel, self._source, place)
                 self._keys[channel.id] = channel.topic
             elif opcode == Opcode.DATA_END:
                 self._data_end = self._data_end or place
             yield place
-        if opcode != Opcode.FOOTER and (self.complete or not is_cut(self._source, end)):
+        if opcode != Opcode.FOOTER and (self.complete or not layout.is_cut(self._source, end)):
             self._rest = end
 
     def _scan(self) -> Iterator[_Chunk]:
         known: dict[frozenset[int], frozenset[int]] = {}  # most chunks hold the same channels
         found = self._places()
-        chunk_groups = [group for group in groups(self._source, found) if group.place.opcode == Opcode.CHUNK]
+        chunk_groups = [group for group in layout.groups(self._source, found) if group.place.opcode == Opcode.CHUNK]
         for _ in found:  # of the summary
             continue
-        for group in chunk_groups:
-            cut = group is chunk_groups[-1] and not self.complete
-            counts = self._counted(group) if cut else {index.channel: index.messages for index in group.indexes}
+        for place, indexes, _ in chunk_groups:
+            counts = {index.channel: index.messages for index in indexes}
+            if place is chunk_groups[-1].place and not self.complete:  # its indexes may have been cut
+                content = layout.content_of(self._source, place)
+                if content is None:
+                    self._damaged.add(place)
+                counts = {channel: len(entries) // 2 for channel, entries in layout.indexes_of(content or b"").items()}
+                indexes = ()
             self._counts.update(counts)
-            channels = frozenset(counts)
-            head = chunk_head(self._source, group.place)
-            known_channels = known.setdefault(channels, channels)
-            yield _Chunk(group.place, head.first_ns, head.last_ns, known_channels, () if cut else group.indexes)
-
-    def _counted(self, group: RecordGroup) -> dict[int, int]:
-        """Return the messages per channel of a chunk whose message indexes may have been cut."""
-        content = content_of(self._source, group.place)
-        if content is None:
-            self._damaged.add(group.place)
-        return {channel: len(entries) // 2 for channel, entries in indexes_of(content or b"").items()}
+            head, channels = layout.chunk_head(self._source, place), frozenset(counts)
+            yield _Chunk(place, head.first_ns, head.last_ns, known.setdefault(channels, channels), indexes)
 
     def _as_written(self, chunks: list[_Chunk], wanted: dict[int, str]) -> Iterator[Recorded]:
         for chunk in chunks:
-            content = content_of(self._source, chunk.place)
+            content = layout.content_of(self._source, chunk.place)
             if content is None:
                 self._damaged.add(chunk.place)
                 continue
-            if chunk.channels <= wanted.keys():
-                yield from _recorded(content, wanted)
+            unpack, payload, head = layout.MESSAGE.unpack_from, layout.MESSAGE.size, layout.HEAD.size
+            if chunk.channels <= wanted.keys():  # without its indexes
+                at, end = 0, len(content) - payload
+                while at <= end:
+                    opcode, length, number, _, t_ns, wall_ns = unpack(content, at)
+                    after = at + head + length
+                    if number in wanted and opcode == Opcode.MESSAGE:
+                        yield Recorded(wanted[number], content[at + payload : after], t_ns, wall_ns)
+                    at = after
                 continue
             channel, places = self._indexed(chunk, content)
             for at in np.sort(places[np.isin(channel, list(wanted))]).tolist():
-                _, length, number, _, t_ns, wall_ns = MESSAGE.unpack_from(content, at)
-                payload = content[at + MESSAGE.size : at + HEAD.size + length]
-                yield Recorded(wanted[number], payload, t_ns, wall_ns)
+                _, length, number, _, t_ns, wall_ns = unpack(content, at)
+                yield Recorded(wanted[number], content[at + payload : at + head + length], t_ns, wall_ns)
 
     def _by_time(self, chunks: list[_Chunk], wanted: dict[int, str]) -> Iterator[Recorded]:
         """Yield by time, holding no more chunks in memory than overlap in time, and stragglers."""
@@ -303,40 +278,13 @@ class RecordReader:
             if chunk.first_ns >= chunks[number - 1].last_ns - OVERLAP_NS:
                 continue
             entries = [(m.t_ns, number, m) for m in self._as_written([chunk], wanted)]
-            floor_ns = _floor_ns([t_ns for t_ns, _, _ in entries])
+            floor_ns = 0  # before most of its times, robust against a few outliers on either side
+            if times := sorted(t_ns for t_ns, _, _ in entries):
+                middle, late = times[len(times) // 2], times[3 * len(times) // 4]
+                floor_ns = middle - 3 * (late - middle) - OVERLAP_NS  # evenly spread, 2 (late - middle) do
             strays += (each for each in entries if each[0] < floor_ns)
             floors[number] = min((t_ns for t_ns, _, _ in entries if t_ns >= floor_ns), default=chunk.first_ns)
         return strays, floors
-
-
-def _recorded(content: bytes, wanted: dict[int, str]) -> Iterator[Recorded]:
-    """Yield the messages of a chunk's content."""
-    at, end = 0, len(content) - MESSAGE.size
-    unpack, payload, head = MESSAGE.unpack_from, MESSAGE.size, HEAD.size
-    while at <= end:
-        opcode, length, channel, _, t_ns, wall_ns = unpack(content, at)
-        after = at + head + length
-        if channel in wanted and opcode == Opcode.MESSAGE:
-            yield Recorded(wanted[channel], content[at + payload : after], t_ns, wall_ns)
-        at = after
-
-
-def _floor_ns(times: list[int]) -> int:
-    """Return a time before most of some times, robust against a few outliers on either side."""
-    if not times:
-        return 0
-    ordered = sorted(times)
-    middle, late = ordered[len(times) // 2], ordered[3 * len(times) // 4]
-    return middle - 3 * (late - middle) - OVERLAP_NS  # evenly spread, they begin at middle - 2 (late - middle)
-
-
-def _mapped(path: Path) -> Source:
-    """Return the bytes of a file without reading them yet."""
-    try:
-        with open(path, "rb") as file:
-            return mmap(file.fileno(), 0, access=ACCESS_READ) if path.stat().st_size else b""
-    except OSError as error:
-        raise RecordError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 def record_notes(reader: RecordReader) -> list[str]:
@@ -350,6 +298,5 @@ def record_notes(reader: RecordReader) -> list[str]:
 
 
 def shown(texts: Sequence[str]) -> str:
-    """Return the first few of many texts, and the number of the rest."""
     more = len(texts) - SHOWN
     return ", ".join(texts[:SHOWN]) + (f" and {more} more" if more > 0 else "")

@@ -37,12 +37,7 @@ CHUNK_BYTES = 1024 * 1024  # not yet on disk at most, besides the last message
 CHUNK_AGE_NS = 250_000_000  # wall time; with a tick every 0.1 s nothing waits longer than 0.5 s
 CHANNELS_MAX = 65_535  # MCAP counts channels in 16 bits
 _TIME_MAX = 2**64 - 1
-_MEDIA = {
-    "": "msgpack",
-    "application/msgpack": "msgpack",
-    "application/json": "json",
-    "text/json": "json",
-}  # MCAP's names
+_MEDIA = {"": "msgpack", "application/msgpack": "msgpack", "application/json": "json", "text/json": "json"}  # in MCAP
 _encode = messages.encode
 
 
@@ -50,22 +45,18 @@ class RecordWriter:
     """Appends messages to a record; for one thread.
 
     The file is readable at any moment, whatever happens to this process: a chunk and its indexes are one write. Memory
-    holds the open chunk and the names of the keys, however long the run.
-
-    Attributes:
-        has_former: whether the file had messages of a former writer.
-        refused: messages on keys beyond the 65 535 that a record can hold.
+    holds the open chunk and the names of the keys, however long the run. When the disk is full or gone, every method
+    raises RecordError; the file was closed at its last whole chunk.
     """
 
     def __init__(self, path: str | Path, goes_on: bool = False) -> None:
         """Create the file, or continue one whose writer died behind its last whole chunk; none is overwritten.
 
-        Raises:
-            RecordError: the file exists, cannot be continued, or cannot be written.
+        RecordError if the file exists, cannot be continued, or cannot be written.
         """
         self.path = Path(path)
-        self.has_former = False
-        self.refused = 0
+        self.has_former = False  # whether the file had messages of a former writer
+        self.refused = 0  # messages on keys beyond the 65 535 that a record can hold
         self._channels: dict[str, int] = {}  # by key, counted from 1
         self._gate_channels = PerPattern(self._channels_of)
         self._schemas: dict[str, int] = {}
@@ -115,9 +106,6 @@ class RecordWriter:
             encoding: Zenoh's, e.g. `application/msgpack;Truth`; the first one of a key holds for all of it.
             t_ns: simulated time.
             wall_ns: wall clock of the recorder.
-
-        Raises:
-            RecordError: the disk is full or gone; the file was closed at its last whole chunk.
         """
         channel = self._channels.get(key) or self._register(key, encoding)
         if not channel:
@@ -127,11 +115,7 @@ class RecordWriter:
         self._end_if_full(wall_ns)
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
-        """Take one message of this process, encoded as for the wire.
-
-        Raises:
-            RecordError: as `add`.
-        """
+        """Take one message of this process, encoded as for the wire."""
         channel = self._channels.get(key) or self._register(key, messages.encoding(key))
         if not channel:
             self.refused += 1
@@ -141,11 +125,7 @@ class RecordWriter:
             self._end_chunk()
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
-        """Take the messages of a gate, whose columns have been checked.
-
-        Raises:
-            RecordError: as `add`.
-        """
+        """Take the messages of a gate, whose columns have been checked."""
         channels = self._gate_channels.of(gate)
         if channels:
             self._open.add_gate(channels, gate, wall_ns)
@@ -155,7 +135,6 @@ class RecordWriter:
             self.add(key, payload, messages.encoding(key), t_ns, wall_ns)
 
     def _end_if_full(self, wall_ns: int) -> None:
-        """End the open chunk if it is large or old."""
         if self._open.size >= CHUNK_BYTES or wall_ns - self._open.since_ns >= CHUNK_AGE_NS:
             self._end_chunk()
 
@@ -166,14 +145,7 @@ class RecordWriter:
         return np.array(channels, dtype=np.int64).tobytes() if all(channels) else b""
 
     def tick(self, wall_ns: int) -> None:
-        """Put the open chunk on disk when it is old; call it every 0.1 s, also while nothing arrives.
-
-        Args:
-            wall_ns: a monotonic clock; only its own earlier values are compared with it.
-
-        Raises:
-            RecordError: as `add`.
-        """
+        """Put the open chunk on disk when it is old; call it every 0.1 s of a monotonic clock, always."""
         end, since_ns = self._seen
         if not self._open.size or end != self._end:
             self._seen = (self._end if self._open.size else 0, wall_ns)
@@ -181,24 +153,18 @@ class RecordWriter:
             self._end_chunk()
 
     def flush(self) -> None:
-        """Put everything taken so far on disk.
-
-        Raises:
-            RecordError: as `add`.
-        """
         if self._open.size:
             self._end_chunk()
 
     def close(self) -> None:
-        """Finish the file; closing twice does nothing.
-
-        Raises:
-            RecordError: as `add`.
-        """
+        """Finish the file; closing twice does nothing."""
         if self._file.closed:
             return
         self.flush()
-        self._guarded(lambda: finish(self._file))
+        try:
+            finish(self._file)
+        except OSError as error:
+            self._give_up(error)
         self._file.close()
 
     def __enter__(self) -> "RecordWriter":
@@ -237,14 +203,11 @@ class RecordWriter:
         self._ahead.clear()
 
     def _append(self, data: bytes) -> None:
-        self._guarded(lambda: write_all(self._file, data))
-        self._end += len(data)
-
-    def _guarded(self, write: Callable[[], None]) -> None:
         try:
-            write()
+            write_all(self._file, data)
         except OSError as error:
             self._give_up(error)
+        self._end += len(data)
 
     def _give_up(self, error: OSError) -> NoReturn:
         """Close the file at its last whole chunk, with as much of a summary as there is room for."""
@@ -324,7 +287,6 @@ class OpenChunk:
         self._log, self._published = array("Q"), array("Q")
 
     def add(self, channel: int, payload: bytes, t_ns: int, wall_ns: int) -> None:
-        """Take one message; its times are such as MCAP can hold."""
         start = self.size + MESSAGE.size
         if start == MESSAGE.size:
             self.since_ns = wall_ns
@@ -340,8 +302,7 @@ class OpenChunk:
     def add_gate(self, channels: bytes, gate: GateMessages, wall_ns: int) -> None:
         """Take the messages of a gate, in whose buffer there is room before each for its head.
 
-        Args:
-            channels: number of each message's, int64.
+        `channels`: number of each message's, int64.
         """
         if not self.size:
             self.since_ns = wall_ns
@@ -379,8 +340,7 @@ class Content:
     def write_heads(self, counted: NDArray) -> NDArray:
         """Write the head of each message; return how many messages each channel has had by now.
 
-        Args:
-            counted: messages that channels have had before.
+        `counted`: messages that channels have had before.
         """
         heads = np.empty(len(self._ends), dtype=MESSAGE_HEAD)
         heads["opcode"], heads["channel"] = int(Opcode.MESSAGE), self._channels
@@ -395,7 +355,6 @@ class Content:
         return before + came
 
     def indexes(self) -> Iterator[bytes]:
-        """Yield the message index records."""
         places = self._starts[self._order].astype("Q")
         entries = np.column_stack((self._log[self._order], places)).astype("<u8").tobytes()
         came = np.bincount(self._channels)
@@ -415,7 +374,6 @@ def cut_at_last(path: Path, key: str, is_it: Callable[[bytes], bool]) -> bool:
     """Cut a record before the last message of a key, so that its run can be resumed; return whether there was one.
 
     Args:
-        key: of the message.
         is_it: tells by the payload whether it is the wanted one.
 
     Raises:

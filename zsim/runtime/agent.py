@@ -3,14 +3,8 @@
     runner ──receive(key, message)──▶ agent          every input of a gate, in canonical order
     runner ──step(t_ns)────────────▶ agent ──▶ [(key, message), …]
 
-Two runners drive it: `zsim.runtime.runner` as a process on Zenoh, `zsim.runtime.bus` on an in-memory bus. Both hand
-over the same inputs in the same order, so that the outputs are the same to the bit.
-
-The world's messages about its drones arrive as one GateMessages: `deliver` takes it apart, except for an agent that
-reads it as arrays (`takes_gates`, `receive_gate`).
-
-An `AgentGroup` is several agents that share a process, its name, its join and its done. A process costs more than the
-agents in it; three estimators and a controller in one are about twice as fast.
+`zsim.runtime.runner` drives it as a process on Zenoh, `zsim.runtime.bus` on an in-memory bus. Both hand over the same
+inputs in the same order, so that the outputs are the same to the bit.
 """
 
 from abc import ABC, abstractmethod
@@ -42,36 +36,26 @@ class Output(NamedTuple):
 
 
 class Agent(ABC):
-    """Base class of everything that takes part in the lockstep.
+    """Base class of everything that takes part in the lockstep."""
 
-    Attributes:
-        name: process name `role.thing`, e.g. `estimator.drone1`.
-        period_ns: how often it publishes done; a multiple of the gate.
-        reads: key expressions it subscribes to.
-        gate_keys: keys of which one message stamped t closes the gate t, e.g. the drone's sensor/status.
-        counted: drones of which it reads all sensors, so that what their status counts is waited for.
-        uncounted: keys whose messages belong to no gate: a late one is handed over with the next gate.
-        writes: keys that it publishes at every gate and that others of its process may read.
-        serves: names of processes whose work it does beside its own.
-        takes_gates: whether it takes the world's messages of a gate as columns and one buffer, in `receive_gate`.
-        repeats: keys of its outputs that carry the requests that it took, for `repeat`.
-    """
-
-    name: str
-    period_ns: int
-    reads: tuple[str, ...]
-    gate_keys: tuple[str, ...]
+    name: str  # process name `role.thing`, e.g. `estimator.drone1`
+    period_ns: int  # how often it publishes done; a multiple of the gate
+    reads: tuple[str, ...]  # key expressions it subscribes to
+    gate_keys: tuple[str, ...]  # keys of which one message stamped t closes the gate t, e.g. the drone's sensor/status
+    # drones of which it reads all sensors, so that what their status counts is waited for
     counted: tuple[str, ...] = ()
+    # keys whose messages belong to no gate: a late one is handed over with the next gate
     uncounted: tuple[str, ...] = ()
-    writes: tuple[str, ...] = ()
-    serves: tuple[str, ...] = ()
+    writes: tuple[str, ...] = ()  # keys that it publishes at every gate and that others of its process may read
+    serves: tuple[str, ...] = ()  # names of processes whose work it does beside its own
+    # whether it takes the world's messages of a gate as columns and one buffer, in `receive_gate`
     takes_gates: bool = False
-    repeats: tuple[str, ...] = ()
+    repeats: tuple[str, ...] = ()  # keys of its outputs that carry the requests that it took, for `repeat`
     _links: LinkFaults | None = None
 
     def __init__(self) -> None:
         self._seq: defaultdict[str, int] = defaultdict(int)
-        self._process = ""
+        self._process = ""  # of the group that it is a member of, under whose name it publishes
 
     @property
     def role(self) -> str:
@@ -79,17 +63,13 @@ class Agent(ABC):
 
     @property
     def source(self) -> str:
-        """Name of the process that publishes its outputs: its own, unless it shares one."""
+        """Name of the process that publishes its outputs: its own, unless it is in a group."""
         return self._process or self.name
 
     @property
     def overhears(self) -> bool:
         """Tell whether it may read outputs of others that close none of its gates."""
         return any(not keys.is_sensor(key) and key not in self.gate_keys for key in self.reads)
-
-    def share_process(self, process: str) -> None:
-        """Publish under the name of a group's process, which also takes gates apart where its members need that."""
-        self._process = process
 
     def update_faults(self, info: Info, faults: Faults) -> None:
         """Take the faults injected into the run; called before the first gate in which one of them acts."""
@@ -127,28 +107,21 @@ class Agent(ABC):
         return plugin.is_own(type(self))
 
     def _checked(self, output: Output) -> Output:
-        """Return an output of a user's class as it would be received."""
+        """Return an output of a user's class as it would be received, with this process as its sender."""
         key, message = output
         try:
             kind = messages.output_type(key)
             if type(message) is not kind:
                 raise DecodeError(f"{key}: message is a {type(message).__name__}; must be a {kind.__name__}")
-            sent = messages.decode(key, messages.encode(message))
-            return Output(key, self._signed(key, sent))
+            sent = messages.decode(key, encode(message))
+            field = "controller" if isinstance(sent, ClusterRequest) else "source"
+            sender = getattr(sent, field)
+            if sender not in ("", self.source):
+                allowed = f"must be {self.source!r}, the agent's own name, or empty"
+                raise DecodeError(f"{key}: {field} is {sender!r}; {allowed}")
+            return Output(key, replace(sent, **{field: self.source}))
         except (DecodeError, *messages.REFUSALS) as error:
             raise UserCodeError(f"{plugin.full_name(type(self))}.step returns {error}") from error
-
-    def _signed(self, key: str, message: Any) -> Struct:
-        """Return a message with this process as its sender, by which the world counts it.
-
-        Raises:
-            DecodeError: it names another one.
-        """
-        field = "controller" if isinstance(message, ClusterRequest) else "source"
-        sender = getattr(message, field)
-        if sender not in ("", self.source):
-            raise DecodeError(f"{key}: {field} is {sender!r}; must be {self.source!r}, the agent's own name, or empty")
-        return replace(message, **{field: self.source})
 
     def deliver(self, t_ns: int, inputs: Sequence[Input]) -> None:
         """Take the inputs of a gate in canonical order, as far as faults of the links bring them."""
@@ -192,7 +165,6 @@ class Agent(ABC):
         return
 
     def control_keys(self) -> tuple[str, ...]:
-        """Return the keys on which it answers requests."""
         return ()
 
     def control(self, key: str, request: ControlRequest) -> ControlAnswer:
@@ -200,7 +172,6 @@ class Agent(ABC):
         return ControlAnswer(ok=False, error=f"{key}: {self.name} answers no requests")
 
     def warm_start_keys(self) -> tuple[str, ...]:
-        """Return the keys whose last values a restarted process takes over before anything else."""
         return ()
 
     def warm_start(self, key: str, message: Any) -> None:  # noqa: B027 - taking over nothing is a choice
@@ -246,9 +217,11 @@ class Agent(ABC):
 
 
 class AgentGroup(Agent):
-    """Steps its members at each gate, one after the other.
+    """Several agents that share a process, its name, its join and its done; steps them one after the other.
 
         AgentGroup([estimators, controller], output_hold_ns(info))     sensors in, estimates and commands out
+
+    A process costs more than the agents in it; three estimators and a controller in one are about twice as fast.
 
     A member receives each message at the gate at which a process of its own would: outputs of others on keys that
     close its gate (`writes` of theirs, `gate_keys` of its own) at once, all others as the transport brings them back to
@@ -265,7 +238,6 @@ class AgentGroup(Agent):
 
     def __init__(self, members: Sequence[Agent], hold_ns: int) -> None:
         super().__init__()
-        _check(members)
         self._members = _in_order(members)
         self._hold_ns = hold_ns
         last = members[-1]
@@ -288,11 +260,11 @@ class AgentGroup(Agent):
         self._places: dict[str, list[tuple[int, int]]] = {}  # by key, which members receive it, how long after [ns]
         self._relays = {key: [i for i, closing in enumerate(self._closing) if key in closing] for key in inner}
         self._whole = [place for place, member in enumerate(self._members) if member.takes_gates]
-        of_single = [() if member.takes_gates else member.reads for member in self._members]
-        self._gates = GateRouter(RoutingTable(of_single))
+        readers = [() if member.takes_gates else member.reads for member in self._members]
+        self._gates = GateRouter(RoutingTable(readers))
         self.takes_gates = True  # and takes them apart for its members that do not
         for member in members:
-            member.share_process(self.name)
+            member._process = self.name
 
     def update_faults(self, info: Info, faults: Faults) -> None:
         for member in self._members:  # each has links of its own
@@ -300,25 +272,18 @@ class AgentGroup(Agent):
 
     def receive(self, key: str, message: Any) -> None:
         places = self._places.get(key)
-        for place, hold_ns in self._find_places(key) if places is None else places:
+        if places is None:
+            places = self._places[key] = []
+            for place in self._routes.readers(key):
+                closing = self._closing[place]  # what closes the gate of one member may be read by another only
+                if key not in self._inner & closing:  # else it has been relayed
+                    held = is_held(key, closing, self._members[place].uncounted)
+                    places.append((place, self._hold_ns if held else 0))
+        for place, hold_ns in places:
             if hold_ns:
                 self._held.append((message.t_ns + hold_ns, place, (key, message)))
             else:
                 self._waiting[place].append((key, message))
-
-    def _find_places(self, key: str) -> list[tuple[int, int]]:
-        """Return which members receive a key from the transport, and how long after its stamp.
-
-        A key that closes the gate of one member may be one that another only reads.
-        """
-        found = []
-        for place in self._routes.readers(key):
-            closing = self._closing[place]
-            if key not in self._inner & closing:  # else it has been relayed
-                held = is_held(key, closing, self._members[place].uncounted)
-                found.append((place, self._hold_ns if held else 0))
-        self._places[key] = found
-        return found
 
     def receive_gate(self, gate: GateMessages) -> None:
         for place in self._whole:
@@ -335,7 +300,10 @@ class AgentGroup(Agent):
             self._held = [held for held in self._held if held[0] > t_ns]
         outputs: list[Output] = []
         for place, member in enumerate(self._members):
-            own = member.answer(t_ns, self._take(place)) or ()
+            inputs, self._waiting[place] = self._waiting[place], []
+            if len(inputs) > 1:
+                inputs.sort(key=canonical)
+            own = member.answer(t_ns, inputs) or ()
             for output in own:
                 for reader in self._relays.get(output.key, ()):
                     self._waiting[reader].append(output)
@@ -344,13 +312,6 @@ class AgentGroup(Agent):
 
     def views(self, t_ns: int) -> list[Output]:
         return [output for member in self._members for output in member.views(t_ns)]
-
-    def _take(self, place: int) -> list[Input]:
-        """Return what a member is to receive, in canonical order."""
-        inputs, self._waiting[place] = self._waiting[place], []
-        if len(inputs) > 1:
-            inputs.sort(key=canonical)
-        return inputs
 
     def rehearse(self) -> None:
         for member in self._members:
@@ -391,21 +352,21 @@ class AgentGroup(Agent):
         next(member for member in self._members if key in member.repeats).repeat(key, message)
 
     def _owner(self, key: str) -> Agent:
-        """Return the member that takes over the last value of a key."""
         return next(member for member in self._members if key in member.warm_start_keys())
 
 
 def _joined(parts: Any) -> tuple[str, ...]:
-    """Return everything that is in any of the parts, once, in order."""
     return tuple(dict.fromkeys(each for part in parts for each in part))
 
 
 def _in_order(members: Sequence[Agent]) -> tuple[Agent, ...]:
-    """Return the members so that each comes after those whose outputs close its gate.
-
-    Raises:
-        RunError: some wait for each other.
-    """
+    """Return the members so that each comes after those whose outputs close its gate, if they can be a group."""
+    if not members:
+        raise RunError("a group has no members; must have one at least")
+    periods = {member.name: member.period_ns for member in members}
+    if len(set(periods.values())) > 1:
+        listed = ", ".join(f"{name} {period_ns}" for name, period_ns in periods.items())
+        raise RunError(f"period_ns of a group's members is {listed}; must be the same")
     writers = {key: place for place, member in enumerate(members) for key in member.writes}
     waits_for = {i: [writers[key] for key in m.gate_keys if writers.get(key, i) != i] for i, m in enumerate(members)}
     try:
@@ -414,12 +375,3 @@ def _in_order(members: Sequence[Agent]) -> tuple[Agent, ...]:
         names = ", ".join(members[place].name for place in sorted(set(error.args[1])))
         found = f"gate_keys of a group's members {names} are outputs of each other"
         raise RunError(f"{found}; must not wait for each other: leave one of them to `reads` alone") from None
-
-
-def _check(members: Sequence[Agent]) -> None:
-    if not members:
-        raise RunError("a group has no members; must have one at least")
-    periods = {member.name: member.period_ns for member in members}
-    if len(set(periods.values())) > 1:
-        listed = ", ".join(f"{name} {period_ns}" for name, period_ns in periods.items())
-        raise RunError(f"period_ns of a group's members is {listed}; must be the same")

@@ -4,26 +4,23 @@ The agents get the same inputs in the same order as on Zenoh, and so give the sa
 """
 
 import socket
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
-from msgspec import UNSET, Struct
+from msgspec import Struct
 
 from zsim.contract import keys, messages, run_messages
-from zsim.contract.fingerprint import join_of
+from zsim.contract.fingerprint import Membership
 from zsim.contract.framing import GateMessages
 from zsim.errors import RunError, UserCodeError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.inbox import NEVER_NS, Inbox, RoutingTable, output_hold_ns
 from zsim.scenario.faults import PROCESS_KILL
 
-INCARNATION = 0  # of every agent: in one process none is ever restarted
 GATES_MAX = 10  # of the world in a row, where commands are delayed by as many
 
 
 class SteppedWorld(Protocol):
-    """What the bus needs of a world: see `Coordinator` in zsim_world."""
-
     run_id: str
 
     @property
@@ -38,51 +35,33 @@ class SteppedWorld(Protocol):
     def waiting_for(self, wall_ns: int) -> Sequence[run_messages.Waiting]: ...
 
 
-Sink = Callable[[str, Any], None]
-GateSink = Callable[[GateMessages], None]
-
-
 class _Route(NamedTuple):
-    """Where the messages of a key go.
-
-    Attributes:
-        inboxes: of the agents that read them.
-        is_counted: whether the world counts them among the outputs of their sender.
-        is_relayed: whether that is all that it does with them.
-    """
-
-    inboxes: tuple[Inbox, ...]
-    is_counted: bool
-    is_relayed: bool
+    inboxes: tuple[Inbox, ...]  # of the agents that read them
+    is_counted: bool  # whether the world counts them among the outputs of their sender
+    is_relayed: bool  # whether that is all that it does with them
 
 
 class Bus:
-    """The keys of one process: every message goes to the sink, the world and the inboxes that read it.
-
-    Args:
-        coordinator: the world of the run.
-        agents: in the order in which they are stepped.
-        wall_ns: monotonic wall time.
-        sink: takes every message in order of publication.
-        gate_sink: takes the world's messages of a gate; without it the sink is given each one decoded.
-    """
+    """The keys of one process: every message goes to the sink, the world and the inboxes that read it."""
 
     def __init__(
         self,
         coordinator: SteppedWorld,
-        agents: Sequence[Agent],
+        agents: Sequence[Agent],  # in the order in which they are stepped
         wall_ns: Callable[[], int],
-        sink: Sink = lambda key, message: None,
-        gate_sink: GateSink | None = None,
+        sink: Callable[[str, Any], None] = lambda key, message: None,  # takes every message in order of publication
+        # takes the world's messages of a gate; without it the sink is given each one decoded
+        gate_sink: Callable[[GateMessages], None] | None = None,
     ) -> None:
         self._coordinator = coordinator
         self._wall_ns = wall_ns
         self._sink = sink
-        self._gate_sink = gate_sink or self._sink_each
+        self._gate_sink = gate_sink
         self._agents = [(agent, Inbox(agent.gate_keys, agent.counted, uncounted=agent.uncounted)) for agent in agents]
         self._readers = RoutingTable([agent.reads for agent in agents])
         self._routes: dict[str, _Route] = {}
         self._gate_route: tuple[Sequence[str], tuple[Inbox, ...]] = ((), ())  # a table of keys, and who reads any
+        self._memberships: dict[str, Membership] = {}
         self._done_keys = {agent.name: keys.process(agent.name, "done") for agent in agents}
         self._t_ns = 0
         self._info: messages.Info | None = None
@@ -90,11 +69,12 @@ class Bus:
 
     def join(self) -> None:
         """Let every agent get ready and join the run."""
+        host, run_id = socket.gethostname(), self._coordinator.run_id
         for agent, _ in self._agents:
             agent.rehearse()
-            seq, host, run_id = agent.next_seq("join"), socket.gethostname(), self._coordinator.run_id
-            join = join_of(agent.name, host, run_id, INCARNATION, seq, period_ns=agent.period_ns, serves=agent.serves)
-            self._to_world(keys.process(agent.name, "join"), join)
+            member = Membership(agent.name, host, run_id, agent.next_seq, agent.serves, agent.period_ns)
+            self._memberships[agent.name] = member
+            self._to_world(keys.process(agent.name, "join"), member.join())
         if any(agent.overhears for agent, _ in self._agents):
             hold_ns = output_hold_ns(self._coordinator.info())
             for _, inbox in self._agents:
@@ -127,7 +107,18 @@ class Bus:
         """Let every agent take all its complete gates, then publish its outputs; return whether any had one."""
         stepped = False
         for agent, inbox in self._agents:
-            steps = list(self._steps(agent, inbox))
+            steps = []
+            t_ns = inbox.next_gate_ns()
+            while t_ns is not None and inbox.missing(t_ns) is None:
+                self._t_ns = t_ns
+                try:
+                    outputs = agent.answer(t_ns, inbox.take(t_ns))
+                except UserCodeError as failure:
+                    self._failures[agent.name] = failure
+                    break
+                if outputs is not None:
+                    steps.append((t_ns, outputs))
+                t_ns = inbox.next_gate_ns()
             for t_ns, outputs in steps:
                 self._publish(agent, t_ns, outputs)
             stepped = stepped or bool(steps)
@@ -137,15 +128,13 @@ class Bus:
         return stepped
 
     def _leave(self, agent: Agent, reason: str, failed: bool = False) -> None:
-        seq, of = agent.next_seq("bye"), (self._coordinator.run_id, INCARNATION)
-        bye = run_messages.Bye(self._t_ns, seq, reason, failed or UNSET, *of)
+        bye = self._memberships[agent.name].bye(self._t_ns, reason, failed)
         self._to_world(keys.process(agent.name, "bye"), bye)
 
     def end(self) -> None:
         """Let every agent leave, and publish the world's last messages.
 
-        Raises:
-            UserCodeError: a user's class failed before the end; everything has been published nevertheless.
+        UserCodeError if a user's class failed before the end; everything has been published nevertheless.
         """
         self._coordinator.publish_end()
         self._spread()
@@ -159,7 +148,11 @@ class Bus:
     def _spread(self) -> None:
         for key, message in self._coordinator.take_outbox():
             if type(message) is GateMessages:
-                self._gate_sink(message)
+                if self._gate_sink is not None:
+                    self._gate_sink(message)
+                else:
+                    for each_key, each in message.decoded():
+                        self._sink(each_key, each)
                 if message.table is not self._gate_route[0]:
                     readers = self._readers.readers_of_any(message.table)
                     self._gate_route = (message.table, tuple(self._agents[reader][1] for reader in readers))
@@ -171,10 +164,6 @@ class Bus:
                 self._update_faults(message)
             for inbox in self._route(key).inboxes:
                 inbox.put(key, message)
-
-    def _sink_each(self, gate: GateMessages) -> None:
-        for key, message in gate.decoded():
-            self._sink(key, message)
 
     def _update_faults(self, faults: run_messages.Faults) -> None:
         if not faults.faults and self._info is None:
@@ -189,20 +178,6 @@ class Bus:
         for agent, _ in self._agents:
             agent.update_faults(info, faults)
 
-    def _steps(self, agent: Agent, inbox: Inbox) -> Iterator[tuple[int, Sequence[Output]]]:
-        """Hand an agent each complete gate; yield those at which it steps, with its outputs."""
-        t_ns = inbox.next_gate_ns()
-        while t_ns is not None and inbox.missing(t_ns) is None:
-            self._t_ns = t_ns
-            try:
-                outputs = agent.answer(t_ns, inbox.take(t_ns))
-            except UserCodeError as failure:
-                self._failures[agent.name] = failure
-                return
-            if outputs is not None:
-                yield t_ns, outputs
-            t_ns = inbox.next_gate_ns()
-
     def _publish(self, agent: Agent, t_ns: int, outputs: Sequence[Output]) -> None:
         sent, world, routes = 0, self._coordinator, self._routes
         for key, message in outputs:
@@ -215,8 +190,9 @@ class Bus:
                 world.count_output(agent.name)
             else:
                 world.handle(key, message, self._wall_ns())
-        done = run_messages.Done(t_ns, agent.next_seq("done"), self._coordinator.run_id, INCARNATION, t_ns, sent)
-        self._to_world(self._done_keys[agent.name], done)
+        done_key, done = self._done_keys[agent.name], self._memberships[agent.name].done(t_ns, sent)
+        self._sink(done_key, done)
+        world.handle(done_key, done, self._wall_ns())
 
     def _to_world(self, key: str, message: Struct) -> None:
         self._sink(key, message)

@@ -21,16 +21,8 @@ ALLOCATIONS = 50_000  # between two collections, chosen: a gate allocates hundre
 class HealthMeter:
     """Counters of one process.
 
-    Args:
-        role: of the process.
-        wall_s: monotonic wall time.
-        host: the name of its host; None for the system's.
-        reads: the expressions that it subscribes to, as its session keeps them.
-
     Attributes:
         received, refused, dropped: messages taken in, messages not decodable, and gates given up.
-        lag_ns: how far the newest gate is ahead of the one just handled.
-        link_lost: whether the world cannot be reached now.
     """
 
     def __init__(
@@ -38,7 +30,7 @@ class HealthMeter:
         role: str,
         wall_s: Callable[[], float] = time.monotonic,
         host: str | None = None,
-        reads: Sequence[str] = (),
+        reads: Sequence[str] = (),  # the expressions that it subscribes to, as its session keeps them
     ) -> None:
         self._role = role
         self._host = host or socket.gethostname()
@@ -47,11 +39,10 @@ class HealthMeter:
         self._limit = RateLimit(PERIOD_S, now=wall_s)
         self._limit.spend()  # the first is due in a second
         self.received = self.refused = self.dropped = 0
-        self.lag_ns = 0
-        self.link_lost = False
+        self.lag_ns = 0  # how far the newest gate is ahead of the one just handled
+        self.link_lost = False  # whether the world cannot be reached now
 
     def step(self, duration_ns: int) -> None:
-        """Note how long one step took."""
         self._steps_us.append(duration_ns / 1000)
 
     def due(self) -> bool:
@@ -59,7 +50,6 @@ class HealthMeter:
         return self._limit.spend()
 
     def message(self, t_ns: int, seq: int) -> Health:
-        """Return the message of `process/{p}/health`."""
         steps = sorted(self._steps_us) or [0.0]
         return Health(
             t_ns=t_ns,

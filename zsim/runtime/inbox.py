@@ -8,7 +8,6 @@ the numbers of a status.
 from bisect import bisect_right, insort
 from collections import defaultdict
 from collections.abc import Container, Iterable, Iterator, Sequence
-from operator import itemgetter
 from typing import Any
 
 from zsim.contract import keys, messages
@@ -19,7 +18,6 @@ from zsim.errors import DecodeError
 GAP_MAX = 10  # gates lost in a row that are asked for again; the world runs ahead of nobody by more
 ALWAYS_NS = -1  # before every gate
 NEVER_NS = 2**63 - 1  # after every gate
-UNHEARD_NS = ALWAYS_NS - 1  # before whatever was taken last
 KEYS_MAX = 200_000  # whose readers are remembered; 1000 drones have about 15 000, other processes may make up any
 Input = tuple[str, Any]
 """A key and a message; or `keys.GATE` and a GateMessages."""
@@ -39,47 +37,34 @@ def is_held(key: str, gate_keys: Container[str], uncounted: Container[str]) -> b
 
 
 def canonical(entry: Input) -> tuple[int, str, int]:
-    """Return what inputs are sorted by: time, key and number."""
     key, message = entry
     return message.t_ns, key, message.seq
 
 
 class Inbox:
-    """Collects messages until the gate that they belong to is complete.
-
-    Args:
-        gate_keys: keys of which one message with t_ns == t closes the gate t. For a drone's sensor/status its
-            `count` is checked too, when all of that drone's sensors are read (`counted`).
-        counted: drones of which all `sensor/*` keys are read.
-        keep_late: hand out what comes after its gate was taken, once, with the next gate: in realtime an old input
-            is better than none.
-        uncounted: keys of which everything that comes late is handed out with the next gate in any case, since it
-            belongs to no gate, such as what a detector finds in a picture.
-        sparse: closing keys whose publishers may skip gates, such as the driver of an external drone: a key is waited
-            for only as long as it comes at every gate.
-        hold_ns: after which an agent's output on a key that closes no gate is handed out, as if stamped so much later:
-            command delay and a gate, when it has come wherever the world may be, so that no order of arrival counts.
-
-    Attributes:
-        duplicates: messages that came again before their gate was taken.
-        late: messages that came when their gate had been taken.
-        taken_ns: the gate that was taken last, below 0 before the first.
-    """
+    """Collects messages until the gate that they belong to is complete."""
 
     def __init__(
         self,
+        # a message of each with t_ns == t closes the gate t; the `count` of a counted drone's sensor/status is checked
         gate_keys: Sequence[str],
-        counted: Sequence[str] = (),
+        counted: Sequence[str] = (),  # drones of which all `sensor/*` keys are read
+        # hand out what comes after its gate was taken with the next, once: in realtime an old input is better than none
         keep_late: bool = False,
+        # keys of which this is so in any case: they belong to no gate, such as what a detector finds in a picture
         uncounted: Sequence[str] = (),
+        # closing keys whose publishers may skip gates, as drivers of external drones: waited for while they skip none
         sparse: Sequence[str] = (),
+        # after which an agent's output on a key that closes no gate is handed out, as if stamped so much later: command
+        # delay and a gate, when it has come wherever the world may be, so that no order of arrival counts
         hold_ns: int = 0,
     ) -> None:
         self._closing = dict.fromkeys(gate_keys)
-        self._sparse = dict.fromkeys(sparse, (UNHEARD_NS, UNHEARD_NS))  # with the stamps of its last two messages
-        of_world = {key for key in gate_keys if keys.is_status(key) and key not in self._sparse}
-        self._beside = dict.fromkeys(key for key in gate_keys if key not in of_world)  # not closed by GateMessages
-        self._pulse = next((key for key in gate_keys if key in of_world), None)
+        # with the stamps of its last two messages; before any, they are before whatever was taken last
+        self._sparse = dict.fromkeys(sparse, (ALWAYS_NS - 1, ALWAYS_NS - 1))
+        of_world = dict.fromkeys(key for key in gate_keys if keys.is_status(key) and key not in self._sparse)
+        self._not_of_world = {key: None for key in gate_keys if key not in of_world}  # not closed by GateMessages
+        self._pulse = next(iter(of_world), None)  # whose numbers show a gap
         self._waiting: dict[int, dict[tuple[str, int], Input]] = {}  # by stamp, then by key and number
         self._stamps: list[int] = []
         self._lacking: dict[int, dict[str, None]] = {}  # by gate, the closing keys that have not come
@@ -89,7 +74,7 @@ class Inbox:
         self._came_of: dict[str, list[int] | None] = {}
         self._beats: dict[int, int] = {}  # by gate, the number of the pulse
         self._last_beat: tuple[int, int] | None = None
-        self.taken_ns = self._former_ns = -1  # the gates that were taken last
+        self.taken_ns = self._former_ns = -1  # the gates that were taken last; below 0 before the first
         self.hold_ns = hold_ns
         self._hold_of: dict[str, int] = {}
         self._holds = False
@@ -97,14 +82,10 @@ class Inbox:
         self._uncounted = frozenset(uncounted)
         self._belated: dict[tuple[str, int], Input] = {}
         self._newest: dict[str, int] = {}  # t_ns handed out per key, where late ones are kept
-        self.duplicates = self.late = 0
-
-    @property
-    def may_skip(self) -> bool:
-        """Tell whether all closing keys are of publishers that may skip gates."""
-        return len(self._sparse) == len(self._closing)
-
-    # What comes
+        # whether all closing keys are of publishers that may skip gates
+        self.may_skip = len(self._sparse) == len(self._closing)
+        self.duplicates = 0  # messages that came again before their gate was taken
+        self.late = 0  # messages that came when their gate had been taken
 
     def put(self, key: str, message: Any) -> bool:
         """Keep one message, or GateMessages on `keys.GATE`; return False for a duplicate or one that is too late."""
@@ -113,91 +94,70 @@ class Inbox:
             _, newest_ns = last = self._sparse[key]
             self._sparse[key] = (newest_ns, t_ns) if t_ns > newest_ns else last
         hold_ns = self._hold_of.get(key)
-        t_ns += self._find_hold(key) if hold_ns is None else hold_ns
-        if t_ns <= self.taken_ns:
+        if hold_ns is None:
+            hold_ns = self._hold_of[key] = self.hold_ns if is_held(key, self._closing, self._uncounted) else 0
+            self._holds = self._holds or hold_ns > 0
+        due_ns = t_ns + hold_ns
+        if due_ns <= self.taken_ns:
             self.late += 1
-            return self._put_late(key, message)
-        stamped = self._waiting.get(t_ns)
+            is_old = not self._keep_late or t_ns <= self._newest.get(
+                key, ALWAYS_NS
+            )  # it, or a newer one, was handed out
+            if is_old and key not in self._uncounted:
+                return False
+            self._belated[key, message.seq] = (key, message)
+            return True
+        stamped = self._waiting.get(due_ns)
         if stamped is None:
-            stamped = self._waiting[t_ns] = {}
-            _insert(self._stamps, t_ns)
+            stamped = self._waiting[due_ns] = {}
+            _insert(self._stamps, due_ns)
         mark = (key, message.seq)
         if mark in stamped:
             self.duplicates += 1
             return False
         stamped[mark] = (key, message)
-        came = self._came_of[key] if key in self._came_of else self._find_came(key)
+        if key not in self._came_of:
+            meter = self._meters.get(f"{key.rpartition('/')[0]}/status")
+            self._came_of[key] = meter.came if meter else None
+        came = self._came_of[key]
         if came is not None:
-            _insert(came, t_ns)
+            _insert(came, due_ns)
         if key in self._closing:
-            self._close(key, message)
-        elif type(message) is GateMessages:
-            self._close_all(message)
+            lacking = self._lacking.get(t_ns)
+            if lacking is None:
+                lacking = self._lacking[t_ns] = self._closing.copy()
+                _insert(self._gates, t_ns)
+            lacking.pop(key, None)
+            if key == self._pulse:
+                self._beats[t_ns] = message.seq
+            if key in self._meters:
+                self._meters[key].count(message)
+        elif type(message) is GateMessages:  # whose messages have come as one: none of them can be missing
+            if t_ns in self._lacking:
+                self._lacking[t_ns] = {each: None for each in self._lacking[t_ns] if each in self._not_of_world}
+            else:
+                self._lacking[t_ns] = self._not_of_world.copy()
+                _insert(self._gates, t_ns)
+            if self._pulse is not None:
+                self._beats[t_ns] = message.seq
         return True
-
-    def _find_hold(self, key: str) -> int:
-        held = is_held(key, self._closing, self._uncounted)
-        self._hold_of[key] = hold_ns = self.hold_ns if held else 0
-        self._holds = self._holds or hold_ns > 0
-        return hold_ns
-
-    def _find_came(self, key: str) -> list[int] | None:
-        """Return the list of what has come of the counted drone that a sensor key belongs to."""
-        meter = self._meters.get(f"{key.rpartition('/')[0]}/status")
-        self._came_of[key] = came = meter.came if meter else None
-        return came
-
-    def _put_late(self, key: str, message: Any) -> bool:
-        """Keep a late message, of a counted key unless a newer one of it, or itself, has been handed out."""
-        is_old = not self._keep_late or message.t_ns <= self._newest.get(key, ALWAYS_NS)
-        if is_old and key not in self._uncounted:
-            return False
-        self._belated[key, message.seq] = (key, message)
-        return True
-
-    def _close(self, key: str, message: Any) -> None:
-        t_ns = message.t_ns
-        lacking = self._lacking.get(t_ns)
-        if lacking is None:
-            lacking = self._lacking[t_ns] = self._closing.copy()
-            _insert(self._gates, t_ns)
-        lacking.pop(key, None)
-        if key == self._pulse:
-            self._beats[t_ns] = message.seq
-        if key in self._meters:
-            self._meters[key].count(message)
-
-    def _close_all(self, gate: GateMessages) -> None:
-        """Close a gate for the drones whose messages have come as one: none of them can be missing."""
-        t_ns = gate.t_ns
-        if t_ns in self._lacking:
-            self._lacking[t_ns] = {key: None for key in self._lacking[t_ns] if key in self._beside}
-        else:
-            self._lacking[t_ns] = self._beside.copy()
-            _insert(self._gates, t_ns)
-        if self._pulse is not None:
-            self._beats[t_ns] = gate.seq
 
     # What is complete, and what is missing
 
     def next_gate_ns(self) -> int | None:
-        """Return the earliest gate that is not taken, judged by closing messages."""
+        """Return the earliest gate that is not taken, by the closing messages and the gaps in the pulse's numbers."""
         if not self._gates:
             return None
-        skipped_ns = self._skipped_ns(self._gates[0])
-        return self._gates[0] if skipped_ns is None else skipped_ns
-
-    def _skipped_ns(self, t_ns: int) -> int | None:
-        """Return the gate after the last one taken if t_ns is not that gate but a later one."""
-        if t_ns not in self._beats or self._last_beat is None:
-            return None
-        last_ns, last_seq = self._last_beat
-        gates = self._beats[t_ns] - last_seq
-        next_ns = last_ns + (t_ns - last_ns) // gates if 1 < gates <= GAP_MAX + 1 else -1
-        return next_ns if next_ns > self.taken_ns else None
+        t_ns = self._gates[0]
+        if t_ns in self._beats and self._last_beat is not None:
+            last_ns, last_seq = self._last_beat
+            gates = self._beats[t_ns] - last_seq
+            if 1 < gates <= GAP_MAX + 1:
+                next_ns = last_ns + (t_ns - last_ns) // gates
+                return next_ns if next_ns > self.taken_ns else t_ns
+        return t_ns
 
     def latest_gate_ns(self) -> int | None:
-        """Return the latest gate for which a closing message has come."""
         return self._gates[-1] if self._gates else None
 
     def missing(self, t_ns: int) -> str | None:
@@ -239,12 +199,8 @@ class Inbox:
         former_ns, newest_ns = self._sparse.get(key, (NEVER_NS, NEVER_NS))
         return newest_ns >= self.taken_ns and former_ns >= self._former_ns
 
-    def ignore(self, key: str) -> None:
-        """Wait for a key no longer: its publisher is dropped from the run."""
-        self._expected_from_ns[key] = NEVER_NS
-
-    def expect(self, key: str, from_ns: int = ALWAYS_NS) -> None:
-        """Wait for a key again, from the gate `from_ns` on."""
+    def expect(self, key: str, from_ns: int) -> None:
+        """Wait for a key from the gate `from_ns` on; NEVER_NS for one whose publisher is dropped from the run."""
         self._expected_from_ns[key] = from_ns
 
     # What is handed out
@@ -257,8 +213,11 @@ class Inbox:
             ready += stamped.values() if len(stamped) == 1 else map(stamped.__getitem__, sorted(stamped))
         if self._holds:
             ready.sort(key=canonical)
-        if self._keep_late or self._belated:
-            ready = self._with_belated(ready)
+        if self._keep_late or self._belated:  # what came late is in front
+            ready = sorted(self._belated.values(), key=canonical) + ready
+            self._belated.clear()
+            for key, message in ready:
+                self._newest[key] = max(self._newest.get(key, ALWAYS_NS), message.t_ns)
         for gate_ns in _cut(self._gates, t_ns):
             del self._lacking[gate_ns]
             if gate_ns in self._beats:
@@ -268,14 +227,6 @@ class Inbox:
                 meter.forget(t_ns)
         self._former_ns, self.taken_ns = self.taken_ns, t_ns
         return _once(ready) if len(ready) > 1 else ready
-
-    def _with_belated(self, ready: list[Input]) -> list[Input]:
-        """Put what came late in front, and note what is handed out."""
-        ready = sorted(self._belated.values(), key=canonical) + ready
-        self._belated.clear()
-        for key, message in ready:
-            self._newest[key] = max(self._newest.get(key, ALWAYS_NS), message.t_ns)
-        return ready
 
     def start_after(self, t_ns: int) -> None:
         """Ignore everything up to and including t_ns; the next gate is counted in full."""
@@ -296,20 +247,16 @@ class _Meter:
 
     The first gate of a late joiner is not compared, since it began before the joiner was there; a status with
     seq 0 counts from the beginning.
-
-    Attributes:
-        came: stamps of the drone's messages that wait, sorted.
-        counts: stamps of the drone's statuses that wait, and what they count; a meter without any is not short.
-        partial: whether nothing is compared yet.
     """
 
     def __init__(self) -> None:
-        self.came: list[int] = []
+        self.came: list[int] = []  # stamps of the drone's messages that wait, sorted
+        # stamps of the drone's statuses that wait, and what they count; a meter without any is not short
         self.counts: list[tuple[int, int]] = []
-        self.partial = True
+        self.partial = True  # whether nothing is compared yet
 
     def count(self, status: Any) -> None:
-        insort(self.counts, (status.t_ns, status.count))
+        self.counts.append((status.t_ns, status.count))
         if status.seq == 0:
             self.partial = False
 
@@ -317,17 +264,12 @@ class _Meter:
         """Tell whether sensor messages of the gates up to t_ns are still to come."""
         if self.partial:
             return False
-        due = sum(count for _, count in self.counts[: self._until(t_ns)])
-        return bisect_right(self.came, t_ns) < due
+        return bisect_right(self.came, t_ns) < sum(count for gate_ns, count in self.counts if gate_ns <= t_ns)
 
     def forget(self, t_ns: int) -> None:
         _cut(self.came, t_ns)
-        del self.counts[: self._until(t_ns)]
+        self.counts = [counted for counted in self.counts if counted[0] > t_ns]
         self.partial = False
-
-    def _until(self, t_ns: int) -> int:
-        """Return how many of the counts are of gates up to t_ns."""
-        return bisect_right(self.counts, t_ns, key=itemgetter(0))
 
 
 def _insert(stamps: list[int], t_ns: int) -> None:
@@ -362,54 +304,42 @@ class RoutingTable:
 
     def __init__(self, expressions: Sequence[Sequence[str]]) -> None:
         self._filed: defaultdict[str, list[int]] = defaultdict(list)  # without wildcards, or with * only
-        self._starred: dict[int, set[tuple[int, ...]]] = {}  # by number of chunks, where the wildcards stand
+        self._starred: defaultdict[int, set[tuple[int, ...]]] = defaultdict(set)  # by number of chunks, places of the *
         self._compared: list[tuple[str, int]] = []
         self._known: dict[str, tuple[int, ...]] = {}
         for reader, own in enumerate(expressions):
             for expression in own:
-                self._file(expression, reader)
-
-    def _file(self, expression: str, reader: int) -> None:
-        chunks = expression.split("/")
-        if "**" in chunks or "$*" in expression:
-            self._compared.append((expression, reader))
-            return
-        self._filed[expression].append(reader)
-        starred = tuple(place for place, chunk in enumerate(chunks) if chunk == "*")
-        if starred:
-            self._starred.setdefault(len(chunks), set()).add(starred)
+                chunks = expression.split("/")
+                if "**" in chunks or "$*" in expression:
+                    self._compared.append((expression, reader))
+                    continue
+                self._filed[expression].append(reader)
+                if "*" in chunks:
+                    starred = tuple(place for place, chunk in enumerate(chunks) if chunk == "*")
+                    self._starred[len(chunks)].add(starred)
 
     def readers(self, key: str) -> tuple[int, ...]:
-        """Return the places of those who read a key, in order."""
-        readers = self._known.get(key)
-        if readers is None:
-            readers = tuple(sorted(set(self._find(key))))
-            if len(self._known) < KEYS_MAX:
-                self._known[key] = readers
-        return readers
-
-    def readers_of_any(self, of: Iterable[str]) -> tuple[int, ...]:
-        """Return the places of those who read one of some keys at least, in order."""
-        return tuple(sorted({reader for key in of for reader in self.readers(key)}))
-
-    def _find(self, key: str) -> Iterator[int]:
-        yield from self._filed.get(key, ())
+        known = self._known.get(key)
+        if known is not None:
+            return known
+        found = set(self._filed.get(key, ()))
         chunks = key.split("/")
         for starred in self._starred.get(len(chunks), ()):
             if not any(chunks[place].startswith("@") for place in starred):  # which no wildcard takes
                 masked = ["*" if place in starred else chunk for place, chunk in enumerate(chunks)]
-                yield from self._filed.get("/".join(masked), ())
-        for expression, reader in self._compared:
-            if keys.matches(expression, key):
-                yield reader
+                found.update(self._filed.get("/".join(masked), ()))
+        found.update(reader for expression, reader in self._compared if keys.matches(expression, key))
+        readers = tuple(sorted(found))
+        if len(self._known) < KEYS_MAX:
+            self._known[key] = readers
+        return readers
+
+    def readers_of_any(self, of: Iterable[str]) -> tuple[int, ...]:
+        return tuple(sorted({reader for key in of for reader in self.readers(key)}))
 
 
 class GateRouter:
-    """Takes apart the messages of gates: of each only what somebody reads, decoded once for all its readers.
-
-    Args:
-        routes: of the readers.
-    """
+    """Takes apart the messages of gates: of each only what somebody reads, decoded once for all its readers."""
 
     def __init__(self, routes: RoutingTable) -> None:
         self._routes = routes
@@ -437,7 +367,7 @@ class GateRouter:
 
     def one_by_one(self, inputs: Sequence[Input]) -> Sequence[Input]:
         """Return inputs with the messages of gates one by one, as far as they are read, in canonical order."""
-        if GateMessages not in map(type, map(_message, inputs)):
+        if not any(type(message) is GateMessages for _, message in inputs):
             return inputs
         single: list[Input] = []
         for key, message in inputs:
@@ -446,6 +376,3 @@ class GateRouter:
             else:
                 single.append((key, message))
         return sorted(single, key=canonical)
-
-
-_message = itemgetter(1)  # of an input

@@ -24,8 +24,6 @@ WORLD, RADIO = "world", "radio"
 KINDS = frozenset(name for name, kind in fault_kinds.KINDS.items() if kind.strikes in ("link", RADIO))
 NEVER = None  # as a delay: the message is lost
 Point = Sequence[float]
-Where = Callable[[str], Point | None]
-"""Returns where a drone is in W [m], None where that is not known."""
 
 
 def uniform(seed: int, link: str, fault: Fault, key: str, t_ns: int, seq: int) -> float:
@@ -44,19 +42,17 @@ def senders(key: str, message: Any) -> tuple[str, ...]:
     Estimators and controllers may share a process, under one name: they are named after the thing of the key.
     """
     kind, whose, what = keys.parts(key)
+    source = getattr(message, "source", "")
     if kind == "drone" and what.startswith("cmd/"):
-        return (message.source,)
+        return (source,)
     if kind == "drone" and what == "estimate":
-        return _doing(f"estimator.{whose}", message.source)
-    if kind == "cluster":
-        return _doing(f"controller.{whose}", getattr(message, "source", ""))
-    return (whose,) if kind == "process" else (WORLD,)
-
-
-def _doing(role: str, source: str) -> tuple[str, ...]:
-    """Return the name of a process, and that of another process that does its work."""
-    shared = source.partition(".")[0] in ("estimator", "controller")
-    return (role,) if shared or not source else (role, source)
+        named = f"estimator.{whose}"
+    elif kind == "cluster":
+        named = f"controller.{whose}"
+    else:
+        return (whose,) if kind == "process" else (WORLD,)
+    is_shared = source.partition(".")[0] in ("estimator", "controller")
+    return (named,) if is_shared or not source else (named, source)  # another process that does its work
 
 
 def joins(fault: Fault, froms: Sequence[str], to: str) -> bool:
@@ -67,13 +63,11 @@ def joins(fault: Fault, froms: Sequence[str], to: str) -> bool:
     return first == to and second in froms and not fault.parameters["one_way"]
 
 
-def reception_probability(distance_m: float, range_m: float, spread_m: float) -> float:
-    """Return the probability that a message comes over a radio: 1 / (1 + exp((d - range) / spread))."""
-    return 1.0 / (1.0 + math.exp(min((distance_m - range_m) / spread_m, 700.0)))  # exp(700) is the last finite one
+def place_of(process: str, places: Mapping[str, Any], where: Callable[[str], Point | None]) -> Point | None:
+    """Return where a process is [m; W]: where `places` has it, on its drone, or at the origin.
 
-
-def place_of(process: str, places: Mapping[str, Any], where: Where) -> Point | None:
-    """Return where a process is [m; W]: where `places` has it, on its drone, or at the origin."""
+    `where`: returns where a drone is in W [m], None where that is not known.
+    """
     place = places.get(process)
     if place is None:
         role, _, thing = process.partition(".")
@@ -81,64 +75,48 @@ def place_of(process: str, places: Mapping[str, Any], where: Where) -> Point | N
     return where(place) if isinstance(place, str) else place
 
 
-def delay_ns(fault: Fault, draw: float, distance_m: float | None = None) -> int | None:
-    """Return how much later a message comes because of a fault that acts on it; NEVER if it is lost.
-
-    Args:
-        draw: its number of the link's stream.
-        distance_m: between sender and receiver, for a radio; None where it is not known.
-    """
-    p = fault.parameters
-    if fault.kind == "link_delay":
-        return math.ceil(p["delay_ms"] * 1e6)
-    if fault.kind == "link_jitter":
-        return math.ceil(draw * p["jitter_ms"] * 1e6)
-    if fault.kind == "link_loss":
-        return NEVER if draw < p["probability"] else 0
-    if fault.kind == RADIO:
-        comes = distance_m is None or draw < reception_probability(distance_m, p["range_m"], p["spread_m"])
-        return 0 if comes else NEVER
-    return NEVER  # link_cut
-
-
 def total_delay_ns(
-    faults: Iterable[Fault],
-    seed: int,
-    link: str,
-    key: str,
+    faults: Iterable[Fault],  # that act on its link
+    seed: int,  # of the scenario
+    link: str,  # name of the link's stream: its receiver
+    key: str,  # which is sent
     message: Any,
+    # returns that between sender and receiver for a radio, None where it is not known
     distance_m: Callable[[Fault], float | None] = lambda fault: None,
 ) -> int | None:
     """Return how much later a message comes because of several faults [ns]; NEVER if one of them loses it.
 
-    Args:
-        faults: that act on its link.
-        seed: of the scenario.
-        link: name of the link's stream: its receiver.
-        key, message: which is sent.
-        distance_m: returns that between sender and receiver for a radio, None where it is not known.
+    A message comes over a radio with the probability 1 / (1 + exp((d - range) / spread)).
     """
     total_ns = 0
     for fault in faults:
-        draw = uniform(seed, link, fault, key, message.t_ns, message.seq)
-        late_ns = delay_ns(fault, draw, distance_m(fault) if fault.kind == RADIO else None)
-        if late_ns is None:
+        draw, p = uniform(seed, link, fault, key, message.t_ns, message.seq), fault.parameters
+        if fault.kind == "link_delay":
+            total_ns += math.ceil(p["delay_ms"] * 1e6)
+        elif fault.kind == "link_jitter":
+            total_ns += math.ceil(draw * p["jitter_ms"] * 1e6)
+        elif fault.kind == "link_loss":
+            if draw < p["probability"]:
+                return NEVER
+        elif fault.kind == RADIO:
+            d_m = distance_m(fault)
+            if d_m is not None:
+                exponent = min((d_m - p["range_m"]) / p["spread_m"], 700.0)  # exp(700) is the last finite one
+                if draw >= 1.0 / (1.0 + math.exp(exponent)):
+                    return NEVER
+        else:  # link_cut
             return NEVER
-        total_ns += late_ns
     return total_ns
 
 
 def distance_between(a: Point | None, b: Point | None) -> float | None:
-    """Return the distance of two points [m], None where one is not known."""
     return math.dist(a, b) if a is not None and b is not None else None
 
 
 class LinkFaults:
     """Holds back, of the messages of a gate for one receiver, what its links deliver later or never.
 
-    Args:
-        info: of the run.
-        names: of the receiver; an estimator of several drones has the name of each one's.
+    `names`: of the receiver; an estimator of several drones has the name of each one's.
     """
 
     def __init__(self, info: Info, names: Sequence[str]) -> None:
@@ -151,7 +129,6 @@ class LinkFaults:
         self._positions: dict[str, Point] = {}
 
     def update(self, faults: Faults) -> None:
-        """Take the list of faults, unless a newer one has come before."""
         if self._list and faults.seq <= self._list.seq:
             return
         self._list = faults
@@ -168,56 +145,52 @@ class LinkFaults:
     def delivered(self, t_ns: int, inputs: Sequence[Input]) -> list[Input]:
         """Return what the receiver is handed at the gate t_ns, in canonical order.
 
-        Args:
-            inputs: the messages that have come for that gate, one by one.
+        `inputs`: the messages that have come for that gate, one by one.
         """
         acting = [fault for fault in self._faults if fault_kinds.acts(fault, t_ns)]
         if acting:
             positions = {keys.thing(key): message.position_m for key, message in inputs if type(message) is Estimate}
             self._positions |= positions
-        coming = [entry for entry in self._later if entry[0] <= t_ns]
+        handed = [(key, message) for gate_ns, key, message in self._later if gate_ns <= t_ns]
         self._later = [entry for entry in self._later if entry[0] > t_ns]
-        handed = [(key, message) for _, key, message in coming]
-        handed += [(key, message) for key, message in inputs if self._comes_now(t_ns, key, message, acting)]
+        for key, message in inputs:
+            late_ns = self._delay_ns(key, message, acting)
+            if late_ns is None:
+                continue
+            gate_ns = -(-(message.t_ns + late_ns) // self._gate_ns) * self._gate_ns
+            if late_ns == 0 or gate_ns <= t_ns:
+                handed.append((key, message))
+            else:
+                self._later.append((gate_ns, key, message))
         return sorted(handed, key=canonical)
 
+    def _delay_ns(self, key: str, message: Any, acting: Sequence[Fault]) -> int | None:
+        """Return how much later a message comes [ns]; of several estimators, that of the drone of the key receives it.
+
+        A radio carries what one of its drones sends to a process that is not on that drone.
+        """
+        froms, (kind, thing, _) = senders(key, message), keys.parts(key)
+        to = stock if keys.is_sensor(key) and (stock := f"estimator.{thing}") in self._names else self._names[0]
+
+        def acts(fault: Fault) -> bool:
+            if fault.kind != RADIO:
+                return joins(fault, froms, to)
+            drones = self._clusters.get(fault.target)
+            return kind == "drone" and to != f"estimator.{thing}" and (drones is None or thing in drones)
+
+        def distance_m(fault: Fault) -> float | None:
+            place = place_of(to, fault.parameters["place"], self._positions.get)
+            return distance_between(self._positions.get(thing), place)
+
+        return total_delay_ns(filter(acts, acting), self._seed, to, key, message, distance_m)
+
     def snapshot(self) -> State:
-        """Return its faults, what it holds back, and where drones were."""
         later = [[gate_ns, key, messages.encode(message)] for gate_ns, key, message in self._later]
         positions = {drone: list(place) for drone, place in self._positions.items()}
         return {"later": later, "positions": positions, "list": messages.encode(self._list) if self._list else None}
 
     def restore(self, state: State) -> None:
-        """Take over the state of the receiver's predecessor."""
         if state["list"]:
             self.update(messages.decode(keys.FAULTS, state["list"]))
         self._later = [(gate_ns, key, messages.decode(key, payload)) for gate_ns, key, payload in state["later"]]
         self._positions = state["positions"]
-
-    def _comes_now(self, t_ns: int, key: str, message: Any, acting: Sequence[Fault]) -> bool:
-        """Tell whether a message is handed over at once; keep it if it comes later."""
-        froms, to = senders(key, message), self._receiver(key)
-        faults = (f for f in acting if (self._on_the_air(f, key, to) if f.kind == RADIO else joins(f, froms, to)))
-        late_ns = total_delay_ns(faults, self._seed, to, key, message, lambda fault: self._distance_m(fault, key, to))
-        if late_ns is None:
-            return False
-        gate_ns = -(-(message.t_ns + late_ns) // self._gate_ns) * self._gate_ns
-        if late_ns == 0 or gate_ns <= t_ns:
-            return True
-        self._later.append((gate_ns, key, message))
-        return False
-
-    def _receiver(self, key: str) -> str:
-        """Return the name of the receiver of a key: of several estimators, that of the drone of the key."""
-        stock = f"estimator.{keys.thing(key)}" if keys.is_sensor(key) else ""
-        return stock if stock in self._names else self._names[0]
-
-    def _on_the_air(self, fault: Fault, key: str, to: str) -> bool:
-        """Tell whether a message is sent by one of the fault's drones to a process that is not on that drone."""
-        kind, drone, _ = keys.parts(key)
-        drones = self._clusters.get(fault.target)
-        return kind == "drone" and to != f"estimator.{drone}" and (drones is None or drone in drones)
-
-    def _distance_m(self, fault: Fault, key: str, to: str) -> float | None:
-        there = self._positions.get(keys.thing(key))
-        return distance_between(there, place_of(to, fault.parameters["place"], self._positions.get))

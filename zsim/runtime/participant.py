@@ -12,14 +12,13 @@ runs an agent: it also takes over the state of its predecessor and fetches what 
 import os
 import secrets
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
-from functools import partial
 
-from msgspec import UNSET, Struct
+from msgspec import Struct
 
 from zsim.contract import keys, messages, run_messages
-from zsim.contract.fingerprint import join_of
+from zsim.contract.fingerprint import Membership
 from zsim.contract.framing import Pairs
 from zsim.contract.messages import ProcessEntry
 from zsim.contract.snapshot import VERSION, pack, unpack
@@ -28,7 +27,7 @@ from zsim.runtime.agent import Agent, Output
 from zsim.runtime.health import HealthMeter
 from zsim.runtime.inbox import output_hold_ns
 from zsim.transport.connection import read_info
-from zsim.transport.session import RawSample, ReceivedSample, Session
+from zsim.transport.session import ReceivedSample, Session
 from zsim.transport.traffic import replay
 
 ANOTHER_RUN = "the world has begun another run"
@@ -43,21 +42,8 @@ GATES_KEPT = 2  # gates of which the outputs are kept to answer a get (contract)
 class Participant:
     """One process in one run.
 
-    Args:
-        link: an open session.
-        info: of the run.
-        name: process name, role.thing.
-        serves: names of processes whose work it does.
-        slack_ns: how far the world may be ahead of what it has reported as done; 0 for a process that never gates.
-        period_ns: how often an agent reports done; 0 for other processes.
-        calculates: whether its results depend on its arithmetic; otherwise its join states no fingerprint.
-
     Attributes:
-        now_ns: simulated time of the newest clock received.
-        done_ns: newest gate that it is done with, -1 before the first.
-        health: counters that it publishes.
         admitted: whether the world has admitted its newest incarnation.
-        must_rejoin: whether the world may have taken it for dead, or another process for it.
         successor: host and pid of the process that has taken over the name; empty while it has the name.
         end_reason: why it has nothing left to do in this run; empty while the run goes on.
     """
@@ -66,89 +52,77 @@ class Participant:
         self,
         link: Session,
         info: messages.Info,
-        name: str,
-        serves: tuple[str, ...] = (),
+        name: str,  # process name, role.thing
+        serves: tuple[str, ...] = (),  # names of processes whose work it does
+        # how far the world may be ahead of what it has reported as done; 0 for a process that never gates
         slack_ns: int = 0,
         *,
-        period_ns: int = 0,
+        period_ns: int = 0,  # how often an agent reports done; 0 for other processes
+        # whether its results depend on its arithmetic; otherwise its join states no fingerprint
         calculates: bool = True,
+        next_seq: Callable[[str], int] | None = None,
     ) -> None:
         self.name = name
-        self.now_ns = 0
-        self.done_ns = -1
-        self.health = HealthMeter(name.split(".", 1)[0], host=link.host, reads=link.reads)
-        self.admitted = self.must_rejoin = False
+        # whether the world waits for it; it then announces itself once it has subscribed to all that it needs
+        self.gates = slack_ns > 0
+        self.now_ns = 0  # simulated time of the newest clock received
+        self.done_ns = -1  # newest gate that it is done with, -1 before the first
+        self.health = HealthMeter(name.split(".", 1)[0], host=link.host, reads=link.reads)  # counters that it publishes
+        self.must_rejoin = False  # whether the world may have taken it for dead, or another process for it
         self.successor = self.end_reason = ""
+        self.next_seq = next_seq or self._count  # returns the number of its next message of a kind, from 0
         self._link, self._info = link, info
-        self._slack_ns = slack_ns
-        self._join_of = partial(
-            join_of,
-            name,
-            link.host,
-            info.run_id,
-            period_ns=period_ns,
-            serves=tuple(each for each in serves if each != name),
-            calculates=calculates,
-            slack_ns=slack_ns,
-        )
-        self._process = link.host, os.getpid()
-        self._seq: dict[str, int] = {}
-        self.next_seq: Callable[[str], int] = self._count  # the number of the next message of a kind, from 0
+        others = tuple(each for each in serves if each != name)
+        own = (name, link.host, info.run_id, self.next_seq)
+        self._membership = Membership(*own, others, period_ns, slack_ns, calculates)
+        self._seq: defaultdict[str, int] = defaultdict(int)
         self._incarnations: list[int] = []  # the newest last
         self._renew_incarnation()
         self._was_link_lost = self._has_left = False
 
     def _count(self, kind: str) -> int:
-        self._seq[kind] = self._seq.get(kind, -1) + 1
-        return self._seq[kind]
+        self._seq[kind] += 1
+        return self._seq[kind] - 1
 
     def _renew_incarnation(self) -> None:
         self.admitted = False
-        self._incarnation = secrets.randbits(62)
-        self._incarnations.append(self._incarnation)
-
-    @property
-    def gates(self) -> bool:
-        """Whether the world waits for it; it then announces itself once it has subscribed to all that it needs."""
-        return self._slack_ns > 0
+        self._membership.incarnation = secrets.randbits(62)
+        self._incarnations.append(self._membership.incarnation)
 
     @property
     def superseded(self) -> bool:
-        """Whether another process has taken over the name."""
         return bool(self.successor)
 
     # What it publishes
 
     def announce(self) -> None:
         """Join the run, and follow the events and the link that decide whether to join again."""
-        self._link.declare_subscriber(keys.EVENT, self._on_event)
-        self._link.on_link(self._on_link)
+
+        def follow_link(up: bool) -> None:
+            self.must_rejoin = up and self._was_link_lost
+            self._was_link_lost = not up
+
+        self._link.declare_subscriber(keys.EVENT, lambda sample: self.take_event(sample.payload))
+        self._link.on_link(follow_link)
         self._link.declare_process(self.name)
         self.join()
 
     def join(self, again: bool = False) -> None:
-        """Publish join; `again` as a new incarnation."""
         if again:
             self._renew_incarnation()
-        self.publish("join", self._join_of(self._incarnation, self.next_seq("join"), self.now_ns))
+        self.publish("join", self._membership.join(self.now_ns))
 
     def done(self, t_ns: int) -> None:
         """Report, if the world waits for this process, that everything up to a gate is done."""
         if self.gates:
-            self.publish("done", self._done(t_ns, 0))
-
-    def _done(self, t_ns: int, sent: int) -> run_messages.Done:
-        self.done_ns = max(self.done_ns, t_ns)
-        seq = self.next_seq("done")
-        return run_messages.Done(t_ns, seq, self._info.run_id, self._incarnation, t_ns, sent)
+            self.done_ns = max(self.done_ns, t_ns)
+            self.publish("done", self._membership.done(t_ns, 0))
 
     def leave(self, reason: str, failed: bool = False) -> None:
         """Publish bye once, unless superseded; `failed` for a process that cannot go on."""
-        if self.superseded or self._has_left:
-            return
-        self._has_left = True
-        seq, of = self.next_seq("bye"), (self._info.run_id, self._incarnation)
-        self.publish("bye", run_messages.Bye(self.now_ns, seq, reason, failed or UNSET, *of))
+        if not self.superseded and not self._has_left:
+            self._has_left = True
+            self.publish("bye", self._membership.bye(self.now_ns, reason, failed))
 
     def tick(self) -> None:
         """Rejoin where that is needed, and publish health once a wall second; to be called more often."""
@@ -165,7 +139,6 @@ class Participant:
             self.publish("health", self.health.message(self.now_ns, self.next_seq("health")))
 
     def publish(self, kind: str, message: Struct) -> None:
-        """Publish a message on one of the process's own keys."""
         self._link.put(keys.process(self.name, kind), message)
 
     # What it is told
@@ -185,7 +158,6 @@ class Participant:
         return clock
 
     def take_event(self, payload: bytes) -> None:
-        """Take a message on `world/event`."""
         entry = self.entry_in(payload)
         if entry is not None:
             self.take_entry(entry)
@@ -209,56 +181,33 @@ class Participant:
             self.admitted = True
         elif not self.admitted or entry.incarnation in self._incarnations:
             return
-        elif (entry.host, entry.pid) == self._process:
+        elif (entry.host, entry.pid) == (self._link.host, os.getpid()):
             self.must_rejoin = True  # somebody else has joined under the identity of this process
         else:
             self.successor = f"{entry.host} (pid {entry.pid})"
             self.end_reason = f"another process of this name joined from {self.successor}"
 
     def is_own(self, entry: ProcessEntry) -> bool:
-        """Tell whether an entry is that of the newest incarnation of this process."""
-        return entry.incarnation == self._incarnation
-
-    def _on_event(self, sample: RawSample) -> None:
-        self.take_event(sample.payload)
-
-    def _on_link(self, up: bool) -> None:
-        self.must_rejoin = up and self._was_link_lost
-        self._was_link_lost = not up
+        return entry.incarnation == self._membership.incarnation
 
 
 class AgentParticipant(Participant):
     """The process of an agent in one run.
 
     Whatever the world does not answer is asked for again, until it does (`settle`).
-
-    Args:
-        link: an open session.
-        info: of the run.
-        agent: whose name and sequence numbers it uses.
-        take_in: takes the messages that a replay brings.
-        say: called with lines for the user.
-        wall_s: monotonic wall time.
-        stopped: tells whether the process is to end.
-
-    Attributes:
-        published_ns: gate up to which the predecessor has published all outputs; they are not published again.
-        awaited: whether the world has still to admit this process.
-        failure: why it cannot take part any longer; None while it can.
     """
 
     def __init__(
         self,
         link: Session,
         info: messages.Info,
-        agent: Agent,
-        take_in: Callable[[ReceivedSample], None],
+        agent: Agent,  # whose name and sequence numbers it uses
+        take_in: Callable[[ReceivedSample], None],  # takes the messages that a replay brings
         say: Callable[[str], None],
         wall_s: Callable[[], float] = time.monotonic,
-        stopped: Callable[[], bool] = lambda: False,
+        stopped: Callable[[], bool] = lambda: False,  # tells whether the process is to end
     ) -> None:
-        super().__init__(link, info, agent.name, agent.serves, period_ns=agent.period_ns)
-        self.next_seq = agent.next_seq
+        super().__init__(link, info, agent.name, agent.serves, period_ns=agent.period_ns, next_seq=agent.next_seq)
         self._agent = agent
         self._take_in = take_in
         self._say = say
@@ -275,9 +224,10 @@ class AgentParticipant(Participant):
         self._missed_since_ns: int | None = None
         self._asked_ns, self._asked = -1, 0
         self._retry_s = 0.0
+        # gate up to which the predecessor has published all outputs; they are not published again
         self.published_ns = -1
-        self.awaited = False
-        self.failure: RunError | None = None
+        self.awaited = False  # whether the world has still to admit this process
+        self.failure: RunError | None = None  # why it cannot take part any longer; None while it can
 
     # Taking over from a predecessor
 
@@ -290,7 +240,12 @@ class AgentParticipant(Participant):
             fresh = self._agent.checkpoint()
             try:
                 snapshot: run_messages.Snapshot = messages.decode(sample.key, sample.payload)
-                self._restore(snapshot)
+                clocks = [messages.decode(each.key, each.payload) for each in self._last_values(keys.CLOCK)]
+                age_ns = (clocks[0].t_ns if clocks else 0) - snapshot.t_ns
+                if not 0 <= age_ns <= RESUME_NS or snapshot.version != VERSION:
+                    found = f"it is of version {snapshot.version}, and {age_ns / 1e9:.2f} s old"
+                    raise DecodeError(f"{found}; must be of version {VERSION}, and 0 to {RESUME_NS / 1e9:g} s old")
+                self._agent.resume(self._info, unpack(snapshot.state))
             except Exception as error:  # anybody may have written it, and a user's class reads it
                 self._say(f"{self.name}: its former snapshot is of no use: {error or type(error).__name__}")
                 if fresh is not None:
@@ -301,30 +256,6 @@ class AgentParticipant(Participant):
             self._resumed = True
             return self.done_ns
         return None
-
-    def _restore(self, snapshot: run_messages.Snapshot) -> None:
-        clocks = [messages.decode(sample.key, sample.payload) for sample in self._last_values(keys.CLOCK)]
-        age_ns = (clocks[0].t_ns if clocks else 0) - snapshot.t_ns
-        if not 0 <= age_ns <= RESUME_NS or snapshot.version != VERSION:
-            allowed = f"must be of version {VERSION}, and 0 to {RESUME_NS / 1e9:g} s old"
-            raise DecodeError(f"it is of version {snapshot.version}, and {age_ns / 1e9:.2f} s old; {allowed}")
-        self._agent.resume(self._info, unpack(snapshot.state))
-
-    def _last_values(self, key: str) -> list[ReceivedSample]:
-        """Return what the world has as the last value of a key, once there is a world that answers.
-
-        A world that has died is started again, and an agent that did not wait for it would lose its former state.
-        """
-        while not self._stopped():
-            found = self._link.get_surely(key)
-            if not found and self._link.get_surely(keys.INFO):  # there is a world, which may have come just now
-                found = self._link.get_surely(key)
-                if found is not None:
-                    return found
-            if found:
-                return found
-            time.sleep(RETRY_S)
-        return []
 
     def warm_start(self) -> int | None:
         """Hand the agent what its predecessor published last; return the time of it, None if there was none."""
@@ -343,11 +274,29 @@ class AgentParticipant(Participant):
         self._say(f"{self.name}: warm start from t = {self.done_ns / 1e9:.2f} s")
         return self.done_ns
 
+    def _last_values(self, key: str) -> list[ReceivedSample]:
+        """Return what the world has as the last value of a key, once there is a world that answers.
+
+        A world that has died is started again, and an agent that did not wait for it would lose its former state.
+        """
+        while not self._stopped():
+            found = self._link.get_surely(key)
+            if not found and self._link.get_surely(keys.INFO):  # there is a world, which may have come just now
+                found = self._link.get_surely(key)
+                if found is not None:
+                    return found
+            if found:
+                return found
+            time.sleep(RETRY_S)
+        return []
+
     def check_reach(self, t_ns: int, snapshot_ns: int) -> None:
         """Fail if the first gate that the world brings again is not the one after a snapshot."""
         if t_ns > snapshot_ns + self._info.gate_ns:
-            what = f"the gates after its snapshot of t = {snapshot_ns / 1e9:.2f} s are kept by nobody any more"
-            self.failure = BehindError(f"{self.name}: {what}; this one ends, start it again")
+            self._fail_behind(f"the gates after its snapshot of t = {snapshot_ns / 1e9:.2f} s are")
+
+    def _fail_behind(self, what: str) -> None:
+        self.failure = BehindError(f"{self.name}: {what} kept by nobody any more; this one ends, start it again")
 
     # Taking part
 
@@ -360,8 +309,8 @@ class AgentParticipant(Participant):
     def publish_gate(self, t_ns: int, outputs: Sequence[Output]) -> None:
         """Encode the outputs of a gate and the done that counts them, for `send`."""
         self._kept.append((t_ns, outputs))
-        done = self._done(t_ns, _counted(outputs))
-        self.now_ns = self.done_ns
+        self.now_ns = self.done_ns = max(self.done_ns, t_ns)
+        done = self._membership.done(t_ns, _counted(outputs))
         if t_ns <= self.published_ns:
             return
         self._unsent += [(key, messages.encode(message)) for key, message in outputs]
@@ -392,31 +341,28 @@ class AgentParticipant(Participant):
         return [[key, messages.encode(message)] for _, outputs in self._kept for key, message in outputs]
 
     def take_entry(self, entry: ProcessEntry) -> None:
+        """Take the news of an admission; once it is this process's, fetch what came since the state taken over."""
         is_rejoining = self.must_rejoin
         super().take_entry(entry)
         if self.is_own(entry):
             self._unproved = 0
-            if self.awaited:
-                self._begin(entry)
+            if not self.awaited:
+                return
+            self.awaited = False
+            if self._resumed:
+                self.published_ns = entry.done_ns
+            elif self.done_ns >= 0:
+                self._link.put(self._done_key, self._membership.done(self.done_ns, 0))
+            if self.done_ns >= 0:
+                self._fetch_soon(self.done_ns)
+            elif entry.former_pid is not None:
+                self._fetch_soon(max(entry.from_ns - 1, entry.done_ns))
         elif self.successor:
-            self.failure = SupersededError(
-                f"{self.name}: {self.end_reason}; this one ends. Give each process its own name."
-            )
+            advice = "this one ends. Give each process its own name."
+            self.failure = SupersededError(f"{self.name}: {self.end_reason}; {advice}")
         elif self.must_rejoin and not is_rejoining:
             self._say(f"{self.name}: somebody else has joined as this process; it joins again")
             self.come_back()
-
-    def _begin(self, entry: ProcessEntry) -> None:
-        """Fetch what came since the state that was taken over, or since the predecessor."""
-        self.awaited = False
-        if self._resumed:
-            self.published_ns = entry.done_ns
-        elif self.done_ns >= 0:
-            self._link.put(self._done_key, self._done(self.done_ns, 0))
-        if self.done_ns >= 0:
-            self._catch_up(self.done_ns)
-        elif entry.former_pid is not None:
-            self._catch_up(max(entry.from_ns - 1, entry.done_ns))
 
     # Catching up and coming back
 
@@ -436,8 +382,7 @@ class AgentParticipant(Participant):
             self._asked_ns, self._asked, self._retry_s = t_ns, 0, 0.0
             self._say(f"{self.name}: {missing} of t = {t_ns / 1e9:.2f} s did not come; asking for it again")
         if self._asked >= ASKED_MAX:
-            what = f"{missing} of t = {t_ns / 1e9:.2f} s is kept by nobody any more"
-            self.failure = BehindError(f"{self.name}: {what}; this one ends, start it again")
+            self._fail_behind(f"{missing} of t = {t_ns / 1e9:.2f} s is")
             return
         self._missed_since_ns = t_ns - self._info.gate_ns
         self.settle()
@@ -449,7 +394,7 @@ class AgentParticipant(Participant):
         self._retry_s = 0.0
         self.settle()
 
-    def _catch_up(self, since_ns: int) -> None:
+    def _fetch_soon(self, since_ns: int) -> None:
         self._missed_since_ns = since_ns
         self._retry_s = 0.0
         self.settle()
@@ -459,7 +404,15 @@ class AgentParticipant(Participant):
         if not self.owes or self._wall_s() < self._retry_s:
             return
         if self.must_rejoin:
-            self._rejoin()
+            info = read_info(self._link)
+            if info is not None:  # a world answers; it must still be that of the same run
+                self.must_rejoin = False
+                if info.run_id == self._info.run_id:
+                    self._unproved = REJOINS_MAX
+                    self._proof_ns = self.done_ns + GATES_KEPT * self._info.command_delay_ns
+                    self._publish_again()
+                else:
+                    self.failure = RunError(f"{self.name}: {ANOTHER_RUN}")
         elif self.awaited:
             self.join()
         elif self._unproved:
@@ -472,29 +425,16 @@ class AgentParticipant(Participant):
             self._fetch(self._missed_since_ns)
         self._retry_s = self._wall_s() + RETRY_S
 
-    def _rejoin(self) -> None:
-        """Join the run again, once a world answers that it is still the same one."""
-        info = read_info(self._link)
-        if info is None:
-            return
-        self.must_rejoin = False
-        if info.run_id != self._info.run_id:
-            self.failure = RunError(f"{self.name}: {ANOTHER_RUN}")
-            return
-        self._unproved, self._proof_ns = REJOINS_MAX, self.done_ns + GATES_KEPT * self._info.command_delay_ns
-        self._publish_again()
-
     def _publish_again(self) -> None:
         """Join, and repeat the outputs and dones that may have been lost."""
         self.join()
         for t_ns, outputs in self._kept:
             for key, message in outputs:
                 self._link.put(key, message)
-            self._link.put(self._done_key, self._done(t_ns, _counted(outputs)))
+            self._link.put(self._done_key, self._membership.done(t_ns, _counted(outputs)))
         self._missed_since_ns = self.done_ns
 
     def ask_faults(self) -> None:
-        """Ask which faults are injected."""
         for sample in self._link.get(keys.FAULTS):
             self._take_in(sample)
 
@@ -512,5 +452,4 @@ class AgentParticipant(Participant):
 
 
 def _counted(outputs: Sequence[Output]) -> int:
-    """Return how many outputs the world counts."""
     return sum(messages.is_output(key) for key, _ in outputs)

@@ -5,25 +5,25 @@ A world that a launcher started writes it as JSON lines (`JsonProgress`); otherw
 
 import json
 import math
-import re
 import sys
 import threading
 from collections.abc import Callable
 from typing import Any, Protocol, Self
 
+import msgspec
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
 from zsim.contract.flight_messages import ClusterState
-from zsim.errors import printable
+from zsim.contract.run_messages import Waiting, holding_up
+from zsim.errors import printable, without_figures
 
 PERIOD_S = 0.2  # wall time between two updates
 SLOW_S = 3.0  # wall time; what is compiled already is loaded within two, unless the machine is busy
 SLOW_NOTICE = "loading what is compiled, or compiling it: once on a machine, that takes a minute"
 REPEATED_S = 10.0  # simulated time; as often as the clock is a line where there is no live one
 REASON_NS = 5_000_000_000  # simulated time; a take-off gives one reason for 3 s
-_NUMBER = re.compile(r"-?[0-9][0-9.]*")
 DRIVERS, COMINGS = "driver.", ("join", "leave")  # they are started by hand, by people who look here
 QUIET = frozenset({"join", "leave", "command", "control", "mode", "commander", "release", "refused", "end"})
 
@@ -43,12 +43,7 @@ class ProgressSink(Protocol):
 
 
 class SlowStart:
-    """Shows a line when a start takes long, which nearly always is because something is compiled.
-
-    Args:
-        say: shows it, from a thread of its own.
-        text: the line.
-    """
+    """Shows a line, from a thread of its own, when a start takes long: nearly always something is being compiled."""
 
     def __init__(self, say: Callable[[str], None], text: str = SLOW_NOTICE) -> None:
         self._timer = threading.Timer(SLOW_S, say, args=(text,))
@@ -56,7 +51,6 @@ class SlowStart:
         self._timer.start()
 
     def over(self) -> None:
-        """Show nothing any more: it has started, or failed to."""
         self._timer.cancel()
 
 
@@ -69,7 +63,7 @@ class HoldReasons:
 
     def line(self, cluster: str, state: ClusterState) -> str | None:
         """Return a line with the reason of a state if it has been the same, but for its numbers, for REASON_NS."""
-        shape = _NUMBER.sub("#", state.reason)
+        shape = without_figures(state.reason)
         former, since_ns = self._since.get(cluster, ("", 0))
         if shape != former:
             self._since[cluster] = (shape, state.t_ns)
@@ -88,7 +82,6 @@ class RepeatedEvents:
         self._counted: dict[tuple[str, str], tuple[float, float, int]] = {}
 
     def lines(self, t_s: float, kind: str, text: str) -> list[str]:
-        """Return the lines to show now that an event has come."""
         lines = self.over(t_s)
         first = self._counted.get((kind, text))
         self._counted[kind, text] = (first[0], t_s, first[2] + 1) if first else (t_s, t_s, 1)
@@ -109,20 +102,20 @@ class JsonProgress:
     """Writes progress as JSON lines for a launcher."""
 
     def clock(self, line: dict[str, Any]) -> None:
-        self._write({"clock": line})
+        self._write("clock", line)
 
     def event(self, line: dict[str, Any]) -> None:
-        self._write({"event": line})
+        self._write("event", line)
 
     def health(self, line: dict[str, Any]) -> None:
-        self._write({"health": line})
+        self._write("health", line)
 
     def say(self, text: str) -> None:
-        self._write({"say": text})
+        self._write("say", text)
 
-    def _write(self, line: dict[str, Any]) -> None:
+    def _write(self, kind: str, content: Any) -> None:
         try:
-            sys.stdout.write(json.dumps(line) + "\n")
+            sys.stdout.write(json.dumps({kind: content}) + "\n")
             sys.stdout.flush()
         except (BrokenPipeError, ValueError):
             return  # the launcher is gone; its stop channel ends this process
@@ -132,7 +125,6 @@ class PipedConsole(Console):
     """A console whose reader may go away: what nobody reads is dropped, and nothing fails because of it."""
 
     def on_broken_pipe(self) -> None:
-        """Write nothing more."""
         self.quiet = True
 
 
@@ -166,7 +158,6 @@ class Screen:
             self.say(text)
 
     def say(self, text: str) -> None:
-        """Show a line that stays."""
         if self.console.quiet:
             self._live.stop()
             self.console.quiet = False
@@ -197,7 +188,7 @@ class Screen:
                 self.say(text)
 
     def health(self, line: dict[str, Any]) -> None:
-        """Do nothing: the one live line has no room for it; `zsim up` has a table."""
+        """The one live line has no room for it; `zsim up` has a table."""
 
 
 def describe(line: dict[str, Any], duration_s: float, from_s: float = 0.0) -> str:
@@ -211,14 +202,8 @@ def describe(line: dict[str, Any], duration_s: float, from_s: float = 0.0) -> st
         text += f"  {line['phase']}"
     if line["state"] != "running":
         text += f"  {line['state']}"
-    waiting = [w for w in line["waiting_for"] if line["state"] == "waiting" or w["since_wall_s"] > 0.5]
-    waiting = [w for w in waiting if not w.get("held_by")] or waiting  # causes alone
+    waiting = holding_up(line["state"], msgspec.convert(line["waiting_for"], list[Waiting]))
     if waiting:
-        named = ", ".join(_name(w) for w in waiting[:4]) + (" …" if len(waiting) > 4 else "")
-        text += f"  waiting for {named}"
+        names = [f"{w.name}{w.host and f' on {w.host}'} ({w.since_wall_s:.1f} s)" for w in waiting[:4]]
+        text += f"  waiting for {', '.join(names)}{' …' if len(waiting) > 4 else ''}"
     return text
-
-
-def _name(waiting: dict[str, Any]) -> str:
-    host = f" on {waiting['host']}" if waiting["host"] else ""
-    return f"{waiting['name']}{host} ({waiting['since_wall_s']:.1f} s)"

@@ -25,11 +25,9 @@ class RateLimit:
         self._spent: dict[str, tuple[float, float]] = {}  # what counted, and when
 
     def knows(self, subject: str) -> bool:
-        """Tell whether a subject has spent anything."""
         return subject in self._spent
 
     def allows(self, subject: str = "") -> bool:
-        """Tell whether a subject may spend one more."""
         return self._counted(subject) <= self._burst - 1
 
     def spend(self, subject: str = "") -> bool:

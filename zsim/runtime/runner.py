@@ -21,7 +21,7 @@ from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError, SessionError
 from zsim.runtime.agent import Agent
 from zsim.runtime.health import HealthMeter, rare_collections
-from zsim.runtime.inbox import Inbox, RoutingTable, output_hold_ns
+from zsim.runtime.inbox import NEVER_NS, Inbox, RoutingTable, output_hold_ns
 from zsim.runtime.participant import AgentParticipant
 from zsim.scenario.faults import PROCESS_KILL
 from zsim.schema import plugin
@@ -33,31 +33,18 @@ VIEW_PERIOD_S = 1 / 20  # contract: at most 30 Hz wall; a console draws 20 pictu
 
 
 class Runner:
-    """One agent on one session.
-
-    Args:
-        link: an open session.
-        info: of the run.
-        agent: what to run.
-        stopped: asked every TICK_S; True ends the process with a bye.
-        say: called with lines for the user.
-        deserted: asked at the end; True leaves without a bye, as a process that dies, so that the world waits for a
-            successor.
-        snapshot_ns: simulated time between two snapshots of the agent; 0 for none.
-
-    Attributes:
-        killed: whether a fault has ended it, without a bye; its process is to die as well.
-    """
+    """One agent on one session."""
 
     def __init__(
         self,
         link: Session,
         info: messages.Info,
         agent: Agent,
-        stopped: Callable[[], bool] = lambda: False,
+        stopped: Callable[[], bool] = lambda: False,  # asked every TICK_S; True ends the process with a bye
         say: Callable[[str], None] = lambda text: None,
+        # asked at the end; True leaves without a bye, as a process that dies, so that the world waits for a successor
         deserted: Callable[[], bool] = lambda: False,
-        snapshot_ns: int = 0,
+        snapshot_ns: int = 0,  # simulated time between two snapshots of the agent; 0 for none
     ) -> None:
         self._link = link
         self._info = info
@@ -65,7 +52,9 @@ class Runner:
         self._stopped = stopped
         self._say = say
         self._deserted = deserted
-        self._member = AgentParticipant(link, info, agent, self._take_in, say, stopped=stopped)
+        self._member = AgentParticipant(
+            link, info, agent, lambda sample: self._inputs.take_in(sample), say, stopped=stopped
+        )
         self.health = self._member.health
         self._inputs = RunnerInputs(link, info, agent, self.health, say)
         self._inbox = self._inputs.inbox
@@ -81,7 +70,7 @@ class Runner:
         self._end_wall_s = 0.0
         self._leave: str | None = None
         self._over = threading.Event()
-        self.killed = False
+        self.killed = False  # whether a fault has ended it, without a bye; its process is to die as well
 
     def run(self) -> str:
         """Take part until the run ends; return why it left.
@@ -123,11 +112,6 @@ class Runner:
             self._member.leave(self._leave)
         return self._leave
 
-    def _take_in(self, sample: ReceivedSample) -> None:
-        self._inputs.take_in(sample)
-
-    # One turn
-
     def _turn(self) -> None:
         """Take in what has arrived, step through every gate that is complete, and wait if there was none."""
         self._serve_rare()
@@ -137,8 +121,12 @@ class Runner:
             self._step(t_ns)
             stepped = True
         self._member.send()
-        if self._leave is None:
-            self._look_for_end()
+        if self._leave is None and self._stopped():
+            self._leave = "stopped"
+        elif self._leave is None and self._end_ns is not None:
+            late = time.monotonic() - self._end_wall_s > DRAIN_S
+            if self._member.done_ns >= self._end_ns // self._agent.period_ns * self._agent.period_ns or late:
+                self._leave = run_messages.RUN_ENDED
         if self._leave is None and not stepped:
             try:
                 self._inputs.wait()
@@ -147,44 +135,39 @@ class Runner:
 
     def _ready_gate(self) -> int | None:
         """Return the gate to step now, None if it must be waited for."""
-        t_ns = self._inbox.next_gate_ns()
+        inbox, member = self._inbox, self._member
+        t_ns = inbox.next_gate_ns()
         self._lacks = False
-        if t_ns is None or self._member.awaited or not self._reaches_back(t_ns):
+        if t_ns is None or member.awaited:
             return None
-        if self._inbox.missing(t_ns) is None:
+        if self._resumed_ns is not None:  # the gate that follows the snapshot is to be there: the world brings it again
+            if member.is_fetching:
+                return None
+            if not inbox.may_skip:
+                member.check_reach(t_ns, self._resumed_ns)
+            self._resumed_ns = None
+            if member.failure:
+                self._leave = str(member.failure)
+                return None
+        if inbox.missing(t_ns) is None:
             return t_ns
         if self._info.mode == "lockstep":
-            return self._find_lost(t_ns)
-        if self._inbox.latest_gate_ns() == t_ns:
+            lost = inbox.lost(t_ns)
+            if lost is None or self.health.link_lost:
+                return None
+            member.ask_again(t_ns, lost)  # it will not come any more by itself
+            self._lacks = inbox.missing(t_ns) is not None
+            return None if self._lacks else t_ns
+        if inbox.latest_gate_ns() == t_ns:
             return None
         self.health.dropped += 1  # the next gate is there: this one is stepped with what has come
         return t_ns
 
-    def _reaches_back(self, t_ns: int) -> bool:
-        """Tell whether, after a snapshot, the gate that follows it is there, which the world brings again."""
-        if self._resumed_ns is None:
-            return True
-        if self._member.is_fetching:
-            return False
-        if not self._inbox.may_skip:
-            self._member.check_reach(t_ns, self._resumed_ns)
-        self._resumed_ns = None
-        if self._member.failure:
-            self._leave = str(self._member.failure)
-        return self._leave is None
-
-    def _find_lost(self, t_ns: int) -> int | None:
-        """Ask again for what will not come any more; return the gate if it is complete now."""
-        lost = self._inbox.lost(t_ns)
-        if lost is None or self.health.link_lost:
-            return None
-        self._member.ask_again(t_ns, lost)
-        self._lacks = self._inbox.missing(t_ns) is not None
-        return None if self._lacks else t_ns
-
     def _step(self, t_ns: int) -> None:
         start_ns = time.perf_counter_ns()
-        self._update_faults(t_ns)
+        for faults in self._inputs.fault_lists_before(t_ns):
+            self._agent.update_faults(self._info, faults)
+            self._update_kills(faults)
         for key, request in self._inputs.repeated(t_ns):
             self._agent.repeat(key, request)
         outputs = self._agent.answer(t_ns, self._inbox.take(t_ns))
@@ -199,43 +182,29 @@ class Runner:
             self._view_wall_s = now_s
             for key, message in self._agent.views(t_ns):
                 self._link.put(key, message)
-        self._die(t_ns)
+        if self._lives_after_ns is None:
+            self._lives_after_ns = t_ns - self._agent.period_ns
+        for fault in self._kills.values():  # it ends in one of the gates that it has lived; their outputs still go out
+            lives_after_ns = max(self._lives_after_ns, self._member.published_ns)
+            if lives_after_ns < fault.from_ns + self._info.gate_ns <= t_ns:
+                self._leave, self.killed = f"killed by fault {fault.id}", True
         self.health.step(time.perf_counter_ns() - start_ns)
         newest_ns = self._inbox.latest_gate_ns()
         self.health.lag_ns = newest_ns - t_ns if newest_ns is not None else 0
 
-    def _update_faults(self, t_ns: int) -> None:
-        """Take the lists of faults that the world published before a gate.
+    def _update_kills(self, faults: run_messages.Faults) -> None:
+        """Take the faults that kill this process from a list.
 
         A list may have forgotten a kill that a late process has still to die of; one that has not begun when a list
         is published, and is not on it, has been cleared.
         """
-        for faults in self._inputs.fault_lists_before(t_ns):
-            self._agent.update_faults(self._info, faults)
-            if faults.seq > self._list_seq:
-                self._list_seq = faults.seq
-                kills = self._kills.values()
-                begun = {f.id: f for f in kills if f.until_ns is not None and f.until_ns <= faults.t_ns}
-                names = self._agent.name, *self._agent.serves
-                listed = {f.id: f for f in faults.faults if f.kind == PROCESS_KILL and f.target in names}
-                self._kills = begun | listed
-
-    def _die(self, t_ns: int) -> None:
-        """End, if a fault kills it in one of the gates that it has lived; their outputs still go out."""
-        if self._lives_after_ns is None:
-            self._lives_after_ns = t_ns - self._agent.period_ns
-        lives_after_ns = max(self._lives_after_ns, self._member.published_ns)
-        for fault in self._kills.values():
-            if lives_after_ns < fault.from_ns + self._info.gate_ns <= t_ns:
-                self._leave, self.killed = f"killed by fault {fault.id}", True
-
-    def _look_for_end(self) -> None:
-        if self._stopped():
-            self._leave = "stopped"
-        elif self._end_ns is not None:
-            late = time.monotonic() - self._end_wall_s > DRAIN_S
-            if self._member.done_ns >= self._end_ns // self._agent.period_ns * self._agent.period_ns or late:
-                self._leave = run_messages.RUN_ENDED
+        if faults.seq > self._list_seq:
+            self._list_seq = faults.seq
+            kills = self._kills.values()
+            begun = {f.id: f for f in kills if f.until_ns is not None and f.until_ns <= faults.t_ns}
+            names = self._agent.name, *self._agent.serves
+            listed = {f.id: f for f in faults.faults if f.kind == PROCESS_KILL and f.target in names}
+            self._kills = begun | listed
 
     # What arrives rarely
 
@@ -246,62 +215,48 @@ class Runner:
             self._member.publish_health()
 
     def _serve_rare(self) -> None:
-        while self._inputs.notices:
-            self._serve_notice(self._inputs.notices.popleft())
-        while self._inputs.links:
-            self._serve_link(self._inputs.links.popleft())
-        while self._inputs.queries:
-            self._serve_query(self._inputs.queries.popleft())
+        while self._inputs.rare:
+            arrived = self._inputs.rare.popleft()
+            if isinstance(arrived, WorldEvent):
+                self._serve_event(arrived)
+            elif not isinstance(arrived, bool):
+                self._serve_query(arrived)
+            elif not arrived:
+                self.health.link_lost = True
+                self._say(f"{self._agent.name}: lost the link to the world; waiting for it to come back")
+            elif self.health.link_lost:
+                self.health.link_lost = False
+                self._say(f"{self._agent.name}: the link is back")
+                self._member.come_back()
         if not self.health.link_lost:
             self._member.settle()
         if self._member.failure:
             self._leave = str(self._member.failure)
 
-    def _serve_notice(self, read: WorldEvent) -> None:
-        if isinstance(read.data, RunEnd):
-            self._end_ns = read.data.last_ns
+    def _serve_event(self, event: WorldEvent) -> None:
+        if isinstance(event.data, RunEnd):
+            self._end_ns = event.data.last_ns
             self._end_wall_s = time.monotonic()
-        elif read.kind in ("drop", "leave"):
-            self._inputs.ignore_estimates(read.subject)
-        elif isinstance(read.data, ProcessEntry) and read.subject == self._agent.name:
-            self._member.take_entry(read.data)
-        elif isinstance(read.data, ProcessEntry) and read.kind == "join":
-            self._inputs.expect_estimates(read.subject, read.data.from_ns)
-
-    def _serve_link(self, up: bool) -> None:
-        if up and self.health.link_lost:
-            self.health.link_lost = False
-            self._say(f"{self._agent.name}: the link is back")
-            self._member.come_back()
-        elif not up:
-            self.health.link_lost = True
-            self._say(f"{self._agent.name}: lost the link to the world; waiting for it to come back")
+        elif event.kind in ("drop", "leave"):
+            self._inputs.ignore_estimates(event.subject)
+        elif isinstance(event.data, ProcessEntry) and event.subject == self._agent.name:
+            self._member.take_entry(event.data)
+        elif isinstance(event.data, ProcessEntry) and event.kind == "join":
+            self._inputs.expect_estimates(event.subject, event.data.from_ns)
 
     def _serve_query(self, query: Query) -> None:
-        if query.expression == keys.process(self._agent.name, "outputs"):
-            query.answer(ControlAnswer(ok=True, result=self._member.outputs()))
-            return
         try:
-            answer = self._agent.control(query.expression, query.request())
+            if query.expression == keys.process(self._agent.name, "outputs"):
+                answer = ControlAnswer(ok=True, result=self._member.outputs())
+            else:
+                answer = self._agent.control(query.expression, query.request())
         except DecodeError as error:
             answer = ControlAnswer(ok=False, error=str(error))
         query.answer(answer)
 
 
 class RunnerInputs:
-    """The subscriptions of one agent, sorted into its inbox, and what other threads of Zenoh bring.
-
-    Args:
-        link: an open session.
-        info: of the run.
-        agent: whose inputs they are.
-        health: counts what is received and refused.
-        say: called with a line for the user.
-
-    Attributes:
-        inbox: the agent's inputs, by gate.
-        notices, links, queries: what has come from other threads and is to be served in turn.
-    """
+    """The subscriptions of one agent, sorted into its inbox, and what other threads of Zenoh bring."""
 
     def __init__(
         self, link: Session, info: messages.Info, agent: Agent, health: HealthMeter, say: Callable[[str], None]
@@ -323,22 +278,16 @@ class RunnerInputs:
         self._subscriptions: dict[str, Subscription] = {}
         self._expressions = RoutingTable([[expression] for expression in agent.reads])
         self._table = run_key_table(info)
-        self._gate_key = self._choose_gate_key()
-        self.notices: deque[WorldEvent] = deque()
-        self.queries: deque[Query] = deque()
-        self.links: deque[bool] = deque()
+        # on which the sensors of a gate come as GateMessages; those of external drones come singly, from drivers
+        of_world = [drone for drone in agent.counted if drone not in self._external]
+        self._gate_key = ""
+        if of_world and len(agent.counted) > 1:
+            self._gate_key = keys.GATE
+        elif of_world and agent.takes_gates:
+            self._gate_key = keys.gate(of_world[0])
+        self.rare: deque[WorldEvent | Query | bool] = deque()  # to be served in turn; a bool: whether the link is up
         self._fault_lists: deque[run_messages.Faults] = deque()
         self._repeated: dict[int, dict[tuple[str, int], Any]] = {}  # by gate, then by key and number
-
-    def _choose_gate_key(self) -> str:
-        """Return the key on which the agent takes the sensors of a gate as GateMessages; empty for none.
-
-        Sensors of external drones come on their own keys, from drivers.
-        """
-        of_world = [drone for drone in self._agent.counted if drone not in self._external]
-        if of_world and len(self._agent.counted) > 1:
-            return keys.GATE
-        return keys.gate(of_world[0]) if of_world and self._agent.takes_gates else ""
 
     def subscribe(self) -> None:
         """Subscribe to all that the agent reads, answer its requests, and show that the process lives."""
@@ -352,31 +301,22 @@ class RunnerInputs:
         self._link.declare_subscriber(keys.FAULTS, lambda sample: self._on_faults(sample.payload))
         if self._is_realtime:
             self._link.declare_subscriber(keys.CLOCK, self._on_clock)
-        self._link.on_link(self._on_link)
+        self._link.on_link(self._on_rare)
         for key in (*self._agent.control_keys(), keys.process(self._agent.name, "outputs")):
-            self._link.declare_queryable(key, self._on_query)
+            self._link.declare_queryable(key, self._on_rare)
         self._link.declare_process(self._agent.name)
 
     def wait(self) -> None:
-        """Wait for what completes the next gate, or until woken.
-
-        Raises:
-            SessionError: the session was closed meanwhile.
-        """
-        self._blocking = self._subscriptions[self._blocking_expression()]
+        """Wait for what completes the next gate, or until woken; SessionError if the session was closed meanwhile."""
+        wanted = self.inbox.last_missing() or self._agent.gate_keys[-1]
+        expression = self._agent.reads[self._expressions.readers(wanted)[0]]
+        self._blocking = self._subscriptions[expression if expression in self._subscriptions else self._gate_key]
         sample = self._blocking.receive()
         self._blocking = None
         if sample is not None:
             self._open(sample)
 
-    def _blocking_expression(self) -> str:
-        """Return the subscription from which the next missing message comes."""
-        wanted = self.inbox.last_missing() or self._agent.gate_keys[-1]
-        expression = self._agent.reads[self._expressions.readers(wanted)[0]]
-        return expression if expression in self._subscriptions else self._gate_key
-
     def wake(self) -> None:
-        """Let a `wait` of another thread return."""
         for subscription in list(self._subscriptions.values()):
             subscription.wake()
 
@@ -402,7 +342,6 @@ class RunnerInputs:
         self.inbox.put(keys.GATE, gate)
 
     def take_in(self, sample: ReceivedSample) -> None:
-        """Take in one message."""
         if sample.key == keys.FAULTS:
             self._on_faults(sample.payload)
             return
@@ -442,7 +381,7 @@ class RunnerInputs:
         """Wait no longer for the estimates of a process: those that it published last, or has the name for."""
         for key, stock in self._stock.items():
             if process == (self._estimated_by.get(key) or stock):
-                self.inbox.ignore(key)
+                self.inbox.expect(key, NEVER_NS)
 
     def expect_estimates(self, process: str, from_ns: int) -> None:
         """Wait again for the estimates of a process, from the gate `from_ns` on."""
@@ -459,8 +398,7 @@ class RunnerInputs:
             self._health.refused += 1  # of somebody else; the world's own events can be read
             return
         if read is not None:
-            self.notices.append(read)
-            self.wake()
+            self._on_rare(read)
 
     def _on_clock(self, sample: RawSample) -> None:
         """In realtime, end a wait for a gate that the world has left behind: what it lacks may never come."""
@@ -478,10 +416,6 @@ class RunnerInputs:
         except DecodeError:
             self._health.refused += 1
 
-    def _on_link(self, up: bool) -> None:
-        self.links.append(up)
-        self.wake()
-
-    def _on_query(self, query: Query) -> None:
-        self.queries.append(query)
+    def _on_rare(self, arrived: WorldEvent | Query | bool) -> None:
+        self.rare.append(arrived)
         self.wake()

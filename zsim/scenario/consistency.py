@@ -45,11 +45,9 @@ SIGHTED_MAX = 12  # drones of a cluster: each of its estimators has the states o
 
 
 def cross_faults(scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
-    """Yield every fault between fields of a scenario, or of the sound parts of one.
+    """Yield every fault between fields of a scenario, or of the parts of one that `checker.sound` gives.
 
-    Args:
-        scenario: as `checker.sound` gives it.
-        vehicles: by model; what depends on a vehicle that is not among them is left out.
+    `vehicles`: by model; what depends on a vehicle that is not among them is left out.
     """
     drones, clusters = _entries(scenario.drones), _entries(scenario.clusters)
     yield from _name_faults("drones", drones)
@@ -105,7 +103,6 @@ def _names(entries: _Entries) -> list[str]:
 
 
 def _under(section: str, faults: Iterable[Fault]) -> Iterator[Fault]:
-    """Yield faults of a section with their paths in the scenario."""
     yield from ((f"{section}.{path}", text) for path, text in faults)
 
 
@@ -200,10 +197,15 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
         yield "rotor_min_rad_s", f"is {low:g}; must be < rotor_max_rad_s ({high:g})"
     gravity = scenario.environment and scenario.environment.gravity_m_s2
     vehicle = vehicles.get(drone.model) if drone.model else None
-    if vehicle and _known(drone.thrust_n_s2, high) and (fault := _tip_fault(drone, vehicle)):
-        yield "rotor_max_rad_s", fault
-    elif vehicle and _known(drone.mass_kg, drone.thrust_n_s2, high, gravity):
-        yield from _hover_faults(drone, vehicle, scenario.environment)
+    if vehicle and _known(drone.thrust_n_s2, high):
+        scale = (drone.thrust_n_s2 / vehicle.thrust_n_s2) ** 0.25  # of a rotor; larger may be a wrong unit of that
+        radius_m = vehicle.rotor_radius_m * min(1.0, scale)
+        if radius_m * high > TIP_MAX_M_S:
+            tip = f"so that the tip of a rotor of {radius_m:.3g} m moves at {radius_m * high:.0f} m/s"
+            most = f"sane: at most {TIP_MAX_M_S / radius_m:.0f}, the speed of sound"
+            yield "rotor_max_rad_s", f"is {high:g}, {tip}; {most}; check its unit, rad/s: rpm over 9.55"
+        elif _known(drone.mass_kg, gravity):
+            yield from _hover_faults(drone, vehicle, scenario.environment)
     if vehicle and _known(drone.mass_kg, drone.thrust_n_s2):
         yield from _drag_faults(drone, len(vehicle.rotors))
     if _known(drone.mass_kg, drone.arm_m, drone.inertia_kg_m2) and None not in drone.inertia_kg_m2:
@@ -211,20 +213,17 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
         if max(drone.inertia_kg_m2) > greatest:
             found = f"is {list(drone.inertia_kg_m2)}; sane: at most {greatest:.3g}, ten times mass_kg arm_m^2"
             yield "inertia_kg_m2", f"{found}; check its unit, kg m^2"
-    yield from _height_faults(drone, scenario.environment and scenario.environment.height_m)
+    origin_m = scenario.environment and scenario.environment.height_m
+    heights = {
+        "position_m[2]": drone.position_m and drone.position_m[2],
+        "limits.altitude_m": drone.limits and drone.limits.altitude_m,
+    }
+    for path, height_m in heights.items():
+        if _known(origin_m, height_m) and origin_m + height_m > SEA_HEIGHT_MAX_M:
+            limit = f"with environment.height_m ({origin_m:g}) it must be <= {SEA_HEIGHT_MAX_M} m above the sea"
+            yield path, f"is {height_m:g}; {limit}"
     if drone.sensors is not None:
         yield from _under("sensors", _sensor_faults(drone.sensors))
-
-
-def _tip_fault(drone: Any, vehicle: Vehicle) -> str | None:
-    """Return the fault of a rotor speed whose tips would be supersonic: it is in rpm."""
-    scale = (drone.thrust_n_s2 / vehicle.thrust_n_s2) ** 0.25  # of a rotor; larger may be a wrong unit of that
-    radius_m, high = vehicle.rotor_radius_m * min(1.0, scale), drone.rotor_max_rad_s
-    if radius_m * high <= TIP_MAX_M_S:
-        return None
-    tip = f"so that the tip of a rotor of {radius_m:.3g} m moves at {radius_m * high:.0f} m/s"
-    most = f"sane: at most {TIP_MAX_M_S / radius_m:.0f}, the speed of sound"
-    return f"is {high:g}, {tip}; {most}; check its unit, rad/s: rpm over 9.55"
 
 
 def _drag_faults(drone: Any, rotors: int) -> Iterator[Fault]:
@@ -300,17 +299,6 @@ def _hover_faults(drone: Any, vehicle: Vehicle, environment: Any) -> Iterator[Fa
             yield "battery_mah", f"is {drone.battery_mah:g}, {lasts}; {sane}; check its unit, mAh"
 
 
-def _height_faults(drone: Any, origin_m: float | None) -> Iterator[Fault]:
-    heights = {
-        "position_m[2]": drone.position_m and drone.position_m[2],
-        "limits.altitude_m": drone.limits and drone.limits.altitude_m,
-    }
-    for path, height_m in heights.items():
-        if _known(origin_m, height_m) and origin_m + height_m > SEA_HEIGHT_MAX_M:
-            limit = f"with environment.height_m ({origin_m:g}) it must be <= {SEA_HEIGHT_MAX_M} m above the sea"
-            yield path, f"is {height_m:g}; {limit}"
-
-
 def _sensor_faults(sensors: Any) -> Iterator[Fault]:
     if sensors.as_printed and sensors.preset not in (None, "paper"):
         yield "as_printed", "is true; must be false unless preset is paper"
@@ -329,7 +317,6 @@ def _sensor_faults(sensors: Any) -> Iterator[Fault]:
 
 
 def _own_sensor_faults(drones: _Entries) -> Iterator[Fault]:
-    """Yield where a sensor of one name has messages of two kinds, or its message the name of another."""
     first: dict[str, tuple[int, str]] = {}
     fields_of: dict[str, dict[str, str]] = {}
     taken = {kind.__name__ for kind in messages.types_by_shape().values()}
@@ -363,7 +350,6 @@ def _membership_faults(drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
 
 
 def _shape_faults(cluster: Any, drones: _Entries) -> Iterator[Fault]:
-    """Yield what is wrong with the groups and templates of a cluster."""
     if not _known(cluster.drones, cluster.groups) or None in cluster.groups:
         return
     placed = {drone.name: drone.position_m for _, drone in drones if _known(drone.name)}
@@ -449,7 +435,6 @@ def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Ite
 def _injected_faults(
     scenario: Any, drones: _Entries, clusters: _Entries, vehicles: Mapping[str, Vehicle]
 ) -> Iterator[Fault]:
-    """Yield what is wrong with the faults that a scenario injects, where their possible targets are known."""
     if any(item.name is None for _, item in [*drones, *clusters]) or not drones:
         return
     expected = scenario.processes and scenario.processes.expect
@@ -491,8 +476,19 @@ def _sighting_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Ite
 def _camera_faults(sensors: Any) -> Iterator[Fault]:
     cameras = {"front": sensors.front_camera, "bottom": sensors.bottom_camera}
     for name, camera in cameras.items():
-        if camera:
-            yield from _under(f"{name}_camera", _lens_faults(camera))
+        if not camera:
+            continue
+        path = f"{name}_camera"
+        of_lens = camera.width_px, camera.height_px, camera.diagonal_deg, camera.distortion
+        if None not in of_lens and None not in camera.distortion and folds(lens_of(camera)):
+            least = LEAST_K1 / math.tan(math.radians(camera.diagonal_deg) / 2) ** 2
+            given = f"is {list(camera.distortion)}, which folds a picture of {camera.diagonal_deg:g} deg"
+            needed = f"must give every pixel a ray of its own, k1 alone more than {least:.3f}"
+            yield f"{path}.distortion", f"{given}; {needed}"
+        if None not in (camera.exposure_ms, camera.rate_hz) and camera.exposure_ms * camera.rate_hz > 1e3:
+            most = f"{1e3 / camera.rate_hz:.4g} ms at rate_hz {camera.rate_hz:g}"
+            found = f"is {camera.exposure_ms:g}; must be <= {most}, the time from one picture to the next"
+            yield f"{path}.exposure_ms", found
     looks_at = (sensors.sightings and sensors.sightings.cameras) or ()
     for place, name in enumerate(looks_at):
         path = f"sightings.cameras[{place}]"
@@ -500,14 +496,3 @@ def _camera_faults(sensors: Any) -> Iterator[Fault]:
             yield path, f"is {name!r}, as cameras[{looks_at.index(name)}]; must be unique"
         elif name in cameras and not cameras[name]:
             yield path, f"is {name!r}, which the drone does not have; give it {name}_camera: {{}}"
-
-
-def _lens_faults(camera: Any) -> Iterator[Fault]:
-    of_lens = camera.width_px, camera.height_px, camera.diagonal_deg, camera.distortion
-    if None not in of_lens and None not in camera.distortion and folds(lens_of(camera)):
-        least = LEAST_K1 / math.tan(math.radians(camera.diagonal_deg) / 2) ** 2
-        given = f"is {list(camera.distortion)}, which folds a picture of {camera.diagonal_deg:g} deg"
-        yield "distortion", f"{given}; must give every pixel a ray of its own, k1 alone more than {least:.3f}"
-    if None not in (camera.exposure_ms, camera.rate_hz) and camera.exposure_ms * camera.rate_hz > 1e3:
-        most = f"{1e3 / camera.rate_hz:.4g} ms at rate_hz {camera.rate_hz:g}"
-        yield "exposure_ms", f"is {camera.exposure_ms:g}; must be <= {most}, the time from one picture to the next"

@@ -34,42 +34,29 @@ COMMON = ("kind", "target", "at_s", "for_s")  # what every fault may have; the r
 
 
 class FaultParameter(NamedTuple):
-    """One number, vector, word or map of a kind.
-
-    Attributes:
-        unit: of the number or vector; empty for one without.
-        least, most: limits, each of a vector's entries.
-        above: whether `least` itself is not allowed.
-        choices: of a word.
-        default: where it is left out; `required` then says that it may not be.
-        description: what it is, for tables.
-    """
+    """One number, vector, word or map of a kind."""
 
     name: str
     shape: Shape
-    description: str
-    unit: str = ""
-    least: float = -1e9
+    description: str  # what it is, for tables
+    unit: str = ""  # of the number or vector; empty for one without
+    least: float = -1e9  # limits, each of a vector's entries
     most: float = 1e9
-    above: bool = False
-    choices: tuple[str, ...] = ()
-    default: Any = None
+    above: bool = False  # whether `least` itself is not allowed
+    choices: tuple[str, ...] = ()  # of a word
+    default: Any = None  # where it is left out; `required` then says that it may not be
     required: bool = True
 
 
 class FaultKind(NamedTuple):
-    """One kind of fault.
+    """One kind of fault."""
 
-    Attributes:
-        strikes: what its target is: a drone; the world; a link "a/b" of two processes; the drones of a cluster, or of
-            the world, on the radio; a process.
-        description: what it does, for tables.
-        lasts: "ends" needs `for_s`, "once" takes none, "any" takes it or lasts until it is cleared.
-    """
-
+    # its target: a drone; the world; a link "a/b" of two processes; the drones of a cluster, or of the world, on the
+    # radio; a process
     strikes: Target
-    description: str
+    description: str  # what it does, for tables
     parameters: tuple[FaultParameter, ...] = ()
+    # "ends" needs `for_s`, "once" takes none, "any" takes it or lasts until it is cleared
     lasts: Literal["any", "ends", "once"] = "any"
 
 
@@ -77,10 +64,6 @@ def _number(
     name: str, description: str, unit: str, least: float = -1e9, most: float = 1e9, **more: Any
 ) -> FaultParameter:
     return FaultParameter(name, "number", description, unit, least, most, **more)
-
-
-def _vector(name: str, description: str, unit: str, most: float) -> FaultParameter:
-    return FaultParameter(name, "vector", description, unit, -most, most)
 
 
 _PROBABILITY = FaultParameter("probability", "number", "of each sample", "", 0.0, 1.0, default=1.0, required=False)
@@ -98,31 +81,17 @@ _RADIO = (
 
 
 class SensorPart(NamedTuple):
-    """Numbers of a sensor that a fault strikes together.
+    """Numbers of a sensor that a fault strikes together."""
 
-    Attributes:
-        sensor: its name.
-        label: what the part is called.
-        channel: that of its first numbers, which a bias is added to.
-        first, width: place of its numbers among those of the sensor.
-    """
-
-    sensor: str
-    label: str
-    channel: Channel
-    first: int
+    sensor: str  # its name
+    label: str  # what the part is called
+    channel: Channel  # that of its first numbers, which a bias is added to
+    first: int  # place of its numbers among those of the sensor
     width: int
 
 
-Declared = SensorType | Declaration
-
-
-def sensor_parts(sensors: Mapping[str, Declared]) -> dict[str, SensorPart]:
-    """Return the parts of sensors by the first word of their fault kinds: accel and gyro of an IMU, else a whole one.
-
-    Args:
-        sensors: by name.
-    """
+def sensor_parts(sensors: Mapping[str, SensorType | Declaration]) -> dict[str, SensorPart]:
+    """Return the parts of sensors by the first word of their fault kinds: accel and gyro of an IMU, else the sensor."""
     parts: dict[str, SensorPart] = {}
     for name, sensor in sensors.items():
         first = 0
@@ -135,31 +104,21 @@ def sensor_parts(sensors: Mapping[str, Declared]) -> dict[str, SensorPart]:
     return parts
 
 
-def _sensor_kinds(sensors: Mapping[str, Declared]) -> dict[str, FaultKind]:
-    """Return the kinds of faults that sensors have."""
-    labels = {name: sensor.label or name for name, sensor in sensors.items()}
-    parts = sensor_parts(sensors)
-    return {
-        **{f"{n}_dropout": FaultKind("drone", f"samples of the {labels[n]} are lost", (_PROBABILITY,)) for n in labels},
-        **{f"{n}_stuck": FaultKind("drone", f"the {labels[n]} shows one sample again and again") for n in labels},
-        **{
-            f"{part}_bias": FaultKind("drone", f"the {of.label} has a constant error more", (_bias(of.channel),))
-            for part, of in parts.items()
-        },
-        **{
-            f"{n}_noise": FaultKind("drone", f"the {of.label} has more white noise", (_FACTOR,))
-            for n, of in parts.items()
-        },
-    }
-
-
-def _bias(channel: Channel) -> FaultParameter:
-    """Return the parameter of a constant error in a channel."""
-    unit = "" if channel.unit == "1" else re.sub(r"[^a-z0-9]+", "_", channel.unit.lower().replace("^", ""))
-    most, name = channel.bias_max, f"value_{unit}".strip("_")
-    if channel.width == VECTOR_SIZE:
-        return _vector(name, channel.axes, channel.unit, most)
-    return _number(name, channel.axes, channel.unit, -most, most)
+def _sensor_kinds(sensors: Mapping[str, SensorType | Declaration]) -> dict[str, FaultKind]:
+    dropouts, stuck, biases, noises = {}, {}, {}, {}
+    for name, sensor in sensors.items():
+        label = sensor.label or name
+        dropouts[f"{name}_dropout"] = FaultKind("drone", f"samples of the {label} are lost", (_PROBABILITY,))
+        stuck[f"{name}_stuck"] = FaultKind("drone", f"the {label} shows one sample again and again")
+    for name, part in sensor_parts(sensors).items():
+        channel = part.channel
+        unit = "" if channel.unit == "1" else re.sub(r"[^a-z0-9]+", "_", channel.unit.lower().replace("^", ""))
+        shape: Shape = "vector" if channel.width == VECTOR_SIZE else "number"
+        limits = -channel.bias_max, channel.bias_max
+        bias = FaultParameter(f"value_{unit}".strip("_"), shape, channel.axes, channel.unit, *limits)
+        biases[f"{name}_bias"] = FaultKind("drone", f"the {part.label} has a constant error more", (bias,))
+        noises[f"{name}_noise"] = FaultKind("drone", f"the {part.label} has more white noise", (_FACTOR,))
+    return dropouts | stuck | biases | noises
 
 
 KINDS: dict[str, FaultKind] = {
@@ -175,7 +134,7 @@ KINDS: dict[str, FaultKind] = {
     "gust": FaultKind(
         "world",
         "the wind swells and ebbs: (1 - cos) / 2",
-        (_vector("velocity_m_s", "at its peak, in W", "m/s", 100.0),),
+        (FaultParameter("velocity_m_s", "vector", "at its peak, in W", "m/s", -100.0, 100.0),),
         "ends",
     ),
     "link_delay": FaultKind(
@@ -198,12 +157,10 @@ KINDS: dict[str, FaultKind] = {
 
 
 def kinds_of(own: Mapping[str, Declaration]) -> dict[str, FaultKind]:
-    """Return the kinds of faults of a run: KINDS, and those of its users' sensors."""
     return {**KINDS, **_sensor_kinds(own)} if own else KINDS
 
 
 def expected(p: FaultParameter) -> str:
-    """Return in words what a parameter may be."""
     unit = f" {p.unit}" if p.unit else ""
     if p.shape == "choice":
         return f"one of {', '.join(p.choices)}"
@@ -229,10 +186,10 @@ def unstated(kind: FaultKind, parameters: Mapping[str, Any]) -> list[FaultParame
 
 
 def planned(
-    description: Mapping[str, Any],
-    number: int,
+    description: Mapping[str, Any],  # without flaws
+    number: int,  # its id
     source: str,
-    now_ns: int,
+    now_ns: int,  # when it begins where `at_s` is left out
     gate_ns: int,
     kinds: Mapping[str, FaultKind] = KINDS,
 ) -> Fault:
@@ -240,12 +197,6 @@ def planned(
 
     It acts in the gates after `from_ns` up to `until_ns`: on what happens between these instants, and on messages that
     belong to those gates.
-
-    Args:
-        description: without flaws.
-        number: its id.
-        now_ns: when it begins where `at_s` is left out.
-        kinds: of the run.
     """
     kind, at_s, for_s = kinds[description["kind"]], description.get("at_s"), description.get("for_s")
     from_ns = now_ns if at_s is None else round(at_s * 1e9 / gate_ns) * gate_ns
@@ -278,32 +229,24 @@ def acts(fault: Fault, gate_ns: int) -> bool:
 
 
 class Known(NamedTuple):
-    """Names that a target may have, and the kinds of faults of the run.
-
-    Attributes:
-        processes: those that take part, besides estimators and controllers.
-        rotors: of each drone; none of one whose vehicle is a module that is not read here.
-        external: drones whose bodies and sensors nobody simulates.
-    """
+    """Names that a target may have, and the kinds of faults of the run."""
 
     drones: tuple[str, ...]
     clusters: tuple[str, ...]
-    processes: tuple[str, ...] = ()
+    processes: tuple[str, ...] = ()  # those that take part, besides estimators and controllers
     kinds: Mapping[str, FaultKind] = KINDS
+    # of each drone; none of one whose vehicle is a module that is not read here
     rotors: Mapping[str, tuple[str, ...]] = {}
-    external: tuple[str, ...] = ()
+    external: tuple[str, ...] = ()  # drones whose bodies and sensors nobody simulates
 
     def things(self) -> dict[str, tuple[str, ...]]:
-        """Return what the processes of each role with agents may be named after."""
         return {name: self.drones if role.about == "drone" else self.clusters for name, role in AGENTS.items()}
 
     def takes_part(self, process: str) -> bool:
-        """Tell whether a process is in the lockstep, by its name."""
         role, _, thing = process.partition(".")
         return thing in self.things().get(role, ()) or process in self.processes
 
     def example(self) -> str:
-        """Return the name of a process that takes part."""
         return f"estimator.{self.drones[0]}" if self.drones else "estimator.drone1"
 
 
@@ -323,8 +266,12 @@ def flaws(fault: Any, known: Known) -> Iterator[Flaw]:
             allowed = ", ".join([*COMMON, *of])
             yield str(field)[:40], f"is not known; {suggestion(field, (*COMMON, *of))}allowed: {allowed} ({name})"
     faults = [*_target_flaws(fault, kind, known), *_time_flaws(fault, kind)]
-    for parameter in kind.parameters:
-        faults += _parameter_flaws(fault, _of_target(parameter, fault.get("target"), known), known)
+    target = fault.get("target")
+    rotors = known.rotors.get(target) if isinstance(target, str) else None
+    for p in kind.parameters:
+        if p is ROTOR and rotors is not None:  # of the target's vehicle, or of any name where that is not known
+            p = p._replace(choices=(*rotors, "all")) if rotors else p._replace(shape="word")
+        faults += _parameter_flaws(fault, p, known)
     for path, text in faults:
         yield path, text if text.endswith(f"({name})") else f"{text} ({name})"
 
@@ -341,8 +288,10 @@ def _target_flaws(fault: Mapping[str, Any], kind: FaultKind, known: Known) -> It
         if not isinstance(target, str) or not known.takes_part(target):
             yield "target", f"{actual}; must be a process that takes part, as {known.example()}"
         elif target.partition(".")[0] in UNGATED:
-            allowed = f"must be a process that takes part, as {known.example()}"
-            yield "target", f"{actual}, outside of the lockstep; {allowed}"
+            yield (
+                "target",
+                f"{actual}, outside of the lockstep; must be a process that takes part, as {known.example()}",
+            )
     else:
         allowed = {"drone": known.drones, "world": ("world",), "radio": ("world", *known.clusters)}[kind.strikes]
         if target not in allowed:
@@ -395,14 +344,6 @@ def _time_flaws(fault: Mapping[str, Any], kind: FaultKind) -> Iterator[Flaw]:
         yield "for_s", f"is {show(for_s)}; must be > 0 and <= {FOR_EVER_S:g} s"
 
 
-def _of_target(p: FaultParameter, target: Any, known: Known) -> FaultParameter:
-    """Return a parameter as a target has it: its rotors are those of its vehicle, or have any name."""
-    rotors = known.rotors.get(target) if p is ROTOR and isinstance(target, str) else None
-    if rotors is None:
-        return p
-    return p._replace(choices=(*rotors, "all")) if rotors else p._replace(shape="word")
-
-
 def _parameter_flaws(fault: Mapping[str, Any], p: FaultParameter, known: Known) -> Iterator[Flaw]:
     value = fault.get(p.name)
     if value is None:
@@ -410,7 +351,12 @@ def _parameter_flaws(fault: Mapping[str, Any], p: FaultParameter, known: Known) 
             yield p.name, f"is missing; must be {expected(p)}"
         return
     if p.shape == "places" and isinstance(value, Mapping):
-        yield from _place_flaws(value, p.name, known)
+        for process, place in value.items():
+            path = f"{p.name}.{str(process)[:48]}"
+            if allowed := _allowed_instead(process if isinstance(process, str) else "", known):
+                yield path, f"names no process; must be {allowed}"
+            if not _is_vector(place, -1e6, 1e6) and place not in known.drones:
+                yield path, f"is {show(place)}; must be a drone or [x, y, z] in m"
         return
     is_sound = {
         "number": lambda: _within(value, p.least, p.most, p.above),
@@ -422,15 +368,6 @@ def _parameter_flaws(fault: Mapping[str, Any], p: FaultParameter, known: Known) 
     }
     if not is_sound[p.shape]():
         yield p.name, f"is {show(value)}; must be {expected(p)}"
-
-
-def _place_flaws(places: Mapping[Any, Any], name: str, known: Known) -> Iterator[Flaw]:
-    for process, place in places.items():
-        allowed = _allowed_instead(process if isinstance(process, str) else "", known)
-        if allowed:
-            yield f"{name}.{str(process)[:48]}", f"names no process; must be {allowed}"
-        if not _is_vector(place, -1e6, 1e6) and place not in known.drones:
-            yield f"{name}.{str(process)[:48]}", f"is {show(place)}; must be a drone or [x, y, z] in m"
 
 
 def _is_vector(value: Any, least: float, most: float) -> bool:
@@ -451,11 +388,7 @@ _OPTIONS = {"--for": "for_s", "--at": "at_s"}
 
 
 def typed_duration_s(text: str) -> float:
-    """Return the duration in a text such as 10s, 500ms or 2min.
-
-    Raises:
-        ValueError: it is none.
-    """
+    """Return the duration in a text such as 10s, 500ms or 2min; ValueError if it is none."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(ms|s|min|)", text.strip())
     if not match:
         raise ValueError(f"is {text[:40]!r}; must be a duration such as 10s, 500ms or 2min")
@@ -465,8 +398,7 @@ def typed_duration_s(text: str) -> float:
 def typed_parameters(words: Sequence[str]) -> dict[str, Any]:
     """Return the parameters in words NAME=VALUE; values are YAML.
 
-    Raises:
-        ValueError: one is no such word, is given twice, or is given by an argument or option instead.
+    ValueError if one is no such word, is given twice, or is given by an argument or option instead.
     """
     values: dict[str, Any] = {}
     for text in words:
@@ -508,7 +440,6 @@ def typed_rest(text: str) -> dict[str, Any]:
 
 
 def _words(text: str) -> list[str]:
-    """Return the words of a text; words inside brackets are kept together."""
     words: list[str] = []
     depth = 0
     try:

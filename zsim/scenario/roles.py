@@ -18,22 +18,15 @@ OPERATOR, RECORDER, WORLD, ROUTER, DRIVER = "operator", "recorder", "world", "ro
 
 
 class Role(NamedTuple):
-    """A role.
+    """A role."""
 
-    Attributes:
-        extra: of the distribution, that a host of it needs; empty for none.
-        on_death: what the death of a process means for a run where the scenario does not say.
-        about: what its processes are named after, ROLE.NAME of each drone or cluster; None for roles without an agent.
-        agent: `package.module:Class` of the agent, made of world/info, scenario and name.
-        joint: one agent may do the work of many, made of all their names.
-        on_overdue: what follows where it does not come back and the scenario does not say; `drop` where nothing waits.
-    """
-
-    extra: str
-    on_death: OnDeath
+    extra: str  # of the distribution, that a host of it needs; empty for none
+    on_death: OnDeath  # what the death of a process means for a run where the scenario does not say
+    # what its processes are named after, ROLE.NAME of each drone or cluster; None for roles without an agent
     about: Literal["drone", "cluster"] | None = None
-    agent: str = ""
-    joint: bool = False
+    agent: str = ""  # `package.module:Class` of the agent, made of world/info, scenario and name
+    joint: bool = False  # one agent may do the work of many, made of all their names
+    # what follows where it does not come back and the scenario does not say; `drop` where nothing waits
     on_overdue: OnOverdue = "end"
 
 
@@ -57,12 +50,10 @@ AGENTS = {name: role for name, role in ROLES.items() if role.about}
 
 
 def things(role: str, scenario: Scenario) -> list[str]:
-    """Return the names of the drones or clusters that a role with agents is about."""
     return [entry.name for entry in getattr(scenario, f"{AGENTS[role].about}s")]
 
 
 def agent_names(scenario: Scenario) -> list[str]:
-    """Return the names of all processes with agents that a scenario has, role by role."""
     return [f"{role}.{thing}" for role in AGENTS for thing in things(role, scenario)]
 
 
@@ -79,7 +70,6 @@ def on_death(actions: Mapping[str, OnDeath], name: str, role: str | None = None)
 
     Args:
         actions: of the scenario, by process name or role.
-        name: of the process.
         role: as the process stated it; by default the beginning of its name.
     """
     role = role or name.partition(".")[0]
@@ -90,11 +80,9 @@ def on_death(actions: Mapping[str, OnDeath], name: str, role: str | None = None)
 def on_overdue(
     actions: Mapping[str, OnOverdue], name: str, role: str | None = None, gating: Collection[str] = ()
 ) -> OnOverdue:
-    """Return what is to be done when a process has not come back in its time.
+    """Return what is to be done when a process has not come back in its time; arguments as of `on_death`.
 
-    Args:
-        actions, name, role: as of `on_death`.
-        gating: roles for which the run waits beside the agents.
+    `gating`: roles for which the run waits beside the agents.
     """
     role = role or name.partition(".")[0]
     default = ROLES[role].on_overdue if role in ROLES and role not in gating else "end"
@@ -102,12 +90,7 @@ def on_overdue(
 
 
 def lets_drop(actions: Mapping[str, str], name: str) -> bool:
-    """Tell whether a scenario explicitly lets a run go on without a process, which is then no failure.
-
-    Args:
-        actions: `on_death` or `on_overdue` of the scenario, by process name or role.
-        name: of the process.
-    """
+    """Tell whether `on_death` or `on_overdue` explicitly lets a run go on without a process: that is no failure."""
     return (actions.get(name) or actions.get(name.partition(".")[0])) == "drop"
 
 
@@ -118,11 +101,7 @@ def is_needed(name: str) -> bool:
 
 
 def check_pace(scenario: Scenario, mode: str) -> None:
-    """Refuse to run external drones, which fly in wall time, in any mode but realtime.
-
-    Raises:
-        ScenarioError: the scenario has some, and the mode is not "realtime".
-    """
+    """Raise ScenarioError for external drones, which fly in wall time, in any mode but realtime."""
     external = scenario.external()
     if external and mode != "realtime":
         who = f"{listed(external)} {'is' if len(external) == 1 else 'are'} external"
@@ -131,7 +110,6 @@ def check_pace(scenario: Scenario, mode: str) -> None:
 
 
 def drivers_of(scenario: Scenario) -> list[str]:
-    """Return the names of the processes that publish the external drones."""
     return [f"{DRIVER}.{drone}" for drone in scenario.external()]
 
 
@@ -148,23 +126,14 @@ def driver_lines(scenario: Scenario, endpoint: str) -> list[str]:
 
 
 class Rights(NamedTuple):
-    """Key expressions, without the federation.
+    """Key expressions, without the federation."""
 
-    Attributes:
-        reads: what it may subscribe to.
-        writes: what it may publish.
-        asks: what it may get; a get on a control key is a request.
-        answers: what it may answer gets on.
-        tokens: liveliness tokens that it may declare.
-        watches: liveliness tokens that it may see.
-    """
-
-    reads: tuple[str, ...] = ()
+    reads: tuple[str, ...] = ()  # what it may subscribe to
     writes: tuple[str, ...] = ()
-    asks: tuple[str, ...] = ()
-    answers: tuple[str, ...] = ()
-    tokens: tuple[str, ...] = ()
-    watches: tuple[str, ...] = ()
+    asks: tuple[str, ...] = ()  # what it may get; a get on a control key is a request
+    answers: tuple[str, ...] = ()  # what it may answer gets on
+    tokens: tuple[str, ...] = ()  # liveliness tokens that it may declare
+    watches: tuple[str, ...] = ()  # liveliness tokens that it may see
 
 
 EVERYTHING = ("**", keys.BATCH, keys.GATE, keys.gate("*"))  # no wildcard takes a key that begins with @
@@ -183,7 +152,12 @@ def rights_for(process: str, scenario: Scenario) -> Rights:
     role, _, thing = process.partition(".")
     if process == WORLD:
         return ALL_RIGHTS
-    own = combined([_granted("each", process=[process]), _services_of(process)])
+    services = Rights(
+        asks=(keys.replay(process),),
+        answers=(keys.process(process, "outputs"),),
+        tokens=(keys.token(process), keys.session_token(process, "*")),
+    )
+    own = combined([_granted("each", process=[process]), services])
     if process == RECORDER:
         return combined([own, _READER])
     if role == OPERATOR:
@@ -198,8 +172,13 @@ def rights_for(process: str, scenario: Scenario) -> Rights:
     about = AGENTS[role].about if role in AGENTS else None
     granted = [own]
     if about != "cluster" and thing in [drone.name for drone in scenario.drones]:
-        gates = Rights(reads=(keys.gate(thing), *_sensed_by_mates(thing, scenario)))
-        granted += [_granted("estimator", drone=[thing], estimates=[process]), gates]
+        sensed = [keys.gate(thing)]
+        if scenario.estimation.use_sightings is True:  # all that the drones of its cluster sense
+            mates = next((cluster.drones for cluster in scenario.clusters if thing in cluster.drones), [thing])
+            sensed.append(keys.GATE)
+            for mate in mates:
+                sensed += [keys.sensors(mate), keys.gate(mate), keys.detections(mate)]
+        granted += [_granted("estimator", drone=[thing], estimates=[process]), Rights(reads=tuple(sensed))]
     if about != "drone" and thing in [cluster.name for cluster in scenario.clusters]:
         granted.append(_granted("controller", drone=scenario.cluster(thing).drones, cluster=[thing]))
         granted.append(Rights(answers=(keys.cluster_control(thing),)))
@@ -209,8 +188,7 @@ def rights_for(process: str, scenario: Scenario) -> Rights:
 def _granted(role: str, **names: Sequence[str]) -> Rights:
     """Return what the messages of the contract let a role do on the keys of some drones, clusters or processes.
 
-    Args:
-        names: of `drone`, `cluster`, `process`, and of the process itself as `estimates`.
+    `names`: of `drone`, `cluster`, `process`, and of the process itself as `estimates`.
     """
     reads, writes, asks, answers = [], [], [], []
     for key, topic in TOPICS.items():
@@ -227,26 +205,7 @@ def _granted(role: str, **names: Sequence[str]) -> Rights:
     return Rights(tuple(reads), tuple(writes), tuple(asks), tuple(answers))
 
 
-def _services_of(process: str) -> Rights:
-    """Return what every process may do in its own name besides its messages."""
-    return Rights(
-        asks=(keys.replay(process),),
-        answers=(keys.process(process, "outputs"),),
-        tokens=(keys.token(process), keys.session_token(process, "*")),
-    )
-
-
-def _sensed_by_mates(drone: str, scenario: Scenario) -> tuple[str, ...]:
-    """Return what an estimator that uses sightings reads: all that the drones of its cluster sense."""
-    if scenario.estimation.use_sightings is not True:
-        return ()
-    mates = next((cluster.drones for cluster in scenario.clusters if drone in cluster.drones), [drone])
-    expressions = (keys.sensors, keys.gate, keys.detections)
-    return (keys.GATE, *(expression(mate) for mate in mates for expression in expressions))
-
-
 def watched_drones(thing: str, scenario: Scenario) -> list[str]:
-    """Return the drones of a camera or detector: the one it is named after, or all that have cameras."""
     names = [drone.name for drone in scenario.drones]
     return [thing] if thing in names else [drone.name for drone in scenario.drones if drone.sensors.cameras()]
 
@@ -258,5 +217,4 @@ def combined(many: Iterable[Rights]) -> Rights:
 
 
 def permits(expressions: Iterable[str], key: str) -> bool:
-    """Tell whether a key is among some expressions."""
     return any(keys.matches(expression, key) for expression in expressions)

@@ -67,7 +67,6 @@ class Drone(Spec, frozen=True, kw_only=True):
 
     @property
     def is_external(self) -> bool:
-        """Whether a driver, and not the world, has its body and its sensors."""
         return self.body == EXTERNAL
 
 
@@ -225,7 +224,6 @@ class Estimation(Spec, frozen=True, kw_only=True):
     """Whether drones of a cluster are located by what they see of each other; unset: not."""
 
     def chosen(self) -> str:
-        """Return the algorithm that flies."""
         return self.algorithm if isinstance(self.algorithm, str) else ESTIMATORS[0]
 
 
@@ -283,11 +281,9 @@ class Scenario(Spec, frozen=True, kw_only=True):
     report: Figures = field(default_factory=Figures)
 
     def drone(self, name: str) -> Drone:
-        """Return the drone of that name; KeyError if there is none."""
         return {drone.name: drone for drone in self.drones}[name]
 
     def cluster(self, name: str) -> Cluster:
-        """Return the cluster of that name; KeyError if there is none."""
         return {cluster.name: cluster for cluster in self.clusters}[name]
 
     def own_code(self) -> list[str]:
@@ -300,11 +296,9 @@ class Scenario(Spec, frozen=True, kw_only=True):
         return sorted({*classes, *sensors, *models})
 
     def external(self) -> list[str]:
-        """Return the names of the drones whose bodies are external."""
         return [drone.name for drone in self.drones if drone.is_external]
 
     def gates(self, role: str) -> bool:
-        """Tell whether the run waits for the processes of a role that is no agent's."""
         return self.processes.gates(role)
 
 

@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from itertools import chain
 from pathlib import Path
@@ -29,7 +29,6 @@ def load(path: str | Path, overrides: Iterable[str] = (), modules: Iterable[Path
     """Return the resolved scenario of a YAML file; classes that it names may stand in modules beside it.
 
     Args:
-        path: the file.
         overrides: texts `a.b.c=value` as given to `--set`, applied in order.
         modules: further folders in which the modules may stand.
         values: top-level fields that replace the file's, None being ignored (`seed=3`).
@@ -46,20 +45,12 @@ def load(path: str | Path, overrides: Iterable[str] = (), modules: Iterable[Path
 
 
 def resolve(document: dict[str, Any], source: str = "scenario") -> Scenario:
-    """Return the scenario of a raw document: presets expanded, everything checked.
-
-    Raises:
-        ScenarioError: with every fault found, a line each.
-    """
+    """Return the scenario of a raw document: presets expanded, everything checked. Errors as of `load`."""
     return _resolve(document, source, [])
 
 
 def from_text(text: str) -> Scenario:
-    """Return the scenario that `world/info` carries; nothing that it names is imported.
-
-    Raises:
-        ScenarioError: with every fault found, a line each.
-    """
+    """Return the scenario that `world/info` carries; nothing that it names is imported. Errors as of `load`."""
     source = "world/info"
     return _resolve(yaml_file.parse(text, source, EXAMPLE, ScenarioError), source, [], imports=False)
 
@@ -73,21 +64,15 @@ def to_text(scenario: Scenario) -> str:
 
 
 def sha256(text: str) -> str:
-    """Return the hash that names a resolved scenario, from its text."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: bool = True) -> Scenario:
-    """Return the scenario of a raw document.
+    """Return the scenario of a raw document; `lines` are faults that were found before.
 
     Later ones take precedence. For a drone: the numbers of its model, the document's `vehicle:`, its own fields; for
     its sensors: the preset, the document's `sensors:`, its own. Faulty parts of the shared sections are not handed on
     to the drones, so that their faults are reported once.
-
-    Args:
-        source: opens the lines of the faults.
-        lines: faults that were found before.
-        imports: whether modules that it names may be imported.
     """
     misread: list[Fault] = []  # error models in units that cannot be read
     unknown: list[Fault] = []  # models that are no vehicles
@@ -97,9 +82,15 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
     given = _in_channel_units(document.get("sensors"), "sensors", misread)
     shared_sensors = given or {}
     sensors = _with_preset(shared_sensors, ARDRONE2.sensor_preset)
-    faulty = {path.partition(".")[0] for path, _ in _sensor_faults(sensors)}
+    rest, _, wrong = separate(sensors) if isinstance(sensors, dict) else (sensors, {}, [])
+    faulty = {path.partition(".")[0] for path, _ in (*wrong, *faults(rest, Sensors))}
     usable = {} if "" in faulty else {name: each for name, each in shared_sensors.items() if name not in faulty}
-    shared_vehicle = _sound_vehicle(document.get("vehicle"))
+    shared_vehicle = document.get("vehicle")
+    if isinstance(shared_vehicle, dict):
+        faulty = {path.partition(".")[0].partition("[")[0] for path, _ in faults(shared_vehicle, SharedVehicle)}
+        shared_vehicle = {name: value for name, value in shared_vehicle.items() if name not in faulty}
+    else:
+        shared_vehicle = {}
 
     def resolved_drone(drone: Any, where: str) -> Any:
         if not isinstance(drone, dict):
@@ -109,7 +100,11 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
         own = _in_channel_units(drone.get("sensors"), f"{where}.sensors", misread)
         own = with_defaults(usable, own) if isinstance(own, dict) else usable if own is None else own
         own = _separated(_with_preset(own, vehicle.sensor_preset), f"{where}.sensors", unsound, imports)
-        return {**with_defaults(_numbers_of(vehicle), drone), "sensors": own}
+        numbers = {name: getattr(vehicle, name) for name in VEHICLE_NUMBERS}
+        numbers["limits"] = msgspec.to_builtins(vehicle.limits)
+        if vehicle.aerodynamics != Aerodynamics():  # else they are left out of the resolved text
+            numbers["aerodynamics"] = msgspec.to_builtins(vehicle.aerodynamics)
+        return {**with_defaults(numbers, drone), "sensors": own}
 
     document = {**document, "sensors": _separated(sensors, "sensors", unsound, imports)}
     drones = document.get("drones")
@@ -127,7 +122,6 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
 
 
 def with_defaults(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """Return a section with defaults for the fields that it does not give; nested sections are merged."""
     merged = dict(base)
     for key, value in over.items():
         both = isinstance(value, dict) and isinstance(merged.get(key), dict)
@@ -155,14 +149,6 @@ def _with_preset(sensors: Any, default: str) -> Any:
     return with_defaults({"preset": name, **preset}, sensors)
 
 
-def _sensor_faults(section: Any) -> Iterator[Fault]:
-    """Yield the faults of a `sensors:` section that has its preset as defaults."""
-    if isinstance(section, dict):
-        section, _, unsound = separate(section)
-        yield from unsound
-    yield from faults(section, Sensors)
-
-
 def _separated(section: Any, where: str, unsound: list[Fault], imports: bool) -> Any:
     """Return a `sensors:` section with the users' sensors in `own`."""
     if not isinstance(section, dict):
@@ -170,14 +156,6 @@ def _separated(section: Any, where: str, unsound: list[Fault], imports: bool) ->
     rest, own, wrong = separate(section, imports)
     unsound += [(f"{where}.{path}", text) for path, text in wrong]
     return {**rest, "own": own} if own else rest
-
-
-def _sound_vehicle(section: Any) -> dict[str, Any]:
-    """Return the sound fields of a document's `vehicle:`; the faults of the others are reported there only."""
-    if not isinstance(section, dict):
-        return {}
-    faulty = {path.partition(".")[0].partition("[")[0] for path, _ in faults(section, SharedVehicle)}
-    return {name: value for name, value in section.items() if name not in faulty}
 
 
 def _vehicle_of(
@@ -202,15 +180,6 @@ def _vehicle_of(
         except DocumentError as error:
             unknown += [(where, line.strip()) for line in error.faults]
     return vehicles.get(model, ARDRONE2)
-
-
-def _numbers_of(vehicle: Vehicle) -> dict[str, Any]:
-    """Return the fields of a drone that its vehicle gives; aerodynamics only if there are any."""
-    numbers = {name: getattr(vehicle, name) for name in VEHICLE_NUMBERS}
-    numbers["limits"] = msgspec.to_builtins(vehicle.limits)
-    if vehicle.aerodynamics != Aerodynamics():
-        numbers["aerodynamics"] = msgspec.to_builtins(vehicle.aerodynamics)
-    return numbers
 
 
 def _whose(document: dict[str, Any], path: str) -> str:
@@ -243,15 +212,18 @@ def apply_override(document: dict[str, Any], text: str, parse: Callable[[str], A
         parse: turns the text of a value into the value; its ValueError says what is wrong.
     """
     path, equals, value_text = text.partition("=")
+    fault: object = None
     if len(path) > PATH_MAX:
-        return f"{_shown_override(text)}: is a path of {len(path)} characters; must have at most {PATH_MAX}"
-    if not equals or not _PATH.fullmatch(path):
-        return f"{_shown_override(text)}: is no assignment; must be {SYNTAX}"
-    try:
-        _assign(document, steps_of(path, document), parse(value_text))
-    except ValueError as error:
-        return f"{_shown_override(text)}: {error}"
-    return None
+        fault = f"is a path of {len(path)} characters; must have at most {PATH_MAX}"
+    elif not equals or not _PATH.fullmatch(path):
+        fault = f"is no assignment; must be {SYNTAX}"
+    else:
+        try:
+            _assign(document, steps_of(path, document), parse(value_text))
+        except ValueError as error:
+            fault = error
+    shown = text if len(text) <= 80 and text.isprintable() else show(text)
+    return None if fault is None else f"--set {shown}: {fault}"
 
 
 def steps_of(path: str, document: Mapping[str, Any] = NOTHING) -> list[str]:
@@ -263,15 +235,11 @@ def steps_of(path: str, document: Mapping[str, Any] = NOTHING) -> list[str]:
 
 
 def whole_path(path: str, document: Mapping[str, Any] = NOTHING) -> str:
-    """Return the path of a field from the top of a scenario.
+    """Return the path of a field from the top of a scenario, whose raw document is given.
 
     The name of a section may be left out where only one section has such a field: wind.gust_m_s stands for
     environment.wind.gust_m_s. Of a list of sections it may be left out where the list has one entry:
     gains.proportional_1_s stands for clusters.main.gains.proportional_1_s.
-
-    Args:
-        path: as given.
-        document: the scenario that is meant, raw.
 
     Raises:
         ValueError: the field is one of a list of sections, of which the document has several.
@@ -288,21 +256,15 @@ def whole_path(path: str, document: Mapping[str, Any] = NOTHING) -> str:
     if owners:
         return f"{owners[0]}.{path}" if len(owners) == 1 else path
     lists = [name for name, kind in sections.items() if any(map(has_field, get_args(kind)))]
-    return _in_entry(path, lists[0], document.get(lists[0])) if len(lists) == 1 else path
-
-
-def _in_entry(path: str, section: str, entries: Any) -> str:
-    """Return the path of a field of the one entry of a list, by its name if it has one."""
+    entries = document.get(lists[0]) if len(lists) == 1 else None
     if not isinstance(entries, list) or not entries:
         return path
-    names = [entry.get("name") if isinstance(entry, dict) else None for entry in entries]
-    places = [
-        f"{section}.{name}" if isinstance(name, str) and _FIRST.fullmatch(name) else f"{section}[{place}]"
-        for place, name in enumerate(names)
-    ]
-    if len(places) > 1:
-        raise ValueError(f"is a field of each of {len(places)} {section}; give the whole path, e.g. {places[0]}.{path}")
-    return f"{places[0]}.{path}"
+    section, entry = lists[0], entries[0]
+    name = entry.get("name") if isinstance(entry, dict) else None
+    whole = f"{section}.{name}" if isinstance(name, str) and _FIRST.fullmatch(name) else f"{section}[0]"
+    if len(entries) > 1:
+        raise ValueError(f"is a field of each of {len(entries)} {section}; give the whole path, e.g. {whole}.{path}")
+    return f"{whole}.{path}"
 
 
 @cache
@@ -318,25 +280,20 @@ def _assign(document: dict[str, Any], steps: list[str], value: Any) -> None:
     for depth, step in enumerate(steps):
         if not isinstance(place, dict | list):
             raise ValueError(f"{'.'.join(steps[:depth])} is {show(place)}; must be a map or a list")
-        key: Any = _index(place, step, steps[:depth]) if isinstance(place, list) else step
+        key: Any = step
+        if isinstance(place, list):
+            names = [item.get("name") if isinstance(item, dict) else None for item in place]
+            if step in names:
+                key = names.index(step)
+            elif re.fullmatch(r"[0-9]{1,9}", step) and int(step) < len(place):
+                key = int(step)
+            else:
+                known = [name for name in names if isinstance(name, str)]
+                places = f"0 to {len(place) - 1}{' or ' if known else ''}{', '.join(known)}"
+                allowed = f"{suggestion(step, known)}allowed: {places if place else 'nothing, it is empty'}"
+                raise ValueError(f"{step[:40]} is not in {'.'.join(steps[:depth])}; {allowed}")
         if depth == len(steps) - 1:
             place[key] = value
         elif isinstance(place, dict) and place.get(key) is None:
             place[key] = {}
         place = place[key]
-
-
-def _index(place: list[Any], step: str, path: list[str]) -> int:
-    names = [item.get("name") if isinstance(item, dict) else None for item in place]
-    if step in names:
-        return names.index(step)
-    if re.fullmatch(r"[0-9]{1,9}", step) and int(step) < len(place):
-        return int(step)
-    texts = [name for name in names if isinstance(name, str)]
-    known = ", ".join(texts)
-    allowed = f"0 to {len(place) - 1}{' or ' if known else ''}{known}" if place else "nothing, it is empty"
-    raise ValueError(f"{step[:40]} is not in {'.'.join(path)}; {suggestion(step, texts)}allowed: {allowed}")
-
-
-def _shown_override(text: str) -> str:
-    return f"--set {text if len(text) <= 80 and text.isprintable() else show(text)}"

@@ -1,9 +1,1 @@
-"""Documents that people write.
-
-    yaml_file             YAML, read with limits
-    checker               every fault of a document against its type
-    plugin                the user's modules and classes that it names
-    quantities, message   types of its numbers, and of those of messages
-
-Imports errors.
-"""
+"""Documents that people write: read with limits, checked against types, with modules of the user's. Imports errors."""

@@ -30,7 +30,6 @@ def faults(value: Any, description: Any, path: str = "") -> Iterator[Fault]:
 
 
 def first_fault(value: Any, description: Any) -> Fault | None:
-    """Return the first place where `value` does not fit, None if it does."""
     return next(faults(value, description), None)
 
 
@@ -120,42 +119,32 @@ def _check_many(value: Any, info: types.ListType | types.VarTupleType | types.Di
 
 
 def _scalar_fault(value: Any, info: types.Type) -> str | None:
+    allowed: str | None = None
     if isinstance(info, types.FloatType | types.IntType):
-        return _number_fault(value, info)
-    if isinstance(info, types.BoolType):
-        return None if isinstance(value, bool) else f"is {show(value)}; must be true or false"
-    if isinstance(info, types.LiteralType):
-        allowed = ", ".join(str(option) for option in info.values)
-        return None if value in info.values else f"is {show(value)}; must be one of {allowed}"
-    if isinstance(info, types.BytesType):
-        return None if isinstance(value, bytes) else f"is {show(value)}; must be bytes"
-    if isinstance(info, types.StrType):
-        if not isinstance(value, str):
-            return f"is {show(value)}; must be text"
-        if info.pattern and not re.search(info.pattern, value):
+        whole = isinstance(info, types.IntType)
+        is_number = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
+        if not is_number or (isinstance(value, float) and not math.isfinite(value)):
+            allowed = _expected(info)
+        elif not (
+            (info.gt is None or value > info.gt)
+            and (info.ge is None or value >= info.ge)
+            and (info.lt is None or value < info.lt)
+            and (info.le is None or value <= info.le)
+        ):
+            wide = whole and not -(2**63) <= value < 2**63
+            allowed = "a whole number of 63 bits and sign" if wide else _limits(info)
+    elif isinstance(info, types.LiteralType):
+        allowed = _expected(info) if value not in info.values else None
+    elif isinstance(info, types.BoolType | types.BytesType | types.StrType):
+        kind = {types.BoolType: bool, types.BytesType: bytes, types.StrType: str}[type(info)]
+        if not isinstance(value, kind):
+            allowed = _expected(info)
+        elif isinstance(info, types.StrType) and info.pattern and not re.search(info.pattern, value):
             return f"is {show(value)}; must match {info.pattern.strip('^$').removesuffix(chr(92) + 'Z')}"
-    return None
-
-
-def _number_fault(value: Any, info: types.FloatType | types.IntType) -> str | None:
-    whole = isinstance(info, types.IntType)
-    is_finite = not isinstance(value, float) or math.isfinite(value)
-    if isinstance(value, bool) or not isinstance(value, int if whole else int | float) or not is_finite:
-        return f"is {show(value)}; must be {_expected(info)}"
-    is_within = (
-        (info.gt is None or value > info.gt)
-        and (info.ge is None or value >= info.ge)
-        and (info.lt is None or value < info.lt)
-        and (info.le is None or value <= info.le)
-    )
-    if not is_within:
-        wide = whole and not -(2**63) <= value < 2**63
-        return f"is {show(value)}; must be {'a whole number of 63 bits and sign' if wide else _limits(info)}"
-    return None
+    return None if allowed is None else f"is {show(value)}; must be {allowed}"
 
 
 def _expected(info: types.Type) -> str:
-    """Say in words what is allowed."""
     if isinstance(info, types.Metadata):
         return _expected(info.type)
     if isinstance(info, types.FloatType | types.IntType):
@@ -191,20 +180,20 @@ def _sound(value: Any, info: types.Type) -> Any:
     if isinstance(info, types.StructType):
         if not isinstance(value, dict):
             return None
-        return SimpleNamespace(**{entry.name: _sound_field(value, entry) for entry in info.fields})
+        sound_parts = {}
+        for entry in info.fields:
+            if entry.encode_name in value:
+                sound_parts[entry.name] = _sound(value[entry.encode_name], entry.type)
+            elif entry.default_factory is not msgspec.NODEFAULT:
+                sound_parts[entry.name] = entry.default_factory()
+            else:
+                sound_parts[entry.name] = None if entry.default is msgspec.NODEFAULT else entry.default
+        return SimpleNamespace(**sound_parts)
     if isinstance(info, types.ListType):
         if not isinstance(value, list | tuple) or len(value) > (info.max_length or len(value)):
             return None
         return [_sound(item, info.item_type) for item in value]
     return None if any(_check(value, info, "")) else value
-
-
-def _sound_field(value: dict[str, Any], entry: types.Field) -> Any:
-    if entry.encode_name in value:
-        return _sound(value[entry.encode_name], entry.type)
-    if entry.default_factory is not msgspec.NODEFAULT:
-        return entry.default_factory()
-    return None if entry.default is msgspec.NODEFAULT else entry.default
 
 
 def suggestion(name: Any, known: Iterable[str]) -> str:
@@ -221,7 +210,6 @@ def field_path(path: str, name: Any) -> str:
 
 
 def show(value: Any) -> str:
-    """Return what was found, short enough for one line."""
     if isinstance(value, dict | list | tuple | set) and len(value) > SHOWN_MAX:
         return f"{'a map' if isinstance(value, dict) else 'a list'} of {len(value)} entries"
     try:
@@ -239,12 +227,10 @@ def _as_json(value: Any) -> str:
         return "{" + ", ".join(f"{_as_json(key)}: {_as_json(item)}" for key, item in value.items()) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_as_json, value)) + "]"
-    names = {None: "null", True: "true", False: "false"}
     if value is None or isinstance(value, bool):
-        return names[value]
+        return {None: "null", True: "true", False: "false"}[value]
     return repr(value) if isinstance(value, int | float | str) else " ".join(repr(value).split())
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names for an error, the first 20 of them."""
     return ", ".join(names[:20]) + (f", … ({len(names)})" if len(names) > 20 else "")

@@ -13,7 +13,10 @@ Vector3 = tuple[Number, Number, Number]
 
 
 class Message(Struct, frozen=True, gc=False):
-    """The first fields of every message: simulated time of publication, and a count per key from 0."""
+    """The first fields of every message: simulated time of publication, and a count per key from 0.
+
+    A class may have a method `fault` that returns, or not, what is wrong with a message that its types cannot express.
+    """
 
     t_ns: Count
     seq: Count

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec, PathFinder
 from inspect import Parameter, getattr_static, isclass, isfunction, signature
+from itertools import accumulate
 from pathlib import Path
 from traceback import walk_tb
 from types import FrameType, ModuleType
@@ -54,16 +55,12 @@ def search(*places: Path) -> None:
 
 
 def folders() -> tuple[Path, ...]:
-    """Return the folders that are searched for modules besides Python's own."""
     return tuple(map(Path, filter(None, os.environ.get(FOLDERS, "").split(os.pathsep))))
 
 
 @contextmanager
 def names_only(wanted: bool = True) -> Iterator[list[str]]:
-    """Import nothing that documents name, here and in processes started from here.
-
-    Args:
-        wanted: False to import as usual.
+    """Import nothing that documents name, here and in processes started from here, unless `wanted` is False.
 
     Yields:
         the names of what was found and not imported, as documents have them; empty where all may be imported.
@@ -80,7 +77,6 @@ def names_only(wanted: bool = True) -> Iterator[list[str]]:
 
 
 def may_import() -> bool:
-    """Tell whether what documents name is imported."""
     return os.environ.get(IMPORTS) != NO_IMPORTS
 
 
@@ -88,7 +84,6 @@ def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Cal
     """Return the class of a name `package.module:Class`.
 
     Args:
-        name: the class.
         where: file and path of the field that names it, for the fault.
         kind: class or Protocol whose public methods it must have.
         is_constructed: whether its constructor is called as that of `kind`.
@@ -98,12 +93,13 @@ def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Cal
         NotTrustedError: it is there, and must not be imported.
     """
     loaded = _attribute(name, where, "Class", isclass)
-    own = {method: getattr(loaded, method, None) for method in _methods(kind)}
+    methods = [method for method in dir(kind) if not method.startswith("_") and callable(getattr(kind, method))]
+    own = {method: getattr(loaded, method, None) for method in methods}
     missing = [m for m, each in own.items() if not callable(each) or getattr(each, "__isabstractmethod__", False)]
     if missing:
         lacks = f"{where} is {show(name)}, which has no {', '.join(missing)}()"
         raise DocumentError([f"{lacks}; must have the methods of {kind.__name__}"])
-    for method in (*(("__init__",) if is_constructed else ()), *_methods(kind)):
+    for method in ["__init__", *methods] if is_constructed else methods:
         if (found := _other_arguments(loaded, kind, method)) is not None:
             taken, given = found
             what = f"{where} is {show(name)}, whose {method} takes ({taken})"
@@ -112,26 +108,12 @@ def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Cal
 
 
 def load_function(name: str, where: str) -> Callable[..., Any]:
-    """Return the function of a name `package.module:function`.
-
-    Args:
-        name: the function.
-        where: file and path of the field that names it, for the fault.
-
-    Raises:
-        DocumentError: no such module or function; one line.
-        NotTrustedError: it is there, and must not be imported.
-    """
+    """Return the function of a name `package.module:function`; arguments and errors as of `load`."""
     return _attribute(name, where, "function", callable)
 
 
 def load_module(name: str, where: str) -> ModuleType:
-    """Return the module of a name `package.module`.
-
-    Raises:
-        DocumentError: it cannot be imported; one line.
-        NotTrustedError: it is there, and must not be imported.
-    """
+    """Return the module of a name `package.module`; errors as of `load`."""
     return _imported(name, f"{where} is {show(name)}")
 
 
@@ -145,12 +127,11 @@ def load_object(name: str, where: str, attribute: str, kind: type[Object]) -> Ob
 
 
 def is_own(kind: type) -> bool:
-    """Tell whether a class is a user's own, and none of zsim's."""
+    """Tell whether a class is a user's."""
     return kind.__module__.partition(".")[0] not in PACKAGES
 
 
 def full_name(kind: type) -> str:
-    """Return the name of a class as a scenario has it: `package.module:Class`."""
     return f"{kind.__module__}:{kind.__qualname__}"
 
 
@@ -171,7 +152,7 @@ def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
     frames = [(frame, line) for frame, line in walked if _is_user_frame(frame)]
     if not frames:
         return None
-    if isinstance(error, SystemExit) and _package(walked[-1][0]) in PACKAGES:
+    if isinstance(error, SystemExit) and walked[-1][0].f_globals.get("__name__", "").partition(".")[0] in PACKAGES:
         return None  # the handler of a signal that came meanwhile
     (called, _), (deepest, line) = frames[0], frames[-1]
     method = f"{called.f_globals.get('__name__', '')}:{called.f_code.co_qualname}"
@@ -181,24 +162,16 @@ def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
 
 
 def numbers(returned: Any) -> NDArray[np.float64]:
-    """Return what a user's code returned as an array.
-
-    Raises:
-        ValueError: it is something else than real numbers: text, None, complex numbers, sequences of unequal length.
-    """
+    """Return what a user's code returned as an array; ValueError if it is no real numbers of a regular shape."""
     array = np.asarray(returned)
     if array.dtype.kind not in "biuf":
         raise ValueError(f"no real numbers: {array.dtype}")
     return array.astype(float, copy=False)
 
 
-def _package(frame: FrameType) -> str:
-    return frame.f_globals.get("__name__", "").partition(".")[0]
-
-
 def _is_user_frame(frame: FrameType) -> bool:
     """Tell whether a frame is of a user's file, or of an installed package that a document names."""
-    package, path = _package(frame), frame.f_code.co_filename
+    package, path = frame.f_globals.get("__name__", "").partition(".")[0], frame.f_code.co_filename
     if package in PACKAGES or path.startswith("<"):
         return False
     is_library = path.startswith(LIBRARIES) or "site-packages" in path or "dist-packages" in path
@@ -247,20 +220,19 @@ def _imported(name: str, what: str, attribute: str = "") -> ModuleType:
 
 
 def _find(name: str, what: str, attribute: str) -> None:
-    """Find a module without running any of it, and what its text binds.
-
-    Raises:
-        DocumentError: there is no such module, or nothing of that name in it; one line.
-    """
+    """Find a module without running any of it; DocumentError if there is none, or its text does not bind the name."""
     spec: ModuleSpec | None = None
-    parts = name.split(".")
-    for count in range(1, len(parts) + 1):
+    for part in accumulate(name.split("."), "{}.{}".format):
         where = spec.submodule_search_locations if spec else None
         if spec and where is None:
             raise DocumentError([f"{what}, and {spec.name} is no package; {WHERE}"])
-        spec = _spec(".".join(parts[:count]), None if where is None else list(where))
+        if where is not None:
+            spec = PathFinder.find_spec(part, list(where))
+        else:
+            found = (finder.find_spec(part, None) for finder in sys.meta_path)
+            spec = next(filter(None, found), None) or PathFinder.find_spec(part, list(map(str, folders())))
         if spec is None:
-            reason = f"ModuleNotFoundError: No module named {'.'.join(parts[:count])!r}"
+            reason = f"ModuleNotFoundError: No module named {part!r}"
             raise DocumentError([f"{what}, which cannot be imported ({reason}); {WHERE}"])
     if not attribute or spec is None or not (spec.origin or "").endswith(".py"):
         return
@@ -270,13 +242,6 @@ def _find(name: str, what: str, attribute: str) -> None:
         raise DocumentError([f"{what}, which cannot be imported ({reason_of(error)})"]) from error
     if attribute not in bound and "*" not in bound:
         raise DocumentError([f"{what}; must be of {name}: {', '.join(sorted(bound)) or 'it defines nothing'}"])
-
-
-def _spec(name: str, where: list[str] | None) -> ModuleSpec | None:
-    if where is not None:
-        return PathFinder.find_spec(name, where)
-    found = (finder.find_spec(name, None) for finder in sys.meta_path)
-    return next(filter(None, found), None) or PathFinder.find_spec(name, list(map(str, folders())))
 
 
 def _bound(body: ast.AST) -> set[str]:
@@ -293,11 +258,6 @@ def _bound(body: ast.AST) -> set[str]:
         else:
             names |= _bound(node)
     return names
-
-
-def _methods(kind: type) -> list[str]:
-    """Return the public methods of a class or Protocol."""
-    return [name for name in dir(kind) if not name.startswith("_") and callable(getattr(kind, name))]
 
 
 def _other_arguments(loaded: type, kind: type, method: str) -> tuple[str, str] | None:

@@ -6,18 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from yaml import events
 from yaml.error import MarkedYAMLError
-from yaml.events import (
-    AliasEvent,
-    DocumentEndEvent,
-    DocumentStartEvent,
-    MappingEndEvent,
-    ScalarEvent,
-    SequenceEndEvent,
-    SequenceStartEvent,
-    StreamEndEvent,
-    StreamStartEvent,
-)
 
 from zsim.errors import DocumentError
 from zsim.schema.checker import show
@@ -31,7 +21,6 @@ def read(path: Path, example: str, refuse: type[DocumentError]) -> dict[str, Any
     """Return the map that a YAML file holds.
 
     Args:
-        path: the file.
         example: a file of that kind, named to whoever gave another one.
         refuse: the error to raise, with a line for each fault.
     """
@@ -64,7 +53,6 @@ def parse(text: str, source: str, example: str, refuse: type[DocumentError]) -> 
 
 
 def dump(plain: Any) -> str:
-    """Return YAML text; the same content gives the same text."""
     return yaml.dump(plain, Dumper=_Dumper, sort_keys=True, default_flow_style=None, width=120)
 
 
@@ -92,9 +80,6 @@ class _Reader:
     Refused are aliases, which can expand without end, tags, directives, keys that are given twice, and a depth or a
     number of values for which C code has no limit of its own. Words mean what YAML 1.2 says (its core schema, section
     10.3.2): 1e3 and 010 are decimal numbers; 1:30, 1_000, yes, off, 2026-01-31 and the key << are text.
-
-    Args:
-        text: to be read.
     """
 
     def __init__(self, text: str) -> None:
@@ -105,45 +90,43 @@ class _Reader:
 
     def document(self) -> Any:
         """Return the content of the only document; None of an empty text."""
-        content, event = None, self._after(StreamStartEvent)
-        if isinstance(event, DocumentStartEvent):
+        content, event = None, self._after(events.StreamStartEvent)
+        if isinstance(event, events.DocumentStartEvent):
             content = self._node(next(self._events), 0)
-            event = self._after(DocumentEndEvent)
-        if not isinstance(event, StreamEndEvent):
+            event = self._after(events.DocumentEndEvent)
+        if not isinstance(event, events.StreamEndEvent):
             raise _refusal("a second document is not allowed", event)
         return content
 
     def _after(self, kind: type[Any]) -> Any:
-        """Return the event that follows the next one, which is of a kind."""
         event = next(self._events)
         assert isinstance(event, kind), event
         return next(self._events)
 
     def _node(self, event: Any, depth: int) -> Any:
-        """Return what begins with an event."""
         self._count += 1
-        if isinstance(event, AliasEvent):
+        if isinstance(event, events.AliasEvent):
             raise _refusal("aliases are not allowed", event)
         if event.tag is not None:
             raise _refusal("tags are not allowed", event)
         if self._count > VALUES_MAX:
             raise _refusal(f"there are more than {VALUES_MAX} keys and values", event)
-        if isinstance(event, ScalarEvent):
+        if isinstance(event, events.ScalarEvent):
             return _word(event.value) if event.implicit[0] else event.value
         if depth == DEPTH_MAX:
             raise RecursionError
-        return self._list(depth + 1) if isinstance(event, SequenceStartEvent) else self._map(depth + 1)
+        return self._list(depth + 1) if isinstance(event, events.SequenceStartEvent) else self._map(depth + 1)
 
     def _list(self, depth: int) -> list[Any]:
         items: list[Any] = []
-        while not isinstance(event := next(self._events), SequenceEndEvent):
+        while not isinstance(event := next(self._events), events.SequenceEndEvent):
             items.append(self._node(event, depth))
         return items
 
     def _map(self, depth: int) -> dict[Any, Any]:
         content: dict[Any, Any] = {}
         written: set[str] = set()
-        while not isinstance(event := next(self._events), MappingEndEvent):
+        while not isinstance(event := next(self._events), events.MappingEndEvent):
             key = self._node(event, depth)
             if isinstance(key, list | dict):
                 raise _refusal(f"a key is {show(key)}; must be text or a number", event)
@@ -159,7 +142,6 @@ def _refusal(problem: str, event: Any) -> MarkedYAMLError:
 
 
 def _word(text: str) -> Any:
-    """Return what a text without quotes means."""
     for _, pattern, first, meaning in _WORDS:
         if text[:1] in first and pattern.match(text):
             return meaning(text)
@@ -167,7 +149,6 @@ def _word(text: str) -> Any:
 
 
 def _whole(text: str) -> int:
-    """Return a whole number: decimal, 0o for octal, 0x for hexadecimal."""
     return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
 
 

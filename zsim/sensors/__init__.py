@@ -1,11 +1,5 @@
-"""Sensors as declarations: message, settings with errors, channels, presets.
+"""Sensors as declarations: message, settings with errors, channels, presets. Imports schema and math.
 
-    sensor             what a sensor is, stock or of a user's own
-    stock_sensors      IMU, GPS, magnetometer, barometer, sonar, optical flow
-    camera             settings of cameras, sightings and hats; the header of a JPEG
-    camera_model       lenses: points to pixels and back
-    sensor_catalogue   all sensors of a drone, those of users found by their modules
-    error_units        error models in the units of data sheets and of Kalibr
-
-Scenario, faults, keys, messages and the arrays of the world follow from the declarations. Imports schema and math.
+Scenario, faults, keys, messages and the arrays of the world follow from them. What a sensor is: sensor; those there
+are: stock_sensors, camera (with camera_model, its lens), and a user's own, found by sensor_catalogue.
 """

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from zsim.math.compiled import portable
 from zsim.math.frames import quaternion_from_matrix
-from zsim.math.rotation import matrix_from_rpy
+from zsim.math.rotation import Quaternion, matrix_from_rpy
 from zsim.sensors.camera import Camera
 
 Array = NDArray[np.float64]
@@ -45,9 +45,9 @@ class CameraPose(NamedTuple):
     R_BK: Array
 
     @property
-    def q_BK(self) -> tuple[float, ...]:
-        """The rotation as a quaternion, w first."""
-        return tuple(quaternion_from_matrix(self.R_BK).tolist())
+    def q_BK(self) -> Quaternion:
+        w, x, y, z = quaternion_from_matrix(self.R_BK).tolist()
+        return w, x, y, z
 
 
 def lens_of(camera: Camera) -> Lens:
@@ -59,7 +59,6 @@ def lens_of(camera: Camera) -> Lens:
 
 
 def camera_pose(camera: Camera) -> CameraPose:
-    """Return where a camera is in the body."""
     R_BS = np.array(matrix_from_rpy(*map(math.radians, camera.mount.rpy_deg)))
     return CameraPose(np.array(camera.mount.position_m), R_BS @ R_SK)
 

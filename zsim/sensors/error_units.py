@@ -81,7 +81,6 @@ def in_channel_units(sensors: dict[str, Any], where: str) -> tuple[Any, list[Fau
 
 
 def _of_kalibr(section: dict[str, Any], where: str, wrong: list[Fault]) -> dict[str, Any]:
-    """Return the section of an IMU with Kalibr's keys replaced by those of a scenario."""
     read = {key: value for key, value in section.items() if key not in KALIBR}
     for key, place in KALIBR.items():
         if key not in section:
@@ -101,14 +100,13 @@ def _of_kalibr(section: dict[str, Any], where: str, wrong: list[Fault]) -> dict[
 
 
 def _in_unit(model: dict[str, Any], units: dict[str, Unit], where: str, wrong: list[Fault]) -> dict[str, Any]:
-    """Return an error model whose fields are those of ErrorModel."""
     read = {key: value for key, value in model.items() if key not in units}
     for key, unit in units.items():
         if key in model:
             found = [*faults(model[key], NonNegative, f"{where}.{key}")]
             if unit.field in read:
-                twice = f"says what another of the fields for {unit.field} says; must be the only one"
-                found.append((f"{where}.{key}", twice))
+                text = f"says what another of the fields for {unit.field} says; must be the only one"
+                found.append((f"{where}.{key}", text))
             wrong += found
             if not found:
                 read[unit.field] = unit.factor * model[key]

@@ -46,18 +46,16 @@ class ErrorModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     @property
     def correlation_time_s(self) -> float:
-        """Return the correlation time [s], 0 where no error is correlated."""
         return 0.0 if self.correlation_s is UNSET else self.correlation_s
 
     @property
     def correlated_sigma(self) -> float:
-        """Return the stationary standard deviation of the Gauss-Markov process."""
         if not self.correlation_time_s:
             return 0.0
         return math.hypot(self.noise, 0.0 if self.bias_instability is UNSET else self.bias_instability)
 
     def white_sigma(self, rate_hz: float) -> float:
-        """Return the standard deviation of a sample's white noise: what is no step of the converter's."""
+        """Return the standard deviation of white noise per sample, without the rounding of the converter."""
         return math.hypot(0.0 if self.correlation_time_s else self.noise, self.density * math.sqrt(rate_hz))
 
 
@@ -69,7 +67,7 @@ class Mount(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Sensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Settings that all sensors share."""
+    """Settings of every sensor."""
 
     rate_hz: RateHz
     latency_ms: LatencyMs = 0.0
@@ -89,13 +87,10 @@ class Channel(Struct, frozen=True, omit_defaults=True):
     Attributes:
         settings: field of the settings that has the ErrorModel.
         unit: of the ErrorModel, and of a bias that a fault adds.
-        width: how many numbers.
         to_si: what a unit is in that of the equation's values, e.g. pi / 180 where settings are in deg/s and values
             in rad/s.
-        part: first word of its fault kinds; empty for the sensor as a whole.
-        label: what the part is called.
-        axes: what the bias of a fault is along, or of.
-        bias_max: largest that a fault may add, in each number.
+        part, label: first word of its fault kinds, empty for the sensor as a whole; what it is called.
+        axes, bias_max: what the bias of a fault is along, or of; largest that it may add, in each number.
     """
 
     settings: FieldName
@@ -166,11 +161,10 @@ class SensorType(Struct, frozen=True, kw_only=True):
     Attributes:
         message: subclass of Sample; its own fields are numbers, tuples of numbers, whole numbers, or true and false.
         settings: subclass of Sensor, with an ErrorModel for each channel.
-        channels: in the order of the equation's values.
-        exact: values after those of the channels, without an error of their own.
+        channels: in the order of the equation's values; `exact` ones follow, without an error of their own.
         label: what the sensor is called in tables; empty for its name in the scenario.
-        equation: of a user's sensor. Those of the stock ones are compiled in zsim_world.sensors.
-        convert: of a user's sensor, from the reading to the message; None: the values are the message's numbers.
+        equation, convert: of a user's sensor, the latter from the reading to the message (None: the values are the
+            message's numbers). The equations of the stock ones are compiled in zsim_world.sensors.
         presets: of a stock sensor, its section by the name of the preset.
     """
 
@@ -184,19 +178,19 @@ class SensorType(Struct, frozen=True, kw_only=True):
     presets: dict[str, dict[str, Any]] = {}
 
     @property
-    def width(self) -> int:
-        """Numbers with an error of their own."""
+    def width(self) -> int:  # numbers with an error of their own
         return sum(channel.width for channel in self.channels)
 
     @property
-    def values(self) -> int:
-        """Numbers of a reading."""
+    def values(self) -> int:  # numbers of a reading
         return self.width + self.exact
 
     def errors(self, settings: Sensor) -> list[ErrorModel]:
         """Return the error model of every number that has one, in SI units."""
-        models = [scaled(getattr(settings, channel.settings), channel.to_si) for channel in self.channels]
-        return [model for model, channel in zip(models, self.channels, strict=True) for _ in range(channel.width)]
+        models = [
+            (scaled(getattr(settings, channel.settings), channel.to_si), channel.width) for channel in self.channels
+        ]
+        return [model for model, width in models for _ in range(width)]
 
 
 class Declaration(Struct, frozen=True, omit_defaults=True):
@@ -209,7 +203,6 @@ class Declaration(Struct, frozen=True, omit_defaults=True):
 
     @classmethod
     def of(cls, kind: SensorType) -> "Declaration":
-        """Return the declaration of a sensor."""
         return cls(kind.message.__name__, field_types(kind.message), kind.channels, kind.label)
 
 
@@ -227,8 +220,6 @@ def noise_sigma(model: ErrorModel, rate_hz: float) -> float:
     return math.hypot(white, correlated) if correlated else white
 
 
-# Messages by the types of their fields
-
 _WORDS = {types.FloatType: "number", types.IntType: "whole", types.BoolType: "flag"}
 _TYPES: dict[str, Any] = {"number": Number, "whole": Whole, "flag": bool}
 
@@ -240,9 +231,8 @@ def field_types(message: type[Sample]) -> dict[FieldName, FieldType]:
         TypeError: a field is of a type that no sensor's message has.
     """
     info: Any = types.type_info(message)
-    known = len(Sample.__struct_fields__)
     words: dict[str, Any] = {}
-    for field in info.fields[known:]:
+    for field in info.fields[len(Sample.__struct_fields__) :]:
         kind = field.type
         if isinstance(kind, types.TupleType) and all(isinstance(item, types.FloatType) for item in kind.item_types):
             words[field.name] = f"number[{len(kind.item_types)}]"
@@ -270,8 +260,9 @@ def _message_type(name: str, fields: tuple[tuple[str, str], ...], sensor: str) -
         (field, tuple[(Number,) * int(word[7:-1])] if "[" in word else _TYPES[word])  # type: ignore[misc]
         for field, word in fields
     ]
-    made: Any = msgspec.defstruct(name, own, bases=(Sample,), namespace={"__sensor__": sensor}, frozen=True, gc=False)
-    return made
+    space = {"__sensor__": sensor}
+    message: Any = msgspec.defstruct(name, own, bases=(Sample,), namespace=space, frozen=True, gc=False)
+    return message
 
 
 def as_fields(numbers: Sequence[Any], fields: Mapping[str, str]) -> list[Any]:
@@ -283,17 +274,14 @@ def as_fields(numbers: Sequence[Any], fields: Mapping[str, str]) -> list[Any]:
     values, at = [], 0
     for word in fields.values():
         count = int(word[7:-1]) if word.startswith("number[") else 1
-        taken = numbers[at : at + count]
-        at += len(taken)
-        values.append(_value(word, taken) if len(taken) == count else None)
-    if at != len(numbers) or None in values:
+        part = numbers[at : at + count]
+        at += len(part)
+        if len(part) < count:
+            break
+        if word in ("number", "whole", "flag"):
+            values.append({"number": float, "whole": int, "flag": bool}[word](part[0]))
+        else:
+            values.append(tuple(map(float, part)))
+    if at != len(numbers) or len(values) < len(fields):
         raise ValueError(f"is given {len(numbers)} numbers; must be given those of {', '.join(fields)}")
     return values
-
-
-def _value(word: str, taken: Sequence[Any]) -> Any:
-    if word == "flag":
-        return bool(taken[0])
-    if word == "whole":
-        return int(taken[0])
-    return float(taken[0]) if word == "number" else tuple(map(float, taken))

@@ -46,7 +46,6 @@ class Sensors(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     others, see `flattened`."""
 
     def cameras(self) -> dict[str, Camera]:
-        """Return the cameras that the drone has, by name."""
         found = {name: getattr(self, f"{name}_camera") for name in CAMERAS}
         return {name: camera for name, camera in found.items() if camera is not UNSET}
 
@@ -59,7 +58,15 @@ class Sensors(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         for name, kind in STOCK.items():
             yield name, kind, getattr(self, name)
         for name, section in ({} if self.own is UNSET else self.own).items():
-            yield name, *_typed(name, section)
+            where = f"sensors.{name}"
+            kind = sensor_type(section[MODULE], f"{where}.{MODULE}")
+            wrong = [f"{path} {text}" for path, text in faults(_settings_of(section), kind.settings, where)]
+            if section[DECLARED] != _plain(Declaration.of(kind)):
+                what = f"{where}.{DECLARED} is not what {section[MODULE]} declares here"
+                wrong.append(f"{what}; the scenario must be resolved with the same version of the module")
+            if wrong:
+                raise DocumentError(wrong)
+            yield name, kind, msgspec.convert(_settings_of(section), kind.settings)
 
 
 PRESETS = {
@@ -91,7 +98,6 @@ def sensor_type(module_name: str, where: str = "module") -> SensorType:
 
 
 def _check(sensor: SensorType) -> None:
-    """Refuse a sensor whose parts contradict each other."""
     for part, base in (("message", Sample), ("settings", Sensor)):
         kind = getattr(sensor, part)
         if not (isinstance(kind, type) and issubclass(kind, base)):
@@ -142,8 +148,14 @@ def separate(
             continue
         section_faults = [*_section_faults(name, value, imports)]
         wrong += section_faults
-        if not section_faults and (DECLARED in value or plugin.may_import()):
-            own[name] = _resolved(value)
+        if section_faults:
+            continue
+        if DECLARED in value:
+            own[name] = value
+        elif plugin.may_import():
+            kind = sensor_type(value[MODULE])
+            settings = _plain(msgspec.convert(_settings_of(value), kind.settings))
+            own[name] = {MODULE: value[MODULE], DECLARED: _plain(Declaration.of(kind)), **settings}
     return rest, dict(sorted(own.items())), wrong
 
 
@@ -168,7 +180,6 @@ def own_sections(drone: Any) -> dict[str, dict[str, Any]]:
 
 
 def own_rates(drone: Any) -> dict[str, float]:
-    """Return the rates of the users' sensors of a drone [Hz], by name."""
     return {name: section["rate_hz"] for name, section in own_sections(drone).items()}
 
 
@@ -199,32 +210,6 @@ def _section_faults(name: str, section: dict[str, Any], imports: bool) -> Iterat
     yield from faults(_settings_of(section), kind.settings, name)
 
 
-def _resolved(section: dict[str, Any]) -> dict[str, Any]:
-    """Return a sound section with every setting and the declaration of the sensor."""
-    if DECLARED in section:
-        return section
-    kind = sensor_type(section[MODULE])
-    settings = msgspec.convert(_settings_of(section), kind.settings)
-    return {MODULE: section[MODULE], DECLARED: _plain(Declaration.of(kind)), **_plain(settings)}
-
-
 def _plain(value: Struct) -> dict[str, Any]:
     """Return a struct as a file holds it: maps, lists, texts and numbers."""
     return msgspec.json.decode(msgspec.json.encode(value))
-
-
-def _typed(name: str, section: dict[str, Any]) -> tuple[SensorType, Sensor]:
-    """Return type and settings of a user's sensor.
-
-    Raises:
-        DocumentError: see `Sensors.sections`.
-    """
-    where = f"sensors.{name}"
-    kind = sensor_type(section[MODULE], f"{where}.{MODULE}")
-    wrong = [f"{path} {text}" for path, text in faults(_settings_of(section), kind.settings, where)]
-    if section[DECLARED] != _plain(Declaration.of(kind)):
-        what = f"{where}.{DECLARED} is not what {section[MODULE]} declares here"
-        wrong.append(f"{what}; the scenario must be resolved with the same version of the module")
-    if wrong:
-        raise DocumentError(wrong)
-    return kind, msgspec.convert(_settings_of(section), kind.settings)

@@ -1,7 +1,5 @@
 """The stock sensors: message, settings, channels and presets of each, one after the other.
 
-    IMU   GPS   MAG   BARO   SONAR   FLOW
-
 Their equations are compiled in zsim_world.sensors. Where the paper is silent about a sensor, its preset `paper` is
 chosen as the AR.Drone's or as said there.
 """
@@ -11,8 +9,6 @@ import math
 from zsim.schema.message import Count, Number, Vector3
 from zsim.schema.quantities import G_M_S2, NonNegative, Positive
 from zsim.sensors.sensor import Channel, ErrorModel, Sample, Sensor, SensorType
-
-# The inertial measurement unit: accelerometer and gyroscope of the navigation board
 
 BOARD_RATE_HZ = 200.0  # Hz, navigation board of the AR.Drone 2.0: its IMU samples and its firmware steps
 
@@ -79,9 +75,6 @@ IMU = SensorType(
 IMU_AS_PRINTED = {"accel_m_s2": {"noise": 0.35 * G_M_S2}}  # m/s^2, section VI: "std errors 0.35 g"
 
 
-# The satellite receiver: position and velocity of its antenna
-
-
 class Gps(Sample, frozen=True):
     """A fix of the antenna: WGS 84 (deg, m), the same in W [m], velocity in W [m/s].
 
@@ -132,9 +125,6 @@ GPS = SensorType(
 )
 
 
-# The magnetometer
-
-
 class Mag(Sample, frozen=True):
     """The Earth's field in the axes of the sensor [uT]."""
 
@@ -161,9 +151,6 @@ MAG = SensorType(
 )
 
 
-# The barometer
-
-
 class Baro(Sample, frozen=True):
     """Static pressure [Pa], and the height over the origin of W that it stands for [m]."""
 
@@ -187,9 +174,6 @@ BARO = SensorType(
     exact=1,
     presets=dict.fromkeys(("ardrone2", "paper", "crazyflie2"), _BARO_PRESET),
 )
-
-
-# The sonar, or another ranger that looks down
 
 
 class Sonar(Sample, frozen=True):
@@ -225,9 +209,6 @@ SONAR = SensorType(
         },
     },
 )
-
-
-# The optical flow: velocity over the ground, by the camera that looks down
 
 
 class Flow(Sample, frozen=True):

@@ -8,7 +8,7 @@ import re
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 
 from zsim.contract import keys, messages
@@ -47,48 +47,36 @@ def listen(
 ) -> Iterator[Session]:
     """Open the hub: a router that listens, to which every other role is a client.
 
-    A peer would do for clients, but carries nothing between two routers that both connect to it.
-
-    Raises:
-        SessionError: an endpoint is taken or malformed, or the identity cannot be used.
+    A peer would do for clients, but carries nothing between two routers that both connect to it. SessionError if an
+    endpoint is taken or malformed, or the identity cannot be used.
     """
     with _listening(endpoints, federation, mode, identity or Identity(), zenoh_settings.hub(mode)) as session:
         session.use(mode)
         yield session
 
 
-@contextmanager
 def route(
     endpoint: str, upstream: str, federation: str, mode: Mode = "lockstep", identity: Identity | None = None
-) -> Iterator[Session]:
+) -> AbstractContextManager[Session]:
     """Open a router: it listens on an endpoint, and keeps trying to reach the world, or another router, upstream.
 
-    Raises:
-        SessionError: an endpoint is taken or malformed, or the identity cannot be used.
+    Errors as of `listen`.
     """
     identity = identity or Identity()
-    with _listening([endpoint], federation, mode, identity, zenoh_settings.upstream(upstream, identity)) as session:
-        yield session
+    return _listening([endpoint], federation, mode, identity, zenoh_settings.upstream(upstream, identity))
 
 
 @contextmanager
 def connect(
-    endpoint: str,
+    endpoint: str,  # e.g. "tcp/192.168.1.2:7447"
     federation: str,
-    mode: Mode = "lockstep",
-    wait_s: float | None = None,
+    mode: Mode = "lockstep",  # of the run, if it is known already
+    wait_s: float | None = None,  # how long to try; None tries once
+    # whether it never gates; then a silence of LEASE_READER_MS counts as its death, in lockstep too
     reader: bool = False,
-    identity: Identity | None = None,
+    identity: Identity | None = None,  # host and certificate; by default this host's name and no TLS
 ) -> Iterator[Session]:
     """Open a client of the hub (or of a router).
-
-    Args:
-        endpoint: e.g. "tcp/192.168.1.2:7447".
-        federation: prefix of all keys.
-        mode: of the run, if it is known already.
-        wait_s: how long to try; None tries once.
-        reader: whether it never gates; then a silence of LEASE_READER_MS counts as its death, in lockstep too.
-        identity: host and certificate; by default this host's name and no TLS.
 
     Raises:
         SessionError: nobody listens there within `wait_s`, or a certificate, here or there, is refused.
@@ -101,11 +89,7 @@ def connect(
 
 
 def check_listening(endpoints: Sequence[str], identity: Identity | None = None) -> None:
-    """Refuse endpoints on which nobody can listen, without listening.
-
-    Raises:
-        SessionError: one is malformed, or identity and endpoints do not go together.
-    """
+    """Raise SessionError, without listening, if an endpoint is malformed or does not go with the identity."""
     if any(endpoint.endswith(":0") for endpoint in endpoints):
         raise SessionError(f"cannot listen on {', '.join(endpoints)}: port 0 is no port that others can connect to")
     identity = identity or Identity()
@@ -119,8 +103,16 @@ def _listening(
     check_listening(endpoints, identity)
     settings = zenoh_settings.common("router", mode) | zenoh_settings.listening(endpoints, identity) | others
     with open_session(settings, federation, identity, partial(no_listening, endpoints)) as session:
-        if identity.access is not None:
-            _answer_permissions(session, identity)
+        if identity.access is not None:  # a router answers for itself, not for the world behind it
+            rules = zenoh_settings.read_access(identity)
+
+            def tell_permissions(query: Query) -> None:
+                process = keys.leaf(query.expression)
+                if keys.PROCESS_NAME.fullmatch(process):
+                    query.reply(query.expression, messages.encode(permissions_of(rules, session.process, process)))
+                query.end()
+
+            session.declare_queryable(keys.access("*"), tell_permissions, complete=True)
         yield session
 
 
@@ -134,41 +126,18 @@ def no_listening(endpoints: Sequence[str], error: str) -> str:
     return f"{text}: {why}" if why else f"{text} ({error}); {_OTHER}"
 
 
-def _answer_permissions(session: Session, identity: Identity) -> None:
-    """Tell every process what its certificate permits here; a router answers for itself, not the world behind it."""
-    rules = zenoh_settings.read_access(identity)
-
-    def answer(query: Query) -> None:
-        process = keys.leaf(query.expression)
-        if keys.PROCESS_NAME.fullmatch(process):
-            query.reply(query.expression, messages.encode(permissions_of(rules, session.process, process)))
-        query.end()
-
-    session.declare_queryable(keys.access("*"), answer, complete=True)
-
-
 @contextmanager
 def find_world(
-    endpoint: str,
+    endpoint: str,  # see `connect`
     federation: str,
-    wait_s: float | None = None,
-    say: Callable[[str], None] = lambda text: None,
-    stopped: Callable[[], bool] = lambda: False,
+    wait_s: float | None = None,  # how long to wait for a world; None waits for ever
+    say: Callable[[str], None] = lambda text: None,  # called at growing intervals with what is waited for
+    stopped: Callable[[], bool] = lambda: False,  # tells whether to wait no longer
     reader: bool = False,
-    run_id: str | None = None,
+    run_id: str | None = None,  # of the only run to take part in; None takes any
     identity: Identity | None = None,
 ) -> Iterator[tuple[Session, messages.Info]]:
     """Yield a session and the `world/info` of the run that it belongs to.
-
-    Args:
-        endpoint: where the world (or a router) listens.
-        federation: its name.
-        wait_s: how long to wait for a world; None waits for ever.
-        say: called at growing intervals with what is waited for.
-        stopped: tells whether to wait no longer.
-        reader: see `connect`.
-        run_id: of the only run to take part in; None takes any.
-        identity: see `connect`.
 
     Raises:
         NoWorldError: no world answered within `wait_s`, or `stopped` returned true.
@@ -228,29 +197,22 @@ def _no_answer(link: Session, identity: Identity | None) -> str:
 
 def _no_link(endpoint: str) -> str:
     """Return why there is no session; a port that opens nevertheless speaks another protocol, or TLS."""
-    if not _opens(endpoint):
-        return "; start one with `zsim world`"
-    return ", but who listens there refuses us; if it is a world with TLS, say tls/ and give --tls FOLDER"
-
-
-def _opens(endpoint: str) -> bool:
-    """Tell whether an endpoint without TLS accepts connections."""
+    nobody = "; start one with `zsim world`"
     protocol, _, place = endpoint.partition("/")
     if protocol != "tcp":
-        return False
+        return nobody
     host, _, port = place.partition("?")[0].partition("#")[0].rpartition(":")
     try:
-        with socket.create_connection((host.strip("[]"), int(port)), ANSWER_S):
-            return True
+        socket.create_connection((host.strip("[]"), int(port)), ANSWER_S).close()
     except (OSError, OverflowError, ValueError):
-        return False
+        return nobody
+    return ", but who listens there refuses us; if it is a world with TLS, say tls/ and give --tls FOLDER"
 
 
 def read_permissions(link: Session) -> Permissions | None:
     """Return what access control at the other end permits us, None where nobody answers that.
 
-    Raises:
-        SessionError: it does not let us in.
+    SessionError if it does not let us in.
     """
     for sample in link.get(keys.access(link.process), timeout_s=ANSWER_S):
         permissions = messages.decode_as(Permissions, sample.payload, sample.key)

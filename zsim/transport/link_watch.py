@@ -50,33 +50,20 @@ COMMAND_MAX = 80  # characters of a command line that are shown
 
 
 class Awaited(NamedTuple):
-    """A process that is waited for.
-
-    Attributes:
-        names: its own, and those whose work it does.
-        pid: as it joined.
-    """
+    """A process that is waited for: its own name and those whose work it does, and its pid as it joined."""
 
     names: tuple[str, ...]
     pid: int
 
 
 class ClosedLink(NamedTuple):
-    """A link that was closed.
+    """A link that was closed."""
 
-    Attributes:
-        address: of its far end.
-        process: at that end, by pid and command, if it is on this machine.
-        names: of the processes that its session stands for.
-        held_bytes: what it held back in the kernel.
-        times: that a link of its session was closed so far.
-    """
-
-    address: str
-    process: str
-    names: tuple[str, ...]
-    held_bytes: int
-    times: int
+    address: str  # of its far end
+    process: str  # at that end, by pid and command, if it is on this machine
+    names: tuple[str, ...]  # of the processes that its session stands for
+    held_bytes: int  # in the kernel
+    times: int  # that a link of its session was closed so far
 
 
 @dataclass
@@ -89,24 +76,13 @@ class _Backlog:
 
 
 class LinkWatch:
-    """Watches the links of the hub, in a thread of its own while it is entered.
-
-    Args:
-        link: the listening session.
-        tokens: of all processes.
-        awaited: returns the participants that must not lose anything.
-        sockets: of this process.
-        wall_s: monotonic.
-
-    Attributes:
-        closed: links that were closed, in order, one of a session in TOLD_S; to be taken from it.
-    """
+    """Watches the links of the hub, in a thread of its own while it is entered."""
 
     def __init__(
         self,
         link: Session,
         tokens: "SessionTokens",
-        awaited: Callable[[], list[Awaited]],
+        awaited: Callable[[], list[Awaited]],  # returns the participants that must not lose anything
         sockets: "LinkSockets | None" = None,
         wall_s: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -123,6 +99,7 @@ class LinkWatch:
         self._kept_out_s: dict[str, float] = {}
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="links", daemon=True)
+        # links that were closed, in order, one of a session in TOLD_S; to be taken from it
         self.closed: deque[ClosedLink] = deque()
 
     def __enter__(self) -> "LinkWatch":
@@ -141,24 +118,29 @@ class LinkWatch:
         """Look at all links once, and close those that have to be."""
         now_s, queued = self._wall_s(), self._sockets.queued()
         self._backlogs = {address: self._backlogs[address] for address in queued if address in self._backlogs}
+        keeps_out = now_s < max(self._kept_out_s.values(), default=now_s)
         for address, held_bytes in queued.items():
-            if self._holds_up(address, held_bytes, now_s) or self._is_kept_out(address, now_s):
+            is_bad = self._holds_up(address, held_bytes, now_s)
+            if not is_bad and keeps_out:
+                far = self._far_end(address, now_s)
+                is_bad = far is not None and now_s < self._kept_out_s.get(far.session, now_s)
+            if is_bad:
                 self._judge(address, held_bytes, now_s)
 
     def stuck(self) -> list[str]:
         """Return who is at the far end of the links that take nothing, the fullest first."""
         queued, before_s = self._sockets.queued(), self._wall_s() - STALL_S
         standing = [address for address, backlog in self._backlogs.copy().items() if backlog.moved_s <= before_s]
-        full = sorted(standing, key=lambda address: -queued.get(address, 0))
-        return [" ".join((*self._who(address), f"at {address}")) for address in full]
-
-    def _who(self, address: str) -> tuple[str, ...]:
-        """Return the processes at a far end, or else what is known of it."""
-        far = self._far_ends.get(address)
-        names = self._tokens.processes(far.session) if far else ()
-        return names or ("a router" if far and far.is_router else "somebody",)
+        lines = []
+        for address in sorted(standing, key=lambda address: -queued.get(address, 0)):
+            far = self._far_ends.get(address)
+            names = self._tokens.processes(far.session) if far else ()
+            who = " ".join(names) or ("a router" if far and far.is_router else "somebody")
+            lines.append(f"{who} at {address}")
+        return lines
 
     def _holds_up(self, address: str, held_bytes: int, now_s: float) -> bool:
+        """Tell whether a link takes nothing, or never catches up."""
         if held_bytes < STALL_BYTES:
             self._backlogs.pop(address, None)
             return False
@@ -171,12 +153,6 @@ class LinkWatch:
         stall_s = STALL_S + ROUND_TRIPS * round_trip_s
         return now_s - backlog.moved_s >= stall_s or now_s - backlog.low_s >= HELD_S
 
-    def _is_kept_out(self, address: str, now_s: float) -> bool:
-        if now_s >= max(self._kept_out_s.values(), default=now_s):
-            return False
-        far = self._far_end(address, now_s)
-        return far is not None and now_s < self._kept_out_s.get(far.session, now_s)
-
     def _far_end(self, address: str, now_s: float) -> FarEnd | None:
         if now_s - self._refreshed_s >= FRESH_S:
             self._refreshed_s = now_s
@@ -186,9 +162,16 @@ class LinkWatch:
     def _judge(self, address: str, held_bytes: int, now_s: float) -> None:
         """Close a link, unless a participant that must lose nothing is, or may be, behind it."""
         far, inode = self._far_end(address, now_s), local_socket(address)
-        if far is None or far.is_router or self._may_be_awaited(far, inode):
+        if far is None or far.is_router:
+            return
+        awaited, names = self._awaited(), self._tokens.processes(far.session)
+        if any(name in each.names for each in awaited for name in names):
             return
         pid = owner(inode)
+        if not names:  # then it is known by its pid at best
+            unknown = [each.pid for each in awaited if not any(map(self._tokens.sessions, each.names))]
+            if int(pid) in unknown if pid else unknown:
+                return
         self._sockets.close(address)
         self._backlogs.pop(address, None)
         times = self._times.setdefault(far.session, [])
@@ -198,17 +181,7 @@ class LinkWatch:
         # a link that held nothing back, as of a session that is kept out, is not worth a report
         if held_bytes >= STALL_BYTES and now_s - self._told_s.get(far.session, -TOLD_S) >= TOLD_S:
             self._told_s[far.session] = now_s
-            names = self._tokens.processes(far.session)
             self.closed.append(ClosedLink(address, command(pid), names, held_bytes, len(times)))
-
-    def _may_be_awaited(self, far: FarEnd, inode: str) -> bool:
-        """Tell whether a far end is waited for: by its tokens, or else by its pid, if that can be known."""
-        awaited = self._awaited()
-        if names := self._tokens.processes(far.session):
-            return any(name in each.names for each in awaited for name in names)
-        unknown = [each.pid for each in awaited if not any(map(self._tokens.sessions, each.names))]
-        pid = owner(inode) if unknown else ""
-        return int(pid) in unknown if pid else bool(unknown)
 
 
 Sessions = frozenset[str]  # by Zenoh's names of them: hexadecimal digits
@@ -222,7 +195,6 @@ class SessionTokens:
     `process/{p}/session/{session}`.
 
     Args:
-        link: the listening session.
     """
 
     def __init__(self, link: Session) -> None:
@@ -239,7 +211,6 @@ class SessionTokens:
         return self._sessions.get(process, Sessions())
 
     def shown(self) -> list[str]:
-        """Return the processes of which sessions are known."""
         return list(self._sessions)
 
     def is_alive(self, process: str) -> bool:
@@ -247,7 +218,6 @@ class SessionTokens:
         return process in self._alive or process in self._sessions
 
     def processes(self, session: str) -> tuple[str, ...]:
-        """Return the processes that a session stands for."""
         return tuple(process for process, sessions in list(self._sessions.items()) if session in sessions)
 
     def _on_token(self, key: str, alive: bool) -> None:
@@ -292,7 +262,6 @@ class LinkSockets:
         return waiting
 
     def progress(self, address: str) -> Progress:
-        """Return how far a far end has come."""
         with suppress(OSError), self._open(address) as connection:
             info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, TCP_INFO.size)
             round_trip_us, acknowledged = TCP_INFO.unpack(info)
@@ -306,11 +275,7 @@ class LinkSockets:
             connection.shutdown(socket.SHUT_RDWR)
 
     def _open(self, address: str) -> socket.socket:
-        """Return a connection as a socket of our own.
-
-        Raises:
-            OSError: it is gone.
-        """
+        """Return a connection as a socket of our own; OSError if it is gone."""
         for file, far in self._connections().items():
             if far == address:
                 duplicate = socket.socket(fileno=os.dup(file))
@@ -320,25 +285,22 @@ class LinkSockets:
         raise OSError(f"{address}: no connection")
 
     def _connections(self) -> dict[int, str]:
-        found = {}
+        """Return the far end of each TCP connection, by its file, and see to it that none lingers."""
+        far: dict[tuple[int, int], str] = {}
         for name in os.listdir(OWN_FILES):
             with suppress(OSError):
-                status = os.fstat(int(name))
-                if stat.S_ISSOCK(status.st_mode):
-                    found[int(name), status.st_ino] = ""
-        self._far = {key: self._far[key] if key in self._far else _first_seen(key[0]) for key in found}
-        return {file: address for (file, _), address in self._far.items() if address}
-
-
-def _first_seen(file: int) -> str:
-    """Return the far end of a file, empty where it is no connection, and see to it that it does not linger."""
-    try:
-        with socket.socket(fileno=os.dup(file)) as duplicate:
-            if address := _far_end(duplicate):
-                duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, IN_BACKGROUND)
-            return address
-    except OSError:
-        return ""
+                file, status = int(name), os.fstat(int(name))
+                if not stat.S_ISSOCK(status.st_mode):
+                    continue
+                known = self._far.get((file, status.st_ino))
+                far[file, status.st_ino] = known or ""
+                if known is None:
+                    with socket.socket(fileno=os.dup(file)) as duplicate:
+                        if address := _far_end(duplicate):
+                            duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, IN_BACKGROUND)
+                            far[file, status.st_ino] = address
+        self._far = far
+        return {file: address for (file, _), address in far.items() if address}
 
 
 def _far_end(connection: socket.socket) -> str:

@@ -32,30 +32,21 @@ class ReceivedSample(NamedTuple):
 
 
 class FarEnd(NamedTuple):
-    """A session at the other end of a link, by Zenoh's name of it, and whether others may be behind it."""
+    """A session at the other end of a link."""
 
-    session: str
-    is_router: bool
+    session: str  # Zenoh's name of it
+    is_router: bool  # whether others may be behind it
 
 
 class RawSample(NamedTuple):
-    """A publication, or a reply to a query, with all that Zenoh knows of it.
+    """A publication, or a reply to a query, with all that Zenoh knows of it."""
 
-    Attributes:
-        kind: "PUT" or "DELETE"; "ERROR" for a reply that refuses, which has no key.
-        key: without the prefix of the session that received it.
-        payload: as sent.
-        encoding: Zenoh's text of it, e.g. "application/msgpack;Imu".
-        timestamp: of Zenoh, as text; None where nobody stamped it.
-        attachment: what was sent beside the payload; empty where nothing was.
-    """
-
-    kind: str
-    key: str
-    payload: bytes
-    encoding: str
-    timestamp: str | None
-    attachment: bytes = b""
+    kind: str  # "PUT" or "DELETE"; "ERROR" for a reply that refuses, which has no key
+    key: str  # without the prefix of the session that received it
+    payload: bytes  # as sent
+    encoding: str  # Zenoh's text of it, e.g. "application/msgpack;Imu"
+    timestamp: str | None  # of Zenoh, as text; None where nobody stamped it
+    attachment: bytes = b""  # what was sent beside the payload; empty where nothing was
 
 
 def _raw_sample(sample: zenoh.Sample, prefix: str) -> RawSample:
@@ -70,20 +61,8 @@ def _raw_sample(sample: zenoh.Sample, prefix: str) -> RawSample:
     )
 
 
-def _raw_reply(reply: zenoh.Reply, prefix: str) -> RawSample:
-    """Return the sample in a reply, or its refusal; `prefix` is removed from its key."""
-    if reply.ok is not None:
-        return _raw_sample(reply.ok, prefix)
-    assert reply.err is not None
-    return RawSample("ERROR", "", reply.err.payload.to_bytes(), str(reply.err.encoding), None)
-
-
 def check_expression(expression: str) -> None:
-    """Check that a text is a key expression.
-
-    Raises:
-        SessionError: it is none; says what was found and what is allowed.
-    """
+    """Raise SessionError if a text is no key expression."""
     with _key_errors(expression):
         zenoh.KeyExpr(expression)
 
@@ -130,8 +109,7 @@ class Subscription:
     def receive(self) -> ReceivedSample | None:
         """Wait for one message; None when woken by `wake`.
 
-        Raises:
-            SessionError: the session, or the subscription, was closed meanwhile.
+        SessionError if the session, or the subscription, was closed meanwhile.
         """
         try:
             return self._take(self._handler.recv())
@@ -168,27 +146,22 @@ class Query:
     """A query to be answered once.
 
     Attributes:
-        expression: the keys that are queried, without the prefix of the session.
         payload, attachment: as sent; empty where nothing was.
     """
 
     def __init__(self, raw: zenoh.Query, prefix: str) -> None:
         self._raw: zenoh.Query | None = raw
         self._prefix = prefix
+        # the keys that are queried, without the prefix of the session
         self.expression = str(raw.key_expr).removeprefix(prefix)
         self.payload = raw.payload.to_bytes() if raw.payload is not None else b""
         self.attachment = raw.attachment.to_bytes() if raw.attachment is not None else b""
 
     def request(self) -> ControlRequest:
-        """Return the request in it.
-
-        Raises:
-            DecodeError: it holds none.
-        """
+        """Return the request in it; DecodeError if it holds none."""
         return messages.decode_as(ControlRequest, self.payload, self.expression)
 
     def reply(self, key: str, payload: bytes) -> None:
-        """Add one reply."""
         if self._raw is not None:
             self._raw.reply(self._prefix + key, payload, encoding=zenoh.Encoding(messages.encoding(key)))
 
@@ -199,7 +172,6 @@ class Query:
         self.end()
 
     def answer(self, answer: ControlAnswer) -> None:
-        """Reply to a request and end it."""
         if self._raw is not None:
             encoding = zenoh.Encoding("application/msgpack;ControlAnswer")
             self._raw.reply(self._prefix + self.expression, messages.encode(answer), encoding=encoding)
@@ -217,25 +189,18 @@ class Unanswered(ControlAnswer, frozen=True):
 
 
 class Session:
-    """A Zenoh session; `open_session` opens and closes it.
-
-    Attributes:
-        federation: prefix of all keys.
-        host: the name of this process's host, as its messages give it.
-        process: the name in its certificate; empty without one.
-        guarded: whether access control is enforced here.
-        permissions: what access control at the other end permits this process; None where it has none, or is not asked.
-        reads: the expressions that it has subscribed to so far.
-    """
+    """A Zenoh session; `open_session` opens and closes it."""
 
     def __init__(self, raw: zenoh.Session, federation: str, identity: Identity) -> None:
         self._raw = raw
-        self.federation = federation
-        self.host = identity.host
+        self.federation = federation  # prefix of all keys
+        self.host = identity.host  # the name of this process's host, as its messages give it
+        # the name in its certificate; empty without one
         self.process = tls.own_name(identity) if identity.tls is not None else ""
-        self.guarded = identity.access is not None
+        self.guarded = identity.access is not None  # whether access control is enforced here
+        # what access control at the other end permits this process; None where it has none, or is not asked
         self.permissions: Permissions | None = None
-        self.reads: list[str] = []
+        self.reads: list[str] = []  # the expressions that it has subscribed to so far
         self._prefix = f"{federation}/" if federation else ""
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._cached_publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
@@ -254,7 +219,6 @@ class Session:
         return session
 
     def zid(self) -> str:
-        """Return Zenoh's name of this session: hexadecimal digits."""
         return str(self._raw.info.zid())
 
     def undeclare_all(self) -> None:
@@ -264,33 +228,27 @@ class Session:
                 undeclare()
 
     def _keep(self, declared: Any) -> Any:
-        """Return what has been declared, to be undeclared with everything else."""
         self._declared[id(declared)] = declared.undeclare
         return declared
 
     def _refusal(self, act: Act, expression: str) -> str | None:
-        """Return why access control at the other end would drop what we do, None if it permits it."""
-        if self.permissions is None:
+        """Return why access control at the other end would silently drop what we do, None if it permits it."""
+        with _key_errors(expression):
+            wanted = zenoh.KeyExpr(self._prefix + expression) if self.permissions else None
+        if self.permissions is None or wanted is None:
             return None
-        wanted = zenoh.KeyExpr(self._prefix + expression)
         if any(zenoh.KeyExpr(each).includes(wanted) for each in self.permissions.allowed.get(act, ())):
             return None
         return self.permissions.denial(act, expression, self._prefix)
 
     def _check(self, act: Act, expression: str) -> None:
-        """Refuse what access control at the other end would drop silently."""
-        with _key_errors(expression):
-            if fault := self._refusal(act, expression):
-                raise SessionError(fault)
+        if fault := self._refusal(act, expression):
+            raise SessionError(fault)
 
     # Publishing
 
     def put(self, key: str, message: Struct) -> None:
-        """Publish a message on its key.
-
-        Raises:
-            SessionError: our certificate does not permit us to publish there.
-        """
+        """Publish a message on its key; SessionError if our certificate does not permit us to publish there."""
         self.put_raw(key, messages.encode(message))
 
     def put_raw(self, key: str, payload: bytes) -> None:
@@ -299,7 +257,6 @@ class Session:
         publisher.put(payload)
 
     def put_all(self, encoded: Sequence[tuple[str, bytes]]) -> None:
-        """Publish many encoded payloads in one go."""
         for key, payload in encoded:  # not by put_raw: thousands of messages a gate
             publisher = self._publishers.get(key) or self._declare(key)
             publisher.put(payload)
@@ -315,13 +272,9 @@ class Session:
         return publisher
 
     def has_subscribers(self, key: str) -> bool:
-        """Tell whether anybody subscribes to a key of ours."""
-        if key not in self._matching:
-            self._follow_subscribers(key)
-        return self._matching[key]
-
-    def _follow_subscribers(self, key: str) -> None:
-        """Keep up to date whether a key has subscribers: Zenoh takes too long to be asked at each gate."""
+        """Tell whether anybody subscribes to a key of ours; kept up to date, as Zenoh is too slow for each gate."""
+        if key in self._matching:
+            return self._matching[key]
         publisher = self._publishers.get(key) or self._declare(key)
 
         def note(status: Any) -> None:
@@ -332,12 +285,12 @@ class Session:
         status: Any = publisher.matching_status  # the stub says bool; it is an object that has one
         if status.matching:  # and never False: the listener's thread may have noted a subscriber meanwhile
             self._matching[key] = True
+        return self._matching[key]
 
     def put_sample(self, key: str, payload: bytes, encoding: str) -> None:
         """Publish a payload of any encoding on any of many keys, without declaring a publisher.
 
-        Raises:
-            SessionError: it is no key.
+        SessionError if it is no key.
         """
         picture = keys.is_picture(key)
         with _key_errors(key):
@@ -346,15 +299,12 @@ class Session:
     def declare_publisher(self, key: str, encoding: str) -> Callable[[bytes, bytes], None]:
         """Return a function that publishes (payload, attachment) on one key; a full link drops it.
 
-        Raises:
-            SessionError: it is no key, or our certificate does not permit us to publish there.
+        SessionError if it is no key, or our certificate does not permit us to publish there.
         """
         self._check("publish", key)
         with _key_errors(key):
             publisher = self._raw.declare_publisher(
-                self._prefix + key,
-                encoding=zenoh.Encoding(encoding),
-                congestion_control=zenoh.CongestionControl.DROP,
+                self._prefix + key, encoding=zenoh.Encoding(encoding), congestion_control=zenoh.CongestionControl.DROP
             )
         self._keep(publisher)
         return lambda payload, attachment: publisher.put(payload, attachment=attachment)
@@ -362,32 +312,26 @@ class Session:
     def put_cached(self, key: str, payload: bytes, encoding: str = "", attachment: bytes = b"") -> None:
         """Publish a payload, and keep it for later subscribers that query it, as Zenoh's advanced subscribers do.
 
+        Samples are numbered, since no session here stamps them.
+
         Raises:
             SessionError: it is no key.
         """
         with _key_errors(key):
-            publisher = self._cached_publishers.get(key) or self._declare_cached(key, encoding)
-            publisher.put(payload, attachment=attachment)
-
-    def _declare_cached(self, key: str, encoding: str) -> zenoh.ext.AdvancedPublisher:
-        """Return a publisher that keeps its last sample; samples are numbered, since no session here stamps them."""
-        publisher = zenoh.ext.declare_advanced_publisher(
-            self._raw,
-            self._prefix + key,
-            encoding=zenoh.Encoding(encoding),
-            cache=zenoh.ext.CacheConfig(1),
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
-            publisher_detection=True,
-        )
-        self._cached_publishers[key] = self._keep(publisher)
-        return publisher
+            if key not in self._cached_publishers:
+                publisher = zenoh.ext.declare_advanced_publisher(
+                    self._raw,
+                    self._prefix + key,
+                    encoding=zenoh.Encoding(encoding),
+                    cache=zenoh.ext.CacheConfig(1),
+                    sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
+                    publisher_detection=True,
+                )
+                self._cached_publishers[key] = self._keep(publisher)
+            self._cached_publishers[key].put(payload, attachment=attachment)
 
     def delete(self, key: str) -> None:
-        """Publish that a key has no value any more.
-
-        Raises:
-            SessionError: it is no key.
-        """
+        """Publish that a key has no value any more; SessionError if it is no key."""
         with _key_errors(key):
             self._raw.delete(self._prefix + key)
 
@@ -396,8 +340,7 @@ class Session:
     def subscribe(self, expression: str) -> Subscription:
         """Return a subscription to everything that others publish on an expression, in order.
 
-        Raises:
-            SessionError: it is no key expression, or our certificate does not permit us to read it.
+        SessionError if it is no key expression, or our certificate does not permit us to read it.
         """
         self._check("read", expression)
         self.reads.append(expression)
@@ -405,7 +348,7 @@ class Session:
             return self._keep(Subscription(self._raw, self._prefix, expression))
 
     def subscribe_remote(self, without: tuple[str, ...]) -> Subscription:
-        """Return a subscription to all that other sessions publish, except pictures and keys with these prefixes.
+        """Return a subscription to all that other sessions publish, but for pictures and keys with these prefixes.
 
         A waiting `receive` cannot be woken.
         """
@@ -415,8 +358,7 @@ class Session:
     def declare_subscriber(self, expression: str, callback: Callable[[RawSample], None]) -> Callable[[], None]:
         """Call back, in a thread of Zenoh's, for everything on an expression until the returned function is called.
 
-        Raises:
-            SessionError: it is no key expression, or our certificate does not permit us to read it.
+        SessionError if it is no key expression, or our certificate does not permit us to read it.
         """
         self._check("read", expression)
         self.reads.append(expression)
@@ -438,32 +380,26 @@ class Session:
     def query(
         self, expression: str, parameters: str = "", payload: bytes = b"", encoding: str = "", timeout_s: float = 2.0
     ) -> list[RawSample]:
-        """Return all replies to a query, refusals among them.
-
-        Raises:
-            SessionError: it is no key expression.
-        """
+        """Return all replies to a query, refusals among them; SessionError if it is no key expression."""
         body: dict[str, Any] = {"payload": payload, "encoding": zenoh.Encoding(encoding)} if payload else {}
         with _key_errors(expression):
             selector = zenoh.Selector(self._prefix + expression, parameters)
             replies = self._raw.get(selector, timeout=timeout_s, **body)
-        return [_raw_reply(reply, self._prefix) for reply in replies]
+        found = []
+        for reply in replies:
+            if reply.ok is not None:
+                found.append(_raw_sample(reply.ok, self._prefix))
+            elif reply.err is not None:
+                found.append(RawSample("ERROR", "", reply.err.payload.to_bytes(), str(reply.err.encoding), None))
+        return found
 
     def get(self, expression: str, timeout_s: float = 2.0) -> list[ReceivedSample]:
-        """Return the last values of the keys of an expression.
-
-        Raises:
-            SessionError: it is no key expression.
-        """
+        """Return the last values of the keys of an expression."""
         replies = self.query(expression, timeout_s=timeout_s)
         return [ReceivedSample(reply.key, reply.payload) for reply in replies if reply.kind != "ERROR"]
 
     def get_surely(self, expression: str, timeout_s: float = 2.0) -> list[ReceivedSample] | None:
-        """Return the last values of the keys of an expression; None if a process did not reply in time.
-
-        Raises:
-            SessionError: it is no key expression.
-        """
+        """Return the last values of the keys of an expression; None if a process did not reply in time."""
         replies = self.query(expression, timeout_s=timeout_s)
         if any(reply.kind == "ERROR" for reply in replies):  # Zenoh's own "Timeout" among them
             return None
@@ -474,17 +410,15 @@ class Session:
     ) -> ControlAnswer:
         """Send a request to `key` and return its answer; `Unanswered` if none comes, or we may not ask there.
 
-        Raises:
-            SessionError: it is no key, or the arguments cannot be encoded.
+        SessionError if it is no key, or the arguments cannot be encoded.
         """
         try:
             payload = messages.encode(ControlRequest(op=op, args=args or {}, source=source))
         except (OverflowError, UnicodeEncodeError) as error:
             allowed = "must hold whole numbers of 64 bits, and text in UTF-8"
             raise SessionError(f"{key}: {op} cannot be sent ({error}); {allowed}") from error
-        with _key_errors(key):
-            if fault := self._refusal("ask", key):
-                return Unanswered(ok=False, error=fault)
+        if fault := self._refusal("ask", key):
+            return Unanswered(ok=False, error=fault)
         start_s = time.monotonic()
         for reply in self.query(key, payload=payload, timeout_s=timeout_s):
             if reply.kind != "ERROR":
@@ -494,13 +428,7 @@ class Session:
         return Unanswered(ok=False, error=f"{key}: {what}; is it running?")
 
     def declare_queryable(self, expression: str, callback: Callable[[Query], None], complete: bool = False) -> None:
-        """Call back, in a thread of Zenoh's, for every query on an expression.
-
-        Args:
-            expression: what is answered on.
-            callback: takes each query.
-            complete: whether no other process need be asked about it.
-        """
+        """Call back, in a thread of Zenoh's, for every query; `complete` if no other process need be asked about it."""
         queryable = self._raw.declare_queryable(
             self._prefix + expression, lambda query: callback(Query(query, self._prefix)), complete=complete
         )
@@ -527,17 +455,15 @@ class Session:
         self._keep(self._raw.liveliness().declare_subscriber(self._prefix + expression, forward, history=True))
 
     def tokens(self, expression: str, timeout_s: float = 1.0) -> list[str]:
-        """Return the keys of the tokens that exist now."""
         replies = self._raw.liveliness().get(self._prefix + expression, timeout=timeout_s)
         return [str(r.ok.key_expr).removeprefix(self._prefix) for r in replies if r.ok is not None]
 
     def on_link(self, callback: Callable[[bool], None]) -> None:
         """Call back with True when a transport to another process opens and False when one closes."""
-
-        def forward(event: zenoh.TransportEvent) -> None:
-            callback(event.kind == zenoh.SampleKind.PUT)
-
-        self._keep(self._raw.info.declare_transport_events_listener(forward, history=True))
+        listener = self._raw.info.declare_transport_events_listener(
+            lambda event: callback(event.kind == zenoh.SampleKind.PUT), history=True
+        )
+        self._keep(listener)
 
     def far_ends(self) -> dict[str, FarEnd]:
         """Return who is at the other end of each link, by its address there, e.g. "192.168.1.2:41000"."""
@@ -548,7 +474,6 @@ class Session:
         }
 
     def links(self) -> int:
-        """Return how many other processes this one has a transport to."""
         return len(self._raw.info.peers_zid()) + len(self._raw.info.routers_zid())
 
 
@@ -595,11 +520,7 @@ def _flow(view: bool, drop: bool) -> dict[str, Any]:
 
 
 def config_of(settings: Settings, identity: Identity) -> zenoh.Config:
-    """Return the configuration of a session.
-
-    Raises:
-        SessionError: Zenoh refuses a setting.
-    """
+    """Return the configuration of a session; SessionError if Zenoh refuses a setting."""
     config = zenoh.Config()
     for path, value in settings.items():
         try:

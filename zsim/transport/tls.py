@@ -40,42 +40,22 @@ _MISNAMED = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISM
 
 
 class Identity(NamedTuple):
-    """The identity that a process is started with: its host, its certificate, and whom it admits.
+    """The identity that a process is started with: its host, its certificate, and whom it admits."""
 
-    Attributes:
-        host: the name that its messages give.
-        tls: folder with ca.pem, certificate.pem and key.pem; None goes without TLS.
-        access: file with Zenoh's access control, for a process that listens; None admits everybody.
-        insecure: whether links may leave the machine without TLS.
-        process: name that the certificate must have; empty for any.
-    """
-
-    host: str = socket.gethostname()
-    tls: Path | None = None
-    access: Path | None = None
-    insecure: bool = False
-    process: str = ""
+    host: str = socket.gethostname()  # the name that its messages give
+    tls: Path | None = None  # folder with ca.pem, certificate.pem and key.pem; None goes without TLS
+    access: Path | None = None  # file with Zenoh's access control, for a process that listens; None admits everybody
+    insecure: bool = False  # whether links may leave the machine without TLS
+    process: str = ""  # name that the certificate must have; empty for any
 
     @property
-    def authority(self) -> Path:
-        """The certificate of the authority that signs for everybody."""
-        return self._file(AUTHORITY)
-
-    @property
-    def certificate(self) -> Path:
-        return self._file(CERTIFICATE)
-
-    @property
-    def key(self) -> Path:
-        return self._file(KEY)
-
-    def _file(self, name: str) -> Path:
+    def files(self) -> tuple[Path, Path, Path]:
+        """The certificate of the authority that signs for everybody; the process's own; its key."""
         assert self.tls is not None
-        return self.tls / name
+        return self.tls / AUTHORITY, self.tls / CERTIFICATE, self.tls / KEY
 
 
 def is_tls(endpoint: str) -> bool:
-    """Tell whether a link of an endpoint is encrypted."""
     return endpoint.startswith(("tls/", "quic/"))
 
 
@@ -93,16 +73,13 @@ def leaves_machine(endpoint: str) -> bool:
 
 def own_fault(identity: Identity) -> str | None:
     """Return what is wrong with a process's own files, None if they are good."""
-    assert identity.tls is not None
-    for name in CERTIFICATES:
+    for path in identity.files:
         try:
-            with open(identity.tls / name, "rb") as file:
+            with open(path, "rb") as file:
                 file.read(1)
         except OSError as error:
-            return (
-                f"{identity.tls / name}: cannot be read ({error.strerror}); --tls needs a folder with "
-                f"{', '.join(CERTIFICATES[:2])} and {CERTIFICATES[2]}, as zsim certs init makes"
-            )
+            needed = f"{AUTHORITY}, {CERTIFICATE} and {KEY}, as zsim certs init makes"
+            return f"{path}: cannot be read ({error.strerror}); --tls needs a folder with {needed}"
     try:
         certificate = _read_own(identity)
     except (ssl.SSLError, ValueError) as error:
@@ -135,20 +112,12 @@ def peer_fault(identity: Identity, endpoint: str) -> str | None:
     place = _ENDPOINT.fullmatch(endpoint)
     if identity.tls is None or place is None:
         return None
+    host, address = place["host"], (place["host"], int(place["port"]))
     try:
-        with _dial(place) as plain:
-            return _shake(identity, plain, place, endpoint)
-    except OSError:
-        return None
-
-
-def _dial(place: re.Match[str]) -> socket.socket:
-    return socket.create_connection((place["host"], int(place["port"])), PROBE_S)
-
-
-def _shake(identity: Identity, plain: socket.socket, place: re.Match[str], endpoint: str) -> str | None:
-    try:
-        with _client(identity).wrap_socket(plain, server_hostname=place["host"]) as link:
+        with (
+            socket.create_connection(address, PROBE_S) as plain,
+            _client(identity).wrap_socket(plain, server_hostname=host) as link,
+        ):
             fault = _date_fault(link.getpeercert() or {})
             if fault is None:
                 link.settimeout(LATE_S)
@@ -156,29 +125,30 @@ def _shake(identity: Identity, plain: socket.socket, place: re.Match[str], endpo
                     link.recv(1)
             return fault
     except ssl.SSLCertVerificationError as error:
-        if error.verify_code in _MISNAMED:
-            return _misnamed(identity, place)
         if error.verify_code in _UNRELATED:
             return f"the certificate of who listens there is of another authority than ours; {MEND} and use one set"
-        return f"the certificate of who listens there is refused ({error.verify_message}); {MEND}"
+        if error.verify_code not in _MISNAMED:
+            return f"the certificate of who listens there is refused ({error.verify_message}); {MEND}"
     except ssl.SSLError as error:
         return _words(error, endpoint)
-
-
-def _misnamed(identity: Identity, place: re.Match[str]) -> str:
-    """Return for which addresses the other certificate is valid: not for the one that we connect to."""
+    except OSError:
+        return None
     context = _client(identity)
     context.check_hostname = False
-    with _dial(place) as plain, context.wrap_socket(plain) as link:
-        there = (link.getpeercert() or {}).get("subjectAltName", ())
+    try:
+        with socket.create_connection(address, PROBE_S) as plain, context.wrap_socket(plain) as link:
+            there = (link.getpeercert() or {}).get("subjectAltName", ())
+    except OSError:
+        return None
     found = ", ".join(str(name) for _, name in there) or "no address"
-    return f"the certificate of who listens there is for {found}; must be for {place['host']}; {ADDRESS_MEND}"
+    return f"the certificate of who listens there is for {found}; must be for {host}; {ADDRESS_MEND}"
 
 
 def _client(identity: Identity) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.load_verify_locations(identity.authority)
-    context.load_cert_chain(identity.certificate, identity.key)
+    authority, certificate, key = identity.files
+    context.load_verify_locations(authority)
+    context.load_cert_chain(certificate, key)
     context.verify_flags |= NO_CHECK_TIME
     return context
 
@@ -206,12 +176,13 @@ def _date_fault(certificate: dict[str, Any]) -> str | None:
     """Return that a certificate has expired, or is not valid yet; None if it is valid now."""
     if not certificate:
         return None
-    now_s = time.time()
-    if now_s > ssl.cert_time_to_seconds(certificate["notAfter"]):
-        return f"the certificate of {_name(certificate)} expired on {_day(certificate['notAfter'])}; {RENEW}"
-    if now_s < ssl.cert_time_to_seconds(certificate["notBefore"]):
-        since = _day(certificate["notBefore"])
-        return f"the certificate of {_name(certificate)} is valid from {since}; set the clock of this host"
+    now_s, whose = time.time(), f"the certificate of {_name(certificate)}"
+    begin_s, end_s = (ssl.cert_time_to_seconds(certificate[each]) for each in ("notBefore", "notAfter"))
+    if now_s > end_s:
+        return f"{whose} expired on {time.strftime('%Y-%m-%d', time.gmtime(end_s))}; {RENEW}"
+    if now_s < begin_s:
+        since = time.strftime("%Y-%m-%d", time.gmtime(begin_s))
+        return f"{whose} is valid from {since}; set the clock of this host"
     return None
 
 
@@ -220,18 +191,13 @@ def _name(certificate: dict[str, Any]) -> str:
     return names.get("commonName", "nobody")
 
 
-def _day(text: str) -> str:
-    return time.strftime("%Y-%m-%d", time.gmtime(ssl.cert_time_to_seconds(text)))
-
-
 def _read_own(identity: Identity) -> dict[str, Any]:
     """Return the content of a process's own certificate, by a handshake with itself in memory.
 
-    Raises:
-        ssl.SSLError: key, certificate and authority do not belong together.
+    ssl.SSLError if key, certificate and authority do not belong together.
     """
     server_side = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    server_side.load_cert_chain(identity.certificate, identity.key)
+    server_side.load_cert_chain(*identity.files[1:])
     client_side = _client(identity)
     client_side.check_hostname = False
     there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
@@ -244,19 +210,12 @@ def _read_own(identity: Identity) -> dict[str, Any]:
 
 
 class Permissions(Struct, frozen=True):
-    """What one process may do at the process that listens; expressions include the federation's name.
+    """What one process may do at the process that listens; expressions include the federation's name."""
 
-    Attributes:
-        listener: name of the process that listens.
-        process: name in the certificate.
-        allowed: expressions by act; empty for a process that is not admitted.
-        known: names that are admitted, where this one is not.
-    """
-
-    listener: str
-    process: str
-    allowed: dict[Act, tuple[str, ...]] = {}
-    known: tuple[str, ...] = ()
+    listener: str  # name of the process that listens
+    process: str  # name in the certificate
+    allowed: dict[Act, tuple[str, ...]] = {}  # expressions by act; empty for a process that is not admitted
+    known: tuple[str, ...] = ()  # names that are admitted, where this one is not
 
     def refusal(self) -> str | None:
         """Return why the process is not admitted, None if it is."""

@@ -18,7 +18,6 @@ class Traffic:
     """What the world and others publish, in the order in which it passed the hub, except views.
 
     Args:
-        link: an open session.
         table: keys of the world's messages about the drones of the run, see `run_key_table`.
         refused: called for each batch, or part of one, that cannot be read.
     """
@@ -39,14 +38,12 @@ class Traffic:
     def receive(self) -> list[Passed]:
         """Wait for what passes next; nothing when woken by `wake`.
 
-        Raises:
-            SessionError: the session, or this subscription, was closed meanwhile.
+        SessionError if the session, or this subscription, was closed meanwhile.
         """
         sample = self._subscription.receive()
         return list(self._opened(sample.payload)) if sample is not None else []
 
     def drain(self) -> Iterator[Passed]:
-        """Yield what has passed, without waiting."""
         for sample in self._subscription.drain():
             yield from self._opened(sample.payload)
 
@@ -70,7 +67,6 @@ class Traffic:
 
 
 def samples(passed: Iterable[Passed]) -> Iterator[ReceivedSample]:
-    """Yield messages one by one."""
     for entry in passed:
         if isinstance(entry, GateMessages):
             yield from (ReceivedSample(key, payload) for key, payload in entry.pairs)
@@ -86,8 +82,6 @@ def replay(
     The world keeps the last seconds, and answers page by page.
 
     Args:
-        link: an open session.
-        process: name of the one that asks.
         from_ns: simulated time [ns]; -1 for everything that the world still has.
         expressions: keys that are wanted.
         timeout_s: how long each page is waited for.

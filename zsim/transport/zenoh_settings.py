@@ -46,13 +46,7 @@ Settings = dict[str, str]
 
 
 def common(mode: str, timing: Mode, reader: bool = False) -> Settings:
-    """Return what every session has.
-
-    Args:
-        mode: Zenoh's: client, peer or router.
-        timing: of the run.
-        reader: whether the process never gates.
-    """
+    """Return what every session has; `mode` is Zenoh's (client, peer, router), a `reader` never gates."""
     lease = LEASE_READER_MS if reader else LEASE_REALTIME_MS if timing == "realtime" else LEASE_LOCKSTEP_MS
     return {
         "mode": json.dumps(mode),
@@ -69,8 +63,7 @@ def common(mode: str, timing: Mode, reader: bool = False) -> Settings:
 def listening(endpoints: Sequence[str], identity: Identity) -> Settings:
     """Return what a hub or a router has in addition: it needs its port, and gives up on a reader that takes nothing.
 
-    Raises:
-        SessionError: endpoints and identity do not go together, or a file of the identity cannot be used.
+    SessionError if endpoints and identity do not go together, or a file of the identity cannot be used.
     """
     return {
         "listen/endpoints": json.dumps(list(endpoints)),
@@ -84,11 +77,7 @@ def listening(endpoints: Sequence[str], identity: Identity) -> Settings:
 
 
 def connecting(endpoint: str, identity: Identity, wait_s: float) -> Settings:
-    """Return what a client has in addition; it tries to connect for `wait_s`.
-
-    Raises:
-        SessionError: as for `listening`.
-    """
+    """Return what a client has in addition; it tries to connect for `wait_s`. Errors as of `listening`."""
     return {
         "connect/endpoints": json.dumps([endpoint]),
         "connect/timeout_ms": str(int(1000 * wait_s)),
@@ -109,27 +98,37 @@ def hub(timing: Mode) -> Settings:
 
 
 def upstream(endpoint: str, identity: Identity) -> Settings:
-    """Return what a router has in addition: it keeps trying to reach its upstream."""
     return connecting(endpoint, identity, 0.0) | {"connect/exit_on_failure": "false", "connect/timeout_ms": "-1"}
 
 
 def _security(identity: Identity, endpoints: Sequence[str], doing: str) -> Settings:
     """Return TLS with a certificate on both sides, and access control."""
-    _agree(identity, endpoints)
+    for endpoint in endpoints:  # no combination is less secure than it looks
+        secure = tls.is_tls(endpoint)
+        if secure and identity.tls is None:
+            raise SessionError(f"{endpoint}: needs a certificate; give --tls the folder that zsim certs init made")
+        if not secure and identity.tls is not None:
+            raise SessionError(f"{endpoint}: is not encrypted; with --tls it must be tls/ADDRESS:PORT")
+        if not secure and not identity.insecure and tls.leaves_machine(endpoint):
+            raise SessionError(
+                f"{endpoint}: is not encrypted and leaves this machine; give --tls and a tls/ endpoint (zsim certs "
+                "init makes certificates), or --insecure on a network that is nobody else's"
+            )
+    if identity.access is not None and identity.tls is None:
+        raise SessionError(f"{identity.access}: access control goes by certificate; give --tls too")
     if identity.tls is None:
         return {}
-    fault = tls.own_fault(identity)
-    if fault:
+    if fault := tls.own_fault(identity):
         raise SessionError(f"cannot {doing} {', '.join(endpoints)}: {fault}")
-    files = {
-        "root_ca_certificate": identity.authority,
-        "listen_certificate": identity.certificate,
-        "listen_private_key": identity.key,
-        "connect_certificate": identity.certificate,
-        "connect_private_key": identity.key,
+    authority, certificate, key = (json.dumps(str(path.resolve())) for path in identity.files)
+    settings = {
+        f"{_TLS}/root_ca_certificate": authority,
+        f"{_TLS}/listen_certificate": certificate,
+        f"{_TLS}/listen_private_key": key,
+        f"{_TLS}/connect_certificate": certificate,
+        f"{_TLS}/connect_private_key": key,
+        f"{_TLS}/enable_mtls": "true",
     }
-    settings = {f"{_TLS}/{name}": json.dumps(str(path.resolve())) for name, path in files.items()}
-    settings[f"{_TLS}/enable_mtls"] = "true"
     if identity.access is not None:
         settings[ACCESS] = json.dumps(read_access(identity))
     return settings
@@ -143,71 +142,44 @@ def refusal(path: str, value: str, identity: Identity) -> str:
     return f"endpoint is {endpoints}; must be PROTOCOL/ADDRESS such as tcp/127.0.0.1:7447"
 
 
-def _agree(identity: Identity, endpoints: Sequence[str]) -> None:
-    """Refuse a combination that would be less secure than it looks."""
-    for endpoint in endpoints:
-        secure = tls.is_tls(endpoint)
-        if secure and identity.tls is None:
-            raise SessionError(f"{endpoint}: needs a certificate; give --tls the folder that zsim certs init made")
-        if not secure and identity.tls is not None:
-            raise SessionError(f"{endpoint}: is not encrypted; with --tls it must be tls/ADDRESS:PORT")
-        if not secure and not identity.insecure and tls.leaves_machine(endpoint):
-            raise SessionError(
-                f"{endpoint}: is not encrypted and leaves this machine; give --tls and a tls/ endpoint (zsim certs "
-                "init makes certificates), or --insecure on a network that is nobody else's"
-            )
-    if identity.access is not None and identity.tls is None:
-        raise SessionError(f"{identity.access}: access control goes by certificate; give --tls too")
-
-
 def read_access(identity: Identity) -> Any:
     """Return the access control in a file; Zenoh checks its content.
 
-    Raises:
-        SessionError: it cannot be read, or is not JSON.
+    SessionError if it cannot be read, or is not JSON.
     """
     assert identity.access is not None
     try:
         return json.loads(identity.access.read_bytes())
     except OSError as error:
-        raise SessionError(
-            f"{identity.access}: cannot be read ({error.strerror}); zsim certs init makes access.json"
-        ) from error
+        fault = f"cannot be read ({error.strerror}); zsim certs init makes access.json"
+        raise SessionError(f"{identity.access}: {fault}") from error
     except ValueError as error:
-        raise SessionError(
-            f"{identity.access}: is not JSON ({error}); must be an access.json of zsim certs init"
-        ) from error
+        fault = f"is not JSON ({error}); must be an access.json of zsim certs init"
+        raise SessionError(f"{identity.access}: {fault}") from error
 
 
 def hub_files(clients: int) -> int:
-    """Return how many files a hub needs for a number of processes that connect to it."""
     return SESSION_FILES + CLIENT_FILES * (clients + SPARE_CLIENTS)
 
 
 def launcher_files(roles: int, names: int) -> int:
-    """Return how many files the process of a run that needs most of them needs.
+    """Return how many files the process of a run that needs most of them needs: its hub or its launcher.
 
     Args:
         roles: processes that are started, the world among them.
-        names: of processes that the world waits for: more than are started, where one does the work of many.
+        names: number of processes that the world waits for: more than are started, where one does the work of many.
     """
     return max(hub_files(max(roles - 1, names)), SESSION_FILES + ROLE_FILES * roles)
 
 
 def host_launcher_files(roles: int, hosts: int) -> int:
-    """Return how many files the launcher of a run on several hosts needs."""
     return SESSION_FILES + ROLE_FILES * roles + HOST_FILES * hosts
 
 
 def require_files(needed: int, what: str) -> None:
-    """Raise the soft limit to what is needed, where it is lower.
+    """Raise the soft limit to the files needed at once; SessionError if the hard limit does not allow it.
 
-    Args:
-        needed: number of files open at once.
-        what: what needs them, for the error: "12 processes".
-
-    Raises:
-        SessionError: the hard limit does not allow it.
+    `what`: what needs them, for the error: "12 processes".
     """
     allowed = allow_files(needed)
     if allowed is not None and allowed < needed:

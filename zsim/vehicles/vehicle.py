@@ -162,7 +162,6 @@ class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     @property
     def rotor_names(self) -> tuple[str, ...]:
-        """Return the names of the rotors, in their order."""
         return tuple(rotor.name for rotor in self.rotors)
 
     def __post_init__(self) -> None:
@@ -207,7 +206,7 @@ def allocation(vehicle: Vehicle) -> np.ndarray:
 
 
 def is_balanced(vehicle: Vehicle) -> bool:
-    """Return whether rotors that turn alike give no moment."""
+    """Tell whether rotors that turn alike give no moment."""
     return bool(np.abs(allocation(vehicle).sum(axis=1)).max() <= BALANCE_MAX * len(vehicle.rotors))
 
 
@@ -225,10 +224,9 @@ def mixing(vehicle: Vehicle) -> np.ndarray:
 
 def lift_shares(vehicle: Vehicle) -> np.ndarray:
     """Return the thrust of each rotor over the mean, (R,), that gives no moment: 1 where they are balanced."""
-    layout = allocation(vehicle)
+    layout, count = allocation(vehicle), len(vehicle.rotors)
     if is_balanced(vehicle):
-        return np.ones(layout.shape[1])
-    count = layout.shape[1]
+        return np.ones(count)
     return count * _rounded(np.linalg.pinv(np.vstack([np.ones(count), layout]))[:, :1])[:, 0]
 
 

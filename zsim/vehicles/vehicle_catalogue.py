@@ -22,8 +22,8 @@ def vehicle_of(model: str, where: str = "model") -> Vehicle:
     """Return the vehicle of a model.
 
     Args:
-        model: a stock name, or `package.module` of a module that defines VEHICLE.
-        where: file and path of the field that names it, for the faults.
+        model: a stock name, or the `package.module` of one that defines VEHICLE.
+        where: file and path of the field that names it.
 
     Raises:
         DocumentError: there is none, or its parameters are faulty; a line for each fault.

@@ -38,25 +38,6 @@ DRAIN_S = 1.0  # wall; how long to wait for the last truths of a run
 PENDING_MAX = 64  # gates of which the truth of a drone may be missing
 
 
-def serve(
-    link: Session,
-    info: Info,
-    participant: Participant,
-    stopped: Callable[[], bool],
-    scenario: Scenario,
-    drones: Sequence[str],
-) -> None:
-    """Publish the pictures of some drones' cameras until the run is over or the process is stopped."""
-    process = CameraProcess(link, info, participant, scenario, drones)
-    process.begin()
-    if participant.gates:
-        process.join()
-    while not (participant.end_reason or stopped()):
-        process.turn()
-    if participant.end_reason == RUN_ENDED:
-        process.finish()
-
-
 class _Eye:
     """One camera of one drone: its renderer, and which picture is next."""
 
@@ -68,8 +49,7 @@ class _Eye:
         self.seq = 0
         self.last = -1  # number of its last picture among those of all cameras
 
-    def exposure_ns(self, number: int) -> int:
-        """Return the middle of the exposure of a picture: number / rate."""
+    def exposure_ns(self, number: int) -> int:  # its middle
         return round(number * 1e9 / self.camera.rate_hz)
 
     def last_due(self, t_ns: int) -> int:
@@ -115,6 +95,14 @@ class CameraProcess(RunProcess):
         self._link.declare_subscriber(keys.truth("*"), self._on_truth)
         self._publish_infos()
 
+    def run(self, stopped: Callable[[], bool]) -> None:
+        self.begin()
+        if self._participant.gates:
+            self.join()
+        super().run(stopped)
+        if self._participant.end_reason == RUN_ENDED:
+            self._finish()
+
     def join(self) -> None:
         """Let the world wait for this process.
 
@@ -126,7 +114,6 @@ class CameraProcess(RunProcess):
             self._catch_up()
 
     def turn(self) -> None:
-        """Wait for messages, and publish the pictures that are due."""
         self.wait()
         if self.is_back:
             self.is_back = False
@@ -134,7 +121,7 @@ class CameraProcess(RunProcess):
             self._catch_up()
         self._draw()
 
-    def finish(self) -> None:
+    def _finish(self) -> None:
         """Publish the pictures that are due by the end of the run, whose truth may still be on its way."""
         end_s = time.monotonic() + DRAIN_S
         self._draw()
@@ -160,7 +147,6 @@ class CameraProcess(RunProcess):
         query.end()
 
     def _draw(self) -> None:
-        """Publish the pictures that are due."""
         self._take_truths()
         newest_ns = self._truths.newest_ns
         for eye, number in self._due():
@@ -174,13 +160,13 @@ class CameraProcess(RunProcess):
         health = self._participant.health
         while self._arrived:
             sample = self._arrived.popleft()
-            number = self._numbers.get(keys.thing(sample.key))
             try:
                 truth = messages.decode(sample.key, sample.payload)
             except DecodeError:
                 health.refused += 1
                 continue
             health.received += 1
+            number = self._numbers.get(keys.thing(sample.key))
             if number is not None:
                 self._truths.add(number, truth)
 
@@ -235,7 +221,6 @@ class CameraProcess(RunProcess):
     def _camera_info(self, eye: _Eye) -> CameraInfo:
         camera = eye.camera
         lens, pose = lens_of(camera), camera_pose(camera)
-        w, x, y, z = pose.q_BK
         return CameraInfo(
             t_ns=max(0, self._truths.newest_ns),
             seq=self._info_seq,
@@ -245,7 +230,7 @@ class CameraProcess(RunProcess):
             K=tuple(camera_matrix(lens).ravel().tolist()),  # type: ignore[arg-type]
             D=(lens.k1, lens.k2, lens.p1, lens.p2, lens.k3),
             position_m=tuple(pose.p_BK.tolist()),  # type: ignore[arg-type]
-            orientation_wxyz=(w, x, y, z),
+            orientation_wxyz=pose.q_BK,
             rate_hz=camera.rate_hz,
             exposure_s=camera.exposure_ms * 1e-3,
             gate_ns=self._info.gate_ns,
@@ -258,8 +243,6 @@ class TruthHistory:
     External drones, whose drivers may skip gates, are extrapolated from their last pose.
 
     Args:
-        drones: how many there are.
-        gate_ns: time between two gates.
         span_ns: how far back it reaches, at least.
         external: by index, where each external drone stands until its driver publishes.
     """
@@ -274,7 +257,6 @@ class TruthHistory:
         self.newest_ns = -1
 
     def add(self, drone: int, truth: Truth) -> None:
-        """Add the truth of a drone, by its index."""
         t_ns = truth.t_ns
         if drone in self._external:
             if truth_fault(truth, len(self._external[drone].rotor_rad_s)):
@@ -285,7 +267,10 @@ class TruthHistory:
         states = self._pending.setdefault(t_ns, {})
         states[drone] = truth
         if states.keys() >= self._simulated:
-            self._whole[t_ns] = [states.get(i) or _moved_on(self._external[i], t_ns) for i in range(self._drones)]
+            for i, last in self._external.items():
+                moved = moved_on(last.position_m, last.velocity_m_s, t_ns - last.t_ns)
+                states.setdefault(i, replace(last, t_ns=t_ns, position_m=moved))
+            self._whole[t_ns] = [states[i] for i in range(self._drones)]
             self.newest_ns = t_ns
             self._pending = {t: left for t, left in self._pending.items() if t > t_ns}
             while len(self._whole) > self._kept:
@@ -309,10 +294,6 @@ def standing(drone: Drone, rotors: int) -> Truth:
     half = 0.5 * math.radians(drone.yaw_deg)
     still, q_WB = (0.0, 0.0, 0.0), (math.cos(half), 0.0, 0.0, math.sin(half))
     return Truth(0, 0, drone.position_m, still, q_WB, still, still, (0.0,) * rotors)
-
-
-def _moved_on(last: Truth, t_ns: int) -> Truth:
-    return replace(last, t_ns=t_ns, position_m=moved_on(last.position_m, last.velocity_m_s, t_ns - last.t_ns))
 
 
 def _between(t_s: float, gate_s: float, before: Sequence[Truth], after: Sequence[Truth]) -> DroneStates:

@@ -9,8 +9,6 @@ The edge is searched from outside inwards, in directions all around a point of t
 of the points in a row decides which others are on the same one. Circles are fitted by least squares to
 x^2 + y^2 = 2 a x + 2 b y + c (I. Kasa, IEEE Trans. Instrum. Meas. 25, 1976) in the plane that touches the unit sphere
 at the ball: there it is a circle wherever in the picture it stands.
-
-Order of this file: JPEG decoding, the detector, the hat in one part of the picture, the compiled fit of its outline.
 """
 
 import math
@@ -116,13 +114,7 @@ class _Box(NamedTuple):
 
 
 class HatDetector:
-    """Finds hats in the pictures of one camera.
-
-    Args:
-        lens: of the camera.
-        pose: of the camera in the body.
-        diameter_m: of a hat.
-    """
+    """Finds hats of a diameter [m] in the pictures of one camera."""
 
     def __init__(self, lens: Lens, pose: CameraPose, diameter_m: float) -> None:
         self._lens, self._R_BK, self._radius_m = lens, pose.R_BK, diameter_m / 2
@@ -130,14 +122,7 @@ class HatDetector:
         self._half = max(1, lens.width // 2), max(1, lens.height // 2)
 
     def seen(self, picture: Picture) -> tuple[Seen, ...]:
-        """Return the hats in a picture of B, G, R, (height, width, 3), the largest first.
-
-        Raises:
-            ValueError: the picture has another size than the camera.
-        """
-        size = picture.shape[1], picture.shape[0]
-        if size != (self._lens.width, self._lens.height):
-            raise ValueError(f"picture is {size[0]} x {size[1]}; must be {self._lens.width} x {self._lens.height}")
+        """Return the hats in a picture of B, G, R, (height, width, 3) as the camera's, the largest first."""
         found = [self._hat(picture, box) for box in self._boxes(picture)]
         return tuple(hat for hat in found if hat is not None)
 
@@ -169,7 +154,10 @@ class HatDetector:
         if u <= 2 or v <= 2 or u + wide >= self._lens.width - 2 or v + high >= self._lens.height - 2:
             return None  # a part of a hat gives neither bearing nor range
         part = slice(max(v0, 0), v1), slice(max(u0, 0), u1)
-        level = _magenta(picture[part])
+        blue, green, red = (channel.astype(np.float32) for channel in cv2.split(picture[part]))
+        level, bluish = red - green, blue - green  # how magenta each pixel is: R - G, less where blue is missing
+        lack = np.maximum(np.float32(BLUE_SHARE) * level - bluish, 0) * np.float32(BLUE_WEIGHT)
+        level = np.where(level > 0, np.maximum(level - lack, 0), level)
         sides = level[0], level[-1], level[1:-1, 0], level[1:-1, -1]
         behind = float(np.median(np.concatenate(sides)))
         noise = min(_deviation(side) for side in sides)  # of those that no hull crosses
@@ -189,14 +177,6 @@ class HatDetector:
         range_m = self._radius_m / math.sin(circle.radius_rad)
         x, y, z = (self._R_BK @ circle.ray).tolist()
         return Seen((x, y, z), range_m, centre_px / scale, range_m * size_px / diameter_px)
-
-
-def _magenta(picture: Picture) -> Levels:
-    """Return how magenta each pixel is, (h, w): R - G, less where blue is missing."""
-    blue, green, red = (channel.astype(np.float32) for channel in cv2.split(picture))
-    level, bluish = red - green, blue - green
-    lack = np.maximum(np.float32(BLUE_SHARE) * level - bluish, 0) * np.float32(BLUE_WEIGHT)
-    return np.where(level > 0, np.maximum(level - lack, 0), level)
 
 
 def _deviation(values: Levels) -> float:

@@ -22,23 +22,8 @@ ASK_S = 2.0  # wall; how often a camera is asked what its pixels mean, while tha
 REPORTS_MAX = 5  # lines about refused pictures; health has the count
 
 
-def serve(
-    link: Session,
-    participant: Participant,
-    stopped: Callable[[], bool],
-    say: Callable[[str], None],
-    drones: Sequence[str],
-    diameter_m: float,
-) -> None:
-    """Publish the hats, of a diameter [m], in the pictures of some drones until the run is over or it is stopped."""
-    process = DetectorProcess(link, participant, say, drones, diameter_m)
-    process.begin()
-    while not (participant.end_reason or stopped()):
-        process.turn()
-
-
 class DetectorProcess(RunProcess):
-    """The detector of some drones' cameras in one run."""
+    """Publishes the hats, of a diameter [m], in the pictures of some drones' cameras."""
 
     def __init__(
         self,
@@ -59,6 +44,10 @@ class DetectorProcess(RunProcess):
         self._reported = 0
         super().__init__(link, participant)
 
+    def run(self, stopped: Callable[[], bool]) -> None:
+        self.begin()
+        super().run(stopped)
+
     def begin(self) -> None:
         """Subscribe to pictures and to what their pixels mean, for known names only: anybody could make up others."""
         rehearse()
@@ -67,7 +56,7 @@ class DetectorProcess(RunProcess):
             self._link.declare_subscriber(keys.camera(drone, name), self._on_picture)
 
     def turn(self) -> None:
-        """Wait for messages, and search the newest picture of each camera, the longest waiting first."""
+        """Search the newest picture of each camera, the longest waiting first."""
         self.wait()
         while self._infos:
             self._learn(self._infos.popitem()[1])
@@ -85,8 +74,6 @@ class DetectorProcess(RunProcess):
         self.wake()
 
     def _learn(self, sample: RawSample) -> None:
-        """Take what a camera's pixels mean."""
-
         def meaning(info: CameraInfo | None) -> object:
             return info and (info.width, info.height, info.K, info.D, info.orientation_wxyz)
 
@@ -100,7 +87,6 @@ class DetectorProcess(RunProcess):
             self._refuse(sample.key, error)
 
     def _look(self, sample: RawSample) -> None:
-        """Publish the hats in a picture."""
         start_ns = time.perf_counter_ns()
         health = self._participant.health
         try:
@@ -143,11 +129,7 @@ class DetectorProcess(RunProcess):
 
 
 def _detector_of(info: CameraInfo, diameter_m: float) -> HatDetector:
-    """Return the detector for any camera.
-
-    Raises:
-        PictureError: its pictures are too large, or its intrinsics invalid.
-    """
+    """Return the detector of any camera; PictureError: its pictures are too large, or its intrinsics invalid."""
     if info.width * info.height > PIXELS_MAX:
         raise PictureError(f"{info.width} x {info.height} are too many pixels; must be at most {PIXELS_MAX}")
     fx, skew, cx, _, fy, cy, *_ = info.K
@@ -156,5 +138,5 @@ def _detector_of(info: CameraInfo, diameter_m: float) -> HatDetector:
     lens = Lens(fx, fy, cx, cy, *info.D, info.width, info.height)
     if folds(lens):
         raise PictureError(f"D is {list(info.D)}, which folds the picture; must give every pixel a ray of its own")
-    R_BK = rotation_matrix(np.array(info.orientation_wxyz))
-    return HatDetector(lens, CameraPose(np.array(info.position_m), R_BK), diameter_m)
+    pose = CameraPose(np.array(info.position_m), rotation_matrix(info.orientation_wxyz))
+    return HatDetector(lens, pose, diameter_m)

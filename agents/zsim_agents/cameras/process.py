@@ -1,6 +1,7 @@
 """What the processes of cameras and of detectors share: their place in a run, and waiting for messages."""
 
 import threading
+from collections.abc import Callable
 
 from zsim.contract import keys
 from zsim.runtime.participant import Participant
@@ -10,7 +11,7 @@ TICK_S = 0.1  # how often a stop is looked for while nothing arrives
 
 
 class RunProcess:
-    """A process that waits for messages, which arrive in Zenoh's threads.
+    """A process that waits for messages, which arrive in Zenoh's threads, and handles them in `turn`.
 
     Attributes:
         is_back: whether the link was lost and is back.
@@ -24,8 +25,15 @@ class RunProcess:
         link.declare_subscriber(keys.CLOCK, self._on_clock)
         link.on_link(self._on_link)
 
+    def turn(self) -> None:
+        raise NotImplementedError
+
+    def run(self, stopped: Callable[[], bool]) -> None:
+        """Take turns until the run is over or the process is stopped."""
+        while not (self._participant.end_reason or stopped()):
+            self.turn()
+
     def wake(self) -> None:
-        """Let a waiting `wait` return."""
         self._wake_event.set()
 
     def wait(self) -> None:

@@ -1,6 +1,6 @@
 """Estimators of drones: sensors in, rows moved and corrected, an estimate out at every gate. Imports zsim alone.
 
-estimator (the agent) -> estimator_bank (one step for all drones) or joint_filter (of a cluster) -> strapdown,
-measurement_update -> mathematics (dead_reckoning, kalman_update). The columns of a row: filter_state; its initial
-values: filter_setup. Instead of these: paper_estimator, or a class of the user's (drone_estimator).
+estimator (the agent) -> estimator_bank (one step for all drones) or joint_filter (of a cluster) -> measurement_update
+and strapdown -> kalman_update. Columns of a row: filter_state; initial values: filter_setup. Instead of these:
+paper_estimator, or a class of the user's (drone_estimator).
 """

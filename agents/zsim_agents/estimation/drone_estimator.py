@@ -28,20 +28,14 @@ Numbers = Sequence[float] | NDArray[np.float64]
 class StateEstimate(NamedTuple):
     """State of a drone at an instant."""
 
-    position_m: Numbers
-    """p_WB."""
-    velocity_m_s: Numbers
-    """v_WB, in W."""
-    orientation_wxyz: Numbers
-    """q_WB."""
+    position_m: Numbers  # p_WB
+    velocity_m_s: Numbers  # v_WB, in W
+    orientation_wxyz: Numbers  # q_WB
     yaw_rad: float
-    covariance: Numbers
-    """Of position and velocity, 6 x 6, row-major, SI units."""
+    covariance: Numbers  # of position and velocity, 6 x 6, row-major, SI units
     yaw_sigma_rad: float
-    gyro_bias_rad_s: Numbers = (0.0, 0.0, 0.0)
-    """In B."""
-    sensors: Mapping[str, tuple[int, int]] = {}
-    """Readings (used, refused) since the start, by sensor."""
+    gyro_bias_rad_s: Numbers = (0.0, 0.0, 0.0)  # in B
+    sensors: Mapping[str, tuple[int, int]] = {}  # readings (used, refused) since the start, by sensor
 
 
 class DroneEstimator(Protocol):
@@ -112,19 +106,15 @@ class EstimatorSet:
         return False  # its messages are to be passed one by one
 
     def estimate(self, t_s: float) -> list[StateEstimate]:
-        """Return the estimates for `t_s`, as plain numbers.
-
-        Raises:
-            UserCodeError: a class raised, or returned an invalid estimate.
-        """
-        return [self._estimate(i, t_s) for i in range(len(self._estimators))]
-
-    def _estimate(self, i: int, t_s: float) -> StateEstimate:
-        try:
-            estimate = self._estimators[i].estimate(t_s)
-        except plugin.RAISED as error:
-            self._raise(error, i)
-        return _plain(estimate, self._estimators[i], self._drones[i])
+        """Return the estimates for `t_s`, as plain numbers; UserCodeError: a class raised, or one is invalid."""
+        estimates = []
+        for i, estimator in enumerate(self._estimators):
+            try:
+                estimate = estimator.estimate(t_s)
+            except plugin.RAISED as error:
+                self._raise(error, i)
+            estimates.append(_plain(estimate, estimator, self._drones[i]))
+        return estimates
 
     def _raise(self, error: BaseException, i: int) -> NoReturn:
         """Raise an error of a user's class with its drone, any other one again."""
@@ -164,7 +154,12 @@ def _plain(estimate: StateEstimate, estimator: DroneEstimator, drone: str) -> St
             raise UserCodeError(
                 f"{what} {found}; must be {f'{size} finite numbers' if size > 1 else 'a finite number'}"
             )
-        if wrong := _impossible(field, numbers):
+        wrong = ""
+        if field in ("covariance", "yaw_sigma_rad") and (least := min(numbers[:: STATES + 1])) < 0.0:
+            wrong = f"the {'variance' if field == 'covariance' else 'value'} {least:g}; must be >= 0"
+        elif field == "orientation_wxyz" and abs((norm := math.hypot(*numbers)) - 1.0) > NORM_TOLERANCE:
+            wrong = f"the norm {norm:g}; must be 1"
+        if wrong:
             raise UserCodeError(f"{what} {field} with {wrong}")
         values[field] = tuple(numbers)
     yaw, yaw_sigma = values.pop("yaw_rad"), values.pop("yaw_sigma_rad")
@@ -174,14 +169,3 @@ def _plain(estimate: StateEstimate, estimator: DroneEstimator, drone: str) -> St
         found = f"sensors = {show(getattr(estimate, 'sensors', None))}"
         raise UserCodeError(f"{what} {found}; must be a map of (used, refused) by sensor") from error
     return StateEstimate(**values, yaw_rad=yaw[0], yaw_sigma_rad=yaw_sigma[0], sensors=sensors)
-
-
-def _impossible(field: str, numbers: Sequence[float]) -> str:
-    """Describe values that no drone's state can have; empty where all are possible."""
-    if field == "covariance" and min(numbers[:: STATES + 1]) < 0.0:
-        return f"the variance {min(numbers[:: STATES + 1]):g}; must be >= 0"
-    if field == "yaw_sigma_rad" and numbers[0] < 0.0:
-        return f"the value {numbers[0]:g}; must be >= 0"
-    if field == "orientation_wxyz" and abs(math.hypot(*numbers) - 1.0) > NORM_TOLERANCE:
-        return f"the norm {math.hypot(*numbers):g}; must be 1"
-    return ""

@@ -25,11 +25,6 @@ class Estimator(Agent):
 
     It is named after the first of its drones and serves for the estimators of the others too.
 
-    Args:
-        info: of the run.
-        scenario: the resolved one in the info.
-        drones: a name, or several.
-
     Raises:
         RunError: the scenario has no such drone, or none is named.
         DocumentError: the class that the scenario names cannot be loaded here.
@@ -58,7 +53,9 @@ class Estimator(Agent):
         read = names
         if isinstance(self._estimators, ClusterBanks):
             read = tuple(self._estimators.drones)
-            self.uncounted = tuple(keys.detections(drone) for drone in read if not _has_own_sightings(scenario, drone))
+            specs = [scenario.drone(drone) for drone in read]  # whose sightings the world does not compute: detectors'
+            detected = (each.name for each in specs if each.sensors.sightings is UNSET or each.is_external)
+            self.uncounted = tuple(map(keys.detections, detected))
         self.gate_keys = tuple(keys.status(drone) for drone in read)
         self.counted = read
         if own_class:
@@ -83,14 +80,13 @@ class Estimator(Agent):
         super().deliver(t_ns, inputs)
 
     def receive(self, key: str, message: Any) -> None:
-        if self._external and isinstance(message, flight_messages.Status):
+        if isinstance(message, flight_messages.Status):
             self._silent.discard(keys.thing(key))
-        if not isinstance(message, flight_messages.Status):
+            return
+        _, drone, what = keys.parts(key)
+        if drone in self._index:
             # over a slow link it has not arrived before the last gate, whatever its stamp
             t_arrival_s = max(message.t_ns, self._since_ns) * 1e-9
-            _, drone, what = keys.parts(key)
-            if drone not in self._index:
-                return
             self._estimators.receive(self._index[drone], what.removeprefix("sensor/"), message, t_arrival_s)
 
     def receive_gate(self, gate: GateMessages) -> None:
@@ -139,9 +135,3 @@ class Estimator(Agent):
 
     def warm_start(self, key: str, message: flight_messages.Estimate) -> None:
         self._estimators.warm_start(self.writes.index(key), message)
-
-
-def _has_own_sightings(scenario: Scenario, drone: str) -> bool:
-    """Tell whether the world computes a drone's sightings; else a detector's are used."""
-    spec = scenario.drone(drone)
-    return spec.sensors.sightings is not UNSET and not spec.is_external

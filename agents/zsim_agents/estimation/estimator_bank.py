@@ -2,8 +2,6 @@
 
 Readings are only stored when they come. At the end of the gate every drone's IMU moves its nominal state (strapdown),
 its covariance follows, and its other readings are judged and used (measurement_update).
-
-Order of this file: the bank, its step, and reading a gate's messages into rows of readings.
 """
 
 import struct
@@ -12,7 +10,6 @@ from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zsim.contract import encoding, keys, messages
 from zsim.contract.encoding import GAP, Layouts, Program
@@ -24,7 +21,6 @@ from zsim.math.compiled import Held, hold, inlined, portable
 from zsim.math.rotation import axpy, multiply, normalised, scaled
 from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim_agents.estimation import measurement_update, strapdown
-from zsim_agents.estimation.dead_reckoning import acceleration, heading_and_sigma, rotation_vector_quaternion
 from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.filter_setup import initial_rows
 from zsim_agents.estimation.filter_state import (
@@ -42,6 +38,7 @@ from zsim_agents.estimation.filter_state import (
     SONAR,
     STATES,
     VALUES_MAX,
+    Array,
     Rows,
     put,
     put_quaternion,
@@ -49,7 +46,7 @@ from zsim_agents.estimation.filter_state import (
     vector,
 )
 from zsim_agents.estimation.measurement_update import HEADING_SIGMA_RAD, YAW, set_variance
-from zsim_agents.estimation.strapdown import MANOEUVRE_M_S2
+from zsim_agents.estimation.strapdown import MANOEUVRE_M_S2, acceleration, heading_and_sigma, rotation_vector_quaternion
 
 _READING = struct.Struct(f"{READING.size}d")
 _ROOM = 256  # readings of a gate, initially
@@ -84,11 +81,6 @@ class EstimatorBank:
 
     Sensors may come in any order between two gates. Duplicates are ignored; readings that are older than the sensor's
     last one, not finite, or outside of their gate are refused and counted.
-
-    Args:
-        drones: their mounts and error models are what the filter assumes.
-        environment: gravity and magnetic field.
-        gate_s: interval of the gates [s].
 
     Attributes:
         counted: sensors in the order of publication, and where their used and refused are counted.
@@ -146,7 +138,7 @@ class EstimatorBank:
             for row, of in zip(rows, counts, strict=True)
         ]
 
-    def use(self, t_s: float, readings: NDArray[np.float64]) -> NDArray[np.float64]:
+    def use(self, t_s: float, readings: Array) -> Array:
         """Use readings (M, READING.size) and return the estimates for `t_s`, (N, ESTIMATE.size)."""
         if self._held_rows is not self.rows:
             self._held, self._held_rows = hold(self.rows), self.rows
@@ -174,11 +166,7 @@ class EstimatorBank:
         return {name: getattr(self.rows, name) for name in STATES}
 
     def restore(self, state: State) -> None:
-        """Take over the rows of another bank of the same drones and settings.
-
-        Raises:
-            KeyError, ValueError: they are of another shape.
-        """
+        """Take over the rows of another bank of the same drones; KeyError, ValueError: they are of another shape."""
         for name in STATES:
             rows = getattr(self.rows, name)
             if state[name].shape != rows.shape:
@@ -192,12 +180,11 @@ class EstimatorBank:
 
 
 @portable
-def step(held: Held, t_s: float, readings: np.ndarray, estimates: np.ndarray) -> None:
+def step(held: Held, t_s: float, readings: Array, estimates: Array) -> None:
     """Use the readings of a gate of all drones and write their estimates for `t_s`.
 
     Args:
         held: the Rows of N drones, by `hold`; changed.
-        t_s: instant of the gate [s].
         readings: (M, READING.size), each drone's in the order of their arrival.
         estimates: (N, ESTIMATE.size), written.
     """
@@ -211,11 +198,10 @@ def step(held: Held, t_s: float, readings: np.ndarray, estimates: np.ndarray) ->
 
 
 @portable
-def sort_readings(rows: Rows, readings: np.ndarray, first: np.ndarray, after: np.ndarray) -> None:
+def sort_readings(rows: Rows, readings: Array, first: Array, after: Array) -> None:
     """Move every drone by its IMU, and chain the aiding readings that are to be used.
 
     Args:
-        rows: of N drones; changed.
         readings: (M, READING.size).
         first: the first of each drone, (N,); comes in as -1 for none.
         after: of each reading, the next one of the same drone, (M,); comes in as -1.
@@ -235,9 +221,7 @@ def sort_readings(rows: Rows, readings: np.ndarray, first: np.ndarray, after: np
 
 
 @portable
-def _step_one(
-    rows: Rows, i: int, t_s: float, readings: np.ndarray, first: int, after: np.ndarray, estimate: np.ndarray
-) -> None:
+def _step_one(rows: Rows, i: int, t_s: float, readings: Array, first: int, after: Array, estimate: Array) -> None:
     """Let the covariance of a drone follow its IMU, use its aiding readings, and write its estimate."""
     row, counts, n = rows.nominal[i], rows.counts[i], rows.layout[i, LAYOUT.states]
     if not counts[COUNT.running]:
@@ -253,7 +237,7 @@ def _step_one(
 
 
 @portable
-def write_estimate(row: np.ndarray, setting: np.ndarray, P: np.ndarray, t_s: float, estimate: np.ndarray) -> None:
+def write_estimate(row: Array, setting: Array, P: Array, t_s: float, estimate: Array) -> None:
     """Write the estimate for an instant that the IMU may not have reached yet, (ESTIMATE.size,).
 
     Until then it is extrapolated with the acceleration of the last sample, its noise, and possible manoeuvres.
@@ -287,10 +271,10 @@ class ReaderTables(NamedTuple):
     """The layout of the messages of a gate for compiled code, and buffers for one of them."""
 
     program: Program
-    owner: NDArray[np.int64]  # (keys, 2): drone and sensor of each key of the table, or NOBODY
-    ints: NDArray[np.int64]
-    floats: NDArray[np.float64]
-    bits: NDArray[np.uint64]  # of the floats
+    owner: Array  # (keys, 2): drone and sensor of each key of the table, or NOBODY
+    ints: Array
+    floats: Array
+    bits: Array  # of the floats
 
 
 class GateReader:
@@ -308,11 +292,10 @@ class GateReader:
         self._tables = ReaderTables(layouts.program, owner, ints, floats, floats.view(np.uint64))
         self._held = hold(self._tables)
 
-    def take(self, gate: GateMessages, readings: NDArray[np.float64], count: int) -> int:
-        """Write readings from row `count` on; return the new count, -1 if a message has to be decoded.
+    def take(self, gate: GateMessages, readings: Array, count: int) -> int:
+        """Write the readings of a gate from row `count` on, for all of which `readings` (M, READING.size) has room.
 
-        Args:
-            readings: (M, READING.size), with room for all messages of the gate.
+        Returns the new count, -1 if a message has to be decoded.
         """
         if gate.table is not self._table:
             self._table = gate.table
@@ -326,7 +309,7 @@ class GateReader:
 
 
 @portable
-def collect(held: Held, which: NDArray, ends: NDArray, data: NDArray, readings: NDArray, count: int) -> int:
+def collect(held: Held, which: Array, ends: Array, data: Array, readings: Array, count: int) -> int:
     """Write the sensor messages of a gate as readings, of each drone by time and name; see GateReader.take."""
     program, owner, ints, floats, bits = held.content
     start, first = 0, count
@@ -351,8 +334,7 @@ def collect(held: Held, which: NDArray, ends: NDArray, data: NDArray, readings: 
 
 
 @inlined
-def fill(reading: NDArray, i: int, kind: int, ints: NDArray, floats: NDArray) -> None:
-    """Write one message of drone i as a reading."""
+def fill(reading: Array, i: int, kind: int, ints: Array, floats: Array) -> None:
     reading[READING.drone], reading[READING.sensor] = i, kind
     reading[READING.t_arrival], reading[READING.t_sample] = ints[0] * NS_S, ints[2] * NS_S
     first = BARO_ALTITUDE if kind == BARO else GPS_POSITION if kind == GPS else 0

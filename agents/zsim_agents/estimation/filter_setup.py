@@ -19,14 +19,6 @@ from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim.sensors.sensor import ErrorModel, Sensor, scaled
 from zsim.sensors.sensor_catalogue import Sensors
 from zsim.sensors.stock_sensors import ImuConfig
-from zsim_agents.estimation.dead_reckoning import (
-    ATTITUDE,
-    GYRO_BIAS,
-    POSITION,
-    VELOCITY,
-    beta_for,
-    levelling_time_s,
-)
 from zsim_agents.estimation.filter_state import (
     BIAS,
     CHANNELS,
@@ -37,14 +29,23 @@ from zsim_agents.estimation.filter_state import (
     LAYOUT,
     MOMENT,
     NOMINAL,
-    SENSOR,
     SETTING,
     VALUES_MAX,
     Rows,
 )
 from zsim_agents.estimation.kalman_update import DOF_MAX
 from zsim_agents.estimation.measurement_update import HEADING_SIGMA_RAD, SET_DOWN_SIGMA_RAD
-from zsim_agents.estimation.strapdown import MANOEUVRE_M_S2, MANOEUVRE_S, ZERO
+from zsim_agents.estimation.strapdown import (
+    ATTITUDE,
+    GYRO_BIAS,
+    MANOEUVRE_M_S2,
+    MANOEUVRE_S,
+    POSITION,
+    VELOCITY,
+    ZERO,
+    beta_for,
+    levelling_time_s,
+)
 
 Array = NDArray[np.float64]
 
@@ -81,7 +82,6 @@ class UpdateChannel(NamedTuple):
     sigma_min: float
 
     def error(self, sensors: Sensors) -> ErrorModel:
-        """Return the channel's error model in a drone's sensors."""
         return getattr(getattr(sensors, self.sensor), self.field)
 
     def sigma(self, sensors: Sensors) -> float:
@@ -101,7 +101,7 @@ AIDING = (  # in the order of the values of a reading
 )
 
 
-class BiasPrior(NamedTuple):
+class Bias(NamedTuple):
     """Equal states of bias: standard deviation at the start, random walk per sqrt(s) in the channel's unit.
 
     `decay_1_s` of a Gauss-Markov process is 1 over its correlation time.
@@ -113,31 +113,18 @@ class BiasPrior(NamedTuple):
     decay_1_s: float = 0.0
 
 
-class AidingBias(NamedTuple):
-    """Names a bias of an aiding channel: constant or walking, or a Gauss-Markov process."""
-
-    channel: UpdateChannel
-    correlated: bool
-
-
-BiasPriors = dict[AidingBias | str, BiasPrior]
-"""In the order of the error state: "gyro", "accel" if present, then aiding channels."""
-
-
 def initial_rows(
     drones: Sequence[Drone], environment: Environment, estimation: Estimation, gate_s: float
 ) -> tuple[Rows, Array]:
     """Return the rows of drones before their first reading, and room for their estimates, (N, ESTIMATE.size)."""
-    clones = [_clone_count(drone.sensors, environment, estimation, gate_s) for drone in drones]
-    states = [_ErrorState(bias_priors(d.sensors, estimation), k) for d, k in zip(drones, clones, strict=True)]
-    count, size = len(drones), max(each.size for each in states)
+    setups = [DroneSetup(drone, environment, estimation, gate_s) for drone in drones]
+    count, size = len(drones), max(each.size for each in setups)
     covariance, walk, decay = np.zeros((count, size, size)), np.zeros((count, size)), np.zeros((count, size))
-    for i, each in enumerate(states):
-        covariance[i, : each.size, : each.size] = each.covariance
+    for i, each in enumerate(setups):
+        covariance[i, : each.size, : each.size] = np.diag(each.variance)
         walk[i, : each.size], decay[i, : each.size] = each.walk, each.decay
-    setting = np.array([_setting(drone, environment, estimation, gate_s) for drone in drones], dtype=float)
-    pairs = zip(drones, states, strict=True)
-    layout = np.array([_layout(drone, environment, estimation, gate_s, each) for drone, each in pairs], dtype=np.int64)
+    setting = np.array([each.setting() for each in setups], dtype=float)
+    layout = np.array([each.layout() for each in setups], dtype=np.int64)
     nominal = np.zeros((count, NOMINAL.size))
     nominal[:, NOMINAL.q_WB : NOMINAL.q_WB + 4] = LEVEL
     nominal[:, NOMINAL.f_B + 2] = setting[:, SETTING.gravity]
@@ -150,7 +137,7 @@ def initial_rows(
         covariance=covariance,
         bias=np.zeros((count, size)),
         history=np.zeros((count, layout[:, LAYOUT.history].max(), MOMENT.size)),
-        clones=np.full((count, max(clones), CLONE.size), math.nan),
+        clones=np.full((count, max(each.clones for each in setups), CLONE.size), math.nan),
         setting=setting,
         layout=layout,
         walk=walk,
@@ -162,76 +149,173 @@ def initial_rows(
     return rows, np.zeros((count, ESTIMATE.size))
 
 
-class _ErrorState:
-    """Layout and initial covariance of an error state.
+class DroneSetup:
+    """What the sections of a scenario give for the rows of one drone.
 
     Attributes:
+        clones: how many late readings need; 0 where process noise is small compared to their noise.
+        biases: that the filter estimates, in the order of the error state: "gyro", "accel" if present, then of aiding
+            channels, which are (channel, whether it is a Gauss-Markov process).
+        first: first state of each bias.
         own: states before the clones.
         size: n, clones included.
-        first: first state of each bias.
-        walk: density of each bias' random walk [unit^2/s], (n,).
-        decay: of each bias [1/s], (n,).
-        covariance: at the start, (n, n).
+        variance, walk, decay: at the start, of each bias' random walk [unit^2/s], and of each bias [1/s], (n,).
     """
 
-    def __init__(self, priors: BiasPriors, clones: int) -> None:
-        self.clones = clones
-        self.first: dict[AidingBias | str, int] = {}
+    def __init__(self, drone: Drone, environment: Environment, estimation: Estimation, gate_s: float) -> None:
+        self._drone, self._environment, self._estimation, self._gate_s = drone, environment, estimation, gate_s
+        imu, self._gravity = drone.sensors.imu, environment.gravity_m_s2
+        self._accel_sigma = accel_sigma(imu)
+        self._gyro_sigma = max(math.radians(white_sigma(imu.gyro_deg_s, imu.rate_hz)), GYRO_SIGMA_MIN)
+        self._beta, self._direction_sigma = (
+            madgwick_beta(estimation, imu, self._gravity),
+            accel_sigma(imu) / self._gravity,
+        )
+        self._tilt_density = tilt_density(self._beta, self._direction_sigma, self._gravity, 1.0 / imu.rate_hz)
+        latency_s = max(getattr(drone.sensors, name).latency_ms for name in SENSORS) * 1e-3
+        self._age_max_s = 2.0 * latency_s + 5.0 * gate_s + (LINK_S if drone.is_external else 0.0)
+        self.clones = self._clone_count()
+        self.biases = biases_of(drone.sensors, estimation)
+        self.first: dict[BiasName, int] = {}
         self.own = GYRO_BIAS
-        for name, prior in priors.items():
+        for name, bias in self.biases.items():
             self.first[name] = self.own
-            self.own += prior.axes
-        self.size = self.own + clones * CLONED
-        variance, self.walk, self.decay = np.zeros(self.size), np.zeros(self.size), np.zeros(self.size)
-        variance[POSITION : POSITION + 3] = POSITION_SIGMA_M**2
-        variance[VELOCITY : VELOCITY + 3] = VELOCITY_SIGMA_M_S**2
-        variance[ATTITUDE : ATTITUDE + 3] = TILT_SIGMA_RAD**2, TILT_SIGMA_RAD**2, HEADING_SIGMA_RAD**2
-        for name, prior in priors.items():
-            span = slice(self.first[name], self.first[name] + prior.axes)
-            variance[span], self.walk[span], self.decay[span] = prior.sigma**2, prior.walk**2, prior.decay_1_s
-        self.covariance = np.diag(variance)
+            self.own += bias.axes
+        self.size = self.own + self.clones * CLONED
+        self.variance, self.walk, self.decay = np.zeros(self.size), np.zeros(self.size), np.zeros(self.size)
+        self.variance[POSITION : POSITION + 3] = POSITION_SIGMA_M**2
+        self.variance[VELOCITY : VELOCITY + 3] = VELOCITY_SIGMA_M_S**2
+        self.variance[ATTITUDE : ATTITUDE + 3] = TILT_SIGMA_RAD**2, TILT_SIGMA_RAD**2, HEADING_SIGMA_RAD**2
+        for name, bias in self.biases.items():
+            span = slice(self.first[name], self.first[name] + bias.axes)
+            self.variance[span], self.walk[span], self.decay[span] = bias.sigma**2, bias.walk**2, bias.decay_1_s
+
+    def _clone_count(self) -> int:
+        """Return how many clones late readings need, by what process noise adds to position and velocity meanwhile.
+
+        White acceleration and a random walk of the tilt, integrated per horizontal axis (Y. Bar-Shalom, X. R. Li,
+        T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 6.2).
+        """
+        sensors, longest_s = self._drone.sensors, 0.0
+        white = self._accel_sigma**2 / sensors.imu.rate_hz  # m^2/s^3
+        tilt = self._gyro_sigma**2 / sensors.imu.rate_hz + self._tilt_density
+        walk = self._gravity * self._gravity * tilt  # m^2/s^5
+        for channel in AIDING:
+            section: Sensor = getattr(sensors, channel.sensor)
+            late_s = (section.latency_ms - sensors.imu.latency_ms) * 1e-3
+            is_used = channel.sensor != "mag" and (channel.sensor != "flow" or self._estimation.flow)
+            if late_s <= self._gate_s or not is_used:
+                continue
+            if channel.field == "velocity_m_s":
+                gained = white * late_s + walk * late_s**3 / 3.0  # m^2/s^2
+            else:
+                gained = white * late_s**3 / 3.0 + walk * late_s**5 / 20.0  # m^2
+            if gained > CLONED_FROM * channel.sigma(sensors) ** 2:
+                longest_s = max(longest_s, late_s + self._gate_s)
+        return math.ceil(longest_s / CLONE_EVERY_S) + 1 if longest_s else 0
+
+    def setting(self) -> list[float]:
+        """Return the columns SETTING."""
+        sensors, imu = self._drone.sensors, self._drone.sensors.imu
+        row = [
+            self._gravity,
+            self._beta,
+            1.0 / imu.rate_hz,
+            imu.latency_ms * 1e-3 + self._gate_s + 5.0 * (1.0 / imu.rate_hz),
+            max(JOLT_SIGMAS * self._accel_sigma, JOLT_MIN_M_S2),
+            self._age_max_s,
+            math.radians(self._drone.yaw_deg),
+            self._accel_sigma**2,
+            self._gyro_sigma**2,
+            self._tilt_density,
+            levelling_time_s(self._beta, self._direction_sigma),
+            CLONE_EVERY_S,
+            *self._environment.magnetic_field_ut,
+        ]
+        for name in SENSORS:  # the columns SENSOR
+            section: Sensor = getattr(sensors, name)
+            variance: list[float] = []
+            correlated = 0.0
+            for channel in AIDING:
+                if channel.sensor == name:
+                    variance += [channel.sigma(sensors) ** 2] * channel.axes
+                    if channel.field == "position_m":
+                        correlated = channel.error(sensors).correlated_sigma
+            variance += [0.0] * (VALUES_MAX - len(variance))
+            R_BS = np.array(matrix_from_rpy(*map(math.radians, section.mount.rpy_deg)))
+            row += [*variance, *section.mount.position_m, *R_BS.flat, *-R_BS[:, 2]]
+            row += [PATIENCE_S.get(name, math.inf), correlated**2]
+        assert len(row) == SETTING.size
+        return row
+
+    def layout(self) -> list[int]:
+        """Return the columns LAYOUT."""
+        estimation, mag, mount = self._estimation, self._drone.sensors.mag.field_ut, self._drone.sensors.imu.mount
+        # whether one reading of the magnetometer gives a heading as good as setting the drone down by eye does
+        horizontal_ut = math.hypot(*self._environment.magnetic_field_ut[:2])
+        sideways_ut = math.hypot(HEADING_CHANNEL.sigma(self._drone.sensors), math.hypot(mag.bias, mag.correlated_sigma))
+        has_compass = estimation.magnetometer and sideways_ut <= COMPASS_SIGMA_RAD * horizontal_ut
+        flags = (
+            mount.rpy_deg != ZERO or mount.position_m != ZERO,
+            "accel" in self.biases,
+            any(isinstance(name, tuple) for name in self.biases) or self.clones > 0,
+            self.decay.any(),
+            estimation.magnetometer,
+            has_compass,
+            estimation.flow,
+        )
+        entries = int(self._age_max_s / self._gate_s) + 3
+        row = [self.size, self.clones, self.own, entries, *map(int, flags)]
+        for sensor in SENSORS:  # the columns BIAS of every channel
+            places: list[int] = []
+            value = 0
+            for channel in AIDING:
+                if channel.sensor == sensor:
+                    names = ((channel, correlated) for correlated in (False, True))
+                    places += [
+                        x for name in names if name in self.first for x in (self.first[name], value, channel.axes)
+                    ]
+                    value += channel.axes
+            row += places + [-1, 0, 0] * (CHANNELS - len(places) // BIAS.size)
+        assert len(row) == LAYOUT.size
+        return row
 
 
-def bias_priors(sensors: Sensors, estimation: Estimation) -> BiasPriors:
+BiasName = str | tuple[UpdateChannel, bool]
+
+
+def biases_of(sensors: Sensors, estimation: Estimation) -> dict[BiasName, Bias]:
     """Return the biases that the filter estimates.
 
     A Gauss-Markov process of the IMU is combined with its other biases as a random walk, which gains as much over the
     correlation time and goes on growing: never overconfident. That of an aiding channel is a state by itself.
     """
-    accel, gyro = sensors.imu.accel_m_s2, scaled(sensors.imu.gyro_deg_s, math.radians(1.0))
-    sigma, walk = _as_walk(gyro)
-    priors: BiasPriors = {"gyro": BiasPrior(3, max(sigma, GYRO_BIAS_MIN), max(walk, GYRO_WALK_MIN))}
-    if _has_bias(accel) or accel.correlated_sigma:
-        priors["accel"] = BiasPrior(3, *_as_walk(accel))
+
+    def gauss_markov_walk(error: ErrorModel) -> float:  # driving noise per sqrt(s)
+        return error.correlated_sigma * math.sqrt(2.0 / error.correlation_time_s)
+
+    def as_walk(error: ErrorModel) -> Bias:
+        if not error.correlated_sigma:
+            return Bias(3, error.bias, error.bias_walk)
+        sigma = math.hypot(error.bias, error.correlated_sigma)
+        return Bias(3, sigma, math.hypot(error.bias_walk, gauss_markov_walk(error)))
+
+    accel = as_walk(sensors.imu.accel_m_s2)
+    gyro = as_walk(scaled(sensors.imu.gyro_deg_s, math.radians(1.0)))
+    biases: dict[BiasName, Bias] = {"gyro": Bias(3, max(gyro.sigma, GYRO_BIAS_MIN), max(gyro.walk, GYRO_WALK_MIN))}
+    if accel.sigma > 0.0 or accel.walk > 0.0:
+        biases["accel"] = accel
     used = {"mag": estimation.magnetometer, "flow": estimation.flow}
     for channel in AIDING:
         if not used.get(channel.sensor, True):
             continue
         error = channel.error(sensors)
-        if _has_bias(error):
-            priors[AidingBias(channel, False)] = BiasPrior(channel.axes, error.bias, error.bias_walk)
+        if error.bias > 0.0 or error.bias_walk > 0.0:
+            biases[channel, False] = Bias(channel.axes, error.bias, error.bias_walk)
         if error.correlated_sigma:
-            priors[AidingBias(channel, True)] = BiasPrior(
-                channel.axes, error.correlated_sigma, _gauss_markov_walk(error), 1.0 / error.correlation_time_s
-            )
-    return priors
-
-
-def _has_bias(error: ErrorModel) -> bool:
-    return error.bias > 0.0 or error.bias_walk > 0.0
-
-
-def _as_walk(error: ErrorModel) -> tuple[float, float]:
-    """Return initial standard deviation and random walk of all biases of an IMU's channel together."""
-    if not error.correlated_sigma:
-        return error.bias, error.bias_walk
-    return math.hypot(error.bias, error.correlated_sigma), math.hypot(error.bias_walk, _gauss_markov_walk(error))
-
-
-def _gauss_markov_walk(error: ErrorModel) -> float:
-    """Return the driving noise of a channel's Gauss-Markov process, per sqrt(s): sigma sqrt(2/T)."""
-    sigma = error.correlated_sigma
-    return sigma * math.sqrt(2.0 / error.correlation_time_s) if sigma else 0.0
+            sigma, decay_1_s = error.correlated_sigma, 1.0 / error.correlation_time_s
+            biases[channel, True] = Bias(channel.axes, sigma, gauss_markov_walk(error), decay_1_s)
+    return biases
 
 
 def innovation_limits(gate_probability: float) -> Array:
@@ -253,11 +337,6 @@ def accel_sigma(imu: ImuConfig) -> float:
     return max(white_sigma(imu.accel_m_s2, imu.rate_hz), ACCEL_SIGMA_MIN)
 
 
-def gyro_sigma(imu: ImuConfig) -> float:
-    """Return the gyroscope's white noise per sample [rad/s]."""
-    return max(math.radians(white_sigma(imu.gyro_deg_s, imu.rate_hz)), GYRO_SIGMA_MIN)
-
-
 def madgwick_beta(estimation: Estimation, imu: ImuConfig, gravity: float) -> float:
     """Return the gain [rad/s]: the scenario's, or the one that levels in `LEVELLING_S` under the IMU's noise."""
     if estimation.madgwick_beta is not None:
@@ -276,124 +355,3 @@ def tilt_density(beta: float, direction_sigma: float, gravity: float, period_s: 
         return 0.0
     pull = min(MANOEUVRE_M_S2 / gravity / levelling_time_s(beta, direction_sigma), 2.0 * beta)
     return 2.0 * beta * beta * period_s + pull * pull * 2.0 * MANOEUVRE_S
-
-
-def _clone_count(sensors: Sensors, environment: Environment, estimation: Estimation, gate_s: float) -> int:
-    """Return how many clones late readings need; 0 where process noise is small compared to their noise."""
-    longest_s = 0.0
-    for channel in AIDING:
-        section: Sensor = getattr(sensors, channel.sensor)
-        late_s = (section.latency_ms - sensors.imu.latency_ms) * 1e-3
-        is_used = channel.sensor != "mag" and (channel.sensor != "flow" or estimation.flow)
-        if late_s <= gate_s or not is_used:
-            continue
-        position, velocity = _gained_variance(sensors.imu, environment, estimation, late_s)
-        gained = velocity if channel.field == "velocity_m_s" else position
-        if gained > CLONED_FROM * channel.sigma(sensors) ** 2:
-            longest_s = max(longest_s, late_s + gate_s)
-    return math.ceil(longest_s / CLONE_EVERY_S) + 1 if longest_s else 0
-
-
-def _gained_variance(
-    imu: ImuConfig, environment: Environment, estimation: Estimation, span_s: float
-) -> tuple[float, float]:
-    """Return what process noise adds to position [m^2] and velocity [m^2/s^2], per horizontal axis, over a time.
-
-    White acceleration and a random walk of the tilt, integrated (Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation
-    with Applications to Tracking and Navigation", 2001, section 6.2).
-    """
-    gravity = environment.gravity_m_s2
-    beta, direction_sigma = madgwick_beta(estimation, imu, gravity), accel_sigma(imu) / gravity
-    white = accel_sigma(imu) ** 2 / imu.rate_hz  # m^2/s^3
-    tilt = gyro_sigma(imu) ** 2 / imu.rate_hz + tilt_density(beta, direction_sigma, gravity, 1.0 / imu.rate_hz)
-    walk = gravity * gravity * tilt  # m^2/s^5
-    return white * span_s**3 / 3.0 + walk * span_s**5 / 20.0, white * span_s + walk * span_s**3 / 3.0
-
-
-def _age_max_s(drone: Drone, gate_s: float) -> float:
-    """Return the oldest age [s] at which a reading of a drone can be used."""
-    sections: list[Sensor] = [getattr(drone.sensors, name) for name in SENSORS]
-    latency_s = max(section.latency_ms for section in sections) * 1e-3
-    link_s = LINK_S if drone.is_external else 0.0
-    return 2.0 * latency_s + 5.0 * gate_s + link_s
-
-
-def _has_compass(drone: Drone, environment: Environment, estimation: Estimation) -> bool:
-    """Tell whether one reading of the magnetometer gives a heading as good as setting the drone down by eye does."""
-    horizontal_ut, error = math.hypot(*environment.magnetic_field_ut[:2]), drone.sensors.mag.field_ut
-    sideways_ut = math.hypot(HEADING_CHANNEL.sigma(drone.sensors), math.hypot(error.bias, error.correlated_sigma))
-    return estimation.magnetometer and sideways_ut <= COMPASS_SIGMA_RAD * horizontal_ut
-
-
-def _setting(drone: Drone, environment: Environment, estimation: Estimation, gate_s: float) -> list[float]:
-    """Return the columns SETTING of a drone."""
-    imu, gravity = drone.sensors.imu, environment.gravity_m_s2
-    beta, direction_sigma = madgwick_beta(estimation, imu, gravity), accel_sigma(imu) / gravity
-    row = [
-        gravity,
-        beta,
-        1.0 / imu.rate_hz,
-        imu.latency_ms * 1e-3 + gate_s + 5.0 * (1.0 / imu.rate_hz),
-        max(JOLT_SIGMAS * accel_sigma(imu), JOLT_MIN_M_S2),
-        _age_max_s(drone, gate_s),
-        math.radians(drone.yaw_deg),
-        accel_sigma(imu) ** 2,
-        gyro_sigma(imu) ** 2,
-        tilt_density(beta, direction_sigma, gravity, 1.0 / imu.rate_hz),
-        levelling_time_s(beta, direction_sigma),
-        CLONE_EVERY_S,
-        *environment.magnetic_field_ut,
-    ]
-    for name in SENSORS:
-        row += _sensor_setting(name, drone.sensors)
-    assert len(row) == SETTING.size
-    return row
-
-
-def _sensor_setting(name: str, sensors: Sensors) -> list[float]:
-    """Return the columns SENSOR of one sensor."""
-    section: Sensor = getattr(sensors, name)
-    variance: list[float] = []
-    correlated = 0.0
-    for channel in AIDING:
-        if channel.sensor == name:
-            variance += [channel.sigma(sensors) ** 2] * channel.axes
-            if channel.field == "position_m":
-                correlated = channel.error(sensors).correlated_sigma
-    variance += [0.0] * (VALUES_MAX - len(variance))
-    R_BS = np.array(matrix_from_rpy(*map(math.radians, section.mount.rpy_deg)))
-    mount, patience_s = (*section.mount.position_m, *R_BS.flat, *-R_BS[:, 2]), PATIENCE_S.get(name, math.inf)
-    row = [*variance, *mount, patience_s, correlated**2]
-    assert len(row) == SENSOR.size
-    return row
-
-
-def _layout(
-    drone: Drone, environment: Environment, estimation: Estimation, gate_s: float, states: _ErrorState
-) -> list[int]:
-    """Return the columns LAYOUT of a drone."""
-    mount = drone.sensors.imu.mount
-    entries = int(_age_max_s(drone, gate_s) / gate_s) + 3
-    displaced = mount.rpy_deg != ZERO or mount.position_m != ZERO
-    aiding = any(isinstance(name, AidingBias) for name in states.first) or states.clones > 0
-    own = (displaced, "accel" in states.first, aiding, states.decay.any())
-    flags = (*own, estimation.magnetometer, _has_compass(drone, environment, estimation), estimation.flow)
-    row = [states.size, states.clones, states.own, entries, *map(int, flags)]
-    for name in SENSORS:
-        row += _bias_places(name, states)
-    assert len(row) == LAYOUT.size
-    return row
-
-
-def _bias_places(sensor: str, states: _ErrorState) -> list[int]:
-    """Return the columns BIAS of every channel of a sensor."""
-    places: list[int] = []
-    row = 0
-    for channel in AIDING:
-        if channel.sensor == sensor:
-            for correlated in (False, True):
-                name = AidingBias(channel, correlated)
-                if name in states.first:
-                    places += [states.first[name], row, channel.axes]
-            row += channel.axes
-    return places + [-1, 0, 0] * (CHANNELS - len(places) // BIAS.size)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from zsim.contract.keys import SENSORS
 from zsim.math.compiled import Field, columns, inlined
 from zsim.math.rotation import Matrix, Quaternion, Vector
-from zsim_agents.estimation.dead_reckoning import Reckoning, vector
 
+Array = np.ndarray
 IMU, GPS, MAG, BARO, SONAR, FLOW = (SENSORS.index(name) for name in ("imu", "gps", "mag", "baro", "sonar", "flow"))
 SIZES = (6, 6, 3, 1, 1, 3)  # values of a reading of each sensor
 VALUES_MAX = max(SIZES)
@@ -148,6 +148,8 @@ ESTIMATE = columns(
     ),
 )
 
+Reckoning = tuple[Vector, Vector, Quaternion, Vector, Vector, Vector]
+"""p_WB [m], v_WB [m/s], q_WB, a_WB [m/s^2; W]; rate [rad/s] and specific force [m/s^2] in B, bias-free."""
 Moment = tuple[float, Vector, Vector, Quaternion, Vector, Vector, Vector]
 """t [s], p, v, q, w, and the filter's corrections of p and v in all by then."""
 
@@ -174,35 +176,38 @@ STATES = "nominal", "counts", "covariance", "bias", "history", "clones", "joint"
 
 
 @inlined
-def put(row: np.ndarray, at: int, a: Vector) -> None:
+def vector(row: Array, at: int) -> Vector:
+    return float(row[at]), float(row[at + 1]), float(row[at + 2])
+
+
+@inlined
+def put(row: Array, at: int, a: Vector) -> None:
     row[at], row[at + 1], row[at + 2] = a[0], a[1], a[2]
 
 
 @inlined
-def increase(row: np.ndarray, at: int, more: np.ndarray, first: int) -> None:
-    """Add three entries of an array to three columns."""
+def increase(row: Array, at: int, more: Array, first: int) -> None:
     for k in range(3):
         row[at + k] += more[first + k]
 
 
 @inlined
-def quaternion(row: np.ndarray, at: int) -> Quaternion:
+def quaternion(row: Array, at: int) -> Quaternion:
     return float(row[at]), float(row[at + 1]), float(row[at + 2]), float(row[at + 3])
 
 
 @inlined
-def put_quaternion(row: np.ndarray, at: int, q: Quaternion) -> None:
+def put_quaternion(row: Array, at: int, q: Quaternion) -> None:
     row[at], row[at + 1], row[at + 2], row[at + 3] = q[0], q[1], q[2], q[3]
 
 
 @inlined
-def matrix_at(row: np.ndarray, at: int) -> Matrix:
-    """Return nine columns as a matrix, row by row."""
+def matrix_at(row: Array, at: int) -> Matrix:
     return vector(row, at), vector(row, at + 3), vector(row, at + 6)
 
 
 @inlined
-def reckoning(row: np.ndarray) -> Reckoning:
+def reckoning(row: Array) -> Reckoning:
     return (
         vector(row, NOMINAL.p_WB), vector(row, NOMINAL.v_WB), quaternion(row, NOMINAL.q_WB),
         vector(row, NOMINAL.a_WB), vector(row, NOMINAL.w_WB_B), vector(row, NOMINAL.f_B),
@@ -210,7 +215,7 @@ def reckoning(row: np.ndarray) -> Reckoning:
 
 
 @inlined
-def put_reckoning(row: np.ndarray, state: Reckoning) -> None:
+def put_reckoning(row: Array, state: Reckoning) -> None:
     put(row, NOMINAL.p_WB, state[0])
     put(row, NOMINAL.v_WB, state[1])
     put_quaternion(row, NOMINAL.q_WB, state[2])
@@ -220,7 +225,7 @@ def put_reckoning(row: np.ndarray, state: Reckoning) -> None:
 
 
 @inlined
-def put_moment(row: np.ndarray, m: Moment) -> None:
+def put_moment(row: Array, m: Moment) -> None:
     row[MOMENT.t] = m[0]
     put(row, MOMENT.p_WB, m[1])
     put(row, MOMENT.v_WB, m[2])
@@ -231,7 +236,7 @@ def put_moment(row: np.ndarray, m: Moment) -> None:
 
 
 @inlined
-def moment(row: np.ndarray) -> Moment:
+def moment(row: Array) -> Moment:
     """Return a moment of the history, or the present one from a nominal row."""
     return (
         float(row[MOMENT.t]), vector(row, MOMENT.p_WB), vector(row, MOMENT.v_WB), quaternion(row, MOMENT.q_WB),

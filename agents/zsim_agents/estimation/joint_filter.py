@@ -2,10 +2,7 @@
 
 Each estimator of such a cluster reads the sensors of all its drones and computes the same filter; it publishes its own
 drones' estimates. For a sighting, first the owner of the seen hat is found, then both drones are corrected. A sighting
-is compared with the states of both drones at the instant of its picture. Errors: R_true = (I + [theta]x) R_WB, as in
-dead_reckoning.
-
-Order of this file: the banks of clusters, the bank of one, its step, and the compiled use of sightings.
+is compared with the states of both drones at the instant of its picture. Errors are those of strapdown.
 """
 
 import math
@@ -13,7 +10,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Estimate, Sightings
@@ -26,10 +22,9 @@ from zsim.scenario.scenario import Drone, Environment, Estimation, Scenario
 from zsim.sensors.camera import Hats
 from zsim.sensors.camera_model import camera_pose
 from zsim_agents.estimation import measurement_update, strapdown
-from zsim_agents.estimation.dead_reckoning import ATTITUDE, POSITION, VELOCITY
 from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.estimator_bank import EstimatorBank, sort_readings, write_estimate
-from zsim_agents.estimation.filter_state import COUNT, NOMINAL, SETTING, Moment, Rows, moment, vector
+from zsim_agents.estimation.filter_state import COUNT, NOMINAL, SETTING, Array, Moment, Rows, moment, vector
 from zsim_agents.estimation.kalman_update import (
     add_innovation_covariance,
     add_projection,
@@ -39,7 +34,7 @@ from zsim_agents.estimation.kalman_update import (
     within_gates,
 )
 from zsim_agents.estimation.measurement_update import correct_all
-from zsim_agents.estimation.strapdown import move_columns, recall_known
+from zsim_agents.estimation.strapdown import ATTITUDE, POSITION, VELOCITY, move_columns, recall_known
 
 SIGHTINGS_MAX = 1000  # used per gate; more are a flood
 PICTURES_KEPT = 256  # the last that were used; of 12 drones at 15 Hz, those of 1.4 s
@@ -73,10 +68,6 @@ Sighting = tuple[float, ...]  # columns SIGHTING
 
 class ClusterBanks:
     """A JointBank for each cluster of some drones, an EstimatorBank for a drone of none; methods of an EstimatorBank.
-
-    Args:
-        drones: whose estimates are wanted.
-        gate_s: interval of the gates [s].
 
     Attributes:
         drones: whose sensors are needed, in the order in which `receive` counts them.
@@ -158,8 +149,11 @@ class JointBank(EstimatorBank):
         p_BK = self._cameras[i].get(message.camera)
         if p_BK is None or not message.seen:
             return
+        # Two detectors that look at one picture have the same errors. Of two at one gate the first by name counts,
+        # whichever came first: other estimators of the cluster do the same.
         picture = (i, message.camera, message.t_sample_ns)
-        if self._is_taken(picture, message.source):
+        other = self._sighted.get(picture)
+        if picture in self._pictures_used or (other is not None and other[0] <= message.source):
             return
         camera = i, t_arrival_s, message.t_sample_ns * 1e-9, *p_BK
         rows = [
@@ -168,14 +162,6 @@ class JointBank(EstimatorBank):
         ]
         self._hats += len(rows)
         self._sighted[picture] = (message.source, rows)
-
-    def _is_taken(self, picture: Picture, source: str) -> bool:
-        """Tell whether a picture is used already: two detectors that look at it have the same errors.
-
-        Of two at one gate the first by name counts, whichever came first: other estimators of the cluster do the same.
-        """
-        other = self._sighted.get(picture)
-        return picture in self._pictures_used or (other is not None and other[0] <= source)
 
     def receive_gate(self, gate: GateMessages) -> bool:
         if not super().receive_gate(gate):
@@ -204,32 +190,26 @@ class JointBank(EstimatorBank):
         super().restore(state)
         self._pictures_used = dict.fromkeys((i, camera, t_ns) for i, camera, t_ns in state["pictures"])
 
-    def use(self, t_s: float, readings: NDArray[np.float64]) -> NDArray[np.float64]:
-        sightings = self._taken() if self._sighted else NO_SIGHTINGS
+    def use(self, t_s: float, readings: Array) -> Array:
+        sightings = NO_SIGHTINGS
+        if self._sighted:
+            seen = sorted(row for _, of_picture in self._sighted.values() for row in of_picture)
+            sightings = np.array(seen) if seen else NO_SIGHTINGS
+            self._pictures_used |= dict.fromkeys(self._sighted)
+            while len(self._pictures_used) > PICTURES_KEPT:
+                del self._pictures_used[next(iter(self._pictures_used))]
+            self._sighted, self._hats = {}, 0
         step_jointly(self.rows, t_s, readings, sightings, self._hat_B, self._estimates)
         return self._estimates
 
-    def _taken(self) -> NDArray[np.float64]:
-        """Return the sightings of this gate, (M, SIGHTING.size), and forget them."""
-        rows = sorted(row for _, of_picture in self._sighted.values() for row in of_picture)
-        self._pictures_used |= dict.fromkeys(self._sighted)
-        while len(self._pictures_used) > PICTURES_KEPT:
-            del self._pictures_used[next(iter(self._pictures_used))]
-        self._sighted, self._hats = {}, 0
-        return np.array(rows) if rows else NO_SIGHTINGS
-
 
 @portable
-def step_jointly(
-    rows: Rows, t_s: float, readings: np.ndarray, sightings: np.ndarray, hat_B: Vector, estimates: np.ndarray
-) -> None:
+def step_jointly(rows: Rows, t_s: float, readings: Array, sightings: Array, hat_B: Vector, estimates: Array) -> None:
     """Use the readings and sightings of a gate of all drones and write their estimates for `t_s`.
 
     Args:
-        rows: of N drones; changed.
-        t_s: instant of the gate [s].
         readings: (M, READING.size), each drone's in the order of their arrival.
-        sightings: (M, SIGHTING.size).
+        sightings: (M, SIGHTING.size), those of one picture in sequence.
         hat_B: centre of a hat in the body of its drone [m].
         estimates: (N, ESTIMATE.size), written.
     """
@@ -253,7 +233,6 @@ def step_jointly(
 
 @portable
 def _grow(rows: Rows, i: int, t_s: float) -> None:
-    """Let the errors of a drone follow its dead reckoning since the last gate."""
     row, n = rows.nominal[i], rows.covariance.shape[1]
     if not rows.counts[i, COUNT.running]:
         strapdown.begin(row, rows.counts[i], t_s)
@@ -266,14 +245,8 @@ def _grow(rows: Rows, i: int, t_s: float) -> None:
 
 
 @portable
-def use_sightings(rows: Rows, sightings: np.ndarray, hat_B: Vector) -> None:
-    """Use the sightings of a gate, one after the other; those that no hat explains are counted as refused.
-
-    Args:
-        rows: of all drones; changed.
-        sightings: (M, SIGHTING.size), those of one picture in sequence.
-        hat_B: centre of a hat in the body of its drone [m].
-    """
+def use_sightings(rows: Rows, sightings: Array, hat_B: Vector) -> None:
+    """Use the sightings of a gate, one after the other; those that no hat explains are counted as refused."""
     taken = np.zeros(rows.nominal.shape[0], dtype=np.bool_)
     HJ, S, y = np.zeros((3, rows.joint.shape[0])), np.zeros((3, 3)), np.zeros(3)
     for m in range(sightings.shape[0]):
@@ -291,7 +264,7 @@ def use_sightings(rows: Rows, sightings: np.ndarray, hat_B: Vector) -> None:
 
 
 @portable
-def is_possible(rows: Rows, sighting: np.ndarray) -> bool:
+def is_possible(rows: Rows, sighting: Array) -> bool:
     """Tell whether time and values of a sighting are plausible."""
     i = int(sighting[SIGHTING.drone])
     age_s = sighting[SIGHTING.t_arrival] - sighting[SIGHTING.t_sample]
@@ -302,9 +275,7 @@ def is_possible(rows: Rows, sighting: np.ndarray) -> bool:
 
 
 @portable
-def owner(
-    rows: Rows, sighting: np.ndarray, hat_B: Vector, taken: np.ndarray, HJ: np.ndarray, S: np.ndarray, y: np.ndarray
-) -> int:
+def owner(rows: Rows, sighting: Array, hat_B: Vector, taken: Array, HJ: Array, S: Array, y: Array) -> int:
     """Return whose hat was seen; NOBODY where none fits, two do, or the filter could not tell two from each other.
 
     HJ, S and the innovation y, (3,), are those of the returned hat; `taken` marks the hats already seen in the picture.
@@ -341,15 +312,11 @@ def owner(
 
 @portable
 def predict_sighting(
-    rows: Rows, sighting: np.ndarray, j: int, hat_B: Vector, HJ: np.ndarray, S: np.ndarray
+    rows: Rows, sighting: Array, j: int, hat_B: Vector, HJ: Array, S: Array
 ) -> tuple[Vector, tuple[Vector, Vector, Vector]]:
-    """Return the expected place of the hat of drone j, and axes along and across; write H J and S along these.
+    """Return the expected place of the hat of drone j, and axes along and across.
 
-    Args:
-        sighting: (SIGHTING.size,).
-        j: assumed owner of the hat.
-        HJ: (3, D), written.
-        S: covariance of the innovation, (3, 3), written.
+    Writes H J, (3, D), and the covariance S of the innovation, (3, 3), along these axes.
     """
     i, n = int(sighting[SIGHTING.drone]), rows.covariance.shape[1]
     t_s = sighting[SIGHTING.t_sample]
@@ -382,8 +349,8 @@ def expected(a: Moment, b: Moment, hat_B: Vector, p_BK: Vector) -> Vector:
 
 @portable
 def write_rows(
-    H_i: np.ndarray,
-    H_j: np.ndarray,
+    H_i: Array,
+    H_j: Array,
     a: Moment,
     b: Moment,
     hat_B: Vector,
@@ -418,21 +385,20 @@ def across(d: Vector) -> tuple[Vector, Vector, Vector]:
 
 
 @portable
-def innovation(axes: tuple[Vector, Vector, Vector], seen: Vector, r: Vector) -> np.ndarray:
+def innovation(axes: tuple[Vector, Vector, Vector], seen: Vector, r: Vector) -> Array:
     """Return the difference of what was seen and what was expected, along and across, (3,) [m]."""
     miss = subtract(seen, r)
     return np.array([dot(axes[0], miss), dot(axes[1], miss), dot(axes[2], miss)])
 
 
 @portable
-def distance_squared(rows: Rows, S: np.ndarray, y: np.ndarray) -> float:
-    """Return y^T S^-1 y."""
+def distance_squared(rows: Rows, S: Array, y: Array) -> float:
     blocks, distances = np.array([[0, 3]]), np.zeros(1)
     within_gates(S, y, blocks, rows.limits, distances)
     return distances[0]
 
 
 @portable
-def place_of(sighting: np.ndarray) -> Vector:
+def place_of(sighting: Array) -> Vector:
     """Return where a hat was seen, from the camera in axes of the body [m]."""
     return scaled(vector(sighting, SIGHTING.direction_B), sighting[SIGHTING.range])

@@ -11,28 +11,18 @@ import numpy as np
 
 from zsim.math.compiled import portable
 
+Array = np.ndarray
 DOF_MAX = 6  # rows of the largest block, GPS with position and velocity
 JOSEPH_MAX = 24  # states, chosen: with more, of clones, its products of n^3 would cost more than all else
 
 
 @portable
 def stacked_update(
-    P: np.ndarray,
-    H: np.ndarray,
-    variance: np.ndarray,
-    y: np.ndarray,
-    blocks: np.ndarray,
-    limits: np.ndarray,
-    distances: np.ndarray,
-) -> tuple[bool, np.ndarray, np.ndarray, np.ndarray]:
-    """Judge the innovations of a stack and, if all are within their gates, use them.
+    P: Array, H: Array, variance: Array, y: Array, blocks: Array, limits: Array, distances: Array
+) -> tuple[bool, Array, Array, Array]:
+    """Judge the innovations y (m,) of a stack and, if all are within their gates, use them; P (n, n) stays as it is.
 
-    Args:
-        P: covariance, (n, n); not changed.
-        H: Jacobian, (m, n).
-        variance: of each row's white noise, (m,).
-        y: innovations, (m,).
-        blocks, limits, distances: see `within_gates`.
+    H is the Jacobian, (m, n), `variance` that of each row's white noise, (m,); for the others see `within_gates`.
 
     Returns:
         Whether they were used; the state's correction K y, (n,); the new covariance; S, (m, m).
@@ -50,14 +40,13 @@ def stacked_update(
 
 
 @portable
-def within_gates(S: np.ndarray, y: np.ndarray, blocks: np.ndarray, limits: np.ndarray, distances: np.ndarray) -> bool:
+def within_gates(S: Array, y: Array, blocks: Array, limits: Array, distances: Array) -> bool:
     """Write y^T S^-1 y of every block of innovations by itself; return whether all are within their limits.
 
     By the block's Cholesky factor; infinite where S is not positive definite or the innovation is NaN.
 
     Args:
-        S: covariance of all innovations, (m, m).
-        y: all innovations, (m,).
+        S, y: covariance (m, m) of all innovations (m,).
         blocks: first row and number of rows of each block, (k, 2).
         limits: by number of rows, (DOF_MAX + 1,).
         distances: the result, (k,) or longer.
@@ -89,7 +78,7 @@ def within_gates(S: np.ndarray, y: np.ndarray, blocks: np.ndarray, limits: np.nd
 
 
 @portable
-def predicted_covariance(P: np.ndarray, F: np.ndarray, Q: np.ndarray) -> np.ndarray:
+def predicted_covariance(P: Array, F: Array, Q: Array) -> Array:
     """Return F P F^T + Q, (n, n), for a transition F that is the unit matrix but for few entries."""
     n = P.shape[0]
     FP = np.zeros((n, n))
@@ -110,7 +99,7 @@ def predicted_covariance(P: np.ndarray, F: np.ndarray, Q: np.ndarray) -> np.ndar
 
 
 @portable
-def predict_jointly(J: np.ndarray, i: int, F: np.ndarray, Q: np.ndarray) -> None:
+def predict_jointly(J: Array, i: int, F: Array, Q: Array) -> None:
     """Let the i-th n errors of J grow by F and Q, (n, n), and with them their covariance with all others."""
     n, size = F.shape[0], J.shape[0]
     first = i * n
@@ -139,14 +128,8 @@ def predict_jointly(J: np.ndarray, i: int, F: np.ndarray, Q: np.ndarray) -> None
 
 
 @portable
-def innovation_covariance(P: np.ndarray, H: np.ndarray, variance: np.ndarray, PHt: np.ndarray) -> np.ndarray:
-    """Return S = H P H^T + R, (m, m), and write P H^T, (n, m).
-
-    Args:
-        P: covariance, (n, n), symmetric.
-        H: Jacobian of the measurements, (m, n); mostly zeros.
-        variance: diagonal of R, (m,).
-    """
+def innovation_covariance(P: Array, H: Array, variance: Array, PHt: Array) -> Array:
+    """Return S = H P H^T + R, (m, m), and write P H^T, (n, m); `variance` is the diagonal of R, (m,)."""
     m, n = H.shape
     S = np.zeros((m, m))
     PHt[:, :] = 0.0
@@ -167,7 +150,7 @@ def innovation_covariance(P: np.ndarray, H: np.ndarray, variance: np.ndarray, PH
 
 
 @portable
-def gain(S: np.ndarray, PHt: np.ndarray) -> np.ndarray:
+def gain(S: Array, PHt: Array) -> Array:
     """Return K = P H^T S^-1, (n, m), by the Cholesky factor of S."""
     n, m = PHt.shape
     L = cholesky(S)
@@ -185,7 +168,7 @@ def gain(S: np.ndarray, PHt: np.ndarray) -> np.ndarray:
 
 
 @portable
-def cholesky(S: np.ndarray) -> np.ndarray:
+def cholesky(S: Array) -> Array:
     """Return the lower triangular L of S = L L^T, (m, m)."""
     m = S.shape[0]
     L = np.zeros((m, m))
@@ -199,7 +182,7 @@ def cholesky(S: np.ndarray) -> np.ndarray:
 
 
 @portable
-def joseph(P: np.ndarray, H: np.ndarray, variance: np.ndarray, K: np.ndarray) -> np.ndarray:
+def joseph(P: Array, H: Array, variance: Array, K: Array) -> Array:
     """Return (I - K H) P (I - K H)^T + K R K^T, (n, n)."""
     m, n = H.shape
     A = np.eye(n)
@@ -220,7 +203,7 @@ def joseph(P: np.ndarray, H: np.ndarray, variance: np.ndarray, K: np.ndarray) ->
 
 
 @portable
-def downdated(P: np.ndarray, PHt: np.ndarray, K: np.ndarray) -> np.ndarray:
+def downdated(P: Array, PHt: Array, K: Array) -> Array:
     """Return P - K H P, (n, n), symmetric, for P H^T and the gain K = P H^T S^-1, (n, m)."""
     n, m = K.shape
     updated = P.copy()
@@ -235,20 +218,19 @@ def downdated(P: np.ndarray, PHt: np.ndarray, K: np.ndarray) -> np.ndarray:
 
 
 @portable
-def put_block(J: np.ndarray, i: int, P: np.ndarray) -> None:
-    """Write a drone's own covariance into the joint one."""
+def put_block(J: Array, i: int, P: Array) -> None:
     n = P.shape[0]
     J[i * n : i * n + n, i * n : i * n + n] = P
 
 
 @portable
-def block(J: np.ndarray, i: int, n: int) -> np.ndarray:
+def block(J: Array, i: int, n: int) -> Array:
     """Return a drone's own covariance, (n, n)."""
     return J[i * n : i * n + n, i * n : i * n + n].copy()
 
 
 @portable
-def add_projection(J: np.ndarray, H: np.ndarray, first: int, HJ: np.ndarray) -> None:
+def add_projection(J: Array, H: Array, first: int, HJ: Array) -> None:
     """Add H J to HJ, (m, D), for a Jacobian H by the errors from `first` on, (m, n), mostly zeros."""
     for j in range(H.shape[0]):
         for k in range(H.shape[1]):
@@ -259,7 +241,7 @@ def add_projection(J: np.ndarray, H: np.ndarray, first: int, HJ: np.ndarray) -> 
 
 
 @portable
-def add_innovation_covariance(HJ: np.ndarray, H: np.ndarray, first: int, S: np.ndarray) -> None:
+def add_innovation_covariance(HJ: Array, H: Array, first: int, S: Array) -> None:
     """Add H J H^T to S, (m, m), for a Jacobian as in `add_projection`."""
     for i in range(H.shape[0]):
         for k in range(H.shape[1]):
@@ -270,7 +252,7 @@ def add_innovation_covariance(HJ: np.ndarray, H: np.ndarray, first: int, S: np.n
 
 
 @portable
-def whiten(S: np.ndarray, HJ: np.ndarray, y: np.ndarray) -> None:
+def whiten(S: Array, HJ: Array, y: Array) -> None:
     """Replace HJ by W = L^-1 HJ and y by u = L^-1 y, with S = L L^T: then J^+ = J - W^T W, and x = W^T u."""
     L = cholesky(S)
     for i in range(L.shape[0]):

@@ -7,8 +7,6 @@ A measurement model takes the state at the instant of the sample (p, v in the wo
 the Jacobian H, which come in as zero, and returns the predicted reading. `lag` is the age of the sample [s]: to first
 order an error of the past position is the present one less lag times that of the velocity. The body rate's own error
 times a lever arm is left out: below 1 mm/s.
-
-Order of this file: acceptance, the first heading, the update of a gate, its parts, measurement models.
 """
 
 import math
@@ -18,14 +16,6 @@ import numpy as np
 from zsim.math.compiled import inlined, portable
 from zsim.math.rotation import Matrix, Vector, add, column, composed, cross, heading, matrix, product, transposed
 from zsim_agents.estimation import strapdown
-from zsim_agents.estimation.dead_reckoning import (
-    ATTITUDE,
-    HORIZONTAL_MIN,
-    POSITION,
-    VELOCITY,
-    heading_gradient,
-    write_minus_cross,
-)
 from zsim_agents.estimation.filter_state import (
     BARO,
     BIAS,
@@ -43,6 +33,7 @@ from zsim_agents.estimation.filter_state import (
     SIZES,
     SONAR,
     VALUES_MAX,
+    Array,
     Moment,
     Rows,
     matrix_at,
@@ -60,6 +51,14 @@ from zsim_agents.estimation.kalman_update import (
     whiten,
     within_gates,
 )
+from zsim_agents.estimation.strapdown import (
+    ATTITUDE,
+    HORIZONTAL_MIN,
+    POSITION,
+    VELOCITY,
+    heading_gradient,
+    write_minus_cross,
+)
 
 ROWS_MAX = 32  # of one stacked update; more measurements of a gate go into a second one
 YAW = ATTITUDE + 2  # place in the error state
@@ -74,7 +73,7 @@ COSINE_MIN = 0.1  # of the sonar's ray to the vertical; beyond 84 deg it does no
 
 
 @inlined
-def accept(rows: Rows, i: int, reading: np.ndarray) -> bool:
+def accept(rows: Rows, i: int, reading: Array) -> bool:
     """Tell whether an aiding reading is to be used at the end of the gate.
 
     One that is out of order, too old or not finite is counted as refused; a duplicate is not counted, nor is a sonar
@@ -104,9 +103,7 @@ def accept(rows: Rows, i: int, reading: np.ndarray) -> bool:
 
 
 @inlined
-def start_heading(
-    rows: Rows, i: int, P: np.ndarray, t_s: float, readings: np.ndarray, first: int, after: np.ndarray
-) -> None:
+def start_heading(rows: Rows, i: int, P: Array, t_s: float, readings: Array, first: int, after: Array) -> None:
     """Initialise the heading: by the magnetometer, or where that gives none, as the drone was set down."""
     row, counts, setting = rows.nominal[i], rows.counts[i], rows.setting[i]
     if math.isnan(row[NOMINAL.t_first_gate]):
@@ -128,28 +125,26 @@ def start_heading(
 
 
 @inlined
-def _turn_heading(row: np.ndarray, counts: np.ndarray, gravity: float, angle: float) -> None:
+def _turn_heading(row: Array, counts: Array, gravity: float, angle: float) -> None:
     strapdown.turn_heading(row, gravity, angle)
     counts[COUNT.kept] = 0  # a turn invalidates the history
     counts[COUNT.heading_known] = 1
 
 
 @inlined
-def set_variance(P: np.ndarray, k: int, variance: float) -> None:
-    """Give one state a new variance and no correlation with the others."""
+def set_variance(P: Array, k: int, variance: float) -> None:
+    """Give one state a new variance, uncorrelated with the others."""
     for j in range(P.shape[0]):
         P[k, j] = P[j, k] = 0.0
     P[k, k] = variance
 
 
 @portable
-def fuse(rows: Rows, i: int, P: np.ndarray, readings: np.ndarray, first: int, after: np.ndarray) -> np.ndarray:
+def fuse(rows: Rows, i: int, P: Array, readings: Array, first: int, after: Array) -> Array:
     """Judge and use a gate's readings, in one stacked update unless there are very many; return the covariance.
 
     Args:
-        rows: of all drones.
-        i: the drone.
-        P: its covariance, (n, n).
+        P: covariance of drone i, (n, n).
         readings: of the gate, (M, READING.size).
         first: the drone's first among them; -1 for none.
         after: for each reading, the next one of the same drone, (M,); -1 after the last.
@@ -194,19 +189,9 @@ def fuse(rows: Rows, i: int, P: np.ndarray, readings: np.ndarray, first: int, af
 
 @inlined
 def stack(
-    rows: Rows,
-    i: int,
-    reading: np.ndarray,
-    H: np.ndarray,
-    z: np.ndarray,
-    expected: np.ndarray,
-    at: int,
-    known: tuple[Moment, float, int],
+    rows: Rows, i: int, reading: Array, H: Array, z: Array, expected: Array, at: int, known: tuple[Moment, float, int]
 ) -> None:
-    """Add a reading to a stack of measurements from row `at` on, compared with the state of its own instant.
-
-    That state is `known`, as returned by `strapdown.recall_known`.
-    """
+    """Add a reading to a stack of measurements from row `at` on; `known` is what `strapdown.recall_known` returned."""
     kind, setting = int(reading[READING.sensor]), rows.setting[i]
     past, lag, state = known
     predict(H, at, kind, setting, past, lag, expected)
@@ -217,7 +202,7 @@ def stack(
 
 
 @inlined
-def predict(H: np.ndarray, at: int, kind: int, setting: np.ndarray, past: Moment, lag: float, out: np.ndarray) -> None:
+def predict(H: Array, at: int, kind: int, setting: Array, past: Moment, lag: float, out: Array) -> None:
     """Write the expected reading of a sensor into out[at:], and its rows of H."""
     aid = SETTING.sensors + kind * SENSOR.size
     _, p, v, q, w, _, _ = past
@@ -238,8 +223,7 @@ def predict(H: np.ndarray, at: int, kind: int, setting: np.ndarray, past: Moment
 
 
 @inlined
-def with_biases(rows: Rows, i: int, kind: int, H: np.ndarray, at: int, out: np.ndarray) -> None:
-    """Add the sensor's biases to the prediction, and write their columns of H."""
+def with_biases(rows: Rows, i: int, kind: int, H: Array, at: int, out: Array) -> None:
     for channel in range(CHANNELS):
         place = LAYOUT.biases + (kind * CHANNELS + channel) * BIAS.size
         state, row = rows.layout[i, place + BIAS.state], at + rows.layout[i, place + BIAS.row]
@@ -249,7 +233,7 @@ def with_biases(rows: Rows, i: int, kind: int, H: np.ndarray, at: int, out: np.n
 
 
 @inlined
-def distrust_turn(P: np.ndarray, H: np.ndarray, expected: np.ndarray, at: int) -> None:
+def distrust_turn(P: Array, H: Array, expected: Array, at: int) -> None:
     """Let the flow determine the heading, in rows from `at` on, only as far as the drone surely moves.
 
     A heading's error turns the velocity. The velocity's error of a drone at rest would thereby give a heading that
@@ -265,7 +249,7 @@ def distrust_turn(P: np.ndarray, H: np.ndarray, expected: np.ndarray, at: int) -
 
 
 @inlined
-def write_variance(reading: np.ndarray, setting: np.ndarray, variance: np.ndarray, at: int) -> None:
+def write_variance(reading: Array, setting: Array, variance: Array, at: int) -> None:
     """Write the variances of a reading's rows; a GPS receiver's own figure counts where it is worse."""
     kind = int(reading[READING.sensor])
     known = SETTING.sensors + kind * SENSOR.size
@@ -289,7 +273,7 @@ def is_denied(rows: Rows, i: int, kind: int) -> bool:
 
 
 @portable
-def inflate(rows: Rows, i: int, P: np.ndarray, kind: int, z: np.ndarray, expected: np.ndarray, at: int) -> None:
+def inflate(rows: Rows, i: int, P: Array, kind: int, z: Array, expected: Array, at: int) -> None:
     """Make the states observed by a long refused sensor as uncertain as its innovation: it is trusted again."""
     row, layout = rows.nominal[i], rows.layout[i]
     squares, total = np.zeros(VALUES_MAX), 0.0
@@ -311,7 +295,7 @@ def inflate(rows: Rows, i: int, P: np.ndarray, kind: int, z: np.ndarray, expecte
 
 
 @inlined
-def widen(P: np.ndarray, k: int, variance: float, layout: np.ndarray) -> None:
+def widen(P: Array, k: int, variance: float, layout: Array) -> None:
     """Add a variance to a state of position or velocity, and to its clones: all have the same error."""
     first = layout[LAYOUT.first_clone] + k
     end = first + CLONED * layout[LAYOUT.clones]  # beyond are the places of larger error states
@@ -325,16 +309,8 @@ def widen(P: np.ndarray, k: int, variance: float, layout: np.ndarray) -> None:
 
 @portable
 def correct(
-    rows: Rows,
-    i: int,
-    P: np.ndarray,
-    H: np.ndarray,
-    z: np.ndarray,
-    expected: np.ndarray,
-    variance: np.ndarray,
-    blocks: np.ndarray,
-    kinds: np.ndarray,
-) -> np.ndarray:
+    rows: Rows, i: int, P: Array, H: Array, z: Array, expected: Array, variance: Array, blocks: Array, kinds: Array
+) -> Array:
     """Use a stack of measurements, (m,) each, whose blocks are in `blocks` (b, 2); return the covariance.
 
     All are tried together; if that fails, those outside of their own gates are left out.
@@ -356,15 +332,8 @@ def correct(
 
 @portable
 def _correct_jointly(
-    rows: Rows,
-    i: int,
-    P: np.ndarray,
-    H: np.ndarray,
-    y: np.ndarray,
-    variance: np.ndarray,
-    blocks: np.ndarray,
-    kinds: np.ndarray,
-) -> np.ndarray:
+    rows: Rows, i: int, P: Array, H: Array, y: Array, variance: Array, blocks: Array, kinds: Array
+) -> Array:
     """Like `correct`, with the joint covariance of all drones, whose states are corrected."""
     distances = np.zeros(ROWS_MAX)
     put_block(rows.joint, i, P)  # it may have been inflated
@@ -376,18 +345,10 @@ def _correct_jointly(
 
 
 @portable
-def use_own(
-    rows: Rows, i: int, H: np.ndarray, variance: np.ndarray, y: np.ndarray, blocks: np.ndarray, distances: np.ndarray
-) -> bool:
+def use_own(rows: Rows, i: int, H: Array, variance: Array, y: Array, blocks: Array, distances: Array) -> bool:
     """Judge measurements of a drone's own sensors together and, if all are within their gates, use them.
 
-    Args:
-        rows: of all drones; `rows.joint` is changed.
-        i: the drone.
-        H: Jacobian by its own errors, (m, n).
-        variance: of the rows' white noise, (m,).
-        y: innovations, (m,).
-        blocks, distances: see `kalman_update.within_gates`.
+    H is by its own errors, (m, n); blocks, distances: see `kalman_update.within_gates`. `rows.joint` is changed.
     """
     first, HJ = i * H.shape[1], np.zeros((H.shape[0], rows.joint.shape[0]))
     add_projection(rows.joint, H, first, HJ)
@@ -400,7 +361,7 @@ def use_own(
 
 
 @portable
-def correct_all(rows: Rows, HJ: np.ndarray, S: np.ndarray, y: np.ndarray) -> None:
+def correct_all(rows: Rows, HJ: Array, S: Array, y: Array) -> None:
     """Correct all drones and the joint covariance by innovations y (m,) of covariance S; HJ = H J, overwritten as y."""
     whiten(S, HJ, y)
     J, x = rows.joint, np.zeros(HJ.shape[1])
@@ -423,7 +384,7 @@ def correct_all(rows: Rows, HJ: np.ndarray, S: np.ndarray, y: np.ndarray) -> Non
 
 
 @portable
-def keep(rows: Rows, i: int, used: bool, distances: np.ndarray, blocks: np.ndarray, kinds: np.ndarray) -> np.ndarray:
+def keep(rows: Rows, i: int, used: bool, distances: Array, blocks: Array, kinds: Array) -> Array:
     """Count the outcome of each block; return the rows (m,) to use: all, or those inside of their own gates."""
     kept, m = np.zeros(ROWS_MAX, dtype=np.int64), 0
     for b in range(blocks.shape[0]):
@@ -437,7 +398,7 @@ def keep(rows: Rows, i: int, used: bool, distances: np.ndarray, blocks: np.ndarr
 
 
 @inlined
-def count_outcome(row: np.ndarray, counts: np.ndarray, kind: int, passed: bool) -> None:
+def count_outcome(row: Array, counts: Array, kind: int, passed: bool) -> None:
     """Count a reading as used or refused, and note since when its sensor is refused."""
     if passed:
         counts[COUNT.used + kind] += 1
@@ -452,7 +413,7 @@ SIX = tuple[float, float, float, float, float, float]
 
 
 @inlined
-def write_gps(H: np.ndarray, i: int, p: Vector, v: Vector, R: Matrix, w: Vector, arm: Vector, lag: float) -> SIX:
+def write_gps(H: Array, i: int, p: Vector, v: Vector, R: Matrix, w: Vector, arm: Vector, lag: float) -> SIX:
     """Antenna at p_BS = `arm`: position p + R r [m], velocity v + R (w x r) [m/s]; six rows from `i`."""
     offset = product(R, arm)
     swing = product(R, cross(w, arm))
@@ -466,7 +427,7 @@ def write_gps(H: np.ndarray, i: int, p: Vector, v: Vector, R: Matrix, w: Vector,
 
 
 @inlined
-def write_mag(H: np.ndarray, i: int, R: Matrix, R_BS: Matrix, field_W: Vector) -> Vector:
+def write_mag(H: Array, i: int, R: Matrix, R_BS: Matrix, field_W: Vector) -> Vector:
     """Magnetometer turned by R_BS in a known field: (R R_BS)^T m [uT]; three rows from `i`."""
     R_WS = composed(R, R_BS)
     for k in range(3):
@@ -478,7 +439,7 @@ def write_mag(H: np.ndarray, i: int, R: Matrix, R_BS: Matrix, field_W: Vector) -
 
 
 @inlined
-def write_baro(H: np.ndarray, i: int, p: Vector, R: Matrix, arm: Vector, lag: float) -> float:
+def write_baro(H: Array, i: int, p: Vector, R: Matrix, arm: Vector, lag: float) -> float:
     """Barometer at p_BS = `arm`: its height [m]; one row."""
     offset = product(R, arm)
     H[i, POSITION + 2] = 1.0
@@ -489,7 +450,7 @@ def write_baro(H: np.ndarray, i: int, p: Vector, R: Matrix, arm: Vector, lag: fl
 
 
 @inlined
-def write_sonar(H: np.ndarray, i: int, p: Vector, R: Matrix, arm: Vector, down_B: Vector, lag: float) -> float:
+def write_sonar(H: Array, i: int, p: Vector, R: Matrix, arm: Vector, down_B: Vector, lag: float) -> float:
     """Sonar at p_BS = `arm` that looks along `down_B` at the ground z_W = 0: height / cosine [m]; one row.
 
     Returns 0 with an empty row if the sonar does not look down.
@@ -509,7 +470,7 @@ def write_sonar(H: np.ndarray, i: int, p: Vector, R: Matrix, arm: Vector, down_B
 
 
 @inlined
-def write_flow(H: np.ndarray, i: int, v: Vector, R: Matrix, w: Vector, arm: Vector) -> Vector:
+def write_flow(H: Array, i: int, v: Vector, R: Matrix, w: Vector, arm: Vector) -> Vector:
     """Velocity of the camera at p_BS = `arm` in the heading frame, Rz(yaw)^T (v + R (w x r)); three rows."""
     swing = product(R, cross(w, arm))
     x, y, _ = column(R, 0)

@@ -23,8 +23,8 @@ from zsim.math import frames
 from zsim.math.rotation import Quaternion, Vector
 from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim.sensors.sensor import ErrorModel, noise_sigma
-from zsim_agents.estimation.dead_reckoning import madgwick_step
 from zsim_agents.estimation.drone_estimator import StateEstimate
+from zsim_agents.estimation.strapdown import madgwick_step
 
 YAW = 3  # place in the state
 POSITION_SIGMA_M = 100.0  # m: a start anywhere on the field
@@ -72,7 +72,12 @@ class PaperEstimator:
         dt = 0.0 if math.isnan(self._t_s) else t_s - self._t_s
         self._t_s = t_s
         yaw = float(frames.heading(self._q))
-        self._filter.reckon(self._velocity or (0.0, 0.0, 0.0), yaw, self._process_noise(dt), dt)
+        position = (
+            self._velocity_variance() * self._flow_period_s * dt
+        )  # velocities err independently, held for a period
+        drift = (self._gyro_sigma**2 * self._imu_period_s + self._gyro_bias**2 * DRIFT_S) * dt
+        noise = np.diag([position, position, position, drift])
+        self._filter.reckon(self._velocity or (0.0, 0.0, 0.0), yaw, noise, dt)
         if self._fix:
             self._filter.correct(self._fix, self._fix_variance_factor)
             self._fix = None
@@ -124,12 +129,6 @@ class PaperEstimator:
         """Return the variance per axis of the velocity used by dead reckoning [m^2/s^2]."""
         return (self._speed_sigma if self._velocity else SPEED_SIGMA_M_S) ** 2
 
-    def _process_noise(self, dt: float) -> NDArray[np.float64]:
-        """Return the process noise of an interval, (4, 4): velocities err independently, each held for its period."""
-        position = self._velocity_variance() * self._flow_period_s * dt
-        yaw = (self._gyro_sigma**2 * self._imu_period_s + self._gyro_bias**2 * DRIFT_S) * dt
-        return np.diag([position, position, position, yaw])
-
 
 class DeadReckoningFilter(ExtendedKalmanFilter):
     """Position and heading, (p_WB, yaw), by dead reckoning and fixes."""
@@ -149,8 +148,7 @@ class DeadReckoningFilter(ExtendedKalmanFilter):
         self.Q = Q
         self.predict()
 
-    def predict_x(self, u: float = 0) -> None:
-        """Set the state to that of dead reckoning, which is not linear."""
+    def predict_x(self, u: float = 0) -> None:  # to that of dead reckoning, which is not linear
         self.x = self._next
 
     def correct(self, fix: Gps, variance_factor: float) -> None:

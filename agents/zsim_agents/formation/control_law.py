@@ -1,7 +1,7 @@
 """Control laws of a formation, from the estimated robots and a reference to velocity commands.
 
-Order of this file: gains and command, what all laws share (`law:` of a cluster may name a subclass of your own), the
-stock law, and compiled: the saturation of the robots' velocities, and the guard of the distances between them.
+What all laws share (`law:` of a cluster may name a subclass of your own), the stock law, and compiled: the saturation
+of the robots' velocities, and the guard of the distances between them.
 """
 
 from __future__ import annotations
@@ -38,14 +38,13 @@ GUARD_SWEEPS = 4  # passes over all pairs; one settles two robots, three robots 
 
 @dataclass(frozen=True)
 class FormationGains:
-    """Parameters of the law; all are positive, validated with the scenario.
+    """Parameters of the law; all are positive, validated with the scenario. For those not named here see `RobotLimits`.
 
     Attributes:
         k_1_s: proportional gain [1/s]; 0.5 to 0.8 is good, unstable from about 2 on a drone's velocity loop.
         integral_1_s2: integral gain [1/s^2]; removes the offset that wind causes, 0 switches it off.
         integral_max_m_s, integral_max_rad_s: clamp of the integral term for lengths and for angles.
         separation_min_m: least distance between two robots of a reference, and where the guard acts.
-        all others: see `RobotLimits`.
     """
 
     k_1_s: float = 0.6
@@ -71,8 +70,7 @@ class FormationCommand(Struct, eq=False):
     Attributes:
         v_W: velocities (n, 3) [m/s, W]; yaw_rate: (n,) [rad/s].
         factor: the common factor of the saturation, 1 where nothing is saturated.
-        guarded: pairs of robot indices that the guard holds apart.
-        alarmed: pairs that are nearer than the alarm threshold.
+        guarded, alarmed: pairs of robot indices that the guard holds apart; that are nearer than the alarm threshold.
     """
 
     v_W: Array
@@ -144,13 +142,11 @@ class ControlLaw(ABC):
         factor, guards, alarms = limited(r_dot, p_W, v_W, v_cmd_W, yaw_rate, order, *self.gains.limits)
         if factor == 1.0 and not guards:
             self.followed(dt_s)
-        guarded, alarmed = pairs_of(guards, alarms, order) if guards or alarms else ((), ())
+        guarded, alarmed = numbered(order) if guards else (), numbered(order.T) if alarms else ()
         return FormationCommand(v_cmd_W, yaw_rate, factor, guarded, alarmed)
 
     def _checked(self, r_dot: Any) -> Array:
-        """Return the result of a user's `rates` as an array (4n,) of finite numbers."""
-        what = f"{plugin.full_name(type(self))}.rates returns"
-        size = self.space.size
+        what, size = f"{plugin.full_name(type(self))}.rates returns", self.space.size
         try:
             rates = plugin.numbers(r_dot)
         except ValueError as error:
@@ -165,12 +161,9 @@ class ControlLaw(ABC):
 
 
 class ProportionalLaw(ControlLaw):
-    """Feed-forward, proportional and integral terms in cluster space.
+    """Feed-forward, proportional and integral terms in cluster space; the integral I (4n,) is its only state.
 
-        c_dot_cmd = c_dot_des + k (c_des - c) + I,    I' = k_i (c_des - c),    r_dot = J^-1(c) c_dot_cmd
-
-    Attributes:
-        integral: I, its only state (4n,) [m/s, rad/s].
+    c_dot_cmd = c_dot_des + k (c_des - c) + I,    I' = k_i (c_des - c),    r_dot = J^-1(c) c_dot_cmd
     """
 
     def __init__(self, space: ClusterSpace, gains: FormationGains | None = None) -> None:
@@ -213,7 +206,6 @@ def put_cluster_rate(
 
 @portable
 def grow(integral: Array, error: Array, rate: float, clamp: Array) -> None:
-    """Add rate error to the integral, within its clamp."""
     for k in range(integral.size):
         integral[k] = min(max(integral[k] + rate * error[k], -clamp[k]), clamp[k])
 
@@ -222,9 +214,7 @@ class RobotLimits(NamedTuple):
     """Limits of the saturation and of the guard, for compiled code.
 
     Attributes:
-        speed_max_m_s, climb_max_m_s, yaw_rate_max_rad_s: limits of each robot.
-        separation_min_m: least distance between two robots.
-        separation_alarm_m: below it two robots are reported.
+        separation_min_m, separation_alarm_m: least distance between two robots; below the other two are reported.
         guard_horizon_s: how far ahead the guard looks.
         response_s: lag of a drone's velocity loop, during which the guard expects it to keep its velocity.
     """
@@ -248,15 +238,10 @@ def guard(p_W: Array, v_W: Array, v_cmd_W: Array, limits: RobotLimits) -> tuple[
     """
     parted_W, order = v_cmd_W.copy(), np.empty((len(p_W), len(p_W)), np.int64)
     guards, alarms = hold_apart(p_W, v_W, parted_W, order, *limits)
-    return parted_W, *pairs_of(guards, alarms, order)
+    return parted_W, numbered(order) if guards else (), numbered(order.T) if alarms else ()
 
 
-def pairs_of(guards: int, alarms: int, order: Order) -> tuple[Pairs, Pairs]:
-    """Return the pairs that `hold_apart` has held apart, and those in alarm."""
-    return _numbered(order) if guards else (), _numbered(order.T) if alarms else ()
-
-
-def _numbered(order: Order) -> Pairs:
+def numbered(order: Order) -> Pairs:
     """Return the pairs with a number above the diagonal, in the order of their numbers."""
     numbers = order.tolist()
     places = [(numbers[i][j], i, j) for j in range(len(numbers)) for i in range(j) if numbers[i][j]]

@@ -1,7 +1,6 @@
 """The cluster controller as an agent: estimates and states in, velocity commands and cluster state out."""
 
 import math
-from collections.abc import Sequence
 from functools import partial
 from operator import itemgetter
 from struct import Struct as Packing
@@ -28,11 +27,6 @@ _variances_of = itemgetter(0, 7, 14)  # of the position, in the 6 x 6 covariance
 class Controller(Agent):
     """Flies one cluster.
 
-    Args:
-        info: of the run.
-        scenario: the resolved one in the info.
-        cluster: name.
-
     Raises:
         RunError: the scenario has no such cluster, or its plan can never be flown.
     """
@@ -48,12 +42,10 @@ class Controller(Agent):
         self.drones = tuple(spec.drones)
         estimates = tuple(keys.estimate(drone) for drone in spec.drones)
         states = tuple(keys.status(drone) for drone in spec.drones)
-        self.gate_keys = states + estimates
-        self.reads = self.gate_keys
-        self.writes = (keys.cluster_state(cluster),)
-        self._state_key = keys.cluster_state(cluster)
-        self._view_key = keys.cluster_view(cluster)
-        self._control_key = keys.cluster_control(cluster)
+        self.reads = self.gate_keys = states + estimates
+        self._state_key, self._view_key = keys.cluster_state(cluster), keys.cluster_view(cluster)
+        self._control_key, self._request_key = keys.cluster_control(cluster), keys.cluster_request(cluster)
+        self.writes, self.repeats = (self._state_key,), (self._request_key,)
         self._place = {key: i for of_drones in (states, estimates) for i, key in enumerate(of_drones)}
         self._velocity_keys = [keys.command(drone, "velocity") for drone in spec.drones]
         self._estimates = [_UNKNOWN] * len(spec.drones)
@@ -66,8 +58,6 @@ class Controller(Agent):
         self._engagement = engagement_of(scenario, spec)
         self._last_state: flight_messages.ClusterState | None = None
         self._stepped_ns: int | None = None
-        self._request_key = keys.cluster_request(cluster)
-        self.repeats = (self._request_key,)
         self._answered: list[tuple[ControlRequest, ControlAnswer]] = []  # since the last gate
 
     def receive(self, key: str, message: Any) -> None:
@@ -85,9 +75,9 @@ class Controller(Agent):
         source, outputs = self.source, []
         answered, self._answered = self._answered, []
         for request, answer in answered:  # since the last gate; a re-run of the record makes them before this one
-            key = self._request_key
+            key, of_request = self._request_key, (request.op, request.args, request.source)
             message = run_messages.ClusterRequest(
-                t_ns, self.next_seq(key), request.op, request.args, request.source, answer.ok, answer.error, source
+                t_ns, self.next_seq(key), *of_request, answer.ok, answer.error, source
             )
             outputs.append(Output(key, message))
         for drone, mode in output.modes:
@@ -95,7 +85,8 @@ class Controller(Agent):
             outputs.append(Output(key, flight_messages.Mode(t_ns, self.next_seq(key), source, mode)))  # type: ignore[arg-type]
         for key, setpoint, estimate in zip(self._velocity_keys, output.setpoints, self._estimates, strict=True):
             if setpoint is not None and estimate is not _UNKNOWN:
-                velocity = in_heading(setpoint.v_W, estimate.yaw_rad)
+                (x, y, z), c, s = setpoint.v_W, math.cos(estimate.yaw_rad), math.sin(estimate.yaw_rad)
+                velocity = (c * x + s * y, -s * x + c * y, z)  # forward, left, up
                 message = flight_messages.Velocity(t_ns, self.next_seq(key), source, velocity, setpoint.yaw_rate)
                 outputs.append(Output(key, message))
         self._last_state = state = flight_messages.ClusterState(
@@ -127,7 +118,9 @@ class Controller(Agent):
             ages_s.append((t_ns - e.t_ns) * 1e-9 if e is not _UNKNOWN else math.inf)
         self._fill(*positions, *velocities, *variances, *yaws, *yaw_sigmas, *ages_s)
         np.sqrt(self._sigma_m, self._sigma_m)
-        p_W = ahead(self._p_W, self._v_W, self._age_s) if any(ages_s) else self._p_W
+        p_W = self._p_W
+        if any(ages_s):  # old estimates are taken on at constant velocity; an age is infinite where there is none
+            p_W = p_W + self._v_W * np.where(np.isfinite(self._age_s), self._age_s, 0.0)[:, None]
         sigmas = self._sigma_m, self._yaw_sigma
         return GateInput(t_ns * 1e-9, p_W, self._yaw, self._v_W, *sigmas, self._age_s, tuple(self._states))
 
@@ -181,23 +174,17 @@ class Controller(Agent):
 
 
 _UNKNOWN = flight_messages.Estimate(
-    0,
-    0,
-    (math.nan, math.nan, math.nan),
-    (math.nan, math.nan, math.nan),
-    (1.0, 0.0, 0.0, 0.0),
-    math.nan,
-    (math.inf,) * 36,
-    math.inf,
-    (0.0, 0.0, 0.0),
-    {},
+    t_ns=0,
+    seq=0,
+    position_m=(math.nan, math.nan, math.nan),
+    velocity_m_s=(math.nan, math.nan, math.nan),
+    orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
+    yaw_rad=math.nan,
+    covariance=(math.inf,) * 36,
+    yaw_sigma_rad=math.inf,
+    gyro_bias_rad_s=(0.0, 0.0, 0.0),
+    sensors={},
 )
-
-
-def in_heading(v_W: Sequence[float], yaw: float) -> tuple[float, float, float]:
-    """Return a velocity of W in the heading frame: x forward, y left, z up."""
-    c, s = math.cos(yaw), math.sin(yaw)
-    return (c * v_W[0] + s * v_W[1], -s * v_W[0] + c * v_W[1], v_W[2])
 
 
 def _finite(values: np.ndarray) -> tuple[float, ...]:
@@ -206,11 +193,3 @@ def _finite(values: np.ndarray) -> tuple[float, ...]:
     if not math.isfinite(sum(numbers)):  # one of them is not, or the sum overflows
         numbers = [number if math.isfinite(number) else 0.0 for number in numbers]
     return tuple(numbers)
-
-
-def ahead(p_W: np.ndarray, v_W: np.ndarray, age_s: np.ndarray) -> np.ndarray:
-    """Return the present positions (n, 3) of drones with old estimates, at constant velocity.
-
-    The ages (n,) are infinite where there is no estimate.
-    """
-    return p_W + v_W * np.where(np.isfinite(age_s), age_s, 0.0)[:, None]

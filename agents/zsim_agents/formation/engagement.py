@@ -23,11 +23,17 @@ from zsim_agents.formation.control_law import (
 )
 from zsim_agents.formation.flight_check import (
     AIRBORNE,
+    ASSEMBLY_CLIMB_M_S,
+    ASSEMBLY_HEIGHT_M,
     DOWN,
     GUARD_PARTS,
+    HEAL_S,
     HELD_ON_REQUEST,
     READY_TO_ENGAGE,
     REJOINING,
+    RESEND_S,
+    SHAPE,
+    SHAPE_IN_FLIGHT,
     TOO_NEAR,
     EngagementLimits,
     FlightCheck,
@@ -40,17 +46,12 @@ from zsim_agents.formation.flight_check import (
 )
 from zsim_agents.formation.flight_plan import (
     REFUSALS,
-    Engage,
     FlightPlan,
     FlightRequest,
-    Follow,
-    Land,
     MoveTo,
-    Pause,
+    Order,
     RefusalError,
-    Rejoin,
     Scheduled,
-    TakeOff,
 )
 from zsim_agents.formation.guidance import IN_PLACE_M, Guidance, Places
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
@@ -64,10 +65,8 @@ class Engagement:
     """The phase machine of one formation.
 
     Args:
-        space: cluster space of n robots.
-        drones: their names in the order of the robots, for commands and reasons.
-        plan: requests that the scenario makes by itself; a Land by request drops the rest of them.
-        law: class of the control law.
+        drones: their names in the order of the robots.
+        plan: requests that the scenario makes by itself; a landing by request drops the rest of them.
 
     Raises:
         ValueError: the plan can never be flown (see `FlightPlan`), or the number of names is not n.
@@ -87,12 +86,11 @@ class Engagement:
         self.space = space
         self.drones = tuple(drones)
         self.gains = gains or FormationGains()
-        self.limits = limits or EngagementLimits()
         self.law = law(space, self.gains)
         self.law.robots = self.drones
-        self.guidance = Guidance(space, self.gains, self.limits.shape)
+        self.guidance = Guidance(space, self.gains)
         self.plan = FlightPlan(space, plan)
-        self.check = FlightCheck(space, self.drones, self.gains, self.limits)
+        self.check = FlightCheck(space, self.drones, self.gains, limits or EngagementLimits())
         self._held_limits = self.gains.limits._replace(separation_min_m=self.gains.separation_min_m + HOLD_APART_M)
         self._phase = "idle"
         self._gate: GateInput | None = None
@@ -111,7 +109,6 @@ class Engagement:
         return "held" if self._phase == "engaged" and (self._fault or self.guidance.paused) else self._phase
 
     def step(self, gate: GateInput) -> GateOutput:
-        """Advance to this gate and return its commands and state."""
         last_s = self._gate.t_s if self._gate else gate.t_s
         self._dt_s = min(max(gate.t_s - last_s, 0.0), DT_MAX_S)
         self._gate = gate
@@ -122,21 +119,22 @@ class Engagement:
         if self._phase == "engaged":
             self._judge(gate)
             return self._hold(gate) if self._fault else self._fly(gate)
-        if self._phase == "taking_off":
-            waiting = self.check.state_fault(gate, AIRBORNE)
-            if waiting:
-                return self._climb(gate, waiting, self._mode_commands(gate, "takeoff", frozenset({"landed"})))
-            self._phase = "assembling"
-        if self._phase == "assembling":
-            return self._climb(gate, self.check.engagement_fault(gate) or READY_TO_ENGAGE)
-        return self._land(gate) if self._phase == "landing" else self._output(gate, "")
+        if self._phase in ("taking_off", "assembling"):
+            return self._climb(gate)
+        if self._phase != "landing":
+            return self._output(gate, "")
+        # a take-off sent just before may still be on its way: idle only after a while on the ground
+        if gate.down and gate.t_s - self._landing_s >= RESEND_S:
+            self._phase = "idle"
+        modes = self._mode_commands(gate, "land", AIRBORNE | {"taking_off"})
+        return self._output(gate, self.check.state_fault(gate, DOWN | {"landing"}) or "", modes=modes)
 
     def request(self, request: FlightRequest) -> str | None:
         """Grant a request and return None, or return why it is refused; then nothing has changed."""
         refusal = self._try(request)
-        if refusal is None and isinstance(request, Land):
+        if refusal is None and request is Order.LAND:
             self.plan.clear()
-        elif refusal is None and isinstance(request, MoveTo | Follow):
+        elif refusal is None and not isinstance(request, Order):
             self.plan.overrule()
         return refusal
 
@@ -152,7 +150,6 @@ class Engagement:
         self.plan.start_at(plan_step)
 
     def snapshot(self) -> State | None:
-        """Return the whole state, without the last gate, as plain values; None if the law has none."""
         law = self.law.snapshot()
         if law is None:
             return None
@@ -194,39 +191,43 @@ class Engagement:
         return None
 
     def _grant(self, request: FlightRequest, gate: GateInput) -> None:
-        if isinstance(request, TakeOff):
-            self._grant_take_off(gate)
-        elif isinstance(request, Engage):
-            self._grant_engage(gate)
-        elif isinstance(request, Land):
+        if request is Order.TAKE_OFF:
+            if self._phase != "idle":
+                raise RefusalError(f"phase is {self.phase}; take-off is possible when idle")
+            if fault := self.check.take_off_fault(gate):
+                raise RefusalError(fault)
+            self._phase = "taking_off"
+            self._modes.clear()
+        elif request is Order.ENGAGE:
+            self._grant_engagement(gate)
+        elif request is Order.LAND:
             if self._phase == "idle" and gate.down:
                 raise RefusalError("all drones are on the ground")
             self._phase, self._landing_s, self._places = "landing", gate.t_s, None
             self._modes.clear()
-        elif isinstance(request, Rejoin):
-            self._grant_rejoin(gate)
-        elif isinstance(request, Pause) and self._places is not None:
+        elif request is Order.REJOIN:
+            if self._phase != "engaged" or not self._fault:
+                raise RefusalError(f"phase is {self.phase}; possible when held by a fault")
+            if fault := self._unflyable(gate):
+                raise RefusalError(fault)
+            c = self._checked if self._checked.size else self.guidance.value(gate.t_s)[0]
+            if fault := formation_fault(self.space, c, self.gains, SHAPE_IN_FLIGHT):
+                raise RefusalError(fault)
+            self._places = self._places_at(self.space.inverse(c)[0])
+        elif request is Order.PAUSE and self._places is not None:
             self._places = None
         elif self._phase != "engaged":
             raise RefusalError(f"phase is {self.phase}; possible when engaged")
         elif self._fault:
             raise RefusalError(self._fault)
-        elif isinstance(request, Pause):
+        elif isinstance(request, Order):
             self.guidance.pause(gate.t_s)
         elif isinstance(request, MoveTo):
             self.guidance.target(request, gate.t_s)
         else:
             self.guidance.follow(request, gate.t_s)
 
-    def _grant_take_off(self, gate: GateInput) -> None:
-        if self._phase != "idle":
-            raise RefusalError(f"phase is {self.phase}; take-off is possible when idle")
-        if fault := self.check.take_off_fault(gate):
-            raise RefusalError(fault)
-        self._phase = "taking_off"
-        self._modes.clear()
-
-    def _grant_engage(self, gate: GateInput) -> None:
+    def _grant_engagement(self, gate: GateInput) -> None:
         if self._phase == "engaged" and self.guidance.paused and not self._fault:
             self.guidance.resume(gate.t_s)
             return
@@ -240,74 +241,71 @@ class Engagement:
         self._fault = ""
         self._phase = "engaged"
 
-    def _grant_rejoin(self, gate: GateInput) -> None:
-        if self._phase != "engaged" or not self._fault:
-            raise RefusalError(f"phase is {self.phase}; possible when held by a fault")
-        if fault := self._unflyable(gate):
-            raise RefusalError(fault)
-        c = self._checked if self._checked.size else self.guidance.value(gate.t_s)[0]
-        if fault := formation_fault(self.space, c, self.gains, self.limits.shape_in_flight):
-            raise RefusalError(fault)
-        self._places = self._places_at(self.space.inverse(c)[0])
-
     def _places_at(self, p_W: Array) -> Places:
-        return Places(p_W, self.gains, self._held_limits, self.limits.shape.share)
+        return Places(p_W, self.gains, self._held_limits, SHAPE.share)
 
     def _unflyable(self, gate: GateInput) -> str | None:
         """Return why the drones cannot be led one by one."""
         return self.check.state_fault(gate, AIRBORNE) or self.check.estimate_fault(gate)
 
     def _mode_commands(self, gate: GateInput, mode: str, states: frozenset[str]) -> tuple[ModeCommand, ...]:
-        """Return a mode command for each drone in one of the states, once per resend_s."""
+        """Return a mode command for each drone in one of the states, once per RESEND_S."""
         due = []
         for drone, state in zip(self.drones, gate.states, strict=True):
-            if state in states and gate.t_s - self._modes.get(drone, -math.inf) >= self.limits.resend_s:
+            if state in states and gate.t_s - self._modes.get(drone, -math.inf) >= RESEND_S:
                 self._modes[drone] = gate.t_s
                 due.append(ModeCommand(drone, mode))
         return tuple(due)
 
-    def _climb(self, gate: GateInput, reason: str, modes: tuple[ModeCommand, ...] = ()) -> GateOutput:
+    def _climb(self, gate: GateInput) -> GateOutput:
         """Lead the drones that fly straight up to the assembly height, each by its own velocity loop."""
-        below_m = self.limits.assembly_height_m - gate.p_W[:, 2]
-        climb_m_s = np.minimum(np.maximum(CLIMB_GAIN_1_S * below_m, 0.0), self.limits.assembly_climb_m_s)
+        modes: tuple[ModeCommand, ...] = ()
+        reason = self.check.state_fault(gate, AIRBORNE) if self._phase == "taking_off" else None
+        if reason:
+            modes = self._mode_commands(gate, "takeoff", frozenset({"landed"}))
+        else:
+            self._phase = "assembling"
+            reason = self.check.engagement_fault(gate) or READY_TO_ENGAGE
+        below_m = ASSEMBLY_HEIGHT_M - gate.p_W[:, 2]
+        climb_m_s = np.minimum(np.maximum(CLIMB_GAIN_1_S * below_m, 0.0), ASSEMBLY_CLIMB_M_S)
         return self._output(gate, reason, modes=modes, command=self._upright(gate, climb_m_s, self.gains.limits))
-
-    def _land(self, gate: GateInput) -> GateOutput:
-        # A take-off sent just before may still be on its way: idle only after a while on the ground.
-        if gate.down and gate.t_s - self._landing_s >= self.limits.resend_s:
-            self._phase = "idle"
-        modes = self._mode_commands(gate, "land", AIRBORNE | {"taking_off"})
-        return self._output(gate, self.check.state_fault(gate, DOWN | {"landing"}) or "", modes=modes)
 
     def _judge(self, gate: GateInput) -> None:
         """Set the fault of an engaged formation, or clear it when all has been well for a while."""
         fault = self._way_fault(gate) or self.check.flight_fault(gate)
-        fault = fault or (None if self._fault else self._reference_fault(gate.t_s))
+        if not fault and not self._fault:  # the checks before the flight cover a limited time of the reference
+            try:
+                c_des = self.guidance.value(gate.t_s)[0]
+                if c_des is not self._checked:
+                    fault = place_fault(self.space, c_des, self.gains, SHAPE)
+                    self._checked = self._checked if fault else c_des
+            except REFUSALS as error:
+                fault = str(error)
+            fault = f"reference: {fault}" if fault else None
         if fault:
             self._fault, self._well_since_s = fault, math.inf
         elif self._fault:
             self._well_since_s = min(self._well_since_s, gate.t_s)
-            if gate.t_s - self._well_since_s >= self.limits.heal_s:
-                self._heal(gate)
+            if gate.t_s - self._well_since_s < HEAL_S:
+                return
+            try:
+                self.guidance.rejoin(self.check.value, gate.t_s)
+            except REFUSALS as refusal:
+                self._fault, self._well_since_s = f"cannot go on: {refusal}", gate.t_s
+            else:
+                self._fault, self._places = "", None
+                self.law.reset()
 
-    def _heal(self, gate: GateInput) -> None:
-        try:
-            self.guidance.rejoin(self.check.value, gate.t_s, self.limits.shape_in_flight)
-        except REFUSALS as refusal:
-            self._fault, self._well_since_s = f"cannot go on: {refusal}", gate.t_s
-        else:
-            self._fault, self._places = "", None
-            self.law.reset()
-
-    def _reference_fault(self, t_s: float) -> str | None:
-        """Return why the reference may not be flown now: the checks before the flight cover a limited time."""
-        try:
-            c_des = self.guidance.value(t_s)[0]
-            fault = None if c_des is self._checked else place_fault(self.space, c_des, self.gains, self.limits.shape)
-            self._checked = self._checked if fault else c_des
-        except REFUSALS as error:
-            fault = str(error)
-        return f"reference: {fault}" if fault else None
+    def _way_fault(self, gate: GateInput) -> str | None:
+        """Return which drone is not in its place yet, while they are led; a drone that cannot be flown ends that."""
+        if self._places is None:
+            return None
+        if self._unflyable(gate):
+            self._places = None
+            return None
+        i, away_m = self._places.farthest(gate.p_W)
+        place = f"{self.drones[i]} is {away_m:.1f} m from its place; allowed: {IN_PLACE_M:g} m"
+        return f"{REJOINING}: {place}" if away_m > IN_PLACE_M else None
 
     def _fly(self, gate: GateInput) -> GateOutput:
         c_des, c_dot_des = self.guidance.value(gate.t_s)
@@ -328,17 +326,6 @@ class Engagement:
             command = FormationCommand(v_W, np.zeros(self.space.n), 1.0, guarded, alarmed)
         return self._output(gate, self._fault, command=command)
 
-    def _way_fault(self, gate: GateInput) -> str | None:
-        """Return which drone is not in its place yet, while they are led; a drone that cannot be flown ends that."""
-        if self._places is None:
-            return None
-        if self._unflyable(gate):
-            self._places = None
-            return None
-        i, away_m = self._places.farthest(gate.p_W)
-        place = f"{self.drones[i]} is {away_m:.1f} m from its place; allowed: {IN_PLACE_M:g} m"
-        return f"{REJOINING}: {place}" if away_m > IN_PLACE_M else None
-
     def _upright(self, gate: GateInput, climb_m_s: Array | float, limits: RobotLimits) -> FormationCommand:
         """Return a guarded climb (n,) without turning; rest where the estimates cannot be flown on."""
         v_W = np.zeros((self.space.n, 3))
@@ -358,9 +345,9 @@ class Engagement:
         reference: tuple[Array, Array] | None = None,
     ) -> GateOutput:
         """Return the output of a gate; without a reference the present value is the desired one."""
-        alarmed = command.alarmed if command else ()
-        if alarmed:
-            reason = f"{TOO_NEAR}, nearer than {self.gains.separation_alarm_m:g} m: {self._pairs(alarmed)}; {reason}"
+        if command and command.alarmed:
+            near = f"nearer than {self.gains.separation_alarm_m:g} m: {self._pairs(command.alarmed)}"
+            reason = f"{TOO_NEAR}, {near}; {reason}"
         if self.plan.note:
             reason = f"{reason}; {self.plan.note}" if reason else self.plan.note
         desired, desired_rate = reference or (self.check.value, np.zeros(self.space.size))
@@ -375,7 +362,6 @@ class Engagement:
             margin=self.check.margin,
             reason=reason,
             factor=command.factor if command else 1.0,
-            alarmed=alarmed,
             plan_step=self.plan.resume_at(engaged=self._phase == "engaged" and not self.guidance.paused),
         )
 

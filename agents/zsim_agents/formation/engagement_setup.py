@@ -1,10 +1,9 @@
 """The engagement that a scenario's cluster asks for: its space, gains, law and plan, rehearsed before the flight.
 
-A plan is judged before the flight from where the drones stand. In flight the guidance refuses what is beyond the
-limits, twice a second anew, and the formation hovers meanwhile. A plan that is certain to be refused to its end, or is
-over before any formation could begin it, is refused here, with the factor by which its time has to be stretched. Limits
-are a little wider than in flight, as the formation is never exactly where it was set down: cases between the two are
-left to the flight.
+A plan is judged before the flight from where the drones stand. One that is certain to be refused to its end in flight,
+or is over before any formation could begin it, is refused here, with the factor by which its time has to be stretched.
+Limits are a little wider than in flight, as the formation is never exactly where it was set down: cases between the two
+are left to the flight, in which the guidance refuses them, twice a second anew, and the formation hovers meanwhile.
 """
 
 from __future__ import annotations
@@ -30,6 +29,9 @@ from zsim_agents.formation.control_law import (
 )
 from zsim_agents.formation.engagement import Engagement
 from zsim_agents.formation.flight_check import (
+    ASSEMBLY_HEIGHT_M,
+    SHAPE,
+    SHAPE_IN_FLIGHT,
     EngagementLimits,
     GateInput,
     all_near,
@@ -57,11 +59,7 @@ STEP_S, STEPS_MIN, STEPS_MAX = 0.1, 41, 3001  # of a reference that is sampled
 
 
 def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
-    """Return the phase machine that one of a scenario's clusters asks for.
-
-    Raises:
-        RunError: the plan can never be flown, with the reason.
-    """
+    """Return the phase machine of a cluster; raises RunError where its plan can never be flown."""
     with _refusals_of(scenario, cluster):
         space, gains = scenario_space(scenario, cluster), gains_of(cluster.gains)
         name = cluster.law or "proportional"
@@ -78,11 +76,7 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
 
 
 def check_plan(scenario: Scenario, cluster: Cluster) -> None:
-    """Refuse a plan that `engagement_of` refuses; no law is rehearsed.
-
-    Raises:
-        RunError: the plan can never be flown, with the reason.
-    """
+    """Refuse a plan that `engagement_of` refuses, by a RunError; no law is rehearsed."""
     with _refusals_of(scenario, cluster):
         space = scenario_space(scenario, cluster)
         FlightPlan(space, plan_of(cluster))
@@ -113,13 +107,10 @@ def _rehearse(
     space: ClusterSpace, gains: FormationGains, law: Callable[[ClusterSpace, FormationGains], ControlLaw]
 ) -> None:
     """Fly a gate of another formation: code is compiled, or loaded, here and not in flight."""
-    c = space.specimen(max(gains.separation_min_m, APART_M))
-    p_W, yaw = space.inverse(c)
-    c = space.forward(p_W, yaw)
-    none = np.zeros((space.n, 3))
+    p_W, yaw = space.inverse(space.specimen(max(gains.separation_min_m, APART_M)))
+    c, none, still = space.forward(p_W, yaw), np.zeros((space.n, 3)), np.zeros(space.n)
     rehearsal = Engagement(space, [f"robot {i + 1}" for i in range(space.n)], gains, law=law)
     rehearsal.warm_start("engaged", c)
-    still = np.zeros(space.n)
     rehearsal.step(GateInput(0.0, p_W, yaw, none, none, still, still, ("flying",) * space.n))
     ramp_onto(space, c, c, Hold(c), 0.0, 2.0).value(1.0)
     all_near(p_W, yaw)
@@ -129,7 +120,6 @@ def _rehearse(
 
 
 def gains_of(gains: Gains) -> FormationGains:
-    """Return the control law's gains in SI units."""
     return FormationGains(
         k_1_s=gains.proportional_1_s,
         integral_1_s2=gains.integral_1_s2,
@@ -142,11 +132,7 @@ def gains_of(gains: Gains) -> FormationGains:
 
 
 def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, gains: FormationGains) -> None:
-    """Refuse a plan that these drones cannot fly; without a valid formation at the start it is not judged.
-
-    Raises:
-        PlanError: names the step, its demand, and what is possible.
-    """
+    """Refuse, by a PlanError, a plan that these drones cannot fly; without a valid formation at the start none."""
     plan = cluster.plan
     if plan.takeoff_s is None or not (plan.target or plan.trajectory):
         return
@@ -156,8 +142,14 @@ def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, ga
         what = "trajectory" if plan.trajectory else "target"
         reason = f"the {what} of the plan begins at {begins_s:g} s at the earliest"
         raise PlanError(f"plan.land_s is {plan.land_s:g}; must be later: {reason}")
-    start = _formation_at_start(scenario, cluster, space)
-    if start is None:
+    drones = [scenario.drone(name) for name in cluster.drones]
+    p_W = np.array([drone.position_m for drone in drones], float)
+    p_W[:, 2] += ASSEMBLY_HEIGHT_M  # above their starting places
+    try:
+        start = space.forward(p_W, np.radians([drone.yaw_deg for drone in drones]))
+    except SingularClusterError:
+        return
+    if shape_fault(space, start, SHAPE):
         return
     rehearsal = _Rehearsal(scenario, cluster, space, gains)
     goal = start.copy()
@@ -175,45 +167,25 @@ def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, ga
             raise PlanError(f"{step.path}: {error}") from None
 
 
-def _formation_at_start(scenario: Scenario, cluster: Cluster, space: ClusterSpace) -> Array | None:
-    """Return the variables (4n,) of the drones above their starting places; None where they form none."""
-    drones = [scenario.drone(name) for name in cluster.drones]
-    p_W = np.array([drone.position_m for drone in drones], float)
-    p_W[:, 2] += EngagementLimits().assembly_height_m
-    try:
-        c = space.forward(p_W, np.radians([drone.yaw_deg for drone in drones]))
-        return None if shape_fault(space, c, EngagementLimits().shape) else c
-    except SingularClusterError:
-        return None
-
-
 class _Rehearsal:
     """Checks the ways of a plan against the limits of formation, controller and drones."""
 
     def __init__(self, scenario: Scenario, cluster: Cluster, space: ClusterSpace, gains: FormationGains) -> None:
-        limits = EngagementLimits()
-        self._space = space
-        self._share = limits.shape.share
+        self._space, self._share = space, SHAPE.share
         self._drones = [(name, scenario.drone(name).limits) for name in cluster.drones]
-        own = [each for _, each in self._drones]
-        asked = gains.limits
-        self._limits: RobotLimits = asked._replace(
-            speed_max_m_s=min(asked.speed_max_m_s, *(each.horizontal_speed_m_s for each in own)),
-            climb_max_m_s=min(asked.climb_max_m_s, *(each.vertical_speed_m_s for each in own)),
-            yaw_rate_max_rad_s=min(asked.yaw_rate_max_rad_s, *(math.radians(each.yaw_rate_deg_s) for each in own)),
+        of_drones = [each for _, each in self._drones]
+        self._limits: RobotLimits = gains.limits._replace(
+            speed_max_m_s=min(gains.speed_max_m_s, *(each.horizontal_speed_m_s for each in of_drones)),
+            climb_max_m_s=min(gains.climb_max_m_s, *(each.vertical_speed_m_s for each in of_drones)),
+            yaw_rate_max_rad_s=min(gains.yaw_rate_max_rad_s, *(math.radians(e.yaw_rate_deg_s) for e in of_drones)),
         )
-        in_flight = limits.shape_in_flight
         wide = replace(gains, separation_min_m=NEAR_ROOM * gains.separation_min_m)
-        self._wide = wide, replace(in_flight, height_min_m=NEAR_ROOM * in_flight.height_min_m)
-        self._exact = gains, limits.shape
-        self._planner = RampPlanner(space, gains, limits.shape)
+        self._wide = wide, replace(SHAPE_IN_FLIGHT, height_min_m=NEAR_ROOM * SHAPE.height_min_m)
+        self._exact = gains, SHAPE
+        self._planner = RampPlanner(space, gains, SHAPE)
 
     def check_target(self, start: Array, goal: Array, over_s: float | None) -> None:
-        """Refuse a target that is not allowed, or too far for its time.
-
-        Raises:
-            PlanError: with the factor; TrajectoryError: it is out of reach.
-        """
+        """Refuse a target that is not allowed, or too far for its time: PlanError, or TrajectoryError out of reach."""
         if fault := self._fault_at(goal):
             raise PlanError(f"plan.target: {fault}")
         home, rest = Hold(goal), np.zeros_like(start)
@@ -229,11 +201,7 @@ class _Rehearsal:
             )
 
     def check_trajectory(self, start: Array, trajectory: Reference, start_s: float, ready_s: float) -> None:
-        """Refuse a trajectory that is too fast, leads through a place that is not allowed, or is over too soon.
-
-        Raises:
-            PlanError: with the factor, or the earliest time; TrajectoryError: it is out of reach.
-        """
+        """Refuse a trajectory that is too fast, leads through a place that is not allowed, or is over too soon."""
         length_s = trajectory.duration_s
         end_s = start_s + (math.inf if length_s is None else length_s)
         if end_s <= ready_s:

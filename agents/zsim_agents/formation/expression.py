@@ -23,12 +23,7 @@ CONSTANTS = {"pi": math.pi, "e": math.e}
 
 
 class ExpressionError(ValueError):
-    """An expression is not allowed or has no finite value; the message names variable, finding and remedy.
-
-    Attributes:
-        name: of the variable, empty where the fault is not in one expression.
-        finding: the fault without the name.
-    """
+    """An expression is not allowed or has no finite value; the message names variable, finding and remedy."""
 
     def __init__(self, finding: str, name: str = "") -> None:
         super().__init__(f"{name}: {finding}" if name else finding)
@@ -37,12 +32,9 @@ class ExpressionError(ValueError):
 
 
 class Expression:
-    """A function of t with its exact first derivative.
+    """A function of t with its exact first derivative, by the name of the variable that it describes.
 
-    Args:
-        name: the variable that it describes, for messages.
-        text: for example "5*cos(2*pi*f*t)".
-        constants: user constants by name, such as {"f": 0.01}.
+    The text is for example "5*cos(2*pi*f*t)", with user constants such as {"f": 0.01}.
 
     Raises:
         ExpressionError: the text is not an expression of t in numbers, + - * / **, constants and functions.
@@ -55,11 +47,7 @@ class Expression:
         self._evaluate, self.constant = self._build(self._parse(), 0)
 
     def __call__(self, t_s: float) -> Dual:
-        """Return value and rate per second at t_s.
-
-        Raises:
-            ExpressionError: one of them is not finite there.
-        """
+        """Return value and rate per second at t_s; ExpressionError: one of them is not finite there."""
         try:
             value, rate = self._evaluate(t_s)
         except (ArithmeticError, ValueError) as error:
@@ -112,7 +100,13 @@ class Expression:
         nodes = [self._build(tree, depth + 1) for tree in trees]
         parts = [evaluate for evaluate, _ in nodes]
         if all(constant for _, constant in nodes):
-            return self._folded(function, [part(0.0) for part in parts])
+            try:
+                value, _ = function(*(part(0.0) for part in parts))
+            except (ArithmeticError, ValueError) as error:
+                raise self._error(f"has a constant part without a value ({error})") from None
+            if not math.isfinite(value):
+                raise self._error(f"has a constant part of value {value}; allowed: finite values")
+            return _constant(value)
         if len(parts) == 1:
             (only,) = parts
             return lambda t: function(only(t)), False
@@ -120,15 +114,6 @@ class Expression:
             left, right = parts
             return lambda t: function(left(t), right(t)), False
         return lambda t: function(*[part(t) for part in parts]), False
-
-    def _folded(self, function: Callable[..., Dual], arguments: list[Dual]) -> Node:
-        try:
-            value, _ = function(*arguments)
-        except (ArithmeticError, ValueError) as error:
-            raise self._error(f"has a constant part without a value ({error})") from None
-        if not math.isfinite(value):
-            raise self._error(f"has a constant part of value {value}; allowed: finite values")
-        return _constant(value)
 
     def _source(self, tree: ast.expr) -> str:
         return (ast.get_source_segment(self.text.strip(), tree) or "")[:40]
@@ -141,18 +126,14 @@ class Expression:
 
 
 def checked_constants(constants: Mapping[str, float]) -> dict[str, float]:
-    """Return the constants as floats.
-
-    Raises:
-        ExpressionError: there are too many; a name is taken, too long or no identifier; a value is no finite number.
-    """
+    """Return the constants as floats; ExpressionError: too many, a name or value that is not allowed."""
     if len(constants) > CONSTANTS_MAX:
         raise ExpressionError(f"constants: found {len(constants)}; allowed: at most {CONSTANTS_MAX}")
-    taken = ["t", *CONSTANTS, *_FUNCTIONS]
+    reserved = ["t", *CONSTANTS, *_FUNCTIONS]
     for name, value in constants.items():
         is_name = isinstance(name, str) and len(name) <= NAME_MAX and name.isidentifier()
-        if not is_name or name in taken:
-            allowed = f"an identifier of at most {NAME_MAX} characters except {', '.join(taken)}"
+        if not is_name or name in reserved:
+            allowed = f"an identifier of at most {NAME_MAX} characters except {', '.join(reserved)}"
             raise ExpressionError(f"constant {str(name)[:40]!r}: not a free name; allowed: {allowed}")
         if finite_number(value) is None:
             raise ExpressionError(f"constant {name}: found {str(value)[:40]!r}; allowed: a finite number")

@@ -1,6 +1,5 @@
 """Whether a formation may take off, be engaged, flown on, and where it may be led: every fault in words.
 
-Order of this file: limits, input and output of the phase machine at a gate, checks of a gate, checks of a reference.
 The data of a gate are Structs, which take a fifth of the time of a named tuple or dataclass.
 """
 
@@ -9,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -50,50 +49,36 @@ class ShapeLimits:
     share: float = 0.8  # chosen
 
 
+# All chosen, the shape's so that no formation comes near a singularity
+SHAPE = ShapeLimits()
+FLIGHT_SLACK = 1.5  # of spread and tilt in flight, so that noise at the limit does not hold the formation
+SHAPE_IN_FLIGHT = dataclasses.replace(  # beyond it a formation in flight is held
+    SHAPE,
+    spread_min_m=SHAPE.spread_min_m / FLIGHT_SLACK,
+    tilt_max_rad=SHAPE.tilt_max_rad * FLIGHT_SLACK,
+    condition_max=math.inf,
+)
+ASSEMBLY_HEIGHT_M = 1.5  # to which drones climb straight up before engagement: many rotor radii, and a fall withstood
+ASSEMBLY_WITHIN_M = 0.3  # three sigma of the barometer
+ASSEMBLY_CLIMB_M_S = 0.5  # greatest: half of what the firmware allows, so that all drones climb equally
+AGE_MAX_S = 0.5  # of an estimate that is flown on, as long as the firmware tolerates silence: 25 gates
+IN_FLIGHT_FACTOR = 2.0  # by which sigmas may be greater in flight; of a position: 2 m, as of a single GPS fix
+HEAL_S = 0.5  # without fault, after which a held formation goes on: 25 gates are no coincidence
+RESEND_S = 1.0  # after which a mode command without effect is sent again: ten times their delay in the paper's scenario
+
+
 @dataclass(frozen=True)
 class EngagementLimits:
-    """Limits and heights of the phase machine; all chosen, `shape` so that no formation comes near a singularity.
+    """Greatest standard deviations for take-off and engagement."""
 
-    Attributes:
-        shape: where a formation may be engaged and led.
-        flight_slack: in flight the spread may fall to its limit over this, the tilt grow to its limit times this.
-        assembly_height_m: height to which drones climb straight up before engagement, within assembly_within_m.
-        assembly_climb_m_s: greatest speed of that climb.
-        age_max_s: oldest estimate that is flown on.
-        sigma_max_m, yaw_sigma_max_rad: greatest sigma of position and heading for take-off and engagement.
-        in_flight_factor: by which both may be greater in flight.
-        heal_s: time without fault after which a held formation goes on.
-        resend_s: time after which a mode command without effect is sent again.
-    """
-
-    shape: ShapeLimits = field(default_factory=ShapeLimits)
-    flight_slack: float = 1.5  # so that noise at the limit does not hold the formation
-    assembly_height_m: float = 1.5  # many rotor radii over the ground, and a fall that the hull withstands
-    assembly_within_m: float = 0.3  # three sigma of the barometer
-    assembly_climb_m_s: float = 0.5  # half of what the firmware allows: all drones climb equally
-    age_max_s: float = 0.5  # as long as the firmware tolerates silence: 25 gates
     sigma_max_m: float = 1.0  # half of the least separation of 2 m
     yaw_sigma_max_rad: float = math.radians(15.0)  # half of the 30 deg at which three sigma turn a velocity by 90 deg
-    in_flight_factor: float = 2.0  # of a position: 2 m, as of a single GPS fix
-    heal_s: float = 0.5  # 25 gates without a fault are no coincidence
-    resend_s: float = 1.0  # ten times the delay of commands in the paper's scenario, 100 ms
-
-    @property
-    def shape_in_flight(self) -> ShapeLimits:
-        """Wider limits beyond which a formation in flight is held."""
-        return dataclasses.replace(
-            self.shape,
-            spread_min_m=self.shape.spread_min_m / self.flight_slack,
-            tilt_max_rad=self.shape.tilt_max_rad * self.flight_slack,
-            condition_max=math.inf,
-        )
 
 
 class GateInput(Struct, eq=False):
     """The newest estimates of n drones at a gate; its arrays may be overwritten for the next.
 
     Attributes:
-        t_s: simulated time.
         p_W, v_W: (n, 3) [m, m/s]; yaw: (n,) [rad]; non-finite where nothing is known.
         sigma_m: (n, 3) standard deviations of position; yaw_sigma: (n,) of the heading [rad].
         age_s: (n,) ages of the estimates; infinite where there is none.
@@ -110,16 +95,13 @@ class GateInput(Struct, eq=False):
     states: tuple[str, ...]
 
     @property
-    def down(self) -> bool:
-        """Whether no drone is in the air."""
+    def down(self) -> bool:  # no drone is in the air
         return DOWN.issuperset(self.states)
 
 
 class ModeCommand(NamedTuple):
-    """A mode command for one drone: takeoff or land."""
-
     drone: str
-    mode: str
+    mode: str  # takeoff or land
 
 
 class Setpoint(Struct, eq=False):
@@ -141,12 +123,10 @@ class GateOutput(Struct, eq=False):
     """Commands of a gate, and the fields of the cluster's state message.
 
     Attributes:
-        modes: mode commands to send.
         setpoints: (n,) velocity commands, None for no command.
         phase, value, desired, desired_rate, trajectory_t_s, margin, reason, plan_step: as in the message; value and
             desired with wrapped angles.
         factor: common factor of the saturation, 1 where nothing is saturated.
-        alarmed: pairs of drone indices that are nearer than the alarm threshold.
     """
 
     modes: tuple[ModeCommand, ...]
@@ -159,7 +139,6 @@ class GateOutput(Struct, eq=False):
     margin: float
     reason: str
     factor: float
-    alarmed: tuple[tuple[int, int], ...]
     plan_step: int
 
 
@@ -168,23 +147,22 @@ class FlightCheck:
 
     Attributes:
         value: (4n,) cluster of the newest estimates that had a frame, zero before any.
-        margin: its distance to singularity [m] (`ClusterSpace.margin`), 0 while the estimates have no frame.
+        margin: its `ClusterSpace.margin`, 0 while the estimates have no frame.
     """
 
     def __init__(
         self, space: ClusterSpace, drones: tuple[str, ...], gains: FormationGains, limits: EngagementLimits
     ) -> None:
         self.space, self.drones, self.gains, self.limits = space, drones, gains, limits
-        self._shape_in_flight = limits.shape_in_flight
-        self._bounds_in_flight = bounds_of(space, self._shape_in_flight)
+        self._bounds_in_flight = bounds_of(space, SHAPE_IN_FLIGHT)
         self.value: Array = np.zeros(space.size)
         self.margin = 0.0
         self._spread = 0.0
         self._no_frame: str | None = "nothing was observed yet"
         self._flaw = (VALID, 0)  # of the estimates of the gate that was observed, by the limits in flight
         sigmas = limits.sigma_max_m, limits.yaw_sigma_max_rad
-        self._at_start = (limits.age_max_s, *sigmas)
-        self._in_flight = (limits.age_max_s, *(limits.in_flight_factor * sigma for sigma in sigmas))
+        self._at_start = (AGE_MAX_S, *sigmas)
+        self._in_flight = (AGE_MAX_S, *(IN_FLIGHT_FACTOR * sigma for sigma in sigmas))
 
     def observe(self, gate: GateInput) -> None:
         self.margin, self._no_frame = 0.0, "an estimate is not finite"
@@ -200,15 +178,14 @@ class FlightCheck:
 
     def take_off_fault(self, gate: GateInput) -> str | None:
         """Return why the drones may not take off; drones that fly already need not stand well."""
-        fault = self.state_fault(gate, AIRBORNE | {"landed"}) or self._start_fault(gate)
+        fault = self._start_fault(gate, AIRBORNE | {"landed"})
         return fault or (self.formation_fault(gate) if "landed" in gate.states else None)
 
     def engagement_fault(self, gate: GateInput) -> str | None:
-        fault = self.state_fault(gate, AIRBORNE) or self._start_fault(gate)
-        if fault:
+        if fault := self._start_fault(gate, AIRBORNE):
             return fault
         low = int(np.argmin(gate.p_W[:, 2]))
-        least_m = self.limits.assembly_height_m - self.limits.assembly_within_m
+        least_m = ASSEMBLY_HEIGHT_M - ASSEMBLY_WITHIN_M
         if gate.p_W[low, 2] < least_m:
             return f"{self.drones[low]} is at z = {gate.p_W[low, 2]:.2f} m; allowed: {least_m:.2f} m or more"
         return self.formation_fault(gate)
@@ -216,14 +193,14 @@ class FlightCheck:
     def flight_fault(self, gate: GateInput) -> str | None:
         """Return why the loop of an engaged formation cannot be closed."""
         fault = self.state_fault(gate, AIRBORNE) or self.estimate_fault(gate) or self._no_frame
-        shape = self._shape_in_flight
-        if fault or (self._spread > shape.spread_min_m and first_outside(self.value, self._bounds_in_flight) < 0):
+        is_wide = self._spread > SHAPE_IN_FLIGHT.spread_min_m
+        if fault or (is_wide and first_outside(self.value, self._bounds_in_flight) < 0):
             return fault
-        return shape_fault(self.space, self.value, shape, self._spread)
+        return shape_fault(self.space, self.value, SHAPE_IN_FLIGHT, self._spread)
 
     def formation_fault(self, gate: GateInput) -> str | None:
         """Return why the robots, where they are, are no formation to start from."""
-        fault = self._no_frame or shape_fault(self.space, self.value, self.limits.shape, self._spread)
+        fault = self._no_frame or shape_fault(self.space, self.value, SHAPE, self._spread)
         if fault:
             return fault
         distance, i, j = closest_pair(gate.p_W)
@@ -234,7 +211,7 @@ class FlightCheck:
 
     def estimate_fault(self, gate: GateInput) -> str | None:
         """Return why the estimates of drones in flight, at the observed gate, cannot be flown on."""
-        return self._flaw_text(gate, self._flaw, self.limits.in_flight_factor)
+        return self._flaw_text(gate, self._flaw, IN_FLIGHT_FACTOR)
 
     def state_fault(self, gate: GateInput, allowed: frozenset[str]) -> str | None:
         """Return which drone is in another state than those allowed."""
@@ -243,16 +220,16 @@ class FlightCheck:
         drone, state = next(pair for pair in zip(self.drones, gate.states, strict=True) if pair[1] not in allowed)
         return f"{drone} is in state {state}; allowed: {', '.join(sorted(allowed))}"
 
-    def _start_fault(self, gate: GateInput) -> str | None:
-        return self._flaw_text(gate, _first_flaw(gate, *self._at_start))
+    def _start_fault(self, gate: GateInput, allowed: frozenset[str]) -> str | None:
+        return self.state_fault(gate, allowed) or self._flaw_text(gate, _first_flaw(gate, *self._at_start))
 
     def _flaw_text(self, gate: GateInput, flaw: tuple[int, int], factor: float = 1.0) -> str | None:
         kind, i = flaw
         if kind == VALID:
             return None
-        drone, age_max_s = self.drones[i], self.limits.age_max_s
+        drone = self.drones[i]
         if kind == STALE:
-            return f"the estimate of {drone} is {gate.age_s[i]:.2f} s old; allowed: {age_max_s:g} s"
+            return f"the estimate of {drone} is {gate.age_s[i]:.2f} s old; allowed: {AGE_MAX_S:g} s"
         if kind == NOT_FINITE:
             return f"the estimate of {drone} is not finite; allowed: up to {FAR:g} m, m/s or rad"
         if kind == TURNED:
@@ -269,7 +246,7 @@ def _first_flaw(gate: GateInput, age_max_s: float, sigma_max_m: float, yaw_sigma
 
 @portable
 def all_near(p_W: Array, yaw: Array) -> bool:
-    """Return whether all positions (n, 3) and headings (n,) are finite and below FAR."""
+    """Tell whether all positions (n, 3) and headings (n,) are finite and below FAR."""
     fit = True
     for i in range(yaw.size):
         fit = fit and near(p_W, i) and abs(yaw[i]) < FAR
@@ -278,7 +255,7 @@ def all_near(p_W: Array, yaw: Array) -> bool:
 
 @portable
 def near(vectors: Array, i: int) -> bool:
-    """Return whether row i of (n, 3) is finite and below FAR; false for NaN."""
+    """Tell whether row i of (n, 3) is finite and below FAR."""
     return abs(vectors[i, 0]) < FAR and abs(vectors[i, 1]) < FAR and abs(vectors[i, 2]) < FAR
 
 
@@ -294,9 +271,9 @@ def estimate_flaw(
     sigma_max_m: float,
     yaw_sigma_max: float,
 ) -> tuple[int, int]:
-    """Return the flaw of the first unusable estimate (STALE, NOT_FINITE, UNCERTAIN, TURNED), and its drone; else VALID.
+    """Return the flaw of the first unusable estimate, and its drone; VALID if there is none.
 
-    UNCERTAIN: of the position; TURNED: of the heading.
+    UNCERTAIN is of the position, TURNED of the heading.
     """
     for i in range(yaw.size):
         if not age_s[i] <= age_max_s:
@@ -312,10 +289,7 @@ def estimate_flaw(
 
 
 def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits, spread: float | None = None) -> str | None:
-    """Return why c is no shape to engage in or to lead to, or None; names quantity, value and limit.
-
-    `spread` of c is passed where it is known.
-    """
+    """Return why c, whose spread may be known, is no shape to engage in or to lead to: quantity, value and limit."""
     outside = first_outside(c, space.bounds)
     if outside >= 0:
         name, value, (low, high) = space.names[outside], float(c[outside]), space.bounds[outside].tolist()
@@ -328,9 +302,8 @@ def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits, spread: floa
     for k in space.tilts:
         if abs(c[k]) >= limits.tilt_max_rad:
             tilt_deg, most_deg = math.degrees(c[k]), math.degrees(limits.tilt_max_rad)
-            return (
-                f"{space.names[k]} of the formation is {tilt_deg:.1f} deg; allowed: below {most_deg:g} deg either way"
-            )
+            tilt = f"{space.names[k]} of the formation is {tilt_deg:.1f} deg"
+            return f"{tilt}; allowed: below {most_deg:g} deg either way"
     condition = space.condition(c) if math.isfinite(limits.condition_max) else 0.0
     if not condition < limits.condition_max:
         return f"condition number of J^-1 is {condition:.1f}; allowed: below {limits.condition_max:g}"
@@ -361,7 +334,7 @@ def formation_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits
 
 
 def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
-    """Return why the robots may not be where c puts them (too near to each other, too low), or None."""
+    """Return why the robots may not be where c puts them: too near to each other, or too low."""
     p_W, _ = space.inverse(c)
     if well_placed(p_W, gains.separation_min_m, limits.height_min_m):
         return None
@@ -379,7 +352,6 @@ def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: Sh
 
 @portable
 def well_placed(p_W: Array, separation_min_m: float, height_min_m: float) -> bool:
-    """Return whether robots at p_W (n, 3) are neither too near to each other nor too low."""
     fit = closest_pair(p_W)[0] >= separation_min_m - ROUNDING_M
     for i in range(p_W.shape[0]):
         fit = fit and p_W[i, 2] >= height_min_m - ROUNDING_M

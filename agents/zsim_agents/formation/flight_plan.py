@@ -1,13 +1,11 @@
-"""Requests to a formation by a user or a scenario, and the plan of a scenario: requests and when they are due.
-
-Order of this file: requests, the plan, how requests are read from the wire.
-"""
+"""Requests to a formation by a user or a scenario, and the plan of a scenario: requests and when they are due."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -40,34 +38,22 @@ class RequestError(ValueError):
     """A request cannot be understood; the message names the field, finding and remedy."""
 
 
-@dataclass(frozen=True)
-class TakeOff:
-    """Take all drones off and climb straight up to the assembly height."""
+REFUSALS = (RefusalError, TrajectoryError, ExpressionError, SingularClusterError)
 
 
-@dataclass(frozen=True)
-class Engage:
-    """Close the formation loop at the present estimate, or resume after a hold."""
+class Order(Enum):
+    """A request without parameters, by its name on the wire."""
 
-
-@dataclass(frozen=True)
-class Pause:
-    """Stand still in formation until engaged again; `hold` on the wire."""
-
-
-@dataclass(frozen=True)
-class Rejoin:
-    """Lead the drones of a formation held by a fault back to their places, each by itself; then it goes on."""
-
-
-@dataclass(frozen=True)
-class Land:
-    """Land all drones where they are."""
+    TAKE_OFF = "takeoff"  # all drones; they climb straight up to the assembly height
+    ENGAGE = "engage"  # close the formation loop at the present estimate, or resume after a hold
+    PAUSE = "hold"  # stand still in formation until engaged again
+    REJOIN = "rejoin"  # lead the drones of a formation held by a fault back to their places, each by itself
+    LAND = "land"  # all drones where they are
 
 
 @dataclass(frozen=True)
 class MoveTo:
-    """Move the formation to values by name, in over_s or as fast as the limits let it."""
+    """Move the formation to values by name, in over_s or as fast as the limits let it; `target` on the wire."""
 
     values: Mapping[str, str | float] = field(default_factory=dict)
     over_s: float | None = None
@@ -108,10 +94,7 @@ class Follow:
         return ExpressionTrajectory(space, self.expressions, base, self.constants, self.duration_s)
 
 
-FlightRequest = TakeOff | Engage | Pause | Rejoin | Land | MoveTo | Follow
-
-
-REFUSALS = (RefusalError, TrajectoryError, ExpressionError, SingularClusterError)
+FlightRequest = Order | MoveTo | Follow
 
 
 @dataclass(frozen=True)
@@ -127,7 +110,7 @@ class Scheduled:
 
 
 class FlightPlan:
-    """Requests in their order; each waits for those before it, except Land, which drops them.
+    """Requests in their order; each waits for those before it, except Order.LAND, which drops them.
 
     A restarted controller begins it where `resume_at` of the former one was.
 
@@ -139,7 +122,25 @@ class FlightPlan:
     """
 
     def __init__(self, space: ClusterSpace, steps: Sequence[Scheduled] = ()) -> None:
-        _check(space, steps)
+        base, earlier_s = np.zeros(space.size), 0.0
+        for step in steps:
+            if not earlier_s <= step.at_s < math.inf:
+                raise PlanError(f"{step.path} is {step.at_s:g}; allowed: {earlier_s:g} s or later")
+            earlier_s = step.at_s
+            try:
+                if isinstance(step.request, MoveTo):
+                    step.request.goal(space, base)
+                elif isinstance(step.request, Follow):
+                    step.request.trajectory(space, base).value(0.0)
+            except REFUSALS as error:
+                text, path = str(error), f"{step.path}: "
+                if isinstance(error, TrajectoryError):
+                    text = error.finding
+                    path = f"{step.path}{error.at}{' ' if text.startswith('is ') else ': '}"
+                elif isinstance(error, ExpressionError) and error.name:
+                    text = error.finding
+                    path = f"{step.path}{'.expressions' if step.path.endswith('trajectory') else ''}.{error.name}: "
+                raise PlanError(f"{path}{text}") from None
         self._steps = tuple(steps)
         self._next = 0  # first step that is not completed
         self._flown = 0  # first of the steps that make up the reference flown now, _next where none does
@@ -150,16 +151,17 @@ class FlightPlan:
         """Make the requests that are due at t_s."""
         for place in range(len(self._steps) - 1, self._next, -1):
             step = self._steps[place]
-            if step.at_s <= t_s and isinstance(step.request, Land):
+            if step.at_s <= t_s and step.request is Order.LAND:
                 self._go_to(place)
                 break
         while self._next < len(self._steps) and t_s >= max(self._steps[self._next].at_s, self._try_s):
             due = self._steps[self._next].request
             if refusal := request(due):
                 self._try_s = t_s + RETRY_S
-                self.note = f"{_OPS[type(due)]}{WAITS}{refusal}"
+                op = due.value if isinstance(due, Order) else "target" if isinstance(due, MoveTo) else "trajectory"
+                self.note = f"{op}{WAITS}{refusal}"
                 return
-            flown = self._flown if isinstance(due, MoveTo | Follow) else self._next + 1
+            flown = self._next + 1 if isinstance(due, Order) else self._flown
             self._go_to(self._next + 1, flown)
 
     def resume_at(self, engaged: bool) -> int:
@@ -200,47 +202,29 @@ def plan_of(cluster: Cluster) -> list[Scheduled]:
     """Return the steps of a cluster's plan in their order."""
     plan, steps = cluster.plan, []
     if plan.takeoff_s is not None:
-        steps += [Scheduled(plan.takeoff_s, each, "plan.takeoff_s") for each in (TakeOff(), Engage())]
+        steps += [Scheduled(plan.takeoff_s, each, "plan.takeoff_s") for each in (Order.TAKE_OFF, Order.ENGAGE)]
         if plan.target:
             steps.append(Scheduled(plan.takeoff_s, MoveTo(plan.target, plan.target_over_s), "plan.target"))
-        if plan.trajectory is not None:
-            trajectory = plan.trajectory
+        if trajectory := plan.trajectory:
             waypoints = [{"at_s": w.at_s, "values": w.values} for w in trajectory.waypoints]
-            follow = Follow(
-                expressions=trajectory.expressions,
-                constants=trajectory.constants,
-                waypoints=waypoints,
-                start_s=trajectory.start_s,
-            )
+            follow = Follow(trajectory.expressions, trajectory.constants, None, waypoints, trajectory.start_s)
             steps.append(Scheduled(plan.takeoff_s, follow, "plan.trajectory"))
     if plan.land_s is not None:
-        steps.append(Scheduled(plan.land_s, Land(), "plan.land_s"))
+        steps.append(Scheduled(plan.land_s, Order.LAND, "plan.land_s"))
     return steps
 
 
-def _check(space: ClusterSpace, steps: Sequence[Scheduled]) -> None:
-    base = np.zeros(space.size)
-    earlier_s = 0.0
-    for step in steps:
-        if not earlier_s <= step.at_s < math.inf:
-            raise PlanError(f"{step.path} is {step.at_s:g}; allowed: {earlier_s:g} s or later")
-        earlier_s = step.at_s
-        try:
-            if isinstance(step.request, MoveTo):
-                step.request.goal(space, base)
-            elif isinstance(step.request, Follow):
-                step.request.trajectory(space, base).value(0.0)
-        except REFUSALS as error:
-            raise PlanError(_located(step.path, error)) from None
-
-
-def _located(path: str, error: ValueError) -> str:
-    """Return the text of a refusal with the path of the refused value."""
-    if isinstance(error, TrajectoryError):
-        return f"{path}{error.at}{' ' if error.finding.startswith('is ') else ': '}{error.finding}"
-    if isinstance(error, ExpressionError) and error.name:
-        return f"{path}{'.expressions' if path.endswith('trajectory') else ''}.{error.name}: {error.finding}"
-    return f"{path}: {error}"
+_FIELDS = {  # of the requests with parameters, by their operation on the wire
+    "target": {"values": "a map of numbers by variable", "over_s": "a number of seconds"},
+    "trajectory": {
+        "expressions": "a map of expressions by variable",
+        "constants": "a map of numbers by name",
+        "duration_s": "a number of seconds",
+        "waypoints": "a list of waypoints",
+        "start_s": "a number of seconds",
+    },
+}
+OPERATIONS = (*(order.value for order in Order), *_FIELDS)
 
 
 def read_request(op: object, args: object = None) -> FlightRequest:
@@ -249,45 +233,22 @@ def read_request(op: object, args: object = None) -> FlightRequest:
     Raises:
         RequestError: unknown operation or field, or a field of a wrong type.
     """
-    if not isinstance(op, str) or op not in _READERS:
-        raise RequestError(f"op {str(op)[:40]!r} is unknown; allowed: {', '.join(_READERS)}")
-    build, fields = _READERS[op]
-    arguments = {} if args is None else args
+    if not isinstance(op, str) or op not in OPERATIONS:
+        raise RequestError(f"op {str(op)[:40]!r} is unknown; allowed: {', '.join(OPERATIONS)}")
+    fields, arguments = _FIELDS.get(op, {}), {} if args is None else args
     if not isinstance(arguments, Mapping):
         raise RequestError(f"{op}: args is {type(args).__name__}; allowed: a map of {', '.join(fields) or 'nothing'}")
     for name, value in arguments.items():
         if name not in fields:
             allowed = ", ".join(fields) or "none"
             raise RequestError(f"{op}: field {str(name)[:40]!r} is unknown; allowed: {allowed}")
-        if not _fits(value, fields[name]):
+        if fields[name].startswith("a map"):
+            fits = isinstance(value, Mapping)
+        elif fields[name].startswith("a list"):
+            fits = isinstance(value, Sequence) and not isinstance(value, str | bytes)
+        else:
+            fits = value is None or finite_number(value) is not None
+        if not fits:
             raise RequestError(f"{op}: {name} is {str(value)[:40]!r}; allowed: {fields[name]}")
-    return build(**{name: value for name, value in arguments.items() if value is not None})
-
-
-def _fits(value: object, kind: str) -> bool:
-    """Tell whether the value of a field is of a kind, whose text begins with a map, a list or a number."""
-    if kind.startswith("a map"):
-        return isinstance(value, Mapping)
-    if kind.startswith("a list"):
-        return isinstance(value, Sequence) and not isinstance(value, str | bytes)
-    return value is None or finite_number(value) is not None
-
-
-_TARGET = {"values": "a map of numbers by variable", "over_s": "a number of seconds"}
-_TRAJECTORY = {
-    "expressions": "a map of expressions by variable",
-    "constants": "a map of numbers by name",
-    "duration_s": "a number of seconds",
-    "waypoints": "a list of waypoints",
-    "start_s": "a number of seconds",
-}
-_READERS: dict[str, tuple[Callable[..., Any], dict[str, str]]] = {
-    "takeoff": (TakeOff, {}),
-    "engage": (Engage, {}),
-    "hold": (Pause, {}),
-    "rejoin": (Rejoin, {}),
-    "land": (Land, {}),
-    "target": (MoveTo, _TARGET),
-    "trajectory": (Follow, _TRAJECTORY),
-}
-_OPS = {request: op for op, (request, _) in _READERS.items()}
+    given: dict[str, Any] = {name: value for name, value in arguments.items() if value is not None}
+    return MoveTo(**given) if op == "target" else Follow(**given) if op == "trajectory" else Order(op)

@@ -1,8 +1,4 @@
-"""Where a formation is to be at every instant: the reference, and the ramps by which requests change it smoothly.
-
-Order of this file: the reference in flight, ramps within the robots' limits and their checks, the places of robots that
-return one by one.
-"""
+"""Where a formation is to be at every instant: the reference, and the ramps by which requests change it smoothly."""
 
 from __future__ import annotations
 
@@ -12,7 +8,7 @@ import numpy as np
 
 from zsim.contract.snapshot import State
 from zsim_agents.formation.control_law import FormationGains, RobotLimits, load
-from zsim_agents.formation.flight_check import ShapeLimits, formation_fault
+from zsim_agents.formation.flight_check import SHAPE, SHAPE_IN_FLIGHT, ShapeLimits, formation_fault
 from zsim_agents.formation.flight_plan import Follow, MoveTo
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, robot_rates
 from zsim_agents.formation.trajectory import (
@@ -46,16 +42,13 @@ class Guidance:
 
     Methods that change the reference raise TrajectoryError, ExpressionError or SingularClusterError where the way is
     not allowed, and change nothing then.
-
-    Attributes:
-        paused: the formation stands still on request.
     """
 
-    def __init__(self, space: ClusterSpace, gains: FormationGains, shape: ShapeLimits) -> None:
+    def __init__(self, space: ClusterSpace, gains: FormationGains) -> None:
         self.space = space
         self.paused = False
         self._gains = gains
-        self._planner = RampPlanner(space, gains, shape)
+        self._planner = RampPlanner(space, gains, SHAPE)
         self._home: Reference = Hold(np.zeros(space.size))
         self._flown: Reference = self._home
         self._goal = np.zeros(space.size)
@@ -112,14 +105,14 @@ class Guidance:
         self._flown = self._planner.ramp(self.value(t_s), self._home, t_s)
         self.paused = False
 
-    def rejoin(self, c: Array, t_s: float, shape: ShapeLimits) -> None:
+    def rejoin(self, c: Array, t_s: float) -> None:
         """Go on after a fault from the estimate c (4n,), at rest; a paused formation stays there.
 
-        The way back keeps the limits of shape: a formation recovers from where it may just be flown.
+        The way back keeps the limits in flight: a formation recovers from where it may just be flown.
         """
         home = Hold(c) if self.paused else self._home
         start = (c, np.zeros_like(c))
-        self._flown = RampPlanner(self.space, self._gains, shape).ramp(start, home, t_s)
+        self._flown = RampPlanner(self.space, self._gains, SHAPE_IN_FLIGHT).ramp(start, home, t_s)
 
     def snapshot(self) -> State:
         return {
@@ -173,11 +166,7 @@ class RampPlanner:
         return ramp
 
     def fastest(self, start: tuple[Array, Array], onto: Reference, start_s: float) -> Ramp:
-        """Return the ramp that uses the limits; its way is not checked.
-
-        Raises:
-            TrajectoryError: it would take longer than an hour.
-        """
+        """Return the ramp that uses the limits, its way unchecked; TrajectoryError: it would take over an hour."""
         over_s = RAMP_MIN_S
         while over_s <= RAMP_MAX_S:
             ramp = ramp_onto(self._space, *start, onto, start_s, over_s)
@@ -200,31 +189,21 @@ class RampPlanner:
         count = min(max(math.ceil((to_s - from_s) / SAMPLE_S) + 1, SAMPLES_MIN), SAMPLES_MAX)
         count = count if to_s > from_s else 1
         for t_s in np.linspace(from_s, to_s, count).tolist():
-            fault = self._fault_at(*reference.value(t_s))
+            c, c_dot = reference.value(t_s)
+            fault = formation_fault(self._space, c, self._gains, self._limits)
+            if not fault and (share := self._load(c, c_dot)) > self._limits.share * LOAD_TOLERANCE:
+                fault = f"a robot moves at {share:.2f} of its limits; allowed: {self._limits.share:g}"
             if fault:
                 return f"{t_s - from_s:.1f} s after its start {fault}" if t_s > from_s else fault
         return None
 
-    def _fault_at(self, c: Array, c_dot: Array) -> str | None:
-        if fault := formation_fault(self._space, c, self._gains, self._limits):
-            return fault
-        share = self._load(c, c_dot)
-        if share > self._limits.share * LOAD_TOLERANCE:
-            return f"a robot moves at {share:.2f} of its limits; allowed: {self._limits.share:g}"
-        return None
-
 
 class Places:
-    """The places of the robots of a held formation, and how each gets there by itself.
+    """The places p_W (n, 3) [m] of the robots of a held formation, and how each gets there by itself.
 
     A robot that is far out of step (landed, and flown low again) makes a shape in which no formation can be led. It
-    first flies horizontally, at its height and so below or above the others, then straight up or down.
-
-    Args:
-        p_W: (n, 3) m; the places.
-        gains: of the formation.
-        limits: of its robots.
-        share: of those limits that is used.
+    first flies horizontally, at its height and so below or above the others, then straight up or down, with a share of
+    the robots' limits.
     """
 
     def __init__(self, p_W: Array, gains: FormationGains, limits: RobotLimits, share: float) -> None:

@@ -3,8 +3,6 @@
 Time is in seconds from the start of the reference; outside [0, duration_s] a reference stands still at the nearest
 end. Angles are continuous in time, not wrapped. Users give values by the names of variables: in metres and radians, or
 in degrees as NAME_deg.
-
-Order of this file: the interface, references of users, ramps, a reference as plain values, values by name.
 """
 
 from __future__ import annotations
@@ -30,9 +28,7 @@ ANGLE_MAX_RAD = TAU + 1e-3  # a full turn as typed with four digits; a target be
 class TrajectoryError(ValueError):
     """A trajectory is not possible as written; the message names the place, finding and remedy.
 
-    Attributes:
-        finding: the fault without its place.
-        at: path of the value below the target or the trajectory, empty for the whole.
+    `at` is the path of the value below the target or the trajectory, empty for the whole.
     """
 
     def __init__(self, finding: str, where: str = "", at: str = "") -> None:
@@ -42,14 +38,15 @@ class TrajectoryError(ValueError):
 
 
 class Reference(Protocol):
-    """A motion in cluster space; duration_s is the time after which it stands still, None where it never does."""
+    """A motion in cluster space; duration_s is the time after which it stands still, None where it never does.
+
+    `value` returns c and its exact derivative c_dot, each (4n,), at t_s.
+    """
 
     @property
     def duration_s(self) -> float | None: ...
 
-    def value(self, t_s: float) -> tuple[Array, Array]:
-        """Return c and c_dot, each (4n,), at t_s; c_dot is the exact derivative of c."""
-        ...
+    def value(self, t_s: float) -> tuple[Array, Array]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +83,6 @@ class ExpressionTrajectory:
         expressions: text or a number by variable name, e.g. {"x_c": "5*cos(2*pi*f*t)", "p": 4, "yaw_deg": "6*t"}.
         constants: user constants by name, e.g. {"f": 0.01}.
         duration_s: end of the motion, None for none.
-
-    Attributes:
-        arguments: of the constructor, by name, as plain values.
 
     Raises:
         ExpressionError, TrajectoryError: an unknown name, an expression or duration not allowed.
@@ -142,9 +136,6 @@ class WaypointTrajectory:
     A waypoint is {"at_s": 10.0, "values": {"x_c": 5.0, ...}}; variables that it does not name stay as in the one before
     (in the first: as in base). Angles that wrap turn by the shorter way.
 
-    Attributes:
-        arguments: of the constructor, by name, as plain values.
-
     Raises:
         TrajectoryError: names the waypoint and its fault.
     """
@@ -155,7 +146,15 @@ class WaypointTrajectory:
         self._times: list[float] = []
         places: list[Array] = []
         for number, waypoint in enumerate(waypoints, start=1):
-            self._times.append(self._time(waypoint, number))
+            is_map = isinstance(waypoint, Mapping)
+            given = waypoint.get("at_s") if is_map else waypoint
+            at_s = finite_number(given) if is_map else None
+            least = self._times[-1] if self._times else -1e-9
+            if at_s is None or not at_s > least:
+                more = f" above {least:g}, that of the waypoint before" if self._times else ", 0 or more"
+                finding = f"is {str(given)[:40]}; allowed: a number of seconds{more}"
+                raise TrajectoryError(finding, f"waypoint {number}: at_s", f".waypoints[{number - 1}].at_s")
+            self._times.append(at_s)
             unknown = sorted(str(key)[:40] for key in waypoint if key not in ("at_s", "values"))
             if unknown:
                 raise TrajectoryError(f"waypoint {number}: field {unknown[0]!r} is unknown; allowed: at_s, values")
@@ -184,28 +183,14 @@ class WaypointTrajectory:
         c_dot = (m0 + s * (6 * step - 4 * m0 - 2 * m1 + 3 * s * (m0 + m1 - 2 * step))) / span
         return c, c_dot
 
-    def _time(self, waypoint: Mapping[str, object], number: int) -> float:
-        value = waypoint.get("at_s") if isinstance(waypoint, Mapping) else waypoint
-        at_s = finite_number(value) if isinstance(waypoint, Mapping) else None
-        least = self._times[-1] if self._times else -1e-9
-        if at_s is None or not at_s > least:
-            more = f" above {least:g}, that of the waypoint before" if self._times else ", 0 or more"
-            finding = f"is {str(value)[:40]}; allowed: a number of seconds{more}"
-            raise TrajectoryError(finding, f"waypoint {number}: at_s", f".waypoints[{number - 1}].at_s")
-        return at_s
-
 
 @dataclass(frozen=True, eq=False)
 class Ramp:
-    """A smooth move from a state of motion onto another reference.
+    """A smooth move from a state of motion onto another reference, which may move meanwhile; see `ramp_onto`.
 
     c(t) = onto(t) + the offset of the start, which a quintic takes to zero with its first and second derivative. On a
-    reference at rest, from rest, this is the minimum-jerk move.
-
-    Attributes:
-        onto: where the ramp leads; it may move meanwhile.
-        start_s, over_s: the ramp runs in [start_s, start_s + over_s] of the time of `onto`.
-        offset, offset_rate: (4n,) c and c_dot at start_s minus those of onto; use `ramp_onto`.
+    reference at rest, from rest, this is the minimum-jerk move. It runs in [start_s, start_s + over_s] of the time of
+    `onto`; offset and offset_rate, (4n,), are c and c_dot at start_s minus those of onto.
     """
 
     onto: Reference
@@ -259,13 +244,9 @@ _KINDS: dict[str, Any] = {
 
 
 def state_of(reference: Reference) -> State:
-    """Return a reference of this module as plain values, for `reference_of`.
-
-    Raises:
-        TypeError: another reference.
-    """
-    for kind, made in _KINDS.items():
-        if type(reference) is made:
+    """Return a reference of this module as plain values; TypeError: it is another."""
+    for kind, known in _KINDS.items():
+        if type(reference) is known:
             arguments = getattr(reference, "arguments", None) or vars(reference)
             own = {name: state_of(value) if name in ("of", "onto") else value for name, value in arguments.items()}
             return {"kind": kind, **own}
@@ -273,34 +254,21 @@ def state_of(reference: Reference) -> State:
 
 
 def reference_of(space: ClusterSpace, state: State) -> Reference:
-    """Return the reference of a state.
-
-    Raises:
-        KeyError, TypeError, ValueError: the state is not one of `state_of`.
-    """
-    arguments = {
-        name: reference_of(space, value) if name in ("of", "onto") else value
-        for name, value in state.items()
-        if name != "kind"
-    }
+    """Return the reference of a state; KeyError, TypeError, ValueError: it is none of `state_of`."""
+    own = ((name, value) for name, value in state.items() if name != "kind")
+    arguments = {name: reference_of(space, value) if name in ("of", "onto") else value for name, value in own}
     kind = _KINDS[state["kind"]]
     make: Any = kind
     return make(space, **arguments) if kind in (ExpressionTrajectory, WaypointTrajectory) else make(**arguments)
 
 
 class Variable(NamedTuple):
-    """Place of a variable in c (4n,), and the factor from a user's unit."""
-
-    entry: int
-    scale: float
+    entry: int  # of c (4n,)
+    scale: float  # from a user's unit
 
 
 def variable_of(space: ClusterSpace, name: object, where: str, at: str = "") -> Variable:
-    """Return the variable of a name: one of the space's, or an angle's with `_deg`.
-
-    Raises:
-        TrajectoryError: there is none of that name.
-    """
+    """Return the variable of a name: one of the space's, or an angle's with `_deg`; TrajectoryError: there is none."""
     text = str(name)
     angle = text.removesuffix(DEGREES)
     if text not in space.names and angle in space.names and space.in_radians[space.index(angle)]:

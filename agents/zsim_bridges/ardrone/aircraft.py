@@ -14,7 +14,7 @@ from zsim.sensors.camera import CAMERAS
 from zsim_bridges.ardrone import at_commands, configuration
 from zsim_bridges.ardrone.at_commands import Command
 from zsim_bridges.ardrone.configuration import Configuration, ConfigurationError
-from zsim_bridges.ardrone.navdata import ControlState, Hovering, StateBit
+from zsim_bridges.ardrone.navdata import LOST_COM, MAGNETO_CALIBRATION, ControlState, StateBit
 from zsim_bridges.ardrone.navdata_sender import NavdataContent, NavdataSender, Send
 from zsim_bridges.ardrone.pilot import IN_THE_AIR, Pilot, SetpointSender
 from zsim_bridges.vehicle_links.drone_link import CommandSender, OnboardState
@@ -25,14 +25,8 @@ SECOND_NS = 1_000_000_000
 MALFORMED_SHOWN = 20  # parts of datagrams that are no commands, chosen; more are only counted
 LOW_BATTERY_PERCENT = 10.0  # %, below it zsim's firmware does not take off; below 5 % it lands
 RANGE_COSINE = math.cos(math.radians(75.0))  # of the tilt at which the firmware cuts the motors
-ALWAYS = int(
-    StateBit.ALTITUDE_CONTROL
-    | StateBit.PIC_VERSION_OK
-    | StateBit.AT_THREAD
-    | StateBit.NAVDATA_THREAD
-    | StateBit.VIDEO_THREAD
-    | StateBit.ACQUISITION_THREAD
-)  # the bits that an aircraft on the ground shows
+THREADS = StateBit.AT_THREAD | StateBit.NAVDATA_THREAD | StateBit.VIDEO_THREAD | StateBit.ACQUISITION_THREAD
+ALWAYS = int(StateBit.ALTITUDE_CONTROL | StateBit.PIC_VERSION_OK | THREADS)  # of an aircraft on the ground
 CONTROL_STATES = {
     "landed": ControlState.LANDED,
     "taking_off": ControlState.TAKING_OFF,
@@ -47,14 +41,7 @@ FIGURES = "figures are not flown here; the aircraft's flips are its firmware's"
 
 
 class Outlets(NamedTuple):
-    """The outputs of an aircraft.
-
-    Attributes:
-        put: publishes a message on a key.
-        send_navdata: sends a datagram to a program that asked for navdata.
-        send_control: sends bytes to the programs that are connected to the control port.
-        refuse: counts what is not obeyed, with the reason.
-    """
+    """The outputs of an aircraft: messages to the run, navdata to programs, bytes to the control port, refusals."""
 
     put: Callable[[str, Any], None]
     send_navdata: Send
@@ -63,17 +50,7 @@ class Outlets(NamedTuple):
 
 
 class Aircraft:
-    """One aircraft.
-
-    Args:
-        drone: its name, limits and sensors.
-        source: process name under which commands are sent.
-        gate_ns: of the run: how exactly the time of an arrival is known.
-        outlets: its outputs.
-
-    Attributes:
-        configuration: its values.
-    """
+    """One aircraft, steered by the programs of its pilot; `gate_ns` is how exactly the time of an arrival is known."""
 
     def __init__(self, drone: Drone, source: str, gate_ns: int, outlets: Outlets) -> None:
         self._name = drone.name
@@ -92,7 +69,7 @@ class Aircraft:
         )
         sender = CommandSender(drone.name, source, outlets.put)
         self._setpoints = SetpointSender(sender, limits, self.configuration)
-        self._pilot = Pilot(sender, self._setpoints, source, self._refuse)
+        self.pilot = Pilot(sender, self._setpoints, source, self._refuse)
         self._content = NavdataContent(self._state, drone.rotor_max_rad_s)
         outputs = outlets.send_navdata, self._state_bits, self._ctrl_state, self._refuse
         self._navdata = NavdataSender(self._content, self.configuration, *outputs)
@@ -110,15 +87,9 @@ class Aircraft:
         """The camera whose pictures are streamed."""
         return CAMERAS[0] if self._channel in FRONT_CHANNELS else CAMERAS[1]
 
-    @property
-    def is_steered(self) -> bool:
-        """Whether a pilot's program steers it now."""
-        return self._pilot.setpoint is not None
-
     # The run
 
     def update(self, message: Any) -> None:
-        """Take a message of the drone or of its estimator."""
         message = self._state.update(message)
         self._content.update(message)
         match message:
@@ -128,12 +99,12 @@ class Aircraft:
                 self._now_ns = message.t_ns
                 self._setpoints.altitude_m = self._state.altitude_m
                 self._setpoints.heading_rad = math.radians(self._content.heading_deg)
-                self._watch()
-                self._pilot.on_status(message)
+                self._watch_pilot()
+                self.pilot.on_status(message)
                 self._navdata.on_gate()
                 self._navdata.on_instant(message.t_ns)
 
-    def _watch(self) -> None:
+    def _watch_pilot(self) -> None:
         """Hover, and then land, when the pilot's program has gone silent."""
         silent_ns = self._silent_ns()
         lost_ns = round(self.configuration.number("general:com_watchdog") * SECOND_NS)
@@ -141,10 +112,10 @@ class Aircraft:
             return
         if not self._is_lost:
             self._is_lost = True
-            self._navdata.drop_clients()
-            self._pilot.on_lost()
+            self._navdata.clients.clear()
+            self.pilot.on_lost()
         elif silent_ns > lost_ns + LAND_AFTER_NS:
-            self._pilot.land()
+            self.pilot.land()
 
     def _silent_ns(self) -> int:
         """Return since when no AT command has arrived, less the gate within which its arrival is not known."""
@@ -153,12 +124,10 @@ class Aircraft:
     # Pilots' programs
 
     def on_navdata_request(self, datagram: bytes, address: Hashable) -> None:
-        """Send navdata to an address that asks for it."""
         if not self._navdata.on_request(datagram, address, self._now_ns):
             self._refuse(f"a datagram of {len(datagram)} bytes on the navdata port does not ask for navdata")
 
     def on_at(self, datagram: bytes) -> None:
-        """Obey the AT commands of a datagram."""
         commands, refusals = at_commands.parse(datagram)
         for refusal in refusals:
             self._malformed += 1
@@ -176,19 +145,25 @@ class Aircraft:
         ids, self._ids = self._ids, None
         match command:
             case at_commands.Ref():
-                self._pilot.on_ref(command)
+                self.pilot.on_ref(command)
             case at_commands.Pcmd() | at_commands.PcmdMag():
-                self._pilot.on_pcmd(command)
+                self.pilot.on_pcmd(command)
             case at_commands.ConfigIds():
                 self._ids = command
             case at_commands.Config():
                 self._configure(command, ids)
-            case at_commands.Control():
-                self._control(command)
+            case at_commands.Control(mode=at_commands.ACKNOWLEDGE):
+                self._ack = False
+            case at_commands.Control(mode=at_commands.SEND_CONFIGURATION):
+                self._outlets.send_control(configuration.format_configuration(self.configuration.all()))
+                self._ack = True
+            case at_commands.Control(mode=at_commands.SEND_CUSTOM_LIST):
+                self._outlets.send_control(configuration.format_custom_list(self.configuration.custom_list()))
+                self._ack = True
             case at_commands.Calibrate():
-                self._pilot.calibrate()
-            case at_commands.FlatTrim() if self._pilot.state != "landed":
-                self._refuse(f"FTRIM is not obeyed: the drone is {self._pilot.state}; must be landed")
+                self.pilot.calibrate()
+            case at_commands.FlatTrim() if self.pilot.state != "landed":
+                self._refuse(f"FTRIM is not obeyed: the drone is {self.pilot.state}; must be landed")
             case at_commands.Animation():
                 self._refuse(f"ANIM is not obeyed: {FIGURES}")
 
@@ -214,47 +189,34 @@ class Aircraft:
             wanted = int(self.configuration.number("video:video_channel"))
             self._channel = int(self.camera == CAMERAS[0]) if wanted == NEXT_CHANNEL else wanted
 
-    def _control(self, control: at_commands.Control) -> None:
-        if control.mode == at_commands.ACKNOWLEDGE:
-            self._ack = False
-        elif control.mode == at_commands.SEND_CONFIGURATION:
-            self._outlets.send_control(configuration.format_configuration(self.configuration.all()))
-            self._ack = True
-        elif control.mode == at_commands.SEND_CUSTOM_LIST:
-            self._outlets.send_control(configuration.format_custom_list(self.configuration.custom_list()))
-            self._ack = True
-
     # State
 
     def _refuse(self, reason: str) -> None:
         self._outlets.refuse(f"{self._name}: {reason}")
 
     def _ctrl_state(self) -> int:
-        major, minor = CONTROL_STATES[self._pilot.state], 0
+        major, minor = CONTROL_STATES[self.pilot.state], 0
         if major == ControlState.HOVERING and self._is_lost:
-            minor = Hovering.LOST_COM
-        elif self._pilot.calibrates:
-            major, minor = ControlState.HOVERING, Hovering.MAGNETO_CALIBRATION
+            minor = LOST_COM
+        elif self.pilot.calibrates:
+            major, minor = ControlState.HOVERING, MAGNETO_CALIBRATION
         return major << 16 | minor
 
     def _state_bits(self) -> int:
+        status = self._state.status
         is_silent = self._command_ns is None or self._silent_ns() > WATCHDOG_NS
         bits = (
-            (StateBit.FLYING, self._pilot.state in (*IN_THE_AIR, "landing")),
+            (StateBit.FLYING, self.pilot.state in (*IN_THE_AIR, "landing")),
             (StateBit.COMMAND_ACK, self._ack),
             (StateBit.CAMERA_READY, self._has_camera),
             (StateBit.COM_WATCHDOG, is_silent),
             (StateBit.COM_LOST, self._is_lost),
             (StateBit.ULTRASOUND_DEAF, self._content.is_sonar_deaf),
+            (StateBit.BATTERY_LOW, status is not None and status.battery_percent < LOW_BATTERY_PERCENT),
         )
-        return sum((bit for bit, is_set in bits if is_set), ALWAYS + self._fault_bits())  # a flag's `|` is slow
-
-    def _fault_bits(self) -> int:
-        status = self._state.status
-        is_low = status is not None and status.battery_percent < LOW_BATTERY_PERCENT
-        bits = int(StateBit.BATTERY_LOW) if is_low else 0
-        if self._pilot.state == "emergency":
-            bits += StateBit.EMERGENCY + (StateBit.USER_EMERGENCY if self._pilot.stopped_by_pilot else StateBit.CUTOUT)
+        state = sum((bit for bit, is_set in bits if is_set), ALWAYS)  # a flag's `|` is slow
+        if self.pilot.state == "emergency":
+            state += StateBit.EMERGENCY + (StateBit.USER_EMERGENCY if self.pilot.stopped_by_pilot else StateBit.CUTOUT)
             if float(rotations.rotation_matrix(self._state.attitude)[2, 2]) < RANGE_COSINE:
-                bits += StateBit.ANGLES_OUT_OF_RANGE
-        return bits
+                state += StateBit.ANGLES_OUT_OF_RANGE
+        return state

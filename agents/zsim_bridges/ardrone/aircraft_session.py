@@ -7,7 +7,7 @@ where the aircraft was switched on. Source: AR.Drone Developer Guide SDK 2.0, ch
 import math
 from collections import deque
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 from zsim.contract.flight_messages import DroneState
 from zsim.contract.messages import Info
@@ -28,9 +28,16 @@ from zsim_bridges.ardrone.navdata import (
     NavdataError,
     StateBit,
 )
-from zsim_bridges.vehicle_links.aircraft_readings import STILL, AircraftPose, AircraftReadings
-from zsim_bridges.vehicle_links.driver_options import DriverOptions
-from zsim_bridges.vehicle_links.vehicle_session import AircraftState, Demand, UdpChannel, VehicleSession
+from zsim_bridges.vehicle_links.driver import DriverOptions
+from zsim_bridges.vehicle_links.vehicle_session import (
+    STILL,
+    AircraftPose,
+    AircraftReadings,
+    AircraftState,
+    Demand,
+    UdpChannel,
+    VehicleSession,
+)
 
 NAVDATA, AT = 0, 1  # channels
 REQUEST_NS = 100_000_000  # chosen as npm ar-drone: navdata is requested again after as long
@@ -66,58 +73,29 @@ GAP_S_MAX = 0.5  # s; over longer gaps nothing is integrated
 GPS_FIX = 3  # three-dimensional
 
 
-class AircraftSettings(NamedTuple):
-    """The configuration that an aircraft is given.
-
-    Attributes:
-        tilt_rad: euler_angle_max.
-        climb_m_s, yaw_rate_rad_s: control_vz_max, control_yaw.
-        altitude_m: altitude_max.
-        ultrasound: ultrasound_freq of its sonar: 7 (22.2 Hz) or 8 (25 Hz).
-    """
-
-    tilt_rad: float = 0.35  # outdoor default of the SDK
-    climb_m_s: float = 1.0  # likewise
-    yaw_rate_rad_s: float = 1.75  # indoor default of the SDK
-    altitude_m: float = 100.0  # no limit of its own: the driver's fence holds
-    ultrasound: int = 8  # default of the SDK
-
-    def entries(self) -> list[Config]:
-        """Return what is set: `outdoor` first, which brings limits of its own."""
-        entries = {
-            "general:navdata_demo": "FALSE",
-            "general:navdata_options": str(OPTIONS_MASK),
-            "control:outdoor": "TRUE",
-            "control:euler_angle_max": f"{self.tilt_rad:g}",
-            "control:control_vz_max": f"{1e3 * self.climb_m_s:g}",
-            "control:control_yaw": f"{self.yaw_rate_rad_s:g}",
-            "control:altitude_max": f"{1e3 * self.altitude_m:g}",
-            "pic:ultrasound_freq": str(self.ultrasound),
-        }
-        return [Config(0, key, value) for key, value in entries.items()]
+# What the aircraft is given; the limits are the SDK's own: of tilt and climb outdoors, of yaw rate indoors
+TILT_RAD, CLIMB_M_S, YAW_RATE_RAD_S = 0.35, 1.0, 1.75
+SETTINGS = {  # `outdoor` brings limits of its own, so that it comes first
+    "general:navdata_demo": "FALSE",
+    "general:navdata_options": str(OPTIONS_MASK),
+    "control:outdoor": "TRUE",
+    "control:euler_angle_max": f"{TILT_RAD:g}",
+    "control:control_vz_max": f"{1e3 * CLIMB_M_S:g}",
+    "control:control_yaw": f"{YAW_RATE_RAD_S:g}",
+    "control:altitude_max": "100000",  # mm; no limit of its own: the driver's fence holds
+}
 
 
 class AircraftSession(VehicleSession):
-    """The session with one aircraft.
+    """The session with one aircraft, whose sonar has the `ultrasound` frequency 7 (22.2 Hz) or 8 (25 Hz)."""
 
-    Args:
-        host: its address.
-        readings: what its navdata is turned into.
-        settings: that it is given.
-        ports: of navdata and AT commands.
-    """
-
-    def __init__(
-        self,
-        host: str,
-        readings: "NavdataReadings",
-        settings: AircraftSettings = AircraftSettings(),  # noqa: B008
-        ports: tuple[int, int] = (navdata.PORT, at_commands.PORT),
-    ) -> None:
-        super().__init__((UdpChannel(host, ports[0]), UdpChannel(host, ports[1])), readings, modulus=1 << 32)
+    def __init__(self, host: str, readings: "NavdataReadings", ultrasound: int) -> None:
+        channels = UdpChannel(host, navdata.PORT), UdpChannel(host, at_commands.PORT)
+        super().__init__(channels, readings, modulus=1 << 32)
         self._navdata = readings
-        self._commands = FlightCommands(settings)
-        self._entries = settings.entries()
+        self._commands = FlightCommands()
+        settings = SETTINGS | {"pic:ultrasound_freq": str(ultrasound)}
+        self._entries = [Config(0, key, value) for key, value in settings.items()]
         self._pending: deque[Config] = deque(self._entries)
         self._sequence = 0
         self._newest = 0
@@ -129,18 +107,16 @@ class AircraftSession(VehicleSession):
 
     @classmethod
     def of_run(
-        cls, info: Info, scenario: Scenario, options: DriverOptions, host: str, settings: AircraftSettings
+        cls, info: Info, scenario: Scenario, options: DriverOptions, host: str, ultrasound: int
     ) -> "AircraftSession":
-        """Return the session of a driver in a run."""
         origin = info.origin.latitude_deg, info.origin.longitude_deg, info.origin.height_m
         place = options.origin_m or scenario.drone(options.drone).position_m
         yaw_rad = None if options.yaw_deg is None else math.radians(options.yaw_deg)
-        return cls(host, NavdataReadings(origin, place, scenario.environment.magnetic_field_ut, yaw_rad), settings)
+        return cls(host, NavdataReadings(origin, place, scenario.environment.magnetic_field_ut, yaw_rad), ultrasound)
 
     # From the aircraft
 
     def receive(self, channel: int, datagram: bytes, now_ns: int) -> None:
-        """Take a datagram of the aircraft."""
         if channel != NAVDATA:
             return
         try:
@@ -176,7 +152,6 @@ class AircraftSession(VehicleSession):
     # To the aircraft
 
     def advance(self, now_ns: int, demand: Demand) -> Iterator[tuple[int, bytes]]:
-        """Yield the datagrams that are due."""
         silent_ns = now_ns - max(self._received_ns or 0, self._requested_ns)
         if silent_ns >= REQUEST_NS:
             self._requested_ns = now_ns
@@ -220,20 +195,14 @@ class FlightCommands:
     Source: AR.Drone Developer Guide SDK 2.0, chapter 6.
     """
 
-    def __init__(self, settings: AircraftSettings) -> None:
-        self._settings = settings
+    def __init__(self) -> None:
         self._axes = _Axis(), _Axis()
         self._sent_ns = -PERIOD_NS
         self._last: Demand | None = None
         self._rose_ns = -PULSES_NS  # when the emergency bit last did
 
     def advance(self, now_ns: int, demand: Demand, emergency: bool, pose: AircraftPose | None) -> Iterator[Command]:
-        """Yield the commands that are due; none if nothing is demanded.
-
-        Args:
-            emergency: whether the aircraft is in its emergency.
-            pose: of the aircraft.
-        """
+        """Yield the commands that are due to an aircraft with a pose, in its emergency or not; none if none are."""
         if now_ns - self._sent_ns < (PERIOD_NS if demand == self._last else CHANGED_NS):
             return
         self._last, self._sent_ns = demand, now_ns
@@ -264,11 +233,11 @@ class FlightCommands:
         if demand.action != "fly" or pose is None:
             self._axes = _Axis(), _Axis()
             return HOVER
-        settings, wanted, yaw_rad = self._settings, demand.velocity_m_s, float(heading(pose.q_WB))
-        full = G_M_S2 * math.tan(settings.tilt_rad)
+        wanted, yaw_rad = demand.velocity_m_s, float(heading(pose.q_WB))
+        full = G_M_S2 * math.tan(TILT_RAD)
         x, y = (axis.accel(now_ns, wanted[k], pose.velocity_m_s[k], full) for k, axis in enumerate(self._axes))
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-        up, turn = wanted[2] / settings.climb_m_s, demand.yaw_rate_rad_s / settings.yaw_rate_rad_s
+        up, turn = wanted[2] / CLIMB_M_S, demand.yaw_rate_rad_s / YAW_RATE_RAD_S
         shares = (y * c - x * s) / full, (x * c + y * s) / full, up, turn
         left, forward, up, yaw_left = (max(-1.0, min(1.0, share)) for share in shares)
         return Pcmd(0, at_commands.PROGRESSIVE, -left, -forward, up, -yaw_left)
@@ -295,19 +264,15 @@ class _Axis:
         self._then_ns = now_ns
         slope = VELOCITY_1_S * (wanted - self._reference)
         self._reference += dt_s * slope
-        error = self._reference_then(now_ns) - measured
-        accel = slope + DRAG_1_S * self._reference + VELOCITY_1_S * error + self._wind_m_s2
-        if abs(accel) < most_m_s2:
-            self._wind_m_s2 += INTEGRAL_1_S2 * error * dt_s
-        return accel
-
-    def _reference_then(self, now_ns: int) -> float:
-        """Return the reference that the velocity measured now answers to."""
         references = self._references
         references.append((now_ns, self._reference))
         while len(references) > 1 and references[1][0] <= now_ns - ANSWER_NS:
             references.popleft()
-        return references[0][1]
+        error = references[0][1] - measured  # from the reference that the velocity measured now answers to
+        accel = slope + DRAG_1_S * self._reference + VELOCITY_1_S * error + self._wind_m_s2
+        if abs(accel) < most_m_s2:
+            self._wind_m_s2 += INTEGRAL_1_S2 * error * dt_s
+        return accel
 
 
 class NavdataReadings(AircraftReadings):
@@ -336,7 +301,6 @@ class NavdataReadings(AircraftReadings):
         self._gps_ns: int | None = None
 
     def receive(self, packet: Navdata, now_ns: int) -> None:
-        """Take a packet that arrives now."""
         options, taken_ns = packet.options, now_ns
         if time := options.get(TIME):
             stamp_ns = (time.time >> SECONDS_SHIFT) * 1_000_000_000 + (time.time & MICROSECONDS) * 1_000
@@ -365,7 +329,10 @@ class NavdataReadings(AircraftReadings):
         dt_s = 0.0 if self._then_ns is None else (taken_ns - self._then_ns) * 1e-9
         self._then_ns = taken_ns
         if mag := options.get(MAGNETO):
-            self._align(yaw, self._magnetic_yaw(roll, pitch, _flipped((mag.mx, mag.my, mag.mz))), dt_s)
+            m = _flipped((mag.mx, mag.my, mag.mz))  # the field of the Earth in B
+            my, mz = m[1] * math.cos(roll) - m[2] * math.sin(roll), m[1] * math.sin(roll) + m[2] * math.cos(roll)
+            mx = m[0] * math.cos(pitch) + mz * math.sin(pitch)
+            self._align(yaw, self._north_rad - math.atan2(my, mx), dt_s)
         yaw += self._yaw_offset_rad or 0.0
         vx, vy, vz = own = _flipped((demo.vx_mm_s / 1e3, demo.vy_mm_s / 1e3, demo.vz_mm_s / 1e3))
         velocity = vx * math.cos(yaw) - vy * math.sin(yaw), vx * math.sin(yaw) + vy * math.cos(yaw), vz
@@ -376,12 +343,6 @@ class NavdataReadings(AircraftReadings):
         rate = self._last["imu"][1] if "imu" in self._last else STILL
         self.pose = AircraftPose(taken_ns, position, velocity, (w, x, y, z), rate)
         self.read("flow", taken_ns, own, 1.0)
-
-    def _magnetic_yaw(self, roll: float, pitch: float, m: Vector) -> float:
-        """Return the heading by the field of the Earth seen in B."""
-        y, z = m[1] * math.cos(roll) - m[2] * math.sin(roll), m[1] * math.sin(roll) + m[2] * math.cos(roll)
-        x = m[0] * math.cos(pitch) + z * math.sin(pitch)
-        return self._north_rad - math.atan2(y, x)
 
     def _align(self, yaw: float, magnetic: float, dt_s: float) -> None:
         """Let the heading follow the magnetometer slowly; a stated one is kept."""
@@ -395,7 +356,7 @@ class NavdataReadings(AircraftReadings):
         self._yaw_offset_rad += min(1.0, YAW_1_S * max(0.0, dt_s)) * error
 
     def _on_gps(self, gps: Any, taken_ns: int) -> None:
-        """Take a fix once, and let the position follow it."""
+        """Read a fix once, and let the position follow it."""
         place = gps.latitude_deg, gps.longitude_deg, gps.elevation_m
         values = self.gps_values(place, gps.speed_m_s, math.radians(gps.degree), gps.ehpe_m, GPS_FIX, gps.satellites)
         before_ns, fix = self._gps_ns, (place, gps.speed_m_s, gps.degree)

@@ -5,10 +5,11 @@ import contextlib
 import errno
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from zsim.contract import keys
 from zsim.contract.messages import Info
+from zsim.contract.run_messages import Event
 from zsim.errors import RunError, install_command
 from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
@@ -26,9 +27,8 @@ from zsim_bridges.ardrone.ports import (
     read_until_end,
 )
 from zsim_bridges.ardrone.video import VideoServer
-from zsim_bridges.intake import PictureIntake, TrafficIntake
 from zsim_bridges.vehicle_links import drone_link
-from zsim_bridges.vehicle_links.server import Say, VehicleServer
+from zsim_bridges.vehicle_links.server import PictureIntake, Say, TrafficIntake, VehicleServer
 
 AUTHENTICATION_PORT = 5552  # UDP, where programs look for drones (ARDroneLib, config.h)
 QUESTION, ANSWER = b"PARROT AUTH", b"PARROT AUTH OK"  # ARDroneLib, ardrone_auth.c
@@ -36,13 +36,7 @@ NOT_PERMITTED = (errno.EACCES, errno.EPERM)  # a port below 1024 needs a privile
 
 
 class ArdroneOptions(NamedTuple):
-    """How the drones are offered.
-
-    Attributes:
-        addresses: see `drone_addresses`.
-        peers: addresses of hosts that are obeyed on addresses that are not loopback.
-        rate: simulated per wall second, to be set; None leaves the run's.
-    """
+    """How the drones are offered: see `drone_addresses`; `peers` are obeyed on addresses that are not loopback."""
 
     addresses: str
     peers: frozenset[str]
@@ -78,7 +72,7 @@ class ArdroneServer(VehicleServer):
             self.say(f"{name} is an AR.Drone 2.0 at {drone.address}")
         stack.callback(self._pictures.follow, ())
 
-    async def take_in(self, intake: TrafficIntake) -> None:
+    async def on_arrivals(self, intake: TrafficIntake) -> None:
         for arrived in intake.arrivals():
             for key, payload in arrived:
                 self.forward(key, payload)
@@ -98,7 +92,6 @@ class ArdroneServer(VehicleServer):
                     self.say_once(f"video: av is not installed, no pictures are streamed; {advice}")
 
     def forward(self, key: str, payload: bytes) -> None:
-        """Hand a message that has passed the world to its aircraft."""
         kind, thing, leaf = keys.parts(key)
         # an aircraft's electronics know sensors, the estimate, and how fast the rotors turn
         is_onboard = leaf.startswith("sensor/") or leaf in ("estimate", "truth")
@@ -118,34 +111,26 @@ class ArdroneServer(VehicleServer):
         if image is not None and drone is not None and keys.leaf(key) == drone.aircraft.camera:
             drone.video.on_picture(image)
 
-    def on_event(self, payload: bytes) -> None:
+    def on_event(self, event: Event) -> None:
         """Count and print which commands of pilots' programs the world refuses."""
-        event = self.decoded(keys.EVENT, payload)
-        if event is None or (event.kind, event.source) != ("refused", self.observer.name):
+        if (event.kind, event.source) != ("refused", self.observer.name):
             return
         _, thing, what = keys.parts(event.subject)
         drone = self._drones.get(thing)
-        is_overtaken = what != "cmd/mode" and drone is not None and not drone.aircraft.is_steered
+        is_overtaken = what != "cmd/mode" and drone is not None and drone.aircraft.pilot.setpoint is None
         if not is_overtaken:  # a setpoint of the gate in which the pilot lands the drone says nothing
             self.refuse(f"{event.subject}: {event.data.get('reason', event.text)}")
 
 
 class DroneServer:
-    """The ports of one drone on its address, and the aircraft behind them.
-
-    Args:
-        drone: its name, limits and sensors.
-        address: of its ports.
-        peers: who is obeyed.
-        server: of the run.
-    """
+    """The ports of one drone on its address, and the aircraft behind them."""
 
     def __init__(self, drone: Drone, address: str, peers: AllowedHosts, server: ArdroneServer) -> None:
         self.address = address
         self._name = drone.name
         self._refuse: Callable[[str], None] = lambda reason: server.refuse(f"{drone.name}: {reason}")
-        self._navdata = DatagramPort(peers, self._on_navdata_request, self._refuse)
-        self._commands = DatagramPort(peers, self._on_commands, self._refuse)
+        self._navdata = DatagramPort(peers, lambda *asked: self.aircraft.on_navdata_request(*asked), self._refuse)
+        commands = DatagramPort(peers, lambda datagram, _: self.aircraft.on_at(datagram), self._refuse)
         self._authentication = DatagramPort(peers, self._on_question, self._refuse)
         self._control = StreamPort(peers, read_until_end, self._refuse)
         outlets = Outlets(server.link.put, self._navdata.send, self._control.broadcast, server.refuse)
@@ -155,7 +140,7 @@ class DroneServer:
         self._files = FileServer(address, peers, {}, self._refuse).port
         self._ports: tuple[tuple[DatagramPort | StreamPort, str, int], ...] = (
             (self._navdata, "UDP", navdata.PORT),
-            (self._commands, "UDP", at_commands.PORT),
+            (commands, "UDP", at_commands.PORT),
             (self._authentication, "UDP", AUTHENTICATION_PORT),
             (self._control, "TCP", configuration.PORT),
             (self.video.port, "TCP", video.PORT),
@@ -185,17 +170,10 @@ class DroneServer:
         return []
 
     async def close(self) -> None:
-        """Close all ports."""
         self.video.close()
         for opened, _, _ in self._ports:
             await opened.close()
         await self._files.close()
-
-    def _on_navdata_request(self, datagram: bytes, address: Address) -> None:
-        self.aircraft.on_navdata_request(datagram, address)
-
-    def _on_commands(self, datagram: bytes, _: Any) -> None:
-        self.aircraft.on_at(datagram)
 
     def _on_question(self, datagram: bytes, address: Address) -> None:
         if datagram.startswith(QUESTION):

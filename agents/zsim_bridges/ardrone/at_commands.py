@@ -132,20 +132,8 @@ class Ignored(NamedTuple):
     name: str
 
 
-Command = (
-    Ref
-    | Pcmd
-    | PcmdMag
-    | FlatTrim
-    | Calibrate
-    | ConfigIds
-    | Config
-    | Control
-    | ResetWatchdog
-    | Led
-    | Animation
-    | Ignored
-)
+FlightCommand = Ref | Pcmd | PcmdMag | FlatTrim | Calibrate | Animation
+Command = FlightCommand | ConfigIds | Config | Control | ResetWatchdog | Led | Ignored
 KINDS: dict[str, type[Any]] = {
     "REF": Ref,
     "PCMD": Pcmd,
@@ -213,7 +201,6 @@ def _command(part: bytes) -> Command:
 
 
 def _argument_types(kind: type[Any]) -> list[type]:
-    """Return the types of a command's arguments, after its sequence number."""
     return list(kind.__annotations__.values())[1:]
 
 
@@ -255,7 +242,6 @@ def bits_of_float(value: float) -> int:
 
 
 def format_command(command: Command) -> bytes:
-    """Return a command as it goes on the wire."""
     if isinstance(command, Ignored):
         return f"AT*{command.name}={command.sequence}\r".encode("ascii")
     sequence, *values = command

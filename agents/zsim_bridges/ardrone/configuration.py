@@ -39,13 +39,6 @@ class ConfigurationEntry(NamedTuple):
     high: float = 0.0
 
 
-def _entry(text: str) -> tuple[str, ConfigurationEntry]:
-    """Return the entry of a line of the table."""
-    name, kind, category, default, *limits = text.split("|")
-    low, high = (float(limit) for limit in limits) if limits else (0.0, 0.0)
-    return name, ConfigurationEntry(kind, category, default, low, high)  # type: ignore[arg-type]
-
-
 LIMITS = ("euler_angle_max", "control_vz_max", "control_yaw")
 """Of tilt [rad], climb [mm/s] and yaw rate [rad/s]: the aircraft keeps a set for indoors and one for outdoors."""
 _ALTITUDE = "20|100000"  # mm; the highest means that there is no limit (ARDroneLib)
@@ -146,20 +139,14 @@ gps:latitude|number|session|500|-1000|1000
 gps:longitude|number|session|500|-1000|1000
 gps:altitude|number|session|0|-1e5|1e5
 """
-ENTRIES = dict(_entry(line) for line in _TABLE.split("\n") if line)
+ENTRIES: dict[str, ConfigurationEntry] = {}
 """By `section:key`; in addition, there are the identifiers and descriptions of `custom`."""
+for _name, _kind, _category, _default, *_range in (line.split("|") for line in _TABLE.split("\n") if line):
+    ENTRIES[_name] = ConfigurationEntry(_kind, _category, _default, *map(float, _range))  # type: ignore[arg-type]
 
 
 class ConfigurationError(ValueError):
     """An entry is not accepted; the text says why."""
-
-
-class CustomList(NamedTuple):
-    """Custom configurations that the aircraft keeps: descriptions by identifier."""
-
-    applications: dict[str, str]
-    profiles: dict[str, str]
-    sessions: dict[str, str]
 
 
 class Configuration:
@@ -185,11 +172,9 @@ class Configuration:
         return value if high is None or float(value) <= high else f"{high:g}"
 
     def number(self, key: str) -> float:
-        """Return the value of an entry that is a number."""
         return float(self.text(key))
 
     def flag(self, key: str) -> bool:
-        """Return the value of an entry that is a flag."""
         return self.text(key) == "TRUE"
 
     def all(self) -> dict[str, str]:
@@ -201,12 +186,11 @@ class Configuration:
             custom[f"custom:{name}_desc"] = self._described[level][current]
         return {**{key: self.text(key) for key in ENTRIES}, **custom}
 
-    def custom_list(self) -> CustomList:
-        """Return the configurations that are kept."""
-        return CustomList(*(dict(self._described[level]) for level in _LEVELS.values()))
+    def custom_list(self) -> dict[str, dict[str, str]]:
+        """Return the custom configurations that are kept: descriptions by identifier, by the block of their level."""
+        return {block: dict(self._described[level]) for block, level in zip(_BLOCKS, _LEVELS.values(), strict=True)}
 
     def is_current(self, session: str, user: str, application: str) -> bool:
-        """Return whether these are the identifiers in force."""
         current = self._current
         return (session, user, application) == (current["session"], current["user"], current["application"])
 
@@ -217,24 +201,16 @@ class Configuration:
             ConfigurationError: there is no such entry, it cannot be written, or it cannot have the value.
         """
         key = key.lower()
-        if key.startswith("custom:"):
-            self._set_custom(key.removeprefix("custom:"), value)
+        section, _, name = key.partition(":")
+        if section == "custom":
+            self._set_custom(name, value)
             return
         entry = ENTRIES.get(key)
         if entry is None:
             raise ConfigurationError(f"{key[:60]!r} is no entry of the configuration")
         self._values(entry)[key] = _checked(key, entry, value)
-        self._follow_sets(key)
-
-    def _values(self, entry: ConfigurationEntry) -> dict[str, str]:
-        if entry.category == "common":
-            return self._common
-        return self._kept[entry.category][self._current[entry.category]]
-
-    def _follow_sets(self, key: str) -> None:
-        """Keep the limits in force equal to those of the set in use."""
+        # the limits in force are those of the set in use
         place = "outdoor" if self.flag("control:outdoor") else "indoor"
-        section, _, name = key.partition(":")
         if key == "control:outdoor":
             for limit in LIMITS:
                 self._copy(f"control:{place}_{limit}", f"control:{limit}")
@@ -242,6 +218,11 @@ class Configuration:
             self._copy(key, f"control:{place}_{name}")
         elif section == "control" and name.removeprefix(f"{place}_") in LIMITS:
             self._copy(key, f"control:{name.removeprefix(f'{place}_')}")
+
+    def _values(self, entry: ConfigurationEntry) -> dict[str, str]:
+        if entry.category == "common":
+            return self._common
+        return self._kept[entry.category][self._current[entry.category]]
 
     def _copy(self, key: str, to_key: str) -> None:
         values = self._values(ENTRIES[to_key])
@@ -255,27 +236,22 @@ class Configuration:
         if what == "desc":
             self._described[level][self._current[level]] = _checked_text(f"custom:{name}", value)
         elif value.startswith("-"):
-            self._delete(level, value[1:])
+            identifier = value[1:]
+            deleted = [each for each in self._kept[level] if each != DEFAULT_ID and identifier in ("all", each)]
+            if not deleted and identifier != "all":
+                raise ConfigurationError(f"there is no configuration {identifier[:40]!r} of the level {level}")
+            for each in deleted:
+                del self._kept[level][each], self._described[level][each]
+            if self._current[level] not in self._kept[level]:
+                self._current[level] = DEFAULT_ID
         else:
-            self._select(level, value)
-
-    def _select(self, level: Category, identifier: str) -> None:
-        if not _ID.fullmatch(identifier):
-            raise ConfigurationError(f"the identifier {identifier[:40]!r} must be letters and digits, at most 32")
-        if identifier not in self._kept[level]:
-            if len(self._kept[level]) >= KEPT_MAX:
-                raise ConfigurationError(f"there are {KEPT_MAX} configurations of the level {level}; delete some")
-            self._kept[level][identifier], self._described[level][identifier] = {}, ""
-        self._current[level] = identifier
-
-    def _delete(self, level: Category, identifier: str) -> None:
-        gone = [each for each in self._kept[level] if each != DEFAULT_ID and identifier in ("all", each)]
-        if not gone and identifier != "all":
-            raise ConfigurationError(f"there is no configuration {identifier[:40]!r} of the level {level}")
-        for each in gone:
-            del self._kept[level][each], self._described[level][each]
-        if self._current[level] not in self._kept[level]:
-            self._current[level] = DEFAULT_ID
+            if not _ID.fullmatch(value):
+                raise ConfigurationError(f"the identifier {value[:40]!r} must be letters and digits, at most 32")
+            if value not in self._kept[level]:
+                if len(self._kept[level]) >= KEPT_MAX:
+                    raise ConfigurationError(f"there are {KEPT_MAX} configurations of the level {level}; delete some")
+                self._kept[level][value], self._described[level][value] = {}, ""
+            self._current[level] = value
 
 
 def _checked(key: str, entry: ConfigurationEntry, value: str) -> str:
@@ -306,13 +282,11 @@ def _checked_text(key: str, value: str) -> str:
 
 
 def format_configuration(entries: Mapping[str, str]) -> bytes:
-    """Return the configuration as it goes on the wire."""
     return "".join(f"{key} = {value}\n" for key, value in entries.items()).encode("ascii", "replace") + END
 
 
-def format_custom_list(kept: CustomList) -> bytes:
-    """Return the list of custom configurations as it goes on the wire."""
+def format_custom_list(kept: Mapping[str, Mapping[str, str]]) -> bytes:
     parts: list[str] = []
-    for block, entries in zip(_BLOCKS, kept, strict=True):
+    for block, entries in kept.items():
         parts += [f"[{block}]", *(f"{identifier},{text}" for identifier, text in entries.items())]
     return "".join(f"{part}\r" for part in parts).encode("ascii", "replace") + END

@@ -88,11 +88,7 @@ _TABLE = f"""
 
 
 class OptionLayout(WireLayout):
-    """The layout of an option; `make` makes the NamedTuple of its fields.
-
-    Attributes:
-        size: bytes, tag and size included.
-    """
+    """The layout of an option, of `size` bytes with its tag and its size; `make` makes the NamedTuple of its fields."""
 
     def __init__(self, entry: Entry) -> None:
         super().__init__(entry.fields)
@@ -101,11 +97,9 @@ class OptionLayout(WireLayout):
         self.make: Callable[..., Any] = namedtuple(entry.name, [field.name for field in entry.fields])
 
     def zeros(self) -> Any:
-        """Return the option with all numbers zero."""
         return self.option(self.codec.unpack(bytes(self.codec.size)))
 
     def option(self, numbers: Sequence[Any]) -> Any:
-        """Return the option of the numbers on the wire."""
         return self.make(*self.nested(numbers))
 
 
@@ -129,19 +123,12 @@ StateBit = IntFlag(
 
 
 ControlState = IntEnum(
-    "ControlState",
-    "DEFAULT INIT LANDED FLYING HOVERING TEST TAKING_OFF GO_TO_FIX LANDING LOOPING",
-    start=0,
+    "ControlState", "DEFAULT INIT LANDED FLYING HOVERING TEST TAKING_OFF GO_TO_FIX LANDING LOOPING", start=0
 )
 """The upper half of demo's ctrl_state (ARDroneLib, control_states.h)."""
 
 
-class Hovering(IntEnum):
-    """The lower half of ctrl_state while it hovers, as far as it is used (control_states.h)."""
-
-    OK = 0
-    LOST_COM = 8
-    MAGNETO_CALIBRATION = 12
+LOST_COM, MAGNETO_CALIBRATION = 8, 12  # the lower half of ctrl_state while it hovers (control_states.h)
 
 
 class NavdataError(ValueError):
@@ -174,13 +161,7 @@ def checksum(packet: bytes | bytearray | memoryview) -> int:
 
 
 def pack(state: int, sequence: int, vision: int, options: Iterable[tuple[int, Iterable[Any]]] = ()) -> bytes:
-    """Return a packet.
-
-    Args:
-        state: bits.
-        sequence: from 1 on.
-        vision: flag of the header.
-        options: tag and values of each, in the order of the wire.
+    """Return a packet; sequence numbers begin with 1, options have tag and values, in the order of the wire.
 
     Raises:
         struct.error: a value is out of the range of its field.
@@ -208,7 +189,12 @@ def unpack(datagram: bytes) -> Navdata:
     unknown: dict[int, bytes] = {}
     at = _START.size
     while True:
-        tag, size = _option_header(datagram, at)
+        if at + HEADER.size > len(datagram):
+            raise NavdataError("has no checksum")
+        tag, size = HEADER.unpack_from(datagram, at)
+        if size < HEADER.size or at + size > len(datagram):
+            beyond = f"beyond the packet's {len(datagram)} bytes"
+            raise NavdataError(f"option {tag} at byte {at} has the size {size}, {beyond}")
         if tag == CHECKSUM_TAG:
             if size != _SUM.size:
                 raise NavdataError(f"the checksum's size is {size}; must be {_SUM.size}")
@@ -224,21 +210,8 @@ def unpack(datagram: bytes) -> Navdata:
         at += size
 
 
-def _option_header(datagram: bytes, at: int) -> tuple[int, int]:
-    if at + HEADER.size > len(datagram):
-        raise NavdataError("has no checksum")
-    tag, size = HEADER.unpack_from(datagram, at)
-    if size < HEADER.size or at + size > len(datagram):
-        raise NavdataError(f"option {tag} at byte {at} has the size {size}, beyond the packet's {len(datagram)} bytes")
-    return tag, size
-
-
 class NavdataTemplate:
-    """A packet that is made once and filled anew for each sending; options keep their values until then.
-
-    Args:
-        tags: of its options, in the order of the wire.
-    """
+    """A packet that is made once and filled anew for each sending; options keep their values until then."""
 
     def __init__(self, tags: Sequence[int]) -> None:
         self.tags = tuple(tags)
@@ -260,7 +233,6 @@ class NavdataTemplate:
         return lambda *numbers: pack_into(packet, at, *numbers)
 
     def packet(self, state: int, sequence: int, vision: int) -> bytes:
-        """Return the packet with its header and its checksum."""
         _START.pack_into(self._packet, 0, MAGIC, state, sequence, vision)
         total = int(self._body.sum(dtype=np.uint64)) % _MOST
         _SUM.pack_into(self._packet, self._end, CHECKSUM_TAG, _SUM.size, total)

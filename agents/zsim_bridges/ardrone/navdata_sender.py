@@ -33,22 +33,25 @@ FIX_3D = 3  # of a GPS receiver, as in NMEA
 _INT16 = 32_767
 _UNUSED_OF_DEMO = (0, *(0.0,) * 12, 0, 0, *(0.0,) * 12)  # frames, and what the cameras detect
 
+PWM, ALTITUDE, PRESSURE, MAGNETO, KALMAN_PRESSURE = (
+    TAG_OF[name] for name in ("pwm", "altitude", "pressure_raw", "magneto", "kalman_pressure")
+)
 Send = Callable[[bytes, Hashable], None]
 """Sends a datagram to an address."""
+Putters = dict[str, Callable[..., None]]
+"""By the name of an option, what writes its numbers."""
 
 
 class NavdataSender:
     """Sends an aircraft's navdata.
 
     Args:
-        content: of the packets.
-        configuration: of the aircraft.
-        send: sends a datagram.
         state_bits: returns the state word without the bits of the mode of navdata.
         ctrl_state: returns the state of the flight.
         refuse: counts what cannot be sent, with the reason.
 
     Attributes:
+        clients: addresses to which navdata is sent, the first that asked first.
         is_bootstrap: whether packets have no options yet.
     """
 
@@ -68,7 +71,7 @@ class NavdataSender:
         self._ctrl_state = ctrl_state
         self._refuse = refuse
         self._last: tuple[int, int] | None = None  # rate [Hz], and number of the packet within the simulated time
-        self._clients: dict[Hashable, None] = {}
+        self.clients: dict[Hashable, None] = {}
         self._sequence = 0
         self._prepare(())
         self.is_bootstrap = True
@@ -77,26 +80,22 @@ class NavdataSender:
         """Send navdata to an address from now on; return False for a datagram that does not ask for it."""
         if not datagram.startswith(REQUESTS):
             return False
-        if address not in self._clients:
-            while len(self._clients) >= CLIENTS_MAX:
-                del self._clients[next(iter(self._clients))]
-            self._clients[address] = None
+        if address not in self.clients:
+            while len(self.clients) >= CLIENTS_MAX:
+                del self.clients[next(iter(self.clients))]
+            self.clients[address] = None
             self._send(self._packet(t_ns), address)
         return True
-
-    def drop_clients(self) -> None:
-        """Send no more until it is asked for again."""
-        self._clients.clear()
 
     def on_instant(self, t_ns: int) -> None:
         """Send the packet that is due: a fixed number in each simulated second, without drift."""
         is_full = not (self.is_bootstrap or self._configuration.flag("general:navdata_demo"))
         rate_hz = navdata.FULL_RATE_HZ if is_full else navdata.DEMO_RATE_HZ
         number = rate_hz, t_ns * rate_hz // SECOND_NS
-        if self._clients and number != self._last:
+        if self.clients and number != self._last:
             self._last = number
             packet = self._packet(t_ns)
-            for address in tuple(self._clients):
+            for address in tuple(self.clients):
                 self._send(packet, address)
 
     def on_gate(self) -> None:
@@ -110,8 +109,8 @@ class NavdataSender:
         try:
             if self._is_gate_new:
                 self._is_gate_new = False
-                self._fill_gate()
-            self._fill_packet(self._ctrl_state(), t_ns)
+                self._content.fill_gate(self._put, tags)
+            self._content.fill_packet(self._put, self._ctrl_state(), t_ns)
         except (struct.error, ArithmeticError, ValueError) as error:
             self._refuse(f"navdata has a value beyond what its field can hold ({error})")
         self._sequence += 1
@@ -124,7 +123,7 @@ class NavdataSender:
 
     def _prepare(self, tags: tuple[int, ...]) -> None:
         self._template = NavdataTemplate(tags)
-        self._fill_packet, self._fill_gate = self._content.fillers(self._template)
+        self._put = {name: self._template.filler(tag) for name, tag in TAG_OF.items()}
         self._is_gate_new = True
 
     def _tags(self) -> tuple[int, ...]:
@@ -139,12 +138,7 @@ class NavdataSender:
 
 
 class NavdataContent:
-    """Fills packets with what is known of one aircraft.
-
-    Args:
-        state: what its electronics know.
-        rotor_max_rad_s: greatest speed of a rotor.
-    """
+    """Fills packets with what is known of one aircraft."""
 
     def __init__(self, state: OnboardState, rotor_max_rad_s: float) -> None:
         self._state = state
@@ -178,7 +172,12 @@ class NavdataContent:
         if mag is None:
             return 0.0
         theta_deg, phi_deg, _ = self.angles_deg
-        return magnetic_heading_deg(mag.field_ut, math.radians(phi_deg), math.radians(-theta_deg))
+        roll, pitch = math.radians(phi_deg), math.radians(-theta_deg)  # right side down, nose down
+        x, y, z = mag.field_ut
+        sine_roll, cosine_roll = math.sin(roll), math.cos(roll)
+        forward = x * math.cos(pitch) + math.sin(pitch) * (sine_roll * y + cosine_roll * z)
+        left = cosine_roll * y - sine_roll * z
+        return math.degrees(math.atan2(left, forward))
 
     @property
     def angles_deg(self) -> Vector:
@@ -190,90 +189,58 @@ class NavdataContent:
             self._unwrapped_deg += (self._angles_deg[2] - last_psi_deg + 180.0) % 360.0 - 180.0
         return self._angles_deg
 
-    def fillers(self, template: NavdataTemplate) -> tuple[Callable[[int, int], None], Callable[[], None]]:
-        """Return what fills a packet of these options: each time, with ctrl_state and time [ns]; once a gate."""
-        put = {name: template.filler(tag) for name, tag in TAG_OF.items()}
-        at_gates = [
-            (fill, put[name])
-            for name, fill in (
-                ("pwm", self._fill_pwm),
-                ("altitude", self._fill_altitude),
-                ("pressure_raw", self._fill_pressure),
-                ("magneto", self._fill_magneto),
-                ("kalman_pressure", self._fill_height),
-                ("gps", self._fill_gps),
-            )
-            if TAG_OF[name] in template.tags  # an option that is left out costs nothing
-        ]
-
-        def fill_packet(ctrl_state: int, t_ns: int) -> None:
-            self._fill_packet(put, ctrl_state, t_ns)
-
-        def fill_gate() -> None:
-            for fill, put_option in at_gates:
-                fill(put_option)
-
-        return fill_packet, fill_gate
-
-    def _fill_packet(self, put: dict[str, Callable[..., None]], ctrl_state: int, t_ns: int) -> None:
+    def fill_packet(self, put: Putters, ctrl_state: int, t_ns: int) -> None:
         state = self._state
         theta, phi, psi = (1e3 * angle for angle in self.angles_deg)
-        battery = round(state.status.battery_percent) if state.status else 0
+        charge = state.status.battery_percent if state.status else 0.0
         velocity = state.flow.velocity_m_s if state.flow else (0.0, 0.0, 0.0)
         vx, vy, vz = 1e3 * velocity[0], -1e3 * velocity[1], -1e3 * velocity[2]
         altitude_mm = max(0, round(1e3 * state.altitude_m))
-        put["demo"](ctrl_state, battery, theta, phi, psi, altitude_mm, vx, vy, vz, *_UNUSED_OF_DEMO)
-        put["time"](sdk_time(t_ns))
+        put["demo"](ctrl_state, round(charge), theta, phi, psi, altitude_mm, vx, vy, vz, *_UNUSED_OF_DEMO)
+        seconds, rest_ns = divmod(max(0, t_ns), SECOND_NS)
+        put["time"]((seconds & SECONDS_MASK) << SECONDS_SHIFT | rest_ns // 1000)  # begins again after 2048 s
         put["euler_angles"](theta, phi)
         if state.imu is not None:
-            self._fill_inertial(put, state.imu)
-
-    def _fill_inertial(self, put: dict[str, Callable[..., None]], imu: messages.Imu) -> None:
-        fx, fy, fz = (accel / G_M_S2 for accel in imu.accel_m_s2)
-        p, q, r = (math.degrees(rate) for rate in imu.gyro_rad_s)
-        put["phys_measures"](0.0, 0, 1e3 * fx, -1e3 * fy, -1e3 * fz, p, -q, -r, 0, 0, 0)
-        accs = [round(min(max(ACCEL_ZERO_LSB + ACCEL_LSB_PER_G * f, 0), 2 * _INT16)) for f in (fx, -fy, fz)]
-        gyros = [_int16(GYRO_LSB_PER_DEG_S * rate) for rate in (p, -q, -r)]
-        charge = self._state.status.battery_percent if self._state.status else 0.0
-        put["raw_measures"](*accs, *gyros, 0, 0, round(voltage_mv(charge)), *(0,) * 10, self._echo_mm(), 0)
+            fx, fy, fz = (accel / G_M_S2 for accel in state.imu.accel_m_s2)
+            p, q, r = (math.degrees(rate) for rate in state.imu.gyro_rad_s)
+            put["phys_measures"](0.0, 0, 1e3 * fx, -1e3 * fy, -1e3 * fz, p, -q, -r, 0, 0, 0)
+            accs = [round(min(max(ACCEL_ZERO_LSB + ACCEL_LSB_PER_G * f, 0), 2 * _INT16)) for f in (fx, -fy, fz)]
+            gyros = [_int16(GYRO_LSB_PER_DEG_S * rate) for rate in (p, -q, -r)]
+            put["raw_measures"](*accs, *gyros, 0, 0, round(voltage_mv(charge)), *(0,) * 10, self._echo_mm(), 0)
 
     def _echo_mm(self) -> int:
         return round(1e3 * self._sonar.range_m) if self._sonar and self._sonar.valid else 0
 
-    def _climb_mm_s(self) -> float:
-        return 1e3 * self._state.flow.velocity_m_s[2] if self._state.flow else 0.0
+    def fill_gate(self, put: Putters, tags: tuple[int, ...]) -> None:
+        """Fill what changes with a gate; an option that is left out costs nothing."""
+        state = self._state
+        climb_mm_s = 1e3 * state.flow.velocity_m_s[2] if state.flow else 0.0
+        if PWM in tags:
+            motors = [0, 0, 0, 0]
+            for i, speed in enumerate(self._rotors_rad_s[:4]):
+                motors[i] = min(PWM_MAX, max(0, round(PWM_MAX * speed / self._rotor_max_rad_s)))
+            put["pwm"](*motors, *(0,) * 4, *(0.0,) * 4, *(0,) * 3, 0.0, *(0,) * 3, 0.0, *(0,) * 4, 0.0, 0.0)
+        if ALTITUDE in tags:
+            altitude_mm = max(0, round(1e3 * state.altitude_m))
+            put["altitude"](altitude_mm, climb_mm_s, 0, self._echo_mm(), *(0.0,) * 5, 0, 0.0, 0.0, 0)
+        if PRESSURE in tags:
+            put["pressure_raw"](0, 0, 0, round(state.baro.pressure_pa) if state.baro else 0)
+        if MAGNETO in tags:
+            x, y, z = state.mag.field_ut if state.mag else (0.0, 0.0, 0.0)
+            field_ut = (x, -y, -z)
+            lsb = [_int16(each / MAG_UT_PER_LSB) for each in field_ut]
+            field_mg = [MG_PER_UT * each for each in field_ut]
+            heading_deg, radius = self.heading_deg, math.hypot(*field_ut) / MAG_UT_PER_LSB
+            headings = (heading_deg, self._unwrapped_deg, heading_deg)
+            is_calibrated = int(state.mag is not None)
+            put["magneto"](*lsb, *field_mg, *field_mg, 0.0, 0.0, 0.0, *headings, is_calibrated, 0, radius, 0.0, 0.0)
+        if KALMAN_PRESSURE in tags:
+            height_mm = 1e3 * state.altitude_m
+            put["kalman_pressure"](0.0, height_mm, climb_mm_s, *(0.0,) * 7, 0, 0.0, 0, 0.0, 0.0, 0, 0)
+        if GPS_TAG in tags and self._gps is not None:
+            self._fill_gps(put["gps"], self._gps)
 
-    def _fill_pwm(self, put: Callable[..., None]) -> None:
-        motors = [0, 0, 0, 0]
-        for i, speed in enumerate(self._rotors_rad_s[:4]):
-            motors[i] = min(PWM_MAX, max(0, round(PWM_MAX * speed / self._rotor_max_rad_s)))
-        put(*motors, *(0,) * 4, *(0.0,) * 4, *(0,) * 3, 0.0, *(0,) * 3, 0.0, *(0,) * 4, 0.0, 0.0)
-
-    def _fill_altitude(self, put: Callable[..., None]) -> None:
-        altitude_mm = max(0, round(1e3 * self._state.altitude_m))
-        put(altitude_mm, self._climb_mm_s(), 0, self._echo_mm(), *(0.0,) * 5, 0, 0.0, 0.0, 0)
-
-    def _fill_pressure(self, put: Callable[..., None]) -> None:
-        baro = self._state.baro
-        put(0, 0, 0, round(baro.pressure_pa) if baro else 0)
-
-    def _fill_magneto(self, put: Callable[..., None]) -> None:
-        mag = self._state.mag
-        x, y, z = mag.field_ut if mag else (0.0, 0.0, 0.0)
-        field_ut = (x, -y, -z)
-        lsb = [_int16(each / MAG_UT_PER_LSB) for each in field_ut]
-        field_mg = [MG_PER_UT * each for each in field_ut]
-        heading_deg, radius = self.heading_deg, math.hypot(*field_ut) / MAG_UT_PER_LSB
-        headings = (heading_deg, self._unwrapped_deg, heading_deg)
-        put(*lsb, *field_mg, *field_mg, 0.0, 0.0, 0.0, *headings, int(mag is not None), 0, radius, 0.0, 0.0)
-
-    def _fill_height(self, put: Callable[..., None]) -> None:
-        put(0.0, 1e3 * self._state.altitude_m, self._climb_mm_s(), *(0.0,) * 7, 0, 0.0, 0, 0.0, 0.0, 0, 0)
-
-    def _fill_gps(self, put: Callable[..., None]) -> None:
-        gps = self._gps
-        if gps is None:
-            return
+    def _fill_gps(self, put: Callable[..., None], gps: messages.Gps) -> None:
         has_fix = int(gps.fix >= FIX_3D)
         option = LAYOUTS[GPS_TAG].zeros()
         option = option._replace(
@@ -304,28 +271,7 @@ def angles_deg(q_WB: Quaternion) -> Vector:
     return -math.degrees(pitch), math.degrees(roll), -math.degrees(yaw)
 
 
-def magnetic_heading_deg(field_ut: Vector, roll_rad: float, pitch_rad: float) -> float:
-    """Return the heading clockwise from magnetic north, in (-180, 180].
-
-    Args:
-        field_ut: in B, forward, left, up.
-        roll_rad, pitch_rad: of B, right side down, nose down.
-    """
-    x, y, z = field_ut
-    sine_roll, cosine_roll = math.sin(roll_rad), math.cos(roll_rad)
-    forward = x * math.cos(pitch_rad) + math.sin(pitch_rad) * (sine_roll * y + cosine_roll * z)
-    left = cosine_roll * y - sine_roll * z
-    return math.degrees(math.atan2(left, forward))
-
-
-def sdk_time(t_ns: int) -> int:
-    """Return simulated time in the form of the option `time`, which begins again after 2048 s."""
-    seconds, rest_ns = divmod(max(0, t_ns), 1_000_000_000)
-    return (seconds & SECONDS_MASK) << SECONDS_SHIFT | rest_ns // 1000
-
-
 def voltage_mv(charge_percent: float) -> float:
-    """Return the battery's voltage [mV] at a charge [%]."""
     for (low, low_mv), (high, high_mv) in pairwise(VOLTAGE_MV):
         if charge_percent <= high:
             return low_mv + (high_mv - low_mv) * max(0.0, charge_percent - low) / (high - low)

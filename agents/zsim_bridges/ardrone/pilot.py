@@ -48,16 +48,9 @@ HOVER = TiltSetpoint(hover=True)
 class Pilot:
     """The pilot of one drone.
 
-    Args:
-        sender: of modes to it.
-        setpoints: sends what it is to fly.
-        source: name under which both are sent.
-        refuse: counts a command that is not obeyed, with the reason.
-
     Attributes:
         setpoint: that is flown; None for none.
-        has_flown: whether the flight is this pilot's.
-        stopped_by_pilot: whether the emergency is.
+        has_flown: whether the flight is this pilot's; stopped_by_pilot: whether the emergency is.
     """
 
     def __init__(
@@ -176,7 +169,6 @@ class Pilot:
     # Gates
 
     def on_status(self, status: Status) -> None:
-        """Do what is due at a gate."""
         self._status = status
         if status.state == "emergency" and self._mode == "takeoff":
             self._mode = None
@@ -202,7 +194,13 @@ class Pilot:
 
     def _pursue(self, mode: ModeName) -> None:
         """Ask for a mode until it is entered, given up, or no longer possible."""
-        if self._is_entered(mode):
+        entered = {
+            "takeoff": self.state in (*IN_THE_AIR, "emergency"),
+            "land": self.state not in IN_THE_AIR,
+            "emergency": self.state == "emergency",
+            "reset": self.state != "emergency",
+        }
+        if entered[mode]:
             self._mode = None
         elif mode == "takeoff" and self.state != "landed":
             return  # it lands first
@@ -213,13 +211,6 @@ class Pilot:
             self._mode_ns, self._mode_count = self._now_ns, self._mode_count + 1
             self.has_flown = self.has_flown or mode == "takeoff"
             self._sender.mode(self._now_ns, mode)
-
-    def _is_entered(self, mode: ModeName) -> bool:
-        if mode == "takeoff":
-            return self.state in (*IN_THE_AIR, "emergency")
-        if mode == "land":
-            return self.state not in IN_THE_AIR
-        return (self.state == "emergency") == (mode == "emergency")
 
     def _follow(self, setpoint: TiltSetpoint) -> None:
         """Take a setpoint, and send it at once if it differs from the last one."""
@@ -246,13 +237,11 @@ class SetpointSender:
     """Sends setpoints to one drone: shares of the firmware's limits, below a height, in the drone's frame.
 
     Args:
-        sender: of commands to it.
         limits: what zsim's shares of 1 mean.
         configuration: what the pilot's shares of 1 mean.
 
     Attributes:
-        altitude_m: over the ground, to be kept up to date.
-        heading_rad: clockwise from magnetic north, to be kept up to date.
+        altitude_m, heading_rad: over the ground, and clockwise from magnetic north, to be kept up to date.
         turn_ns: time of a whole turn of the calibration.
     """
 
@@ -274,7 +263,6 @@ class SetpointSender:
         return 0 if self._climb_left_m_s() < climb_m_s else REPEAT_NS
 
     def send(self, t_ns: int, setpoint: TiltSetpoint) -> None:
-        """Send a setpoint."""
         if setpoint.hover:
             self._sender.tilt(t_ns, 0.0, 0.0, 0.0, 0.0, hover=True)
             return
@@ -291,7 +279,6 @@ class SetpointSender:
         self._sender.tilt(t_ns, -back, -right, share(climb_m_s / self._climb_m_s), yaw_left, hover=False)
 
     def send_turn(self, t_ns: int) -> None:
-        """Let the drone turn clockwise, in place."""
         self._sender.velocity(t_ns, (0.0, 0.0, 0.0), -self._turn_rad_s)
 
     def _climb_left_m_s(self) -> float:

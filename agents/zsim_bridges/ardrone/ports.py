@@ -92,10 +92,6 @@ def peer_addresses(hosts: Iterable[str]) -> frozenset[str]:
 class AllowedHosts:
     """Who is obeyed on an address: on loopback every program of this host, elsewhere the hosts that were named.
 
-    Args:
-        address: of the drone.
-        named: addresses of hosts.
-
     Raises:
         RunError: the address is not loopback, and nobody is named.
     """
@@ -110,18 +106,11 @@ class AllowedHosts:
             )
 
     def allow(self, host: str) -> bool:
-        """Return whether a host is obeyed."""
         return self._is_loopback or host in self._named
 
 
 class DatagramPort(asyncio.DatagramProtocol):
-    """A UDP port.
-
-    Args:
-        peers: who is obeyed.
-        take: called with each of their datagrams, and its address.
-        refuse: counts what others send, with the reason.
-    """
+    """A UDP port: `take` is called with each datagram of a peer, and its address; what others send is refused."""
 
     def __init__(self, peers: AllowedHosts, take: Callable[[bytes, Address], None], refuse: Refuse) -> None:
         self._peers = peers
@@ -155,16 +144,7 @@ class DatagramPort(asyncio.DatagramProtocol):
 
 
 class StreamPort:
-    """A TCP port.
-
-    Args:
-        peers: who may connect.
-        serve: serves one connection until it is over.
-        refuse: counts what is not served, with the reason.
-
-    Attributes:
-        writers: of the connections that are served.
-    """
+    """A TCP port: `serve` serves one connection of a peer until it is over; `writers` are those of all of them."""
 
     def __init__(self, peers: AllowedHosts, serve: Serve, refuse: Refuse) -> None:
         self._peers = peers
@@ -184,7 +164,6 @@ class StreamPort:
         return self._server.sockets[0].getsockname()[1]
 
     async def close(self) -> None:
-        """End all connections."""
         if self._server is not None:
             self._server.close()
         for task in tuple(self._tasks):
@@ -192,7 +171,6 @@ class StreamPort:
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     def broadcast(self, data: bytes) -> None:
-        """Send bytes to everybody connected."""
         for writer in self.writers:
             if not writer.is_closing():
                 writer.write(data)
@@ -227,14 +205,7 @@ async def read_until_end(reader: asyncio.StreamReader, _: asyncio.StreamWriter) 
 
 
 class FileServer:
-    """An FTP server.
-
-    Args:
-        address: on which it listens.
-        peers: who may connect.
-        files: contents by name.
-        refuse: counts what is not served, with the reason.
-    """
+    """An FTP server with files by name."""
 
     def __init__(
         self, address: str, peers: AllowedHosts, files: dict[str, bytes], refuse: Callable[[str], None]

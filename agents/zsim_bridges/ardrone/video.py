@@ -7,7 +7,6 @@ import asyncio
 import struct
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from enum import IntEnum
 from fractions import Fraction
 from typing import Any, NamedTuple
 
@@ -23,6 +22,7 @@ WIDTH_PX, HEIGHT_PX, CODED_HEIGHT_PX = 640, 360, 368  # as displayed; coded in w
 RATE_HZ = 30  # frames a second, for the encoder's rate control
 IDR_EVERY = 30  # frames, chosen: after a loss, decoding begins again within a second
 BIT_RATE = 1_000_000  # bit/s: video:bitrate of the SDK, 1000 kbit/s
+IDR_FRAME, P_FRAME = 1, 3  # of a header; an IDR frame has SPS and PPS before it
 IDR, SPS, PPS = 5, 7, 8  # types of NAL units (ITU-T H.264, table 7-1)
 PRESET = {"preset": "ultrafast", "tune": "zerolatency", "profile": "baseline", "x264-params": "annexb=1"}
 BACKLOG_MAX = 500_000  # bytes that a connection may be behind, chosen: some seconds; then it waits for an IDR frame
@@ -30,15 +30,7 @@ _HEADER = struct.Struct("<4sBBHIHHHHIIBBBBIIHBBBB2xI12x")
 
 
 class VideoServer:
-    """Streams the pictures of one drone.
-
-    Args:
-        peers: who may connect.
-        refuse: counts what cannot be streamed, with the reason.
-
-    Attributes:
-        port: to be opened.
-    """
+    """Streams the pictures of one drone on its `port`, which is to be opened."""
 
     def __init__(self, peers: AllowedHosts, refuse: Callable[[str], None]) -> None:
         self._refuse = refuse
@@ -52,11 +44,9 @@ class VideoServer:
 
     @property
     def is_watched(self) -> bool:
-        """Whether somebody is connected."""
         return bool(self.port.writers)
 
     def close(self) -> None:
-        """Encode no more."""
         if self._busy is not None:
             self._busy.cancel()
         self._thread.shutdown(wait=False, cancel_futures=True)
@@ -90,7 +80,6 @@ class VideoServer:
             self._busy = None
 
     def _encode(self, image: CameraImage, begins: bool) -> "VideoFrame | None":
-        """Return the picture as a frame, in the encoder's thread."""
         self._encoder = self._encoder or VideoEncoder()
         return self._encoder.encode(image.data, begins)
 
@@ -104,16 +93,6 @@ class VideoServer:
             elif frame.is_idr or writer in self._ready:
                 self._ready.add(writer)
                 writer.write(packet)
-
-
-class FrameType(IntEnum):
-    """What a frame is; an IDR frame has SPS and PPS before it."""
-
-    UNKNOWN = 0
-    IDR = 1
-    I = 2  # noqa: E741  the header's own name
-    P = 3
-    HEADERS = 4
 
 
 class VideoError(ValueError):
@@ -150,7 +129,7 @@ def pave_header(frame: VideoFrame, frame_number: int, timestamp_ms: int, stream_
         timestamp_ms & 0xFFFF_FFFF,
         1,  # total_chuncks
         0,  # chunck_index
-        FrameType.IDR if frame.is_idr else FrameType.P,
+        IDR_FRAME if frame.is_idr else P_FRAME,
         0,  # control
         stream_byte_position & 0xFFFF_FFFF,
         stream_byte_position >> 32 & 0xFFFF_FFFF,
@@ -179,18 +158,23 @@ class VideoEncoder:
         self._count = 0
 
     def encode(self, jpeg: bytes, begins: bool) -> VideoFrame | None:
-        """Return the frame of a picture.
-
-        Args:
-            jpeg: the picture.
-            begins: whether decoding must be able to begin here.
+        """Return the frame of a JPEG picture; `begins`: decoding must be able to begin here.
 
         Raises:
             VideoError: it is no JPEG that can be read.
         """
+        import av
+        from av.error import FFmpegError
         from av.video.frame import PictureType
 
-        picture = _picture(jpeg).reformat(WIDTH_PX, HEIGHT_PX, "yuv420p")
+        reader: Any = av.CodecContext.create("mjpeg", "r")
+        try:
+            pictures = reader.decode(av.Packet(jpeg))
+        except (FFmpegError, ValueError) as error:
+            raise VideoError(f"it is no JPEG that can be read ({error})") from error
+        if not pictures:
+            raise VideoError("it is no JPEG that can be read")
+        picture = pictures[0].reformat(WIDTH_PX, HEIGHT_PX, "yuv420p")
         picture.pts, picture.time_base = self._count, self._codec.time_base
         picture.pict_type = PictureType.I if begins else PictureType.NONE
         self._count += 1
@@ -199,20 +183,6 @@ class VideoEncoder:
             return None
         sizes = {kind: size for kind, size in nal_units(data) if kind in (IDR, SPS, PPS)}
         return VideoFrame(data, IDR in sizes, sizes.get(SPS, 0), sizes.get(PPS, 0))
-
-
-def _picture(jpeg: bytes) -> Any:
-    import av
-    from av.error import FFmpegError
-
-    reader: Any = av.CodecContext.create("mjpeg", "r")
-    try:
-        pictures = reader.decode(av.Packet(jpeg))
-    except (FFmpegError, ValueError) as error:
-        raise VideoError(f"it is no JPEG that can be read ({error})") from error
-    if not pictures:
-        raise VideoError("it is no JPEG that can be read")
-    return pictures[0]
 
 
 def nal_units(data: bytes) -> Iterator[tuple[int, int]]:

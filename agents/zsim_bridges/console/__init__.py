@@ -1,8 +1,8 @@
 """The console: one run on a web page that viser draws, for operators who steer it and viewers who look.
 
 From what a browser reaches down to what is pure:
-- serving: `console_server`, `page_server` (HTTP, tokens), `page_sockets` (actions, pictures), `private_viser`;
-- one run: `run_page` ties it together; `console_page` and the forms are its panels, `scene` and `page_cameras` its
+- serving: `page_server` (HTTP, tokens), `page_sockets` (actions, pictures), `private_viser`;
+- one run: `console_server` ties it together; `console_page` and the forms are its panels, `scene`, `page_cameras` its
   scene, `page_flying` and `manual_flight` fly single drones;
 - requests: `command_client` sends them, `orders` follows them, `control_desk` decides which page may make them;
 - what is known: `view_buffer`, `time_monitor`, `run_monitor`, `run_condition`, `alarms`, `camera_feed`, `histories`.

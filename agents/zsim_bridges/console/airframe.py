@@ -79,7 +79,6 @@ def coloured(shape: DroneShape) -> bytes:
 
 @cache
 def whole(shape: DroneShape) -> Mesh:
-    """Return a drone as one surface."""
     return _mesh([solid for solids in _solids(shape).values() for solid in solids])
 
 
@@ -118,7 +117,6 @@ def _solids(shape: DroneShape) -> dict[str, list[trimesh.Trimesh]]:
 
 @cache
 def rotor() -> Mesh:
-    """Return a propeller of two blades about its own axis."""
     blades = [_moved(box((ROTOR_RADIUS_M, 0.016, 0.002)), (side * ROTOR_RADIUS_M / 2, 0, 0)) for side in (-1, 1)]
     for side, blade in zip((-1, 1), blades, strict=True):
         blade.apply_transform(trimesh.transformations.rotation_matrix(side * 0.2, (1, 0, 0)))
@@ -127,13 +125,11 @@ def rotor() -> Mesh:
 
 @cache
 def ring() -> Mesh:
-    """Return a flat ring of 1 m radius, about the z axis."""
     return _mesh([annulus(0.93, 1.0, 0.03, sections=40)])
 
 
 @cache
 def ball() -> Mesh:
-    """Return a sphere of 1 m radius."""
     return _mesh([icosphere(subdivisions=2)])
 
 

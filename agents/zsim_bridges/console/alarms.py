@@ -70,14 +70,12 @@ class DroneCondition(NamedTuple):
 
 
 def battery_severity(percent: float) -> Severity | None:
-    """Return the severity of the alarm of a battery, None where there is none."""
     if percent < BATTERY_EMPTY_PERCENT:
         return "red"
     return "amber" if percent < BATTERY_LOW_PERCENT else None
 
 
 def drone_alarms(drone: DroneCondition) -> list[Alarm]:
-    """Return the alarms of one drone."""
     found: list[Alarm] = []
 
     def add(severity: Severity, name: str, text: str = "") -> None:
@@ -87,22 +85,22 @@ def drone_alarms(drone: DroneCondition) -> list[Alarm]:
         add("red", "emergency", drone.failsafe or "rotors stopped")
     elif drone.state == "landing" and drone.failsafe:
         add("red", "lands by itself", drone.failsafe)
-    if drone.tilt_deg is not None and drone.tilt_deg > UPSIDE_DOWN_DEG:
+    if (drone.tilt_deg or 0.0) > UPSIDE_DOWN_DEG:
         add("red", "upside down", f"tilted by {drone.tilt_deg:.0f}°")
     if severity := battery_severity(drone.battery_percent):
         add(severity, "battery", f"{drone.battery_percent:.0f} %")
     if drone.estimate_lost:
         add("red", "no estimate")
-    elif drone.lag_ms is not None and drone.lag_ms > LATE_MS:
+    elif (drone.lag_ms or 0.0) > LATE_MS:
         add("amber", "estimate late", f"{drone.lag_ms:.0f} ms")
-    if drone.sigma_m is not None and drone.sigma_m > SIGMA_HIGH_M:
+    if (drone.sigma_m or 0.0) > SIGMA_HIGH_M:
         add("amber", "sigma", f"{drone.sigma_m:.1f} m")
     if drone.link_state == "lost":
         add("red", "link lost")
         return found
-    if drone.link_age_ms is not None and drone.link_age_ms > LINK_OLD_MS:
+    if (drone.link_age_ms or 0.0) > LINK_OLD_MS:
         add("amber", "link old", f"{drone.link_age_ms:.0f} ms")
-    if drone.link_loss_percent is not None and drone.link_loss_percent > LINK_LOSS_PERCENT:
+    if (drone.link_loss_percent or 0.0) > LINK_LOSS_PERCENT:
         add("amber", "link loss", f"{drone.link_loss_percent:.0f} %")
     return found
 
@@ -127,7 +125,6 @@ def formation_alarms(
 
 
 def foreign_text(commanders: Mapping[str, str]) -> str:
-    """Describe who flies which drone instead of a formation's controller."""
     return ", ".join(f"{drone} is flown by {who}" for drone, who in commanders.items())
 
 
@@ -172,11 +169,7 @@ def parameters_text(fault: Fault) -> str:
 
 
 class Losses:
-    """Keeps which processes and drones are lost; thread-safe.
-
-    Attributes:
-        now: the newest event about each lost one.
-    """
+    """Keeps which processes and drones are lost, by `now`, the newest event about each; thread-safe."""
 
     def __init__(self) -> None:
         self.now: dict[str, Event] = {}
@@ -220,7 +213,6 @@ class AlarmBoard:
         self.alarms: tuple[Alarm, ...] = ()
 
     def update(self, alarms: Sequence[Alarm], wall_s: float) -> None:
-        """Take over the present alarms."""
         with self._lock:
             now = {(each.subject, each.name): each for each in alarms}
             for key, standing in list(self._standing.items()):
@@ -282,7 +274,6 @@ class FaultWatch:
         self._watched: dict[int, _WatchedFault] = {}
 
     def clear(self) -> None:
-        """Remove all: a replay has gone back."""
         self._watched.clear()
 
     def update(
@@ -294,13 +285,7 @@ class FaultWatch:
         lost: Collection[str],
         wind_m_s: float,
     ) -> None:
-        """Take over the present condition.
-
-        Args:
-            begun: faults that have begun, instantaneous ones among them.
-            active: those that act now.
-            lost: processes that are dead or silent.
-        """
+        """Take over the present condition: faults that have begun, or act now; processes that are dead or silent."""
         acting = {fault.id: fault for fault in active}
         known = {fault.id: fault for fault in begun} | acting
         for number in self._watched.keys() - known.keys():
@@ -314,23 +299,17 @@ class FaultWatch:
             del self._watched[number]
 
     def lines(self, is_over: bool = False) -> list[str]:
-        """Return a line for each fault that acts, or for each that is over."""
         return [each.line() for each in self._watched.values() if each.over == is_over]
 
 
 @dataclass
 class _WatchedFault:
-    """A fault, and what it may change of its target, which names drones, or processes named after them.
-
-    Attributes:
-        before, worst: sigma [m], lag [ms] and wind [m/s] of the target at first, and the worst while the fault acts.
-        states: those that drones, formations and processes have gone through, by name.
-    """
+    """A fault, and what it may change of its target, which names drones, or processes named after them."""
 
     fault: Fault
-    before: tuple[float, ...] = ()
-    worst: tuple[float, ...] = ()
-    states: dict[str, list[str]] = field(default_factory=dict)
+    before: tuple[float, ...] = ()  # sigma [m], lag [ms] and wind [m/s] of the target at first
+    worst: tuple[float, ...] = ()  # the same, the worst while the fault acts
+    states: dict[str, list[str]] = field(default_factory=dict)  # that drones, formations and processes went through
     over: bool = False
 
     def update(

@@ -65,14 +65,7 @@ class _Watched:
 class CameraFeed:
     """The cameras of one run, each named `DRONE/CAMERA`; only those that a page watches are subscribed to.
 
-    Args:
-        observer: of the console in the run; counts what is received and refused.
-        drones: of the run; cameras of others are ignored.
-        hat_m: diameter of a hat [m].
-
-    Attributes:
-        refused: number of refused pictures by camera.
-        reasons: why the last of them was refused.
+    Cameras of drones that are not in the run are ignored; `hat_m` is the diameter of a hat [m].
     """
 
     def __init__(
@@ -94,8 +87,8 @@ class CameraFeed:
         self._watched: dict[str, _Watched] = {}
         self._undeclare: dict[str, Callable[[], None]] = {}  # by key
         self._number = 0
-        self.refused: Counter[str] = Counter()
-        self.reasons: dict[str, str] = {}
+        self.refused: Counter[str] = Counter()  # number of refused pictures by camera
+        self.reasons: dict[str, str] = {}  # why the last of them was refused
 
     def open(self) -> None:
         """Learn which cameras exist, and of those that appear later."""
@@ -109,7 +102,6 @@ class CameraFeed:
             self._on_info(sample, kept=True)
 
     def close(self) -> None:
-        """End all subscriptions to pictures."""
         with self._lock:
             self._asked.clear()
         self.update()
@@ -132,7 +124,6 @@ class CameraFeed:
     # For pages; from any thread
 
     def cameras(self) -> tuple[tuple[str, CameraInfo], ...]:
-        """Return the known cameras in the order of the drones."""
         infos = self._infos.copy()
         return tuple((camera, infos[camera]) for camera in self._order if camera in infos)
 
@@ -142,7 +133,6 @@ class CameraFeed:
             self._asked[page] = tuple(cameras), self._wall_s() + ASKED_S
 
     def release(self, page: object) -> None:
-        """Request nothing for a page any more."""
         with self._lock:
             self._asked.pop(page, None)
 
@@ -171,27 +161,22 @@ class CameraFeed:
         return ()
 
     def shown(self, camera: str) -> tuple[CameraInfo, CameraPicture] | None:
-        """Return a camera with its newest picture, None before the first."""
         info, picture = self._infos.get(camera), self.picture(camera)
         return None if info is None or picture is None else (info, picture)
 
     def state(self) -> list[dict[str, Any]]:
-        """Return the cameras as plain data for programs and tests."""
-        found = []
-        for camera, _ in self.cameras():
-            with self._lock:
-                watched = self._watched.get(camera)
-                picture = watched.picture if watched is not None else None
-                found.append(
-                    {
-                        "camera": camera,
-                        "watched": watched is not None,
-                        "t_s": picture.image.t_sample_ns / 1e9 if picture is not None else None,
-                        "refused": self.refused[camera],
-                        "reason": self.reasons.get(camera, ""),
-                    }
-                )
-        return found
+        with self._lock:
+            watched = {camera: self._watched.get(camera) for camera, _ in self.cameras()}
+            return [
+                {
+                    "camera": camera,
+                    "watched": each is not None,
+                    "t_s": each.picture.image.t_sample_ns / 1e9 if each is not None and each.picture else None,
+                    "refused": self.refused[camera],
+                    "reason": self.reasons.get(camera, ""),
+                }
+                for camera, each in watched.items()
+            ]
 
     # Callbacks; in Zenoh's threads
 
@@ -253,7 +238,6 @@ class CameraFeed:
 
 
 def _camera_of(key: str) -> str:
-    """Return the name of the camera that a key is about."""
     _, drone, what = keys.parts(key)
     return f"{drone}/{what.split('/')[1]}"
 
@@ -292,7 +276,6 @@ def is_usable(info: CameraInfo) -> bool:
 
 
 def field_of_view(info: CameraInfo) -> float:
-    """Return the vertical angle of view without distortion [rad]."""
     return 2.0 * math.atan(info.height / 2.0 / info.K[4])
 
 
@@ -340,6 +323,5 @@ def _place(lens: Lens, ray_K: rotation.Vector) -> tuple[float, float] | None:
 
 
 def range_text(seen: Seen) -> str:
-    """Return a range with its sigma: `4.1 ± 0.2 m`."""
     digits = 1 if seen.sigma_range_m >= 0.1 else 2
     return f"{seen.range_m:.{digits}f} ± {seen.sigma_range_m:.{digits}f} m"

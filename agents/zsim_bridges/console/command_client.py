@@ -26,22 +26,15 @@ Task = Callable[[], None]
 
 
 class RequestOutcome(NamedTuple):
-    """A described request, and why it was refused; empty if it was not.
-
-    Attributes:
-        subject: the formation or drone; empty for the run.
-        op, args: the request.
-        order: id of the order of which it is an attempt; empty for none.
-        unanswered: whether it may still be carried out, since nobody has answered.
-    """
+    """A described request, and why it was refused; empty if it was not."""
 
     request: str
     refusal: str
-    subject: str = ""
+    subject: str = ""  # the formation or drone; empty for the run
     op: str = ""
     args: Mapping[str, Any] = {}
-    order: str = ""
-    unanswered: bool = False
+    order: str = ""  # id of the order of which it is an attempt; empty for none
+    unanswered: bool = False  # whether it may still be carried out, since nobody has answered
 
 
 class NoAnswer(str):
@@ -61,11 +54,8 @@ class PastInstant(NamedTuple):
 class CommandClient:
     """Sends requests in the console's name.
 
-    Args:
-        name: of the console's process.
-        views: know which commands have been answered.
-        now_ns: simulated time for a stamp; may poll the world.
-        report: called with the outcome of each request, in any thread.
+    `views` know which commands have been answered, `now_ns` gives the time of a stamp and may poll the world, and
+    `report` is called with the outcome of each request, in any thread.
     """
 
     def __init__(
@@ -84,7 +74,7 @@ class CommandClient:
         self._seqs: Counter[str] = Counter()  # messages sent on each key
         self._modes: Counter[str] = Counter()  # modes requested of each drone
         self._emergencies: Counter[str] = Counter()  # those of them that are emergencies
-        self._cluster_requests: Counter[str] = Counter()  # by formation
+        self.cluster_requests: Counter[str] = Counter()  # made so far, by formation
         self._lock = threading.RLock()
         self._pools = [
             ThreadPoolExecutor(THREADS_PER_POOL, thread_name_prefix=f"console-{kind}")
@@ -94,13 +84,11 @@ class CommandClient:
         self._queue = DroneQueue(modes, stops)
 
     def close(self) -> None:
-        """Drop waiting requests."""
         self._queue.close()
         for pool in self._pools:
             pool.shutdown(wait=False, cancel_futures=True)
 
     def request_world(self, op: str, **args: Any) -> None:
-        """Request an operation of the world."""
         what = RequestOutcome(f"{op} {arguments_text(args)}".strip(), "")
         self._submit(self._requests.submit, what, self._request, keys.CONTROL, op, args)
 
@@ -147,14 +135,10 @@ class CommandClient:
 
     def request_cluster(self, cluster: str, op: str, shown: str = "", order: str = "", **args: Any) -> None:
         """Request an operation of a formation's controller; `shown` describes the arguments as the page shows them."""
-        self._cluster_requests[cluster] += 1
+        self.cluster_requests[cluster] += 1
         text = f"{cluster}: {op} {shown or arguments_text(args)}".strip()
         what = RequestOutcome(text, "", cluster, op, args, order)
         self._submit(self._requests.submit, what, self._request, keys.cluster_control(cluster), op, args)
-
-    def requests_to(self, cluster: str) -> int:
-        """Return the number of requests made of a formation so far."""
-        return self._cluster_requests[cluster]
 
     def send_mode(self, drones: Sequence[str], mode: str, order: str = "") -> None:
         """Let drones take off, land, stop at once or leave the emergency, whoever commands them.
@@ -174,7 +158,6 @@ class CommandClient:
                 self._submit(turn, what, self._acquire_and_send, drone, mode, stops)
 
     def modes_requested(self, drone: str) -> int:
-        """Return the number of modes requested of a drone so far."""
         return self._modes[drone]
 
     def take(self, drone: str, done: Callable[[str], None]) -> None:
@@ -253,7 +236,6 @@ class CommandClient:
 
 
 def _refusal_of(act: Callable[..., str], *args: Any) -> str:
-    """Return why something was not done; empty if it was."""
     try:
         return act(*args)
     except ZsimError as error:
@@ -264,9 +246,7 @@ def _refusal_of(act: Callable[..., str], *args: Any) -> str:
 
 @dataclass
 class _DroneTasks:
-    """Number of running tasks of one drone, and those that wait for them."""
-
-    busy: int = 0
+    busy: int = 0  # that run
     waiting: deque[Task] = field(default_factory=deque)
 
 
@@ -284,7 +264,6 @@ class DroneQueue:
         self._closed = False
 
     def close(self) -> None:
-        """Start no more tasks."""
         with self._lock:
             self._closed = True
             self._tasks.clear()
@@ -292,8 +271,8 @@ class DroneQueue:
     def submit(self, name: str, act: Task) -> None:
         """Run a task after all that were submitted for that name before."""
         with self._lock:
-            tasks = self._tasks_of(name)
-            if tasks.busy:
+            tasks = self._tasks.get(name)
+            if tasks is not None and tasks.busy:
                 tasks.waiting.append(act)
             else:
                 self._start(self._pool, name, act)
@@ -301,13 +280,7 @@ class DroneQueue:
     def submit_urgent(self, name: str, act: Task) -> None:
         """Run a task without waiting for earlier ones; later ones wait for it."""
         with self._lock:
-            self._tasks_of(name)
             self._start(self._urgent, name, act)
-
-    def _tasks_of(self, name: str) -> _DroneTasks:
-        if self._closed:
-            raise RuntimeError("closed")
-        return self._tasks.setdefault(name, _DroneTasks())
 
     def _start(self, pool: Executor, name: str, act: Task) -> None:
         def run() -> None:
@@ -316,8 +289,10 @@ class DroneQueue:
             finally:
                 self._end(name)
 
+        if self._closed:
+            raise RuntimeError("closed")
         pool.submit(run)
-        self._tasks[name].busy += 1
+        self._tasks.setdefault(name, _DroneTasks()).busy += 1
 
     def _end(self, name: str) -> None:
         with self._lock:

@@ -1,5 +1,9 @@
-"""The page's panels in one run: forms, plots and tables that all pages share, and those of each page."""
+"""The page's panels in one run: forms, plots and tables that all pages share, and those of each page.
 
+A page's own are the modes of the chosen drone, or of those selected for one command, the drones, and the events.
+"""
+
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -7,20 +11,30 @@ from typing import Any, NamedTuple
 
 import viser
 
+from zsim_agents.formation.flight_check import DOWN
+from zsim_bridges.console.alarms import BATTERY_LOW_PERCENT
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
-from zsim_bridges.console.console_tables import DroneRow, event_table
+from zsim_bridges.console.console_tables import DroneRow, drone_table, event_table, figure_lines, preflight_lines
 from zsim_bridges.console.control_desk import EVERY, RUN, ControlDesk, ControlForm
-from zsim_bridges.console.drone_forms import DroneForm, FleetTable
 from zsim_bridges.console.formation_form import FormationForm
 from zsim_bridges.console.histories import TRAIL_S, TRAILS_S
 from zsim_bridges.console.operator_input import slider_ranges
 from zsim_bridges.console.picture import Array, DronePoses, FlightPreview
 from zsim_bridges.console.private_viser import control_id, control_ids
-from zsim_bridges.console.run_condition import RunCondition, ShownRun
-from zsim_bridges.console.run_forms import FaultForm, FleetForm, RunForm
+from zsim_bridges.console.run_condition import RunCondition, ShownRun, drone_refusals
+from zsim_bridges.console.run_forms import (
+    ORDERS,
+    FaultForm,
+    FleetForm,
+    OrderButton,
+    RunForm,
+    offered,
+    refusal_lines,
+    set_refusals,
+)
 from zsim_bridges.console.run_monitor import FlightFigures
 from zsim_bridges.console.scene import ChosenRing, draw_ground
-from zsim_bridges.console.variable_plots import VariablePlots, flight_history
+from zsim_bridges.console.variable_plots import FlightHistory, VariablePlots
 from zsim_bridges.console.view_buffer import ALL, KINDS, EventRow, chosen_rows
 
 PANEL_PX = 350
@@ -30,10 +44,41 @@ SWITCHES = {
     "estimates": "Estimates: 2σ ellipsoids (hold 74 % in 3-D)",
     "trails": "Trails",
 }
+MANY = 12  # drones; of more, which do not fit on a page, the worst come first by default
+FILTER_MAX = 80  # characters
+SEVERITIES = ("red", "amber", None)
+SORTINGS: dict[str, Callable[[DroneRow], tuple[float, ...]]] = {
+    "as in the scenario": lambda _: (),
+    "worst first": lambda row: (SEVERITIES.index(row.severity), row.drone.battery_percent, -row.link_badness),
+    "battery, lowest first": lambda row: (row.drone.battery_percent,),
+    "link, worst first": lambda row: (-row.link_badness,),
+    "σ, largest first": lambda row: (-math.inf if row.drone.sigma_m is None else -row.drone.sigma_m,),
+}
+"""Sort keys of rows; equal ones stay in the scenario's order."""
+FILTERS: dict[str, Callable[[DroneRow, "frozenset[str]"], bool]] = {
+    ALL: lambda row, selected: True,
+    "with an alarm": lambda row, selected: row.severity is not None,
+    "in the air": lambda row, selected: row.drone.state not in DOWN,
+    "on the ground": lambda row, selected: row.drone.state in DOWN,
+    "battery low": lambda row, selected: row.drone.battery_percent < BATTERY_LOW_PERCENT,
+    "selected": lambda row, selected: row.name in selected,
+}
+NO_ROW = "no drone is like that; change the filter"
+DRONE_MODES = {
+    "takeoff": "Take off",
+    "land": "Land",
+    "return": "Return",
+    "emergency": "Emergency",
+    "reset": "Reset",
+}  # and, which is no mode, the return to the start
+IN_CONTROL = ("takeoff", "return", "reset")  # these need control; any page may land a drone, or stop it
+DRONE_ICONS = {"takeoff": viser.Icon.PLANE_DEPARTURE, "return": viser.Icon.HOME, "reset": viser.Icon.REFRESH}
 
 
 class ConsolePage:
     """The shared controls of one run, in two panels.
+
+    Folders are for each page's own controls.
 
     Args:
         gui: viser's; the controls of another run are removed.
@@ -44,12 +89,8 @@ class ConsolePage:
         show_preview: shows what a formation would fly; None: nothing.
 
     Attributes:
-        phases, faults: the tables.
-        forms, plots: of each formation.
         flights: history of single drones, for plots.
         chosen: the formation that is shown; empty if there is none.
-        fleet: requests of all drones.
-        control_folder, drone_folder, figure_folder, event_folder, theme_folder: for each page's own controls.
         parts: what a page must be in control of to use a control, by the control's id.
     """
 
@@ -71,7 +112,7 @@ class ConsolePage:
         self._show_preview = show_preview
         self.forms: dict[str, FormationForm] = {}
         self.plots: dict[str, VariablePlots] = {}
-        self.flights = flight_history([drone.name for drone in run.scenario.drones], around=run.is_replay)
+        self.flights = FlightHistory([drone.name for drone in run.scenario.drones], around=run.is_replay)
         self.chosen = next(iter(run.spaces), "")
         self.parts: dict[str, str] = {}
         self._folders: dict[str, list[viser.GuiFolderHandle]] = {}
@@ -80,20 +121,6 @@ class ConsolePage:
         gui.set_panel_label(f"zsim {run.scenario.name}")
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_PX)
-        self._right_panel(gui, show, choose_trail)
-        panel = gui.add_panel()
-        with panel.add_tab("Drones", viser.Icon.DRONE):
-            self.drone_folder = gui.add_folder(None)
-            self.figure_folder = gui.add_folder(None)
-        with panel.add_tab("Events", viser.Icon.LIST):
-            self.event_folder = gui.add_folder(None)
-        panel.dock_left()
-        panel.set_width(PANEL_PX)
-
-    def _right_panel(
-        self, gui: viser.GuiApi, show: Callable[[str, bool], None], choose_trail: Callable[[float], None]
-    ) -> None:
-        run = self._run
         self.phases = gui.add_html("")
         self.control_folder = gui.add_folder(None)
         with self._part(gui, EVERY):
@@ -118,6 +145,14 @@ class ConsolePage:
             trail = gui.add_dropdown("trails of", list(lengths), initial_value=f"the last {TRAIL_S:g} s")
             trail.on_update(lambda _: choose_trail(lengths[trail.value]))
             self.theme_folder = gui.add_folder(None)
+        panel = gui.add_panel()
+        with panel.add_tab("Drones", viser.Icon.DRONE):
+            self.drone_folder = gui.add_folder(None)
+            self.figure_folder = gui.add_folder(None)
+        with panel.add_tab("Events", viser.Icon.LIST):
+            self.event_folder = gui.add_folder(None)
+        panel.dock_left()
+        panel.set_width(PANEL_PX)
 
     def _formation_tabs(self, gui: viser.GuiApi, tabs: Any) -> None:
         """Give every formation a folder in two tabs; only that of the chosen one is visible."""
@@ -151,7 +186,6 @@ class ConsolePage:
                 folder.visible = name == chosen
 
     def refresh(self, run: RunCondition) -> None:
-        """Grey out what would be refused."""
         self.fleet.refresh(run)
         self.run_form.refresh(run)
         for form in self.forms.values():
@@ -162,8 +196,8 @@ class _PageForm(NamedTuple):
     """Controls of one page."""
 
     control: ControlForm
-    drone: DroneForm
-    fleet: FleetTable
+    drone: "DroneForm"
+    fleet: "FleetTable"
     ring: ChosenRing
     instruments: viser.GuiHtmlHandle
     figures: viser.GuiHtmlHandle
@@ -199,7 +233,7 @@ class PageForms:
         self._desk = desk
         self._part_of = part_of
         self._request_return = request_return
-        self._forms: dict[int, _PageForm] = {}
+        self._forms: dict[int | None, _PageForm] = {}  # by viser's number of the page
         self._closed = False
         server.on_client_connect(self._add)
         server.on_client_disconnect(self._remove)
@@ -208,54 +242,56 @@ class PageForms:
         """Add nothing to later pages."""
         self._closed = True
 
-    def _form(self, client_id: int | None) -> _PageForm | None:
-        return None if client_id is None else self._forms.get(client_id)
-
     def choose(self, client_id: int | None, drone: str) -> None:
-        """Choose a drone on one page, as a click on it in the scene does."""
-        if form := self._form(client_id):
+        if (form := self._forms.get(client_id)) and drone in self._names:
             form.drone.choose(drone)
 
     def toggle(self, client_id: int | None, drone: str) -> None:
         """Select a drone on one page for one command with others, or unselect it."""
-        if form := self._form(client_id):
+        if form := self._forms.get(client_id):
             form.fleet.toggle(drone)
 
     def chosen(self, client_id: int | None) -> str:
         """Return the drone that one page has chosen; empty for a page that is not open."""
-        form = self._form(client_id)
+        form = self._forms.get(client_id)
         return form.drone.chosen if form else ""
 
-    def use(self, client_id: int, drone: str) -> str:
+    def use(self, client_id: int | None, drone: str) -> str:
         """Put a page in control of a drone's formation, if that is free; return why it may not be."""
-        return self._desk.use(client_id, self._part_of(drone))
+        return self._desk.use(client_id, self._part_of(drone)) if client_id is not None else ""
 
     def move_rings(self, drones: DronePoses) -> None:
-        """Put the ring of each page about the drone that it has chosen."""
         self._update(lambda form: form.ring.move(drones, form.drone.chosen))
 
-    def show_figures(self, instruments_of: Callable[[str], str], sensors_of: Callable[[str], str]) -> None:
-        """Show on each page instruments and sensors, as HTML, of the drone that it has chosen."""
+    def show(
+        self,
+        rows: Sequence[DroneRow],
+        figures: Mapping[str, FlightFigures],
+        sensors_of: Callable[[str], str],
+        events: Sequence[EventRow],
+    ) -> None:
+        """Show on each page the drones as it sorts and filters them, all of the chosen one, and the chosen events.
+
+        `sensors_of` returns the sensors of a drone as HTML.
+        """
         chosen = {form.drone.chosen for form in list(self._forms.values())}
-        contents = {drone: (instruments_of(drone), sensors_of(drone)) for drone in chosen}
+        contents = {drone: (figure_lines(figures.get(drone)), sensors_of(drone)) for drone in chosen}
 
         def show(form: _PageForm) -> None:
             form.instruments.content, form.figures.content = contents.get(form.drone.chosen, ("", ""))
+            form.events.show(events)
+            form.fleet.show(rows, figures, form.drone.chosen)
 
         self._update(show)
 
-    def show_drones(self, rows: Sequence[DroneRow], figures: Mapping[str, FlightFigures]) -> None:
-        """Show on each page the drones as it sorts and filters them."""
-        self._update(lambda form: form.fleet.show(rows, figures, form.drone.chosen))
-
-    def show_events(self, rows: Sequence[EventRow]) -> None:
-        """Show on each page the events that it has chosen."""
-        self._update(lambda form: form.events.show(rows))
-
     def refresh(self, run: RunCondition, formation: str) -> None:
         """Grey out what would be refused; show who controls the formation that is shown, and the run."""
-        self._update(lambda form: form.drone.refresh(run))
-        self._update(lambda form: form.control.refresh([formation, RUN] if formation else [RUN]))
+
+        def refresh(form: _PageForm) -> None:
+            form.drone.refresh(run)
+            form.control.refresh([formation, RUN] if formation else [RUN])
+
+        self._update(refresh)
 
     def _update(self, change: Callable[[_PageForm], None]) -> None:
         """Change the forms of all pages; a page that closes meanwhile, whose handles viser has removed, is dropped."""
@@ -303,6 +339,162 @@ class PageForms:
         self._desk.close(page.client_id)
 
 
+class DroneForm:
+    """Modes of one drone, or of all that are selected, on one page.
+
+    Args:
+        may: returns why this page may not let a drone take off or reset it; with true, it takes control to do so.
+        request_return: lets drones return to their starts, and land.
+    """
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        client: CommandClient,
+        names: Sequence[str],
+        may: Callable[[str, bool], str] = lambda *_: "",
+        request_return: Callable[[Sequence[str]], None] = lambda _: None,
+    ) -> None:
+        self._client = client
+        self._may = may
+        self._request_return = request_return
+        self._choice = gui.add_dropdown("drone", list(names))
+        self._selected: list[str] = []
+        self._buttons: dict[str, Any] = {}
+        for mode, label in DRONE_MODES.items():
+            if mode in ORDERS:
+                held = mode == "emergency"
+                self._buttons[mode] = OrderButton(gui, f"{label} {self._subject}", mode, self._order, held=held)
+                continue
+            button = gui.add_button(f"{label} {self._subject}", icon=DRONE_ICONS[mode], color="gray")
+            button.on_click(lambda _, mode=mode: self._request(mode))
+            self._buttons[mode] = button
+        self._reasons = gui.add_html("")
+        self._run = RunCondition()
+        self._choice.on_update(lambda _: self._rename())
+
+    @property
+    def chosen(self) -> str:
+        return self._choice.value
+
+    @property
+    def targets(self) -> list[str]:
+        """Names of the drones that buttons are for: the selected ones, or else the chosen one."""
+        return self._selected or [self.chosen]
+
+    @property
+    def _order(self) -> dict[str, str]:
+        return {"drone": ",".join(self.targets)}
+
+    @property
+    def _subject(self) -> str:
+        return self.targets[0] if len(self.targets) == 1 else f"{len(self.targets)} drones"
+
+    def choose(self, drone: str) -> None:
+        self._choice.value = drone
+
+    def select(self, drones: Sequence[str]) -> None:
+        """Let the buttons be for these drones; if there are none, for the chosen one."""
+        self._selected = list(drones)
+        self._rename()
+
+    def refresh(self, run: RunCondition) -> None:
+        """Grey out what all of the drones would refuse."""
+        self._run = run
+        refusals = [offered(run, partial(drone_refusals, drone=drone)) for drone in self.targets]
+        for drone, each in zip(self.targets, refusals, strict=True):
+            for mode in IN_CONTROL:
+                each[mode] = each[mode] or self._may(drone, False)
+        common = {mode: refusals[0][mode] if all(each[mode] for each in refusals) else "" for mode in DRONE_MODES}
+        set_refusals(self._buttons, common)
+        landed = {d: run.checks.get(d, ()) for d in self.targets if run.drones.get(d) == "landed"}
+        checks = {drone: found for drone, found in landed.items() if found}
+        shown = preflight_lines(checks) if checks and not run.grounded() else ""
+        self._reasons.content = refusal_lines(DRONE_MODES, common) + shown
+
+    def _request(self, mode: str) -> None:
+        """Request what needs control, of all drones that would not refuse it."""
+        able = [drone for drone in self.targets if not drone_refusals(self._run, drone)[mode]]
+        drones = able or self.targets  # the condition may have changed meanwhile; otherwise the refusal is shown
+        drones = [drone for drone in drones if not self._may(drone, True)]
+        if not drones:
+            return
+        if mode == "return":
+            self._request_return(drones)
+        else:
+            self._client.send_mode(drones, mode)
+
+    def _rename(self) -> None:
+        for mode, button in self._buttons.items():
+            label = f"{DRONE_MODES[mode]} {self._subject}"
+            if isinstance(button, OrderButton):
+                button.rename(label, self._order)
+            else:
+                button.label = label
+        self.refresh(self._run)
+
+
+class FleetTable:
+    """The table of one page; `changed` is called when the selection changes."""
+
+    def __init__(self, gui: viser.GuiApi, names: Sequence[str], changed: Callable[[], None]) -> None:
+        self._names = tuple(names)
+        self._changed = changed
+        self._selected: frozenset[str] = frozenset()
+        self._shown: tuple[str, ...] = self._names
+        orders, are_many = list(SORTINGS), len(names) > MANY
+        with gui.add_folder("Sort, filter, select", expand_by_default=are_many):
+            self._order = gui.add_dropdown("sort by", orders, initial_value=orders[are_many])
+            self._choice = gui.add_dropdown("show", list(FILTERS))
+            self._text = gui.add_text("filter", "", hint="Parts of a name, state, commander, fault or link")
+            select = gui.add_button_group("select", ["all shown", "none"])
+
+        def select_shown() -> None:
+            self._select(self._selected | set(self._shown) if select.value == "all shown" else frozenset())
+
+        select.on_click(lambda _: select_shown())
+        self.table = gui.add_html("")
+
+    @property
+    def selected(self) -> list[str]:
+        return [name for name in self._names if name in self._selected]
+
+    def toggle(self, drone: str) -> None:
+        if drone in self._names:
+            self._select(self._selected ^ {drone})
+
+    def show(self, rows: Sequence[DroneRow], figures: Mapping[str, FlightFigures], chosen: str) -> None:
+        """Show rows; `chosen` is the drone whose instruments the page shows."""
+        shown = filtered_rows(rows, self._order.value, self._choice.value, self._text.value, self._selected)
+        self._shown = tuple(row.name for row in shown)
+        self.table.content = drone_table(shown, figures, self._selected, chosen, NO_ROW if rows else "")
+
+    def _select(self, names: frozenset[str]) -> None:
+        self._selected = names
+        self._changed()
+
+
+def filtered_rows(
+    rows: Sequence[DroneRow],
+    order: str = next(iter(SORTINGS)),
+    choice: str = ALL,
+    text: str = "",
+    selected: frozenset[str] = frozenset(),
+) -> list[DroneRow]:
+    """Return rows sorted by one of `SORTINGS`, and of them those of one of `FILTERS`.
+
+    Each word of the text must be in a row's name, state, commander, faults or link.
+    """
+    words = text[:FILTER_MAX].lower().split()
+
+    def has_words(row: DroneRow) -> bool:
+        drone = row.drone
+        texts = row.name, drone.state.replace("_", " "), drone.commander or "nobody", *row.faults, row.link[0]
+        return all(any(word in each.lower() for each in texts) for word in words)
+
+    return sorted((row for row in rows if FILTERS[choice](row, selected) and has_words(row)), key=SORTINGS[order])
+
+
 class EventForm:
     """The events that one page has chosen, by drone and kind."""
 
@@ -312,10 +504,8 @@ class EventForm:
         self._table = gui.add_html("")
 
     def show(self, rows: Sequence[EventRow]) -> None:
-        """Show the chosen ones of the rows, newest first."""
         self._table.content = event_table(chosen_rows(rows, self._drone.value, self._kind.value)[:ROWS_SHOWN])
 
 
 def set_theme(gui: viser.GuiApi, *, dark: bool = False) -> None:
-    """Set the theme of all pages, or of one."""
     gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False, dark_mode=dark)

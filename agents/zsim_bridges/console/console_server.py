@@ -1,26 +1,60 @@
-"""The console: shows one run after the other on a viser server that only its own HTTP server can reach."""
+"""The console: shows one run after the other on a viser server that only its own HTTP server can reach.
 
+A run on the page: its views as pictures, tables and plots; the operators' requests are sent.
+"""
+
+import math
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import viser
+from msgspec import UNSET
+
+from zsim.contract.flight_messages import EstimateView, ViewCluster, ViewDrones
 from zsim.contract.messages import Info
+from zsim.contract.run_messages import Event
+from zsim.errors import DocumentError, RunError
 from zsim.runtime.participant import Participant
+from zsim.scenario import scenario_file
+from zsim.sensors.camera import Hats
+from zsim.sensors.sensor_catalogue import own_rates
 from zsim.transport.session import Session
-from zsim_bridges.console.control_desk import OPERATOR, VIEWER
-from zsim_bridges.console.orders import OrderRequest
-from zsim_bridges.console.page_cameras import CameraFollow, CameraFrustums
+from zsim_agents.formation.spaces.scenario_space import scenario_space
+from zsim_bridges.console import console_tables
+from zsim_bridges.console.camera_feed import CameraFeed
+from zsim_bridges.console.command_client import CommandClient, PastInstant, RequestOutcome
+from zsim_bridges.console.console_page import ConsolePage, PageForms
+from zsim_bridges.console.console_tables import TableRows
+from zsim_bridges.console.control_desk import OPERATOR, RUN, VIEWER, ControlDesk
+from zsim_bridges.console.orders import OrderBook, OrderRequest
+from zsim_bridges.console.page_cameras import PageCameras
+from zsim_bridges.console.page_flying import PageFlying
 from zsim_bridges.console.page_server import HttpProxy, ListenAddress, RunFiles, ViserBackend
 from zsim_bridges.console.page_sockets import ActionSockets, CameraSockets
+from zsim_bridges.console.picture import DronePoses, FormationShape, drone_poses
 from zsim_bridges.console.private_viser import PageControls, PrivateViser, is_permitted
-from zsim_bridges.console.run_condition import no_run_head
-from zsim_bridges.console.run_page import RunPage
+from zsim_bridges.console.run_condition import ShownRun, no_run_head
+from zsim_bridges.console.run_monitor import RunMonitor
+from zsim_bridges.console.scene import RunScene
+from zsim_bridges.console.time_monitor import KEPT_S, RecordPlayer, TimeMonitor
+from zsim_bridges.console.view_buffer import ViewBuffer
 
 REASON_S = 0.1  # wall; between two looks for a reason to end
 OFFER_S = 20.0  # wall; how long pages may take to copy what a run left behind: 100 MB over Wi-Fi of 40 Mbit/s
+TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster
+STAMPS_PER_AGE = 5.0  # a stamp is at most this fraction of a command's largest age old; it ages on its way
+TOLD_S = 2.0  # wall; a slider that is dragged is refused many times
+NOTICE_S = 8.0  # wall; how long a notification stays in the corner
+EVENTS_MAX = 20  # in `state`
+SILENT = "silent"  # in place of the clock's state, when the world does not answer
+FEW_DRONES = 20  # drones from which on pictures come half as often
+RATE_HZ, RATE_LOW_HZ = 20.0, 10.0
+FAST_RATE = 4.0  # × real time; from then on the picture rate is halved, too: the run needs the processors
 
 
 class Console:
@@ -53,18 +87,16 @@ class Console:
         self._rate_hz = rate_hz
         self._say = say
         self._run_page: RunPage | None = None
-        self._viser = PrivateViser(self._permits)
+        self._viser = PrivateViser(lambda *use: self._run_page is None or self._run_page.permits(*use))
         server = self._viser.server
-        self._camera_follow = CameraFollow(server)
-        self._frustums = CameraFrustums(server)
+        self._cameras = PageCameras(server)
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.gui.set_panel_label("zsim")
         server.gui.add_markdown(f"Waiting for a world: {world}" if world else "Waiting for a world")
         controls = PageControls(server.gui, lambda: [page.gui for page in server.get_clients().values()])
-        cameras = CameraSockets(lambda: self._run_page and self._run_page.cameras, self._frustums)
+        cameras = CameraSockets(lambda: self._run_page and self._run_page.cameras, self._cameras)
         actions = ActionSockets(
-            self._frustums.client_id,
-            self._camera_follow,
+            self._cameras,
             lambda: self._run_page and self._run_page.record,
             lambda: self._run_page and self._run_page.flying,
         )
@@ -78,17 +110,12 @@ class Console:
             head=lambda: self._run_page.head() if self._run_page else no_run_head(self._world, self._ended),
             command=self._command,
             files=self._files,
-            looked=self._looked,
+            looked=self._on_look,
         )
         self._proxy = HttpProxy(address, token, backend)
 
     @contextmanager
     def open(self) -> Iterator[None]:
-        """Serve pages.
-
-        Raises:
-            RunError: the port is taken.
-        """
         try:
             with self._proxy.open():
                 urls = self._proxy.urls()
@@ -107,7 +134,7 @@ class Console:
         say: Callable[[str], None],
     ) -> None:
         """Show a run until it is over or `stopped` returns true."""
-        shown_by = self._camera_follow, self._frustums, self._rate_hz, self._world
+        shown_by = self._cameras, self._rate_hz, self._world
         self._run_page = page = RunPage(self._viser.server, link, info, observer, *shown_by)
         try:
             page.run(stopped)
@@ -128,11 +155,8 @@ class Console:
             self._run_page.end(reason)
         self._files.offer(OFFER_S, deserted)
 
-    def _permits(self, client_id: int, control: str) -> bool:
-        return self._run_page is None or self._run_page.permits(client_id, control)
-
-    def _looked(self, key: str, role: str, address: str) -> None:
-        client_id = self._frustums.client_id(key)
+    def _on_look(self, key: str, role: str, address: str) -> None:
+        client_id = self._cameras.client_id(key)
         if self._run_page and client_id is not None:
             self._run_page.desk.look(client_id, role, address)
 
@@ -140,3 +164,343 @@ class Console:
         if self._run_page:
             return self._run_page.command(request)
         return {"id": request.id, "op": request.op, "state": "refused", "reason": "there is no run yet"}
+
+
+class RunPage:
+    """The page of one run.
+
+    Args:
+        server: viser's; what another run has left on it is removed.
+        rate_hz: pictures a second; None: by the number of drones and the rate of the run.
+        world: where the run is, in words.
+
+    Raises:
+        RunError: a user's cluster space refuses its robots.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        link: Session,
+        info: Info,
+        observer: Participant,
+        page_cameras: PageCameras,
+        rate_hz: float | None,
+        world: str = "",
+    ) -> None:
+        scenario = scenario_file.from_text(info.scenario)
+        try:
+            spaces = {cluster.name: scenario_space(scenario, cluster) for cluster in scenario.clusters}
+        except (ValueError, DocumentError) as error:
+            raise RunError(f"console: {error}") from error
+        self._run = run = ShownRun(info, scenario, spaces)
+        self._server = server
+        self._observer = observer
+        self._page_cameras = page_cameras
+        self._rate_hz = rate_hz
+        self._names, self._members = run.names, run.members
+        self._table_s = self._monitor_s = 0.0
+        self._told_s: dict[int, float] = {}  # when a page was last told that it is not in control [s; wall]
+
+        variables = {name: space.names for name, space in spaces.items()}
+        age_s = scenario.time.max_command_age_ms / 1e3 / STAMPS_PER_AGE
+        self._time_monitor = TimeMonitor(link, observer, age_s if info.mode == "realtime" else math.inf)
+        self.views = ViewBuffer(
+            link, info, observer, variables, self._on_refused_command, asked=self._on_foreign_request
+        )
+        self._monitor = RunMonitor(self.views, self._time_monitor, run, world)
+        hats = scenario.environment.hats
+        self.cameras = CameraFeed(link, observer, self._names, (Hats() if hats is UNSET else hats).diameter_m)
+        rates = {drone.name: own_rates(drone) for drone in scenario.drones}
+        self._table_rows = TableRows(self.views, rates, self._monitor.board.severity_of)
+
+        self._client = CommandClient(link, observer.name, self.views, self._time_monitor.now_ns, self._on_outcome)
+        self.orders = OrderBook(
+            self._client, info.run_id, self._members, self._names, self._monitor.unflyable, lambda: observer.now_ns,
+            lambda: self._time_monitor.silent_s, self.views.external,
+        )  # fmt: skip
+        self.views.on_own_event = self.orders.on_event
+        self.record = RecordPlayer(self._client, self._time_monitor, run.is_replay, len(self._names))
+
+        self._scene = RunScene(server, run, self.views, page_cameras)
+        self._scene.nodes.on_click(self._on_click)
+        self._page = ConsolePage(
+            server.gui, run, self._client, self._on_outcome, self._scene.nodes.show,
+            self._scene.trails.choose_length, lambda cluster: self.flying.returns.request_formation(cluster),
+            self._scene.preview,
+        )  # fmt: skip
+        self.desk = ControlDesk(list(spaces), partial(self._tell, "Control", "orange"))
+        part_of = {drone: name for name, drones in self._members.items() for drone in drones}
+        self._page_forms = PageForms(
+            server, self._client, self._page, self._names, self._scene.nodes.radii_m, self.desk,
+            lambda drone: part_of.get(drone, RUN), lambda drones: self.flying.returns.request_drones(drones),
+        )  # fmt: skip
+        self.flying = PageFlying(
+            self._monitor, self._client, observer.name, self._scene, self._page_forms, self._on_return_over
+        )
+
+    def close(self) -> None:
+        """Send nothing any more."""
+        self._client.close()
+        self._page_forms.close()
+        self.cameras.close()
+        self._page_cameras.clear_frusta()
+        self._scene.nodes.close()
+
+    def run(self, stopped: Callable[[], bool]) -> None:
+        """Draw pictures until the run is over or `stopped` returns true."""
+        self.views.open()
+        self.cameras.open()
+        self.record.load()
+        timeline = self.record.timeline
+        if timeline:
+            self._monitor.record_s = timeline["from_s"], timeline["to_s"]
+        pause = threading.Event()
+        next_s = time.monotonic()
+        with self._time_monitor.polling(), self.flying.control.running():
+            while not self._observer.end_reason and not stopped():
+                self._update(time.monotonic())
+                next_s = max(next_s + self._period_s(), time.monotonic())
+                pause.wait(next_s - time.monotonic())
+        # the end of the run, for pages that are opened between two runs
+        self.views.update()
+        if self._observer.end_reason or self.views.end:
+            self._monitor.end(self._observer.end_reason)
+        self._monitor.update(time.monotonic())
+        self._update_orders()
+        with self._server.atomic():
+            if self.views.drones is not None:
+                self._draw(self.views.drones)
+            self._update_tables(time.monotonic())
+
+    def end(self, reason: str) -> None:
+        """Show that the run is over, after `run`, which may not have learnt of it."""
+        self._monitor.end(reason)
+        self._monitor.update(time.monotonic())
+        with self._server.atomic():
+            self._update_tables(time.monotonic())
+
+    # For pages, in other threads
+
+    def state(self) -> dict[str, Any]:
+        state = console_state(self._run.info.run_id, self.views, self._time_monitor, dict(self._scene.shapes))
+        return {**state, "cameras": self.cameras.state(), "timeline": self.record.state(self._monitor.condition)}
+
+    def head(self) -> dict[str, Any]:
+        head, stall = self._monitor.head(time.monotonic()), self._time_monitor.stall
+        stood = stall and {"lasted_s": stall.lasted_s, "ago_s": time.monotonic() - stall.ended_s}
+        ages = {"heard_s": self._time_monitor.heard_s, "stall": stood}
+        return {**head, **ages, "run_id": self._run.info.run_id, "orders": self.orders.rows()}
+
+    def command(self, request: OrderRequest) -> dict[str, Any]:
+        """Carry out an order of a page; return its progress as plain data with its `state`."""
+        if request.op == "acknowledge":
+            self._monitor.board.acknowledge()
+            return {"id": request.id, "op": request.op, "state": "confirmed", "reason": ""}
+        return self.orders.place(request)
+
+    def permits(self, client_id: int, control: str) -> bool:
+        """Return whether a page may use a shared control; tell it why if not."""
+        part = self._page.parts.get(control)
+        refusal = "" if part is None else self.desk.use(client_id, part)
+        if refusal and time.monotonic() - self._told_s.get(client_id, -math.inf) > TOLD_S:
+            self._told_s[client_id] = time.monotonic()
+            self._tell("Control", "orange", client_id, f"Refused: {refusal}")
+        return not refusal
+
+    # Pictures
+
+    def _period_s(self) -> float:
+        """Return the time from one picture to the next [wall]."""
+        rate = self._time_monitor.clock.rate if self._time_monitor.clock is not None else 0.0
+        return 1.0 / (self._rate_hz or picture_rate_hz(len(self._names), rate))
+
+    def _update(self, wall_s: float) -> None:
+        self._observer.tick()
+        view = self.views.drones if self.views.update() else None  # None: nothing new
+        if view is not None:
+            self._monitor.flight.update(view)
+        if wall_s - self._monitor_s >= TABLE_S:
+            self._monitor_s = wall_s
+            if self._run.is_replay and self._scene.drones is not None:
+                self._keep_past(self._scene.drones.t_ns / 1e9)
+            for done in self._monitor.update(wall_s):
+                self._note("done", done.subject, f"{done.text}: done")
+            self._update_orders()
+        self._fill_past(self.record.take())
+        self.cameras.update()
+        self.flying.returns.tick()
+        for form in self._page.forms.values():
+            form.send(wall_s)
+        if not self._server.get_clients():
+            if view is not None:  # for pages that are opened later
+                self._add_newest_points(self._scene.store(view))
+            return
+        with self._server.atomic():
+            if view is not None:
+                self._draw(view)
+            self._page_cameras.draw_frusta(self._scene.drones, self.cameras.shown)
+            if wall_s - self._table_s >= TABLE_S:
+                self._table_s = wall_s
+                self._update_tables(wall_s)
+
+    def _update_orders(self) -> None:
+        run, drones = self._monitor.condition, self.views.drones
+        states = {**run.drones, **{name: phase for name, (phase, _) in run.phases.items()}}
+        self.orders.update(states, drones.t_ns if drones else -1, paused=run.clock != "running")
+
+    def _draw(self, view: ViewDrones) -> None:
+        drones = self._scene.draw(view, self._period_s(), self._page.chosen)
+        self._page_forms.move_rings(drones)
+        self._add_newest_points(drones)
+
+    def _on_click(self, event: viser.SceneClickEvent) -> None:
+        drone = self._scene.clicked(event)
+        if drone is not None:
+            self._page_forms.choose(event.client_id, drone)
+            self._page_cameras.click(event.client_id, drone)
+
+    # Trails and plots
+
+    def _fill_past(self, instants: list[PastInstant]) -> None:
+        """Add what was read of a record to trails and plots."""
+        spaces = self._run.spaces
+        for past in instants:
+            drones = drone_poses(past.drones, self._names)
+            self._scene.trails.add(drones.t_ns / 1e9, drones.p_W)
+            known = {n: view for n, view in past.clusters.items() if n in spaces and view.names == spaces[n].names}
+            self._add_points(drones, self._scene.shapes_of(drones), known, past.estimates)
+        self._scene.trails.number += bool(instants)
+
+    def _keep_past(self, t_s: float) -> None:
+        """Read the record around the instant that a replay shows, and drop what is far from it."""
+        self.record.fill(t_s)
+        kept = t_s - KEPT_S, t_s + KEPT_S
+        self._scene.trails.keep(*kept)
+        for history in (self._page.flights.history, *(plots.history for plots in self._page.plots.values())):
+            history.keep(*kept)
+
+    def _add_newest_points(self, drones: DronePoses) -> None:
+        estimates = {name: each.estimate for name, each in self.views.estimates().items() if each.fresh}
+        self._add_points(drones, self._scene.shapes, self.views.clusters, estimates)
+
+    def _add_points(
+        self,
+        drones: DronePoses,
+        shapes: Mapping[str, FormationShape | None],
+        clusters: Mapping[str, ViewCluster],
+        estimates: Mapping[str, EstimateView],
+    ) -> None:
+        """Add the formations' variables and the drones' flight to the plots."""
+        for name, true_shape in shapes.items():
+            view = clusters.get(name)
+            if view is not None:
+                true_c = None if true_shape is None else true_shape.c
+                self._page.plots[name].history.add(drones.t_ns / 1e9, view.desired, view.value, true_c)
+        self._page.flights.add(drones, estimates)
+
+    # Controls and tables
+
+    def _update_tables(self, wall_s: float) -> None:
+        page, run, flown = self._page, self._monitor.condition, self._monitor.flight.figures
+        page.refresh(run)
+        self.desk.release_lost()
+        self._page_forms.refresh(run, page.chosen)
+        rows, sensors_of = self._table_rows.drone_rows(), self._table_rows.sensor_table
+        self._page_forms.show(rows, flown, sensors_of, self.views.log.rows())
+        page.phases.content = console_tables.formation_lines(run.phases)
+        watch = self._monitor.fault_watch
+        page.faults.content = console_tables.fault_lines(watch.lines(), watch.lines(is_over=True))
+        if page.chosen:
+            page.forms[page.chosen].refresh(self.views.clusters.get(page.chosen), wall_s)
+            page.plots[page.chosen].draw(self._scene.drones.t_ns / 1e9 if self._scene.drones else 0.0)
+        self._scene.draw_trails()
+
+    def _on_outcome(self, outcome: RequestOutcome) -> None:
+        """Show the outcome of a request: a refusal in the corner of every page, and either among the events.
+
+        The world publishes events of what it does, but not of requests to formations, which are only accepted.
+        """
+        if outcome.order and not self.orders.note(outcome):
+            return
+        if outcome.refusal:
+            self.flying.returns.refused(outcome.subject)
+            self._note("refused", outcome.subject, f"{outcome.request}: {outcome.refusal}")
+            self._notify(outcome.request, outcome.refusal)
+            return
+        known = self._monitor.pending.accept(outcome.subject, outcome.op, outcome.request, outcome.args)
+        if known or outcome.subject in self._run.spaces:
+            self._note("accepted", outcome.subject, f"{outcome.request}: accepted")
+
+    def _on_return_over(self, subject: str, text: str) -> None:
+        self._note("refused", subject, text)
+        self._notify(f"return of {subject}", text)
+
+    def _on_refused_command(self, event: Event) -> None:
+        self._notify(event.subject, str(event.data.get("reason", event.text)))
+
+    def _on_foreign_request(self, cluster: str, text: str) -> None:
+        """Tell every page of a request that somebody else made of a formation, since the last one counts."""
+        for client_id in () if self._run.is_replay else self._server.get_clients():
+            self._tell("Control", "orange", client_id, text)
+
+    def _note(self, kind: str, subject: str, text: str) -> None:
+        """Log an event of the console's own."""
+        self.views.log.add(Event(self._observer.now_ns, 0, kind, self._observer.name, subject, text))
+
+    def _notify(self, what: str, refusal: str) -> None:
+        for client_id in self._server.get_clients():
+            self._tell(f"Refused: {what}", "red", client_id, refusal)
+
+    def _tell(self, title: str, colour: Any, client_id: int, line: str) -> None:
+        """Show a notification in the corner of one page."""
+        client = self._server.get_clients().get(client_id)
+        if client is not None:
+            client.add_notification(title, line, color=colour, auto_close_seconds=NOTICE_S)
+
+
+def picture_rate_hz(drones: int, rate: float) -> float:
+    """Return a suitable number of pictures a second for so many drones at a rate [× real time]."""
+    return RATE_LOW_HZ if drones >= FEW_DRONES or rate >= FAST_RATE else RATE_HZ
+
+
+def console_state(
+    run_id: str, views: ViewBuffer, time_monitor: TimeMonitor, shapes: Mapping[str, FormationShape | None]
+) -> dict[str, Any]:
+    """Return what is shown of a run as plain data; called in another thread than the one that draws.
+
+    `shapes` are the formations' true shapes.
+    """
+    view, clock, silent_s = views.drones, time_monitor.clock, time_monitor.silent_s
+    sigmas = {name: received.sigma_m for name, received in views.estimates().items() if received.fresh}
+    clusters = []
+    for name, cluster in dict(views.clusters).items():
+        shape = shapes.get(name)
+        values = {"desired": cluster.desired, "value": cluster.value, "true": () if shape is None else shape.c.tolist()}
+        named = {what: dict(zip(cluster.names, each, strict=False)) for what, each in values.items()}
+        clusters.append({"name": name, "phase": cluster.phase, "reason": cluster.reason, **named})
+    return {
+        "run_id": run_id,
+        "t_s": view.t_ns / 1e9 if view else 0.0,
+        "clock": SILENT if silent_s else clock.state if clock else None,
+        "silent_s": silent_s,
+        "drones": [
+            {"name": d.name, "position_m": list(d.position_m), "state": d.state, "sigma_m": sigmas.get(d.name)}
+            for d in (view.drones if view else ())
+        ],
+        "clusters": clusters,
+        "faults": [
+            {
+                "id": fault.id,
+                "kind": fault.kind,
+                "target": fault.target,
+                "from_s": fault.from_ns / 1e9,
+                "until_s": None if fault.until_ns is None else fault.until_ns / 1e9,
+            }
+            for fault in views.faults
+        ],
+        "events": [
+            {"t_s": event.t_ns / 1e9, "kind": event.kind, "text": event.text}
+            for event in list(views.log.newest)[:EVENTS_MAX]
+        ],
+    }

@@ -54,21 +54,13 @@ Counts = Mapping[str, tuple[int, int]]
 
 
 class DroneRow(NamedTuple):
-    """A drone's row in the table of drones.
-
-    Attributes:
-        drone: its condition.
-        gps: fixes used and refused.
-        faults: injected ones that act on it.
-        link: of a driver, described, and its colour.
-        severity: of its worst alarm.
-    """
+    """A drone's row in the table of drones."""
 
     drone: DroneCondition
-    gps: str = "–"
-    faults: tuple[str, ...] = ()
-    link: tuple[str, str] = ("", "")
-    severity: Severity | None = None
+    gps: str = "–"  # fixes used and refused
+    faults: tuple[str, ...] = ()  # injected ones that act on it
+    link: tuple[str, str] = ("", "")  # of a driver, described, and its colour
+    severity: Severity | None = None  # of its worst alarm
 
     @property
     def name(self) -> str:
@@ -105,7 +97,6 @@ class TableRows:
         self._rates = SensorRates()
 
     def drone_rows(self) -> list[DroneRow]:
-        """Return a row for each drone."""
         views, rows = self._views, []
         faults, estimates = views.active_faults(), views.estimates()
         for name, drone in views.conditions().items():
@@ -200,7 +191,8 @@ def _drone_cells(row: DroneRow, figures: FlightFigures | None, selected: bool, c
     flown = ["–"] * 3
     if figures is not None:
         flown = [f"{figures.position_m[2]:.1f}", f"{figures.speed_m_s:.1f}", f"{figures.heading_deg:.0f}°"]
-    left = battery_left_text(figures.battery_left_s if figures else None)
+    left_s = figures.battery_left_s if figures else None
+    left = "" if left_s is None or left_s > LEFT_MAX_S else f"{left_s / 60.0:.0f}\N{NO-BREAK SPACE}min"
     severity = battery_severity(drone.battery_percent)
     colour = SEVERITY_COLOURS[severity] if severity else "inherit"
     charge = _coloured(f"{drone.battery_percent:.0f} %{',' if left else ''}", colour)
@@ -221,11 +213,6 @@ def _drone_cells(row: DroneRow, figures: FlightFigures | None, selected: bool, c
         for note, colour in notes
         if note
     )
-
-
-def battery_left_text(left_s: float | None) -> str:
-    """Return the remaining time of a battery, unbroken; empty where it is unknown."""
-    return "" if left_s is None or left_s > LEFT_MAX_S else f"{left_s / 60.0:.0f}\N{NO-BREAK SPACE}min"
 
 
 def link_note(link: ReceivedLink | None) -> tuple[str, str]:

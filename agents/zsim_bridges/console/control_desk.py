@@ -70,7 +70,6 @@ class ControlDesk:
         self.parts = tuple(dict.fromkeys((*parts, RUN)))
 
     def open(self, page: int) -> None:
-        """Note that a page is open."""
         with self._lock:
             if page not in self._pages:
                 self._count += 1
@@ -85,7 +84,6 @@ class ControlDesk:
             self._pages.pop(page, None)
 
     def look(self, page: int, role: str, address: str) -> None:
-        """Note that a page is alive, its role, and its address."""
         with self._lock:
             self.open(page)
             known = self._pages[page]
@@ -122,7 +120,6 @@ class ControlDesk:
         return refusal
 
     def ask(self, page: int, part: str) -> None:
-        """Ask the page in control for a part."""
         with self._lock:
             holder = self._holders.get(part)
             if holder is None or holder == page:
@@ -132,7 +129,6 @@ class ControlDesk:
             self._tell(holder, f"{self.name_of(page)} asks for control of {words(part)}: see Control")
 
     def answer(self, page: int, part: str, granted: bool) -> None:
-        """Grant a part to the page that asks for it, or keep it."""
         with self._lock:
             asker = self._askers.get(part)
             if self._holders.get(part) != page or asker is None:
@@ -144,13 +140,11 @@ class ControlDesk:
             self._tell(asker, f"{self.name_of(page)} {done} {words(part)}")
 
     def release(self, page: int, part: str) -> None:
-        """Give up a part: it is free, or goes to the page that asks for it."""
         with self._lock:
             if self._holders.get(part) == page:
                 self._pass_on(part, f"{self.name_of(page)} has released")
 
     def holdings(self, page: int, parts: Collection[str]) -> list[Holding]:
-        """Return who is in control of some parts, as a page sees it."""
         found = []
         with self._lock:
             for part in parts:
@@ -176,8 +170,7 @@ class ControlDesk:
         return held | {EVERY} if held else held
 
     def name_of(self, page: int) -> str:
-        known = self._pages.get(page)
-        return known.name if known else "a page"
+        return self._pages[page].name if page in self._pages else "a page"
 
     def _silent_s(self, page: int) -> float:
         known = self._pages.get(page)
@@ -192,16 +185,13 @@ class ControlDesk:
 
 
 def words(part: str) -> str:
-    """Return the name of a part on pages."""
     return "time and faults" if part == RUN else part
 
 
 class ControlForm:
-    """Who is in control, on one page, with buttons to ask for control, grant it and give it up.
+    """Who is in control, on one page (viser's number), with buttons to ask for control, grant it and give it up.
 
-    Args:
-        page: viser's number of this one.
-        part_of: part of each shared control by its id, which its element on the page has, too.
+    `part_of` has the part of each shared control by its id, which its element on the page has, too.
     """
 
     def __init__(self, gui: viser.GuiApi, desk: ControlDesk, page: int, part_of: Mapping[str, str]) -> None:
@@ -218,7 +208,6 @@ class ControlForm:
             self._buttons.append((first, second))
 
     def refresh(self, parts: list[str]) -> None:
-        """Show who is in control of some parts."""
         self._parts = parts
         holdings, others = self._desk.holdings(self._page, parts), self._desk.others(self._page)
         here = f"you are {escape(self._desk.name_of(self._page))}"

@@ -62,11 +62,11 @@ WAYPOINT_UNITS = "seconds from the start, lengths in metres, angles in degrees a
 
 
 class _Flight(NamedTuple):
-    """A request for a target or trajectory; its arguments in SI units, and as the page shows them."""
+    """A request for a target or trajectory."""
 
     op: str
-    shown: str
-    args: dict[str, Any]
+    shown: str  # the arguments as the page shows them
+    args: dict[str, Any]  # in SI units
 
 
 class FormationForm:
@@ -102,7 +102,14 @@ class FormationForm:
         self._shown: tuple[float, ...] | None = None  # where the formation is desired to be
         self._written: tuple[float, ...] | None = None  # where the prefilled waypoints begin
         self._edited = False
-        self._controls = {op: self._button(gui, label, op) for label, op in OPERATIONS.items()}
+        self._controls: dict[str, Any] = {}
+        for label, op in OPERATIONS.items():
+            if op in ORDERS:
+                self._controls[op] = OrderButton(gui, label, op, {"cluster": cluster.name})
+            else:
+                colour = "blue" if op in ("takeoff", "engage") else "gray"
+                self._controls[op] = button = gui.add_button(label, icon=ICONS[op], color=colour)
+                button.on_click(lambda _, op=op: client.request_cluster(cluster.name, op))
         self.safe = [self._controls[op] for op in SAFE]
         if {"x_c", "y_c"} <= set(space.names):
             back = gui.add_button(RETURN, icon=viser.Icon.HOME, color="gray")
@@ -159,8 +166,8 @@ class FormationForm:
 
     def send(self, wall_s: float) -> None:
         """Request the values of moved sliders together, once all have come to rest."""
-        moved_s = [slider.moved_s for slider in self._sliders.values()]
-        if wall_s - max((at_s for at_s in moved_s if at_s is not None), default=wall_s) < REST_S:
+        moves = [slider.moved for slider in self._sliders.values()]
+        if wall_s - max((move[1] for move in moves if move is not None), default=wall_s) < REST_S:
             return
         moved = {name: value for name, slider in self._sliders.items() if (value := slider.pop_value()) is not None}
         if self.request_target(moved):
@@ -214,13 +221,6 @@ class FormationForm:
     def _send(self, flight: _Flight) -> None:
         self._client.request_cluster(self._cluster.name, flight.op, shown=flight.shown, **flight.args)
 
-    def _button(self, gui: viser.GuiApi, label: str, op: str) -> Any:
-        if op in ORDERS:
-            return OrderButton(gui, label, op, {"cluster": self._cluster.name})
-        button = gui.add_button(label, icon=ICONS[op], color="blue" if op in ("takeoff", "engage") else "gray")
-        button.on_click(lambda _: self._client.request_cluster(self._cluster.name, op))
-        return button
-
     def _other_button(self, gui: viser.GuiApi, op: str, label: str, act: Callable[[], Any]) -> None:
         button = gui.add_button(label)
         button.on_click(lambda _: act())
@@ -248,7 +248,10 @@ class FormationForm:
         add = partial(self._other_button, gui, "trajectory")
         with gui.add_folder("Trajectory", expand_by_default=False):
             if planned is not None:
-                add("Fly the scenario's", lambda: self._fly(lambda: _planned_trajectory(planned)))
+                flown: dict[str, Any] = {"expressions": planned.expressions, "constants": planned.constants}
+                if planned.waypoints:
+                    flown = {"waypoints": [{"at_s": each.at_s, "values": each.values} for each in planned.waypoints]}
+                add("Fly the scenario's", lambda: self._fly(lambda: flown))
             gui.add_markdown(f"<sub>{EXPRESSION_UNITS}</sub>")
             text = gui.add_text("expressions [m, deg]", EXPRESSIONS, multiline=True)
             add("Fly the expressions", lambda: self._fly(lambda: parse_expressions(text.value, names, angles)))
@@ -277,18 +280,10 @@ class FormationForm:
         self._request(_Flight("trajectory", "", args))
 
 
-def _planned_trajectory(trajectory: Trajectory) -> dict[str, Any]:
-    if trajectory.waypoints:
-        return {"waypoints": [{"at_s": point.at_s, "values": point.values} for point in trajectory.waypoints]}
-    return {"expressions": trajectory.expressions, "constants": trajectory.constants}
-
-
 class _HeldValue(NamedTuple):
-    """Value of a slider that was moved, the formation's goal, and since when it is the goal [s; wall]."""
-
-    value: float
-    goal: float
-    since_s: float
+    value: float  # of a slider that was moved
+    goal: float  # of the formation
+    since_s: float  # for which it is the goal [wall]
 
 
 class VariableSlider:
@@ -300,26 +295,19 @@ class VariableSlider:
     def __init__(self, gui: viser.GuiApi, range_: SliderRange) -> None:
         self._range = range_
         self._lock = threading.Lock()
-        self._moved: tuple[float, float] | None = None  # to which value, and when [s; wall]
+        self.moved: tuple[float, float] | None = None  # by an operator, to which value, and when [s; wall]
         self._held: _HeldValue | None = None
         self._slider: Any = gui.add_slider(range_.label, range_.low, range_.high, range_.step, range_.start)
-        self._slider.label = range_.label_unknown
+        self._slider.label = f"{range_.label}: not known"
         self._slider.on_update(self._on_update)
 
     def lock(self, locked: bool) -> None:
-        """Disable or enable it."""
         assign(self._slider, disabled=locked)
-
-    @property
-    def moved_s(self) -> float | None:
-        """When an operator last moved it [s; wall]; None once the value has been popped."""
-        moved = self._moved
-        return None if moved is None else moved[1]
 
     def pop_value(self) -> float | None:
         """Return once the value to which it was moved, None if it was not."""
         with self._lock:
-            moved, self._moved = self._moved, None
+            moved, self.moved = self.moved, None
         return None if moved is None else moved[0]
 
     def hold(self, wall_s: float) -> None:
@@ -332,7 +320,7 @@ class VariableSlider:
         The slider reaches as far as what it shows; what may be requested remains the range.
         """
         shown = self._range.to_display(goal)
-        if self._moved is not None or self._is_held(shown, wall_s):
+        if self.moved is not None or self._is_held(shown, wall_s):
             return
         low, high = min(self._range.low, shown), max(self._range.high, shown)
         if (self._slider.min, self._slider.max) != (low, high):
@@ -354,4 +342,4 @@ class VariableSlider:
         if event.client_id is None:
             return  # set by `follow`
         with self._lock:
-            self._moved = (float(self._slider.value), time.monotonic())
+            self.moved = float(self._slider.value), time.monotonic()

@@ -49,7 +49,6 @@ class _TimedRows(Generic[Row]):
         self.rows.insert(place, row)
 
     def keep(self, from_s: float, to_s: float = math.inf) -> None:
-        """Remove the rows of other times."""
         old, late = bisect_left(self.times, from_s), bisect_left(self.times, to_s)
         del self.times[late:], self.rows[late:], self.times[:old], self.rows[:old]
 
@@ -94,7 +93,6 @@ class CanvasTrails:
             points.keep(t_s - SPAN_S)
 
     def keep(self, from_s: float, to_s: float) -> None:
-        """Remove the points of other times."""
         self._points.keep(from_s, to_s)
 
     def choose_length(self, length_s: float) -> None:
@@ -167,7 +165,6 @@ class VariableHistory:
         return True
 
     def keep(self, from_s: float, to_s: float) -> None:
-        """Remove the points of other times."""
         with self._lock:
             self._points.keep(from_s, to_s)
 

@@ -45,9 +45,9 @@ class Stick(NamedTuple):
 
 
 class DronePose(NamedTuple):
-    """Position [m; W] and heading [rad] of a drone by its estimator."""
+    """Position and heading of a drone by its estimator."""
 
-    p_W: Vector
+    p_W: Vector  # m
     yaw_rad: float
 
 
@@ -70,41 +70,24 @@ class DroneSight(NamedTuple):
 
 
 class RunSight(NamedTuple):
-    """What is known of the run.
+    """What is known of the run."""
 
-    Attributes:
-        off: why nothing can be flown; otherwise empty.
-        rate: simulated per wall second, as measured.
-        paused: whether it stands still.
-        silence: that the world does not answer, in words; otherwise empty. A drone is requested all the same.
-    """
-
-    off: str = ""
-    rate: float = 1.0
+    off: str = ""  # why nothing can be flown; otherwise empty
+    rate: float = 1.0  # simulated per wall second, as measured
     paused: bool = False
-    silence: str = ""
+    silence: str = ""  # that the world does not answer, in words; a drone is requested all the same
 
 
 class FlightAnswer(NamedTuple):
-    """What a page shows of the drone that it flies.
-
-    Attributes:
-        drone: its name; empty for none.
-        state: none, taking or flying.
-        text: why it is not flown, or what it does.
-        over: whether it may be taken over from its commander.
-        commander: who flies it.
-        id: of the page's request to take it.
-        goal: the place to which it flies [m; W].
-    """
+    """What a page shows of the drone that it flies."""
 
     drone: str = ""
-    state: str = "none"
-    text: str = ""
-    over: bool = False
+    state: str = "none"  # none, taking or flying
+    text: str = ""  # why it is not flown, or what it does
+    over: bool = False  # whether it may be taken over from its commander
     commander: str = ""
-    id: str = ""
-    goal: Vector | None = None
+    id: str = ""  # of the page's request to take it
+    goal: Vector | None = None  # the place to which it flies [m; W]
 
 
 class Geofence(NamedTuple):
@@ -133,7 +116,6 @@ class Geofence(NamedTuple):
 
 
 def geofence_of(scenario: Scenario) -> Geofence:
-    """Return the fence of a scenario's drones: around all starts, and below the lowest ceiling."""
     xs, ys, _ = zip(*(drone.position_m for drone in scenario.drones), strict=True)
     low_m, top_m = height_range_m(scenario.drones)
     corner_m = (round(min(xs)) - SIDEWAYS_M, round(min(ys)) - SIDEWAYS_M, low_m)
@@ -165,50 +147,32 @@ def _fenced(velocity_W: Vector, pose: DronePose, fence: Geofence) -> Vector:
 
 
 def _too_fast(rate: float) -> str:
-    """Return why nobody can fly by hand at a rate; empty where somebody can."""
-    if rate <= RATE_MAX:
-        return ""
-    return f"time goes {rate:.1f} × as fast as the wall clock; to fly by hand set the rate to {RATE_MAX:g} or less"
+    slower = f"to fly by hand set the rate to {RATE_MAX:g} or less"
+    return f"time goes {rate:.1f} × as fast as the wall clock; {slower}" if rate > RATE_MAX else ""
 
 
 @dataclass
 class _Flight:
-    """A drone that a page flies, or is about to; times in s, wall.
-
-    Attributes:
-        modes: number requested of the drone before; a later one ends the flight.
-        begun_s: when the page requested it.
-        seen_s: when the page was last heard.
-        id: of the page's request.
-        owned_s: since when it is commanded; None before.
-        sent_s: when it was last commanded.
-        stick: that is held; None: hover, or on the way to `place_W`.
-        lost: whether the page's connection is gone.
-        asked_s, asking: when the world was last asked for the drone, and whether its answer is outstanding.
-    """
+    """A drone that a page flies, or is about to; times in s, wall."""
 
     drone: str
-    modes: int
-    begun_s: float
-    seen_s: float
-    id: str = ""
-    owned_s: float | None = None
-    sent_s: float = 0.0
-    stick: Stick | None = None
+    modes: int  # number requested of the drone before; a later one ends the flight
+    begun_s: float  # when the page requested it
+    seen_s: float  # when the page was last heard
+    id: str = ""  # of the page's request
+    owned_s: float | None = None  # since when it is commanded; None before
+    sent_s: float = 0.0  # when it was last commanded
+    stick: Stick | None = None  # that is held; None: hover, or on the way to `place_W`
     place_W: Vector | None = None
-    lost: bool = False
-    asked_s: float = 0.0
-    asking: bool = False
+    lost: bool = False  # whether the page's connection is gone
+    asked_s: float = 0.0  # when the world was last asked for the drone
+    asking: bool = False  # whether its answer is outstanding
 
 
 class ManualFlight:
     """Flies drones for pages, each identified by any hashable value; thread-safe.
 
-    Args:
-        name: of the console's process.
-        gate_s: simulated seconds of a gate, for which one command is sent at most.
-        sight_of: returns what is known of a drone.
-        run_sight: returns what is known of the run.
+    `gate_s` is the simulated time of a gate, for which one command is sent at most.
     """
 
     def __init__(
@@ -318,7 +282,6 @@ class ManualFlight:
         return self.answer(page)
 
     def is_on_way(self, page: Any) -> bool:
-        """Return whether the page's drone flies to a place."""
         with self._lock:
             flight = self._flights.get(page)
             return flight is not None and flight.place_W is not None
@@ -344,7 +307,6 @@ class ManualFlight:
                 self._send_soon(flight)
 
     def answer(self, page: Any) -> FlightAnswer:
-        """Return what the page shows."""
         with self._lock:
             flight = self._flights.get(page)
             if flight is None:

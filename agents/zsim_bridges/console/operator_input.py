@@ -48,11 +48,6 @@ class SliderRange(NamedTuple):
         return f"{self.name} [{self.unit}]"
 
     @property
-    def label_unknown(self) -> str:
-        """The label while the variable is unknown, and the slider's position means nothing."""
-        return f"{self.label}: not known"
-
-    @property
     def start(self) -> float:
         """Position of the slider while the variable is unknown."""
         return min(max(0.0, self.low), self.high)
@@ -62,7 +57,6 @@ class SliderRange(NamedTuple):
         return math.degrees(math.remainder(value, math.tau)) if self.unit == "deg" else value
 
     def to_si(self, shown: float) -> float:
-        """Return a value in the unit of the range as [m, rad]."""
         return math.radians(shown) if self.unit == "deg" else shown
 
     def to_display(self, value: float) -> float:

@@ -69,38 +69,27 @@ class OrderRequest(Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass
 class _Target:
-    """A drone or formation that an order concerns.
-
-    Attributes:
-        reason: why it is refused, or not confirmed.
-        busy: whether an attempt is in progress.
-        attempts: number of attempts.
-        sent_s: when the last one began [s; wall].
-        modes: number of modes requested of a drone up to this order's; a further one replaces it.
-        accepted: whether the world has accepted the last command.
-    """
+    """A drone or formation that an order concerns."""
 
     is_drone: bool
     state: OrderState = "sent"
-    reason: str = ""
-    busy: bool = False
+    reason: str = ""  # why it is refused, or not confirmed
+    busy: bool = False  # whether an attempt is in progress
     attempts: int = 0
-    sent_s: float = 0.0
-    modes: int = 0
-    accepted: bool = False
+    sent_s: float = 0.0  # when the last attempt began [s; wall]
+    modes: int = 0  # number requested of a drone up to this order's; a further one replaces it
+    accepted: bool = False  # whether the world has accepted the last command
 
 
 @dataclass
 class _Order:
-    """An order, its targets by name, and when it was given and settled [s; wall]."""
-
     id: str
     op: Any
     subject: str
-    targets: dict[str, _Target]
-    given_s: float
+    targets: dict[str, _Target]  # by name
+    given_s: float  # wall
     since_ns: int
-    over_s: float | None = None
+    over_s: float | None = None  # when it was settled [s; wall]
     confirmed_ns: int | None = None
     refusal: str = ""
     told: set[str] = field(default_factory=set)
@@ -186,7 +175,6 @@ class OrderBook:
             return is_new
 
     def on_event(self, event: Event) -> None:
-        """Take an event of the world about a command of this console."""
         subject = commanded_drone(event)
         with self._lock:
             for order in self._open():
@@ -205,10 +193,7 @@ class OrderBook:
     def update(self, states: Mapping[str, str], t_ns: int, *, paused: bool) -> None:
         """Settle orders that have had their effect, and repeat those that have not.
 
-        Args:
-            states: of drones, and phases of formations, by name.
-            t_ns: their simulated time.
-            paused: whether the run stands still, so that accepted commands have no effect yet.
+        `states` of drones, and phases of formations, are of t_ns; commands accepted in a paused run have no effect yet.
         """
         with self._lock:
             self._paused = paused
@@ -240,8 +225,16 @@ class OrderBook:
         return [order for order in self._orders.values() if order.over_s is None]
 
     def _new(self, order_id: str, request: OrderRequest) -> _Order:
-        targets = {name: _Target(is_drone=name in self._drones) for name in self._concerned(request)}
         subject = request.drone or request.cluster
+        if subject:
+            concerned = [subject]
+        elif request.op == "emergency":
+            concerned = list(self._drones)
+        else:
+            led = {name for drones in self._members.values() for name in drones}
+            single = [] if request.op == "hold" else [name for name in self._drones if name not in led]
+            concerned = [*self._members, *single]
+        targets = {name: _Target(is_drone=name in self._drones) for name in concerned}
         order = _Order(order_id, request.op, subject, targets, self._wall_s(), self._now_ns())
         order.refusal = self._refusal()
         if request.run and request.run != self._run_id:
@@ -253,15 +246,6 @@ class OrderBook:
         if order.refusal:
             order.over_s = order.given_s
         return order
-
-    def _concerned(self, request: OrderRequest) -> list[str]:
-        if request.drone or request.cluster:
-            return [request.drone or request.cluster]
-        if request.op == "emergency":
-            return list(self._drones)
-        led = {name for drones in self._members.values() for name in drones}
-        single = [] if request.op == "hold" else [name for name in self._drones if name not in led]
-        return [*self._members, *single]
 
     def _replace_earlier(self, order: _Order) -> None:
         """Settle earlier orders that a new one contradicts; an emergency, all of its drones and their formations."""
@@ -335,7 +319,6 @@ class PendingRequests:
         return known
 
     def pop_done(self, clusters: Mapping[str, ViewCluster], drones: Mapping[str, str]) -> list[PendingRequest]:
-        """Return and remove the requests that are done."""
         done = [each for each in list(self._pending.values()) if _is_done(each, clusters, drones)]
         for each in done:
             self._pending.pop(each.subject, None)
@@ -349,10 +332,12 @@ def _is_done(request: PendingRequest, clusters: Mapping[str, ViewCluster], drone
     if request.op != "target":
         return view.phase in PHASES_DONE[request.op]
     flown = dict(zip(view.names, view.value, strict=True))
-    return all(name in flown and _is_there(name, flown[name] - value) for name, value in request.values.items())
-
-
-def _is_there(name: str, away: float) -> bool:
-    if unit(name) == "rad":
-        return abs(math.remainder(away, math.tau)) < THERE_RAD
-    return abs(away) < THERE_M
+    for name, value in request.values.items():
+        away = flown.get(name, math.inf) - value
+        if unit(name) == "rad" and math.isfinite(away):
+            there = abs(math.remainder(away, math.tau)) < THERE_RAD
+        else:
+            there = abs(away) < THERE_M
+        if not there:
+            return False
+    return True

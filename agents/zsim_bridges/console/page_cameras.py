@@ -91,7 +91,6 @@ def _unit(vector: Array) -> Array:
 
 
 def _aim(client: viser.ClientHandle, centre: Array, offset: Array) -> None:
-    """Aim a page's camera at a point from an offset [m; W]."""
     with client.atomic():
         client.camera.position = centre + offset
         client.camera.look_at = centre
@@ -99,32 +98,60 @@ def _aim(client: viser.ClientHandle, centre: Array, offset: Array) -> None:
 
 @dataclass
 class _Page:
-    """A page's camera.
-
-    Attributes:
-        follows: whether it moves with the formation.
-        fits: whether it keeps all drones in view by its distance.
-        direction: from which it looks at the next picture; None: unchanged.
-        moved: whether it must be aimed anew.
-    """
+    """A page: how its camera looks at the scene, and the frustum within it; `key` identifies it to its sockets."""
 
     client: viser.ClientHandle
-    follows: bool = True
-    fits: bool = True
-    direction: Array | None = field(default_factory=DIRECTIONS["reset"].copy)
-    moved: bool = True
+    key: str = field(default_factory=lambda: secrets.token_urlsafe(PAGE_KEY_BYTES))
+    follows: bool = True  # whether its camera moves with the formation
+    fits: bool = True  # whether that keeps all drones in view by its distance
+    direction: Array | None = field(default_factory=DIRECTIONS["reset"].copy)  # of the next look; None: unchanged
+    moved: bool = True  # whether it must be aimed anew
+    camera: str = ""  # whose frustum is shown
+    clicked: str = ""  # the drone clicked last in its scene
 
 
-class CameraFollow:
-    """The cameras with which all pages look at the scene."""
+@dataclass
+class _Frustum:
+    camera: str
+    node: Any  # viser's
+    number: int = 0  # of its picture
+
+
+class PageCameras:
+    """The cameras with which all pages look at the scene, and the frusta within it.
+
+    A frustum that appears out of its page's view is brought into it.
+    """
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
         self._lock = threading.Lock()
         self._pages: dict[int, _Page] = {}  # by viser's number
         self._points: Array = np.zeros((1, 3))
+        self._frusta: dict[int, _Frustum] = {}  # by viser's number of the page; only touched by the thread that draws
         server.on_client_connect(self._on_connect)
         server.on_client_disconnect(self._on_disconnect)
+
+    def _on_connect(self, client: viser.ClientHandle) -> None:
+        page = _Page(client)
+        self._move(page)
+        page.moved = True  # once more at the next picture: this one may be that of another run
+        with self._lock:
+            self._pages[client.client_id] = page
+        client.gui.add_html(f'<i data-zsim-page="{page.key}"></i>', order=-2.0)
+        if client.client_id not in self._server.get_clients():
+            self._on_disconnect(client)  # it has disconnected meanwhile
+
+    def _on_disconnect(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            self._pages.pop(client.client_id, None)
+
+    def client_id(self, key: str) -> int | None:
+        """Return viser's number of a page, None if it is not open."""
+        with self._lock:
+            return next((number for number, page in self._pages.items() if page.key == key), None)
+
+    # How pages look at the scene
 
     def restart(self) -> None:
         """Aim all cameras anew at the first picture of another run."""
@@ -132,7 +159,7 @@ class CameraFollow:
             for page in self._pages.values():
                 page.moved = True
 
-    def choose(self, client_id: int, follows: bool, fits: bool, direction: str = "") -> None:
+    def look(self, client_id: int, follows: bool, fits: bool, direction: str = "") -> None:
         """Let a page's camera follow or not, keep all in view or not, and look from a direction of `DIRECTIONS`."""
         with self._lock:
             page = self._pages.get(client_id)
@@ -171,21 +198,64 @@ class CameraFollow:
             distance_m = now_m if keeps else SPARE * fit_m
             _aim(page.client, centre, direction * distance_m / float(np.linalg.norm(direction)))
 
-    def _on_connect(self, client: viser.ClientHandle) -> None:
-        page = _Page(client)
-        self._move(page)
-        page.moved = True  # once more at the next picture: this one may be that of another run
+    # Frusta
+
+    def show_frustum(self, key: str, camera: str) -> None:
+        """Show a camera's frustum on a page; empty: none."""
         with self._lock:
-            self._pages[client.client_id] = page
-        if client.client_id not in self._server.get_clients():
-            self._on_disconnect(client)  # it has disconnected meanwhile
+            for page in self._pages.values():
+                if page.key == key:
+                    page.camera = camera
 
-    def _on_disconnect(self, client: viser.ClientHandle) -> None:
+    def click(self, client_id: int | None, drone: str) -> None:
+        """Note that a drone was clicked in the scene of a page."""
         with self._lock:
-            self._pages.pop(client.client_id, None)
+            if client_id in self._pages:
+                self._pages[client_id].clicked = drone
 
+    def take_click(self, key: str) -> str:
+        """Return once the drone that was clicked last in a page's scene; empty for none."""
+        clicked = ""
+        with self._lock:
+            for page in self._pages.values():
+                if page.key == key:
+                    clicked, page.clicked = page.clicked, ""
+        return clicked
 
-# Frusta
+    def draw_frusta(
+        self, drones: DronePoses | None, shown: Callable[[str], tuple[CameraInfo, CameraPicture] | None]
+    ) -> None:
+        """Draw the chosen frusta, and remove others; `shown` returns a camera with its newest picture."""
+        with self._lock:
+            chosen = {number: (page.client, page.camera) for number, page in self._pages.items() if page.camera}
+        for number, frustum in list(self._frusta.items()):
+            if number not in chosen or chosen[number][1] != frustum.camera:
+                self._frusta.pop(number).node.remove()
+        for number, (client, camera) in chosen.items():
+            found, index = shown(camera), drone_index(drones, camera)
+            if found is None or drones is None or index is None:
+                continue
+            info, picture = found
+            p_W, q_WK = frustum_pose(info, drones.p_W[index], drones.q_WB[index])
+            frustum = self._frusta.get(number)
+            if frustum is None:
+                _bring_into_view(client, p_W, p_W + frames.rotate(q_WK, (0.0, 0.0, SCALE)))
+                node: Any = client.scene.add_camera_frustum(
+                    NODE, min(field_of_view(info), FIELD_MAX_RAD), info.width / info.height, scale=SCALE,
+                    thickness=EDGE_PX, thickness_units="screen", color=COLOUR, cast_shadow=False, receive_shadow=False,
+                )  # fmt: skip
+                frustum = self._frusta[number] = _Frustum(camera, node)
+            frustum.node.position, frustum.node.wxyz = p_W, q_WK
+            if picture.number != frustum.number:
+                frustum.number = picture.number
+                show_jpeg(frustum.node, picture.image.data)
+
+    def clear_frusta(self) -> None:
+        """Remove all: the run is over."""
+        with self._lock:
+            for page in self._pages.values():
+                page.camera = ""
+        self.draw_frusta(None, lambda _: None)
 
 
 def frustum_pose(info: CameraInfo, p_WB: Array, q_WB: Array) -> tuple[Array, Array]:
@@ -201,108 +271,6 @@ def drone_index(drones: DronePoses | None, camera: str) -> int | None:
         return None
     index = drones.names.index(drone)
     return index if drones.present[index] else None
-
-
-@dataclass
-class _KeyedPage:
-    """A page, the camera whose frustum it shows, and the drone clicked last in its scene; empty for none."""
-
-    client: viser.ClientHandle
-    camera: str = ""
-    clicked: str = ""
-
-
-@dataclass
-class _Frustum:
-    """A frustum of a camera, as viser's node, and the number of its picture."""
-
-    camera: str
-    node: Any
-    number: int = 0
-
-
-class CameraFrustums:
-    """The frusta of all pages; each page is told a key, by which its sockets identify it.
-
-    A frustum that appears out of its page's view is brought into it.
-    """
-
-    def __init__(self, server: viser.ViserServer) -> None:
-        self._lock = threading.Lock()
-        self._pages: dict[str, _KeyedPage] = {}  # by key
-        self._frusta: dict[str, _Frustum] = {}  # by key; only touched by the thread that draws
-        server.on_client_connect(self._on_connect)
-        server.on_client_disconnect(self._on_disconnect)
-
-    def client_id(self, page: str) -> int | None:
-        """Return viser's number of a page, None if it is not open."""
-        with self._lock:
-            return self._pages[page].client.client_id if page in self._pages else None
-
-    def choose(self, page: str, camera: str) -> None:
-        """Show a camera's frustum on a page; empty: none."""
-        with self._lock:
-            if page in self._pages:
-                self._pages[page].camera = camera
-
-    def click(self, client_id: int, drone: str) -> None:
-        """Note that a drone was clicked in the scene of a page, by viser's number."""
-        with self._lock:
-            for page in self._pages.values():
-                if page.client.client_id == client_id:
-                    page.clicked = drone
-
-    def take_click(self, page: str) -> str:
-        """Return once the drone that was clicked last in a page's scene; empty for none."""
-        with self._lock:
-            if page not in self._pages:
-                return ""
-            clicked, self._pages[page].clicked = self._pages[page].clicked, ""
-            return clicked
-
-    def draw(self, drones: DronePoses | None, shown: Callable[[str], tuple[CameraInfo, CameraPicture] | None]) -> None:
-        """Draw the chosen frusta, and remove others; `shown` returns a camera with its newest picture."""
-        with self._lock:
-            chosen = {key: (page.client, page.camera) for key, page in self._pages.items() if page.camera}
-        for key, frustum in list(self._frusta.items()):
-            if key not in chosen or chosen[key][1] != frustum.camera:
-                self._frusta.pop(key).node.remove()
-        for key, (client, camera) in chosen.items():
-            found, index = shown(camera), drone_index(drones, camera)
-            if found is None or drones is None or index is None:
-                continue
-            info, picture = found
-            p_W, q_WK = frustum_pose(info, drones.p_W[index], drones.q_WB[index])
-            frustum = self._frusta.get(key)
-            if frustum is None:
-                _bring_into_view(client, p_W, p_W + frames.rotate(q_WK, (0.0, 0.0, SCALE)))
-                node: Any = client.scene.add_camera_frustum(
-                    NODE, min(field_of_view(info), FIELD_MAX_RAD), info.width / info.height, scale=SCALE,
-                    thickness=EDGE_PX, thickness_units="screen", color=COLOUR, cast_shadow=False, receive_shadow=False,
-                )  # fmt: skip
-                frustum = self._frusta[key] = _Frustum(camera, node)
-            frustum.node.position, frustum.node.wxyz = p_W, q_WK
-            if picture.number != frustum.number:
-                frustum.number = picture.number
-                show_jpeg(frustum.node, picture.image.data)
-
-    def clear(self) -> None:
-        """Remove all: the run is over."""
-        with self._lock:
-            for page in self._pages.values():
-                page.camera = ""
-        self.draw(None, lambda _: None)
-
-    def _on_connect(self, client: viser.ClientHandle) -> None:
-        key = secrets.token_urlsafe(PAGE_KEY_BYTES)
-        with self._lock:
-            self._pages[key] = _KeyedPage(client)
-        client.gui.add_html(f'<i data-zsim-page="{key}"></i>', order=-2.0)
-
-    def _on_disconnect(self, client: viser.ClientHandle) -> None:
-        with self._lock:
-            others = {key: page for key, page in self._pages.items() if page.client.client_id != client.client_id}
-            self._pages = others
 
 
 def _bring_into_view(client: viser.ClientHandle, *points_W: Array) -> None:

@@ -45,13 +45,7 @@ Place = tuple[float, float]
 class PageFlying:
     """Single drones for the pages of one run, which viser's number identifies.
 
-    Args:
-        name: of the console's process.
-        note: called with a drone or formation whose return is over, and why.
-
-    Attributes:
-        control: of the drones that are flown from pages.
-        returns: of drones and formations.
+    `note` is called with a drone or formation whose return is over, and why.
     """
 
     def __init__(
@@ -67,7 +61,7 @@ class PageFlying:
         self._views = views = monitor.views
         self._monitor = monitor
         self._scene = scene
-        self._pages = pages
+        self.pages = pages
         self._members = {name: [run.names.index(each) for each in drones] for name, drones in run.members.items()}
         fence = geofence_of(run.scenario)
         self._surroundings = surroundings(run.scenario, fence)
@@ -76,22 +70,9 @@ class PageFlying:
         self.control = ManualFlight(client, name, limits, fence, gate_s, self._sight, self._run_sight)
         self.returns = ReturnFlights(run.scenario, client, self.control, self._sight, lambda: views.clusters, note)
 
-    def choose(self, client_id: int | None, drone: str) -> None:
-        """Choose a drone on one page."""
-        if drone in self._run.names:
-            self._pages.choose(client_id, drone)
-
-    def take_refusal(self, client_id: int | None, drone: str) -> str:
-        """Return why a page may not fly a drone, whose formation another page controls; empty where it may."""
-        return self._pages.use(client_id, drone) if client_id is not None else ""
-
-    def select(self, client_id: int | None, drone: str) -> None:
-        """Select a drone on one page for a command to several, or unselect it."""
-        self._pages.toggle(client_id, drone)
-
     def plan(self, client_id: int | None, whole: bool) -> dict[str, Any]:
         """Return the view from above as plain data; `whole`: with what does not change, and the past trails."""
-        drones, chosen = self._scene.drones, self._pages.chosen(client_id)
+        drones, chosen = self._scene.drones, self.pages.chosen(client_id)
         if drones is None:
             return {"t_s": None, "chosen": chosen}
         states = {each.name: each.state for each in self._views.drones.drones} if self._views.drones else {}
@@ -193,21 +174,12 @@ class ReturningDrone(NamedTuple):
 
 @dataclass
 class _ReturningFormation:
-    """Number of requests made of a formation up to its return, and how near its goal has come to the middle."""
-
-    requests: int
-    nearest_m: float = math.inf
+    requests: int  # made of it up to its return
+    nearest_m: float = math.inf  # how near its goal has come to the middle
 
 
 class ReturnFlights:
-    """Returns of the drones and formations of a run; thread-safe.
-
-    Args:
-        control: flies drones to places.
-        sight_of: returns what is known of a drone.
-        clusters: returns the newest view of each formation.
-        note: called with a drone or formation, and why its return is over.
-    """
+    """Returns of the drones and formations of a run; thread-safe. `control` flies drones to places."""
 
     def __init__(
         self,
@@ -247,7 +219,7 @@ class ReturnFlights:
         values = dict(zip(MIDDLE, self.middles[cluster], strict=True))
         self._client.request_cluster(cluster, "target", values=values)
         with self._lock:
-            self._formations[cluster] = _ReturningFormation(self._client.requests_to(cluster))
+            self._formations[cluster] = _ReturningFormation(self._client.cluster_requests[cluster])
 
     def refused(self, cluster: str) -> None:
         """Note that a formation was refused a request: its return is over."""
@@ -288,7 +260,7 @@ class ReturnFlights:
     def _continue_formation(self, name: str, returning: _ReturningFormation) -> bool:
         """Land a formation that has come over its starts; return whether it is on its way."""
         view = self._clusters().get(name)
-        if self._client.requests_to(name) != returning.requests or view is None:
+        if self._client.cluster_requests[name] != returning.requests or view is None:
             return False  # somebody has made another request
         if view.phase != "engaged":
             self._note(name, f"return of {name} is over: it is {view.phase}")

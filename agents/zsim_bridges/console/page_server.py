@@ -47,9 +47,7 @@ SECRET_HEADER = "X-Zsim-Console"  # demanded by viser's server
 ALL_ADDRESSES = ("0.0.0.0", "::")
 PAGES_MAX = 50  # open at once, of operators and of viewers: viewers keep no operator out
 HEARTBEAT_S = 20.0  # after which a page on a machine that is gone is noticed
-CLOSE_S = (
-    0.3  # wall; twice at the end, for requests in progress, and for pages to close their sockets; slow ones do not
-)
+CLOSE_S = 0.3  # wall; twice at the end, for requests in progress, and for pages to close their sockets
 POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; frame-ancestors 'none'; form-action 'none'"
 HEADERS = {
     "Content-Security-Policy": POLICY,  # the page is one file, and nothing on it comes from elsewhere
@@ -107,12 +105,7 @@ class RunFiles:
         self._leaves = False
 
     def shown(self, page: str, has_copies: bool) -> dict[str, Any]:
-        """Return what the head of a page shows of them as plain data.
-
-        Args:
-            page: its name; empty where no page asks.
-            has_copies: whether it has copied everything that it wants to keep.
-        """
+        """Return what the head of a page, by its name, shows of them; `has_copies`: of all that it wants to keep."""
         self._looked_s.pop(page, None)
         if page and not has_copies:
             while len(self._looked_s) >= LOOKS_MAX:
@@ -122,12 +115,7 @@ class RunFiles:
         return {"files": files, "leaves": self._leaves}
 
     def offer(self, within_s: float, deserted: Callable[[], bool]) -> None:
-        """Tell pages to copy the files, since the console leaves; wait until all open ones have.
-
-        Args:
-            within_s: for how long at most [wall].
-            deserted: whether to return at once.
-        """
+        """Tell pages to copy the files, since the console leaves; wait until all open ones have, unless deserted."""
         self._leaves = True
         until_s = time.monotonic() + within_s
         while (now_s := time.monotonic()) < until_s and not deserted():
@@ -146,42 +134,22 @@ class RunFiles:
 
 
 class ViserBackend(NamedTuple):
-    """What is behind the HTTP server.
+    """What is behind the HTTP server; sockets are served until they close."""
 
-    Attributes:
-        port: of viser, on BACKEND_HOST.
-        secret: demanded by viser in SECRET_HEADER.
-        state: returns what the console shows as plain data.
-        permits: returns whether a message of a page in a role may reach viser.
-        serve_cameras: answers a page's request for a socket of pictures, until it closes.
-        serve_actions: answers a request for a socket of actions by a page in a role, until it closes.
-        head: returns what the head of the page shows as plain data.
-        command: takes an order; returns its progress as plain data with `state` and `reason`.
-        files: left behind by the run.
-        looked: called with key, role and address of a page that is alive.
-    """
-
-    port: int
-    secret: str
-    state: Callable[[], dict[str, Any]]
-    permits: Callable[[bytes, str], bool]
-    serve_cameras: Callable[[web.Request], Awaitable[web.StreamResponse]]
-    serve_actions: Callable[[web.Request, str], Awaitable[web.StreamResponse]]
-    head: Callable[[], dict[str, Any]]
-    command: Callable[[OrderRequest], dict[str, Any]]
+    port: int  # of viser, on BACKEND_HOST
+    secret: str  # demanded by viser in SECRET_HEADER
+    state: Callable[[], dict[str, Any]]  # what the console shows
+    permits: Callable[[bytes, str], bool]  # whether a message of a page in a role may reach viser
+    serve_cameras: Callable[[web.Request], Awaitable[web.StreamResponse]]  # a socket of pictures
+    serve_actions: Callable[[web.Request, str], Awaitable[web.StreamResponse]]  # a socket of actions, in a role
+    head: Callable[[], dict[str, Any]]  # what the head of the page shows
+    command: Callable[[OrderRequest], dict[str, Any]]  # takes an order; returns its progress
     files: RunFiles
-    looked: Callable[[str, str, str], None]
+    looked: Callable[[str, str, str], None]  # called with key, role and address of a page that is alive
 
 
 class HttpProxy:
-    """One server of pages.
-
-    Args:
-        token: of operators; None where only this machine can connect.
-
-    Raises:
-        RunError: others could reach it, and there is no token.
-    """
+    """One server of pages; `token` is that of operators, None where only this machine can connect."""
 
     def __init__(self, address: ListenAddress, token: str | None, backend: ViserBackend) -> None:
         self._address = address
@@ -198,17 +166,12 @@ class HttpProxy:
         return PageTokens(address.host, address.port, self._token, self._view_token)
 
     def urls(self) -> dict[str, str]:
-        """Return the URLs to be opened, by role."""
         view_token = self._view_token if self._token is not None else None
         return {OPERATOR: self._address.url("/", self._token), VIEWER: self._address.url(VIEW_PATH, view_token)}
 
     @contextmanager
     def open(self) -> Iterator[None]:
-        """Serve pages on a thread of its own.
-
-        Raises:
-            RunError: the port is taken, or the address is none of this machine.
-        """
+        """Serve pages on a thread of its own; a RunError: the port is taken, or the address is none of this machine."""
         with open_on_thread(self._loop, "console server", self._open, self._close):
             yield
 
@@ -220,12 +183,12 @@ class HttpProxy:
         for path, handler in shared.items():
             app.add_routes([web.get(path, handler), web.get(f"{VIEW_PATH}{path}", handler)])
         app.add_routes([web.post("/command", self._command)])
+        host, port, or_any = self._address
         try:
-            host, port, or_any = self._address
             site = await start_site(app, host, (port, ANY_PORT) if or_any else (port,), shutdown_s=CLOSE_S)
         except OSError as error:
-            address = f"{self._address.host}, port {self._address.port}"
-            raise RunError(f"console: cannot listen on {address} ({error.strerror}); say --port") from error
+            reason = f"cannot listen on {host}, port {port} ({error.strerror})"
+            raise RunError(f"console: {reason}; say --port") from error
         self._address = self._address._replace(port=site.port)
         self._tokens = self._tokens_at(self._address)
         self._client = ClientSession()
@@ -240,26 +203,22 @@ class HttpProxy:
         return self._tokens.role_of(_page_request(request))
 
     async def _page(self, request: web.Request) -> web.StreamResponse:
-        """Serve the page, or its WebSocket."""
         page_request = _page_request(request)
         role = self._tokens.role_of(page_request)
         if role is None:
             return _missing_token()
         if page_request.token:
-            return self._set_cookie(page_request)
+            # The token moves into a cookie; a reverse proxy may serve the page below a path of its own.
+            response = web.Response(status=303, headers={**HEADERS, "Location": f".{page_request.path}"})
+            shown = self._tokens.role_of_address(page_request)
+            if shown is not None:
+                name = self._tokens.cookie(shown)
+                response.set_cookie(name, page_request.token, httponly=True, samesite="Strict", path="/")
+            return response
         if request.headers.get("Upgrade", "").lower() == "websocket":
             return await self._stream(role, lambda: self._relay(request, role))
         headers = {**HEADERS, "Content-Encoding": "gzip"}
         return web.Response(body=self._pages[role], content_type="text/html", charset="utf-8", headers=headers)
-
-    def _set_cookie(self, page_request: "PageRequest") -> web.Response:
-        """Move the token from the address into a cookie; a reverse proxy may serve the page below a path of its own."""
-        response = web.Response(status=303, headers={**HEADERS, "Location": f".{page_request.path}"})
-        role = self._tokens.role_of_address(page_request)
-        if role is not None:
-            name = self._tokens.cookie(role)
-            response.set_cookie(name, page_request.token, httponly=True, samesite="Strict", path="/")
-        return response
 
     async def _state(self, request: web.Request) -> web.Response:
         return _missing_token() if self._role_of(request) is None else _json_response(self._backend.state())
@@ -296,21 +255,18 @@ class HttpProxy:
         return _json_response({"refusal": refusal, "order": progress}, 409 if refusal else 200)
 
     async def _cameras(self, request: web.Request) -> web.StreamResponse:
-        """Serve a page's socket for pictures of cameras, viewers' too."""
-        return await self._socket(request, "cameras", lambda _: self._backend.serve_cameras(request))
+        role = self._role_of(request)
+        if role is None:
+            return _missing_token()
+        return await self._stream(f"cameras of {role}", lambda: self._backend.serve_cameras(request))
 
     async def _actions(self, request: web.Request) -> web.StreamResponse:
-        """Serve a page's socket for actions; viewers move their cameras."""
-        return await self._socket(request, "actions", partial(self._backend.serve_actions, request))
-
-    async def _socket(
-        self, request: web.Request, what: str, serve: Callable[[str], Awaitable[web.StreamResponse]]
-    ) -> web.StreamResponse:
         role = self._role_of(request)
-        return _missing_token() if role is None else await self._stream(f"{what} of {role}", lambda: serve(role))
+        if role is None:
+            return _missing_token()
+        return await self._stream(f"actions of {role}", lambda: self._backend.serve_actions(request, role))
 
     async def _stream(self, what: str, serve: Callable[[], Awaitable[web.StreamResponse]]) -> web.StreamResponse:
-        """Serve a socket, unless too many of its kind are open."""
         if self._open_pages[what] >= PAGES_MAX:
             return web.Response(status=503, text=f"{PAGES_MAX} pages are open already; close one\n", headers=HEADERS)
         self._open_pages[what] += 1
@@ -320,7 +276,6 @@ class HttpProxy:
             self._open_pages[what] -= 1
 
     async def _relay(self, request: web.Request, role: str) -> web.WebSocketResponse:
-        """Relay messages between page and viser until one side closes."""
         header = request.headers.get("Sec-WebSocket-Protocol", "")
         protocols = [part.strip() for part in header.split(",") if part.strip()]
         page = web.WebSocketResponse(
@@ -330,6 +285,7 @@ class HttpProxy:
         assert self._client is not None
         url = f"ws://{BACKEND_HOST}:{self._backend.port}/"
         headers = {SECRET_HEADER: self._backend.secret}
+        permits = self._backend.permits
 
         async def forward(source: Any, sink: Any, permits: Callable[[bytes], bool]) -> None:
             async for message in source:
@@ -339,10 +295,7 @@ class HttpProxy:
         try:
             connecting = self._client.ws_connect(url, protocols=protocols, headers=headers, compress=0, max_msg_size=0)
             async with connecting as viser:
-                ways = (
-                    forward(viser, page, lambda _: True),
-                    forward(page, viser, lambda data: self._backend.permits(data, role)),
-                )
+                ways = forward(viser, page, lambda _: True), forward(page, viser, lambda data: permits(data, role))
                 tasks = [asyncio.ensure_future(way) for way in ways]
                 await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
                 for task in tasks:
@@ -368,7 +321,6 @@ def _missing_token() -> web.Response:
 
 
 def _page(style: str = "") -> bytes:
-    """Return the page, compressed, with a style of `frame/`."""
     html = importlib.resources.files("viser").joinpath("client/build/index.html").read_text()
     folder = importlib.resources.files("zsim_bridges.console.frame")
     parts = "".join(folder.joinpath(name).read_text("utf-8") for name in PARTS)
@@ -420,17 +372,19 @@ class PageTokens:
     def role_of(self, request: PageRequest) -> str | None:
         """Return the role in which the page of this path may be opened, None if it may not."""
         role = VIEWER if request.path.startswith(VIEW_PATH) else OPERATOR
-        from_own_page = request.origin is None or _origin_address(request.origin) == request.host
-        if self._tokens[OPERATOR] is None:
-            try:
-                return role if from_own_page and is_loopback_authority(request.host) else None
-            except ValueError:
-                return None
-        if not from_own_page:
+        try:
+            if request.origin is not None and urlsplit(request.origin).netloc != request.host:
+                return None  # a page of another server
+            if self._tokens[OPERATOR] is None:
+                return role if is_loopback_authority(request.host) else None
+        except ValueError:
             return None
-        sufficient = (OPERATOR,) if role == OPERATOR else (VIEWER, OPERATOR)
-        shown = {each: (request.token, request.cookies.get(self.cookie(each), "")) for each in sufficient}
-        return role if any(self._is_token(token, each) for each in shown for token in shown[each]) else None
+        for each in (OPERATOR,) if role == OPERATOR else (VIEWER, OPERATOR):
+            if any(
+                self._is_token(token, each) for token in (request.token, request.cookies.get(self.cookie(each), ""))
+            ):
+                return role
+        return None
 
     def role_of_address(self, request: PageRequest) -> str | None:
         """Return the role whose token stands in the address, to become a cookie; None if none does."""
@@ -440,11 +394,3 @@ class PageTokens:
     def _is_token(self, received: str, role: str) -> bool:
         token = self._tokens[role]
         return token is not None and tokens_match(received, token)
-
-
-def _origin_address(origin: str) -> str | None:
-    """Return host and port of an Origin header, None if it cannot be parsed."""
-    try:
-        return urlsplit(origin).netloc
-    except ValueError:
-        return None

@@ -14,7 +14,7 @@ from msgspec import Meta, Struct
 
 from zsim_bridges.console.camera_feed import CameraFeed
 from zsim_bridges.console.manual_flight import FlightAnswer, Stick
-from zsim_bridges.console.page_cameras import CameraFollow, CameraFrustums
+from zsim_bridges.console.page_cameras import PageCameras
 from zsim_bridges.console.page_flying import PageFlying
 from zsim_bridges.console.page_server import HEARTBEAT_S, OPERATOR
 from zsim_bridges.console.time_monitor import RecordPlayer
@@ -95,10 +95,6 @@ class SteerDrone(_Action, frozen=True, tag="steer"):
     turn: Deflection = 0.0
     speed_m_s: Annotated[float, Meta(ge=0.0, le=SPEED_MAX_M_S)] = 1.0
 
-    def stick(self) -> Stick | None:
-        """Return the stick, None if it is not held."""
-        return Stick(self.forward, self.left, self.up, self.turn, self.speed_m_s) if self.held else None
-
 
 class GoToPlace(_Action, frozen=True, tag="go"):
     """Send the drone that was taken to a place, at its present height unless `z_m` is given."""
@@ -117,29 +113,18 @@ _Operate = PlayRecord | TakeDrone | SteerDrone | GoToPlace | LeaveDrone
 _ACTIONS = msgspec.json.Decoder(_Look | _Operate)
 
 
-async def _open(request: web.Request, max_bytes: int) -> web.WebSocketResponse:
-    socket = web.WebSocketResponse(compress=False, max_msg_size=max_bytes, heartbeat=HEARTBEAT_S)
-    await socket.prepare(request)
-    return socket
-
-
 class ActionSockets:
     """The sockets for actions of all pages.
 
-    Args:
-        client_id: returns viser's number of a page by its key, None if it is not open.
-        record: returns what a replay plays, None without a run.
-        flying: returns what pages may do with single drones, None without a run.
+    `record` returns what a replay plays, and `flying` what pages may do with single drones, None without a run.
     """
 
     def __init__(
         self,
-        client_id: Callable[[str], int | None],
-        cameras: CameraFollow,
+        cameras: PageCameras,
         record: Callable[[], RecordPlayer | None],
         flying: Callable[[], PageFlying | None] = lambda: None,
     ) -> None:
-        self._client_id = client_id
         self._cameras = cameras
         self._record = record
         self._flying = flying
@@ -147,7 +132,8 @@ class ActionSockets:
 
     async def respond(self, request: web.Request, role: str) -> web.StreamResponse:
         """Answer a request for a socket; return when it is closed."""
-        socket = await _open(request, ACTION_MAX)
+        socket = web.WebSocketResponse(compress=False, max_msg_size=ACTION_MAX, heartbeat=HEARTBEAT_S)
+        await socket.prepare(request)
         try:
             async for message in socket:
                 answer = self.act(message.data, role, socket) if message.type is WSMsgType.TEXT else None
@@ -178,42 +164,43 @@ class ActionSockets:
             action: _Look | _Operate = _ACTIONS.decode(text)
         except (msgspec.MsgspecError, ValueError, RecursionError):
             return None
+        flying = self._flying()
         if isinstance(action, _Operate):
-            return self._operate(action, page) if role == OPERATOR else None
-        client_id, flying = self._client_id(action.page), self._flying()
+            return self._operate(action, page, flying) if role == OPERATOR else None
+        client_id = self._cameras.client_id(action.page)
         if isinstance(action, LookAtPlan) and page is not None:
             self._keys[page] = action.page
         if isinstance(action, LookFrom):
             if client_id is not None:
-                self._cameras.choose(client_id, action.follows, action.fits, action.direction)
+                self._cameras.look(client_id, action.follows, action.fits, action.direction)
         elif flying is None:
             return {}
         elif isinstance(action, LookAtPlan):
             return {"plan": flying.plan(client_id, action.whole)}
         elif isinstance(action, ChooseDrone):
-            flying.choose(client_id, action.drone)
+            flying.pages.choose(client_id, action.drone)
         else:
-            flying.select(client_id, action.drone)
+            flying.pages.toggle(client_id, action.drone)
         return {}
 
-    def _operate(self, action: _Operate, page: Any) -> dict[str, Any]:
+    def _operate(self, action: _Operate, page: Any, flying: PageFlying | None) -> dict[str, Any]:
         if isinstance(action, PlayRecord):
             record = self._record()
             if record is not None:
                 record.play(action.op, action.value)
             return {}
-        flying = self._flying()
         if flying is None:
             return {}
         if isinstance(action, TakeDrone):
-            client_id = self._client_id(self._keys.get(page, "")) if page is not None else None
-            refusal = flying.take_refusal(client_id, action.drone)
+            client_id = self._cameras.client_id(self._keys.get(page, "")) if page is not None else None
+            refusal = flying.pages.use(client_id, action.drone)
             if refusal:
                 answer = FlightAnswer(action.drone, text=refusal)
             else:
                 answer = flying.control.take(page, action.drone, action.over, action.id)
         elif isinstance(action, SteerDrone):
-            answer = flying.control.steer(page, action.stick())
+            deflections = action.forward, action.left, action.up, action.turn
+            answer = flying.control.steer(page, Stick(*deflections, action.speed_m_s) if action.held else None)
         elif isinstance(action, GoToPlace):
             answer = flying.control.go(page, action.x_m, action.y_m, action.z_m)
         else:
@@ -275,19 +262,16 @@ class PageBatches:
 
 
 class CameraSockets:
-    """The sockets for pictures of all pages.
+    """The sockets for pictures of all pages; `feed` returns the cameras of the run that is shown, None without one."""
 
-    Args:
-        feed: returns the cameras of the run that is shown, None without one.
-    """
-
-    def __init__(self, feed: Callable[[], CameraFeed | None], frustums: CameraFrustums) -> None:
+    def __init__(self, feed: Callable[[], CameraFeed | None], cameras: PageCameras) -> None:
         self._feed = feed
-        self._frustums = frustums
+        self._cameras = cameras
 
     async def respond(self, request: web.Request) -> web.StreamResponse:
         """Answer a request for a socket; return when it is closed."""
-        socket = await _open(request, REQUEST_MAX)
+        socket = web.WebSocketResponse(compress=False, max_msg_size=REQUEST_MAX, heartbeat=HEARTBEAT_S)
+        await socket.prepare(request)
         await self.serve(socket)
         await socket.close()
         return socket
@@ -306,7 +290,7 @@ class CameraSockets:
                 feed, want = self._feed(), wanted.want
                 if feed is not None:
                     feed.ask(socket, (*want, wanted.frustum) if wanted.frustum else want)
-                batch = batches.next(feed, want, self._frustums.take_click(wanted.page))
+                batch = batches.next(feed, want, self._cameras.take_click(wanted.page))
                 if batch is not None:
                     ready.clear()
                     await socket.send_bytes(batch)
@@ -321,12 +305,12 @@ class CameraSockets:
                     wanted = _PICTURES.decode(message.data)
                 except (msgspec.MsgspecError, ValueError, RecursionError):
                     break
-                self._frustums.choose(wanted.page, wanted.frustum)
+                self._cameras.show_frustum(wanted.page, wanted.frustum)
                 ready.set()
         finally:
             sending.cancel()
             await asyncio.gather(sending, return_exceptions=True)
-            self._frustums.choose(wanted.page, "")
+            self._cameras.show_frustum(wanted.page, "")
             feed = self._feed()
             if feed is not None:
                 feed.release(socket)

@@ -19,9 +19,7 @@ from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClu
 
 Array = NDArray[np.float64]
 
-ROTOR_SLOWDOWN = (
-    50.0  # of rotors: at 10 pictures/s the fastest turn by 57 degrees, so they do not seem to turn backwards
-)
+ROTOR_SLOWDOWN = 50.0  # at 10 pictures/s the fastest turn by 57 degrees, so they do not seem to turn backwards
 SIGMAS = 2.0  # of an ellipsoid
 SHARE_WITHIN = 1 - math.erfc(SIGMAS / math.sqrt(2)) - math.sqrt(2 / math.pi) * SIGMAS * math.exp(-(SIGMAS**2) / 2)
 """Of a Gaussian in three dimensions, within 2 sigma: chi-squared of three degrees of freedom at 4, 0.739."""

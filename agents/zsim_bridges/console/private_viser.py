@@ -66,14 +66,9 @@ viser.infra._infra.AsyncMessageBuffer = _Buffer  # type: ignore[misc]
 
 
 class PrivateViser:
-    """A viser server on a port of loopback that refuses connections without a secret.
+    """A viser server on a port of loopback that refuses connections without a secret in SECRET_HEADER.
 
-    Args:
-        permits: a use that it does not permit changes nothing, and its page shows the previous value again.
-
-    Attributes:
-        server: viser's.
-        secret: to be sent in SECRET_HEADER.
+    A use that is not permitted changes nothing, and its page shows the previous value again.
     """
 
     def __init__(self, permits: Permits = lambda *_: True) -> None:
@@ -93,7 +88,6 @@ class PrivateViser:
 
 
 def _guard_controls(server: viser.ViserServer, permits: Permits) -> None:
-    """Check each use of a shared control before viser handles it."""
     handle_update, pages = server.gui._handle_gui_updates, server.gui._websock_interface
 
     async def guarded(client_id: Any, message: GuiUpdateMessage) -> None:
@@ -131,7 +125,6 @@ def _requiring_secret(secret: str) -> Iterator[None]:
 
 
 def control_ids(gui: viser.GuiApi) -> frozenset[str]:
-    """Return the ids of all controls that were added."""
     return frozenset(getattr(gui, "_gui_input_handle_from_uuid", ()))
 
 

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 from zsim.contract.flight_messages import state_refusal
 from zsim.contract.messages import Info
-from zsim.contract.run_messages import Clock
+from zsim.contract.run_messages import Clock, holding_up
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.flight_check import (
     AIRBORNE,
@@ -29,8 +29,8 @@ LINK_SILENT_S = 3.0  # wall; drivers publish the state of a link once a second
 LIMITS = EngagementLimits()  # of a formation's controller that lets its drones take off
 AT_END = "the record is at its end; go back on the timeline"
 WAITING_SHOWN = 4  # processes that are named
-SOON_S = 0.5  # wall; a running world waits for so long now and then
 STANDS_S = 2.0  # wall; a running world that waits for longer appears to stand still
+NO_RUN = {"t_s": 0.0, "replay": False, "age_s": 0.0, "alarms": []}
 Level = Literal["no run", "waiting", "running", "paused", "emergency", "silent", "ended"]
 
 
@@ -47,22 +47,18 @@ class ShownRun(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of all drones."""
         return tuple(drone.name for drone in self.info.drones)
 
     @property
     def members(self) -> dict[str, tuple[str, ...]]:
-        """Names of the drones of each formation."""
         return {cluster.name: tuple(cluster.drones) for cluster in self.scenario.clusters}
 
     @property
     def single(self) -> list[str]:
-        """Names of the drones of no formation."""
         return single_drones(self.scenario)
 
 
 def single_drones(scenario: Scenario) -> list[str]:
-    """Return the names of the drones of no formation."""
     led = {name for cluster in scenario.clusters for name in cluster.drones}
     return [drone.name for drone in scenario.drones if drone.name not in led]
 
@@ -71,19 +67,12 @@ def single_drones(scenario: Scenario) -> list[str]:
 
 
 class Check(NamedTuple):
-    """One check of a drone before its take-off.
+    """One check of a drone before its take-off."""
 
-    Attributes:
-        name: what is checked.
-        text: figures, with what is allowed where the check fails.
-        ok: whether it passes.
-        blocks: whether no take-off is offered where it fails.
-    """
-
-    name: str
-    text: str
+    name: str  # what is checked
+    text: str  # figures, with what is allowed where the check fails
     ok: bool = True
-    blocks: bool = False
+    blocks: bool = False  # whether no take-off is offered where it fails
 
 
 def preflight_checks(drone: DroneCondition, in_formation: bool, foreign: str = "") -> tuple[Check, ...]:
@@ -94,79 +83,59 @@ def preflight_checks(drone: DroneCondition, in_formation: bool, foreign: str = "
         foreign: who flies it, if neither this console nor its formation's controller; otherwise empty.
     """
     percent, tilt_deg = drone.battery_percent, drone.tilt_deg or 0.0
+    checks = []
     if percent < BATTERY_EMPTY_PERCENT:
-        battery = Check("battery", f"{percent:.0f} %; must be {BATTERY_EMPTY_PERCENT:.0f} % or more", False, True)
+        text = f"{percent:.0f} %; must be {BATTERY_EMPTY_PERCENT:.0f} % or more"
+        checks.append(Check("battery", text, False, True))
     else:
         low = percent < BATTERY_LOW_PERCENT
-        battery = Check("battery", f"{percent:.0f} %{'; low' if low else ''}", not low)
+        checks.append(Check("battery", f"{percent:.0f} %{'; low' if low else ''}", not low))
     if tilt_deg > TILT_MAX_DEG:
         text = f"tilted by {tilt_deg:.0f}°; must be {TILT_MAX_DEG:.0f}° or less"
-        upright = Check("upright", text, False, True)
+        checks.append(Check("upright", text, False, True))
     else:
-        upright = Check("upright", f"{tilt_deg:.0f}°")
-    link = [_link_check(drone)] if drone.is_external else []
-    text = f"flown by {foreign}; must be given back" if foreign else drone.commander or "free"
-    control = Check("control", text, not foreign, blocks=in_formation)
-    return battery, upright, _estimator_check(drone, in_formation), *link, control
+        checks.append(Check("upright", f"{tilt_deg:.0f}°"))
 
-
-def _estimator_check(drone: DroneCondition, in_formation: bool) -> Check:
-    sigma_m, yaw_deg, yaw_max_deg = drone.sigma_m, drone.yaw_sigma_deg, math.degrees(LIMITS.yaw_sigma_max_rad)
+    sigma_m, yaw_deg, yaw_max_deg = drone.sigma_m, drone.yaw_sigma_deg or 0.0, math.degrees(LIMITS.yaw_sigma_max_rad)
     if sigma_m is None:
-        text = "no estimate of the present"
+        checks.append(Check("estimator", "no estimate of the present", False, in_formation))
     elif sigma_m > LIMITS.sigma_max_m:
         text = f"σ of position is {sigma_m:.1f} m; must be {LIMITS.sigma_max_m:g} m or less"
-    elif yaw_deg is not None and yaw_deg > yaw_max_deg:
+        checks.append(Check("estimator", text, False, in_formation))
+    elif yaw_deg > yaw_max_deg:
         text = f"σ of heading is {yaw_deg:.0f}°; must be {yaw_max_deg:.0f}° or less"
-    elif drone.lag_ms is not None and drone.lag_ms > LATE_MS:
-        return Check("estimator", f"{drone.lag_ms:.0f} ms late", False)
+        checks.append(Check("estimator", text, False, in_formation))
+    elif (drone.lag_ms or 0.0) > LATE_MS:
+        checks.append(Check("estimator", f"{drone.lag_ms:.0f} ms late", False))
     else:
-        return Check("estimator", f"σ {sigma_m:.2f} m")
-    return Check("estimator", text, False, in_formation)
+        checks.append(Check("estimator", f"σ {sigma_m:.2f} m"))
 
-
-def _link_check(drone: DroneCondition) -> Check:
-    if drone.link_state is None or drone.link_age_s is None:
-        return Check("link", "no driver yet", False, True)
-    if drone.link_age_s > LINK_SILENT_S:
-        return Check("link", f"its driver has been silent for {drone.link_age_s:.0f} s", False, True)
-    return Check("link", drone.link_state, drone.link_state in ("connected", "armed"), blocks=True)
-
-
-def takeoff_refusal(drone: str, checks: Sequence[Check]) -> str:
-    """Return why a drone on the ground may not take off."""
-    failed = [f"{check.name} {check.text}" for check in checks if check.blocks and not check.ok]
-    return f"{drone}: {', '.join(failed)}" if failed else ""
+    link, link_age_s = drone.link_state, drone.link_age_s
+    if drone.is_external and (link is None or link_age_s is None):
+        checks.append(Check("link", "no driver yet", False, True))
+    elif link_age_s is not None and link_age_s > LINK_SILENT_S:
+        checks.append(Check("link", f"its driver has been silent for {link_age_s:.0f} s", False, True))
+    elif link is not None:
+        checks.append(Check("link", link, link in ("connected", "armed"), blocks=True))
+    text = f"flown by {foreign}; must be given back" if foreign else drone.commander or "free"
+    return *checks, Check("control", text, not foreign, blocks=in_formation)
 
 
 class RunCondition(NamedTuple):
-    """What the controls of a page depend on.
+    """What the controls of a page depend on."""
 
-    Attributes:
-        clock: state of the run's clock; None before the first answer.
-        silent_s: for how long the world has not answered [s; wall]; 0 while it does.
-        ended: why the run is over; empty while it goes on.
-        replayed: whether it is a replay, in which nothing can be flown.
-        at_end: whether that stands at the end of its record.
-        drones: state by name of the drones seen so far.
-        phases: phase and reason of each formation by name.
-        members: names of the drones of each formation.
-        checks: of each drone before a take-off, as far as known.
-    """
-
-    clock: str | None = None
-    silent_s: float = 0.0
-    ended: str = ""
-    replayed: bool = False
-    at_end: bool = False
-    drones: Mapping[str, str] = {}
-    phases: Mapping[str, tuple[str, str]] = {}
-    members: Mapping[str, Collection[str]] = {}
-    checks: Mapping[str, tuple[Check, ...]] = {}
+    clock: str | None = None  # state of the run's clock; None before the first answer
+    silent_s: float = 0.0  # for how long the world has not answered [wall]; 0 while it does
+    ended: str = ""  # why the run is over; empty while it goes on
+    replayed: bool = False  # whether it is a replay, in which nothing can be flown
+    at_end: bool = False  # whether that stands at the end of its record
+    drones: Mapping[str, str] = {}  # state by name of the drones seen so far
+    phases: Mapping[str, tuple[str, str]] = {}  # phase and reason of each formation by name
+    members: Mapping[str, Collection[str]] = {}  # names of the drones of each formation
+    checks: Mapping[str, tuple[Check, ...]] = {}  # of each drone before a take-off, as far as known
 
     @property
     def level(self) -> Level:
-        """What matters most about the run."""
         if self.ended:
             return "ended"
         if self.silent_s:
@@ -176,13 +145,11 @@ class RunCondition(NamedTuple):
         return "paused" if self.clock == "paused" else "running" if self.clock == "running" else "waiting"
 
     def off(self) -> str:
-        """Return why no request can be answered."""
         if self.ended:
             return f"the run is over: {self.ended}"
         return f"the world has not answered for {self.silent_s:.0f} s" if self.silent_s else ""
 
     def grounded(self) -> str:
-        """Return why nothing can be flown."""
         return self.off() or ("a record is played back" if self.replayed else "")
 
     def all_down(self, names: Collection[str] | None = None) -> bool:
@@ -194,7 +161,6 @@ class RunCondition(NamedTuple):
 
 
 def run_refusals(run: RunCondition) -> dict[str, str]:
-    """Return why each operation on the run's time would be refused."""
     off, state = run.off(), run.clock or "unknown"
     running = "" if state == "running" else f"the run is {state}"
     paused = "" if state == "paused" else f"the run is {state}, not paused"
@@ -203,7 +169,6 @@ def run_refusals(run: RunCondition) -> dict[str, str]:
 
 
 def drone_refusals(run: RunCondition, drone: str) -> dict[str, str]:
-    """Return why each mode of one drone, and its return, would be refused."""
     state = run.drones.get(drone)
     modes = ("takeoff", "land", "return", "emergency", "reset")
     unseen = run.grounded() or ("" if state else f"{drone} was not seen yet")
@@ -213,9 +178,12 @@ def drone_refusals(run: RunCondition, drone: str) -> dict[str, str]:
 
 
 def preflight_refusal(run: RunCondition, drones: Collection[str]) -> str:
-    """Return which failed checks keep drones on the ground from taking off."""
-    landed = [name for name in drones if run.drones.get(name) == "landed"]
-    return "; ".join(filter(None, (takeoff_refusal(name, run.checks.get(name, ())) for name in landed)))
+    refusals = []
+    for name in drones:
+        if run.drones.get(name) == "landed":
+            failed = [f"{each.name} {each.text}" for each in run.checks.get(name, ()) if each.blocks and not each.ok]
+            refusals += [f"{name}: {', '.join(failed)}"] if failed else []
+    return "; ".join(refusals)
 
 
 def is_held_by_fault(run: RunCondition, cluster: str) -> bool:
@@ -283,24 +251,20 @@ def fleet_refusals(run: RunCondition, single: Collection[str] = ()) -> dict[str,
     off = run.grounded()
     in_air = not run.all_down() or any(phase not in ("idle", "landing") for phase, _ in run.phases.values())
     in_emergency = "emergency" in run.drones.values()
-    return {
-        "takeoff": off or _fleet_takeoff_refusal(run, single),
-        "land": off or ("" if in_air else "all drones are on the ground"),
-        "reset": off or ("" if in_emergency else "no drone is in an emergency"),
-    }
-
-
-def _fleet_takeoff_refusal(run: RunCondition, single: Collection[str]) -> str:
-    """Return why neither a formation nor a single drone would take off."""
     refusals = {name: _takeoff_refusal(run, name, phase) for name, (phase, _) in run.phases.items()}
     landed = [name for name in single if run.drones.get(name) == "landed"]
     unfit = [refusal for name in landed if (refusal := preflight_refusal(run, [name]))]
-    if "" in refusals.values() or len(landed) > len(unfit):
-        return ""
-    stopped = [name for name in single if run.drones.get(name) == "emergency"]
-    on_ground = [refusal for name, refusal in refusals.items() if run.all_down(run.members.get(name, ()))]
-    reasons = [*on_ground, *unfit, *([_reset_first(stopped)] if stopped else []), *refusals.values()]
-    return reasons[0] if reasons else "no drone is on the ground"
+    takeoff = ""
+    if "" not in refusals.values() and len(landed) == len(unfit):  # neither a formation nor a single drone
+        stopped = [name for name in single if run.drones.get(name) == "emergency"]
+        on_ground = [refusal for name, refusal in refusals.items() if run.all_down(run.members.get(name, ()))]
+        reasons = [*on_ground, *unfit, *([_reset_first(stopped)] if stopped else []), *refusals.values()]
+        takeoff = reasons[0] if reasons else "no drone is on the ground"
+    return {
+        "takeoff": off or takeoff,
+        "land": off or ("" if in_air else "all drones are on the ground"),
+        "reset": off or ("" if in_emergency else "no drone is in an emergency"),
+    }
 
 
 def _words(phase: str) -> str:
@@ -350,16 +314,9 @@ def page_head(
     phases = run.phases if len(run.phases) <= 1 and not (run.ended or run.silent_s) else {}
     formation = [f"{n}: {_words(p)}{f' – {reason}' if reason else ''}" for n, (p, reason) in phases.items()]
     lines = [name, "a record is played back" if run.replayed else "", detail, *formation]
-    return {
-        "level": level,
-        "title": title,
-        "detail": " · ".join(filter(None, lines)),
-        "t_s": t_ns / 1e9,
-        "replay": run.replayed,
-        "age_s": run.silent_s,
-        "refusals": {"land": fleet_refusals(run, single)["land"], "emergency": run.grounded()},
-        "alarms": list(alarms),
-    }
+    refusals = {"land": fleet_refusals(run, single)["land"], "emergency": run.grounded()}
+    whole = {"t_s": t_ns / 1e9, "replay": run.replayed, "age_s": run.silent_s, "alarms": list(alarms)}
+    return {"level": level, "title": title, "detail": " · ".join(filter(None, lines)), "refusals": refusals, **whole}
 
 
 def no_run_head(world: str, ended: str = "") -> dict[str, Any]:
@@ -371,24 +328,15 @@ def no_run_head(world: str, ended: str = "") -> dict[str, Any]:
     """
     reason = f"the run is over: {ended}" if ended else "there is no run yet"
     level, title, detail = ("ended", "run over", ended) if ended else ("waiting", "waiting for a world", world)
-    return {
-        "level": level,
-        "title": title,
-        "detail": detail,
-        "t_s": 0.0,
-        "replay": False,
-        "age_s": 0.0,
-        "refusals": {"land": reason, "emergency": reason},
-        "alarms": [],
-    }
+    refusals: dict[str, Any] = {"refusals": {"land": reason, "emergency": reason}}
+    return {"level": level, "title": title, "detail": detail, **refusals, **NO_RUN}
 
 
 def _waiting(clock: Clock | None, world: str) -> str:
-    """Return which processes hold up the world, without those waiting for them, and where absent ones are expected."""
+    """Return which processes hold up the world, and where absent ones are expected."""
     if clock is None:
         return "waiting for the world's clock"
-    late = [each for each in clock.waiting_for if clock.state == "waiting" or each.since_wall_s > SOON_S]
-    late = [each for each in late if not each.held_by] or late
+    late = holding_up(clock.state, clock.waiting_for)
     names = [f"{each.name}{each.host and f' on {each.host}'} ({each.since_wall_s:.0f} s)" for each in late]
     rest = [f"{len(names) - WAITING_SHOWN} more"] if len(names) > WAITING_SHOWN else []
     where = f" in {world}" if world and not all(each.host for each in late) else ""

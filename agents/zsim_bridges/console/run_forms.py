@@ -11,7 +11,7 @@ import viser
 
 from zsim.contract.messages import DroneInfo
 from zsim.contract.run_messages import GATES_MAX, RATE_MAX
-from zsim.scenario.faults import PROCESS_KILL, ROTORS, FaultKind, expected, kinds_of, unstated
+from zsim.scenario.faults import PROCESS_KILL, ROTORS, expected, kinds_of, unstated
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor_catalogue import declarations
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
@@ -210,37 +210,29 @@ class FaultForm:
             def choose() -> None:
                 """Describe the kind, and fill in a possible target, and magnitudes that have a default."""
                 chosen = self._kinds[kind.value]
-                help_.content = _help(chosen)
+                magnitudes = unstated(chosen, {})
+                lines = [
+                    f"`{p.name}` {p.description}: {expected(p)}{'' if p in magnitudes else ' (may be left out)'}"
+                    for p in chosen.parameters
+                ]
+                effect = f"{chosen.description}; strikes {STRIKES[chosen.strikes]}."
+                help_.content = f"<sub>{effect} {'; '.join(lines)}</sub>"
                 estimator = f"estimator.{self._drone.value}"
                 targets = {"drone": self._drone.value, "link": f"world/{estimator}", "process": estimator}
                 target.value = targets.get(chosen.strikes, "world")
-                magnitudes = unstated(chosen, {})
                 text.value = " ".join(f"{p.name}={'' if p.default is None else p.default}" for p in magnitudes)
+
+            def inject() -> None:
+                try:
+                    parameters = parse_fault(text.value, kind.value, self._kinds[kind.value])
+                except InputError as error:
+                    self._report(RequestOutcome("fault_add", str(error)))
+                    return
+                self._add(kind.value, target.value.strip(), parameters)
 
             kind.on_update(lambda _: choose())
             choose()
-            gui.add_button("Inject it", color="orange").on_click(
-                lambda _: self._inject(kind.value, target.value, text.value)
-            )
-
-    def _inject(self, kind: str, target: str, text: str) -> None:
-        try:
-            parameters = parse_fault(text, kind, self._kinds[kind])
-        except InputError as error:
-            self._report(RequestOutcome("fault_add", str(error)))
-            return
-        self._add(kind, target.strip(), parameters)
-
-
-def _help(fault: FaultKind) -> str:
-    """Describe a kind's effect, what it strikes, and its parameters with their limits."""
-    stated = unstated(fault, {})
-    lines = [
-        f"`{p.name}` {p.description}: {expected(p)}{'' if p in stated else ' (may be left out)'}"
-        for p in fault.parameters
-    ]
-    strikes = f"{fault.description}; strikes {STRIKES[fault.strikes]}."
-    return f"<sub>{' '.join([strikes, '; '.join(lines)])}</sub>"
+            gui.add_button("Inject it", color="orange").on_click(lambda _: inject())
 
 
 # Elements of forms
@@ -262,13 +254,11 @@ class OrderButton:
         self.disabled = False
         self._html = gui.add_html(self._content())
 
-    def name(self, label: str, of: dict[str, str]) -> None:
-        """Change its label and what it concerns."""
+    def rename(self, label: str, of: dict[str, str]) -> None:
         self._label, self._of = label, of
         assign(self._html, content=self._content())
 
     def lock(self, reason: str) -> None:
-        """Disable it for a reason; enable it if that is empty."""
         self.disabled, self._hint = bool(reason), reason or (HELD_HINT if self._held else "")
         assign(self._html, content=self._content())
 
@@ -281,7 +271,6 @@ class OrderButton:
 
 
 def assign(control: Any, **properties: Any) -> None:
-    """Set the properties of a viser control that differ."""
     for name, value in properties.items():
         if getattr(control, name) != value:
             setattr(control, name, value)

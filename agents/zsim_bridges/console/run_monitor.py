@@ -1,7 +1,7 @@
 """What is known of a run beyond the newest views: condition, alarms, figures of flight, requests in progress."""
 
 import math
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -24,18 +24,10 @@ BATTERY_SPACING_S = 1.0  # simulated
 
 
 class RunMonitor:
-    """Follows the condition of a run.
-
-    Args:
-        world: where the run is, in words.
+    """Follows the condition of a run, which is in `world`, in words.
 
     Attributes:
-        views, time_monitor, run: as given.
         condition: of the run, at the last update.
-        board: its alarms.
-        flight: figures of the drones.
-        fault_watch: what faults strike, and what they have changed.
-        pending: requests in progress.
         record_s: of a replay, simulated times of the first and the last gate on record.
     """
 
@@ -55,7 +47,6 @@ class RunMonitor:
         self.record_s: tuple[float, float] | None = None
 
     def end(self, reason: str) -> None:
-        """Note that the run is over."""
         self._ended = self.views.end or reason
 
     def unflyable(self) -> str:
@@ -145,41 +136,15 @@ class FlightFigures(NamedTuple):
     battery_left_s: float | None  # at the present drain; None while unknown
 
 
-class _Track:
-    """Recent places and charges of one drone, with their simulated times [s]."""
-
-    def __init__(self) -> None:
-        self.places: deque[tuple[float, tuple[float, float, float]]] = deque(maxlen=64)
-        self.charges: deque[tuple[float, float]] = deque(maxlen=BATTERY_POINTS_MAX)
-
-    def add(self, t_s: float, drone: DroneView) -> None:
-        if not self.places or t_s > self.places[-1][0]:
-            self.places.append((t_s, drone.position_m))
-        while len(self.places) > 2 and t_s - self.places[1][0] >= SPEED_S:
-            self.places.popleft()
-        if not self.charges or t_s - self.charges[-1][0] >= BATTERY_SPACING_S:
-            self.charges.append((t_s, drone.battery_percent))
-
-    def velocity(self) -> tuple[float, float, float]:
-        """Return the mean velocity [m/s; W] over the last SPEED_S, or the last two views."""
-        (first_s, first), (last_s, last) = self.places[0], self.places[-1]
-        if last_s <= first_s:
-            return 0.0, 0.0, 0.0
-        vx, vy, vz = ((b - a) / (last_s - first_s) for a, b in zip(first, last, strict=True))
-        return vx, vy, vz
-
-    def battery_left_s(self, t_s: float, percent: float) -> float | None:
-        first_s, first = self.charges[0]
-        if t_s - first_s < BATTERY_S or first - percent <= 0.0:
-            return None
-        return percent * (t_s - first_s) / (first - percent)
-
-
 class FlightMeter:
     """Derives figures of each drone's flight from views of the true states."""
 
     def __init__(self) -> None:
-        self._tracks: dict[str, _Track] = {}
+        # of each drone, with their simulated times [s]
+        self._places: defaultdict[str, deque[tuple[float, tuple[float, float, float]]]]
+        self._charges: defaultdict[str, deque[tuple[float, float]]]
+        self._places = defaultdict(lambda: deque(maxlen=64))
+        self._charges = defaultdict(lambda: deque(maxlen=BATTERY_POINTS_MAX))
         self._t_s = -math.inf
         self._drones: tuple[DroneView, ...] = ()
 
@@ -187,20 +152,35 @@ class FlightMeter:
         """Take over a view; an earlier one, as in a replay, begins anew."""
         t_s = view.t_ns / 1e9
         if t_s < self._t_s:
-            self._tracks.clear()
+            self._places.clear()
+            self._charges.clear()
         self._t_s, self._drones = t_s, view.drones
         for drone in self._drones:
-            self._tracks.setdefault(drone.name, _Track()).add(t_s, drone)
+            places, charges = self._places[drone.name], self._charges[drone.name]
+            if not places or t_s > places[-1][0]:
+                places.append((t_s, drone.position_m))
+            while len(places) > 2 and t_s - places[1][0] >= SPEED_S:
+                places.popleft()
+            if not charges or t_s - charges[-1][0] >= BATTERY_SPACING_S:
+                charges.append((t_s, drone.battery_percent))
 
     @property
     def figures(self) -> dict[str, FlightFigures]:
-        """Figures by drone, at the newest view."""
         found = {}
         for drone in self._drones:
-            track = self._tracks[drone.name]
-            vx, vy, vz = track.velocity()
+            (first_s, first), (last_s, last) = self._places[drone.name][0], self._places[drone.name][-1]
+            span_s = max(last_s - first_s, 1e-9)  # of one view: at rest
+            velocity_m_s = [(b - a) / span_s for a, b in zip(first, last, strict=True)]  # the mean over SPEED_S
             roll, pitch, yaw = np.degrees(frames.rpy_from_quaternion(np.array([drone.orientation_wxyz]))[0]).tolist()
-            left_s = track.battery_left_s(self._t_s, drone.battery_percent)
-            speed_m_s = math.hypot(vx, vy, vz)
-            found[drone.name] = FlightFigures(drone.position_m, speed_m_s, vz, roll, pitch, yaw % 360.0, left_s)
+            since_s, charge = self._charges[drone.name][0]
+            lasted_s, used = self._t_s - since_s, charge - drone.battery_percent
+            found[drone.name] = FlightFigures(
+                drone.position_m,
+                math.hypot(*velocity_m_s),
+                velocity_m_s[2],
+                roll,
+                pitch,
+                yaw % 360.0,
+                drone.battery_percent * lasted_s / used if lasted_s >= BATTERY_S and used > 0.0 else None,
+            )
         return found

@@ -20,7 +20,7 @@ from zsim.scenario.scenario import Obstacle
 from zsim.vehicles.vehicle import cross_layout
 from zsim_bridges.console import airframe
 from zsim_bridges.console.histories import CanvasTrails
-from zsim_bridges.console.page_cameras import CameraFollow
+from zsim_bridges.console.page_cameras import PageCameras
 from zsim_bridges.console.picture import (
     Array,
     DronePoses,
@@ -64,36 +64,25 @@ CHOSEN = (25, 113, 194)
 
 
 class RunScene:
-    """The scene of one run; it replaces that of another run.
+    """The scene of one run; it replaces that of another run."""
 
-    Attributes:
-        nodes: viser's.
-        drones: their newest poses, None before the first view.
-        shapes: the formations' true shapes by name; None where a drone of one is missing.
-        trails: of the drones.
-        previews: ways (n, M, 3) [m] of formations, by name, that would be flown.
-    """
-
-    def __init__(
-        self, server: viser.ViserServer, run: ShownRun, views: ViewBuffer, camera_follow: CameraFollow
-    ) -> None:
+    def __init__(self, server: viser.ViserServer, run: ShownRun, views: ViewBuffer, cameras: PageCameras) -> None:
         self._run = run
         self._views = views
-        self._camera_follow = camera_follow
+        self._cameras = cameras
         self._members = {name: [run.names.index(each) for each in drones] for name, drones in run.members.items()}
         self._drawn_ghosts: dict[str, Any] = {}
-        self.drones: DronePoses | None = None
-        self.shapes: dict[str, FormationShape | None] = {}
-        self.previews: dict[str, Array] = {}
+        self.drones: DronePoses | None = None  # their newest poses
+        self.shapes: dict[str, FormationShape | None] = {}  # true ones by formation; None where a drone is missing
+        self.previews: dict[str, Array] = {}  # ways (n, M, 3) [m] that formations would fly
         self.trails = CanvasTrails(len(run.names), around=run.is_replay)
         robots = sum(space.n for space in run.spaces.values())
         arms_m = [drone.arm_m for drone in run.scenario.drones]
         self.nodes = SceneNodes(server, run.info.drones, arms_m, robots, len(run.spaces))
         self.nodes.obstacles(run.scenario.environment.obstacles)
-        camera_follow.restart()
+        cameras.restart()
 
     def clicked(self, event: viser.SceneClickEvent) -> str | None:
-        """Return the drone that a click hits."""
         if self.drones is None:
             return None
         return drone_on_ray(self.drones, self.nodes.radii_m, event.ray_origin, event.ray_direction)
@@ -104,7 +93,7 @@ class RunScene:
         self.drones = drones
         self.trails.add(drones.t_ns / 1e9, drones.p_W)
         self.shapes = self.shapes_of(drones)
-        self._camera_follow.set_target(self._camera_targets(drones))
+        self._cameras.set_target(self._camera_targets(drones))
         return drones
 
     def draw(self, view: ViewDrones, longest_s: float, chosen: str) -> DronePoses:
@@ -125,7 +114,7 @@ class RunScene:
             poses = [ghosts(self._run.spaces[name], view) for name, view in self._views.clusters.items()]
             shown = [(np.zeros((0, 3)), np.zeros((0, 4))), *(each for each in poses if each is not None)]
             self.nodes.ghosts(np.concatenate([p_W for p_W, _ in shown]), np.concatenate([q for _, q in shown]))
-        self._camera_follow.follow(self._camera_targets(drones))
+        self._cameras.follow(self._camera_targets(drones))
         return drones
 
     def preview(self, cluster: str, shown: FlightPreview | None) -> None:
@@ -135,7 +124,6 @@ class RunScene:
         self.nodes.previews(list(self.previews.values()))
 
     def draw_trails(self) -> None:
-        """Draw what changes slowly: trails and wind."""
         if self.drones is not None:
             segments, owners, _ = self.trails.segments(self.drones.t_ns / 1e9, self.drones.p_W)
             self.nodes.trails(segments, owners)
@@ -151,22 +139,13 @@ class RunScene:
         }
 
     def _camera_targets(self, drones: DronePoses) -> Array:
-        """Return the positions (n, 3) that cameras follow: of the formation, or of all drones."""
+        """Return the positions (n, 3) that cameras follow: of the only formation, or of all drones."""
         members = next(iter(self._members.values())) if len(self._members) == 1 else slice(None)
         return drones.p_W[members][drones.present[members]]
 
 
 class SceneNodes:
-    """The nodes of one run.
-
-    Args:
-        server: viser's; its scene is cleared.
-        arms_m: centre to rotor, of each.
-        robots: number of drones in formations, each with a ghost.
-
-    Attributes:
-        radii_m: (N,), how far each drone reaches from its centre.
-    """
+    """The nodes of one run, of N drones; `robots` is the number of those in formations, each of which has a ghost."""
 
     def __init__(
         self,
@@ -176,40 +155,64 @@ class SceneNodes:
         robots: int,
         clusters: int,
     ) -> None:
-        self._server = server
-        self._scene = server.scene
-        self._count = len(drones)
+        self._scene = scene = server.scene
         names = tuple(drone.name for drone in drones)
         self._trail_node: Any = None
         self._trail_colours = linear(np.array([lightened(rgb(each)) for each in drone_colours(max(1, len(drones)))]))
         self._trails_shown = True
-        server.scene.reset()
-        server.scene.set_up_direction("+z")
-        draw_ground(server.scene)
-        self._origin()
+        scene.reset()
+        scene.set_up_direction("+z")
+        draw_ground(scene)
+        scene.add_frame("/origin", axes_length=1.0, axes_radius=0.02, position=(0.0, 0.0, 0.01))
+        scene.add_label("/origin/e", "east", position=(1.1, 0.0, 0.0))
+        scene.add_label("/origin/n", "north", position=(0.0, 1.1, 0.0))
         looks = [airframe.shape_of(*each) for each in zip(drones, arms_m, strict=True)]
-        self.radii_m: Array = np.array([look.reach_m for look in looks])
-        self._airframes = _AirframeNodes(self._scene, looks)
+        self.radii_m: Array = np.array([look.reach_m for look in looks])  # (N,), from the centre
+
+        self._airframes: list[tuple[NDArray[np.int64], Any]] = []  # one node for all drones that look alike
+        for k, look in enumerate(dict.fromkeys(looks)):
+            owners = np.array([i for i, other in enumerate(looks) if other == look])
+            p, q, _ = _padded(len(owners))
+            node = scene.add_batched_glb(f"/drones/{k}" if k else "/drones", airframe.coloured(look), q, p, lod="off")
+            self._airframes.append((owners, node))
         self._rotors = _RotorNodes(drones, looks, self._batch)
         ghost = airframe.whole(looks[0])
         self._ghosts = self._batch("/ghosts", ghost, robots, GHOST, opacity=0.5) if robots else None
         self._ellipsoids = self._batch("/estimates", airframe.ball(), len(names), ELLIPSOID, opacity=0.35)
         if robots:
             self._preview_ends = self._batch("/preview_ends", ghost, robots, PREVIEW, opacity=0.6)
-            self._preview_lines: Any = self._scene.add_line_segments(
+            self._preview_lines: Any = scene.add_line_segments(
                 "/preview", np.tile(HIDDEN, (1, 2, 1)), PREVIEW, thickness=PREVIEW_PX, thickness_units="screen",
                 visible=False,
             )  # fmt: skip
-        self._names = self._labels(names)
-        self._wind = self._scene.add_arrows(
+        self._names: list[Any] = []
+        if len(names) <= NAMED_MAX:
+            many = len(names) > LARGE_MAX
+            style: Any = {"anchor": "bottom-center", "font_screen_scale": SMALL if many else 1.0}
+            texts = zip(names, short_names(names) if many else names, strict=True)
+            self._names = [scene.add_label(f"/names/{name}", text, **style) for name, text in texts]
+        self._wind = scene.add_arrows(
             "/wind", np.array([[(0, 0, 0), (1, 0, 0)]], float), WIND, shaft_radius=0.035, head_radius=0.1,
             head_length=0.22, visible=False,
         )  # fmt: skip
-        self._wind_label = self._scene.add_label("/wind_speed", "", visible=False, anchor="bottom-left")
-        self._shapes = _FormationNodes(self._scene, clusters) if clusters else None
+        self._wind_label = scene.add_label("/wind_speed", "", visible=False, anchor="bottom-left")
+        self._formation_sides: Any = None
+        if clusters:
+            p, q, _ = _padded(clusters)
+            axes: Any = {"axes_length": 0.7, "axes_radius": 0.02}
+            self._formation_frames: Any = scene.add_batched_axes("/formations/frames", q, p, **axes)
+            self._figures = [
+                scene.add_label(f"/formations/label{i}", "", visible=False, anchor=MIDDLE) for i in range(LABELS_MAX)
+            ]
+
+    def _batch(self, name: str, mesh: airframe.Mesh, count: int, colour: Any, opacity: float | None = None) -> Any:
+        p, q, scales = _padded(count)
+        return self._scene.add_batched_meshes_simple(
+            name, mesh.vertices, mesh.faces, q, p, batched_scales=scales, batched_colors=colour, opacity=opacity,
+            lod="off", flat_shading=opacity is None, cast_shadow=opacity is None, receive_shadow=False,
+        )  # fmt: skip
 
     def obstacles(self, obstacles: Sequence[Obstacle]) -> None:
-        """Draw the obstacles of the scenario: boxes, cylinders and spheres."""
         for each in obstacles:
             x, y, z = each.position_m
             turn = math.radians(each.yaw_deg) / 2
@@ -224,14 +227,6 @@ class SceneNodes:
             else:
                 self._scene.add_icosphere(name, radius=each.radius_m or 0.0, position=(x, y, z), **look)
 
-    def drones(self, drones: DronePoses, dt_s: float) -> None:
-        """Move the drones, and turn their rotors for dt_s."""
-        drones = drones._replace(p_W=np.where(drones.present[:, None], drones.p_W, HIDDEN))
-        self._airframes.move(drones)
-        self._rotors.move(drones, dt_s)
-        for label, p_W in zip(self._names, drones.p_W, strict=False):
-            label.position = p_W + LABEL_B
-
     def on_click(self, act: Callable[[viser.SceneClickEvent], None]) -> None:
         """Call back with viser's event of each click into the scene.
 
@@ -242,6 +237,15 @@ class SceneNodes:
     def close(self) -> None:
         """End callbacks; the nodes stay."""
         self._scene.remove_click_callback("all")
+
+    def drones(self, drones: DronePoses, dt_s: float) -> None:
+        """Move the drones, and turn their rotors for dt_s."""
+        drones = drones._replace(p_W=np.where(drones.present[:, None], drones.p_W, HIDDEN))
+        for owners, node in self._airframes:
+            node.batched_positions, node.batched_wxyzs = drones.p_W[owners], drones.q_WB[owners]
+        self._rotors.move(drones, dt_s)
+        for label, p_W in zip(self._names, drones.p_W, strict=False):
+            label.position = p_W + LABEL_B
 
     def wind(self, drones: DronePoses) -> None:
         """Set the arrow of the wind, above the drones."""
@@ -255,14 +259,10 @@ class SceneNodes:
             self._wind_label.position, self._wind_label.text = start, f"wind {speed:.1f} m/s"
 
     def estimates(self, ellipsoids: Ellipsoids) -> None:
-        """Move the ellipsoids of the estimates."""
-        p, q, half_m = _padded(self._count, ellipsoids.p_W, ellipsoids.wxyz)
+        node = self._ellipsoids
+        p, q, half_m = _padded(len(self.radii_m), ellipsoids.p_W, ellipsoids.wxyz)
         half_m[: len(ellipsoids.half_m)] = ellipsoids.half_m
-        self._ellipsoids.batched_positions, self._ellipsoids.batched_wxyzs, self._ellipsoids.batched_scales = (
-            p,
-            q,
-            half_m,
-        )
+        node.batched_positions, node.batched_wxyzs, node.batched_scales = p, q, half_m
 
     def ghosts(self, p_W: Array, q: Array) -> None:
         """Move the ghosts of the formations to their desired positions; missing ones are hidden."""
@@ -271,22 +271,36 @@ class SceneNodes:
             self._ghosts.batched_positions, self._ghosts.batched_wxyzs = positions, attitudes
 
     def previews(self, ways: Sequence[Array]) -> None:
-        """Draw ways (n, M, 3) that formations would fly, with a mark at the end of each drone's."""
         lines = [np.stack((way[:, :-1], way[:, 1:]), axis=2).reshape(-1, 2, 3) for way in ways]
         ends = [way[:, -1] for way in ways]
         segments = np.asarray(np.concatenate(lines) if lines else np.tile(HIDDEN, (1, 2, 1)), np.float32)
         p_W = np.concatenate(ends) if ends else np.zeros((0, 3))
         self._preview_lines.points, self._preview_lines.visible = segments, bool(lines)
-        p, q, _ = _padded(len(self._preview_ends.batched_positions), p_W, np.tile((1.0, 0.0, 0.0, 0.0), (len(p_W), 1)))
+        p, q, _ = _padded(len(self._preview_ends.batched_positions), p_W)
         self._preview_ends.batched_positions, self._preview_ends.batched_wxyzs = p, q
 
     def shapes(self, shapes: Sequence[FormationShape | None], chosen: int) -> None:
         """Draw the frames and triangles of all formations, and the figures of the chosen one."""
-        if self._shapes is not None:
-            self._shapes.show(shapes, chosen)
+        shown = [shape for shape in shapes if shape is not None]
+        p_W, q = np.array([s.p_c for s in shown]).reshape(-1, 3), np.array([s.q_WC for s in shown]).reshape(-1, 4)
+        frame_nodes = self._formation_frames
+        frame_nodes.batched_positions, frame_nodes.batched_wxyzs, _ = _padded(len(shapes), p_W, q)
+        points = np.array([side.ends_W for shape in shown for side in shape.sides]).reshape(-1, 2, 3)
+        if self._formation_sides is not None:
+            self._formation_sides.points = points
+        elif len(points):
+            self._formation_sides = self._scene.add_line_segments(
+                "/formations/sides", points, SIDE, thickness=SIDE_PX, thickness_units="screen"
+            )
+        shape = shapes[chosen]
+        texts = [] if shape is None else [(s.name, s.ends_W.mean(axis=0)) for s in shape.sides if s.name]
+        texts += [(shape.corner[1], shape.corner[0])] if shape is not None and shape.corner else []
+        for i, label in enumerate(self._figures):
+            label.visible = i < len(texts)
+            if label.visible:
+                label.text, label.position = texts[i]
 
     def trails(self, segments: Array, owners: NDArray[np.int64]) -> None:
-        """Draw the drones' trails."""
         if not len(segments):  # a replay went back: the old ones must vanish
             segments, owners = np.tile(HIDDEN, (1, 2, 1)), np.zeros(1, dtype=np.int64)
         colours = np.repeat(self._trail_colours[owners][:, None], 2, axis=1)
@@ -298,47 +312,10 @@ class SceneNodes:
             self._trail_node.points, self._trail_node.colors = segments, colours
 
     def show(self, what: str, visible: bool) -> None:
-        """Show or hide ghosts, estimates or trails."""
         self._trails_shown = visible if what == "trails" else self._trails_shown
         node = {"ghosts": self._ghosts, "estimates": self._ellipsoids, "trails": self._trail_node}[what]
         if node is not None:
             node.visible = visible
-
-    def _origin(self) -> None:
-        self._scene.add_frame("/origin", axes_length=1.0, axes_radius=0.02, position=(0.0, 0.0, 0.01))
-        self._scene.add_label("/origin/e", "east", position=(1.1, 0.0, 0.0))
-        self._scene.add_label("/origin/n", "north", position=(0.0, 1.1, 0.0))
-
-    def _batch(self, name: str, mesh: airframe.Mesh, count: int, colour: Any, opacity: float | None = None) -> Any:
-        p, q, scales = _padded(count, np.zeros((0, 3)), np.zeros((0, 4)))
-        return self._scene.add_batched_meshes_simple(
-            name, mesh.vertices, mesh.faces, q, p, batched_scales=scales, batched_colors=colour, opacity=opacity,
-            lod="off", flat_shading=opacity is None, cast_shadow=opacity is None, receive_shadow=False,
-        )  # fmt: skip
-
-    def _labels(self, names: tuple[str, ...]) -> list[Any]:
-        if len(names) > NAMED_MAX:
-            return []
-        many = len(names) > LARGE_MAX
-        look: Any = {"anchor": "bottom-center", "font_screen_scale": SMALL if many else 1.0}
-        shown = short_names(names) if many else names
-        return [self._scene.add_label(f"/names/{name}", text, **look) for name, text in zip(names, shown, strict=True)]
-
-
-class _AirframeNodes:
-    """The drones without their rotors, one node for all that look alike."""
-
-    def __init__(self, scene: viser.SceneApi, looks: Sequence[airframe.DroneShape]) -> None:
-        self.nodes: list[tuple[NDArray[np.int64], Any]] = []
-        for k, look in enumerate(dict.fromkeys(looks)):
-            owners = np.array([i for i, other in enumerate(looks) if other == look])
-            p, q, _ = _padded(len(owners), np.zeros((0, 3)), np.zeros((0, 4)))
-            name = f"/drones/{k}" if k else "/drones"
-            self.nodes.append((owners, scene.add_batched_glb(name, airframe.coloured(look), q, p, lod="off")))
-
-    def move(self, drones: DronePoses) -> None:
-        for owners, node in self.nodes:
-            node.batched_positions, node.batched_wxyzs = drones.p_W[owners], drones.q_WB[owners]
 
 
 class _RotorNodes:
@@ -363,46 +340,16 @@ class _RotorNodes:
         self._node.batched_positions, self._node.batched_wxyzs = rotor_poses(p_W, q_WB, self._hubs_B, self._angles)
 
 
-class _FormationNodes:
-    """Frames and triangles of all formations as one node each, and the labels of one of them."""
+def _padded(count: int, p_W: Array | None = None, q: Array | None = None) -> tuple[Array, Array, Array]:
+    """Return positions (count, 3), level attitudes (count, 4) and scales (count, 3), the first ones p_W and q.
 
-    def __init__(self, scene: viser.SceneApi, count: int) -> None:
-        self._scene = scene
-        p, q, _ = _padded(count, np.zeros((0, 3)), np.zeros((0, 4)))
-        self._frames: Any = scene.add_batched_axes("/formations/frames", q, p, axes_length=0.7, axes_radius=0.02)
-        self._lines: Any = None
-        self._labels = [
-            scene.add_label(f"/formations/label{i}", "", visible=False, anchor=MIDDLE) for i in range(LABELS_MAX)
-        ]
-
-    def show(self, shapes: Sequence[FormationShape | None], chosen: int) -> None:
-        shown = [shape for shape in shapes if shape is not None]
-        p_W, q = np.array([s.p_c for s in shown]).reshape(-1, 3), np.array([s.q_WC for s in shown]).reshape(-1, 4)
-        self._frames.batched_positions, self._frames.batched_wxyzs, _ = _padded(len(shapes), p_W, q)
-        self._draw(np.array([side.ends_W for shape in shown for side in shape.sides]).reshape(-1, 2, 3))
-        self._write(shapes[chosen])
-
-    def _draw(self, points: Array) -> None:
-        if self._lines is not None:
-            self._lines.points = points
-        elif len(points):
-            self._lines = self._scene.add_line_segments(
-                "/formations/sides", points, SIDE, thickness=SIDE_PX, thickness_units="screen"
-            )
-
-    def _write(self, shape: FormationShape | None) -> None:
-        texts = [] if shape is None else [(s.name, s.ends_W.mean(axis=0)) for s in shape.sides if s.name]
-        texts += [(shape.corner[1], shape.corner[0])] if shape is not None and shape.corner else []
-        for i, label in enumerate(self._labels):
-            label.visible = i < len(texts)
-            if label.visible:
-                label.text, label.position = texts[i]
-
-
-def _padded(count: int, p_W: Array, q: Array) -> tuple[Array, Array, Array]:
-    """Return positions (count, 3), attitudes (count, 4) and scales (count, 3); those beyond p_W and q are hidden."""
+    Those beyond p_W are hidden.
+    """
     positions, attitudes = np.tile(np.array(HIDDEN), (count, 1)), np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
-    positions[: len(p_W)], attitudes[: len(q)] = p_W, q
+    if p_W is not None:
+        positions[: len(p_W)] = p_W
+    if q is not None:
+        attitudes[: len(q)] = q
     return positions, attitudes, np.ones((count, 3))
 
 

@@ -66,12 +66,8 @@ class AwakeClock:
 class TimeMonitor:
     """Polls the run's clock in a thread of its own, so that drawing waits for no answer.
 
-    Args:
-        observer: of the console in the run; it follows the run's clock.
-        stamp_age_s: simulated; how old the time of a stamp may be.
-
-    Attributes:
-        clock: the newest answer.
+    The observer of the console in the run follows it, too; `stamp_age_s` is how old the time of a stamp may be
+    [simulated].
     """
 
     def __init__(
@@ -90,7 +86,7 @@ class TimeMonitor:
         self._awake = AwakeClock(wall_s)
         self._answered_s = self._awake.now_s()
         self._known_s = -math.inf
-        self.clock: run_messages.Clock | None = None
+        self.clock: run_messages.Clock | None = None  # the newest answer
 
     @contextmanager
     def polling(self) -> Iterator[None]:
@@ -135,9 +131,14 @@ class TimeMonitor:
 
     def now_ns(self) -> int:
         """Return simulated time for a stamp, after a poll if it may be too old; takes 2 ANSWER_TIMEOUT_S at most."""
-        if self._is_old():
+
+        def is_old() -> bool:
+            rate = max(1.0, self.clock.rate) if self.clock else 1.0  # as measured: 0 at the beginning of a run
+            return (self._wall_s() - self._known_s) * rate > self._stamp_age_s
+
+        if is_old():
             with self._one:
-                if self._is_old():  # unless another thread has polled meanwhile
+                if is_old():  # unless another thread has polled meanwhile
                     self.poll()
         return self._observer.now_ns
 
@@ -153,12 +154,7 @@ class TimeMonitor:
 
     @property
     def stall(self) -> Stall | None:
-        """The last stall of this process, None before the first."""
         return self._awake.stall
-
-    def _is_old(self) -> bool:
-        rate = max(1.0, self.clock.rate) if self.clock else 1.0  # as measured: 0 at the beginning of a run
-        return (self._wall_s() - self._known_s) * rate > self._stamp_age_s
 
 
 class RecordPlayer:

@@ -43,11 +43,12 @@ class PlottedVariable(NamedTuple):
     reference: int  # index in SERIES of the curve that errors are relative to
 
 
-class FlightHistory(NamedTuple):
-    """Points of all drones of a run, each with the variables of FLIGHT."""
+class FlightHistory:
+    """Points of all drones of a run, each with the variables of FLIGHT; `around`: of a record."""
 
-    names: tuple[str, ...]
-    history: VariableHistory
+    def __init__(self, names: Sequence[str], around: bool = False) -> None:
+        self.names = tuple(names)
+        self.history = VariableHistory(len(names) * len(FLIGHT), around)
 
     def add(self, drones: DronePoses, estimates: Mapping[str, EstimateView]) -> None:
         """Add the drones' true and estimated poses, if the last point is old enough."""
@@ -63,7 +64,6 @@ class FlightHistory(NamedTuple):
         self.history.add(drones.t_ns / 1e9, None, believed.ravel(), true.ravel())
 
     def variables(self, name: str) -> list[PlottedVariable]:
-        """Return what can be plotted of a drone."""
         first = self.names.index(name) * len(FLIGHT)
         return [
             PlottedVariable(self.history, first + k, f"{variable} of {name} [{unit}]", unit == "deg", TRUE)
@@ -74,11 +74,7 @@ class FlightHistory(NamedTuple):
 class VariablePlots:
     """Plots of one formation and of its drones, three variables at a time.
 
-    Args:
-        replayed: whether it is a replay, whose curves extend beyond the shown instant.
-
-    Attributes:
-        history: of the formation's variables.
+    The curves of a record that is replayed extend beyond the shown instant.
     """
 
     def __init__(
@@ -186,11 +182,6 @@ class AxisRange(NamedTuple):
         return cls((math.floor(least / step) - 0.5) * step, (math.ceil(greatest / step) + 0.5) * step)
 
 
-def flight_history(names: Sequence[str], around: bool = False) -> FlightHistory:
-    """Return an empty history of drones; `around`: of a record."""
-    return FlightHistory(tuple(names), VariableHistory(len(names) * len(FLIGHT), around))
-
-
 def _with_cursor(curves: Sequence[Array], at_s: float, values: AxisRange) -> tuple[Array, ...]:
     """Return curves with one more, a line across the range of values at an instant."""
     place = int(np.searchsorted(curves[0], at_s))
@@ -202,7 +193,6 @@ def _with_cursor(curves: Sequence[Array], at_s: float, values: AxisRange) -> tup
 
 
 def _triples(of: str, variables: list[PlottedVariable]) -> dict[str, tuple[PlottedVariable, ...]]:
-    """Return variables, as many at a time as are plotted, by their label in the dropdown."""
     triples = [variables[k : k + PLOTS_SHOWN] for k in range(0, len(variables), PLOTS_SHOWN)]
     return {of + ", ".join(each.label.partition(" ")[0] for each in triple): tuple(triple) for triple in triples}
 

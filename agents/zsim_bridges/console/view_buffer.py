@@ -75,20 +75,6 @@ class ViewBuffer:
         variables: names of each formation's variables; views of other formations or variables are refused.
         refused: called with the event of each of the console's commands that the world refuses.
         asked: called with a formation and a description of each request that somebody else makes of it.
-
-    Attributes:
-        drones: the newest view of the drones.
-        clusters: the newest view of each formation.
-        estimators: the newest view of each estimator, by its process.
-        healths: the newest of each process.
-        external: names of the drones whose bodies are external.
-        faults: injected ones, planned and active.
-        log: events as they are shown.
-        losses: processes and drones that are lost.
-        begun: the last injected faults that have begun.
-        failsafes: the event of each drone's automatic landing or stop, until it is commanded another mode.
-        end: why the run ended, by its last event; empty while it goes on.
-        on_own_event: called with each event that a command of this console causes.
     """
 
     def __init__(
@@ -114,17 +100,18 @@ class ViewBuffer:
         self._answers: Counter[str] = Counter()
         self.drones: ViewDrones | None = None
         self.clusters: dict[str, ViewCluster] = {}
-        self.estimators: dict[str, ViewEstimates] = {}
+        self.estimators: dict[str, ViewEstimates] = {}  # by process
         self.healths: dict[str, Health] = {}
+        # whose bodies are external
         self.external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
         self._links: dict[str, LinkState] = {}
-        self.faults: tuple[Fault, ...] = ()
+        self.faults: tuple[Fault, ...] = ()  # injected ones, planned and active
         self.log = EventLog(observer.name)
         self.losses = Losses()
-        self.failsafes: dict[str, Event] = {}
-        self.begun: deque[Fault] = deque(maxlen=FAULTS_KEPT)
-        self.end = ""
-        self.on_own_event: Callable[[Event], None] = lambda _: None
+        self.failsafes: dict[str, Event] = {}  # automatic landing or stop of drones that had no other mode since
+        self.begun: deque[Fault] = deque(maxlen=FAULTS_KEPT)  # the last injected faults that have begun
+        self.end = ""  # why the run ended, by its last event; empty while it goes on
+        self.on_own_event: Callable[[Event], None] = lambda _: None  # called with events that a command of ours causes
 
     def open(self) -> None:
         """Subscribe, and read the values published last."""
@@ -163,7 +150,6 @@ class ViewBuffer:
         return newest
 
     def conditions(self) -> dict[str, DroneCondition]:
-        """Return the condition of each drone in the newest view, by name."""
         estimates, found = self.estimates(), {}
         for drone in self.drones.drones if self.drones else ():
             _, x, y, _ = drone.orientation_wxyz
@@ -191,12 +177,10 @@ class ViewBuffer:
         return found
 
     def link_of(self, drone: str) -> ReceivedLink | None:
-        """Return the newest state of an external drone's link, None before the first."""
         key = keys.link(drone)
         return ReceivedLink(self._links[key], self._wall_s() - self._received_s[key]) if key in self._links else None
 
     def active_faults(self) -> list[Fault]:
-        """Return the injected faults active at the time of the newest view."""
         now_ns = self.drones.t_ns if self.drones else 0
         return [f for f in self.faults if f.from_ns <= now_ns and (f.until_ns is None or f.until_ns > now_ns)]
 
@@ -208,7 +192,6 @@ class ViewBuffer:
         return max(0, (self.drones.t_ns if self.drones else 0) - received.t_ns) / 1e6
 
     def answered_commands(self, drone: str) -> int:
-        """Return how many commands to a drone the world has accepted or refused."""
         return self._answers[drone]
 
     def await_answer(self, drone: str, beyond: int, within_s: float) -> None:
@@ -312,18 +295,14 @@ class EventRow(NamedTuple):
 class EventLog:
     """Keeps the newest events, and a row for all that are equal but for their figures; thread-safe.
 
-    Args:
-        name: of the console's process; rows of its own events are kept apart from others.
-
-    Attributes:
-        newest: single events, newest first.
+    Rows of events of the console's own process, of this name, are kept apart from others.
     """
 
     def __init__(self, name: str) -> None:
         self._name = name
         self._lock = threading.Lock()
         self._rows: dict[tuple[str, ...], EventRow] = {}
-        self.newest: deque[Event] = deque(maxlen=EVENTS_KEPT)
+        self.newest: deque[Event] = deque(maxlen=EVENTS_KEPT)  # single ones, newest first
 
     def add(self, event: Event) -> None:
         key = (event.kind, event.source, event.subject, _FIGURE.sub("#", event.text))
@@ -337,7 +316,6 @@ class EventLog:
                 del self._rows[same[0]]
 
     def rows(self) -> list[EventRow]:
-        """Return the rows, newest first."""
         with self._lock:
             return list(reversed(self._rows.values()))
 

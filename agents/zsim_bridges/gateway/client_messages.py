@@ -1,6 +1,7 @@
-"""Messages of clients: on which keys they publish, what they may leave out, and their JSON. Pure.
+"""Messages of clients: errors and limits, keys that clients may use, defaults, JSON, and requests on a stream. Pure.
 
-Order of this file: errors, keys, defaults of messages, JSON.
+A request on a stream is one JSON object per line:
+{"op": "put", "key": "drone/drone1/cmd/velocity", "value": {"velocity_m_s": [1, 0, 0]}, "id": 7}
 """
 
 import base64
@@ -8,12 +9,15 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
+from msgspec import Meta, Struct
 
 from zsim.contract import keys, messages
+from zsim.contract.messages import REFUSALS
 from zsim.errors import DecodeError, ZsimError
+from zsim.runtime.rate_limit import RateLimit
 from zsim.transport.session import RawSample
 
 COUNTED_KEYS = (keys.command("*", "*"), keys.estimate("*"), keys.cluster_state("*"))  # contract: `sent` of a done
@@ -59,16 +63,38 @@ class UnknownError(ZsimError):
 
 
 class MethodError(ZsimError):
-    """An HTTP method that a key does not have.
-
-    Args:
-        text: of the error.
-        allowed: HTTP methods that it has.
-    """
+    """An HTTP method that a key does not have; `allowed` are those that it has."""
 
     def __init__(self, text: str, allowed: tuple[str, ...]) -> None:
         super().__init__(text)
         self.allowed = allowed
+
+
+def count_request(limit: RateLimit, address: str = "") -> None:
+    """Count a request of an address, or raise a TooManyError with how long to wait."""
+    if not limit.spend(address):
+        wait_s = limit.wait(address)
+        raise TooManyError(f"more than {1 / limit.period:g} requests a second; wait {wait_s:.3f} s")
+
+
+class ClientLimit:
+    """Bounds how many clients there are at a time."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._count = 0
+
+    def enter(self) -> None:
+        """Count one more, or raise a TooManyError."""
+        if self._count >= self._limit:
+            raise TooManyError(f"there are {self._limit} clients already; try again later")
+        self._count += 1
+
+    def leave(self) -> None:
+        self._count -= 1
+
+
+# Keys
 
 
 def is_counted_key(key: str) -> bool:
@@ -91,13 +117,12 @@ def is_reserved(key: str) -> bool:
     return _matches_any(RESERVED_KEYS, key) or key.startswith("@") or "/@" in key
 
 
-def check_not_reserved(key: str) -> None:
-    """Refuse a key on which clients may not publish.
+def _matches_any(expressions: Sequence[str], key: str) -> bool:
+    return any(keys.matches(expression, key) for expression in expressions)
 
-    Raises:
-        DecodeError: it is no key.
-        ForbiddenError: it is reserved.
-    """
+
+def check_not_reserved(key: str) -> None:
+    """Raise a DecodeError for what is no key, a ForbiddenError for a key on which clients may not publish."""
     if "*" in key or not key:
         raise DecodeError(f"{key[:80]!r}: is no key; must be names with / between them")
     if is_reserved(key):
@@ -107,41 +132,15 @@ def check_not_reserved(key: str) -> None:
         )
 
 
-def check_shown(expression: str) -> None:
-    """Refuse an expression of Zenoh's own keys: its sessions and routers, and who is connected to them.
-
-    Wildcards do not match these; they have to be named.
-
-    Raises:
-        ForbiddenError: with what may be read.
-    """
-    if any(part.startswith("@") for part in expression.split("/")):
-        raise ForbiddenError(f"{expression[:80]}: Zenoh's own keys are not shown; must be keys without @, as zsim/**")
-
-
-def _matches_any(expressions: Sequence[str], key: str) -> bool:
-    return any(keys.matches(expression, key) for expression in expressions)
-
-
 class MessageDefaults:
-    """Fills in time, sequence number and source of one client's messages.
-
-    Args:
-        source: name under which the client publishes.
-    """
+    """Fills in time, sequence number and source of the messages of one client, which publishes as `source`."""
 
     def __init__(self, source: str) -> None:
         self._source = source
         self._next_seq: Counter[str] = Counter()
 
     def fill(self, key: str, value: Any, now_ns: int) -> Any:
-        """Return a value with `t_ns`, `seq` and `source` where its message has them and the value does not.
-
-        Args:
-            key: on which it is published.
-            value: plain data; what is no map is returned as it is.
-            now_ns: simulated time of the newest gate [ns].
-        """
+        """Return plain data with `t_ns` (the newest gate), `seq` and `source` where its message has them and it not."""
         kind = messages.type_of(key)
         if kind is None or not isinstance(value, dict):
             return value
@@ -162,22 +161,7 @@ class MessageDefaults:
             raise
 
 
-def payload_to_json(key: str, payload: bytes, encoding: str = "") -> bytes:
-    """Return a payload as JSON.
-
-    A message of the contract comes with all of its fields; JSON, text and msgpack on other keys as their value, bytes
-    within as base64; anything else as base64 of the whole.
-
-    Args:
-        key: on which it was published.
-        payload: as published.
-        encoding: Zenoh's, where it is known.
-
-    Raises:
-        DecodeError: it is not the message that the contract puts on its key.
-    """
-    known = messages.type_of(key) is not None
-    return _to_json(messages.decode(key, payload) if known else decode_foreign(payload, encoding))
+# JSON
 
 
 def is_sound(key: str, payload: bytes) -> bool:
@@ -188,24 +172,36 @@ def is_sound(key: str, payload: bytes) -> bool:
         return False
 
 
-def decode_foreign(payload: bytes, encoding: str) -> Any:
-    """Return the value of a payload that is no message of the contract, as JSON can write it."""
+def payload_to_json(key: str, payload: bytes, encoding: str = "") -> bytes:
+    """Return a payload as JSON.
+
+    A message of the contract comes with all of its fields; JSON, text and msgpack on other keys as their value, bytes
+    within as base64; anything else as base64 of the whole. `encoding` is Zenoh's, where it is known.
+
+    Raises:
+        DecodeError: it is not the message that the contract puts on its key.
+    """
+    if messages.type_of(key) is not None:
+        return _to_json(messages.decode(key, payload))
     kind = encoding.partition(";")[0]
+    value: Any
     try:
         if kind in JSON:
-            return msgspec.json.decode(payload)
-        if kind in TEXT:
-            return payload.decode()
-        return json_value(msgspec.msgpack.decode(payload))
-    except messages.REFUSALS:
-        return base64.b64encode(payload).decode()
+            value = msgspec.json.decode(payload)
+        elif kind in TEXT:
+            value = payload.decode()
+        else:
+            value = json_value(msgspec.msgpack.decode(payload))
+    except REFUSALS:
+        value = base64.b64encode(payload).decode()
+    return _to_json(value)
 
 
 def json_value(value: Any) -> Any:
     """Return a value if JSON can write it, otherwise its msgpack as base64."""
     try:
         _to_json(value)
-    except messages.REFUSALS:
+    except REFUSALS:
         return base64.b64encode(msgspec.msgpack.encode(value)).decode()
     return value
 
@@ -220,51 +216,39 @@ def json_to_payload(key: str, value: Any) -> bytes:
     """
     if messages.type_of(key) is None:
         return _pack(key, value)
-    if keys.is_picture(key):
-        value = _with_picture(value, key)
+    if keys.is_picture(key) and isinstance(value, dict) and isinstance(value.get("data"), str):
+        try:
+            value = {**value, "data": base64.b64decode(value["data"], validate=True)}
+        except ValueError as error:
+            raise DecodeError(f"{key[:80]}: data is no base64 ({error}); must be a JPEG as base64") from error
     try:
         return messages.encode(messages.decode(key, _pack(key, value)))
     except DecodeError:
-        return messages.encode(messages.decode(key, _pack(key, _with_integers(value, key))))
-
-
-def _with_picture(value: Any, key: str) -> Any:
-    """Return an image whose data is base64, as JSON has it, with the bytes themselves."""
-    if not isinstance(value, dict) or not isinstance(value.get("data"), str):
-        return value
-    try:
-        return {**value, "data": base64.b64decode(value["data"], validate=True)}
-    except ValueError as error:
-        raise DecodeError(f"{key[:80]}: data is no base64 ({error}); must be a JPEG as base64") from error
+        try:
+            value = _with_integers(value)
+        except RecursionError as error:
+            must = "must be the message of docs/protocol.md"
+            raise DecodeError(f"{key[:80]}: too many lists in each other; {must}") from error
+        return messages.encode(messages.decode(key, _pack(key, value)))
 
 
 def _pack(key: str, value: Any) -> bytes:
     try:
         return msgspec.msgpack.encode(value)
-    except messages.REFUSALS as error:
+    except REFUSALS as error:
         raise DecodeError(f"{key:.80}: {error}; must be JSON of numbers of 64 bits") from error
 
 
-def _with_integers(value: Any, key: str) -> Any:
-    try:
-        return _integers_in(value)
-    except RecursionError as error:
-        raise DecodeError(
-            f"{key[:80]}: too many lists in each other; must be the message of docs/protocol.md"
-        ) from error
-
-
-def _integers_in(value: Any) -> Any:
+def _with_integers(value: Any) -> Any:
     """Return a value with the floats in it that are whole as integers."""
     if isinstance(value, dict):
-        return {name: _integers_in(entry) for name, entry in value.items()}
+        return {name: _with_integers(entry) for name, entry in value.items()}
     if isinstance(value, list):
-        return [_integers_in(entry) for entry in value]
+        return [_with_integers(entry) for entry in value]
     return int(value) if isinstance(value, float) and value.is_integer() and abs(value) < INTEGER_MAX else value
 
 
 def json_entry(key: str, payload: bytes, encoding: str = "") -> dict[str, Any]:
-    """Return a key and its value, to be encoded."""
     return {"key": key, "value": msgspec.Raw(payload_to_json(key, payload, encoding))}
 
 
@@ -276,3 +260,112 @@ def value_line(sample: RawSample) -> bytes:
     except DecodeError:
         return b""
     return b'{"op":"value","key":%b,"value":%b}\n' % (_to_json(sample.key), value)
+
+
+# Requests on a stream
+
+Key = Annotated[str, Meta(max_length=1000)]
+Keys = Annotated[list[Key], Meta(max_length=1000)]
+
+
+class StreamRequest(Struct, tag_field="op", forbid_unknown_fields=True, kw_only=True):
+    """Any request: its `id` comes back with the answer."""
+
+    id: int | str | None = None
+
+
+class HelloRequest(StreamRequest, tag="hello"):
+    """The client's name, and the token where one is needed. The answer describes the run."""
+
+    name: str = ""
+    token: str = ""
+
+
+class LatestRequest(StreamRequest, tag="latest"):
+    """The last values of a key, or of an expression."""
+
+    key: Key
+
+
+class SubscribeRequest(StreamRequest, tag="subscribe"):
+    """Every value on a key expression from now on."""
+
+    key: Key
+
+
+class UnsubscribeRequest(StreamRequest, tag="unsubscribe"):
+    """No more values on it."""
+
+    key: Key
+
+
+class PutRequest(StreamRequest, tag="put"):
+    """A value for a key. `quiet`: an answer comes only if it is refused."""
+
+    key: Key
+    value: Any
+    quiet: bool = False
+
+
+class AskRequest(StreamRequest, tag="ask"):
+    """A control request to whoever answers on a key: world/control, cluster/*/control."""
+
+    key: Key
+    request: str
+    args: dict[str, Any] = {}
+    timeout_s: Annotated[float, Meta(gt=0, le=60)] = 5.0
+
+
+class JoinRequest(StreamRequest, tag="join"):
+    """Take part in the lockstep: a `gate` comes every `period_s`, and time waits for its `done`.
+
+    `reads` are the key expressions whose messages come with each gate; `gates` the keys that close one, of which a
+    message comes at every gate: the status of its drones where none are given.
+    """
+
+    name: str
+    period_s: Annotated[float, Meta(gt=0, le=3600)]
+    reads: Keys = []
+    gates: Keys = []
+
+
+class LockstepOutput(Struct, forbid_unknown_fields=True):
+    """An output of a gate."""
+
+    key: Key
+    value: Any
+
+
+class DoneRequest(StreamRequest, tag="done"):
+    """All outputs of the gate t_ns."""
+
+    t_ns: int
+    outputs: list[LockstepOutput] = []
+
+
+class LeaveRequest(StreamRequest, tag="leave"):
+    """Take part in the lockstep no more."""
+
+    reason: str = ""
+
+
+_decode = msgspec.json.Decoder(
+    HelloRequest
+    | LatestRequest
+    | SubscribeRequest
+    | UnsubscribeRequest
+    | PutRequest
+    | AskRequest
+    | JoinRequest
+    | DoneRequest
+    | LeaveRequest
+).decode
+OPS = ("hello", "latest", "subscribe", "unsubscribe", "put", "ask", "join", "done", "leave")
+
+
+def decode_request(line: bytes) -> StreamRequest:
+    """Return the request in a line, or raise a DecodeError."""
+    try:
+        return _decode(line)
+    except REFUSALS as error:
+        raise DecodeError(f"request: {error}; must be a JSON object with op of {', '.join(OPS)}") from error

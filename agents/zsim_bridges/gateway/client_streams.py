@@ -1,4 +1,4 @@
-"""Byte streams to clients: lines of JSON on TCP, text messages on a WebSocket, server-sent events.
+"""Byte streams to clients: lines of JSON on TCP, text messages on a WebSocket, server-sent events, and pictures.
 
 Each client has a bounded outbox, so that one that does not read costs the others nothing.
 """
@@ -6,25 +6,31 @@ Each client has a bounded outbox, so that one that does not read costs the other
 import asyncio
 import socket
 from collections import deque
-from collections.abc import Callable, Coroutine
-from contextlib import suppress
-from typing import Any, Protocol
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, NamedTuple, Protocol
 
 import msgspec
 from aiohttp import WSMsgType, web
 
+from zsim.contract import messages
+from zsim.contract.flight_messages import CameraImage
+from zsim.errors import DecodeError
 from zsim.transport.session import RawSample
-from zsim_bridges.gateway.publications import SharedSubscriptions
+from zsim_bridges.gateway.run_access import SharedSubscriptions
 
 OUTBOX_BYTES_MAX = 4_000_000  # about 20 s of a drone's sensors as JSON
 FLUSH_S = 2.0  # how long the rest may take to be sent to a client that closes its connection
 LINES_PER_TURN = 100  # lines of one client after which the other tasks of the loop run
 LINE_MAX = 1_000_000  # bytes of a request
 HEARTBEAT_S = 20.0  # wall time after which a WebSocket whose client is gone is noticed
-ALIVE_S = 10.0  # wall time after which a comment shows that a stream of events still lives
+ALIVE_S = 10.0  # wall time after which a stream without news shows that it lives: the client may have gone
+LINGER_S = 10.0  # wall time that a camera's subscription outlives its last client: some request single pictures
+BOUNDARY = "zsim-picture"
+PICTURE_HEADERS = {"Cache-Control": "no-store", "Access-Control-Allow-Origin": "*"}
 _SOCKET_OPTIONS = (
-    (socket.IPPROTO_TCP, "TCP_NODELAY", 1),
-    (socket.SOL_SOCKET, "SO_KEEPALIVE", 1),
+    (socket.IPPROTO_TCP, "TCP_NODELAY", 1),  # a line that waits for more is late
+    (socket.SOL_SOCKET, "SO_KEEPALIVE", 1),  # hosts that are gone are noticed
     (socket.IPPROTO_TCP, "TCP_KEEPIDLE", 5),  # s of silence before the first keepalive probe
     (socket.IPPROTO_TCP, "TCP_KEEPINTVL", 2),  # s between two probes
     (socket.IPPROTO_TCP, "TCP_KEEPCNT", 3),  # probes without an answer that end a connection
@@ -32,8 +38,6 @@ _SOCKET_OPTIONS = (
 )
 
 Half = Coroutine[Any, Any, None]
-EventOf = Callable[[RawSample], bytes]
-"""Makes the event of a publication; an empty one is not sent."""
 
 
 class Outbox:
@@ -58,12 +62,7 @@ class Outbox:
         self._closed = False
 
     def put(self, line: bytes, droppable: bool = False) -> None:
-        """Add a line; to be called on the loop.
-
-        Args:
-            line: with its end.
-            droppable: whether it may be lost: a newer one of its kind replaces it.
-        """
+        """Add a line, with its end; on the loop. One is droppable if a newer one of its kind replaces it."""
         if self._closed:
             return
         self._lines.append((line, droppable))
@@ -98,17 +97,9 @@ class Outbox:
 class StreamHandler(Protocol):
     """The client behind a stream."""
 
-    async def handle_line(self, line: bytes) -> None:
-        """Execute the request in a line."""
-        ...
-
-    def refuse_line(self, error: str) -> None:
-        """Answer a line that cannot be read."""
-        ...
-
-    def close(self) -> None:
-        """End everything that the client has."""
-        ...
+    async def handle_line(self, line: bytes) -> None: ...
+    def refuse_line(self, error: str) -> None: ...
+    def close(self) -> None: ...
 
 
 ClientFactory = Callable[[Outbox, bool], StreamHandler]
@@ -138,36 +129,51 @@ async def run_duplex(reading: Half, sending: Half, finish: Callable[[], None], c
         await asyncio.gather(reader, sender, return_exceptions=True)
 
 
+def _lost_line(lost: int) -> bytes:
+    return msgspec.json.encode({"op": "lost", "lines": lost}) + b"\n"
+
+
 # Lines on TCP
 
 
-class LineServer:
-    """Serves connections of lines.
+async def serve_lines(
+    new_client: ClientFactory, authenticated: bool, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+) -> None:
+    """Serve a connection of lines until it ends; `authenticated`: no token is needed."""
+    cut = writer.transport.abort
+    outbox = Outbox(cut, _lost_line)
+    raw = writer.get_extra_info("socket")
+    for level, name, value in _SOCKET_OPTIONS:
+        if raw is not None and hasattr(socket, name):
+            raw.setsockopt(level, getattr(socket, name), value)
+    client = new_client(outbox, authenticated)
 
-    Args:
-        new_client: see ClientFactory.
-        authenticated: whether no token is needed.
-    """
+    async def send() -> None:
+        with suppress(ConnectionError):
+            while lines := await outbox.take():
+                writer.write(b"".join(lines))
+                await writer.drain()
 
-    def __init__(self, new_client: ClientFactory, authenticated: bool) -> None:
-        self._new_client = new_client
-        self._authenticated = authenticated
-
-    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serve a connection until it ends."""
-        cut = writer.transport.abort
-        outbox = Outbox(cut, _lost_line)
-        _set_socket_options(writer)
-        client = self._new_client(outbox, self._authenticated)
-        with suppress(asyncio.CancelledError):  # the gateway ends
-            await run_duplex(_read_lines(client, reader), _send_lines(outbox, writer), client.close, cut)
-        writer.close()
+    with suppress(asyncio.CancelledError):  # the gateway ends
+        await run_duplex(_read_lines(client, reader), send(), client.close, cut)
+    writer.close()
 
 
 async def _read_lines(client: StreamHandler, reader: asyncio.StreamReader) -> None:
     """Handle line by line; a browser whose page makes it send an HTTP request here is refused."""
     count = 0
-    while line := await _next_line(client, reader):
+    while True:
+        try:
+            line = await reader.readuntil(b"\n")
+        except ConnectionError:
+            return
+        except asyncio.IncompleteReadError as error:
+            line = error.partial
+        except asyncio.LimitOverrunError:
+            client.refuse_line(f"request: is longer than {LINE_MAX} bytes; the connection ends")
+            return
+        if not line:
+            return
         if count == 0 and not line.lstrip().startswith(b"{"):
             client.refuse_line("request: is no JSON object a line; see docs/gateway.md")
             return
@@ -175,39 +181,6 @@ async def _read_lines(client: StreamHandler, reader: asyncio.StreamReader) -> No
         count += 1
         if count % LINES_PER_TURN == 0:
             await asyncio.sleep(0)
-
-
-async def _next_line(client: StreamHandler, reader: asyncio.StreamReader) -> bytes:
-    """Return the next line, empty at the end."""
-    try:
-        return await reader.readuntil(b"\n")
-    except ConnectionError:
-        return b""
-    except asyncio.IncompleteReadError as error:
-        return error.partial
-    except asyncio.LimitOverrunError:
-        client.refuse_line(f"request: is longer than {LINE_MAX} bytes; the connection ends")
-        return b""
-
-
-async def _send_lines(outbox: Outbox, writer: asyncio.StreamWriter) -> None:
-    with suppress(ConnectionError):
-        while lines := await outbox.take():
-            writer.write(b"".join(lines))
-            await writer.drain()
-
-
-def _set_socket_options(writer: asyncio.StreamWriter) -> None:
-    """Send every line at once, since one that waits for more is late; notice hosts that are gone."""
-    raw = writer.get_extra_info("socket")
-    for level, name, value in _SOCKET_OPTIONS:
-        if raw is not None and hasattr(socket, name):
-            raw.setsockopt(level, getattr(socket, name), value)
-
-
-def _lost_line(lost: int) -> bytes:
-    """Return the line that reports how many values were lost."""
-    return msgspec.json.encode({"op": "lost", "lines": lost}) + b"\n"
 
 
 # Text messages on a WebSocket
@@ -220,7 +193,20 @@ async def serve_websocket(request: web.Request, new_client: ClientFactory) -> we
     cut = _cutter(request)
     outbox = Outbox(cut, _lost_line)
     client = new_client(outbox, True)
-    await run_duplex(_read_messages(client, websocket), _send_messages(outbox, websocket), client.close, cut)
+
+    async def read() -> None:
+        async for message in websocket:
+            if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
+                data = message.data
+                await client.handle_line(data.encode() if isinstance(data, str) else data)
+
+    async def send() -> None:
+        with suppress(ConnectionError):
+            while lines := await outbox.take():
+                for line in lines:
+                    await websocket.send_str(line[:-1].decode())
+
+    await run_duplex(read(), send(), client.close, cut)
     return websocket
 
 
@@ -228,39 +214,21 @@ def _cutter(request: web.Request) -> Callable[[], None]:
     return request.transport.abort if request.transport is not None else lambda: None
 
 
-async def _read_messages(client: StreamHandler, websocket: web.WebSocketResponse) -> None:
-    async for message in websocket:
-        if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
-            data = message.data
-            await client.handle_line(data.encode() if isinstance(data, str) else data)
-
-
-async def _send_messages(outbox: Outbox, websocket: web.WebSocketResponse) -> None:
-    with suppress(ConnectionError):
-        while lines := await outbox.take():
-            for line in lines:
-                await websocket.send_str(line[:-1].decode())
-
-
 # Server-sent events
 
 
 async def stream_events(
-    request: web.Request, subscriptions: SharedSubscriptions, expression: str, event_of: EventOf
+    request: web.Request,
+    subscriptions: SharedSubscriptions,
+    expression: str,
+    event_of: Callable[[RawSample], bytes],
 ) -> web.StreamResponse:
-    """Send every publication on an expression until the client leaves.
+    """Send every publication on an expression until the client leaves, as `event_of` makes it; no empty one.
 
-    Args:
-        request: to be answered.
-        subscriptions: to the keys of the expression.
-        expression: what to subscribe to.
-        event_of: see EventOf.
-
-    Raises:
-        SessionError: it is no key expression.
-        TooManyError: the limit of streams is reached.
+    For errors see `SharedSubscriptions.subscribe_stream`.
     """
-    outbox = Outbox(_cutter(request), _lost_comment)
+    lost = b": %d events were lost, they came faster than they were read\n\n"
+    outbox = Outbox(_cutter(request), lambda count: lost % count)
 
     def put(sample: RawSample) -> None:
         if event := event_of(sample):
@@ -272,24 +240,129 @@ async def stream_events(
     try:
         await response.prepare(request)
         while True:
-            await response.write(await _next_chunk(outbox))
+            try:
+                chunk = b"".join(await asyncio.wait_for(outbox.take(), ALIVE_S))
+            except TimeoutError:
+                chunk = b": still here\n\n"
+            await response.write(chunk)
     except ConnectionError:
         return response
     finally:
         unsubscribe()
 
 
-async def _next_chunk(outbox: Outbox) -> bytes:
+# Pictures of cameras, with one subscription for all clients of a camera. A client that reads slowly misses pictures: it
+# is sent the newest one each time, beside what its connection holds.
+
+
+class NumberedPicture(NamedTuple):
+    """A picture, and the number of those before it."""
+
+    number: int
+    image: CameraImage
+
+
+class PictureFeed:
+    """The newest picture of a camera, for clients on one loop.
+
+    `refuse` is called with the reason for each message that is no picture; `stop` ends its subscription.
+    """
+
+    def __init__(self, key: str, refuse: Callable[[str], None]) -> None:
+        self._key = key
+        self._refuse = refuse
+        self._arrived = asyncio.Event()
+        self._count = 0
+        self.newest: NumberedPicture | None = None
+        self.watchers = 0  # clients
+        self.stop: Callable[[], None] = lambda: None
+
+    def take(self, sample: RawSample) -> None:
+        try:
+            image: CameraImage = messages.decode(self._key, sample.payload)
+        except DecodeError as error:
+            self._refuse(str(error))
+            return
+        self.newest = NumberedPicture(self._count, image)
+        self._count += 1
+        arrived, self._arrived = self._arrived, asyncio.Event()
+        arrived.set()
+
+    async def after(self, number: int, within_s: float) -> NumberedPicture | None:
+        """Return the newest picture if its number is greater, otherwise the next; None if none arrives in time."""
+        if self.newest is None or self.newest.number <= number:
+            try:
+                await asyncio.wait_for(self._arrived.wait(), within_s)
+            except TimeoutError:
+                return None
+        return self.newest
+
+
+class PictureFeeds:
+    """The feeds of all cameras with clients, at present or within LINGER_S; `subscribe` returns what ends it."""
+
+    def __init__(
+        self,
+        subscribe: Callable[[str, Callable[[RawSample], None]], Callable[[], None]],
+        refuse: Callable[[str], None],
+    ) -> None:
+        self._subscribe = subscribe
+        self._refuse = refuse
+        self._feeds: dict[str, PictureFeed] = {}
+
+    @contextmanager
+    def watched(self, key: str) -> Iterator[PictureFeed]:
+        """Yield the feed of a key, on the loop."""
+        feed = self._feeds.get(key)
+        if feed is None:
+            feed = PictureFeed(key, self._refuse)
+            feed.stop = self._subscribe(key, feed.take)
+            self._feeds[key] = feed
+        feed.watchers += 1
+        try:
+            yield feed
+        finally:
+            feed.watchers -= 1
+            if not feed.watchers:
+                asyncio.get_running_loop().call_later(LINGER_S, self._close_unwatched, key)
+
+    def _close_unwatched(self, key: str) -> None:
+        feed = self._feeds.get(key)
+        if feed is not None and not feed.watchers:
+            del self._feeds[key]
+            feed.stop()
+
+    def forget(self) -> None:
+        """Drop the newest pictures: another run begins."""
+        for feed in self._feeds.values():
+            feed.newest = None
+
+
+async def stream_pictures(request: web.Request, feed: PictureFeed) -> web.StreamResponse:
+    """Send pictures as multipart/x-mixed-replace, as fast as the client reads, until it leaves."""
+    kind = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
+    response = web.StreamResponse(headers={**PICTURE_HEADERS, "Content-Type": kind})
     try:
-        return b"".join(await asyncio.wait_for(outbox.take(), ALIVE_S))
-    except TimeoutError:
-        return b": still here\n\n"
+        await response.prepare(request)
+        await response.write(b"--%b\r\n" % BOUNDARY.encode())
+        number = -1
+        while request.transport is not None and not request.transport.is_closing():
+            picture = await feed.after(number, ALIVE_S) or feed.newest  # again: in a paused run the client may be gone
+            if picture is not None:
+                number = picture.number
+                await response.write(picture_part(picture.image))
+    except ConnectionError:
+        return response  # the client is gone
+    return response
 
 
-def _lost_comment(lost: int) -> bytes:
-    return b": %d events were lost, they came faster than they were read\n\n" % lost
+def picture_part(image: CameraImage) -> bytes:
+    """Return a picture as a part followed by the boundary, which browsers read before they show the part."""
+    kind = f"Content-Type: image/jpeg\r\nContent-Length: {len(image.data)}\r\n"
+    head = f"{kind}X-Timestamp: {exposure_s(image)}\r\n\r\n"
+    return b"%b%b\r\n--%b\r\n" % (head.encode(), image.data, BOUNDARY.encode())
 
 
-def event_bytes(kind: str, data: bytes) -> bytes:
-    """Return a server-sent event."""
-    return b"event: %b\ndata: %b\n\n" % (kind.encode(), data)
+def exposure_s(image: CameraImage) -> str:
+    """Return the simulated time of a picture's exposure for a header [s]."""
+    return f"{image.t_sample_ns / 1e9:.6f}"

@@ -1,4 +1,4 @@
-"""The gateway: serves HTTP, WebSocket and lines of JSON, for one run after the other."""
+"""The gateway: serves HTTP, WebSocket and lines of JSON, for one run after the other, and each client on a stream."""
 
 import asyncio
 import secrets
@@ -9,24 +9,32 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from typing import Any, NamedTuple
 
+import msgspec
+
 from zsim.contract import keys
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import RUN_ENDED
-from zsim.errors import NoWorldError, RunError, ZsimError
+from zsim.errors import DecodeError, NoWorldError, RunError, ZsimError
 from zsim.runtime.participant import ANOTHER_RUN, Participant
 from zsim.runtime.rate_limit import RateLimit
 from zsim.runtime.runner import Runner
-from zsim.transport.session import Session
-from zsim_bridges.gateway.access_check import AccessCheck, ConnectionLimit
-from zsim_bridges.gateway.client_messages import TooManyError
-from zsim_bridges.gateway.client_streams import LINE_MAX, LineServer, Outbox
-from zsim_bridges.gateway.http_routes import application
-from zsim_bridges.gateway.http_trees import CameraTree, JsonTree, RestTree
+from zsim.transport.session import RawSample, Session, check_expression
+from zsim_bridges.gateway import client_messages
+from zsim_bridges.gateway.client_messages import (
+    ClientLimit,
+    ForbiddenError,
+    MessageDefaults,
+    StreamRequest,
+    TooManyError,
+    count_request,
+    json_entry,
+    json_value,
+    value_line,
+)
+from zsim_bridges.gateway.client_streams import LINE_MAX, OUTBOX_BYTES_MAX, Outbox, PictureFeeds, serve_lines
+from zsim_bridges.gateway.http_server import AccessCheck, CameraTree, JsonTree, RestTree, application
 from zsim_bridges.gateway.lockstep_session import LockstepSession
-from zsim_bridges.gateway.publications import SharedSubscriptions
-from zsim_bridges.gateway.run_access import RunAccess
-from zsim_bridges.gateway.stream_client import Client
-from zsim_bridges.web.picture_streams import PictureFeeds
+from zsim_bridges.gateway.run_access import RunAccess, SharedSubscriptions
 from zsim_bridges.web.web_server import (
     ServedSite,
     cancel_other_tasks,
@@ -46,6 +54,11 @@ RELEASE_TIMEOUT_S = 1.0  # the world answers within milliseconds
 STREAM_RATE_HZ = 5_000.0  # requests per wall second of one stream; a loop at the speed of the fastest run has 2 500
 STREAM_BURST = 10_000.0
 BYE_TIMEOUT_S = 2.0  # how long the end waits for the byes of the agents
+SUBSCRIPTIONS_MAX = 100  # of one client; `drone/*/truth` is one
+ANSWER_MAX = OUTBOX_BYTES_MAX  # bytes of an answer
+PENDING_MAX = 8  # requests of one client that wait for their answers
+ROLE = "client"  # of a name without a role
+_encode = msgspec.json.Encoder().encode
 
 
 class GatewayPorts(NamedTuple):
@@ -60,8 +73,6 @@ class Gateway:
     """One gateway.
 
     Args:
-        ports: where it listens.
-        name: process name.
         token: that clients must show; None on this machine alone.
         dial: opens a session to the world for a process of a name.
         say: prints a line.
@@ -83,14 +94,16 @@ class Gateway:
         check_token("gateway", ports.host, token)
         self.loop = asyncio.new_event_loop()
         self.loop.set_exception_handler(self._on_loop_error)
-        self._client_limit = ConnectionLimit(CLIENTS_MAX, "clients")
+        self._client_limit = ClientLimit(CLIENTS_MAX)
         self.subscriptions = SharedSubscriptions(self.loop, self._client_limit)
         self._full_key_subscriptions = SharedSubscriptions(self.loop, self._client_limit)
         self._picture_subscriptions = SharedSubscriptions(self.loop, self._client_limit, PICTURES_WAITING_MAX)
         self._pictures = PictureFeeds(self._picture_subscriptions.subscribe, self._refuse_picture)
         self._ports = ports
         self.name = name
+        self._needs_token = token is not None
         self._access_check = AccessCheck(token, self.report)
+        self.is_token = self._access_check.is_token
         self._dial = dial
         self._secured = secured
         self._say = say
@@ -104,18 +117,10 @@ class Gateway:
     # For clients
 
     def run(self) -> RunAccess:
-        """Return the current run.
-
-        Raises:
-            NoWorldError: there is none.
-        """
+        """Return the current run, or raise a NoWorldError."""
         if self._run is None:
             raise NoWorldError("there is no run now; the gateway waits for the next")
         return self._run
-
-    def is_token(self, token: str) -> bool:
-        """Return whether a token is the right one."""
-        return self._access_check.is_token(token)
 
     def start_lockstep(self, session: LockstepSession, ended: Callable[[str], None]) -> None:
         """Run a client's agent, on a link of its own, until it leaves; `ended` is called with the reason."""
@@ -124,34 +129,6 @@ class Gateway:
         thread = threading.Thread(target=self._run_lockstep, args=(session, ended), name=session.name, daemon=True)
         self._lockstep_threads.add(thread)
         thread.start()
-
-    def report(self, text: str) -> None:
-        """Print a fault of the gateway itself."""
-        self._say(f"{self.name}: {text}")
-
-    def remove(self, client: Client) -> None:
-        """Forget a client that is gone, and release the drones that it commanded."""
-        if client not in self._clients:
-            return
-        self._clients.discard(client)
-        if client.authenticated:
-            self._client_limit.leave()
-        self._unauthenticated.pop(client, None)
-        others = {other.source for other in self._clients}
-        released = [(source, drone) for source, drone in client.commanded if source not in others]
-        if self._run is not None and released:
-            self.loop.run_in_executor(None, _release_drones, self._run.link, released)
-
-    def admit(self, client: Client) -> None:
-        """Count a client that has shown the token among those that have.
-
-        Raises:
-            TooManyError: the limit of clients is reached, or it had to make room for others.
-        """
-        if client not in self._unauthenticated:
-            raise TooManyError("the connection has waited too long for its token; connect again")
-        self._client_limit.enter()
-        del self._unauthenticated[client]
 
     def _run_lockstep(self, session: LockstepSession, ended: Callable[[str], None]) -> None:
         reason = "the gateway failed"
@@ -168,6 +145,34 @@ class Gateway:
             self._lockstep_threads.discard(threading.current_thread())
             with suppress(RuntimeError):  # the gateway has ended
                 self.loop.call_soon_threadsafe(ended, reason)
+
+    def report(self, text: str) -> None:
+        """Print a fault of the gateway itself."""
+        self._say(f"{self.name}: {text}")
+
+    def remove(self, client: "Client") -> None:
+        """Forget a client that is gone, and release the drones that it commanded."""
+        if client not in self._clients:
+            return
+        self._clients.discard(client)
+        if client.authenticated:
+            self._client_limit.leave()
+        self._unauthenticated.pop(client, None)
+        others = {other.source for other in self._clients}
+        released = [(source, drone) for source, drone in client.commanded if source not in others]
+        if self._run is not None and released:
+            self.loop.run_in_executor(None, _release_drones, self._run.link, released)
+
+    def admit(self, client: "Client") -> None:
+        """Count a client that has shown the token among those that have.
+
+        Raises:
+            TooManyError: the limit of clients is reached, or it had to make room for others.
+        """
+        if client not in self._unauthenticated:
+            raise TooManyError("the connection has waited too long for its token; connect again")
+        self._client_limit.enter()
+        del self._unauthenticated[client]
 
     # A run
 
@@ -194,6 +199,12 @@ class Gateway:
             self._call_on_loop(self._end, run, observer.end_reason == ANOTHER_RUN)
             run.close()
 
+    def _call_on_loop(self, act: Callable[..., None], *args: Any) -> None:
+        async def call() -> None:
+            act(*args)
+
+        asyncio.run_coroutine_threadsafe(call(), self.loop).result()
+
     def _begin(self, run: RunAccess) -> None:
         self._run, self._link_lost = run, False
         self.subscriptions.attach(run.link)
@@ -204,6 +215,11 @@ class Gateway:
 
     def _end(self, run: RunAccess, another: bool = False) -> None:
         """End a run for the clients; where the world has begun another one, the link is back, whoever reports it."""
+
+        def end_lockstep_sessions() -> None:
+            for client in self._clients:
+                client.end_lockstep(run, RUN_ENDED)
+
         if another:
             self._notify_link(run, True)
         self._run = None
@@ -211,40 +227,20 @@ class Gateway:
         self._full_key_subscriptions.detach()
         self._picture_subscriptions.detach()
         self._notify_clients("ended", run)
-        self.loop.call_later(DRAIN_S, self._end_lockstep_sessions, run)
-
-    def _end_lockstep_sessions(self, run: RunAccess) -> None:
-        for client in self._clients:
-            client.end_lockstep(run, RUN_ENDED)
-
-    def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Print what reaches no client, each text once: a flood of connections makes a flood of these."""
-        self._report_once(f"{context.get('message')}: {context.get('exception')!r}")
-
-    def _report_once(self, text: str) -> None:
-        if text not in self._reported_faults and len(self._reported_faults) < FAULTS_REPORTED_MAX:
-            self._reported_faults.add(text)
-            self.report(text)
-
-    def _refuse_picture(self, reason: str) -> None:
-        """Count what is no picture, and print each text once."""
-        if self._run is not None:
-            self._run.count_refused()
-        self._report_once(reason)
+        self.loop.call_later(DRAIN_S, end_lockstep_sessions)
 
     def _notify_clients(self, state: str, run: RunAccess) -> None:
         for client in self._clients:
             client.notify_run(state, run.info.run_id)
 
     def _observe_link(self, run: RunAccess) -> None:
-        run.link.on_link(partial(self._on_link, run))
-        if not run.link.links():  # lost before anything was observed, so that no event follows
-            self._on_link(run, False)
+        def on_link(up: bool) -> None:
+            with suppress(RuntimeError):  # in a thread of Zenoh's; the gateway has ended
+                self.loop.call_soon_threadsafe(self._notify_link, run, up)
 
-    def _on_link(self, run: RunAccess, up: bool) -> None:
-        """Take the state of a run's link, in a thread of Zenoh's."""
-        with suppress(RuntimeError):  # the gateway has ended
-            self.loop.call_soon_threadsafe(self._notify_link, run, up)
+        run.link.on_link(on_link)
+        if not run.link.links():  # lost before anything was observed, so that no event follows
+            on_link(False)
 
     def _notify_link(self, run: RunAccess, up: bool) -> None:
         """Notify clients of a link that is lost or back, but not when the world goes after the end of its run."""
@@ -252,35 +248,39 @@ class Gateway:
             self._link_lost = not up
             self._notify_clients("back" if up else "lost", run)
 
-    def _call_on_loop(self, act: Callable[..., None], *args: Any) -> None:
-        async def call() -> None:
-            act(*args)
+    def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Print what reaches no client, each text once: a flood of connections makes a flood of these."""
+        self._report_once(f"{context.get('message')}: {context.get('exception')!r}")
 
-        asyncio.run_coroutine_threadsafe(call(), self.loop).result()
+    def _refuse_picture(self, reason: str) -> None:
+        if self._run is not None:
+            self._run.count_refused()
+        self._report_once(reason)
+
+    def _report_once(self, text: str) -> None:
+        if text not in self._reported_faults and len(self._reported_faults) < FAULTS_REPORTED_MAX:
+            self._reported_faults.add(text)
+            self.report(text)
 
     # Servers
 
     @contextmanager
     def open(self) -> Iterator[None]:
-        """Serve clients, on a thread of its own.
-
-        Raises:
-            RunError: a port is taken.
-        """
+        """Serve clients, on a thread of its own; a RunError says that a port is taken."""
         with open_on_thread(self.loop, "gateway servers", self._open, lambda servers: self._close(*servers)):
             yield
 
     async def _open(self) -> tuple[ServedSite, asyncio.Server]:
         host, http_port, lines_port = self._ports
-        line_server = LineServer(self._new_client, authenticated=not self._access_check.needs_token)
         rest = RestTree(self.run, self._full_key_subscriptions)
         tree = JsonTree(self.run, self.subscriptions, self.name)
         cameras = CameraTree(self.run, self._pictures, self._client_limit)
         app = application(self._access_check, rest, tree, cameras, self._new_client)
+        serve = partial(serve_lines, self._new_client, not self._needs_token)
         try:
             site = await start_site(app, host, (http_port,), shutdown_s=1.0)
             try:
-                lines = await asyncio.start_server(line_server.serve, host, lines_port, limit=LINE_MAX)
+                lines = await asyncio.start_server(serve, host, lines_port, limit=LINE_MAX)
             except OSError:
                 await site.cleanup()
                 raise
@@ -292,36 +292,36 @@ class Gateway:
         return site, lines
 
     async def _close(self, site: ServedSite, lines: asyncio.Server) -> None:
+        def join_all(threads: list[threading.Thread]) -> None:
+            end_s = time.monotonic() + BYE_TIMEOUT_S
+            for thread in threads:
+                thread.join(max(0.0, end_s - time.monotonic()))
+
         lines.close()
         for client in list(self._clients):
             client.close(connection_lost=False)
-        await asyncio.to_thread(_join_all, list(self._lockstep_threads), BYE_TIMEOUT_S)
+        await asyncio.to_thread(join_all, list(self._lockstep_threads))
         await cancel_other_tasks()
         await site.cleanup()
 
-    def _new_client(self, outbox: Outbox, authenticated: bool) -> Client:
+    def _new_client(self, outbox: Outbox, authenticated: bool) -> "Client":
         limit = RateLimit(1 / STREAM_RATE_HZ, STREAM_BURST)
         client = Client(self, outbox, f"client.{secrets.token_hex(3)}", authenticated, limit)
-        if not authenticated:
-            self._make_room()
-        try:
-            if authenticated:
+        if authenticated:
+            try:
                 self._client_limit.enter()
-        except TooManyError as error:
-            client.refuse(str(error))
-            return client
-        self._clients.add(client)
-        if not authenticated:
+            except TooManyError as error:
+                client.refuse(str(error))
+                return client
+        else:
+            if len(self._unauthenticated) >= UNAUTHENTICATED_MAX:  # who has waited longest makes room
+                oldest = next(iter(self._unauthenticated))
+                oldest.expire()
+                self.remove(oldest)
             self._unauthenticated[client] = None
             self.loop.call_later(HELLO_TIMEOUT_S, client.expire)
+        self._clients.add(client)
         return client
-
-    def _make_room(self) -> None:
-        """Let go of the client that has waited longest with its token, where there are too many of them."""
-        if len(self._unauthenticated) >= UNAUTHENTICATED_MAX:
-            client = next(iter(self._unauthenticated))
-            client.expire()
-            self.remove(client)
 
 
 def _release_drones(link: Session, commanded: Iterable[tuple[str, str]]) -> None:
@@ -331,7 +331,219 @@ def _release_drones(link: Session, commanded: Iterable[tuple[str, str]]) -> None
             link.request(keys.CONTROL, "release", source, {"drone": drone}, RELEASE_TIMEOUT_S)
 
 
-def _join_all(threads: list[threading.Thread], timeout_s: float) -> None:
-    end_s = time.monotonic() + timeout_s
-    for thread in threads:
-        thread.join(max(0.0, end_s - time.monotonic()))
+class Client:
+    """One connection of a stream: its requests are executed, answers and values go into its outbox.
+
+    Args:
+        source: name under which it publishes until it gives its own.
+        authenticated: whether it has shown the token already, or needs none.
+
+    Attributes:
+        commanded: (source, drone) of the drones that it has commanded, outside of a lockstep session, in this run.
+    """
+
+    def __init__(self, gateway: Gateway, outbox: Outbox, source: str, authenticated: bool, limit: RateLimit) -> None:
+        self._gateway = gateway
+        self._outbox = outbox
+        self.authenticated = authenticated
+        self._limit = limit
+        self._defaults = MessageDefaults(source)
+        self._subscriptions: dict[str, Callable[[], None]] = {}
+        self.commanded: set[tuple[str, str]] = set()
+        self._pending: set[asyncio.Task[None]] = set()
+        self._session: LockstepSession | None = None
+        self._closed = False
+        self.source = source
+
+    async def handle_line(self, line: bytes) -> None:
+        """Execute the request in a line; an error is an answer."""
+        request: StreamRequest | None = None
+        try:
+            count_request(self._limit)
+            if line.isspace():
+                return
+            request = client_messages.decode_request(line)
+            if not self.authenticated and not isinstance(request, client_messages.HelloRequest):
+                raise ForbiddenError('a token is asked for here; begin with {"op": "hello", "token": "…"}')
+            getattr(self, f"_{request.__struct_config__.tag}")(request)  # the method that has the name of the op
+        except ZsimError as error:
+            self.refuse_line(str(error), request)
+        except Exception as error:  # a fault of the gateway: this client and the others are served on
+            self._gateway.report(f"{self.source}: {line[:80]!r}: {error!r}")
+            self.refuse_line(f"the gateway failed ({type(error).__name__}); its terminal says more", request)
+
+    def send(self, answer: dict[str, Any], request: StreamRequest | None = None) -> None:
+        """Put an answer into the outbox, with the id of its request."""
+        if request is not None and request.id is not None:
+            answer["id"] = request.id
+        line = _encode(answer) + b"\n"
+        if len(line) > ANSWER_MAX:
+            error = f"{answer['op']}: the answer has {len(line)} bytes, more than {ANSWER_MAX}; ask for less at a time"
+            line = _encode({"op": "error", "error": error, "id": answer.get("id")}) + b"\n"
+        self._outbox.put(line)
+
+    def refuse_line(self, error: str, request: StreamRequest | None = None) -> None:
+        """Answer a request, or a line that is none, with an error."""
+        self.send({"op": "error", "error": error}, request)
+
+    def refuse(self, error: str, request: StreamRequest | None = None) -> None:
+        """Answer with an error and close the connection."""
+        self.refuse_line(error, request)
+        self._outbox.close()
+
+    def expire(self) -> None:
+        """Close the connection of a client that has not shown the token."""
+        if not self.authenticated and not self._closed:
+            self.refuse("hello: none came with the token in time")
+
+    def _hello(self, request: client_messages.HelloRequest) -> None:
+        if not self.authenticated and not self._gateway.is_token(request.token):
+            self.refuse("hello: no token, or a wrong one; ask whoever started the gateway for it", request)
+            return
+        name = self._process_name(request.name) if request.name else self.source
+        if not self.authenticated:
+            self._gateway.admit(self)
+            self.authenticated = True
+        if self._session is None and name != self.source:
+            self.source, self._defaults = name, MessageDefaults(name)
+        answer: dict[str, Any] = {"op": "hello", "name": self.source, "run_id": None}
+        with suppress(NoWorldError):
+            run = self._gateway.run()
+            info = run.info
+            answer |= {
+                "run_id": info.run_id,
+                "federation": info.federation,
+                "mode": info.mode,
+                "gate_s": info.gate_ns / 1e9,
+                "t_ns": run.now_ns,
+                "drones": [drone.name for drone in info.drones],
+                "clusters": [{"name": cluster.name, "drones": cluster.drones} for cluster in info.clusters],
+            }
+        self.send(answer, request)
+
+    def _process_name(self, name: str) -> str:
+        """Return the process name of a client, a name without a role with ROLE, or raise a DecodeError."""
+        process = name if "." in name else f"{ROLE}.{name}"
+        if not keys.PROCESS_NAME.fullmatch(process) or "." not in process.strip(".") or process == self._gateway.name:
+            raise DecodeError(
+                f"name is {name[:60]!r}; must be NAME or ROLE.NAME of a-z 0-9 _ -, at most 48, e.g. myctrl or "
+                "matlab.main, and not the gateway's"
+            )
+        return process
+
+    def _latest(self, request: client_messages.LatestRequest) -> None:
+        check_expression(request.key)
+        last = self._gateway.run().values
+        entries = [json_entry(key, payload, last.encoding(key)) for key, payload in last.matching(request.key)]
+        self.send({"op": "latest", "values": entries}, request)
+
+    def _put(self, request: client_messages.PutRequest) -> None:
+        self._gateway.run().put(request.key, request.value, self._defaults)
+        if keys.matches(keys.command("*", "*"), request.key):
+            self.commanded.add((self.source, keys.thing(request.key)))
+        if not request.quiet:
+            self.send({"op": "put", "key": request.key}, request)
+
+    def _ask(self, request: client_messages.AskRequest) -> None:
+        if len(self._pending) >= PENDING_MAX:
+            raise TooManyError(f"ask: {PENDING_MAX} of this client wait for their answers already")
+        task = asyncio.create_task(self._send_answer(request, self._gateway.run()))
+        self._pending.add(task)
+        task.add_done_callback(self._pending.discard)
+
+    async def _send_answer(self, request: client_messages.AskRequest, run: RunAccess) -> None:
+        """Wait for an answer while other requests are executed: the answer may need the client's next done."""
+        try:
+            answer = await run.request(request.key, request.request, request.args, self.source, request.timeout_s)
+        except ZsimError as error:
+            self.refuse_line(str(error), request)
+            return
+        result = json_value(answer.result)
+        self.send({"op": "answer", "ok": answer.ok, "error": answer.error, "result": result}, request)
+
+    # Subscriptions
+
+    def _subscribe(self, request: client_messages.SubscribeRequest) -> None:
+        if request.key not in self._subscriptions:
+            if len(self._subscriptions) >= SUBSCRIPTIONS_MAX:
+                raise TooManyError(
+                    f"subscribe: there are {SUBSCRIPTIONS_MAX} already; unsubscribe some, or use wildcards"
+                )
+            self._subscriptions[request.key] = self._gateway.subscriptions.subscribe(request.key, self._on_value)
+        self.send({"op": "subscribe", "key": request.key}, request)
+
+    def _on_value(self, sample: RawSample) -> None:
+        if line := value_line(sample):
+            self._outbox.put(line, droppable=True)
+
+    def _unsubscribe(self, request: client_messages.UnsubscribeRequest) -> None:
+        if request.key not in self._subscriptions:
+            raise DecodeError(f"unsubscribe: {request.key[:80]!r} is not subscribed to")
+        self._subscriptions.pop(request.key)()
+        self.send({"op": "unsubscribe", "key": request.key}, request)
+
+    # Lockstep
+
+    def _join(self, request: client_messages.JoinRequest) -> None:
+        if self._session is not None:
+            raise DecodeError(f"join: is {self._session.name} already; leave first, or use another connection")
+        name = self._process_name(request.name)
+        session = LockstepSession(name, request, self._gateway.run(), self._gateway.loop, self._outbox.put)
+        self._session, self.source, self._defaults = session, name, session.defaults
+        self._gateway.start_lockstep(session, lambda reason: self._on_session_ended(session, reason))
+        self.send({"op": "join", "name": name, "gates": session.gate_keys}, request)
+
+    def _done(self, request: client_messages.DoneRequest) -> None:
+        if self._session is None:
+            raise DecodeError("done: has not joined; must say join first")
+        self._session.answer_gate(request)
+
+    def lose_lockstep(self, successor: LockstepSession, reason: str) -> None:
+        """End another session of the same name: its name has been taken."""
+        session = self._session
+        if session is not None and session.name == successor.name and session is not successor:
+            session.leave(connection_lost=True)
+            self._on_session_ended(session, reason)
+
+    def end_lockstep(self, run: RunAccess, reason: str) -> None:
+        """End the session in a run that is over, answered or not."""
+        session = self._session
+        if session is not None and session.run is run:
+            session.leave()
+            self._on_session_ended(session, reason)
+
+    def _on_session_ended(self, session: LockstepSession, reason: str) -> None:
+        if self._session is session:
+            self._session = None
+            self.send({"op": "left", "reason": reason})
+
+    def _leave(self, request: client_messages.LeaveRequest) -> None:
+        if self._session is None:
+            raise DecodeError("leave: has not joined; there is nothing to leave")
+        self._session.leave()
+        self._session = None
+        self.send({"op": "leave"}, request)
+
+    # Runs, and the end of the connection
+
+    def notify_run(self, state: str, run_id: str) -> None:
+        """Send that a run has begun or ended, or that the link to its world is lost or back."""
+        if state == "begun":
+            self._defaults = MessageDefaults(self.source)
+            self.commanded.clear()
+        if self.authenticated:
+            self.send({"op": "run", "state": state, "run_id": run_id})
+
+    def close(self, connection_lost: bool = True) -> None:
+        """End everything that it has; a process in the lockstep whose connection is lost dies rather than leaves."""
+        if self._closed:
+            return
+        self._closed = True
+        for task in self._pending:
+            task.cancel()
+        for unsubscribe in self._subscriptions.values():
+            unsubscribe()
+        if self._session is not None:
+            self._session.leave(connection_lost)
+        self._outbox.close()
+        self._gateway.remove(self)

@@ -13,8 +13,7 @@ from zsim.contract.messages import Info
 from zsim.errors import DecodeError
 from zsim.runtime.agent import Agent, Output
 from zsim.transport.session import check_expression
-from zsim_bridges.gateway import stream_requests
-from zsim_bridges.gateway.client_messages import MessageDefaults, is_counted_key
+from zsim_bridges.gateway.client_messages import DoneRequest, JoinRequest, MessageDefaults, is_counted_key
 from zsim_bridges.gateway.run_access import RunAccess
 
 ANSWER_TIMEOUT_S = 10.0  # wall time after which a client that answers nothing in realtime leaves the lockstep
@@ -30,15 +29,10 @@ class LockstepSession(Agent):
 
     Args:
         name: process name of the participant, role.thing.
-        request: with which it joined.
-        run: that it joined.
         loop: of the client.
         send: sends the line of a gate; called on the loop.
 
     Attributes:
-        run: that it joined.
-        defaults: of its messages.
-        has_left: whether it has ended.
         connection_lost: whether its client went without leaving, so that its process counts as dead.
 
     Raises:
@@ -50,22 +44,32 @@ class LockstepSession(Agent):
     def __init__(
         self,
         name: str,
-        request: stream_requests.JoinRequest,
+        request: JoinRequest,
         run: RunAccess,
         loop: asyncio.AbstractEventLoop,
         send: Callable[[bytes], None],
     ) -> None:
         super().__init__()
-        info, reads = run.info, request.reads
-        for key in (*reads, *request.gates):
+        info, reads, gates = run.info, request.reads, request.gates
+        for key in (*reads, *gates):
             check_expression(key)
         self.name = name
         self.period_ns = round(request.period_s * 1e9)
-        _check(name, info, self.period_ns, request.gates)
-        for key in request.gates:
+        if not keys.PROCESS_NAME.fullmatch(name) or "." not in name.strip("."):
+            raise DecodeError(f"join: name is {name[:60]!r}; must be a role, a dot and a name of a-z 0-9 _ . -")
+        if self.period_ns <= 0 or self.period_ns % info.gate_ns:
+            must = f"must be a multiple of {info.gate_ns / 1e9:g}"
+            raise DecodeError(f"join: period_s is {self.period_ns / 1e9:g}; {must}")
+        if any("*" in key for key in gates):
+            raise DecodeError(
+                "join: gates has a wildcard; must be keys, of each of which a message comes at every gate"
+            )
+        for key in gates:
             run.check_known(key)
-        self.gate_keys = tuple(request.gates) or gate_keys_of(info, reads, name, run.required_processes)
-        self.reads = _with_gate_keys(reads, self.gate_keys)
+        self.gate_keys = tuple(gates) or gate_keys_of(info, reads, name, run.required_processes)
+        # A key that two expressions match would come twice.
+        missing = [key for key in self.gate_keys if not any(keys.matches(each, key) for each in reads)]
+        self.reads = tuple(dict.fromkeys((*reads, *missing)))
         self.counted = tuple(d.name for d in info.drones if any(_matches_sensors(each, d.name) for each in self.reads))
         self.run = run
         self.defaults = MessageDefaults(name)
@@ -99,7 +103,7 @@ class LockstepSession(Agent):
             self._gate_ns = t_ns
             self._send(line)
 
-    def answer_gate(self, request: stream_requests.DoneRequest) -> None:
+    def answer_gate(self, request: DoneRequest) -> None:
         """Answer the gate that waits; an error changes nothing, and the gate goes on waiting.
 
         Raises:
@@ -110,18 +114,22 @@ class LockstepSession(Agent):
             raise DecodeError("done: there is no gate to answer; wait for the next")
         if request.t_ns != self._gate_ns:
             raise DecodeError(f"done: t_ns is {request.t_ns}; must be {self._gate_ns}, the gate that came last")
+        counted: list[Output] = []  # by a done; they go out by the runner, the rest by the gateway
+        others: list[tuple[str, bytes]] = []
         with self.defaults.transaction():
-            payloads = [(each.key, self._payload(each)) for each in request.outputs]
-            counted = [Output(key, messages.decode(key, payload)) for key, payload in payloads if is_counted_key(key)]
-        self.run.publish([(key, payload) for key, payload in payloads if not is_counted_key(key)])
+            for key, value in ((output.key, output.value) for output in request.outputs):
+                is_counted = is_counted_key(key)
+                if not is_counted:
+                    self.run.check_writable(key)
+                payload = self.run.encode(key, self.defaults.fill(key, value, self._gate_ns))
+                if is_counted:
+                    counted.append(Output(key, messages.decode(key, payload)))
+                else:
+                    others.append((key, payload))
+        for key, payload in others:
+            self.run.publish(key, payload)
         self._gate_ns = NO_GATE_NS
         self._answers.put(counted)
-
-    def _payload(self, output: stream_requests.LockstepOutput) -> bytes:
-        """Return an output as a payload: what a done counts goes out by the runner, the rest by the gateway."""
-        if not is_counted_key(output.key):
-            self.run.check_writable(output.key)
-        return self.run.encode(output.key, self.defaults.fill(output.key, output.value, self._gate_ns))
 
     def leave(self, connection_lost: bool = False) -> None:
         """End a step that waits: the client is gone."""
@@ -143,20 +151,5 @@ def gate_keys_of(info: Info, reads: Sequence[str], name: str, required: Collecti
     return tuple(gate_keys) or (keys.CLOCK,)
 
 
-def _with_gate_keys(reads: Sequence[str], gates: Sequence[str]) -> tuple[str, ...]:
-    """Add the gate keys that no expression matches: a key that two expressions match would come twice."""
-    missing = [key for key in gates if not any(keys.matches(each, key) for each in reads)]
-    return tuple(dict.fromkeys((*reads, *missing)))
-
-
 def _matches_sensors(expression: str, drone: str) -> bool:
     return all(keys.matches(expression, keys.sensor(drone, kind)) for kind in (*keys.SENSORS, "status"))
-
-
-def _check(name: str, info: Info, period_ns: int, gates: Sequence[str]) -> None:
-    if not keys.PROCESS_NAME.fullmatch(name) or "." not in name.strip("."):
-        raise DecodeError(f"join: name is {name[:60]!r}; must be a role, a dot and a name of a-z 0-9 _ . -")
-    if period_ns <= 0 or period_ns % info.gate_ns:
-        raise DecodeError(f"join: period_s is {period_ns / 1e9:g}; must be a multiple of {info.gate_ns / 1e9:g}")
-    if any("*" in key for key in gates):
-        raise DecodeError("join: gates has a wildcard; must be keys, of each of which a message comes at every gate")

@@ -1,23 +1,26 @@
-"""What the gateway's clients can do in a run: read last values, publish, and send requests."""
+"""A run for the gateway's clients: the last value of every key, shared subscriptions, publications and requests."""
 
 import asyncio
 import threading
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any
 
 from zsim.contract import keys, messages
 from zsim.contract.framing import GateMessages, run_key_table
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import ControlAnswer
-from zsim.errors import DecodeError
+from zsim.errors import DecodeError, SessionError
 from zsim.runtime.participant import Participant
 from zsim.scenario import roles, scenario_file
 from zsim.scenario.roles import expected_processes
 from zsim.sensors.camera import CAMERAS
 from zsim.transport.session import RawSample, ReceivedSample, Session, check_expression
-from zsim.transport.traffic import Passed, Traffic
+from zsim.transport.traffic import Traffic
 from zsim_bridges.gateway.client_messages import (
+    ClientLimit,
     ForbiddenError,
     MessageDefaults,
     TooManyError,
@@ -28,10 +31,18 @@ from zsim_bridges.gateway.client_messages import (
     is_sound,
     json_to_payload,
 )
-from zsim_bridges.gateway.publications import LastValues
 
 TICK_S = 0.1  # how often health is published and a stop is noticed while nothing arrives
 REQUESTS_MAX = 64  # requests under way at once; each has a thread that waits for Zenoh
+ECHOES_MAX = 256  # of a key; a paused world returns none, and clients may go on
+DELETED = None
+OWN_BYTES_MAX = 64_000_000  # of the values on clients' own keys
+KEYS_MAX = 200_000  # kept; 1000 drones have about 12 000
+WAITING_MAX = 50_000  # messages of an expression that wait for the loop, unless said otherwise
+DELIVER_MAX = 500  # messages delivered before the other tasks of the loop run
+EXPRESSIONS_MAX = 2_000  # of all clients together; each is a subscription that the world's session checks
+
+Subscriber = Callable[[RawSample], None]
 
 
 class RunAccess:
@@ -80,32 +91,31 @@ class RunAccess:
         for expression in roles.LAST_VALUES:
             for sample in self.link.get(expression):
                 self._keep(self.values.add, sample)
-                if sample.key == keys.CLOCK:
-                    self._observer.update_clock(sample.payload)
 
     def receive_until_end(self, stopped: Callable[[], bool]) -> None:
         """Store what passes the world until the run is over or `stopped` returns true."""
-        assert self._traffic is not None
-        over = threading.Event()
-        ticker = threading.Thread(target=_tick, args=(self._traffic, over), name="tick", daemon=True)
+        traffic, over = self._traffic, threading.Event()
+        assert traffic is not None
+
+        def tick() -> None:
+            while not over.wait(TICK_S):
+                traffic.wake()
+
+        ticker = threading.Thread(target=tick, name="tick", daemon=True)
         ticker.start()
         try:
             while not self._observer.end_reason and not stopped():
-                self._add_passed(self._traffic.receive())
+                passed = traffic.receive()
+                self._observer.health.received += bool(passed)
+                for entry in passed:
+                    if isinstance(entry, GateMessages):
+                        self.values.add_gate(entry)
+                    else:
+                        self._keep(self.values.add_passed, entry)
                 self._observer.tick()
         finally:
             over.set()
             ticker.join()
-
-    def _add_passed(self, passed: Sequence[Passed]) -> None:
-        self._observer.health.received += bool(passed)
-        for entry in passed:
-            if isinstance(entry, GateMessages):
-                self.values.add_gate(entry)
-                continue
-            self._keep(self.values.add_passed, entry)
-            if entry.key == keys.CLOCK:
-                self._observer.update_clock(entry.payload)
 
     def _keep(self, add: Callable[[str, bytes], None], sample: RawSample | ReceivedSample) -> None:
         """Keep a last value; of what is no message, which anybody may publish, the one before stays."""
@@ -113,6 +123,8 @@ class RunAccess:
             add(sample.key, sample.payload)
         else:
             self.count_refused()
+        if sample.key == keys.CLOCK:
+            self._observer.update_clock(sample.payload)
 
     def close(self) -> None:
         """Give up requests that wait."""
@@ -121,25 +133,17 @@ class RunAccess:
     # By keys without the federation's name
 
     def put(self, key: str, value: Any, defaults: MessageDefaults) -> None:
-        """Publish plain data on a key, checked, with what it leaves out filled in.
-
-        Raises:
-            DecodeError: with key, field, value and what is allowed.
-            ForbiddenError: the key is reserved.
-            UnknownError: the run has no such drone or cluster.
-            SessionError: it is no key.
-        """
+        """Publish plain data on a key with what it leaves out filled in; for errors see `encode`, `check_writable`."""
         self.check_writable(key)
         with defaults.transaction():
             payload = self.encode(key, defaults.fill(key, value, self.now_ns))
-        self.publish([(key, payload)])
+        self.publish(key, payload)
 
-    def publish(self, checked: Sequence[tuple[str, bytes]]) -> None:
-        """Publish payloads that have been checked."""
-        for key, payload in checked:
-            self.link.put_sample(key, payload, messages.encoding(key))
-            if not keys.is_picture(key):  # nobody's last value: they are large, and the world keeps none either
-                self.values.add_own(key, payload)
+    def publish(self, key: str, payload: bytes, encoding: str = "") -> None:
+        """Publish a payload that has been checked; of an encoding that is not its key's where one is given."""
+        self.link.put_sample(key, payload, encoding or messages.encoding(key))
+        if not keys.is_picture(key):  # nobody's last value: they are large, and the world keeps none either
+            self.values.add_own(key, payload, encoding)
 
     def encode(self, key: str, value: Any) -> bytes:
         """Return plain data as the payload of a key on which clients may publish.
@@ -147,6 +151,8 @@ class RunAccess:
         Raises:
             DecodeError: with key, field, value and what is allowed.
             ForbiddenError: the key is reserved.
+            UnknownError: the run has no such drone or cluster.
+            SessionError: it is no key.
         """
         self._check_key(key)
         return json_to_payload(key, value)
@@ -160,22 +166,14 @@ class RunAccess:
             raise DecodeError(f"{key[:80]}: is no key of the contract; see docs/protocol.md")
 
     def check_writable(self, key: str) -> None:
-        """Refuse a key on which access control drops the gateway's messages.
-
-        Raises:
-            ForbiddenError: with those on which it does not.
-        """
+        """Raise a ForbiddenError for a key on which access control drops the gateway's messages."""
         if self._may_write is not None and not roles.permits(self._may_write, key):
             raise ForbiddenError(
                 f"{key[:80]}: the gateway's certificate lets it write on {', '.join(self._may_write)} only"
             )
 
     def check_known(self, key: str) -> None:
-        """Refuse a message of the contract about a drone or a cluster that the run does not have.
-
-        Raises:
-            UnknownError: with those that it has.
-        """
+        """Raise an UnknownError for a message of the contract about a drone or cluster that the run does not have."""
         kind, thing, _ = keys.parts(key.removeprefix("view/"))
         names = self._known_names.get(kind)
         if names is not None and (messages.type_of(key) or is_control_key(key)) and thing not in names:
@@ -184,11 +182,7 @@ class RunAccess:
             raise UnknownError(f"{key[:80]}: process is {thing[:60]!r}; must be 1 to 48 of a-z 0-9 _ . -")
 
     def camera_key(self, drone: str, camera: str) -> str:
-        """Return the key of a camera's pictures.
-
-        Raises:
-            UnknownError: with the drones that the run has, or the cameras of a drone.
-        """
+        """Return the key of a camera's pictures, or raise an UnknownError."""
         if camera not in CAMERAS:
             raise UnknownError(f"camera is {camera[:40]!r}; must be {' or '.join(CAMERAS)}")
         if drone not in self._known_names["drone"]:
@@ -196,18 +190,12 @@ class RunAccess:
         return keys.camera(drone, camera)
 
     def count_refused(self) -> None:
-        """Count a message that is not what its key promises."""
         self._observer.health.refused += 1
 
     async def request(
         self, key: str, op: str, args: dict[str, Any], source: str, timeout_s: float = 5.0
     ) -> ControlAnswer:
-        """Send a control request to whoever answers on a key.
-
-        Raises:
-            SessionError: it is no key.
-            TooManyError: REQUESTS_MAX others wait already.
-        """
+        """Send a control request to whoever answers on a key."""
         if "*" in key:
             raise DecodeError(f"{key[:80]!r}: is no key; a request goes to one, without wildcards")
         self.check_known(key)
@@ -216,46 +204,27 @@ class RunAccess:
     # By full keys, with the federation's name; keys of other federations too
 
     def last_samples(self, expression: str) -> list[RawSample]:
-        """Return the last values that a full expression matches."""
         return [
             RawSample("PUT", f"{self._prefix}{key}", payload, self.values.encoding(key), None)
             for key, payload in self.values.matching(expression, self._prefix)
         ]
 
     async def query(self, expression: str, parameters: str, payload: bytes, encoding: str) -> list[RawSample]:
-        """Return the answers to a Zenoh get on a full expression.
-
-        Raises:
-            SessionError: it is no key expression.
-            TooManyError: REQUESTS_MAX others wait already.
-        """
+        """Return the answers to a Zenoh get on a full expression."""
         return await self._in_thread(self.bare_link.query, expression, parameters, payload, encoding)
 
     def put_full_key(self, key: str, payload: bytes, encoding: str) -> None:
-        """Publish a payload on a full key.
-
-        Raises:
-            DecodeError: it is not the message that the contract puts there.
-            ForbiddenError: the key is reserved.
-            SessionError: it is no key.
-        """
+        """Publish a payload on a full key; a DecodeError says that it is not the message of the key."""
         own = self._federation_key(key)
-        if own is not None and messages.type_of(own) is not None:
-            messages.decode(own, payload)
         if own is None:
             self.bare_link.put_sample(key, payload, encoding)
             return
-        self.link.put_sample(own, payload, encoding)
-        if not keys.is_picture(own):
-            self.values.add_own(own, payload, encoding)
+        if messages.type_of(own) is not None:
+            messages.decode(own, payload)
+        self.publish(own, payload, encoding)
 
     def delete_full_key(self, key: str) -> None:
-        """Publish that a full key has no value any more.
-
-        Raises:
-            ForbiddenError: the key is reserved.
-            SessionError: it is no key.
-        """
+        """Publish that a full key has no value any more."""
         own = self._federation_key(key)
         self.bare_link.delete(key)
         if own is not None:
@@ -286,6 +255,229 @@ class RunAccess:
             self._pending -= 1
 
 
-def _tick(traffic: Traffic, over: threading.Event) -> None:
-    while not over.wait(TICK_S):
-        traffic.wake()
+class EchoFilter:
+    """Recognises values of clients that come back from the world after a newer value, by key.
+
+    After two values in a row the first comes back when the second is there already; after a value and its deletion
+    the value comes back. An echo that never comes is forgotten with the next of its key. Echoes are expected of
+    `keys_max` keys at most.
+    """
+
+    def __init__(self, keys_max: int) -> None:
+        self._keys_max = keys_max
+        self._waiting: dict[str, deque[int | None]] = {}
+
+    def add(self, key: str, payload: bytes) -> None:
+        """Expect the echo of a payload that is on its way to the world."""
+        if key in self._waiting or len(self._waiting) < self._keys_max:
+            self._waiting.setdefault(key, deque(maxlen=ECHOES_MAX)).append(hash(payload))
+
+    def add_deletion(self, key: str) -> None:
+        """Note that a key whose echoes are expected has no value any more."""
+        if key in self._waiting:
+            self._waiting[key].append(DELETED)
+
+    def is_stale(self, key: str, payload: bytes) -> bool:
+        """Return whether a payload from the world is an echo that a newer value or deletion has followed."""
+        waiting = [*self._waiting.get(key, ())]
+        if hash(payload) not in waiting:
+            return False
+        del self._waiting[key]
+        newer = waiting[waiting.index(hash(payload)) + 1 :]
+        if any(mark is not DELETED for mark in newer):
+            self._waiting[key] = deque(newer, maxlen=ECHOES_MAX)
+        return bool(newer)
+
+
+class LastValues:
+    """The last value of every key that has passed the world, or was published by clients here.
+
+    Args:
+        table: keys of the world's messages about the drones of the run, see `run_key_table`.
+    """
+
+    def __init__(self, table: tuple[str, ...]) -> None:
+        self._table = table
+        self._indices = {key: index for index, key in enumerate(self._table)}
+        self._payloads: dict[str, bytes] = {}
+        self._own_bytes = 0
+        self._lock = threading.Lock()  # clients' thread and the world's both add to what is counted
+        self._encodings: dict[str, tuple[bytes, str]] = {}
+        self._echoes = EchoFilter(KEYS_MAX)
+        self._of_gates: dict[int, tuple[GateMessages, int]] = {}
+
+    def add(self, key: str, payload: bytes) -> None:
+        with self._lock:
+            self._add(key, payload)
+
+    def add_own(self, key: str, payload: bytes, encoding: str = "") -> None:
+        """Store a message of a client here, which the world will return, too."""
+        with self._lock:
+            self._echoes.add(key, payload)
+            self._add(key, payload, encoding)
+
+    def add_passed(self, key: str, payload: bytes) -> None:
+        """Store one message that has passed the world."""
+        with self._lock:
+            if not self._echoes.is_stale(key, payload):
+                self._add(key, payload)
+
+    def _add(self, key: str, payload: bytes, encoding: str = "") -> None:
+        has_room = key in self._payloads or len(self._payloads) < KEYS_MAX
+        if messages.type_of(key) is None:
+            more = len(payload) - len(self._payloads.get(key, b""))
+            if not has_room or self._own_bytes + more > OWN_BYTES_MAX:
+                self._drop(key)  # no value is better than an old one
+                return
+            self._own_bytes += more
+        if has_room:
+            self._payloads[key] = payload
+            if encoding:
+                self._encodings[key] = (payload, encoding)
+
+    def drop(self, key: str) -> None:
+        """Forget the value of a key that is deleted here."""
+        with self._lock:
+            self._echoes.add_deletion(key)
+            self._drop(key)
+
+    def _drop(self, key: str) -> None:
+        dropped = self._payloads.pop(key, b"")
+        if messages.type_of(key) is None:
+            self._own_bytes -= len(dropped)
+        self._encodings.pop(key, None)
+
+    def encoding(self, key: str) -> str:
+        """Return the encoding of a key's last value."""
+        payload, encoding = self._encodings.get(key, (None, ""))
+        return encoding if encoding and payload == self._payloads.get(key) else messages.encoding(key)
+
+    def add_gate(self, gate: GateMessages) -> None:
+        """Store the world's messages of a gate, whose columns have been checked."""
+        for m, place in enumerate(gate.which.tolist()):
+            self._of_gates[place] = (gate, m)
+
+    def matching(self, expression: str, prefix: str = "") -> list[tuple[str, bytes]]:
+        """Return keys and payloads that an expression matches, in order of the keys.
+
+        Args:
+            expression: of keys with the prefix.
+            prefix: that is put before each key to compare it; what is returned is without it.
+        """
+        if "*" not in expression:
+            matching = [expression.removeprefix(prefix)] if expression.startswith(prefix) else []
+        else:
+            known = {*self._payloads, *(self._table[place] for place in list(self._of_gates))}  # filled by a thread
+            matching = sorted(key for key in known if keys.matches(expression, prefix + key))
+        return [(key, payload) for key in matching if (payload := self._payload(key)) is not None]
+
+    def _payload(self, key: str) -> bytes | None:
+        gate, m = self._of_gates.get(self._indices.get(key, -1), (None, 0))
+        return gate.payload(m) if gate else self._payloads.get(key)
+
+
+class SharedSubscriptions:
+    """Subscriptions that clients share, and that outlast the session of a run.
+
+    Args:
+        loop: on which everything but Zenoh's callbacks is called.
+        limit: of clients, in which streams count that are nothing but one subscription.
+        waiting_max: messages of an expression that wait for the loop; then the oldest go.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, limit: ClientLimit, waiting_max: int = WAITING_MAX) -> None:
+        self._loop = loop
+        self._limit = limit
+        self._waiting_max = waiting_max
+        self._link: Session | None = None
+        self._by_expression: dict[str, _SharedSubscription] = {}
+
+    def attach(self, link: Session) -> None:
+        self._link = link
+        for expression, shared in self._by_expression.items():
+            with suppress(SessionError):  # no right to read it; as from keys without publishers, nothing comes
+                shared.undeclare = link.declare_subscriber(expression, shared.on_publication)
+
+    def detach(self) -> None:
+        """Receive nothing until the next `attach`: the session closes."""
+        self._link = None
+        for shared in self._by_expression.values():
+            shared.undeclare = None
+
+    def subscribe(self, expression: str, subscriber: Subscriber) -> Callable[[], None]:
+        """Call a subscriber with every publication on an expression until the returned function is called.
+
+        Raises:
+            SessionError: it is no key expression.
+            TooManyError: there are EXPRESSIONS_MAX others.
+        """
+        shared = self._by_expression.get(expression)
+        if shared is None:
+            check_expression(expression)
+            if len(self._by_expression) >= EXPRESSIONS_MAX:
+                raise TooManyError(f"subscribe: there are {EXPRESSIONS_MAX} expressions already; take one of them")
+            shared = self._by_expression[expression] = _SharedSubscription(self._loop, self._waiting_max)
+            if self._link is not None:
+                shared.undeclare = self._link.declare_subscriber(expression, shared.on_publication)
+        shared.subscribers[subscriber] = None
+
+        def unsubscribe() -> None:
+            shared = self._by_expression.get(expression)
+            if shared is None:
+                return
+            shared.subscribers.pop(subscriber, None)
+            if not shared.subscribers:
+                del self._by_expression[expression]
+                if shared.undeclare is not None:
+                    shared.undeclare()
+
+        return unsubscribe
+
+    def subscribe_stream(self, expression: str, subscriber: Subscriber) -> Callable[[], None]:
+        """Subscribe for a connection that has nothing else, and count it among the clients.
+
+        Raises:
+            SessionError: it is no key expression.
+            TooManyError: the limit of clients or of expressions is reached.
+        """
+        self._limit.enter()
+        try:
+            unsubscribe = self.subscribe(expression, subscriber)
+        except BaseException:
+            self._limit.leave()
+            raise
+
+        def leave() -> None:
+            unsubscribe()
+            self._limit.leave()
+
+        return leave
+
+
+class _SharedSubscription:
+    """One subscription: publications that arrive close together are delivered together."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, waiting_max: int) -> None:
+        self._loop = loop
+        self._waiting: deque[RawSample] = deque(maxlen=waiting_max)
+        self._scheduled = False
+        self.subscribers: dict[Subscriber, None] = {}
+        self.undeclare: Callable[[], None] | None = None
+
+    def on_publication(self, sample: RawSample) -> None:
+        """Store a publication, in a thread of Zenoh's."""
+        self._waiting.append(sample)
+        if not self._scheduled:
+            self._scheduled = True
+            with suppress(RuntimeError):  # the loop is closed
+                self._loop.call_soon_threadsafe(self._deliver)
+
+    def _deliver(self) -> None:
+        self._scheduled = False
+        for _ in range(min(DELIVER_MAX, len(self._waiting))):
+            sample = self._waiting.popleft()
+            for subscriber in list(self.subscribers):
+                subscriber(sample)
+        if self._waiting and not self._scheduled:
+            self._scheduled = True
+            self._loop.call_soon(self._deliver)

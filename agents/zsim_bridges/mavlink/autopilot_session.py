@@ -16,26 +16,17 @@ from zsim.math.rotation import LEVEL, Vector
 from zsim.scenario.scenario import Scenario
 from zsim.schema.quantities import G_M_S2
 from zsim_bridges.mavlink import dialect
-from zsim_bridges.mavlink.dialect import LAYOUTS, UINT16_UNKNOWN, attitude_ned, frd, ned
-from zsim_bridges.mavlink.enums import (
-    FORCE,
-    TYPE_ONBOARD_CONTROLLER,
-    Autopilot,
-    BaseMode,
-    Cmd,
-    LandedState,
-    MavFrame,
-    Result,
-    SystemStatus,
-    TypeMask,
-)
+from zsim_bridges.mavlink.dialect import Autopilot, Cmd, LandedState, TypeMask, frd, ned
 from zsim_bridges.mavlink.frame import Link, Parser, Received, Signing
 from zsim_bridges.mavlink.personality import COPTER_MODES, PX4_MODES, FlightMode
-from zsim_bridges.vehicle_links.aircraft_readings import STILL, AircraftPose, AircraftReadings, ClockOffset
-from zsim_bridges.vehicle_links.driver_options import DriverOptions
+from zsim_bridges.vehicle_links.driver import DriverOptions
 from zsim_bridges.vehicle_links.vehicle_session import (
+    STILL,
     Action,
+    AircraftPose,
+    AircraftReadings,
     AircraftState,
+    ClockOffset,
     Demand,
     LinkFigures,
     UdpChannel,
@@ -74,15 +65,13 @@ DOP_M = 2.0  # m for a dilution of 1, usual for a single frequency
 
 
 class ExternalControl(NamedTuple):
-    """An autopilot whose velocity is controlled from outside: the mode for that, and what leads to it.
+    """How an autopilot's velocity is controlled from outside, and what leads there.
 
     Attributes:
-        custom_mode: as its heartbeats show it.
-        parameters: of DO_SET_MODE that leads there, from the second on.
+        custom_mode: the mode for that, in its heartbeats; parameters: of DO_SET_MODE, from the second on.
         takes_off: whether it takes off in this mode; else in a mode of its own.
         own: further modes while nobody but this driver has control: it may be led back from them.
         landing: in which it lands, be it for this driver, its pilot, or its own failsafe.
-        rates_hz: of the messages that are requested.
     """
 
     custom_mode: int
@@ -117,9 +106,7 @@ class AutopilotSession(VehicleSession):
     """The session with one vehicle.
 
     Args:
-        channel: its UDP port.
         origin: of W: latitude, longitude [deg], height [m].
-        takeoff_height_m: over the ground.
         system: its system id; 0 for the first autopilot that shows itself.
         local_origin_m: origin of its local frame [m; W]; None for what it reports.
         key: of signatures, both ways; None for none.
@@ -164,7 +151,6 @@ class AutopilotSession(VehicleSession):
         system: int = 0,
         key: bytes | None = None,
     ) -> "AutopilotSession":
-        """Return the session of a driver in a run."""
         origin = info.origin.latitude_deg, info.origin.longitude_deg, info.origin.height_m
         height_m = scenario.drone(options.drone).takeoff_height_m
         return cls(channel, origin, height_m, system, options.origin_m, key)
@@ -172,7 +158,6 @@ class AutopilotSession(VehicleSession):
     # From the vehicle
 
     def receive(self, channel: int, datagram: bytes, now_ns: int) -> None:
-        """Take a datagram of the vehicle."""
         for received in self._parser.feed(datagram):
             if self._is_vehicle(received):
                 self._loss.add(received.seq)
@@ -208,25 +193,20 @@ class AutopilotSession(VehicleSession):
                     self._telemetry.add_round_trip(now_ns - message.ts1, now_ns)
             case dialect.Statustext():
                 self.texts.append(f"the vehicle reports: {message.text}")
-            case dialect.CommandAck() if message.result not in (Result.ACCEPTED, Result.IN_PROGRESS):
+            case dialect.CommandAck() if message.result not in (dialect.Result.ACCEPTED, dialect.Result.IN_PROGRESS):
                 self.texts.append(f"the vehicle answers command {message.command} with MAV_RESULT {message.result}")
             case _:
                 self._autopilot.receive(message)
                 self._telemetry.receive(message, now_ns)
-                self._report_mode(self._autopilot)
-
-    def _report_mode(self, autopilot: "AutopilotState") -> None:
-        """Print when somebody else takes the vehicle over in the air, and when it is given back."""
-        taken_over = autopilot.is_taken_over(self._action == "land")
-        if taken_over != self._taken_over:
-            self._taken_over = taken_over
-            what = "somebody else has control" if taken_over else "it is given back"
-            self.texts.append(f"{what} (mode {autopilot.custom_mode:#x})")
+                taken_over = self._autopilot.is_taken_over(self._action == "land")
+                if taken_over != self._taken_over:  # in the air, by somebody else
+                    self._taken_over = taken_over
+                    what = "somebody else has control" if taken_over else "it is given back"
+                    self.texts.append(f"{what} (mode {self._autopilot.custom_mode:#x})")
 
     # To the vehicle
 
     def advance(self, now_ns: int, demand: Demand) -> Iterator[tuple[int, bytes]]:
-        """Yield the datagrams that are due."""
         self._action = demand.action
         for message in self._messages(now_ns, demand):
             yield 0, self._link.pack(message)
@@ -238,7 +218,9 @@ class AutopilotSession(VehicleSession):
             self._heartbeat_ns = now_ns
             if self._signing:
                 self._signing.advance(self._unix_s())
-            yield dialect.Heartbeat(TYPE_ONBOARD_CONTROLLER, Autopilot.INVALID, 0, 0, SystemStatus.ACTIVE, 3)
+            yield dialect.Heartbeat(
+                dialect.TYPE_ONBOARD_CONTROLLER, Autopilot.INVALID, 0, 0, dialect.SystemStatus.ACTIVE, 3
+            )
         autopilot = self._autopilot
         if autopilot is None:
             return
@@ -248,11 +230,11 @@ class AutopilotSession(VehicleSession):
         for kind, rate_hz in autopilot.control.rates_hz.items():
             if now_ns - max(self._newest_ns.get(kind, 0), self._requested_ns.get(kind, 0)) > REQUEST_NS:
                 self._requested_ns[kind] = now_ns
-                yield autopilot.command(Cmd.SET_MESSAGE_INTERVAL, LAYOUTS[kind].id, 1e6 / rate_hz)
+                yield autopilot.command(Cmd.SET_MESSAGE_INTERVAL, dialect.LAYOUTS[kind].id, 1e6 / rate_hz)
         kind = dialect.GpsGlobalOrigin
         if not self._telemetry.has_origin and now_ns - self._requested_ns.get(kind, 0) > REQUEST_NS:
             self._requested_ns[kind] = now_ns
-            yield autopilot.command(Cmd.REQUEST_MESSAGE, LAYOUTS[kind].id)
+            yield autopilot.command(Cmd.REQUEST_MESSAGE, dialect.LAYOUTS[kind].id)
         yield from self._sequence.advance(now_ns, demand, autopilot)
 
     # What is known
@@ -284,15 +266,7 @@ class AutopilotSession(VehicleSession):
 
 
 class AutopilotState:
-    """What an autopilot tells of its flight.
-
-    Attributes:
-        address: its system and component.
-        control: how it is controlled.
-        armed, custom_mode: by its last heartbeat.
-        landed: its MAV_LANDED_STATE.
-        sea_height_m: over the sea, by its GPS.
-    """
+    """What an autopilot tells of its flight; `landed` is its MAV_LANDED_STATE."""
 
     def __init__(self, address: tuple[int, int], control: ExternalControl) -> None:
         self.address = address
@@ -304,12 +278,11 @@ class AutopilotState:
         self._terminated = False
 
     def receive(self, message: Any) -> None:
-        """Take a message."""
         match message:
             case dialect.Heartbeat():
-                self.armed = bool(message.base_mode & BaseMode.ARMED)
+                self.armed = bool(message.base_mode & dialect.BaseMode.ARMED)
                 self.custom_mode = message.custom_mode
-                self._terminated = message.system_status == SystemStatus.TERMINATED
+                self._terminated = message.system_status == dialect.SystemStatus.TERMINATED
             case dialect.ExtendedSysState():
                 self.landed = message.landed_state
             case dialect.GlobalPositionInt():
@@ -327,7 +300,6 @@ class AutopilotState:
 
     @property
     def is_controlled(self) -> bool:
-        """Whether it is in the mode in which it is controlled from outside."""
         return self.custom_mode == self.control.custom_mode
 
     def command(self, number: int, *parameters: float) -> dialect.CommandLong:
@@ -357,9 +329,6 @@ class DemandSequence:
 
     Commands are repeated until the telemetry shows their effect; setpoints are sent at once when they change, and
     repeated while they hold.
-
-    Args:
-        takeoff_height_m: over the ground.
     """
 
     def __init__(self, takeoff_height_m: float) -> None:
@@ -370,7 +339,6 @@ class DemandSequence:
         self._setpoint_ns = self._stream_ns = 0
 
     def advance(self, now_ns: int, demand: Demand, autopilot: AutopilotState) -> Iterator[Any]:
-        """Yield the messages that are due."""
         if demand.action != self._action:
             self._action = demand.action
             self._commanded_ns.clear()
@@ -384,7 +352,7 @@ class DemandSequence:
             case "land" if autopilot.landed not in (LandedState.LANDING, LandedState.ON_GROUND):
                 yield from self._repeat("land", now_ns, autopilot.command(Cmd.NAV_LAND, *HERE, 0.0))
             case "kill":
-                kill = autopilot.command(Cmd.COMPONENT_ARM_DISARM, 0, FORCE)
+                kill = autopilot.command(Cmd.COMPONENT_ARM_DISARM, 0, dialect.FORCE)
                 yield from self._repeat("kill", now_ns, kill, KILL_REPEAT_NS if autopilot.armed else REPEAT_NS)
 
     def _take_off(self, now_ns: int, autopilot: AutopilotState) -> Iterator[Any]:
@@ -406,36 +374,30 @@ class DemandSequence:
             self._stream_ns = now_ns
         if age_ns >= (CHANGED_NS if demand != self._setpoint else SETPOINT_NS):
             self._setpoint, self._setpoint_ns = demand, now_ns
-            yield setpoint(demand, autopilot)
+            flies = demand.action == "fly"
+            vx, vy, vz = ned(demand.velocity_m_s if flies else STILL)
+            yield dialect.SetPositionTargetLocalNed(
+                0,
+                *autopilot.address,
+                dialect.MavFrame.LOCAL_NED,
+                VELOCITY_AND_YAW_RATE,
+                vx=vx,
+                vy=vy,
+                vz=vz,
+                yaw_rate=-demand.yaw_rate_rad_s if flies else 0.0,
+            )
         streamed = now_ns - self._stream_ns >= STREAMED_NS
         if streamed and autopilot.landed == LandedState.IN_AIR and not autopilot.is_controlled:
             yield from self._enter_mode(now_ns, autopilot)
 
     def _enter_mode(self, now_ns: int, autopilot: AutopilotState) -> Iterator[Any]:
-        enter = autopilot.command(Cmd.DO_SET_MODE, BaseMode.CUSTOM, *autopilot.control.parameters)
+        enter = autopilot.command(Cmd.DO_SET_MODE, dialect.BaseMode.CUSTOM, *autopilot.control.parameters)
         return self._repeat("mode", now_ns, enter)
 
     def _repeat(self, name: str, now_ns: int, message: Any, period_ns: int = REPEAT_NS) -> Iterator[Any]:
         if now_ns - self._commanded_ns.get(name, -REPEAT_NS) >= period_ns:
             self._commanded_ns[name] = now_ns
             yield message
-
-
-def setpoint(demand: Demand, autopilot: AutopilotState) -> dialect.SetPositionTargetLocalNed:
-    """Return the setpoint of a velocity and a yaw rate; zero, unless the demand is to fly."""
-    flies = demand.action == "fly"
-    vx, vy, vz = ned(demand.velocity_m_s if flies else STILL)
-    system, component = autopilot.address
-    return dialect.SetPositionTargetLocalNed(
-        target_system=system,
-        target_component=component,
-        coordinate_frame=MavFrame.LOCAL_NED,
-        type_mask=VELOCITY_AND_YAW_RATE,
-        vx=vx,
-        vy=vy,
-        vz=vz,
-        yaw_rate=-demand.yaw_rate_rad_s if flies else 0.0,
-    )
 
 
 class TelemetryReadings(AircraftReadings):
@@ -446,7 +408,6 @@ class TelemetryReadings(AircraftReadings):
         local_origin_m: origin of its local frame [m; W]; None for what its GPS_GLOBAL_ORIGIN says, or that of W.
 
     Attributes:
-        battery_percent: of its charge.
         clock, unix_clock: of messages stamped with the time since its start, and with the time since 1970.
         has_origin: whether the origin of its local frame is known.
     """
@@ -460,48 +421,62 @@ class TelemetryReadings(AircraftReadings):
         self._q_WB, self._w_WB_B = LEVEL, STILL
         self._flow_ns = self._measured_flow_ns = -FLOW_LOST_NS
         self._pressure_pa = 0.0
-        self._handlers = {
-            dialect.AttitudeQuaternion: self._on_attitude,
-            dialect.LocalPositionNed: self._on_position,
-            dialect.HighresImu: self._on_imu,
-            dialect.ScaledImu: self._on_scaled_imu,
-            dialect.ScaledPressure: self._on_pressure,
-            dialect.GpsRawInt: self._on_gps,
-            dialect.GpsGlobalOrigin: self._on_origin,
-            dialect.OpticalFlow: self._on_flow,
-            dialect.DistanceSensor: self._on_distance,
-            dialect.SysStatus: self._on_system,
-        }
 
     def add_round_trip(self, duration_ns: int, now_ns: int) -> None:
-        """Take how long a question for the vehicle's time took."""
         self.clock.add_round_trip(duration_ns, now_ns)
         self.unix_clock.add_round_trip(duration_ns, now_ns)
 
-    def receive(self, message: Any, now_ns: int) -> bool:
-        """Take a message that arrives now; return whether it is one that is read here, and finite."""
-        handler = self._handlers.get(type(message))
-        values = (getattr(message, name) for name in message.__struct_fields__)
-        if handler is None or not all(math.isfinite(value) for value in values if isinstance(value, float)):
-            return False
-        handler(message, now_ns)
-        return True
+    def receive(self, m: Any, now_ns: int) -> None:
+        """Read a message that arrives now, if it is finite."""
+        values = (getattr(m, name) for name in m.__struct_fields__)
+        if not all(math.isfinite(value) for value in values if isinstance(value, float)):
+            return
+        match m:
+            case dialect.AttitudeQuaternion():
+                q = dialect.attitude_ned((m.q1, m.q2, m.q3, m.q4))
+                length = math.hypot(*q)
+                if length > 0.5:  # else it is no attitude at all
+                    w, x, y, z = (part / length for part in q)
+                    self._q_WB, self._w_WB_B = (w, x, y, z), frd((m.rollspeed, m.pitchspeed, m.yawspeed))
+            case dialect.LocalPositionNed():
+                self._on_position(m, now_ns)
+            case dialect.GpsGlobalOrigin() if not self.has_origin:
+                place = m.latitude / 1e7, m.longitude / 1e7, m.altitude / 1e3
+                x, y, z = geodetic_to_enu(place, self._origin).tolist()
+                self._local_origin_m = (x, y, z)
+                self.has_origin = True
+            case dialect.SysStatus() if m.battery_remaining >= 0:  # -1: it does not know
+                self.battery_percent = float(min(100, m.battery_remaining))
+            case dialect.HighresImu():
+                taken_ns, updated = self._since_1970(m, now_ns), m.fields_updated
+                if updated & ACCEL_GYRO == ACCEL_GYRO:
+                    self.read("imu", taken_ns, frd((m.xacc, m.yacc, m.zacc)), frd((m.xgyro, m.ygyro, m.zgyro)))
+                if updated & MAG == MAG:
+                    self._read_field(taken_ns, UT_PER_GAUSS, m)
+                if updated & PRESSURE:
+                    self._read_new_pressure(taken_ns, PA_PER_HPA * m.abs_pressure)
+            case dialect.ScaledImu():  # of ArduPilot: mg, mrad/s, mgauss
+                taken_ns, g = self._since_boot(m, now_ns), G_M_S2 / 1e3
+                accel, gyro = (g * m.xacc, g * m.yacc, g * m.zacc), (m.xgyro / 1e3, m.ygyro / 1e3, m.zgyro / 1e3)
+                self.read("imu", taken_ns, frd(accel), frd(gyro))
+                if m.xmag or m.ymag or m.zmag:
+                    self._read_field(taken_ns, UT_PER_GAUSS / 1e3, m)
+            case dialect.ScaledPressure():
+                self._read_new_pressure(self._since_boot(m, now_ns), PA_PER_HPA * m.press_abs)
+            case dialect.GpsRawInt():
+                self._on_gps(m, now_ns)
+            case dialect.OpticalFlow():
+                taken_ns = self._measured_flow_ns = self._since_1970(m, now_ns)
+                self.read("flow", taken_ns, (m.flow_comp_m_x, -m.flow_comp_m_y, self.climb_m_s), m.quality / 255.0)
+            case dialect.DistanceSensor() if m.orientation == DOWNWARD:
+                valid = m.min_distance <= m.current_distance <= m.max_distance
+                self.read("sonar", self._since_boot(m, now_ns), m.current_distance / 100.0, valid)
 
     def _since_boot(self, m: Any, now_ns: int) -> int:
-        """Return when a message was made, by the clock of this process."""
         return self.clock.taken_ns(m.time_boot_ms * 1_000_000, now_ns)
 
     def _since_1970(self, m: Any, now_ns: int) -> int:
         return self.unix_clock.taken_ns(m.time_usec * 1_000, now_ns)
-
-    # State
-
-    def _on_attitude(self, m: Any, now_ns: int) -> None:
-        q = attitude_ned((m.q1, m.q2, m.q3, m.q4))
-        length = math.hypot(*q)
-        if length > 0.5:  # else it is no attitude at all
-            w, x, y, z = (part / length for part in q)
-            self._q_WB, self._w_WB_B = (w, x, y, z), frd((m.rollspeed, m.pitchspeed, m.yawspeed))
 
     def _on_position(self, m: Any, now_ns: int) -> None:
         x, y, z = ned((m.x, m.y, m.z))
@@ -515,40 +490,8 @@ class TelemetryReadings(AircraftReadings):
             forward, left = vx * math.cos(yaw) + vy * math.sin(yaw), vy * math.cos(yaw) - vx * math.sin(yaw)
             self.read("flow", taken_ns, (forward, left, vz), 1.0)
 
-    def _on_origin(self, m: Any, now_ns: int) -> None:
-        if not self.has_origin:
-            x, y, z = geodetic_to_enu((m.latitude / 1e7, m.longitude / 1e7, m.altitude / 1e3), self._origin).tolist()
-            self._local_origin_m = (x, y, z)
-            self.has_origin = True
-
-    def _on_system(self, m: Any, now_ns: int) -> None:
-        if m.battery_remaining >= 0:  # -1: it does not know
-            self.battery_percent = float(min(100, m.battery_remaining))
-
-    # Sensors
-
-    def _on_imu(self, m: Any, now_ns: int) -> None:
-        taken_ns, updated = self._since_1970(m, now_ns), m.fields_updated
-        if updated & ACCEL_GYRO == ACCEL_GYRO:
-            self.read("imu", taken_ns, frd((m.xacc, m.yacc, m.zacc)), frd((m.xgyro, m.ygyro, m.zgyro)))
-        if updated & MAG == MAG:
-            self._read_field(taken_ns, UT_PER_GAUSS, m)
-        if updated & PRESSURE:
-            self._read_new_pressure(taken_ns, PA_PER_HPA * m.abs_pressure)
-
-    def _on_scaled_imu(self, m: Any, now_ns: int) -> None:
-        """Take what ArduPilot sends: mg, mrad/s, mgauss."""
-        taken_ns, g = self._since_boot(m, now_ns), G_M_S2 / 1e3
-        accel, gyro = (g * m.xacc, g * m.yacc, g * m.zacc), (m.xgyro / 1e3, m.ygyro / 1e3, m.zgyro / 1e3)
-        self.read("imu", taken_ns, frd(accel), frd(gyro))
-        if m.xmag or m.ymag or m.zmag:
-            self._read_field(taken_ns, UT_PER_GAUSS / 1e3, m)
-
     def _read_field(self, taken_ns: int, unit_ut: float, m: Any) -> None:
         self.read("mag", taken_ns, frd((unit_ut * m.xmag, unit_ut * m.ymag, unit_ut * m.zmag)))
-
-    def _on_pressure(self, m: Any, now_ns: int) -> None:
-        self._read_new_pressure(self._since_boot(m, now_ns), PA_PER_HPA * m.press_abs)
 
     def _read_new_pressure(self, taken_ns: int, pressure_pa: float) -> None:
         if pressure_pa != self._pressure_pa:
@@ -560,16 +503,7 @@ class TelemetryReadings(AircraftReadings):
         if (place, m.time_usec) == self._fix:
             return
         self._fix = place, m.time_usec
-        sigma_m = m.h_acc / 1e3 or (DOP_M * m.eph / 100.0 if m.eph != UINT16_UNKNOWN else 0.0)
+        sigma_m = m.h_acc / 1e3 or (DOP_M * m.eph / 100.0 if m.eph != dialect.UINT16_UNKNOWN else 0.0)
         course = math.radians(m.cog / 100.0)
         values = self.gps_values(place, m.vel / 100.0, course, sigma_m, min(m.fix_type, 3), m.satellites_visible)
         self.read("gps", self._since_1970(m, now_ns), *values)
-
-    def _on_flow(self, m: Any, now_ns: int) -> None:
-        taken_ns = self._measured_flow_ns = self._since_1970(m, now_ns)
-        self.read("flow", taken_ns, (m.flow_comp_m_x, -m.flow_comp_m_y, self.climb_m_s), m.quality / 255.0)
-
-    def _on_distance(self, m: Any, now_ns: int) -> None:
-        if m.orientation == DOWNWARD:
-            valid = m.min_distance <= m.current_distance <= m.max_distance
-            self.read("sonar", self._since_boot(m, now_ns), m.current_distance / 100.0, valid)

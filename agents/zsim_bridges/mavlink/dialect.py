@@ -1,4 +1,4 @@
-"""MAVLink's messages, of the dialects common and ardupilotmega, as far as vehicles and their clients use them.
+"""MAVLink's messages and enumerations, of common and ardupilotmega, as far as vehicles and their clients use them.
 
 `dialect.Heartbeat(type=2)` is a HEARTBEAT, a record with the fields of its definition. The table has the form that
 `wire_table` describes, and the units of the definitions; a default is the definition's value for "not known". At the
@@ -12,6 +12,7 @@ https://mavlink.io/en/services/mission.html#mission_item_int for whole numbers.
 
 import math
 from binascii import crc_hqx
+from enum import IntEnum, IntFlag
 from operator import attrgetter
 from struct import calcsize
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,177 @@ import msgspec
 
 from zsim.math.rotation import Quaternion, Vector
 from zsim_bridges.vehicle_links.wire_table import Entry, WireLayout, read_table
+
+
+class Cmd(IntEnum):
+    """MAV_CMD."""
+
+    NAV_WAYPOINT = 16
+    NAV_LOITER_UNLIM = 17
+    NAV_LOITER_TIME = 19
+    NAV_RETURN_TO_LAUNCH = 20
+    NAV_LAND = 21
+    NAV_TAKEOFF = 22
+    NAV_DELAY = 93
+    CONDITION_YAW = 115
+    DO_SET_MODE = 176
+    DO_JUMP = 177
+    DO_CHANGE_SPEED = 178
+    DO_SET_HOME = 179
+    DO_FLIGHTTERMINATION = 185
+    DO_REPOSITION = 192
+    DO_PAUSE_CONTINUE = 193
+    DO_FENCE_ENABLE = 207
+    DO_SET_MISSION_CURRENT = 224
+    PREFLIGHT_REBOOT_SHUTDOWN = 246
+    MISSION_START = 300
+    COMPONENT_ARM_DISARM = 400
+    GET_HOME_POSITION = 410
+    GET_MESSAGE_INTERVAL = 510
+    SET_MESSAGE_INTERVAL = 511
+    REQUEST_MESSAGE = 512
+    REQUEST_AUTOPILOT_CAPABILITIES = 520
+    FENCE_RETURN_POINT = 5000
+    FENCE_POLYGON_INCLUSION = 5001
+    FENCE_POLYGON_EXCLUSION = 5002
+    FENCE_CIRCLE_INCLUSION = 5003
+    FENCE_CIRCLE_EXCLUSION = 5004
+
+
+Result = IntEnum("Result", "ACCEPTED TEMPORARILY_REJECTED DENIED UNSUPPORTED FAILED IN_PROGRESS", start=0)
+"""MAV_RESULT."""
+
+
+Severity = IntEnum("Severity", "EMERGENCY ALERT CRITICAL ERROR WARNING NOTICE INFO", start=0)
+"""MAV_SEVERITY."""
+
+
+class MissionResult(IntEnum):
+    """MAV_MISSION_RESULT."""
+
+    ACCEPTED = 0
+    UNSUPPORTED_FRAME = 2
+    UNSUPPORTED = 3
+    NO_SPACE = 4
+    INVALID = 5
+    INVALID_SEQUENCE = 13
+    OPERATION_CANCELLED = 15
+
+
+MavFrame = IntEnum(
+    "MavFrame",
+    "GLOBAL LOCAL_NED MISSION GLOBAL_RELATIVE_ALT LOCAL_ENU GLOBAL_INT GLOBAL_RELATIVE_ALT_INT "
+    "LOCAL_OFFSET_NED BODY_NED BODY_OFFSET_NED GLOBAL_TERRAIN_ALT GLOBAL_TERRAIN_ALT_INT BODY_FRD",
+    start=0,
+)
+"""MAV_FRAME."""
+
+
+class Autopilot(IntEnum):
+    """MAV_AUTOPILOT."""
+
+    ARDUPILOTMEGA = 3
+    INVALID = 8
+    PX4 = 12
+
+
+class BaseMode(IntFlag):
+    """MAV_MODE_FLAG."""
+
+    CUSTOM = 1
+    AUTO = 4
+    GUIDED = 8
+    STABILIZE = 16
+    MANUAL_INPUT = 64
+    ARMED = 128
+
+
+class SystemStatus(IntEnum):
+    """MAV_STATE."""
+
+    STANDBY = 3
+    ACTIVE = 4
+    CRITICAL = 5
+    EMERGENCY = 6
+    TERMINATED = 8
+
+
+LandedState = IntEnum("LandedState", "UNDEFINED ON_GROUND IN_AIR TAKEOFF LANDING", start=0)
+"""MAV_LANDED_STATE."""
+
+
+class SensorBit(IntFlag):
+    """MAV_SYS_STATUS_SENSOR: the sensors and parts that a vehicle here has."""
+
+    GYRO = 0x01
+    ACCEL = 0x02
+    MAG = 0x04
+    BARO = 0x08
+    GPS = 0x20
+    FLOW = 0x40
+    LASER_POSITION = 0x100
+    RATE_CONTROL = 0x400
+    ATTITUDE_CONTROL = 0x800
+    YAW_POSITION = 0x1000
+    ALTITUDE_CONTROL = 0x2000
+    POSITION_CONTROL = 0x4000
+    MOTORS = 0x8000
+    AHRS = 0x200000
+    BATTERY = 0x2000000
+    PREARM_CHECK = 0x10000000
+
+
+class Capability(IntFlag):
+    """MAV_PROTOCOL_CAPABILITY."""
+
+    MISSION_FLOAT = 1
+    PARAM_FLOAT = 2
+    MISSION_INT = 4
+    COMMAND_INT = 8
+    PARAM_ENCODE_BYTEWISE = 16
+    SET_ATTITUDE_TARGET = 64
+    SET_POSITION_TARGET_LOCAL_NED = 128
+    SET_POSITION_TARGET_GLOBAL_INT = 256
+    FLIGHT_TERMINATION = 2048
+    MAVLINK2 = 8192
+    MISSION_FENCE = 16384
+
+
+TypeMask = IntFlag("TypeMask", "X Y Z VX VY VZ AX AY AZ FORCE YAW YAW_RATE")
+"""POSITION_TARGET_TYPEMASK: the ignored parts of a setpoint."""
+
+
+class AttitudeMask(IntFlag):
+    """ATTITUDE_TARGET_TYPEMASK: the ignored parts of a setpoint."""
+
+    YAW_RATE = 4
+    THRUST = 64
+    ATTITUDE = 128
+
+
+POS_HORIZ_ABS, PRED_POS_HORIZ_ABS = 16, 512  # ESTIMATOR_STATUS_FLAGS, and EKF_STATUS_FLAGS of ArduPilot
+ALL_ESTIMATED = 0x37F  # attitude, velocities, positions relative, absolute and predicted, height over the ground
+
+
+class ParamType(IntEnum):
+    """MAV_PARAM_TYPE."""
+
+    UINT8 = 1
+    INT8 = 2
+    UINT16 = 3
+    INT16 = 4
+    UINT32 = 5
+    INT32 = 6
+    REAL32 = 9
+
+
+NO_GPS, NO_FIX = 0, 1  # GPS_FIX_TYPE
+FORCE = 21196.0  # param2 of COMPONENT_ARM_DISARM: without checks, also in flight
+TYPE_QUADROTOR, TYPE_ONBOARD_CONTROLLER = 2, 18  # MAV_TYPE
+COMPONENT_AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
+MISSION, FENCE = 0, 1  # MAV_MISSION_TYPE
+ALL_MISSION_TYPES = 255
+
 
 DEGREES, LOCAL_M = 1e-7, 1e-4  # unit of x and y in messages that have them as whole numbers
 INT32_UNKNOWN = 2**31 - 1  # INT32_MAX: NaN among whole numbers of 32 bits
@@ -188,11 +360,8 @@ class MessageLayout(WireLayout):
     """How messages of one kind lie in a payload: larger fields first, extensions as they are defined.
 
     Attributes:
-        kind: class of the messages.
-        id, name: of the definition.
         crc_extra: sums up the definition, so that sides with different ones do not understand each other.
-        size: with the extensions [bytes].
-        base_size: without them, as in MAVLink 1.
+        size, base_size: with the extensions [bytes], and without them, as in MAVLink 1.
         wire_order: names of the fields as they lie in a payload.
     """
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from zsim.contract.run_messages import Event
 from zsim.math.rotation import Vector
-from zsim_bridges.mavlink.enums import Cmd, Severity
+from zsim_bridges.mavlink.dialect import Cmd, Severity
 from zsim_bridges.mavlink.mission import PlanItem, place_of
 from zsim_bridges.mavlink.personality import FenceAction, FlightMode, Parameters
 from zsim_bridges.mavlink.telemetry import BREACH_ALTITUDE, BREACH_BOUNDARY, BREACH_NONE, TelemetrySource
@@ -26,10 +26,8 @@ class DroneWatch:
     """Watches one drone, reports changes, and acts at its fence.
 
     Args:
-        drone: its name.
         source: name of this process, whose commands may be refused.
         seen: state and flight of the drone; the breach of its fence is noted there.
-        report: sends a text.
     """
 
     def __init__(self, drone: str, source: str, seen: TelemetrySource, parameters: Parameters, report: Report) -> None:
@@ -43,7 +41,6 @@ class DroneWatch:
         self._was_low = False
 
     def load_fence(self, items: Sequence[PlanItem]) -> None:
-        """Replace the uploaded shapes of the fence."""
         self._shapes = fence_shapes(items, self._seen.state)
 
     def on_event(self, event: Event) -> None:
@@ -53,13 +50,10 @@ class DroneWatch:
             self._report(severity, f"Fault {event.data.get('kind')}{FAULTS[event.kind]}")
         elif event.kind == "collision" and self._drone in (pair := (event.subject, event.data.get("other"))):
             self._report(Severity.CRITICAL, f"Collision with {pair[1] if pair[0] == self._drone else pair[0]}")
-        elif self._is_refusal(event):
-            self._report(Severity.WARNING, f"Refused: {event.data.get('reason', event.text)}")
-
-    def _is_refusal(self, event: Event) -> bool:
-        """Return whether a command of ours was refused, unless it is a setpoint that a landing overtook."""
-        ours = event.kind == "refused" and event.source == self._own and f"/{self._drone}/" in event.subject
-        return ours and (event.subject.endswith("/mode") or self._seen.flight.target is not None)
+        elif event.kind == "refused" and event.source == self._own and f"/{self._drone}/" in event.subject:
+            is_overtaken = not event.subject.endswith("/mode") and self._seen.flight.target is None
+            if not is_overtaken:  # by a landing, a setpoint
+                self._report(Severity.WARNING, f"Refused: {event.data.get('reason', event.text)}")
 
     def look(self) -> None:
         """Report what has changed since the last gate."""
@@ -73,17 +67,14 @@ class DroneWatch:
         if state.is_battery_low and not self._was_low:
             self._report(Severity.CRITICAL, f"Low battery: {self._seen.battery_percent:.0f} %")
         self._was_low = state.is_battery_low
-        self._keep_fence()
-
-    def _keep_fence(self) -> None:
         seen, action = self._seen, self._parameters.fence_action
-        if action is FenceAction.NONE or not seen.state.is_steerable:
+        if action is FenceAction.NONE or not state.is_steerable:
             seen.breach = BREACH_NONE
             return
-        breach = self._breach(seen.state.position_m)
+        breach = self._breach(state.position_m)
         if breach and not seen.breach:
             seen.breaches += 1
-            seen.breach_ns = seen.state.t_ns
+            seen.breach_ns = state.t_ns
             self._report(Severity.CRITICAL, f"Geofence breached: {action.name.lower()}")
             if action in MODE_OF and not seen.flight.foreign_commander:
                 seen.flight.mission.abort("it left its geofence", failsafe=True)
@@ -91,7 +82,6 @@ class DroneWatch:
         seen.breach = breach
 
     def _breach(self, position_m: Vector) -> int:
-        """Return which fence a position is outside of; BREACH_NONE if none."""
         (x, y, z), (home_x, home_y, home_z) = position_m, self._seen.state.home_or_here_m
         ceiling_m, radius_m = self._parameters["fence_altitude_m"], self._parameters["fence_radius_m"]
         if ceiling_m > 0 and z - home_z > ceiling_m:
@@ -108,7 +98,6 @@ class Circle(NamedTuple):
     inside: bool
 
     def allows(self, x: float, y: float) -> bool:
-        """Return whether a point may be flown to."""
         return (math.hypot(x - self.centre_m[0], y - self.centre_m[1]) <= self.radius_m) == self.inside
 
 

@@ -45,18 +45,7 @@ class Target(NamedTuple):
     along_heading: bool = False
     speed_m_s: float | None = None
 
-    @property
-    def is_moving(self) -> bool:
-        """Whether it never comes to rest."""
-        return any(self.velocity_m_s) or (self.yaw_rad is None and self.yaw_rate_rad_s != 0.0)
-
-    def leads_up(self, z_m: float) -> bool:
-        """Return whether it leads above z in W."""
-        z = self.position_m[2]
-        return self.velocity_m_s[2] > 0.0 or (z is not None and z > z_m)
-
     def distance_m(self, position_m: Vector) -> float:
-        """Return how far a vehicle is from its position."""
         pairs = zip(self.position_m, position_m, strict=True)
         return math.hypot(*(0.0 if p is None else p - own for p, own in pairs))
 
@@ -67,15 +56,6 @@ class TiltTarget(NamedTuple):
     q_WB: Quaternion
     thrust_n: float
     yaw_rate_rad_s: float
-
-    @property
-    def is_moving(self) -> bool:
-        """A vehicle that holds a tilt flies away."""
-        return True
-
-    def leads_up(self, z_m: float) -> bool:
-        """No take-off begins with a tilt."""
-        return False
 
 
 def steer(target: Target, position_m: Vector, yaw_rad: float, limits: SpeedLimits) -> tuple[Vector, float]:
@@ -95,7 +75,6 @@ def steer(target: Target, position_m: Vector, yaw_rad: float, limits: SpeedLimit
 
 
 def is_place(position_m: Axes) -> bool:
-    """Return whether a position is finite and near enough to be flown to."""
     return all(p is None or (math.isfinite(p) and abs(p) < PLACE_MAX_M) for p in position_m)
 
 
@@ -108,6 +87,7 @@ class FlightControl:
     Attributes:
         target: what is held; None while nothing is sent.
         climb_to_m: z in W of the climb under way.
+        asked: the mode that the firmware has yet to enter, and since when it is wanted.
     """
 
     def __init__(self, parameters: Parameters, state: VehicleState, sender: CommandSender) -> None:
@@ -116,35 +96,28 @@ class FlightControl:
         self._sender = sender
         self.target: Target | TiltTarget | None = None
         self.climb_to_m: float | None = None
-        self._asked: tuple[Literal["takeoff", "land"], int] | None = None  # a mode of the firmware, and since when
+        self.asked: tuple[Literal["takeoff", "land"], int] | None = None
         self._is_pending = False  # a target that could not be sent at once
         self._allowed = BURST
         self._sent_ns = -REPEAT_NS
         self._stepped_ns = self._now_ns = 0
 
     def advance(self, t_ns: int) -> None:
-        """Follow the gates."""
         self._now_ns = t_ns
         self._allowed = min(BURST, self._allowed + 1)
 
     @property
-    def is_climbing(self) -> bool:
-        return self.climb_to_m is not None
-
-    @property
     def is_moving(self) -> bool:
-        """Whether what is held never comes to rest."""
-        return self.target is not None and self.target.is_moving
-
-    @property
-    def is_asking(self) -> bool:
-        """Whether the firmware has yet to do what was asked."""
-        return self._asked is not None
+        """Whether what is held never comes to rest; a vehicle that holds a tilt flies away."""
+        target = self.target
+        if not isinstance(target, Target):
+            return target is not None
+        return any(target.velocity_m_s) or (target.yaw_rad is None and target.yaw_rate_rad_s != 0.0)
 
     def hold(self, target: Target | TiltTarget) -> None:
         """Hold a target from now on, and send it at once; a climb under way is finished first."""
         self.target = target
-        if self._state.is_steerable and not self.is_climbing:
+        if self._state.is_steerable and self.climb_to_m is None:
             self._is_pending = self._allowed <= BURST // 10  # the rest is for repetitions
             if not self._is_pending:
                 self._send()
@@ -176,39 +149,30 @@ class FlightControl:
 
     def ask(self, mode: Literal["takeoff", "land"]) -> None:
         """Ask the firmware for a mode; again only if it does not answer."""
-        if self._asked is None or self._asked[0] != mode or self._state.t_ns - self._asked[1] > ANSWER_NS:
-            self._asked = mode, self._state.t_ns
+        if self.asked is None or self.asked[0] != mode or self._state.t_ns - self.asked[1] > ANSWER_NS:
+            self.asked = mode, self._state.t_ns
             if mode == "land":
                 self.target = self.climb_to_m = None
             self.send_mode(mode)
 
     def send_mode(self, mode: ModeName) -> None:
-        """Send a mode: take off, land, stop the rotors, or leave the emergency."""
         self._allowed -= 1
         self._sender.mode(self._now_ns, mode)
 
-    def on_airborne(self) -> None:
-        """Note that the drone flies."""
-        if self._asked and self._asked[0] == "takeoff":
-            self._asked = None
-
     def is_takeoff_overdue(self) -> bool:
         """Return whether the drone still stands although it was asked to take off."""
-        if self._asked is None or self._asked[0] != "takeoff" or self._state.is_airborne:
+        if self.asked is None or self.asked[0] != "takeoff" or self._state.is_airborne:
             return False
-        return self._state.t_ns - self._asked[1] > ANSWER_NS
+        return self._state.t_ns - self.asked[1] > ANSWER_NS
 
     def release(self) -> None:
-        """Send no more commands."""
-        self.target = self.climb_to_m = self._asked = None
+        self.target = self.climb_to_m = self.asked = None
 
     def has_arrived(self) -> bool:
-        """Return whether the target is reached."""
         position_m, radius_m = self._state.position_m, self._parameters["acceptance_m"]
         return isinstance(self.target, Target) and self.target.distance_m(position_m) < radius_m
 
     def send_due(self) -> None:
-        """Send what is due at a gate."""
         if isinstance(self.target, Target) and self.target.position_m != NOWHERE:
             if self._state.t_ns - self._stepped_ns >= STEP_NS:
                 self._send()
@@ -217,8 +181,6 @@ class FlightControl:
 
     def _send(self) -> None:
         target, state = self.target, self._state
-        if target is None:
-            return
         self._stepped_ns, self._is_pending = state.t_ns, False
         self._sent_ns = self._now_ns
         self._allowed -= 1
@@ -226,5 +188,5 @@ class FlightControl:
             velocity, yaw_rate = steer(target, state.position_m, state.yaw_rad, self._parameters.speeds)
             frame = "heading" if target.along_heading else "world"
             self._sender.velocity(self._now_ns, velocity, yaw_rate, frame)
-        else:
+        elif target is not None:
             self._sender.attitude(self._now_ns, target.q_WB, target.thrust_n, target.yaw_rate_rad_s)

@@ -5,7 +5,6 @@ Sources: https://mavlink.io/en/guide/serialization.html, https://mavlink.io/en/g
 
 import hmac
 from collections import Counter
-from collections.abc import Collection
 from hashlib import sha256
 from typing import Literal, NamedTuple
 
@@ -19,6 +18,7 @@ ID_MAX_1 = 255  # message ids have one byte in MAVLink 1
 KEY_BYTES = 32  # a secret key
 SIGNATURE_BYTES = 13  # link id, 6 of time, 6 of hash
 HASH_BYTES = 6  # the first of SHA-256
+LINK_ID = b"\0"  # of signatures
 TICKS_PER_S = 100_000  # timestamps count 10 us
 EPOCH_S = 1_420_070_400  # 2015-01-01 in seconds since 1970: zero of timestamps
 BEHIND_MAX = 6_000_000  # ticks, a minute: a new stream may be behind that much
@@ -38,23 +38,16 @@ class Received(NamedTuple):
 
 
 class Signing:
-    """Signs frames with a key, and checks the signatures of received ones.
-
-    Args:
-        key: the secret, 32 bytes.
-        link_id: of the frames that it signs.
-        accepts_unsigned: whether frames without a signature are accepted, or the ids of the messages that are.
+    """Signs frames with a key of 32 bytes, and checks the signatures of received ones.
 
     Attributes:
         timestamp: of the newest frame signed or accepted [10 us since 2015].
     """
 
-    def __init__(self, key: bytes, link_id: int = 0, accepts_unsigned: bool | Collection[int] = False) -> None:
+    def __init__(self, key: bytes) -> None:
         if len(key) != KEY_BYTES:
             raise ValueError(f"the signing key has {len(key)} bytes; must have {KEY_BYTES}")
         self._key = key
-        self._link = bytes([link_id])
-        self._accepts_unsigned = accepts_unsigned
         self._streams: dict[tuple[int, int, int], int] = {}
         self.timestamp = 0
 
@@ -62,15 +55,10 @@ class Signing:
         """Follow the wall clock [s since 1970]; timestamps never go back."""
         self.timestamp = max(self.timestamp, min(TIMESTAMP_MAX, int((unix_s - EPOCH_S) * TICKS_PER_S)))
 
-    def accepts_unsigned(self, message_id: int) -> bool:
-        """Return whether a message is accepted without a signature."""
-        policy = self._accepts_unsigned
-        return policy if isinstance(policy, bool) else message_id in policy
-
     def sign(self, frame: bytes) -> bytes:
         """Return the signature that follows a frame, header to checksum."""
         self.timestamp += 1
-        head = self._link + self.timestamp.to_bytes(6, "little")
+        head = LINK_ID + self.timestamp.to_bytes(6, "little")
         return head + self._hash(frame + head)
 
     def refusal(self, frame: bytes, signature: bytes, system_id: int, component_id: int) -> str | None:
@@ -92,13 +80,7 @@ class Signing:
 
 
 class Link:
-    """Packs the messages of one component for one link, and numbers them.
-
-    Args:
-        system_id, component_id: of the sender.
-        signing: signs what is packed.
-        version: of MAVLink; 1 has no extensions and no signatures.
-    """
+    """Packs the messages of one component for one link, and numbers them; MAVLink 1 has no extensions or signatures."""
 
     def __init__(self, system_id: int, component_id: int, signing: Signing | None = None, version: Version = 2) -> None:
         self._address = bytes([system_id, component_id])
@@ -130,118 +112,74 @@ class Link:
 
 
 class Parser:
-    """Takes the received bytes of a link apart, frame by frame.
+    """Takes received datagrams apart, frame by frame.
 
     Args:
-        signing: checks signatures; None to read frames unchecked.
-        datagrams: whether a frame ends in the part in which it begins.
+        signing: checks signatures, without which no frame is accepted; None to read frames unchecked.
 
     Attributes:
         refused: frames by reason: `bad_crc`, `unknown` (not in the dialect), `incompatible` (flags that must not be
             ignored), `truncated`, `unsigned`, `bad_signature`, `replayed`; and `noise`, bytes outside frames.
     """
 
-    def __init__(self, signing: Signing | None = None, datagrams: bool = True) -> None:
+    def __init__(self, signing: Signing | None = None) -> None:
         self._signing = signing
-        self._datagrams = datagrams
-        self._rest = b""
         self.refused: Counter[str] = Counter()
 
     def feed(self, data: bytes) -> list[Received]:
-        """Return the messages that are complete and accepted."""
-        data = self._rest + data
         received, start = [], 0
         while (begin := self._next_magic(data, start)) is not None:
-            frame = _Frame.at(data, begin)
-            if frame is None:
-                if not self._datagrams:
-                    break  # the rest is to come
-                self.refused["truncated"] += 1
-                start = begin + 1
-                continue
-            result = self._accept(frame)
-            start = begin + 1 if result == "bad_crc" else frame.end
+            end = _frame_end(data, begin)
+            result = "truncated" if end is None else self._accept(data, begin, end)
+            start = begin + 1 if end is None or result == "bad_crc" else end
             if isinstance(result, str):
                 self.refused[result] += 1
             else:
                 received.append(result)
-        self._rest = b"" if begin is None else data[begin:]
         return received
 
     def _next_magic(self, data: bytes, start: int) -> int | None:
-        """Return where the next frame begins; None if there is none."""
         if start < len(data) and data[start] in (MAGIC_1, MAGIC_2):
             return start
         places = [place for place in (data.find(b"\xfd", start), data.find(b"\xfe", start)) if place >= 0]
         self.refused["noise"] += (min(places) if places else len(data)) - start
         return min(places) if places else None
 
-    def _accept(self, frame: "_Frame") -> Received | str:
-        """Return the message of a frame, or why it is refused."""
-        layout = BY_ID.get(frame.message_id)
+    def _accept(self, data: bytes, begin: int, end: int) -> Received | str:
+        """Return the message of a whole frame, or why it is refused."""
+        is_2 = data[begin] == MAGIC_2
+        flags = data[begin + 2] if is_2 else 0
+        at = begin + (4 if is_2 else 2)  # of the sequence number; sender and message id follow
+        payload_at = begin + (HEADER_2 if is_2 else HEADER_1)
+        payload_end = payload_at + data[begin + 1]
+        signed_end = payload_end + CHECKSUM_BYTES
+        sender = data[at + 1], data[at + 2]
+        layout = BY_ID.get(int.from_bytes(data[at + 3 : payload_at], "little"))
         if layout is None:
             return "unknown"
-        if _crc(frame.body, layout) != frame.crc:
+        if _crc(data[begin + 1 : payload_end], layout) != data[payload_end:signed_end]:
             return "bad_crc"
-        if frame.flags & ~SIGNED:
+        if flags & ~SIGNED:
             return "incompatible"
         if self._signing is not None:
-            if frame.signature:
-                if refusal := self._signing.refusal(frame.signed, frame.signature, *frame.sender):
-                    return refusal
-            elif not self._signing.accepts_unsigned(frame.message_id):
+            if not flags & SIGNED:
                 return "unsigned"
-        return Received(layout.unpack(frame.payload), *frame.sender, frame.seq, bool(frame.signature))
+            if refusal := self._signing.refusal(data[begin:signed_end], data[signed_end:end], *sender):
+                return refusal
+        return Received(layout.unpack(data[payload_at:payload_end]), *sender, data[at], bool(flags & SIGNED))
 
 
-class _Frame(NamedTuple):
-    """The parts of a frame.
-
-    Attributes:
-        sender: system and component id.
-        body: what the checksum covers: all but the first byte, to the end of the payload.
-        signed: what a signature covers beside its own head: header to checksum.
-        end: of the frame in the data.
-    """
-
-    flags: int
-    seq: int
-    sender: tuple[int, int]
-    message_id: int
-    body: bytes
-    payload: bytes
-    crc: bytes
-    signed: bytes
-    signature: bytes
-    end: int
-
-    @classmethod
-    def at(cls, data: bytes, begin: int) -> "_Frame | None":
-        """Return the frame that begins at a place; None if the data end before it does."""
-        is_2 = data[begin] == MAGIC_2
-        header = HEADER_2 if is_2 else HEADER_1
-        if begin + header + CHECKSUM_BYTES > len(data):
-            return None
-        flags = data[begin + 2] if is_2 else 0
-        payload_end = begin + header + data[begin + 1]
-        signed_end = payload_end + CHECKSUM_BYTES
-        end = signed_end + (SIGNATURE_BYTES if flags & SIGNED else 0)
-        if end > len(data):
-            return None
-        at = begin + (4 if is_2 else 2)  # of the sequence number; sender and message id follow
-        return cls(
-            flags,
-            data[at],
-            (data[at + 1], data[at + 2]),
-            int.from_bytes(data[at + 3 : begin + header], "little"),
-            data[begin + 1 : payload_end],
-            data[begin + header : payload_end],
-            data[payload_end:signed_end],
-            data[begin:signed_end],
-            data[signed_end:end],
-            end,
-        )
+def _frame_end(data: bytes, begin: int) -> int | None:
+    """Return where the frame that begins at a place ends; None if the data end before it does."""
+    is_2 = data[begin] == MAGIC_2
+    header = HEADER_2 if is_2 else HEADER_1
+    if begin + header + CHECKSUM_BYTES > len(data):
+        return None
+    signature = SIGNATURE_BYTES if is_2 and data[begin + 2] & SIGNED else 0
+    end = begin + header + data[begin + 1] + CHECKSUM_BYTES + signature
+    return end if end <= len(data) else None
 
 
 def _crc(body: bytes, layout: MessageLayout) -> bytes:
+    """Return the checksum of a frame from its second byte to the end of its payload."""
     return checksum(body + layout.crc_extra_byte).to_bytes(2, "little")

@@ -24,15 +24,13 @@ from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Drone
 from zsim.transport.session import Session
-from zsim_bridges.intake import TrafficIntake
-from zsim_bridges.mavlink.dialect import WireMessage
-from zsim_bridges.mavlink.enums import COMPONENT_AUTOPILOT
+from zsim_bridges.mavlink.dialect import COMPONENT_AUTOPILOT, WireMessage
 from zsim_bridges.mavlink.frame import Link, Parser, Received, Signing, Version
 from zsim_bridges.mavlink.mavlink_vehicle import MavlinkVehicle, Options
 from zsim_bridges.mavlink.personality import PERSONALITIES
 from zsim_bridges.mavlink.telemetry import Level
 from zsim_bridges.vehicle_links.drone_link import CommandSender
-from zsim_bridges.vehicle_links.server import Say, VehicleServer
+from zsim_bridges.vehicle_links.server import Say, TrafficIntake, VehicleServer
 from zsim_bridges.web import is_loopback
 
 ANSWER_S = 1.0  # wall time for which an answer of the world is waited for, aside from the traffic
@@ -63,13 +61,10 @@ class MavlinkOptions(NamedTuple):
     """How the drones are offered.
 
     Attributes:
-        autopilot: whose modes and parameters they have.
         level: of the rates of telemetry.
-        listen: address on which the ports are opened.
         gcs, gcs_local: the ground station, and the first port that talks to it.
         api, api_local: the first of the programs' ports, and the first port that talks to them.
         key: of signatures; None for none.
-        version: of MAVLink in what is sent.
         rate: pace that is asked of a run as fast as possible; None for none.
         first_system_id: of the first drone; +1 each.
     """
@@ -85,17 +80,6 @@ class MavlinkOptions(NamedTuple):
     version: Version
     rate: float | None
     first_system_id: int
-
-
-class Served(NamedTuple):
-    """A vehicle and its ports."""
-
-    vehicle: MavlinkVehicle
-    ports: "VehiclePorts"
-
-    def flush(self) -> None:
-        """Send what the vehicle has to send."""
-        self.ports.send(self.vehicle.take())
 
 
 class MavlinkServer(VehicleServer):
@@ -124,7 +108,7 @@ class MavlinkServer(VehicleServer):
             names |= {keys.truth(drone): "truth", keys.estimate(drone): "estimate", keys.status(drone): "status"}
             self._routes |= {key: (drone, name) for key, name in names.items()}
 
-    def _offer(self, index: int, drone: Drone) -> Served:
+    def _offer(self, index: int, drone: Drone) -> "ServedVehicle":
         options, system_id, source = self.options, self.options.first_system_id + index, self.observer.name
         # 64 bits by which programs recognize a vehicle: unique in all runs
         unique_id = int.from_bytes(hashlib.sha256(f"{self.info.run_id}/{drone.name}".encode()).digest()[:8])
@@ -140,16 +124,16 @@ class MavlinkServer(VehicleServer):
             (options.api_local + index, (options.api[0], options.api[1] + index)),
         )
         ports = [VehiclePort((options.listen, port), peer, self._signing, on_received) for port, peer in peers]
-        packer = Link(system_id, COMPONENT_AUTOPILOT, self._signing, options.version)
-        served = Served(vehicle, VehiclePorts(ports, packer))
+        served = ServedVehicle(vehicle, ports, Link(system_id, COMPONENT_AUTOPILOT, self._signing, options.version))
         return served
 
     async def open(self, stack: contextlib.AsyncExitStack) -> None:
         sys.setswitchinterval(SWITCH_S)
         loop, options, last = asyncio.get_running_loop(), self.options, len(self._served) - 1
         for served in self._served.values():
-            stack.callback(served.ports.close, loop)
-            served.ports.open(loop, time.monotonic)
+            for port in served.ports:
+                stack.callback(port.close, loop)
+                port.open(loop, time.monotonic)
         stack.callback(self._requests.shutdown, wait=False, cancel_futures=True)
         for what, (host, port), local, step in (
             ("ground station", options.gcs, options.gcs_local, 0),
@@ -160,8 +144,8 @@ class MavlinkServer(VehicleServer):
             self.say(f"{what}: UDP {host}:{to}, from {options.listen}:{own}")
         stack.callback(loop.create_task(self._tick_always()).cancel)
 
-    async def take_in(self, intake: TrafficIntake) -> None:
-        """Take in what has arrived; of a drone's messages the newest of each."""
+    async def on_arrivals(self, intake: TrafficIntake) -> None:
+        """Read what has arrived; of a drone's messages the newest of each."""
         newest: dict[str, bytes] = {}
         for arrived in intake.arrivals():
             for key, payload in arrived:
@@ -169,37 +153,30 @@ class MavlinkServer(VehicleServer):
                     newest[key] = payload
                 else:
                     self.on_run(key, payload)
-        for served in self._update(newest):
-            served.vehicle.step()
-            self._report_mission(served)
-            served.flush()
-            await asyncio.sleep(0)  # setpoints that have arrived meanwhile go first
-
-    def _update(self, newest: dict[str, bytes]) -> list[Served]:
-        """Update the states of the drones; return those that have reached a gate."""
-        stepping: dict[str, Served] = {}
+        at_gate: dict[str, ServedVehicle] = {}
         for key, payload in newest.items():
             message = self.decoded(key, payload)
             if message is not None:
                 drone, name = self._routes[key]
                 self._served[drone].vehicle.state.update(name, message)
                 if name == "status":
-                    stepping[drone] = self._served[drone]
-        return list(stepping.values())
+                    at_gate[drone] = self._served[drone]
+        for served in at_gate.values():
+            served.vehicle.step()
+            self.report_mission(served.vehicle)
+            served.flush()
+            await asyncio.sleep(0)  # setpoints that have arrived meanwhile go first
 
-    def _report_mission(self, served: Served) -> None:
+    def report_mission(self, vehicle: MavlinkVehicle) -> None:
         """Tell the world how far a mission was flown, for the record; no gate waits for it."""
-        vehicle = served.vehicle
         for report in vehicle.flight.mission.reports:
             args = {"drone": vehicle.name, **report._asdict()}
             self._requests.submit(self.link.request, keys.CONTROL, "mission", self.observer.name, args, ANSWER_S)
         vehicle.flight.mission.reports.clear()
 
-    def on_event(self, payload: bytes) -> None:
-        event = self.decoded(keys.EVENT, payload)
-        if isinstance(event, Event):
-            for served in self._served.values():
-                served.vehicle.on_event(event)
+    def on_event(self, event: Event) -> None:
+        for served in self._served.values():
+            served.vehicle.watch.on_event(event)
 
     async def _tick_always(self) -> None:
         while True:
@@ -208,46 +185,34 @@ class MavlinkServer(VehicleServer):
             for drone, served in self._served.items():
                 served.vehicle.tick(time.monotonic_ns())
                 served.flush()
-                self._count_refused(drone, served.ports.refused())
+                for reason, count in served.refused().items():
+                    mark = f"{drone} {reason}"
+                    before = self._counted[mark]
+                    if count and not before:
+                        self.say(f"{drone}: {REASONS[reason]}; counted from now on")
+                    self._counted[mark] = count
+                    self.observer.health.refused += count - before
             await asyncio.sleep(TICK_S)
 
-    def _count_refused(self, drone: str, counts: Counter[str]) -> None:
-        """Count what clients sent and was refused; print each reason once."""
-        for reason, count in counts.items():
-            mark = f"{drone} {reason}"
-            before = self._counted[mark]
-            if count and not before:
-                self.say(f"{drone}: {REASONS[reason]}; counted from now on")
-            self._counted[mark] = count
-            self.observer.health.refused += count - before
 
+class ServedVehicle:
+    """A vehicle and its ports, with one numbering of what is sent."""
 
-class VehiclePorts:
-    """Both ports of a vehicle, with one numbering of what is sent.
-
-    Args:
-        link: packs the messages.
-    """
-
-    def __init__(self, ports: "Sequence[VehiclePort]", link: Link) -> None:
-        self._ports = ports
-        self._link = link
+    def __init__(self, vehicle: MavlinkVehicle, ports: "Sequence[VehiclePort]", link: Link) -> None:
+        self.vehicle = vehicle
+        self.ports = ports
+        self.link = link
         self._unsent = 0
 
-    def open(self, loop: asyncio.AbstractEventLoop, wall_s: Callable[[], float]) -> None:
-        for port in self._ports:
-            port.open(loop, wall_s)
-
-    def close(self, loop: asyncio.AbstractEventLoop) -> None:
-        for port in self._ports:
-            port.close(loop)
+    def flush(self) -> None:
+        self.send(self.vehicle.take())
 
     def send(self, messages: Sequence[WireMessage]) -> None:
         """Send messages to all peers, many in a datagram; those with values out of range are counted instead."""
         datagrams: list[bytes] = []
         for message in messages:
             try:
-                frame = self._link.pack(message)
+                frame = self.link.pack(message)
             except (struct.error, OverflowError, ValueError):
                 self._unsent += 1
                 continue
@@ -255,26 +220,19 @@ class VehiclePorts:
                 datagrams[-1] += frame
             else:
                 datagrams.append(frame)
-        for port in self._ports:
+        for port in self.ports:
             port.send(datagrams)
 
     def refused(self) -> Counter[str]:
-        """Return how much was refused so far, by reason."""
         counts = Counter({"unsent": self._unsent})
-        for port in self._ports:
+        for port in self.ports:
             counts += port.parser.refused
             counts["stranger"] += port.peers.refused
         return counts
 
 
 class VehiclePort:
-    """One UDP port.
-
-    Args:
-        local: on which it is opened.
-        peer: to which it sends from the start.
-        signing: of what is sent and read.
-        on_received: called with each message of a peer.
+    """One UDP port, which sends to `peer` from the start.
 
     Raises:
         RunError: the port cannot be opened.
@@ -283,13 +241,21 @@ class VehiclePort:
     def __init__(
         self, local: Address, peer: Address, signing: Signing | None, on_received: Callable[[Received], Any]
     ) -> None:
-        self._socket = _bound(local)
+        family = socket.AF_INET6 if ":" in local[0] else socket.AF_INET
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        try:
+            self._socket.bind(local)
+        except OSError as error:
+            self._socket.close()
+            taken = error.errno in (errno.EADDRINUSE, errno.EACCES)  # by another process, or reserved by the system
+            other = "other ports with --gcs-local and --api-local" if taken else "an address of this host with --listen"
+            raise RunError(f"UDP {local[0]}:{local[1]} cannot be opened ({error.strerror}); give {other}") from error
         self._on_received = on_received
         self.peers = Peers(peer)
         self.parser = Parser(signing)
 
     def open(self, loop: asyncio.AbstractEventLoop, wall_s: Callable[[], float]) -> None:
-        """Read from now on."""
         self._wall_s = wall_s
         loop.add_reader(self._socket.fileno(), self._read)
 
@@ -317,25 +283,8 @@ class VehiclePort:
                     self._on_received(received)
 
 
-def _bound(local: Address) -> socket.socket:
-    family = socket.AF_INET6 if ":" in local[0] else socket.AF_INET
-    opened = socket.socket(family, socket.SOCK_DGRAM)
-    opened.setblocking(False)
-    try:
-        opened.bind(local)
-    except OSError as error:
-        opened.close()
-        taken = error.errno in (errno.EADDRINUSE, errno.EACCES)  # by another process, or reserved by the system
-        advice = "other ports with --gcs-local and --api-local" if taken else "an address of this host with --listen"
-        raise RunError(f"UDP {local[0]}:{local[1]} cannot be opened ({error.strerror}); give {advice}") from error
-    return opened
-
-
 class Peers:
     """The peers of one port: the configured one, and programs on this machine that speak to it.
-
-    Args:
-        configured: to which everything is sent from the start.
 
     Attributes:
         refused: datagrams of others.
@@ -358,6 +307,5 @@ class Peers:
         return True
 
     def addresses(self, wall_s: float) -> list[Address]:
-        """Return to whom to send now."""
         self._learnt = {address: last_s for address, last_s in self._learnt.items() if wall_s - last_s <= SILENT_S}
         return [self._configured, *self._learnt]

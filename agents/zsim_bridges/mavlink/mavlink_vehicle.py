@@ -1,29 +1,57 @@
 """One drone as a MAVLink vehicle: messages of its clients and of the drone in, messages and commands to both out.
 
-Pure: no clock, no sockets.
+Pure: no clock, no sockets. Sources: https://mavlink.io/en/services/command.html, and of setpoints
+https://mavlink.io/en/messages/common.html#SET_POSITION_TARGET_LOCAL_NED.
 """
 
+import math
 from typing import Any, NamedTuple
 
 from zsim.contract.messages import Origin
-from zsim.contract.run_messages import Event
 from zsim.errors import without_figures
+from zsim.math.frames import turned_about_up
+from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Drone
 from zsim.schema.quantities import G_M_S2
-from zsim_bridges.mavlink import commands, dialect
-from zsim_bridges.mavlink.commands import Request, VehicleParts, carry_out, put_custom_mode
-from zsim_bridges.mavlink.dialect import WireMessage
+from zsim_bridges.mavlink import dialect
+from zsim_bridges.mavlink.dialect import (
+    DEGREES,
+    AttitudeMask,
+    Cmd,
+    MavFrame,
+    Result,
+    TypeMask,
+    WireMessage,
+    from_int,
+    ned,
+    yaw_ned,
+)
 from zsim_bridges.mavlink.drone_watch import DroneWatch
-from zsim_bridges.mavlink.enums import COMPONENT_AUTOPILOT, FENCE, MISSION, Capability, Result, Severity
-from zsim_bridges.mavlink.flight_control import Target
+from zsim_bridges.mavlink.flight_control import NOWHERE, Target, TiltTarget, is_place
 from zsim_bridges.mavlink.frame import Received
-from zsim_bridges.mavlink.mission import Address, MissionProtocol, PlanItem, home_item, item_fault, item_of, place_of
-from zsim_bridges.mavlink.personality import Parameters, Personality
+from zsim_bridges.mavlink.mission import (
+    ABSOLUTE,
+    FRAMES,
+    LOCAL,
+    RELATIVE,
+    Address,
+    MissionProtocol,
+    PlanItem,
+    item_fault,
+    item_of,
+    place_of,
+)
+from zsim_bridges.mavlink.personality import FlightMode, Parameters, Personality, Setting, px4_mode
 from zsim_bridges.mavlink.telemetry import Level, Telemetry, TelemetrySource, heartbeat, mission_current
 from zsim_bridges.mavlink.vehicle_flight import Flight
 from zsim_bridges.mavlink.vehicle_state import VehicleState
 from zsim_bridges.vehicle_links.drone_link import CommandSender
 
+ALONG_HEADING = (MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED, MavFrame.BODY_FRD)
+FROM_HERE = (MavFrame.LOCAL_OFFSET_NED, *ALONG_HEADING)
+HOVER_THRUST = 0.5  # of the thrust of a setpoint; MPC_THR_HOVER
+SPEED_MAX_M_S = 1e3  # m/s; no vehicle here flies faster
+Setpoint = Target | TiltTarget
 TEXT_MAX = 50  # characters of a STATUSTEXT
 REFUSED_MAX = 100  # reasons remembered, so that each is reported once
 DO_GO_TO = 2  # MISSION_ITEM.current: fly there now, of ArduPilot's older clients
@@ -31,6 +59,9 @@ HEARTBEAT_NS = 1_000_000_000  # ns of wall time
 STICK = 1000.0  # full deflection in MANUAL_CONTROL
 STICKS_UNUSED = 32767
 NO_SUCH_PARAMETER = 1  # MAV_PARAM_ERROR_DOES_NOT_EXIST
+AUTOPILOT_VERSION = dialect.LAYOUTS[dialect.AutopilotVersion].id
+HOME_POSITION = dialect.LAYOUTS[dialect.HomePosition].id
+SPEEDS: dict[int, Setting] = {2: "up_m_s", 3: "down_m_s"}  # SPEED_TYPE; else the horizontal one
 
 
 class Options(NamedTuple):
@@ -43,51 +74,67 @@ class Options(NamedTuple):
     unique_id: int
 
 
+class Request(NamedTuple):
+    """A command: seven parameters, the fifth and sixth in degrees or metres, and the frame of the place."""
+
+    command: int
+    params: tuple[float, float, float, float, float, float, float]
+    frame: int
+
+    @classmethod
+    def of(cls, message: dialect.CommandLong | dialect.CommandInt) -> "Request":
+        m, frame = message, 0
+        place: tuple[float, float, float]
+        if isinstance(m, dialect.CommandLong):
+            place = m.param5, m.param6, m.param7
+        else:
+            frame, unit = m.frame, dialect.LOCAL_M if m.frame in LOCAL else DEGREES
+            place = from_int(m.x, unit), from_int(m.y, unit), m.z
+        return cls(m.command, (m.param1, m.param2, m.param3, m.param4, *place), frame)
+
+    def integer(self, place: int) -> int:
+        """Return a parameter that is a whole number; -1 if it is none."""
+        value = self.params[place]
+        return int(value) if math.isfinite(value) and 0 <= value < 2**31 else -1
+
+
 class MavlinkVehicle:
     """One drone as a MAVLink vehicle.
 
-    Args:
-        drone: of the scenario.
-        origin: of W on the Earth.
-        sender: of commands to the drone.
-        options: how it presents itself.
-
     Attributes:
-        name: of the drone.
-        state: of the drone, to be kept up to date.
+        state: of the drone, to be kept up to date; watch: to be told of events.
         outbox: messages for its clients, to be taken.
     """
 
     def __init__(self, drone: Drone, origin: Origin, sender: CommandSender, options: Options) -> None:
         self.name = drone.name
         self._options = options
-        person, source = options.personality, options.source
+        self._personality = person = options.personality
+        source = options.source
         self.outbox: list[WireMessage] = []
         self.state = VehicleState(drone, origin)
         self._parameters = Parameters(person, drone, options.system_id)
         self.flight = Flight(source, person, self._parameters, self.state, sender, self.report)
         self._source = TelemetrySource(drone, self.state, self.flight, person)
-        self._watch = DroneWatch(drone.name, source, self._source, self._parameters, self.report)
+        self.watch = DroneWatch(drone.name, source, self._source, self._parameters, self.report)
         self._telemetry = Telemetry(self._source, options.level)
-        home = None if person.is_px4 else lambda: home_item(*self.state.to_global(self.state.home_or_here_m))
-        self._missions = MissionProtocol(self._send, self._on_mission, home)
-        self._parts = VehicleParts(
-            person, self._parameters, self.state, self.flight, self._telemetry, self._send, self._version
-        )
+        self._missions = MissionProtocol(self._send, self._on_mission, None if person.is_px4 else self._home_item)
         self._heartbeat_ns: int | None = None
         self._weight_n = drone.mass_kg * G_M_S2
         self._refused: set[str] = set()
+
+    def _home_item(self) -> PlanItem:
+        place = self.state.to_global(self.state.home_or_here_m)
+        return PlanItem(MavFrame.GLOBAL, Cmd.NAV_WAYPOINT, (0.0, 0.0, 0.0, 0.0), *place)
 
     def _send(self, message: WireMessage) -> None:
         """Send a message to all clients; `take` replaces the outbox."""
         self.outbox.append(message)
 
-    def report(self, severity: Severity, text: str) -> None:
-        """Send a text for the operator."""
+    def report(self, severity: dialect.Severity, text: str) -> None:
         self._send(dialect.Statustext(severity, text[:TEXT_MAX]))
 
     def take(self) -> list[WireMessage]:
-        """Return what is to be sent, and forget it."""
         taken, self.outbox = self.outbox, []
         return taken
 
@@ -95,7 +142,7 @@ class MavlinkVehicle:
 
     def step(self) -> None:
         """Do what is due at a gate, after the state has been updated."""
-        self._watch.look()
+        self.watch.look()
         self.flight.step()
         self.outbox += map(dialect.MissionItemReached, self.flight.mission.reached)
         self.flight.mission.reached.clear()
@@ -108,23 +155,14 @@ class MavlinkVehicle:
             self._send(heartbeat(self._source))
         self._missions.tick(wall_ns)
 
-    def on_event(self, event: Event) -> None:
-        """Take an event of the run."""
-        self._watch.on_event(event)
-
     # From clients
 
     def on_message(self, received: Received, wall_ns: int) -> None:
-        """Take a message of a client.
-
-        Args:
-            received: message and sender.
-            wall_ns: wall time, of any zero.
-        """
+        """Do what a client's message asks for; `wall_ns` is wall time, of any zero."""
         message: Any = received.message
         sender = received.system_id, received.component_id
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
-        if system not in (0, self._options.system_id) or component not in (0, COMPONENT_AUTOPILOT):
+        if system not in (0, self._options.system_id) or component not in (0, dialect.COMPONENT_AUTOPILOT):
             return
         if isinstance(message, dialect.MissionItem | dialect.MissionItemInt) and message.current == DO_GO_TO:
             self._go_to(message, sender)
@@ -134,20 +172,21 @@ class MavlinkVehicle:
     def _dispatch(self, message: WireMessage, sender: Address) -> None:
         match message:
             case dialect.CommandLong() | dialect.CommandInt():
-                result, reason = carry_out(self._parts, Request.of(message))
+                refusal = self._carry_out(Request.of(message))
+                result = Result.DENIED if isinstance(refusal, str) else refusal or Result.ACCEPTED
                 self._send(dialect.CommandAck(message.command, result, 0, 0, *sender))
-                if result is not Result.UNSUPPORTED:
-                    self._deny(reason)
+                self._deny(refusal if isinstance(refusal, str) else None)
             case dialect.SetPositionTargetLocalNed():
-                self._set_point(commands.from_local(message, self.state))
+                self._set_point(from_local(message, self.state))
             case dialect.SetPositionTargetGlobalInt():
-                self._set_point(commands.from_global(message, self.state))
+                self._set_point(from_global(message, self.state))
             case dialect.SetAttitudeTarget():
-                self._set_point(commands.from_attitude(message, self._weight_n))
+                self._set_point(from_attitude(message, self._weight_n))
             case dialect.ManualControl(target=target) if target in (0, self._options.system_id):
                 self._steer(message)
             case dialect.SetMode():
-                self._deny(put_custom_mode(self._parts, message.custom_mode).reason)
+                mode = self._personality.mode_of(message.custom_mode)
+                self._deny(self.flight.set_mode(mode) if mode else f"no mode {message.custom_mode:#x}")
             case dialect.ParamRequestList():
                 self.outbox += self._parameters.messages()
             case dialect.ParamRequestRead():
@@ -178,13 +217,119 @@ class MavlinkVehicle:
             case dialect.SetGpsGlobalOrigin():
                 self._deny("the origin is the scenario's")
 
+    def _carry_out(self, request: Request) -> str | Result | None:
+        """Carry out a command; return None, why not, or that it is not supported."""
+        flight, state, parameters = self.flight, self.state, self._parameters
+        first, second = request.params[:2]
+        match request.command:
+            case Cmd.COMPONENT_ARM_DISARM:
+                if first not in (0.0, 1.0):
+                    return f"arm or disarm? {first:g}"
+                arm = flight.arm if first else flight.disarm
+                return arm(second == dialect.FORCE)
+            case Cmd.NAV_TAKEOFF:
+                return self._take_off(request.params[6])
+            case Cmd.NAV_LAND:
+                return flight.set_mode(FlightMode.LAND)
+            case Cmd.NAV_RETURN_TO_LAUNCH:
+                return flight.set_mode(FlightMode.RETURN)
+            case Cmd.NAV_LOITER_UNLIM:
+                return flight.set_mode(FlightMode.HOLD)
+            case Cmd.DO_SET_MODE:
+                if not int(first if math.isfinite(first) else 0) & 1:
+                    return "a mode must be a custom mode"
+                main, sub = request.integer(1), request.integer(2)
+                mode = self._personality.mode_of(px4_mode(main, sub) if self._personality.is_px4 else main)
+                return Result.UNSUPPORTED if mode is None else flight.set_mode(mode)
+            case Cmd.DO_REPOSITION:
+                return self._reposition(request)
+            case Cmd.DO_PAUSE_CONTINUE:
+                return flight.set_mode(FlightMode.HOLD) if first == 0.0 else flight.start_mission()
+            case Cmd.DO_CHANGE_SPEED:
+                if not math.isfinite(second) or second <= 0.0:
+                    return f"a speed of {second} m/s"
+                return parameters.put_setting(SPEEDS.get(request.integer(0), "speed_m_s"), second)
+            case Cmd.DO_SET_HOME:
+                place = state.position_m if first == 1.0 else _place(state, request)
+                if place is None:
+                    return "no place for home"
+                state.home_m = place
+                return self._send_message(HOME_POSITION)
+            case Cmd.DO_FLIGHTTERMINATION:
+                if first > 0.5:
+                    flight.terminate()
+                return None
+            case Cmd.DO_SET_MISSION_CURRENT:
+                return None if flight.mission.set_current(request.integer(0)) else "no such item"
+            case Cmd.DO_FENCE_ENABLE if "FENCE_ENABLE" in parameters.values:
+                return parameters.put("FENCE_ENABLE", float(first == 1.0))
+            case Cmd.MISSION_START:
+                return flight.start_mission(request.integer(0) or None)
+            case Cmd.CONDITION_YAW:
+                return self._turn(request)
+            case Cmd.PREFLIGHT_REBOOT_SHUTDOWN if first in (1.0, 3.0):
+                return flight.reboot()
+            case Cmd.GET_HOME_POSITION:
+                return self._send_message(HOME_POSITION)
+            case Cmd.REQUEST_MESSAGE:
+                return self._send_message(request.integer(0))
+            case Cmd.REQUEST_AUTOPILOT_CAPABILITIES:
+                return self._send_message(AUTOPILOT_VERSION)
+            case Cmd.SET_MESSAGE_INTERVAL:
+                if not math.isfinite(second):
+                    return f"an interval of {second} us"
+                is_sent = self._telemetry.put_interval(request.integer(0), second)
+                return None if is_sent else Result.UNSUPPORTED
+            case Cmd.GET_MESSAGE_INTERVAL:
+                message_id = request.integer(0)
+                self._send(dialect.MessageInterval(message_id & 0xFFFF, self._telemetry.interval_us(message_id)))
+                return None
+            case _:
+                return Result.UNSUPPORTED
+
+    def _take_off(self, altitude_m: float) -> str | None:
+        state, is_px4 = self.state, self._personality.is_px4
+        if not math.isfinite(altitude_m) or (is_px4 and altitude_m == 0.0):
+            altitude_m = self._parameters["takeoff_altitude_m"]
+        elif is_px4:  # PX4 has it over the sea
+            altitude_m -= state.to_global(state.home_or_here_m)[2]
+        if not 0.0 < altitude_m <= 10_000.0:
+            return f"take-off to {altitude_m:.1f} m over home"
+        return self.flight.take_off(altitude_m)
+
+    def _reposition(self, request: Request) -> str | None:
+        speed_m_s, _, _, yaw = request.params[:4]
+        place = _place(self.state, request)
+        if place is None:
+            return "no place to go to"
+        yaw_rad = yaw_ned(yaw) if math.isfinite(yaw) else None
+        speed = speed_m_s if math.isfinite(speed_m_s) and speed_m_s > 0 else None
+        return self.flight.go_to(Target(place, yaw_rad=yaw_rad, speed_m_s=speed))
+
+    def _turn(self, request: Request) -> str | None:
+        """Turn to an angle [deg] from north, or by one in a direction, and hold the position."""
+        angle, _, direction, relative = request.params[:4]
+        state = self.state
+        if not math.isfinite(angle) or not state.is_steerable:
+            return "not flying" if math.isfinite(angle) else "no angle"
+        turn = math.radians(angle) * (-1.0 if direction >= 0 else 1.0)
+        yaw = dialect.wrapped(state.yaw_rad + turn) if relative == 1.0 else yaw_ned(math.radians(angle))
+        return self.flight.go_to(Target(state.position_m, yaw_rad=yaw))
+
+    def _send_message(self, message_id: int) -> Result | None:
+        message = self._version() if message_id == AUTOPILOT_VERSION else self._telemetry.build(message_id)
+        if message is None:
+            return Result.UNSUPPORTED
+        self._send(message)
+        return None
+
     def _deny(self, reason: str | None) -> None:
         """Tell the operator why something was not done; no reason: it was."""
         if reason:
-            self.report(Severity.WARNING, f"Denied: {reason}")
+            self.report(dialect.Severity.WARNING, f"Denied: {reason}")
 
-    def _set_point(self, setpoint: commands.Setpoint | commands.SetpointRefusal) -> None:
-        reason = setpoint.reason if isinstance(setpoint, commands.SetpointRefusal) else self.flight.set_point(setpoint)
+    def _set_point(self, setpoint: Setpoint | str) -> None:
+        reason = setpoint if isinstance(setpoint, str) else self.flight.set_point(setpoint)
         if reason and without_figures(reason) not in self._refused and len(self._refused) < REFUSED_MAX:
             self._refused.add(without_figures(reason))  # a stream would fill the operator's screen
             self._deny(reason)
@@ -208,25 +353,125 @@ class MavlinkVehicle:
 
     def _go_to(self, message: dialect.MissionItem | dialect.MissionItemInt, sender: Address) -> None:
         item = item_of(message)
-        fault = item_fault(item, MISSION)
+        fault = item_fault(item, dialect.MISSION)
         reason = "no place to go to" if fault else self.flight.go_to(Target(place_of(item, self.state)))
         self._deny(reason)
         self._send(dialect.MissionAck(*sender, type=fault or (1 if reason else 0)))
 
     def _on_mission(self, type_: int, items: list[PlanItem]) -> None:
-        if type_ == MISSION:
+        if type_ == dialect.MISSION:
             self.flight.mission.abort("a client replaced it", failsafe=False)
             self.flight.mission.load(items)
-        elif type_ == FENCE:
-            self._watch.load_fence(items)
+        elif type_ == dialect.FENCE:
+            self.watch.load_fence(items)
 
     def _version(self) -> WireMessage:
-        major, minor, patch, type_ = self._options.personality.version
-        capabilities = sum(capability.value for capability in Capability)
-        if not self._options.personality.is_px4:
-            capabilities &= ~Capability.PARAM_ENCODE_BYTEWISE
+        major, minor, patch, type_ = self._personality.version
+        capabilities = sum(capability.value for capability in dialect.Capability)
+        if not self._personality.is_px4:
+            capabilities &= ~dialect.Capability.PARAM_ENCODE_BYTEWISE
         return dialect.AutopilotVersion(
             capabilities=capabilities,
             flight_sw_version=major << 24 | minor << 16 | patch << 8 | type_,
             uid=self._options.unique_id,
         )
+
+
+def _place(state: VehicleState, request: Request) -> Vector | None:
+    """Return the place of a command in W; coordinates that are not finite are the vehicle's."""
+    params, frame = request.params, request.frame
+    item = PlanItem(frame, request.command, params[:4], *params[4:])
+    if frame not in FRAMES or (abs(item.x) > 180.0 and frame not in LOCAL):
+        return None
+    own = state.position_m
+    if not math.isfinite(item.z):
+        if frame in LOCAL:
+            item = item._replace(z=-own[2] if frame == MavFrame.LOCAL_NED else own[2])
+        else:
+            item = item._replace(z=state.to_global(own)[2], frame=ABSOLUTE[0])
+    place = place_of(item, state)
+    return place if is_place(place) else None
+
+
+def from_local(message: dialect.SetPositionTargetLocalNed, state: VehicleState) -> Setpoint | str:
+    frame, place = message.coordinate_frame, (message.x, message.y, message.z)
+    if frame == MavFrame.LOCAL_NED:
+        return _target(message, ned(place), False, state)
+    if frame not in FROM_HERE:
+        return f"frame {frame} of a local setpoint is not flown"
+    along_heading = frame in ALONG_HEADING
+    x, y, z = dialect.frd(place) if along_heading else ned(place)
+    if along_heading:
+        c, s = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
+        x, y = c * x - s * y, s * x + c * y
+    own_x, own_y, own_z = state.position_m
+    return _target(message, (own_x + x, own_y + y, own_z + z), along_heading, state)
+
+
+def from_global(message: dialect.SetPositionTargetGlobalInt, state: VehicleState) -> Setpoint | str:
+    if message.coordinate_frame not in (*ABSOLUTE, *RELATIVE):
+        return f"frame {message.coordinate_frame} of a global setpoint is not flown"
+    own = state.to_global(state.position_m)
+    height_m = message.alt
+    if message.coordinate_frame in RELATIVE:
+        height_m += state.to_global(state.home_or_here_m)[2]
+    given = from_int(message.lat_int, DEGREES), from_int(message.lon_int, DEGREES), height_m
+    known = [value if math.isfinite(value) else here for value, here in zip(given, own, strict=True)]
+    x, y, z = state.to_local(known[0], known[1], known[2])
+    latitude_deg, longitude_deg, _ = given
+    place = x if math.isfinite(longitude_deg) else math.nan, y if math.isfinite(latitude_deg) else math.nan
+    return _target(message, (*place, z if math.isfinite(height_m) else math.nan), False, state)
+
+
+def _target(
+    message: dialect.SetPositionTargetLocalNed | dialect.SetPositionTargetGlobalInt,
+    position_m: Vector,
+    along_heading: bool,
+    state: VehicleState,
+) -> Setpoint | str:
+    mask = TypeMask(message.type_mask)
+    bits = (TypeMask.Y, TypeMask.X, TypeMask.Z)  # x of W is y of MAVLink
+    x, y, z = (None if mask & bit or not math.isfinite(p) else p for p, bit in zip(position_m, bits, strict=True))
+    position = x, y, z
+    bits = (TypeMask.VX, TypeMask.VY, TypeMask.VZ)
+    given = (message.vx, message.vy, message.vz)
+    known = [not mask & bit and math.isfinite(v) for v, bit in zip(given, bits, strict=True)]
+    if position == NOWHERE and not any(known):
+        return "a setpoint without position and velocity is not flown"
+    velocity_m_s: Vector = (0.0, 0.0, 0.0)
+    if any(known):
+        vx, vy, vz = (v if is_known else 0.0 for v, is_known in zip(given, known, strict=True))
+        velocity_m_s = dialect.frd((vx, vy, vz)) if along_heading else ned((vx, vy, vz))
+    if not is_place(position) or not all(abs(v) < SPEED_MAX_M_S for v in velocity_m_s):
+        return "a setpoint is beyond all bounds"
+    along = along_heading and position == NOWHERE
+    if along_heading and not along and any(known):
+        velocity_m_s = turned_about_up(velocity_m_s, state.yaw_rad)
+    yaw, yaw_rate = _yaw(mask, message.yaw, message.yaw_rate, message.coordinate_frame, state)
+    return Target(position, velocity_m_s, yaw, yaw_rate, along)
+
+
+def _yaw(mask: TypeMask, yaw: float, yaw_rate: float, frame: int, state: VehicleState) -> tuple[float | None, float]:
+    """Return the yaw counter-clockwise from east, None if it is not given, and the rate."""
+    if mask & TypeMask.YAW or not math.isfinite(yaw) or abs(yaw) > 1e3:
+        is_given = not mask & TypeMask.YAW_RATE and math.isfinite(yaw_rate)
+        return None, -max(-100.0, min(100.0, yaw_rate)) if is_given else 0.0
+    if frame in (MavFrame.BODY_OFFSET_NED, MavFrame.BODY_FRD):
+        return dialect.wrapped(state.yaw_rad - yaw), 0.0
+    return yaw_ned(yaw), 0.0
+
+
+def from_attitude(message: dialect.SetAttitudeTarget, weight_n: float) -> Setpoint | str:
+    """Return what SET_ATTITUDE_TARGET asks for; half of the thrust carries the weight [N]."""
+    mask = AttitudeMask(message.type_mask & 0xFF)
+    values = (*message.q, message.thrust, message.body_yaw_rate)
+    if mask & AttitudeMask.ATTITUDE:
+        return "body rates alone are not flown; give an attitude"
+    length = math.hypot(*message.q)
+    if not all(map(math.isfinite, values)) or not 0.5 < length < 2.0:
+        return "the attitude of a setpoint is no quaternion"
+    w, x, y, z = dialect.attitude_ned((message.q[0], message.q[1], message.q[2], message.q[3]))
+    q_WB = w / length, x / length, y / length, z / length
+    thrust = HOVER_THRUST if mask & AttitudeMask.THRUST else max(0.0, min(1.0, message.thrust))
+    rate = 0.0 if mask & AttitudeMask.YAW_RATE else -max(-10.0, min(10.0, message.body_yaw_rate))
+    return TiltTarget(q_WB, weight_n * thrust / HOVER_THRUST, rate)

@@ -6,12 +6,12 @@ https://mavlink.io/en/services/mission.html for the protocol.
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
 from zsim.math.rotation import Vector
 from zsim_bridges.mavlink import dialect
-from zsim_bridges.mavlink.dialect import DEGREES, LOCAL_M, WireMessage, from_int, ned, to_int, yaw_ned
-from zsim_bridges.mavlink.enums import ALL_MISSION_TYPES, FENCE, MISSION, Cmd, MavFrame, MissionResult
+from zsim_bridges.mavlink.dialect import FENCE, MISSION, Cmd, MavFrame, MissionResult
 from zsim_bridges.mavlink.flight_control import Target, is_place
 from zsim_bridges.mavlink.personality import Parameters
 from zsim_bridges.mavlink.vehicle_state import VehicleState
@@ -26,26 +26,16 @@ RELATIVE = (
 )
 LOCAL = (MavFrame.LOCAL_NED, MavFrame.LOCAL_ENU)
 FRAMES = (*ABSOLUTE, *RELATIVE, *LOCAL, MavFrame.MISSION)
-COMMANDS = (
-    Cmd.NAV_WAYPOINT,
-    Cmd.NAV_LOITER_UNLIM,
-    Cmd.NAV_LOITER_TIME,
-    Cmd.NAV_RETURN_TO_LAUNCH,
-    Cmd.NAV_LAND,
-    Cmd.NAV_TAKEOFF,
-    Cmd.NAV_DELAY,
-    Cmd.DO_JUMP,
-    Cmd.DO_CHANGE_SPEED,
+COMMANDS: tuple[Any, ...] = (
+    *(Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME, Cmd.NAV_RETURN_TO_LAUNCH, Cmd.NAV_LAND),
+    *(Cmd.NAV_TAKEOFF, Cmd.NAV_DELAY, Cmd.DO_JUMP, Cmd.DO_CHANGE_SPEED),
 )
 ITEMS_MAX = 1000  # chosen: of one mission; autopilots keep some hundreds
 RETRY_NS = 500_000_000  # ns of wall time until an item is requested again
 TRIES_MAX = 10
-FENCE_COMMANDS = (
-    Cmd.FENCE_RETURN_POINT,
-    Cmd.FENCE_POLYGON_INCLUSION,
-    Cmd.FENCE_POLYGON_EXCLUSION,
-    Cmd.FENCE_CIRCLE_INCLUSION,
-    Cmd.FENCE_CIRCLE_EXCLUSION,
+FENCE_COMMANDS: tuple[Any, ...] = (
+    *(Cmd.FENCE_RETURN_POINT, Cmd.FENCE_POLYGON_INCLUSION, Cmd.FENCE_POLYGON_EXCLUSION),
+    *(Cmd.FENCE_CIRCLE_INCLUSION, Cmd.FENCE_CIRCLE_EXCLUSION),
 )
 Address = tuple[int, int]
 """System and component id."""
@@ -69,11 +59,9 @@ class PlanItem(NamedTuple):
 
 
 class MissionReport(NamedTuple):
-    """How far a mission was flown, for the record of the run.
+    """How far a mission was flown, for the record of the run: `done` of its items, without ArduPilot's item 0.
 
     Attributes:
-        items: of the mission, without ArduPilot's item 0.
-        done: how many of them were flown.
         reason: why it was aborted; "" if it was not.
         failsafe: whether the vehicle itself aborted it, and no client.
     """
@@ -98,7 +86,7 @@ def place_of(item: PlanItem, state: VehicleState) -> Vector:
     own_x, own_y, _ = state.position_m
     z = item.z if math.isfinite(item.z) else 0.0
     if item.frame in LOCAL:
-        x, y, up = ned((item.x, item.y, z)) if item.frame == MavFrame.LOCAL_NED else (item.x, item.y, z)
+        x, y, up = dialect.ned((item.x, item.y, z)) if item.frame == MavFrame.LOCAL_NED else (item.x, item.y, z)
         return x if math.isfinite(x) else own_x, y if math.isfinite(y) else own_y, up
     height_m = z if item.frame in ABSOLUTE else state.to_global(state.home_or_here_m)[2] + z
     latitude_deg, longitude_deg, _ = state.to_global(state.position_m)
@@ -117,9 +105,9 @@ class Mission:
         turns: whether the yaw of a waypoint is flown.
 
     Attributes:
-        items: of the mission, without ArduPilot's item 0.
         reached: numbers of items that have been reached, to be reported to clients.
         reports: of how far it was flown, to be sent to the world.
+        has_climbed: whether the climb that was asked for is over.
     """
 
     def __init__(self, first: int = 0, turns: bool = True) -> None:
@@ -133,11 +121,10 @@ class Mission:
         self._since_ns: int | None = None  # at this item
         self._speed_m_s: float | None = None
         self._jumps: dict[int, int] = {}  # left, by item
-        self._climbed = False
+        self.has_climbed = False
 
     @property
     def current(self) -> int:
-        """The number of the present item."""
         return self.first + min(self._index, max(0, len(self.items) - 1))
 
     @property
@@ -151,7 +138,6 @@ class Mission:
         return item is not None and item.command in (Cmd.NAV_LAND, Cmd.NAV_RETURN_TO_LAUNCH)
 
     def load(self, items: Sequence[PlanItem]) -> None:
-        """Replace the items, and begin with the first."""
         self.items = list(items)
         self._rewind()
 
@@ -172,14 +158,16 @@ class Mission:
     def start(self) -> None:
         """Report that it is flown from now on, unless it is flown already."""
         if self._reported is None:
-            self._reported = self._index
-            self.reports.append(MissionReport("active", len(self.items), self._index))
+            self._report_active()
 
     def note_progress(self) -> None:
         """Report what more of it has been flown; a jump back is none."""
         if self._reported is not None and self._index > self._reported:
-            self._reported = self._index
-            self.reports.append(MissionReport("active", len(self.items), self._index))
+            self._report_active()
+
+    def _report_active(self) -> None:
+        self._reported = self._index
+        self.reports.append(MissionReport("active", len(self.items), self._index))
 
     def finish(self) -> None:
         """Report that all of it has been flown."""
@@ -194,10 +182,6 @@ class Mission:
             self._reported = None
 
     # Steps
-
-    def on_climbed(self) -> None:
-        """Note that the climb that was asked for is over."""
-        self._climbed = True
 
     def takeoff_height_m(self, state: VehicleState) -> float | None:
         """Return z in W to which the mission takes off; None if it does not begin with a take-off."""
@@ -217,14 +201,18 @@ class Mission:
         return MissionStep("over")
 
     def _step(self, item: PlanItem, state: VehicleState, parameters: Parameters) -> MissionStep | None:
-        """Return what an item asks for; None once it is done."""
         match item.command:
             case Cmd.DO_CHANGE_SPEED:
                 self._speed_m_s = item.params[1] if item.params[1] > 0 else self._speed_m_s
             case Cmd.DO_JUMP:
-                return self._jump(item)
+                left = self._jumps.setdefault(self._index, int(max(-1.0, min(1e6, item.params[1]))))
+                index = int(max(0.0, min(1e6, item.params[0]))) - self.first
+                if left and 0 <= index < len(self.items):
+                    self._jumps[self._index] = left - 1 if left > 0 else left
+                    self._enter(index)
+                    return None
             case Cmd.NAV_TAKEOFF:
-                if not self._climbed:
+                if not self.has_climbed:
                     return MissionStep("climb", z_m=place_of(item, state)[2])
             case Cmd.NAV_RETURN_TO_LAUNCH:
                 return MissionStep("return")
@@ -249,7 +237,7 @@ class Mission:
 
     def _visit(self, item: PlanItem, state: VehicleState, parameters: Parameters) -> MissionStep | None:
         yaw_deg = item.params[3]
-        yaw = yaw_ned(math.radians(yaw_deg)) if self._turns and math.isfinite(yaw_deg) else None
+        yaw = dialect.yaw_ned(math.radians(yaw_deg)) if self._turns and math.isfinite(yaw_deg) else None
         target = Target(place_of(item, state), yaw_rad=yaw, speed_m_s=self._speed_m_s)
         if self._since_ns is None:
             radius_m = item.params[1] if item.command == Cmd.NAV_WAYPOINT and item.params[1] > 0 else None
@@ -268,24 +256,24 @@ class Mission:
         self._enter(self._index + 1)
         return None
 
-    def _jump(self, item: PlanItem) -> None:
-        left = self._jumps.setdefault(self._index, int(max(-1.0, min(1e6, item.params[1]))))
-        index = int(max(0.0, min(1e6, item.params[0]))) - self.first
-        if left and 0 <= index < len(self.items):
-            self._jumps[self._index] = left - 1 if left > 0 else left
-            self._enter(index)
-        else:
-            self._enter(self._index + 1)
-
     def _enter(self, index: int) -> None:
-        self._index, self._since_ns, self._climbed = index, None, False
+        self._index, self._since_ns, self.has_climbed = index, None, False
+
+
+@dataclass(slots=True)
+class _Upload:
+    sender: Address
+    type: int
+    count: int
+    items: list[PlanItem] = field(default_factory=list)
+    asked_ns: int = 0
+    tries: int = 0
 
 
 class MissionProtocol:
     """The transfers of one vehicle.
 
     Args:
-        send: sends a message.
         loaded: called with the type and the items of a complete upload, or of a removal.
         home: returns item 0 of ArduPilot's missions; None for PX4, whose item 0 is the first waypoint, and which asks
             for items as MISSION_ITEM_INT first.
@@ -293,7 +281,7 @@ class MissionProtocol:
 
     def __init__(
         self,
-        send: Callable[[WireMessage], None],
+        send: Callable[[dialect.WireMessage], None],
         loaded: Callable[[int, list[PlanItem]], None],
         home: Callable[[], PlanItem] | None,
     ) -> None:
@@ -303,23 +291,40 @@ class MissionProtocol:
         self._items: dict[int, list[PlanItem]] = {}
         self._upload: _Upload | None = None
 
-    def on_message(self, message: WireMessage, sender: Address, wall_ns: int) -> bool:
-        """Take a message of the protocol; False for any other.
-
-        Args:
-            wall_ns: wall time, of any zero.
-        """
+    def on_message(self, message: dialect.WireMessage, sender: Address, wall_ns: int) -> bool:
+        """Do what a message of the protocol asks for; False for any other. `wall_ns` is wall time, of any zero."""
         match message:
             case dialect.MissionCount():
-                self._begin(message, sender, wall_ns)
+                upload = _Upload(sender, message.mission_type, message.count)
+                if message.count > ITEMS_MAX:
+                    self._end(upload, MissionResult.NO_SPACE)
+                elif message.mission_type not in (MISSION, FENCE):
+                    self._end(upload, MissionResult.UNSUPPORTED)
+                elif message.count == 0:
+                    self._finish(upload)
+                else:
+                    self._upload = upload
+                    self._request(upload, wall_ns)
             case dialect.MissionItemInt() | dialect.MissionItem():
-                self._take(message, sender, wall_ns)
+                upload = self._upload
+                if upload is not None and upload.sender == sender and message.seq == len(upload.items):
+                    self._take_item(upload, message, wall_ns)  # else it is repeated, or not asked for
             case dialect.MissionRequestList(mission_type=type_):
                 self._send(dialect.MissionCount(*sender, count=len(self._stored(type_)), mission_type=type_))
             case dialect.MissionRequestInt() | dialect.MissionRequest():
-                self._answer(message, sender)
+                items = self._stored(message.mission_type)
+                if message.seq >= len(items):
+                    self._acknowledge(sender, message.mission_type, MissionResult.INVALID_SEQUENCE)
+                    return True
+                item, kind = items[message.seq], dialect.MissionItem
+                x, y = item.x, item.y
+                if isinstance(message, dialect.MissionRequestInt):
+                    unit = dialect.LOCAL_M if item.frame in LOCAL else dialect.DEGREES
+                    kind, x, y = dialect.MissionItemInt, dialect.to_int(item.x, unit), dialect.to_int(item.y, unit)
+                begin = *sender, message.seq, item.frame, item.command, 0, int(item.autocontinue)
+                self._send(kind(*begin, *item.params, x, y, item.z, message.mission_type))
             case dialect.MissionClearAll(mission_type=type_):
-                for each in (MISSION, FENCE) if type_ == ALL_MISSION_TYPES else (type_,):
+                for each in (MISSION, FENCE) if type_ == dialect.ALL_MISSION_TYPES else (type_,):
                     self._items[each] = []
                     self._loaded(each, [])
                 self._acknowledge(sender, type_, MissionResult.ACCEPTED)
@@ -340,30 +345,13 @@ class MissionProtocol:
         else:
             self._request(upload, wall_ns)
 
-    # Uploads
-
-    def _begin(self, count: dialect.MissionCount, sender: Address, wall_ns: int) -> None:
-        upload = _Upload(sender, count.mission_type, count.count)
-        if count.count > ITEMS_MAX:
-            self._end(upload, MissionResult.NO_SPACE)
-        elif count.mission_type not in (MISSION, FENCE):
-            self._end(upload, MissionResult.UNSUPPORTED)
-        elif count.count == 0:
-            self._finish(upload)
-        else:
-            self._upload = upload
-            self._request(upload, wall_ns)
-
-    def _request(self, upload: "_Upload", wall_ns: int) -> None:
+    def _request(self, upload: _Upload, wall_ns: int) -> None:
         upload.asked_ns = wall_ns
         as_int = (self._home is None) != bool(upload.tries % 2)  # some clients know one of the two only
         kind = dialect.MissionRequestInt if as_int else dialect.MissionRequest
         self._send(kind(*upload.sender, seq=len(upload.items), mission_type=upload.type))
 
-    def _take(self, message: dialect.MissionItemInt | dialect.MissionItem, sender: Address, wall_ns: int) -> None:
-        upload = self._upload
-        if upload is None or upload.sender != sender or message.seq != len(upload.items):
-            return  # repeated, or not asked for
+    def _take_item(self, upload: _Upload, message: dialect.MissionItemInt | dialect.MissionItem, wall_ns: int) -> None:
         item = item_of(message)
         is_home = upload.type == MISSION and self._home is not None and message.seq == 0
         fault = None if is_home else item_fault(item, upload.type)
@@ -377,65 +365,37 @@ class MissionProtocol:
         else:
             self._request(upload, wall_ns)
 
-    def _finish(self, upload: "_Upload") -> None:
+    def _finish(self, upload: _Upload) -> None:
         items = upload.items[1:] if self._home and upload.type == MISSION else upload.items
         self._items[upload.type] = items
         self._loaded(upload.type, items)
         self._end(upload, MissionResult.ACCEPTED)
 
-    def _end(self, upload: "_Upload", result: MissionResult) -> None:
+    def _end(self, upload: _Upload, result: MissionResult) -> None:
         self._upload = None
         self._acknowledge(upload.sender, upload.type, result)
 
     def _acknowledge(self, sender: Address, type_: int, result: MissionResult) -> None:
         self._send(dialect.MissionAck(*sender, type=result, mission_type=type_))
 
-    # Downloads
-
     def _stored(self, type_: int) -> list[PlanItem]:
         """Return all items of a type, including ArduPilot's item 0."""
         items = self._items.get(type_, [])
         return [self._home(), *items] if self._home and type_ == MISSION else items
 
-    def _answer(self, request: dialect.MissionRequestInt | dialect.MissionRequest, sender: Address) -> None:
-        items = self._stored(request.mission_type)
-        if request.seq >= len(items):
-            self._acknowledge(sender, request.mission_type, MissionResult.INVALID_SEQUENCE)
-            return
-        item, kind, x, y = items[request.seq], dialect.MissionItem, items[request.seq].x, items[request.seq].y
-        if isinstance(request, dialect.MissionRequestInt):
-            unit = LOCAL_M if item.frame in LOCAL else DEGREES
-            kind, x, y = dialect.MissionItemInt, to_int(item.x, unit), to_int(item.y, unit)
-        begin = *sender, request.seq, item.frame, item.command, 0, int(item.autocontinue)
-        self._send(kind(*begin, *item.params, x, y, item.z, request.mission_type))
-
-
-class _Upload:
-    """An upload under way."""
-
-    def __init__(self, sender: Address, type_: int, count: int) -> None:
-        self.sender = sender
-        self.type = type_
-        self.count = count
-        self.items: list[PlanItem] = []
-        self.asked_ns = 0
-        self.tries = 0
-
 
 def item_of(message: dialect.MissionItemInt | dialect.MissionItem) -> PlanItem:
-    """Return the item in a message."""
     x, y = message.x, message.y
     if isinstance(message, dialect.MissionItemInt):
-        unit = LOCAL_M if message.frame in LOCAL else DEGREES
-        x, y = from_int(message.x, unit), from_int(message.y, unit)
+        unit = dialect.LOCAL_M if message.frame in LOCAL else dialect.DEGREES
+        x, y = dialect.from_int(message.x, unit), dialect.from_int(message.y, unit)
     params = message.param1, message.param2, message.param3, message.param4
     return PlanItem(message.frame, message.command, params, x, y, message.z, bool(message.autocontinue))
 
 
 def item_fault(item: PlanItem, type_: int) -> MissionResult | None:
     """Return what is wrong with an item; None if nothing is."""
-    known: tuple[Any, ...] = COMMANDS if type_ == MISSION else FENCE_COMMANDS
-    if item.command not in known:
+    if item.command not in (COMMANDS if type_ == MISSION else FENCE_COMMANDS):
         return MissionResult.UNSUPPORTED
     if item.frame not in FRAMES:
         return MissionResult.UNSUPPORTED_FRAME
@@ -447,8 +407,3 @@ def item_fault(item: PlanItem, type_: int) -> MissionResult | None:
     else:
         is_good = is_place((None, None, z)) and abs(x) <= 90.0 and abs(y) <= 180.0
     return None if is_good and (type_ != FENCE or is_whole) else MissionResult.INVALID
-
-
-def home_item(latitude_deg: float, longitude_deg: float, height_m: float) -> PlanItem:
-    """Return item 0 of ArduPilot's missions."""
-    return PlanItem(MavFrame.GLOBAL, Cmd.NAV_WAYPOINT, (0.0, 0.0, 0.0, 0.0), latitude_deg, longitude_deg, height_m)

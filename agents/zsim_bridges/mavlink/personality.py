@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 
 from zsim.scenario.scenario import Drone
 from zsim_bridges.mavlink import dialect
-from zsim_bridges.mavlink.enums import Autopilot, ParamType
+from zsim_bridges.mavlink.dialect import Autopilot, ParamType
 
 REAL, INT, SHORT, BYTE = ParamType.REAL32, ParamType.INT32, ParamType.INT16, ParamType.INT8
 CM = 0.01  # m; unit of ArduPilot's parameters of places and speeds
@@ -28,7 +28,6 @@ HOLDING = (*BY_STICKS, FlightMode.HOLD, FlightMode.BRAKE)
 
 
 def px4_mode(main: int, sub: int = 0) -> int:
-    """Return a custom mode of PX4."""
     return main << 16 | sub << 24
 
 
@@ -92,11 +91,7 @@ Setting = Literal[
 
 
 class ParameterSpec(NamedTuple):
-    """A parameter: its value at the start and its range; fixed ones cannot be set.
-
-    Attributes:
-        setting: what it is to the vehicle; unit: of the parameter, in that of the setting.
-    """
+    """A parameter: its value at the start and its range; fixed ones cannot be set. `unit` is in that of the setting."""
 
     name: str
     type: ParamType
@@ -160,9 +155,6 @@ class Personality(NamedTuple):
     """An autopilot as clients see it.
 
     Attributes:
-        autopilot: in heartbeats.
-        modes: its custom modes.
-        first_mode: at the start.
         specs: returns the parameters of a drone with a system id.
         fence_actions: by the value of the parameter.
         is_px4: PX4 begins OFFBOARD only while setpoints come and holds without them, sends integer parameters as their
@@ -179,7 +171,6 @@ class Personality(NamedTuple):
     version: tuple[int, int, int, int]
 
     def mode_of(self, custom_mode: int) -> FlightMode | None:
-        """Return the mode of a number; None for one that is not offered."""
         return next((mode for mode, number in self.modes.items() if number == custom_mode), None)
 
 
@@ -200,19 +191,13 @@ _INTEGERS = {
 
 
 class SpeedLimits(NamedTuple):
-    """Limits of a vehicle's speed [m/s]."""
-
     horizontal_m_s: float
     up_m_s: float
     down_m_s: float
 
 
 class Parameters:
-    """The parameters of one vehicle: `parameters["speed_m_s"]` is a setting, whatever the autopilot calls it.
-
-    Attributes:
-        values: by the names that clients know.
-    """
+    """The parameters of one vehicle: `parameters["speed_m_s"]` is a setting, whatever the autopilot calls it."""
 
     def __init__(self, personality: Personality, drone: Drone, system_id: int) -> None:
         self._personality = personality
@@ -237,7 +222,6 @@ class Parameters:
         return self._personality.fence_actions.get(int(self["fence_action"]), FenceAction.WARN)
 
     def put_setting(self, setting: Setting, value: float) -> str | None:
-        """Set a parameter by its setting; return why not."""
         spec = self._settings[setting]
         return self.put(spec.name, value / spec.unit)
 
@@ -255,7 +239,6 @@ class Parameters:
         return None
 
     def messages(self) -> Iterator[dialect.ParamValue]:
-        """Yield all of them."""
         return map(self.message, self._names)
 
     def find(self, name: str, index: int) -> str | None:
@@ -265,7 +248,6 @@ class Parameters:
         return name if name in self._specs else None
 
     def message(self, name: str) -> dialect.ParamValue:
-        """Return the message with the value of one."""
         type_, value = self._specs[name].type, self.values[name]
         if self._is_bytewise(type_):
             (value,) = struct.unpack("<f", struct.pack(_INTEGERS[type_], int(value)))

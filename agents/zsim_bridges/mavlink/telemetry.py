@@ -1,14 +1,13 @@
 """The telemetry of a vehicle: its messages, each built from one state at a gate, and how often each is sent.
 
-A builder declares the message that it builds, its rates, and the sensor whose samples it follows. It returns None when
-there is nothing to send, or the sensor has failed. Messages that are due at one gate are sent in the order of the
-builders here.
+A builder returns None when there is nothing to send, or its sensor has failed. Messages that are due at one gate are
+sent in the order of the table.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from functools import cached_property
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple
 
 from zsim.math import frames
 from zsim.math.rotation import Vector
@@ -17,31 +16,22 @@ from zsim.schema.quantities import G_M_S2
 from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import (
-    LAYOUTS,
     UINT16_UNKNOWN,
+    BaseMode,
+    LandedState,
+    MavFrame,
+    SystemStatus,
+    TypeMask,
     WireMessage,
-    attitude_ned,
     frd,
     global_ints,
     int16,
     ned,
-    yaw_ned,
-)
-from zsim_bridges.mavlink.enums import (
-    TYPE_QUADROTOR,
-    BaseMode,
-    EstimatorFlag,
-    GpsFix,
-    LandedState,
-    MavFrame,
-    SensorBit,
-    SystemStatus,
-    TypeMask,
 )
 from zsim_bridges.mavlink.flight_control import Target
 from zsim_bridges.mavlink.personality import BY_STICKS, FlightMode, Personality
 from zsim_bridges.mavlink.vehicle_flight import Flight
-from zsim_bridges.mavlink.vehicle_state import VehicleState
+from zsim_bridges.mavlink.vehicle_state import ALL_HEALTHY, VehicleState
 
 Level = Literal["normal", "full"]
 SECOND_NS = 1_000_000_000
@@ -53,8 +43,6 @@ NAN = math.nan
 MG_PER_M_S2 = 1000.0 / G_M_S2
 GAUSS_PER_UT, MILLIGAUSS_PER_UT = 0.01, 10.0
 INERTIAL, MAGNETIC, BAROMETRIC = 0x03F, 0x1C0, 0xA00  # HIGHRES_IMU_UPDATED_FLAGS
-ALL_HEALTHY = sum(part.value for part in SensorBit if part is not SensorBit.GEOFENCE)
-ALL_ESTIMATED = sum(flag.value for flag in EstimatorFlag)
 LANDED_STATES = {
     "landed": LandedState.ON_GROUND,
     "taking_off": LandedState.TAKEOFF,
@@ -70,7 +58,6 @@ class TelemetrySource:
     """What telemetry is built from; values that several messages need are computed once a gate.
 
     Attributes:
-        state, flight, personality: of the vehicle.
         voltage_v, capacity_mah: of its battery, nominal.
         breach: the fence that it is outside of; breaches: how often so far; breach_ns: since when.
     """
@@ -96,7 +83,6 @@ class TelemetrySource:
 
     @property
     def boot_ms(self) -> int:
-        """Simulated time since the start [ms]."""
         return self.state.t_ns // 1_000_000 & 0xFFFFFFFF
 
     @property
@@ -125,41 +111,6 @@ class TelemetrySource:
         return ned(self.state.velocity_m_s)
 
 
-Builder = Callable[[TelemetrySource], WireMessage | None]
-BuilderT = TypeVar("BuilderT", bound=Builder)
-Rates = tuple[float, float]
-"""At the levels normal and full [Hz of simulated time]."""
-
-
-class Row(NamedTuple):
-    """A message of telemetry: its builder, its rates, and the sensor whose samples it follows."""
-
-    build: Builder
-    px4: Rates | None
-    ardupilot: Rates | None
-    sensor: str | None
-
-
-ROWS: dict[type[WireMessage], Row] = {}
-
-
-def builds(
-    kind: type[WireMessage],
-    both: Rates | None = None,
-    px4: Rates | None = None,
-    ardupilot: Rates | None = None,
-    sensor: str | None = None,
-) -> Callable[[BuilderT], BuilderT]:
-    """Return a decorator that registers a builder; without rates its message is sent on request alone."""
-
-    def register(build: BuilderT) -> BuilderT:
-        ROWS[kind] = Row(build, px4 or both, ardupilot or both, sensor)
-        return build
-
-    return register
-
-
-@builds(dialect.Heartbeat)
 def heartbeat(s: TelemetrySource) -> WireMessage:
     flight, modes = s.flight, s.personality.modes
     base = BaseMode.CUSTOM | BaseMode.STABILIZE
@@ -172,14 +123,13 @@ def heartbeat(s: TelemetrySource) -> WireMessage:
     elif s.state.is_airborne and (s.state.is_battery_low or s.breach):
         status = SystemStatus.CRITICAL
     custom = modes[FlightMode.MISSION if flight.foreign_commander else flight.mode]
-    return dialect.Heartbeat(TYPE_QUADROTOR, s.personality.autopilot, base, custom, status, MAVLINK_VERSION)
+    return dialect.Heartbeat(dialect.TYPE_QUADROTOR, s.personality.autopilot, base, custom, status, MAVLINK_VERSION)
 
 
-@builds(dialect.SysStatus, both=(1.0, 5.0))
 def sys_status(s: TelemetrySource) -> WireMessage:
     return dialect.SysStatus(
-        onboard_control_sensors_present=ALL_HEALTHY,
-        onboard_control_sensors_enabled=ALL_HEALTHY,
+        onboard_control_sensors_present=int(ALL_HEALTHY),
+        onboard_control_sensors_enabled=int(ALL_HEALTHY),
         onboard_control_sensors_health=int(s.state.health()),
         voltage_battery=round(1000 * s.voltage_v),
         current_battery=-1,
@@ -187,22 +137,6 @@ def sys_status(s: TelemetrySource) -> WireMessage:
     )
 
 
-@builds(dialect.SystemTime, both=(1.0, 1.0))
-def system_time(s: TelemetrySource) -> WireMessage:
-    return dialect.SystemTime(time_boot_ms=s.boot_ms)
-
-
-@builds(dialect.Attitude, both=(10.0, 50.0))
-def attitude(s: TelemetrySource) -> WireMessage:
-    return dialect.Attitude(s.boot_ms, *s.rpy_ned_rad, *frd(s.state.rate_rad_s))
-
-
-@builds(dialect.LocalPositionNed, both=(10.0, 50.0))
-def local_position_ned(s: TelemetrySource) -> WireMessage:
-    return dialect.LocalPositionNed(s.boot_ms, *s.position_ned_m, *s.velocity_ned_m_s)
-
-
-@builds(dialect.GlobalPositionInt, both=(5.0, 50.0))
 def global_position_int(s: TelemetrySource) -> WireMessage:
     velocity = (int16(100 * v) for v in s.velocity_ned_m_s)
     heading = round(math.degrees(s.rpy_ned_rad[2]) % 360.0 * 100) % 36000
@@ -210,11 +144,10 @@ def global_position_int(s: TelemetrySource) -> WireMessage:
     return dialect.GlobalPositionInt(s.boot_ms, *global_ints(s.place), altitude_mm, *velocity, heading)
 
 
-@builds(dialect.GpsRawInt, both=(5.0, 5.0), sensor="gps")
 def gps_raw_int(s: TelemetrySource) -> WireMessage:
     gps = s.sample("gps")
     if gps is None:
-        return dialect.GpsRawInt(s.boot_us, GpsFix.NO_FIX if "gps" in s.state.samples else GpsFix.NO_GPS)
+        return dialect.GpsRawInt(s.boot_us, dialect.NO_FIX if "gps" in s.state.samples else dialect.NO_GPS)
     vx, vy, _ = gps.velocity_m_s
     course = math.degrees(math.atan2(vx, vy)) % 360.0
     latitude, longitude, altitude = global_ints((gps.latitude_deg, gps.longitude_deg, gps.altitude_m))
@@ -236,7 +169,6 @@ def gps_raw_int(s: TelemetrySource) -> WireMessage:
     )
 
 
-@builds(dialect.VfrHud, both=(4.0, 20.0))
 def vfr_hud(s: TelemetrySource) -> WireMessage:
     vx, vy, vz = s.state.velocity_m_s
     speed = math.hypot(vx, vy)
@@ -244,7 +176,6 @@ def vfr_hud(s: TelemetrySource) -> WireMessage:
     return dialect.VfrHud(speed, speed, heading, 50 if s.state.is_airborne else 0, s.place[2], vz)
 
 
-@builds(dialect.BatteryStatus, both=(0.5, 1.0))
 def battery_status(s: TelemetrySource) -> WireMessage:
     voltage_mv = min(UINT16_UNKNOWN - 1, round(1000 * s.voltage_v))
     return dialect.BatteryStatus(
@@ -256,12 +187,6 @@ def battery_status(s: TelemetrySource) -> WireMessage:
     )
 
 
-@builds(dialect.ExtendedSysState, both=(2.0, 5.0))
-def extended_sys_state(s: TelemetrySource) -> WireMessage:
-    return dialect.ExtendedSysState(0, LANDED_STATES[s.state.state])
-
-
-@builds(dialect.HomePosition, both=(0.5, 1.0))
 def home_position(s: TelemetrySource) -> WireMessage | None:
     home_m = s.state.home_m
     if home_m is None:
@@ -270,12 +195,6 @@ def home_position(s: TelemetrySource) -> WireMessage | None:
     return dialect.HomePosition(*place, *ned(home_m), (1.0, 0.0, 0.0, 0.0), time_usec=s.boot_us)
 
 
-@builds(dialect.GpsGlobalOrigin, both=(0.2, 1.0))
-def gps_global_origin(s: TelemetrySource) -> WireMessage:
-    return dialect.GpsGlobalOrigin(*global_ints(s.state.origin), s.boot_us)
-
-
-@builds(dialect.PositionTargetLocalNed, both=(2.0, 10.0))
 def position_target_local_ned(s: TelemetrySource) -> WireMessage | None:
     target = s.flight.target
     if not isinstance(target, Target):
@@ -287,19 +206,17 @@ def position_target_local_ned(s: TelemetrySource) -> WireMessage | None:
     mask |= TypeMask.YAW_RATE if target.yaw_rad is not None else TypeMask.YAW
     frame, axes = (MavFrame.BODY_NED, frd) if target.along_heading else (MavFrame.LOCAL_NED, ned)
     position = ned((0.0 if x is None else x, 0.0 if y is None else y, 0.0 if z is None else z))
-    yaw = yaw_ned(target.yaw_rad) if target.yaw_rad is not None else 0.0
+    yaw = dialect.yaw_ned(target.yaw_rad) if target.yaw_rad is not None else 0.0
     return dialect.PositionTargetLocalNed(
         s.boot_ms, frame, mask, *position, *axes(target.velocity_m_s), 0.0, 0.0, 0.0, yaw, -target.yaw_rate_rad_s
     )
 
 
-@builds(dialect.MissionCurrent, both=(1.0, 1.0))
 def mission_current(s: TelemetrySource) -> WireMessage:
     mission = s.flight.mission
     return dialect.MissionCurrent(mission.current, mission.first + len(mission.items))
 
 
-@builds(dialect.DistanceSensor, both=(2.0, 10.0), sensor="sonar")
 def distance_sensor(s: TelemetrySource) -> WireMessage | None:
     sonar = s.sample("sonar")
     if sonar is None:
@@ -314,17 +231,6 @@ def distance_sensor(s: TelemetrySource) -> WireMessage | None:
     )
 
 
-@builds(dialect.Vibration, both=(0.1, 1.0))
-def vibration(s: TelemetrySource) -> WireMessage:
-    return dialect.Vibration(s.boot_us)
-
-
-@builds(dialect.AttitudeQuaternion, px4=(10.0, 50.0))
-def attitude_quaternion(s: TelemetrySource) -> WireMessage:
-    return dialect.AttitudeQuaternion(s.boot_ms, *attitude_ned(s.state.q_WB), *frd(s.state.rate_rad_s))
-
-
-@builds(dialect.Odometry, px4=(0.0, 30.0))
 def odometry(s: TelemetrySource) -> WireMessage:
     w, x, y, z = s.state.q_WB
     forward, left, up = frames.rotate((w, -x, -y, -z), s.state.velocity_m_s).tolist()
@@ -334,7 +240,7 @@ def odometry(s: TelemetrySource) -> WireMessage:
         MavFrame.LOCAL_NED,
         MavFrame.BODY_FRD,
         *s.position_ned_m,
-        attitude_ned(s.state.q_WB),
+        dialect.attitude_ned(s.state.q_WB),
         *frd((forward, left, up)),
         *frd(s.state.rate_rad_s),
         (level, *(0.0,) * 5, level, *(0.0,) * 4, height, *(0.0,) * 3, NAN, 0.0, 0.0, NAN, 0.0, NAN),
@@ -343,7 +249,6 @@ def odometry(s: TelemetrySource) -> WireMessage:
     )
 
 
-@builds(dialect.HighresImu, px4=(5.0, 50.0), sensor="imu")
 def highres_imu(s: TelemetrySource) -> WireMessage | None:
     imu = s.sample("imu")
     if imu is None:
@@ -364,12 +269,10 @@ def highres_imu(s: TelemetrySource) -> WireMessage | None:
 
 
 def _inertial(imu: Any) -> WireMessage:
-    """Return HIGHRES_IMU of a sample of the inertial unit alone."""
     t_us = imu.t_sample_ns // 1000
     return dialect.HighresImu(t_us, *frd(imu.accel_m_s2), *frd(imu.gyro_rad_s), fields_updated=INERTIAL)
 
 
-@builds(dialect.Altitude, px4=(1.0, 10.0))
 def altitude(s: TelemetrySource) -> WireMessage:
     z, height = s.state.position_m[2], s.place[2]
     return dialect.Altitude(s.boot_us, z, height, z, s.state.altitude_m, NAN, NAN)
@@ -378,11 +281,10 @@ def altitude(s: TelemetrySource) -> WireMessage:
 def _estimator_flags(s: TelemetrySource) -> int:
     """Return the flags of a complete estimate, without the absolute position if the GPS has failed."""
     if s.state.is_estimated and s.state.has_failed("gps"):
-        return ALL_ESTIMATED & ~(EstimatorFlag.POS_HORIZ_ABS | EstimatorFlag.PRED_POS_HORIZ_ABS)
-    return ALL_ESTIMATED
+        return dialect.ALL_ESTIMATED & ~(dialect.POS_HORIZ_ABS | dialect.PRED_POS_HORIZ_ABS)
+    return dialect.ALL_ESTIMATED
 
 
-@builds(dialect.EstimatorStatus, px4=(1.0, 5.0))
 def estimator_status(s: TelemetrySource) -> WireMessage:
     level, up = s.state.sigma_m
     flags = _estimator_flags(s)
@@ -400,35 +302,21 @@ def _milli_readings(s: TelemetrySource) -> tuple[int, ...] | None:
     return *accel, *gyro, *field
 
 
-@builds(dialect.RawImu, ardupilot=(2.0, 50.0))
 def raw_imu(s: TelemetrySource) -> WireMessage | None:
     values = _milli_readings(s)
     return dialect.RawImu(s.boot_us, *values) if values else None
 
 
-@builds(dialect.ScaledImu, ardupilot=(0.0, 50.0))
 def scaled_imu(s: TelemetrySource) -> WireMessage | None:
     values = _milli_readings(s)
     return dialect.ScaledImu(s.boot_ms, *values) if values else None
 
 
-@builds(dialect.EkfStatusReport, ardupilot=(1.0, 10.0))
-def ekf_status_report(s: TelemetrySource) -> WireMessage:
-    return dialect.EkfStatusReport(_estimator_flags(s))
-
-
-@builds(dialect.FenceStatus, ardupilot=(1.0, 2.0))
-def fence_status(s: TelemetrySource) -> WireMessage:
-    return dialect.FenceStatus(int(s.breach != 0), min(s.breaches, 0xFFFF), s.breach, s.breach_ns // 1_000_000)
-
-
-@builds(dialect.ScaledPressure, px4=(1.0, 5.0), ardupilot=(2.0, 10.0))
 def scaled_pressure(s: TelemetrySource) -> WireMessage | None:
     baro = s.sample("baro")
     return dialect.ScaledPressure(s.boot_ms, baro.pressure_pa / 100.0) if baro else None
 
 
-@builds(dialect.OpticalFlow, px4=(0.0, 15.0), sensor="flow")
 def optical_flow(s: TelemetrySource) -> WireMessage | None:
     flow = s.sample("flow")
     if flow is None:
@@ -438,6 +326,66 @@ def optical_flow(s: TelemetrySource) -> WireMessage | None:
     return dialect.OpticalFlow(s.boot_us, 0, 0, 0, forward, -left, quality, s.state.altitude_m)
 
 
+Builder = Callable[[TelemetrySource], WireMessage | None]
+Rates = tuple[float, float]
+"""At the levels normal and full [Hz of simulated time]."""
+
+
+class Row(NamedTuple):
+    """A message: builder, rates with each autopilot (None: on request alone), sensor whose samples it follows."""
+
+    build: Builder
+    px4: Rates | None = None
+    ardupilot: Rates | None = None
+    sensor: str | None = None
+
+
+ROWS: dict[type[WireMessage], Row] = {
+    dialect.Heartbeat: Row(heartbeat),
+    dialect.SysStatus: Row(sys_status, (1.0, 5.0), (1.0, 5.0)),
+    dialect.SystemTime: Row(lambda s: dialect.SystemTime(time_boot_ms=s.boot_ms), (1.0, 1.0), (1.0, 1.0)),
+    dialect.Attitude: Row(
+        lambda s: dialect.Attitude(s.boot_ms, *s.rpy_ned_rad, *frd(s.state.rate_rad_s)), (10.0, 50.0), (10.0, 50.0)
+    ),
+    dialect.LocalPositionNed: Row(
+        lambda s: dialect.LocalPositionNed(s.boot_ms, *s.position_ned_m, *s.velocity_ned_m_s),
+        (10.0, 50.0),
+        (10.0, 50.0),
+    ),
+    dialect.GlobalPositionInt: Row(global_position_int, (5.0, 50.0), (5.0, 50.0)),
+    dialect.GpsRawInt: Row(gps_raw_int, (5.0, 5.0), (5.0, 5.0), "gps"),
+    dialect.VfrHud: Row(vfr_hud, (4.0, 20.0), (4.0, 20.0)),
+    dialect.BatteryStatus: Row(battery_status, (0.5, 1.0), (0.5, 1.0)),
+    dialect.ExtendedSysState: Row(
+        lambda s: dialect.ExtendedSysState(0, LANDED_STATES[s.state.state]), (2.0, 5.0), (2.0, 5.0)
+    ),
+    dialect.HomePosition: Row(home_position, (0.5, 1.0), (0.5, 1.0)),
+    dialect.GpsGlobalOrigin: Row(
+        lambda s: dialect.GpsGlobalOrigin(*global_ints(s.state.origin), s.boot_us), (0.2, 1.0), (0.2, 1.0)
+    ),
+    dialect.PositionTargetLocalNed: Row(position_target_local_ned, (2.0, 10.0), (2.0, 10.0)),
+    dialect.MissionCurrent: Row(mission_current, (1.0, 1.0), (1.0, 1.0)),
+    dialect.DistanceSensor: Row(distance_sensor, (2.0, 10.0), (2.0, 10.0), "sonar"),
+    dialect.Vibration: Row(lambda s: dialect.Vibration(s.boot_us), (0.1, 1.0), (0.1, 1.0)),
+    dialect.AttitudeQuaternion: Row(
+        lambda s: dialect.AttitudeQuaternion(s.boot_ms, *dialect.attitude_ned(s.state.q_WB), *frd(s.state.rate_rad_s)),
+        (10.0, 50.0),
+    ),
+    dialect.Odometry: Row(odometry, (0.0, 30.0)),
+    dialect.HighresImu: Row(highres_imu, (5.0, 50.0), None, "imu"),
+    dialect.Altitude: Row(altitude, (1.0, 10.0)),
+    dialect.EstimatorStatus: Row(estimator_status, (1.0, 5.0)),
+    dialect.RawImu: Row(raw_imu, None, (2.0, 50.0)),
+    dialect.ScaledImu: Row(scaled_imu, None, (0.0, 50.0)),
+    dialect.EkfStatusReport: Row(lambda s: dialect.EkfStatusReport(_estimator_flags(s)), None, (1.0, 10.0)),
+    dialect.FenceStatus: Row(
+        lambda s: dialect.FenceStatus(int(s.breach != 0), min(s.breaches, 0xFFFF), s.breach, s.breach_ns // 1_000_000),
+        None,
+        (1.0, 2.0),
+    ),
+    dialect.ScaledPressure: Row(scaled_pressure, (1.0, 5.0), (2.0, 10.0)),
+    dialect.OpticalFlow: Row(optical_flow, (0.0, 15.0), None, "flow"),
+}
 STREAMS: dict[int, tuple[type[WireMessage], ...]] = {  # MAV_DATA_STREAM, as ArduCopter fills them
     1: (dialect.RawImu, dialect.ScaledPressure, dialect.ScaledImu),
     2: (dialect.SysStatus, dialect.MissionCurrent, dialect.GpsRawInt, dialect.FenceStatus),
@@ -447,15 +395,11 @@ STREAMS: dict[int, tuple[type[WireMessage], ...]] = {  # MAV_DATA_STREAM, as Ard
     12: (dialect.SystemTime, dialect.EkfStatusReport, dialect.DistanceSensor, dialect.BatteryStatus, dialect.Vibration),
 }
 ALL_STREAMS = 0
-BY_ID = {LAYOUTS[kind].id: kind for kind in ROWS}
+BY_ID = {dialect.LAYOUTS[kind].id: kind for kind in ROWS}
 
 
 class Telemetry:
-    """What one vehicle sends, and how often; clients may change the rates.
-
-    Args:
-        level: of the rates at the start.
-    """
+    """What one vehicle sends, and how often; clients may change the rates."""
 
     def __init__(self, source: TelemetrySource, level: Level) -> None:
         self._source = source
@@ -477,13 +421,14 @@ class Telemetry:
         self._due_ns[kind] = 0
 
     def due(self, t_ns: int) -> list[WireMessage]:
-        """Return the messages that are due at a gate."""
         self._source.advance()
         arrived = self._source.state.take_arrived()
         messages: list[WireMessage] = []
         for kind, interval_ns in self._interval_ns.items():
-            due_ns = self._due_ns[kind]
-            if t_ns >= due_ns + _delay_ns(kind, interval_ns, arrived):
+            due_ns, delay_ns, sensor = self._due_ns[kind], 0, ROWS[kind].sensor
+            if sensor is not None:  # it waits for a sample, at the latest two intervals
+                delay_ns = -interval_ns // 2 if arrived.get(sensor) else 2 * interval_ns
+            if t_ns >= due_ns + delay_ns:
                 self._due_ns[kind] = max(due_ns + interval_ns, t_ns + interval_ns // 2)
                 message = ROWS[kind].build(self._source)
                 if message is not None:
@@ -524,11 +469,3 @@ class Telemetry:
                 for kind in kinds:
                     if kind in self._defaults:
                         self._put(kind, rate_hz)
-
-
-def _delay_ns(kind: type[WireMessage], interval_ns: int, arrived: Mapping[str, Sequence[Any]]) -> int:
-    """Return how long a due message waits: one of a sensor for a sample, at the latest two intervals."""
-    sensor = ROWS[kind].sensor
-    if sensor is None:
-        return 0
-    return -interval_ns // 2 if arrived.get(sensor) else 2 * interval_ns

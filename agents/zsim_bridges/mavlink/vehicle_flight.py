@@ -5,7 +5,7 @@ A landed drone of zsim has no state of its own for armed: armed means that it ta
 
 from collections.abc import Callable
 
-from zsim_bridges.mavlink.enums import Severity
+from zsim_bridges.mavlink.dialect import Severity
 from zsim_bridges.mavlink.flight_control import ARRIVED_M, FlightControl, Target, TiltTarget
 from zsim_bridges.mavlink.mission import Mission
 from zsim_bridges.mavlink.personality import HOLDING, FlightMode, Parameters, Personality
@@ -21,12 +21,6 @@ class Flight:
 
     Args:
         name: of this process among the commanders of drones.
-        sender: of commands to the drone.
-        report: called with texts for the operator.
-
-    Attributes:
-        mode: the present one.
-        mission: its items, and the progress in them.
     """
 
     def __init__(
@@ -65,12 +59,10 @@ class Flight:
 
     @property
     def foreign_commander(self) -> str | None:
-        """Who else flies the drone."""
         commander = self._state.status.commander if self._state.status else None
         return commander if commander != self._name else None
 
     def refusal(self) -> str | None:
-        """Return why nothing can be asked of the drone now."""
         if self._state.status is None:
             return "no status of the drone yet"
         if self.foreign_commander:
@@ -78,7 +70,6 @@ class Flight:
         return "emergency: rotors are stopped; reboot" if self._state.state == "emergency" else None
 
     def arm(self, force: bool) -> str | None:
-        """Arm it."""
         if self.is_armed:
             return None
         failed = [] if force else self._state.failed_sensors()
@@ -132,7 +123,6 @@ class Flight:
         return None
 
     def set_mode(self, mode: FlightMode) -> str | None:
-        """Change the mode."""
         reason = self.refusal()
         if reason and (self._state.is_airborne or self.foreign_commander):
             return reason
@@ -141,7 +131,6 @@ class Flight:
         return self._enter(mode)
 
     def go_to(self, target: Target) -> str | None:
-        """Fly to a position and hold it."""
         reason = self.refusal() or (None if self._state.is_steerable else f"{self._state.state}, not flying")
         if reason is None:
             self.mode = FlightMode.HOLD if FlightMode.TAKEOFF in self._personality.modes else FlightMode.OFFBOARD
@@ -156,11 +145,12 @@ class Flight:
         if self.mode is not FlightMode.OFFBOARD:
             return None if self._personality.is_px4 else "not in GUIDED"
         reason = self.refusal()
-        if reason is None and not self._control.is_climbing:
+        if reason is None and self._control.climb_to_m is None:
             self._control.hold(target)
-            leads_up = target.leads_up(self._state.position_m[2] + ARRIVED_M)
-            if leads_up and self._is_armed and not self._state.is_airborne:
-                self._control.ask("takeoff")
+            if isinstance(target, Target) and self._is_armed and not self._state.is_airborne:
+                z = target.position_m[2]  # no take-off begins with a tilt
+                if target.velocity_m_s[2] > 0.0 or (z is not None and z > self._state.position_m[2] + ARRIVED_M):
+                    self._control.ask("takeoff")
         return reason
 
     def steer_by_sticks(self, target: Target) -> None:
@@ -179,7 +169,6 @@ class Flight:
     # Gates
 
     def step(self) -> None:
-        """Do what is due at a gate, after the state has been updated."""
         self._control.advance(self._state.t_ns)
         self.mission.note_progress()
         if self.mode is not FlightMode.MISSION and not (self.mode is FlightMode.RETURN and self._mission_returns):
@@ -188,7 +177,8 @@ class Flight:
         if self.foreign_commander:
             self._control.release()
         elif self._state.is_steerable and self._is_armed:
-            self._control.on_airborne()
+            if self._control.asked and self._control.asked[0] == "takeoff":
+                self._control.asked = None
             self._fly()
             self._control.send_due()
         elif self._control.is_takeoff_overdue():
@@ -197,7 +187,6 @@ class Flight:
             self.mission.abort("the drone refused the take-off", failsafe=True)
 
     def _follow_drone(self) -> None:
-        """Follow what the drone does by itself."""
         state, airborne = self._state.state, self._state.is_airborne
         if state == "emergency":
             self.mission.abort("its rotors were stopped", failsafe=True)
@@ -209,7 +198,7 @@ class Flight:
             else:
                 self.mission.abort("it landed by itself", failsafe=True)
             self._stand("Landed; disarmed")
-        elif self._is_armed and not airborne and not self._control.is_asking:
+        elif self._is_armed and not airborne and self._control.asked is None:
             delay_s = self._parameters["disarm_s"]
             if delay_s > 0 and self._state.t_ns - self._armed_ns > delay_s * 1e9:
                 self.mission.abort("no take-off", failsafe=True)
@@ -220,21 +209,24 @@ class Flight:
         self._was_airborne = airborne
 
     def _fly(self) -> None:
-        """Do what the mode asks in the air."""
-        if self._control.is_climbing:
+        if self._control.climb_to_m is not None:
             if self._control.continue_climb():
                 if self.mode is FlightMode.TAKEOFF:
                     self.mode = FlightMode.HOLD
                 elif self.mode is FlightMode.MISSION:
-                    self.mission.on_climbed()
+                    self.mission.has_climbed = True
         elif self.mode is FlightMode.MISSION:
             self._fly_mission()
         elif self.mode is FlightMode.RETURN:
             self._fly_home()
         elif self.mode is FlightMode.LAND:
             self._control.ask("land")
-        elif self.mode is FlightMode.OFFBOARD or self._control.is_moving:
-            self._watch_stream()
+        elif self._is_stream_silent() and self.target is not None:  # ArduPilot holds a position anyway
+            if self.mode is FlightMode.OFFBOARD and self._personality.is_px4:
+                self._report(Severity.WARNING, "Offboard lost: no setpoints; holding")
+                self._enter(FlightMode.HOLD)
+            elif self._control.is_moving:
+                self._control.hold_here()
 
     def _fly_mission(self) -> None:
         step = self.mission.step(self._state, self._parameters)
@@ -268,19 +260,8 @@ class Flight:
             self._control.ask("land")
 
     def _is_stream_silent(self) -> bool:
-        """Return whether no setpoint has come for too long, or ever."""
         silence_ns = self._parameters["stream_s"] * 1e9
         return self._setpoint_ns is None or self._state.t_ns - self._setpoint_ns > silence_ns
-
-    def _watch_stream(self) -> None:
-        """Hold when setpoints cease; ArduPilot holds a position anyway."""
-        if not self._is_stream_silent() or self.target is None:
-            return
-        if self.mode is FlightMode.OFFBOARD and self._personality.is_px4:
-            self._report(Severity.WARNING, "Offboard lost: no setpoints; holding")
-            self._enter(FlightMode.HOLD)
-        elif self._control.is_moving:
-            self._control.hold_here()
 
     def _takeoff_refusal(self) -> str | None:
         return "landing" if self._state.state == "landing" else None if self.is_armed else "not armed"
@@ -315,7 +296,6 @@ class Flight:
         self._control.climb(takeoff_m if z_m is None else z_m)
 
     def _stand(self, text: str) -> None:
-        """Be disarmed."""
         self._control.release()
         self._is_armed = False
         if self.mode in OVER_ON_GROUND or (self.mode is FlightMode.OFFBOARD and self._personality.is_px4):

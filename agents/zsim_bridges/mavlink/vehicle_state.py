@@ -12,7 +12,7 @@ from zsim.math.frames import anchor, geodetic
 from zsim.math.rotation import LEVEL, Vector
 from zsim.scenario.scenario import Drone
 from zsim_bridges.mavlink import dialect
-from zsim_bridges.mavlink.enums import SensorBit
+from zsim_bridges.mavlink.dialect import SensorBit
 
 ESTIMATE_AGE_MAX_NS = 500_000_000  # ns; an older estimate is not used
 SAMPLES_MISSED = 5  # periods of a sensor without a sample: it has failed
@@ -27,29 +27,17 @@ SENSORS = {
     "sonar": SensorBit.LASER_POSITION,
     "flow": SensorBit.FLOW,
 }
-CONTROLS = (
-    SensorBit.RATE_CONTROL
-    | SensorBit.ATTITUDE_CONTROL
-    | SensorBit.YAW_POSITION
-    | SensorBit.ALTITUDE_CONTROL
-    | SensorBit.POSITION_CONTROL
-    | SensorBit.MOTORS
-    | SensorBit.AHRS
-)
+
+
+ALL_HEALTHY = SensorBit(sum(SensorBit))
 
 
 class VehicleState:
     """The state of one vehicle.
 
-    Args:
-        drone: of the scenario.
-        origin: of W on the Earth.
-
     Attributes:
         t_ns: simulated time of the newest status.
-        status: of the drone; None before the first.
-        position_m, velocity_m_s: in W.
-        q_WB, rate_rad_s: attitude, and body rate in B.
+        position_m, velocity_m_s: in W; q_WB, rate_rad_s: attitude, and body rate in B.
         is_estimated: whether these are the estimator's.
         sigma_m: standard deviation of the horizontal and of the vertical position; 0 for the truth.
         samples: the newest of each sensor, by name.
@@ -76,12 +64,7 @@ class VehicleState:
         }
 
     def update(self, name: str, message: Any) -> None:
-        """Take in a message of the drone or of its estimator.
-
-        Args:
-            name: of the sensor; `truth`, `estimate`, `status`.
-            message: decoded.
-        """
+        """Note a message of the drone or of its estimator; `name` is the last part of its key."""
         match message:
             case flight_messages.Status():
                 if self.status is None:
@@ -90,9 +73,18 @@ class VehicleState:
                 if self.home_m is None:
                     self.home_m = self.position_m
             case flight_messages.Truth():
-                self._on_truth(message)
+                if message.t_ns - self._estimate_ns > ESTIMATE_AGE_MAX_NS:
+                    self.is_estimated, self.sigma_m = False, (0.0, 0.0)
+                    self.position_m, self.velocity_m_s = message.position_m, message.velocity_m_s
+                    self.q_WB = message.orientation_wxyz
             case flight_messages.Estimate():
-                self._on_estimate(message)
+                if abs(math.hypot(*message.orientation_wxyz) - 1.0) <= UNIT_SLACK:
+                    self._estimate_ns, self.is_estimated = message.t_ns, True
+                    self.position_m, self.velocity_m_s = message.position_m, message.velocity_m_s
+                    self.q_WB = message.orientation_wxyz
+                    variances = message.covariance
+                    level, up = max(0.0, variances[0] + variances[7]), max(0.0, variances[14])
+                    self.sigma_m = math.sqrt(level / 2.0), math.sqrt(up)
             case _:
                 self.samples[name] = message
                 self._arrived.setdefault(name, []).append(message)
@@ -100,25 +92,8 @@ class VehicleState:
                     self.rate_rad_s = message.gyro_rad_s
 
     def take_arrived(self) -> dict[str, list[Any]]:
-        """Return the samples received since the last call, by sensor."""
         arrived, self._arrived = self._arrived, {}
         return arrived
-
-    def _on_truth(self, truth: flight_messages.Truth) -> None:
-        if truth.t_ns - self._estimate_ns <= ESTIMATE_AGE_MAX_NS:
-            return
-        self.is_estimated, self.sigma_m = False, (0.0, 0.0)
-        self.position_m, self.velocity_m_s, self.q_WB = truth.position_m, truth.velocity_m_s, truth.orientation_wxyz
-
-    def _on_estimate(self, estimate: flight_messages.Estimate) -> None:
-        if abs(math.hypot(*estimate.orientation_wxyz) - 1.0) > UNIT_SLACK:
-            return
-        self._estimate_ns, self.is_estimated = estimate.t_ns, True
-        self.position_m, self.velocity_m_s = estimate.position_m, estimate.velocity_m_s
-        self.q_WB = estimate.orientation_wxyz
-        variances = estimate.covariance
-        level, up = max(0.0, variances[0] + variances[7]), max(0.0, variances[14])
-        self.sigma_m = math.sqrt(level / 2.0), math.sqrt(up)
 
     @property
     def is_airborne(self) -> bool:
@@ -131,7 +106,6 @@ class VehicleState:
 
     @property
     def state(self) -> str:
-        """The state in its status; `landed` before the first."""
         return self.status.state if self.status else "landed"
 
     @property
@@ -144,19 +118,16 @@ class VehicleState:
         return self.status is not None and self.status.battery_percent < LOW_BATTERY_PERCENT
 
     def has_failed(self, sensor: str) -> bool:
-        """Return whether a sensor has been silent for too long."""
         sample = self.samples.get(sensor)
         return self.t_ns - (sample.t_ns if sample else self._first_ns) > self._silence_max_ns[sensor]
 
     def failed_sensors(self) -> list[str]:
-        """Return the names of the sensors that are silent."""
         return [name for name in SENSORS if self.has_failed(name)]
 
     def health(self) -> SensorBit:
-        """Return the healthy parts of the vehicle."""
-        healthy = CONTROLS | SensorBit.BATTERY | SensorBit.PREARM_CHECK
-        for name, part in SENSORS.items():
-            healthy |= SensorBit(0) if self.has_failed(name) else part
+        healthy = ALL_HEALTHY
+        for name in self.failed_sensors():
+            healthy &= ~SENSORS[name]
         if self.is_battery_low:
             healthy &= ~SensorBit.BATTERY
         if self.state == "emergency":

@@ -1,4 +1,1 @@
-"""The drones in a ROS 1 graph, under the names and with the messages of ardrone_autonomy, without ROS on this host.
-
-Imports zsim, and what stands beside it; no other bridge.
-"""
+"""The drones in a ROS 1 graph, under the names and with the messages of ardrone_autonomy, without ROS on this host."""

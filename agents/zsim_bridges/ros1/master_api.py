@@ -18,6 +18,10 @@ from zsim.errors import RunError
 TIMEOUT_S = 3.0  # of one call
 BODY_MAX = 1_000_000  # bytes of a request
 DONE = 1  # code of an answer
+DEFAULT_MASTER = "http://127.0.0.1:11311"  # ROS's own
+DEFAULT_PORT = 11311
+CHECK_S = 1.0  # wall time between two checks whether the master still has the registration
+UNREGISTER_S = 2.0  # in which to unregister
 
 
 class ApiError(Exception):
@@ -68,7 +72,7 @@ class _Handler(SimpleXMLRPCRequestHandler):
 
 
 class XmlRpcServer(ThreadingMixIn, SimpleXMLRPCServer):
-    """Serves calls of an object's methods, each connection in a thread of its own."""
+    """Serves calls of an object's public methods, each connection in a thread of its own."""
 
     daemon_threads = True
 
@@ -80,10 +84,6 @@ class XmlRpcServer(ThreadingMixIn, SimpleXMLRPCServer):
         """Log nothing of a client that disconnected."""
 
 
-DEFAULT_MASTER = "http://127.0.0.1:11311"  # ROS's own
-DEFAULT_PORT = 11311
-
-
 def own_address(master_uri: str, environment: Mapping[str, str] = os.environ) -> str:
     """Return the name or address under which nodes of a master's graph reach this host.
 
@@ -92,7 +92,13 @@ def own_address(master_uri: str, environment: Mapping[str, str] = os.environ) ->
     Raises:
         RunError: the URI is none, or its host is unknown.
     """
-    host, port = master_address(master_uri)
+    try:
+        parts = urlsplit(master_uri)
+        scheme, host, port = parts.scheme, parts.hostname, parts.port or DEFAULT_PORT
+    except ValueError:
+        scheme, host, port = "", None, 0
+    if host is None or scheme != "http":
+        raise RunError(f"ROS master is {master_uri!r}; must be such as {DEFAULT_MASTER}")
     configured = environment.get("ROS_HOSTNAME") or environment.get("ROS_IP")
     if configured:
         return configured
@@ -106,36 +112,8 @@ def own_address(master_uri: str, environment: Mapping[str, str] = os.environ) ->
         ) from error
 
 
-def master_address(uri: str) -> tuple[str, int]:
-    """Return host and port of a master.
-
-    Raises:
-        RunError: it is no URI of a master.
-    """
-    try:
-        parts = urlsplit(uri)
-        scheme, host, port = parts.scheme, parts.hostname, parts.port or DEFAULT_PORT
-    except ValueError:
-        scheme, host, port = "", None, 0
-    if host is None or scheme != "http":
-        raise RunError(f"ROS master is {uri!r}; must be such as {DEFAULT_MASTER}")
-    return host, port
-
-
-CHECK_S = 1.0  # wall time between two checks whether the master still has the registration
-UNREGISTER_S = 2.0  # in which to unregister
-
-
 class GraphEntry(NamedTuple):
-    """What a node registers.
-
-    Attributes:
-        caller: its name.
-        slave_uri: of its slave API.
-        service_uri: where its services are.
-        published, subscribed: topics and their types.
-        services: names.
-    """
+    """What a node registers: its name, URIs of its slave API and services, topics with their types, services."""
 
     caller: str
     slave_uri: str
@@ -146,14 +124,11 @@ class GraphEntry(NamedTuple):
 
 
 class Registration:
-    """Keeps a node registered, in a thread of its own.
+    """Keeps a node registered, in a thread of its own, from its construction to `close`.
 
     Args:
-        master_uri: of the master.
-        entry: what to register.
         on_publishers: called with a topic and its publishers, whenever the node has registered.
         on_displaced: called once when another node has taken the name.
-        say: prints a line.
     """
 
     def __init__(
@@ -174,23 +149,35 @@ class Registration:
         self._may_be_registered = False
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="registration", daemon=True)
-
-    def start(self) -> None:
-        """Begin to register."""
         self._thread.start()
 
     def close(self) -> None:
         """Unregister, if the master is there."""
         self._closed.set()
         self._thread.join(2 * TIMEOUT_S)
-        if self._may_be_registered:
-            self._unregister(time.monotonic() + UNREGISTER_S)
+        if not self._may_be_registered:
+            return
+        entry, until_s = self._entry, time.monotonic() + UNREGISTER_S
+        calls = [("unregisterService", service, entry.service_uri) for service in entry.services]
+        calls += [("unregisterSubscriber", topic, entry.slave_uri) for topic, _ in entry.subscribed]
+        calls += [("unregisterPublisher", topic, entry.slave_uri) for topic, _ in entry.published]
+        for call in calls:
+            if time.monotonic() > until_s:
+                return
+            try:
+                self._call(*call)
+            except ApiError:
+                continue
+            except CALL_ERRORS:
+                return  # the master is gone, and its registrations with it
 
     def _run(self) -> None:
         since_s, next_say_s = time.monotonic(), 0.0
         while not self._closed.is_set():
             try:
-                self._check()
+                self._registered = self._registered and self._is_registered()
+                if not self._registered and not self._closed.is_set():
+                    self._register()
                 since_s, next_say_s = time.monotonic(), 0.0
             except CALL_ERRORS as error:
                 self._registered = False
@@ -199,17 +186,6 @@ class Registration:
                     next_say_s = max(2 * next_say_s, 1.0)
                     self._say(f"waiting for a ROS master on {self._uri} ({waited_s:.0f} s): {error}")
             self._closed.wait(CHECK_S)
-
-    def _check(self) -> None:
-        """Register, or check whether the master still has the registration."""
-        if self._registered and not self._is_registered():
-            self._registered = False
-        if not self._registered and not self._closed.is_set():
-            self._register()
-            self._registered = True
-            again = "registered again" if self._was_registered else "registered"
-            self._was_registered = True
-            self._say(f"{self._entry.caller}: {again} with the ROS master on {self._uri}")
 
     def _is_registered(self) -> bool:
         try:
@@ -229,21 +205,10 @@ class Registration:
             self._call("registerService", service, entry.service_uri, entry.slave_uri)
         for topic, kind in entry.subscribed:
             self._on_publishers(topic, self._call("registerSubscriber", topic, kind, entry.slave_uri))
-
-    def _unregister(self, until_s: float) -> None:
-        entry = self._entry
-        calls = [("unregisterService", service, entry.service_uri) for service in entry.services]
-        calls += [("unregisterSubscriber", topic, entry.slave_uri) for topic, _ in entry.subscribed]
-        calls += [("unregisterPublisher", topic, entry.slave_uri) for topic, _ in entry.published]
-        for call in calls:
-            if time.monotonic() > until_s:
-                return
-            try:
-                self._call(*call)
-            except ApiError:
-                continue
-            except CALL_ERRORS:
-                return  # the master is gone, and its registrations with it
+        self._registered = True
+        again = "registered again" if self._was_registered else "registered"
+        self._was_registered = True
+        self._say(f"{entry.caller}: {again} with the ROS master on {self._uri}")
 
     def _call(self, method: str, *arguments: Any) -> Any:
         return call_api(self._uri, method, self._entry.caller, *arguments)

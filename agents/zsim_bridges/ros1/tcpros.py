@@ -14,9 +14,12 @@ from typing import Any, NamedTuple
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 HEADER_MAX = 1_000_000  # bytes; definitions of the largest messages have some 10 000
+FRAME_MAX = 1_000_000  # bytes; nodes send commands alone
+HANDSHAKE_S = 10.0  # within which a header must come
 ANY_TYPE = "*"  # md5sum or type of a node that takes any
+CONNECTION_ERRORS = (OSError, IncompleteReadError, TimeoutError, ValueError, OverflowError)
+"""Errors that end a connection: it is gone, silent, or not TCPROS."""
 _LENGTH = struct.Struct("<I")
-LENGTH_SIZE = _LENGTH.size
 
 
 class TopicType(NamedTuple):
@@ -37,11 +40,6 @@ def frame(payload: bytes) -> bytes:
     return _LENGTH.pack(len(payload)) + payload
 
 
-def length(head: bytes | memoryview) -> int:
-    """Return the length that four bytes encode."""
-    return _LENGTH.unpack(head)[0]
-
-
 def encode_header(fields: Mapping[str, str]) -> bytes:
     """Return a header, its own length first."""
     return frame(b"".join(frame(f"{key}={value}".encode()) for key, value in fields.items()))
@@ -54,16 +52,16 @@ def decode_header(body: bytes) -> dict[str, str]:
         HeaderError: it is none.
     """
     fields: dict[str, str] = {}
-    rest = memoryview(body)
-    while rest:
-        if len(rest) < LENGTH_SIZE or length(rest[:LENGTH_SIZE]) > len(rest) - LENGTH_SIZE:
+    start = 0
+    while start < len(body):
+        first = start + _LENGTH.size
+        if first > len(body) or (end := first + _LENGTH.unpack_from(body, start)[0]) > len(body):
             raise HeaderError("a field is longer than the header")
-        end = LENGTH_SIZE + length(rest[:LENGTH_SIZE])
-        key, separator, value = bytes(rest[LENGTH_SIZE:end]).decode(errors="replace").partition("=")
+        key, separator, value = body[first:end].decode(errors="replace").partition("=")
         if not separator:
             raise HeaderError(f"a field is {key[:40]!r}; must be key=value")
         fields[key] = value
-        rest = rest[end:]
+        start = end
     return fields
 
 
@@ -111,12 +109,6 @@ def mismatch(topic_type: TopicType, header: Mapping[str, str], caller: str) -> s
     )
 
 
-HANDSHAKE_S = 10.0  # within which a header must come
-FRAME_MAX = 1_000_000  # bytes; nodes send commands alone
-CONNECTION_ERRORS = (OSError, IncompleteReadError, TimeoutError, ValueError, OverflowError)
-"""Errors that end a connection: it is gone, silent, or not TCPROS."""
-
-
 async def read_frame(reader: StreamReader, limit: int = FRAME_MAX) -> bytes:
     """Return the next frame's payload.
 
@@ -124,7 +116,7 @@ async def read_frame(reader: StreamReader, limit: int = FRAME_MAX) -> bytes:
         ValueError: it is longer than the limit.
         IncompleteReadError: the connection ended.
     """
-    size = length(await reader.readexactly(LENGTH_SIZE))
+    (size,) = _LENGTH.unpack(await reader.readexactly(_LENGTH.size))
     if size > limit:
         raise ValueError(f"a frame has {size} bytes; must have at most {limit}")
     return await reader.readexactly(size)
@@ -137,8 +129,7 @@ async def read_header(reader: StreamReader) -> dict[str, str]:
         HeaderError: it is none.
         TimeoutError: it does not arrive.
     """
-    body = await asyncio.wait_for(read_frame(reader, HEADER_MAX), HANDSHAKE_S)
-    return decode_header(body)
+    return decode_header(await asyncio.wait_for(read_frame(reader, HEADER_MAX), HANDSHAKE_S))
 
 
 async def send_error(writer: StreamWriter, reason: str) -> None:
@@ -190,15 +181,11 @@ float32[] tags_orientation
 float32[] tags_distance
 float32 tm              # us
 """  # fields of ardrone_autonomy 1.4.1, msg/Navdata.msg; the MD5 sum leaves comments out
-DEFINITIONS = {
-    "ardrone_autonomy/msg/Navdata": NAVDATA,
-    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
-}
 EMPTY_SERVICE = TopicType("", "std_srvs/Empty", "d41d8cd98f00b204e9800998ecf8427e", "")  # MD5 of no text at all
 
 _store = get_typestore(Stores.ROS1_NOETIC)
-for _name, _text in DEFINITIONS.items():
-    _store.register(get_types_from_msg(_text, _name))
+_store.register(get_types_from_msg(NAVDATA, "ardrone_autonomy/msg/Navdata"))
+_store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", "tf2_msgs/msg/TFMessage"))
 
 
 def topic_type_of(topic: str, kind: str) -> TopicType:
@@ -208,7 +195,6 @@ def topic_type_of(topic: str, kind: str) -> TopicType:
 
 
 def message_class(kind: str) -> Callable[..., Any]:
-    """Return the class of a type's messages."""
     return _store.types[_full_name(kind)]
 
 

@@ -10,17 +10,20 @@ import re
 import struct
 from collections.abc import Callable, Iterable
 from itertools import count
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import xxhash
 
 from zsim.transport.session import Query, RawSample, Session
-from zsim_bridges.ros2.ros_types import RosTypes, service_parts
+from zsim_bridges.ros2 import ros_types
 
 CDR = "application/cdr"
-OnRefused = Callable[[str, str], None]
-"""Called with (name, reason) of a message that is refused, in threads of Zenoh's."""
 _OTHERS = re.compile(r"[^a-z0-9]+")  # and no two underscores in a row, which ROS reserves
+TOKEN_SPACE = "@ros2_lv"  # of all tokens; `**` does not match it
+TOKEN_PARTS = 13  # of an endpoint's token
+GID_BYTES = 16
+_HEAD = struct.Struct("<qqB")  # sequence number, wall time [ns], length of the gid
+ATTACHMENT_BYTES = _HEAD.size + GID_BYTES
 
 
 def ros_name(name: str, what: str) -> str:
@@ -32,24 +35,13 @@ def ros_name(name: str, what: str) -> str:
 def ros_names(names: Iterable[str], what: str) -> dict[str, str]:
     """Return the ROS name of each; where two would have the same, the later ones get a number."""
     ros_name_of: dict[str, str] = {}
-    used: set[str] = set()
     for name in names:
         first = chosen = ros_name(name, what)
         number = 2
-        while chosen in used:
+        while chosen in ros_name_of.values():
             chosen, number = f"{first.rstrip('_')}_{number}", number + 1
-        used.add(chosen)
         ros_name_of[name] = chosen
     return ros_name_of
-
-
-TOKEN_SPACE = "@ros2_lv"  # of all tokens; `**` does not match it
-Kind = Literal["NN", "MP", "MS", "SS", "SC"]
-"""A node, a publisher, a subscription, a service, a client."""
-TOKEN_PARTS = 13  # of an endpoint's token
-GID_BYTES = 16
-_HEAD = struct.Struct("<qqB")  # sequence number, wall time [ns], length of the gid
-ATTACHMENT_BYTES = _HEAD.size + GID_BYTES
 
 
 class Qos(NamedTuple):
@@ -84,16 +76,12 @@ class NodeId(NamedTuple):
 
 
 class Endpoint(NamedTuple):
-    """A publisher, subscription, service or client, as its token describes it."""
+    """A publisher (kind MP), subscription (MS), service (SS) or client (SC), as its token describes it."""
 
     kind: str
     name: str
     type_name: str
     type_hash: str
-
-    def key(self, domain: int) -> str:
-        """Return the key of its messages or requests."""
-        return data_key(domain, self.name, self.type_name, self.type_hash)
 
 
 def dds_name(ros_type: str) -> str:
@@ -108,12 +96,10 @@ def data_key(domain: int, name: str, type_name: str, type_hash: str) -> str:
 
 
 def node_token(node: NodeId) -> str:
-    """Return the token of a node."""
     return _token_head(node, node.number, "NN")
 
 
 def endpoint_token(node: NodeId, number: int, endpoint: Endpoint, qos: Qos) -> str:
-    """Return the token of one of a node's endpoints."""
     endpoint_part = f"{_mangled(endpoint.name)}/{endpoint.type_name}/{endpoint.type_hash}/{qos.text()}"
     return f"{_token_head(node, number, endpoint.kind)}/{endpoint_part}"
 
@@ -128,11 +114,6 @@ def _mangled(name: str) -> str:
     return name.replace("/", "%")
 
 
-def subscription_tokens(domain: int) -> str:
-    """Return the expression of the tokens of all subscriptions."""
-    return f"{TOKEN_SPACE}/{domain}/*/*/*/MS/**"
-
-
 def endpoint_of(token: str) -> Endpoint | None:
     """Return the endpoint of a token; None where it is no endpoint's."""
     parts = token.split("/")
@@ -143,8 +124,7 @@ def endpoint_of(token: str) -> Endpoint | None:
 
 def gid_of(token: str) -> bytes:
     """Return the identity of an endpoint: XXH3-128 of its token, the low half first, both little-endian."""
-    digest = xxhash.xxh3_128_intdigest(token.encode())
-    return digest.to_bytes(GID_BYTES, "little")
+    return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(GID_BYTES, "little")
 
 
 class Attachment(NamedTuple):
@@ -175,38 +155,31 @@ class RosContext:
 
     Args:
         link: a session by full keys, without a federation.
-        domain: ROS_DOMAIN_ID.
-        types: of messages and services.
-        wall_ns: time since 1970.
-        refuse: see OnRefused.
+        wall_ns: returns the time since 1970.
+        refuse: called with (name, reason) of a message that is refused, in threads of Zenoh's.
     """
 
     def __init__(
-        self, link: Session, domain: int, types: RosTypes, wall_ns: Callable[[], int], refuse: OnRefused
+        self, link: Session, domain: int, wall_ns: Callable[[], int], refuse: Callable[[str, str], None]
     ) -> None:
         self.link = link
         self.domain = domain
-        self.types = types
         self.wall_ns = wall_ns
         self.refuse = refuse
-        self._numbers = count()
+        self.numbers = count()  # of nodes and endpoints
         self._zid = link.zid()
 
     def node(self, namespace: str, name: str) -> "Ros2Node":
         """Return a new node, which other nodes see from now on."""
-        return Ros2Node(self, NodeId(self.domain, self._zid, self.number(), namespace, name))
-
-    def number(self) -> int:
-        """Return the number of a new node or endpoint."""
-        return next(self._numbers)
+        return Ros2Node(self, NodeId(self.domain, self._zid, next(self.numbers), namespace, name))
 
     def on_subscription(self, callback: Callable[[str, bool], None]) -> None:
         """Call back with (token, alive), in a thread of Zenoh's, for the subscriptions of all contexts."""
-        self.link.on_token(subscription_tokens(self.domain), callback)
+        self.link.on_token(f"{TOKEN_SPACE}/{self.domain}/*/*/*/MS/**", callback)
 
 
 class Ros2Node:
-    """A node of a context."""
+    """A node of a context. An endpoint's token is declared once it works: others may use it at once."""
 
     def __init__(self, context: RosContext, identity: NodeId) -> None:
         self._context = context
@@ -215,75 +188,66 @@ class Ros2Node:
 
     def publisher(self, topic: str, kind: str, qos: Qos) -> "Publisher":
         """Return a publisher of a topic, given by its full name."""
-        endpoint, token = self._endpoint("MP", topic, kind, qos)
-        publisher = Publisher(self._context, endpoint, kind, qos, gid_of(token))
-        self._declare(token)
+        key, token = self._endpoint("MP", topic, kind, qos)
+        publisher = Publisher(self._context, key, kind, qos, gid_of(token))
+        self._context.link.declare_token(token)
         return publisher
 
     def subscription(self, topic: str, kind: str, qos: Qos, callback: Callable[[Any], None]) -> Callable[[], None]:
         """Call back with every message on a topic, in a thread of Zenoh's, until the returned function is called."""
         context = self._context
-        endpoint, token = self._endpoint("MS", topic, kind, qos)
+        key, token = self._endpoint("MS", topic, kind, qos)
 
         def on_publication(sample: RawSample) -> None:
             try:
                 attachment_of(sample.attachment)
-                callback(context.types.decode(sample.payload, kind))
+                callback(ros_types.decode(sample.payload, kind))
             except ValueError as error:
                 context.refuse(topic, str(error))
 
-        undeclare = context.link.declare_subscriber(endpoint.key(context.domain), on_publication)
-        self._declare(token)
+        undeclare = context.link.declare_subscriber(key, on_publication)
+        context.link.declare_token(token)
         return undeclare
 
     def service(self, name: str, kind: str, answer: Callable[[Any], Any]) -> None:
         """Answer a service's requests, each with what `answer` returns, in a thread of Zenoh's."""
         context = self._context
-        endpoint, token = self._endpoint("SS", name, kind, DEFAULT)
-        key, (request_type, response_type) = endpoint.key(context.domain), service_parts(kind)
+        key, token = self._endpoint("SS", name, kind, DEFAULT)
 
         def reply(query: Query) -> None:
             try:
                 received = attachment_of(query.attachment)
-                response = answer(context.types.decode(query.payload, request_type))
+                response = answer(ros_types.decode(query.payload, f"{kind}_Request"))
             except ValueError as error:
                 query.end()
                 context.refuse(name, str(error))
                 return
             attachment = Attachment(received.sequence, context.wall_ns(), received.gid)
-            query.reply_raw(key, context.types.encode(response, response_type), attachment.packed())
+            query.reply_raw(key, ros_types.encode(response, f"{kind}_Response"), attachment.packed())
 
         context.link.declare_queryable(key, reply, complete=True)
-        self._declare(token)
+        context.link.declare_token(token)
 
-    def _endpoint(self, how: Kind, name: str, kind: str, qos: Qos) -> tuple[Endpoint, str]:
-        """Return a new endpoint and its token."""
-        context = self._context
-        endpoint = Endpoint(how, name, dds_name(kind), context.types.hash(kind))
-        return endpoint, endpoint_token(self._identity, context.number(), endpoint, qos)
-
-    def _declare(self, token: str) -> None:
-        """Declare an endpoint once it works: others may use it at once."""
-        self._context.link.declare_token(token)
+    def _endpoint(self, how: str, name: str, kind: str, qos: Qos) -> tuple[str, str]:
+        """Return key and token of a new endpoint."""
+        endpoint = Endpoint(how, name, dds_name(kind), ros_types.type_hash(kind))
+        token = endpoint_token(self._identity, next(self._context.numbers), endpoint, qos)
+        return data_key(self._context.domain, *endpoint[1:]), token
 
 
 class Publisher:
-    """A publisher of a topic.
+    """A publisher of a topic."""
 
-    Attributes:
-        key: where its messages go.
-    """
-
-    def __init__(self, context: RosContext, endpoint: Endpoint, kind: str, qos: Qos, gid: bytes) -> None:
+    def __init__(self, context: RosContext, key: str, kind: str, qos: Qos, gid: bytes) -> None:
         self._context = context
         self._kind = kind
         self._gid = gid
         self._sent = 0
-        self.key = endpoint.key(context.domain)
+        self.key = key
         if qos.transient_local:  # later subscribers receive the last message, too
-            self._write = lambda payload, attached: context.link.put_cached(self.key, payload, CDR, attached)
+            self._write = lambda payload, attached: context.link.put_cached(key, payload, CDR, attached)
         else:
-            self._write = context.link.declare_publisher(self.key, CDR)
+            self._write = context.link.declare_publisher(key, CDR)
 
     def publish(self, message: Any) -> None:
         """Send a message; a subscriber that is too slow loses it, the publisher never waits.
@@ -291,8 +255,6 @@ class Publisher:
         Raises:
             ValueError: the message does not fit its type.
         """
-        context = self._context
-        payload = context.types.encode(message, self._kind)
+        payload = ros_types.encode(message, self._kind)
         self._sent += 1
-        attachment = Attachment(self._sent, context.wall_ns(), self._gid).packed()
-        self._write(payload, attachment)
+        self._write(payload, Attachment(self._sent, self._context.wall_ns(), self._gid).packed())

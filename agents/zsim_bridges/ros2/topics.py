@@ -1,168 +1,216 @@
-"""The topics of a run in ROS 2: name, type, quality of service, source keys and conversion of each."""
+"""The topics of a run in ROS 2: name, type, quality of service, source keys and conversion of each. Pure.
+
+Frames as REP-103 and REP-105 have them: map is W (east, north, up); of each drone `NAME/odom`, the frame of its
+estimate (it lies on map, since the estimate is of W), `NAME/base_link` (forward, left, up), and a frame for each
+sensor. Quaternions are w first. Samples are stamped with the time for which they hold.
+"""
 
 import math
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from rosbags.typesys.stores import ros2_jazzy
 
 from zsim.contract import keys
-from zsim.contract.flight_messages import ClusterState, Estimate, Status
-from zsim.math.frames import rpy_from_quaternion
+from zsim.contract.flight_messages import CameraImage, CameraInfo, ClusterState, Estimate, Quaternion, Status, Truth
+from zsim.math.frames import (
+    quaternion_conjugate,
+    quaternion_from_matrix,
+    quaternion_from_rpy,
+    quaternion_multiply,
+    rotate,
+    rotation_matrix,
+    rpy_from_quaternion,
+)
+from zsim.math.rotation import LEVEL
+from zsim.schema.message import Vector3
 from zsim.schema.quantities import G_M_S2
+from zsim.sensors.camera import CAMERAS
+from zsim.sensors.camera_model import camera_pose
+from zsim.sensors.sensor import ErrorModel, Mount, noise_sigma
 from zsim.sensors.sensor_catalogue import Sensors
-from zsim_bridges.ros2 import conversions, rmw_zenoh
-from zsim_bridges.ros2.conversions import NS_PER_S, FramePose, header
-from zsim_bridges.ros2.rmw_zenoh import Qos
-from zsim_bridges.ros2.ros_types import RosTypes
-from zsim_bridges.ros_frames import NAVDATA_STATES, by_axis, mean_rate
+from zsim_bridges import ros_messages as ros
+from zsim_bridges.ros2 import ros_types
+from zsim_bridges.ros2.rmw_zenoh import CLOCK, DEFAULT, SENSOR, TF, Qos
+from zsim_bridges.ros_messages import NS_PER_S
 
-UNKNOWN_VECTOR = (math.nan, math.nan, math.nan)
-
-
-class NavdataSummary:
-    """The navdata of ardrone_autonomy: a drone's newest samples in that driver's units, at each status, last of a gate.
-
-    Args:
-        kind: class of zsim_msgs/Navdata.
-        frame: of the message.
-    """
-
-    def __init__(self, kind: Any, frame: str) -> None:
-        self._kind = kind
-        self._frame = frame
-        self._last: dict[str, Any] = {}
-
-    def update(self, key: str, message: Any) -> Any | None:
-        """Store a message of the drone; return the summary if it is the status."""
-        leaf = keys.leaf(key)
-        if leaf != "status":
-            self._last[leaf] = message
-            return None
-        return self._kind(
-            header=header(message.t_ns, self._frame),
-            battery_percent=message.battery_percent,
-            state=NAVDATA_STATES[message.state],
-            **by_axis("mag_{}", "xyz", self._scaled("mag", "field_ut", 1.0)),
-            pressure=self._rounded("baro", "pressure_pa", 1.0),
-            **by_axis("rot_{}", "xyz", self._attitude()),
-            altd=self._rounded("sonar", "range_m", 1000.0),
-            **by_axis("v{}", "xyz", self._scaled("flow", "velocity_m_s", 1000.0)),
-            **by_axis("a{}", "xyz", self._scaled("imu", "accel_m_s2", 1.0 / G_M_S2)),
-            tm=message.t_ns / 1000.0,
-        )
-
-    def _scaled(self, sensor: str, field: str, factor: float) -> tuple[float, ...]:
-        values = getattr(self._last.get(sensor), field, UNKNOWN_VECTOR)
-        return tuple(factor * value for value in values)
-
-    def _rounded(self, sensor: str, field: str, factor: float) -> int:
-        return round(factor * getattr(self._last.get(sensor), field, 0.0))
-
-    def _attitude(self) -> tuple[float, ...]:
-        estimate = self._last.get("estimate")
-        return tuple(np.degrees(rpy_from_quaternion(estimate.orientation_wxyz))) if estimate else UNKNOWN_VECTOR
-
-
-Conversion = Callable[[str, Any], Any | None]
-"""Returns the ROS message for (key, message); None where there is none to send."""
+MAP = "map"
+DRIVER = "ardrone"  # under which ardrone_autonomy has its topics and services
+# A sonar looks along -z of its sensor frame; the x axis of a ROS range finder is its beam: turned by 90 deg about y.
+_ALONG_BEAM = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
+TESLA_PER_UT = 1e-6
+NO_ATTITUDE = np.array([-1.0, *[0.0] * 8])  # of sensor_msgs/Imu without an attitude
+ULTRASOUND = 0  # sensor_msgs/Range
+BEAM_RAD = 0.0  # the model's beam is a line
+DISCHARGING, GOOD, LIPO = 2, 1, 3  # sensor_msgs/BatteryState
+NO_CELLS = np.empty(0, dtype=np.float32)
+NAN = math.nan
+ZERO = (0.0, 0.0, 0.0)
 
 
 class Topic(NamedTuple):
-    """A topic that the bridge publishes."""
+    """A topic that the bridge publishes; `convert` returns the message for (key, message), None if none is due."""
 
     name: str
     kind: str
     qos: Qos
     sources: tuple[str, ...]
-    convert: Conversion
+    convert: Callable[[str, Any], Any | None]
 
 
 class RosNames(NamedTuple):
-    """ROS names of drones and clusters by their own."""
-
     drones: dict[str, str]
     clusters: dict[str, str]
 
 
+def stamp(t_ns: int) -> Any:
+    """Return simulated time as ROS writes it."""
+    return ros.Time(*divmod(t_ns, NS_PER_S))
+
+
+def header(t_ns: int, frame: str) -> Any:
+    return ros2_jazzy.std_msgs__msg__Header(stamp(t_ns), frame)
+
+
+def odom(drone: str) -> str:
+    return f"{drone}/odom"
+
+
+def base(drone: str) -> str:
+    return f"{drone}/base_link"
+
+
+def camera_frame(drone: str, camera: str) -> str:
+    """Return the frame of a camera: x to the right of the picture, y down, z ahead (REP 103)."""
+    return f"{drone}/{camera}_camera_optical_frame"
+
+
 def run_topics(names: RosNames) -> Iterator[Topic]:
-    """Yield the topics of the run as a whole."""
-    yield Topic("/clock", "rosgraph_msgs/msg/Clock", rmw_zenoh.CLOCK, (keys.CLOCK,), lambda _, m: conversions.clock(m))
+    def moving_frame(key: str, message: Estimate | ClusterState) -> Any:
+        if isinstance(message, ClusterState):
+            position, q = cluster_pose(message)
+            head, child = header(message.t_ns, MAP), f"cluster/{names.clusters[keys.thing(key)]}"
+        else:
+            drone, position, q = names.drones[keys.thing(key)], message.position_m, message.orientation_wxyz
+            head, child = header(message.t_ns, odom(drone)), base(drone)
+        return ros.TFMessage([ros.transform(head, child, position, q)])
+
+    yield Topic("/clock", "rosgraph_msgs/msg/Clock", CLOCK, (keys.CLOCK,), lambda _, m: ros.Clock(stamp(m.t_ns)))
     moving = (*map(keys.estimate, names.drones), *map(keys.cluster_state, names.clusters))
-    yield Topic("/tf", "tf2_msgs/msg/TFMessage", rmw_zenoh.TF, moving, partial(_moving_frame, names))
+    yield Topic("/tf", "tf2_msgs/msg/TFMessage", TF, moving, moving_frame)
 
 
-def _moving_frame(names: RosNames, key: str, message: Estimate | ClusterState) -> Any:
-    """Return the transform of a drone or of a cluster frame."""
-    if isinstance(message, ClusterState):
-        pose = conversions.cluster_pose(message, conversions.MAP, names.clusters[keys.thing(key)])
-    else:
-        drone = names.drones[keys.thing(key)]
-        pose = FramePose(conversions.odom(drone), conversions.base(drone), message.position_m, message.orientation_wxyz)
-    return conversions.transforms(message.t_ns, [pose])
+def static_transforms(drone: str, sensors: Sensors) -> Iterator[Any]:
+    """Yield the frames of a drone that never move, as TransformStamped: its odom in map, its sensors in its body."""
+
+    def in_body(frame: str, position_m: Vector3, q: np.ndarray) -> Any:
+        return ros.transform(header(0, base(drone)), frame, position_m, _quaternion(q))
+
+    def rotation(mount: Mount) -> np.ndarray:
+        """Return q_BS."""
+        return quaternion_from_rpy(np.radians(mount.rpy_deg))
+
+    yield ros.transform(header(0, MAP), odom(drone), ZERO, LEVEL)
+    for kind in ("imu", "gps", "mag", "baro"):
+        mount: Mount = getattr(sensors, kind).mount
+        yield in_body(f"{drone}/{kind}_link", mount.position_m, rotation(mount))
+    beam = quaternion_multiply(rotation(sensors.sonar.mount), _ALONG_BEAM)
+    yield in_body(f"{drone}/sonar_link", sensors.sonar.mount.position_m, beam)
+    for name, camera in sensors.cameras().items():
+        p_BK, R_BK = camera_pose(camera)
+        x, y, z = p_BK.tolist()
+        yield in_body(camera_frame(drone, name), (x, y, z), quaternion_from_matrix(R_BK))
 
 
-def drone_topics(drone: str, ros: str, sensors: Sensors, types: RosTypes) -> Iterator[Topic]:
-    """Yield a drone's topics.
-
-    Args:
-        drone: its name.
-        ros: its name in ROS, which is its namespace.
-        sensors: for their limits and errors.
-        types: of zsim's own messages.
-    """
-    yield from _sensor_topics(drone, ros, sensors)
-    estimate, status, base = keys.estimate(drone), keys.status(drone), conversions.base(ros)
-    odometry = OdometryTopic(conversions.odom(ros), base)
-    truth = keys.truth(drone)
-    yield Topic(f"/{ros}/odometry", "nav_msgs/msg/Odometry", rmw_zenoh.DEFAULT, (estimate,), odometry.update)
-    yield Topic(
-        f"/{ros}/ground_truth", "nav_msgs/msg/Odometry", rmw_zenoh.DEFAULT, (truth,),
-        lambda _, m: conversions.true_odometry(m, conversions.MAP, base),
-    )  # fmt: skip
-    battery = OnChange(partial(conversions.battery, frame=base))
-    state = OnChange(conversions.state, lambda status: status.state)
-    yield Topic(f"/{ros}/battery", "sensor_msgs/msg/BatteryState", rmw_zenoh.DEFAULT, (status,), battery.update)
-    yield Topic(f"/{ros}/state", "std_msgs/msg/String", rmw_zenoh.DEFAULT, (status,), state.update)
-    summary = NavdataSummary(types.message_class("zsim_msgs/msg/Navdata"), base)
-    sources = (*(keys.sensor(drone, kind) for kind in keys.SENSORS if kind != "gps"), estimate, status)
-    yield Topic(f"/{ros}/navdata", "zsim_msgs/msg/Navdata", rmw_zenoh.SENSOR, sources, summary.update)
+def _quaternion(q: np.ndarray) -> Quaternion:
+    w, x, y, z = q.tolist()
+    return w, x, y, z
 
 
-def _sensor_topics(drone: str, ros: str, sensors: Sensors) -> Iterator[Topic]:
-    """Yield the topics of one sensor each; stamped with the time of the sample."""
+def drone_topics(drone: str, name: str, sensors: Sensors) -> Iterator[Topic]:
+    """Yield a drone's topics; `name` is its name in ROS, `sensors` are for their limits and errors."""
     imu, mag, sonar = sensors.imu, sensors.mag, sensors.sonar
-    gyro = conversions.diagonal(np.radians(1.0) ** 2 * conversions.variance(imu.gyro_deg_s, imu.rate_hz))
-    accel = conversions.diagonal(conversions.variance(imu.accel_m_s2, imu.rate_hz))
-    field = conversions.diagonal(conversions.TESLA_PER_UT**2 * conversions.variance(mag.field_ut, mag.rate_hz))
-    spread = conversions.variance(sonar.range_m, sonar.rate_hz)
+    of_rate = ros.diagonal(np.radians(1.0) ** 2 * variance(imu.gyro_deg_s, imu.rate_hz))
+    of_force = ros.diagonal(variance(imu.accel_m_s2, imu.rate_hz))
+    of_field = ros.diagonal(TESLA_PER_UT**2 * variance(mag.field_ut, mag.rate_hz))
+    of_range = variance(sonar.range_m, sonar.rate_hz)
 
-    def of(name: str, kind: str, sensor: str, make: Callable[[Any, str], Any], frame: str = "") -> Topic:
-        frame = frame or conversions.sensor(ros, sensor)
-        key = keys.sensor(drone, sensor)
-        return Topic(f"/{ros}/{name}", kind, rmw_zenoh.SENSOR, (key,), lambda _, m: make(m, frame))
+    def of_sensor(
+        leaf: str, kind: str, sensor: str, convert: Callable[[Any, Any], Any], frame: str | None = None
+    ) -> Topic:
+        """Return a topic of one sensor; `convert` takes header and sample."""
+        frame = frame or f"{name}/{sensor}_link"
+        source = (keys.sensor(drone, sensor),)
+        return Topic(f"/{name}/{leaf}", kind, SENSOR, source, lambda _, m: convert(header(m.t_sample_ns, frame), m))
 
-    yield of("imu", "sensor_msgs/msg/Imu", "imu", lambda m, frame: conversions.imu(m, frame, gyro, accel))
-    yield of("fix", "sensor_msgs/msg/NavSatFix", "gps", conversions.fix)
-    yield of("fix_velocity", "geometry_msgs/msg/TwistStamped", "gps", conversions.fix_velocity, conversions.MAP)
-    yield of("mag", "sensor_msgs/msg/MagneticField", "mag", lambda m, frame: conversions.mag(m, frame, field))
-    yield of("pressure", "sensor_msgs/msg/FluidPressure", "baro", conversions.pressure)
-    yield of("range", "sensor_msgs/msg/Range", "sonar", lambda m, f: conversions.sonar_range(m, f, sonar, spread))
-
-
-def cluster_topics(cluster: str, ros: str, types: RosTypes) -> Iterator[Topic]:
-    """Yield a cluster's topics."""
-    source = (keys.cluster_state(cluster),)
-    kind = types.message_class("zsim_msgs/msg/ClusterState")
-    yield Topic(
-        f"/cluster/{ros}/state", "zsim_msgs/msg/ClusterState", rmw_zenoh.DEFAULT, source,
-        lambda _, m: conversions.cluster_state(kind, m, conversions.MAP),
+    yield of_sensor(
+        "imu", "sensor_msgs/msg/Imu", "imu",
+        lambda head, m: ros.imu(head, m, LEVEL, (NO_ATTITUDE, of_rate, of_force)),
     )  # fmt: skip
-    yield Topic(
-        f"/cluster/{ros}/pose", "geometry_msgs/msg/PoseStamped", rmw_zenoh.DEFAULT, source,
-        lambda _, m: conversions.pose_stamped(m.t_ns, conversions.cluster_pose(m, conversions.MAP, ros)),
+    yield of_sensor("fix", "sensor_msgs/msg/NavSatFix", "gps", lambda head, m: ros.fix(head, m, bool(m.fix)))
+    yield of_sensor(
+        "fix_velocity", "geometry_msgs/msg/TwistStamped", "gps",  # in ENU
+        lambda head, m: ros2_jazzy.geometry_msgs__msg__TwistStamped(head, ros.twist(m.velocity_m_s, ZERO)), MAP,
     )  # fmt: skip
+    yield of_sensor(
+        "mag", "sensor_msgs/msg/MagneticField", "mag",
+        lambda head, m: ros2_jazzy.sensor_msgs__msg__MagneticField(
+            head, ros.Vector3(*(TESLA_PER_UT * each for each in m.field_ut)), of_field
+        ),
+    )  # fmt: skip
+    yield of_sensor(
+        "pressure", "sensor_msgs/msg/FluidPressure", "baro",
+        lambda head, m: ros2_jazzy.sensor_msgs__msg__FluidPressure(head, m.pressure_pa, 0.0),
+    )  # fmt: skip
+    yield of_sensor(
+        "range", "sensor_msgs/msg/Range", "sonar",  # without an echo it is +Inf (REP-117)
+        lambda head, m: ros2_jazzy.sensor_msgs__msg__Range(
+            head, ULTRASOUND, BEAM_RAD, sonar.min_m, sonar.max_m, m.range_m if m.valid else math.inf, of_range
+        ),
+    )  # fmt: skip
+
+    estimate, status = keys.estimate(drone), keys.status(drone)
+    odometry = OdometryTopic(odom(name), base(name))
+    yield Topic(f"/{name}/odometry", "nav_msgs/msg/Odometry", DEFAULT, (estimate,), odometry.update)
+    yield Topic(
+        f"/{name}/ground_truth", "nav_msgs/msg/Odometry", DEFAULT, (keys.truth(drone),),
+        lambda _, m: true_odometry(m, base(name)),
+    )  # fmt: skip
+    battery_at = OnChange(lambda status: battery(status, base(name)))
+    state = OnChange(lambda status: ros2_jazzy.std_msgs__msg__String(status.state), lambda status: status.state)
+    yield Topic(f"/{name}/battery", "sensor_msgs/msg/BatteryState", DEFAULT, (status,), battery_at.update)
+    yield Topic(f"/{name}/state", "std_msgs/msg/String", DEFAULT, (status,), state.update)
+    summary = NavdataSummary(base(name))
+    sources = (*(keys.sensor(drone, kind) for kind in keys.SENSORS if kind != "gps"), estimate, status)
+    yield Topic(f"/{name}/navdata", "zsim_msgs/msg/Navdata", SENSOR, sources, summary.update)
+
+
+def variance(error: ErrorModel, rate_hz: float) -> float:
+    """Return the variance of one sample about its bias, in the unit of the error squared."""
+    return noise_sigma(error, rate_hz) ** 2 + error.quantum**2 / 12.0  # a step's rounding is uniform
+
+
+def battery(message: Status, frame: str) -> Any:
+    return ros2_jazzy.sensor_msgs__msg__BatteryState(
+        header(message.t_ns, frame),
+        NAN, NAN, NAN, NAN, NAN, NAN,
+        message.battery_percent / 100.0,
+        DISCHARGING, GOOD, LIPO,
+        True, NO_CELLS, NO_CELLS, "", "",
+    )  # fmt: skip
+
+
+def true_odometry(message: Truth, child: str) -> Any:
+    """Return the true state in map; twist in the body, without any uncertainty."""
+    q = message.orientation_wxyz
+    twist = ros.twist(into_body(q, message.velocity_m_s), message.angular_velocity_rad_s)
+    return ros.odometry(header(message.t_ns, MAP), child, ros.pose(message.position_m, q), twist)
+
+
+def into_body(q_WB: Quaternion, v_W: Vector3) -> list[float]:
+    """Return v_B = R_WB^T v_W."""
+    return rotate(quaternion_conjugate(q_WB), v_W).tolist()
 
 
 class OdometryTopic:
@@ -174,23 +222,23 @@ class OdometryTopic:
         self._before: Estimate | None = None
 
     def update(self, _: str, message: Estimate) -> Any:
-        """Return the ROS message for an estimate."""
+        """Return the ROS message; twist in the body. Of the attitude only the heading has an uncertainty."""
         before, self._before = self._before, message
+        q = message.orientation_wxyz
         dt_ns = message.t_ns - before.t_ns if before else 0
-        if before is None or dt_ns <= 0:
-            rate = (0.0, 0.0, 0.0)
-        else:
-            rate = mean_rate(before.orientation_wxyz, message.orientation_wxyz, dt_ns / NS_PER_S)
-        return conversions.odometry(message, self._frame, self._child, rate)
+        rate = ros.mean_rate(before.orientation_wxyz, q, dt_ns / NS_PER_S) if before and dt_ns > 0 else ZERO
+        P = np.array(message.covariance).reshape(6, 6)
+        R = rotation_matrix(q)
+        of_pose, of_twist = np.zeros((6, 6)), np.zeros((6, 6))
+        of_pose[:3, :3], of_pose[5, 5] = P[:3, :3], message.yaw_sigma_rad**2
+        of_twist[:3, :3] = R.T @ P[3:, 3:] @ R
+        head, pose = header(message.t_ns, self._frame), ros.pose(message.position_m, q)
+        twist = ros.twist(into_body(q, message.velocity_m_s), rate)
+        return ros.odometry(head, self._child, pose, twist, of_pose.ravel(), of_twist.ravel())
 
 
 class OnChange:
-    """Converts a status in each simulated second, and whenever a value of it has changed.
-
-    Args:
-        convert: makes the ROS message.
-        value: of a status; without it, one message a second.
-    """
+    """Converts a status in each simulated second, and whenever a value of it has changed."""
 
     def __init__(self, convert: Callable[[Status], Any], value: Callable[[Status], object] = lambda _: None) -> None:
         self._convert = convert
@@ -198,9 +246,131 @@ class OnChange:
         self._last: tuple[object, int] | None = None
 
     def update(self, _: str, message: Status) -> Any | None:
-        """Return the ROS message for a status, None where it is not due."""
         last = self._value(message), message.t_ns // NS_PER_S
         if last == self._last:
             return None
         self._last = last
         return self._convert(message)
+
+
+class NavdataSummary:
+    """A drone's newest samples as ardrone_autonomy's navdata, in that driver's units, with each status."""
+
+    def __init__(self, frame: str) -> None:
+        self._kind = ros_types.message_class("zsim_msgs/msg/Navdata")
+        self._frame = frame
+        self._last: dict[str, Any] = {}
+
+    def update(self, key: str, message: Any) -> Any | None:
+        """Store a message of the drone; return the summary if it is the status."""
+        leaf = keys.leaf(key)
+        if leaf != "status":
+            self._last[leaf] = message
+            return None
+
+        def scaled(sensor: str, field: str, factor: float) -> list[float]:
+            return [factor * value for value in getattr(self._last.get(sensor), field, (NAN, NAN, NAN))]
+
+        def rounded(sensor: str, field: str, factor: float) -> int:
+            return round(factor * getattr(self._last.get(sensor), field, 0.0))
+
+        estimate = self._last.get("estimate")
+        rpy_deg = np.degrees(rpy_from_quaternion(estimate.orientation_wxyz)) if estimate else (NAN, NAN, NAN)
+        return self._kind(
+            header=header(message.t_ns, self._frame),
+            battery_percent=message.battery_percent,
+            state=ros.NAVDATA_STATES[message.state],
+            **ros.by_axis("mag_{}", "xyz", scaled("mag", "field_ut", 1.0)),
+            pressure=rounded("baro", "pressure_pa", 1.0),
+            **ros.by_axis("rot_{}", "xyz", tuple(rpy_deg)),
+            altd=rounded("sonar", "range_m", 1000.0),
+            **ros.by_axis("v{}", "xyz", scaled("flow", "velocity_m_s", 1000.0)),
+            **ros.by_axis("a{}", "xyz", scaled("imu", "accel_m_s2", 1.0 / G_M_S2)),
+            tm=message.t_ns / 1000.0,
+        )
+
+
+class DroneCameras:
+    """The cameras of one drone: a topic for each, and one for the active camera, as ardrone_autonomy does.
+
+    Each picture comes with how its camera sees, with the same stamp: that of the exposure.
+    """
+
+    def __init__(self, drone: str, name: str) -> None:
+        self._drone = drone
+        self._name = name
+        self._infos: dict[str, CameraInfo] = {}
+        self.active = CAMERAS[0]
+
+    def toggle(self, _: Any) -> Any:
+        """Let the next camera be the active one, for a service of type std_srvs/Trigger."""
+        self.active = CAMERAS[(CAMERAS.index(self.active) + 1) % len(CAMERAS)]
+        return ros_types.message_class("std_srvs/srv/Trigger_Response")(True, f"the active camera is {self.active}")
+
+    def topics(self) -> Iterator[Topic]:
+        for camera in CAMERAS:
+            yield from self._topics(f"/{self._name}/{DRIVER}/{camera}", (camera,))
+        yield from self._topics(f"/{self._name}/{DRIVER}", CAMERAS)
+
+    def _topics(self, topic: str, cameras: tuple[str, ...]) -> Iterator[Topic]:
+        """Yield the topics of one camera, or, of several, those of the active one."""
+
+        def header_of(camera: str, message: CameraImage) -> Any | None:
+            """Return the header of a picture; None if it is of a camera that is not active."""
+            if len(cameras) > 1 and camera != self.active:
+                return None
+            return header(message.t_sample_ns, camera_frame(self._name, camera))
+
+        def picture(key: str, message: CameraImage) -> Any | None:
+            head = header_of(keys.leaf(key), message)
+            return None if head is None else ros.compressed_image(head, message)
+
+        def info(key: str, message: CameraImage | CameraInfo) -> Any | None:
+            """Keep how a camera sees, and return it for a picture."""
+            camera = keys.parts(key)[2].split("/")[1]
+            if isinstance(message, CameraInfo):
+                self._infos[camera] = message
+                return None
+            head = header_of(camera, message)
+            if head is None or camera not in self._infos:
+                return None
+            return ros.camera_info(ros2_jazzy.sensor_msgs__msg__CameraInfo, head, self._infos[camera])
+
+        images = tuple(keys.camera(self._drone, camera) for camera in cameras)
+        infos = tuple(keys.camera_info(self._drone, camera) for camera in cameras)
+        yield Topic(f"{topic}/image_raw/compressed", "sensor_msgs/msg/CompressedImage", SENSOR, images, picture)
+        yield Topic(f"{topic}/camera_info", "sensor_msgs/msg/CameraInfo", SENSOR, (*images, *infos), info)
+
+
+def cluster_topics(cluster: str, name: str) -> Iterator[Topic]:
+    source = (keys.cluster_state(cluster),)
+    kind = ros_types.message_class("zsim_msgs/msg/ClusterState")
+
+    def state(_: str, message: ClusterState) -> Any:
+        return kind(
+            header=header(message.t_ns, MAP),
+            phase=message.phase,
+            drones=list(message.drones),
+            names=list(message.names),
+            value=np.array(message.value),
+            desired=np.array(message.desired),
+            desired_rate=np.array(message.desired_rate),
+            trajectory_time=NAN if message.trajectory_t_s is None else message.trajectory_t_s,
+            margin=message.margin,
+            reason=message.reason,
+        )
+
+    def pose(_: str, message: ClusterState) -> Any:
+        placed = ros.pose(*cluster_pose(message))
+        return ros2_jazzy.geometry_msgs__msg__PoseStamped(header(message.t_ns, MAP), placed)
+
+    yield Topic(f"/cluster/{name}/state", "zsim_msgs/msg/ClusterState", DEFAULT, source, state)
+    yield Topic(f"/cluster/{name}/pose", "geometry_msgs/msg/PoseStamped", DEFAULT, source, pose)
+
+
+def cluster_pose(message: ClusterState) -> tuple[Vector3, Quaternion]:
+    """Return position and orientation of the cluster frame C in W by the estimates; a pair has no roll."""
+    values = dict(zip(message.names, message.value, strict=True))
+    x, y, z, roll, pitch, yaw = (values.get(each, 0.0) for each in ("x_c", "y_c", "z_c", "roll", "pitch", "yaw"))
+    rpy = (roll, pitch, yaw)
+    return (x, y, z), _quaternion(quaternion_from_rpy(rpy)) if any(rpy) else LEVEL

@@ -1,34 +1,65 @@
 """The driver as a process: an aircraft at the other end of a wire is one drone of a run.
 
 The session with the aircraft and the failsafe are pure and have files of their own; here are the messages of the drone,
-keys, sockets and the event loop.
+keys, sockets, the event loop, and the options on the command line.
 """
 
 import asyncio
 import contextlib
 import errno
 import math
+import re
+import socket
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
+from urllib.parse import urlsplit
 
 from zsim.contract import flight_messages, keys, messages
 from zsim.contract.flight_messages import Connection
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import RUN_ENDED, ControlAnswer
 from zsim.errors import DecodeError, RunError
+from zsim.math.rotation import Vector
 from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
+from zsim.scenario.roles import DRIVER
 from zsim.scenario.scenario import Drone, Scenario
 from zsim.sensors.sensor_catalogue import STOCK
 from zsim.transport.session import Query, RawSample, Session
 from zsim.vehicles.vehicle import ROTORS_MIN
-from zsim_bridges.vehicle_links.aircraft_readings import STILL, AircraftPose, ClockOffset, Reading
-from zsim_bridges.vehicle_links.driver_options import DriverOptions, check_run
-from zsim_bridges.vehicle_links.failsafe import LINK_LOST_S, Failsafe
-from zsim_bridges.vehicle_links.vehicle_session import STANDING, AircraftState, UdpChannel, VehicleSession
+from zsim_bridges.vehicle_links.failsafe import LINK_LOST_S, Failsafe, FlightLimits
+from zsim_bridges.vehicle_links.vehicle_session import (
+    STANDING,
+    STILL,
+    AircraftState,
+    ClockOffset,
+    Reading,
+    UdpChannel,
+    VehicleSession,
+)
+
+_POSITION = re.compile(r"\s*,\s*")
+_HOST = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9.-]*[A-Za-z0-9])?")  # a name, or an IPv4 address
+
+
+class DriverOptions(NamedTuple):
+    """Options of one driver.
+
+    Attributes:
+        drone: which drone of the run the aircraft is.
+        origin_m: origin of the aircraft's own frame, or where it stands [m; W]; None for what it or the scenario says.
+        yaw_deg: its heading at the start, counter-clockwise from east; None for its own compass.
+    """
+
+    drone: str
+    limits: FlightLimits = FlightLimits()
+    armed: bool = False
+    origin_m: Vector | None = None
+    yaw_deg: float | None = None
+
 
 TICK_S = 0.01  # s, wall; half of the period at which setpoints are repeated
 REPORT_S = 1.0  # s, wall; of the link's figures
@@ -51,16 +82,7 @@ def drive(
     options: DriverOptions,
     make_session: SessionMaker,
 ) -> None:
-    """Drive one aircraft in one run until the run is over.
-
-    Args:
-        link: an open session.
-        info: of the run.
-        observer: of this process in it.
-        stopped: called now and then; True ends the run.
-        say: prints a line.
-        options: of the driver.
-        make_session: returns the session with the aircraft.
+    """Drive one aircraft in one run until the run is over, or `stopped` returns True.
 
     Raises:
         RunError: the drone is not external, or the run does not keep the pace of the wall clock.
@@ -71,16 +93,7 @@ def drive(
 
 
 class DriverProcess:
-    """One aircraft in one run.
-
-    Args:
-        link: an open session.
-        info: of the run.
-        observer: of this process in it.
-        options: of the driver.
-        session: with the aircraft.
-        say: prints a line.
-    """
+    """One aircraft in one run."""
 
     def __init__(
         self,
@@ -109,10 +122,18 @@ class DriverProcess:
 
     async def run(self, stopped: Callable[[], bool]) -> None:
         """Carry messages both ways until the run is over or a stop is requested; then land."""
+        loop = asyncio.get_running_loop()
+
+        def in_loop(handle: Callable[[Any], None], value: Any) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                loop.call_soon_threadsafe(handle, value)
+
         try:
             for socket, channel in zip(self._sockets, self._session.channels, strict=True):
                 await socket.open(channel)
-            self._subscribe(asyncio.get_running_loop())
+            self._link.declare_subscriber(keys.CLOCK, partial(in_loop, self._on_clock))
+            self._link.declare_subscriber(keys.accepted(self._drone, "*"), partial(in_loop, self._on_accepted))
+            self._link.declare_queryable(keys.driver(self._drone), partial(in_loop, self._on_request))
             while not (stopped() or self._observer.end_reason):
                 self._tick()
                 await asyncio.sleep(TICK_S)
@@ -121,21 +142,6 @@ class DriverProcess:
             for socket in self._sockets:
                 socket.close()
 
-    def _subscribe(self, loop: asyncio.AbstractEventLoop) -> None:
-        def in_loop(handle: Callable[..., None], *values: Any) -> None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed
-                loop.call_soon_threadsafe(handle, *values)
-
-        def on_clock(sample: RawSample) -> None:
-            in_loop(self._on_clock, sample.payload)
-
-        def on_accepted(sample: RawSample) -> None:
-            in_loop(self._on_accepted, sample.key, sample.payload)
-
-        self._link.declare_subscriber(keys.CLOCK, on_clock)
-        self._link.declare_subscriber(keys.accepted(self._drone, "*"), on_accepted)
-        self._link.declare_queryable(keys.driver(self._drone), partial(in_loop, self._on_request))
-
     def _say(self, text: str) -> None:
         self._say_line(f"{self._observer.name}: {text}")
 
@@ -143,11 +149,11 @@ class DriverProcess:
 
     def _receive(self, channel: int, datagram: bytes) -> None:
         self._session.receive(channel, datagram, self._clock.now_ns())
-        self._external.add(self._session.take_readings())
+        self._external.readings.extend(self._session.readings.take())
 
-    def _on_clock(self, payload: bytes) -> None:
+    def _on_clock(self, sample: RawSample) -> None:
         """Publish the gate that the world has reached."""
-        clock = self._observer.update_clock(payload)
+        clock = self._observer.update_clock(sample.payload)
         self._has_clock = self._has_clock or clock is not None
         if clock is None or clock.state != "running":
             return
@@ -161,10 +167,9 @@ class DriverProcess:
             for key, message in self._external.gate(clock.t_ns, vehicle, self._failsafe.commander):
                 self._link.put(key, message)
 
-    def _on_accepted(self, key: str, payload: bytes) -> None:
-        """Pass a command on at once."""
+    def _on_accepted(self, sample: RawSample) -> None:
         try:
-            command = messages.decode(key, payload)
+            command = messages.decode(sample.key, sample.payload)
         except DecodeError:
             self._observer.health.refused += 1
             return
@@ -175,10 +180,9 @@ class DriverProcess:
         self._observer.health.refused += 1
         self._ignored += 1
         if self._ignored == 1 or isinstance(command, flight_messages.Mode):
-            self._say(f"{keys.leaf(key)} of {command.source} is not obeyed: {refusal}")
+            self._say(f"{keys.leaf(sample.key)} of {command.source} is not obeyed: {refusal}")
 
     def _on_request(self, query: Query) -> None:
-        """Answer an operator."""
         now_ns = self._clock.now_ns()
         try:
             request = query.request()
@@ -209,16 +213,15 @@ class DriverProcess:
         for text in self._session.texts:
             self._say(text)
         self._session.texts.clear()
-        self._hint()
+        if time.monotonic() >= self._hint_s:
+            self._hint_s = math.inf
+            self._hint()
         is_due = time.monotonic() - self._reported_s > REPORT_S or self._reported != self._reported_now()
         if is_due and self._has_clock:
             self._report(self._clock.now_ns())
 
     def _hint(self) -> None:
-        """Print once what may be amiss if an aircraft does not show itself."""
-        if time.monotonic() < self._hint_s:
-            return
-        self._hint_s = math.inf
+        """Print what may be amiss if an aircraft does not show itself."""
         if self._session.state.received_ns is None:
             channel, refused = self._session.channels[0], self._session.figures(self._clock.now_ns()).refused
             silence = self._sockets[0].fault.lower() or "nothing comes"
@@ -227,7 +230,6 @@ class DriverProcess:
             self._say(f"no aircraft at {channel.host}:{channel.port} ({what}); {advice}")
 
     def _send(self) -> None:
-        """Send the aircraft what is due."""
         now_ns = self._clock.now_ns()
         demand = self._failsafe.demand(now_ns, self._session.state)
         for channel, datagram in self._session.advance(now_ns, demand):
@@ -285,26 +287,19 @@ class DriverProcess:
 
 
 class DriverClock:
-    """The clock of the driver, which goes at the rate of the run's, and the simulated time at its times.
+    """The clock of the driver, which goes at the rate of the run's, and the simulated time at its times."""
 
-    Args:
-        rate: simulated per wall seconds.
-        wall_ns: monotonic wall time.
-    """
-
-    def __init__(self, rate: float, wall_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        self._rate, self._wall_ns = rate, wall_ns
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
         self._offset = ClockOffset()
 
     def now_ns(self) -> int:
-        return round(self._wall_ns() * self._rate)
+        return round(time.monotonic_ns() * self._rate)
 
     def on_gate(self, t_ns: int) -> None:
-        """Take a clock of the run that has just arrived."""
         self._offset.add(t_ns, self.now_ns())
 
     def to_simulated(self, now_ns: int) -> int:
-        """Return simulated time at a time of this clock."""
         return self._offset.to_remote(now_ns)
 
 
@@ -312,10 +307,12 @@ class ExternalDrone:
     """An aircraft's readings as the messages of one drone, gate by gate. Pure.
 
     Args:
-        drone: its name.
-        to_simulated: simulated time at a time of this process's clock.
+        to_simulated: returns simulated time at a time of this process's clock.
         hover_rad_s: speed of each rotor at which the drone hovers: no wire tells how fast they turn, and others fly in
             their downwash.
+
+    Attributes:
+        readings: for the next gate, to be added to.
     """
 
     def __init__(
@@ -324,44 +321,33 @@ class ExternalDrone:
         self._hover_rad_s = hover_rad_s
         self._drone = drone
         self._to_simulated = to_simulated
-        self._readings: deque[Reading] = deque(maxlen=WAITING_MAX)
+        self.readings: deque[Reading] = deque(maxlen=WAITING_MAX)
         self._seq: dict[str, int] = {}
         self._gate_ns = -1
-
-    def add(self, readings: Iterable[Reading]) -> None:
-        """Keep readings for the next gate."""
-        self._readings.extend(readings)
 
     def gate(self, t_ns: int, vehicle: AircraftState, commander: str | None) -> list[tuple[str, Any]]:
         """Return keys and messages of a gate in order: samples by time, truth, and status; nothing for an old gate."""
         if t_ns <= self._gate_ns or vehicle.pose is None:
             return []
         self._gate_ns = t_ns
-        sent = [*self._samples(t_ns), self._truth(t_ns, vehicle.pose, turning=vehicle.state not in STANDING)]
-        key = keys.status(self._drone)
-        status = (vehicle.state, vehicle.battery_percent, False, commander, len(sent))
-        return [*sent, (key, flight_messages.Status(t_ns, self._next(key), *status))]
-
-    def _samples(self, t_ns: int) -> list[tuple[str, Any]]:
-        """Return the messages of what has been measured, in order of time; none is of the future."""
-        taken = [(min(t_ns, self._to_simulated(reading.taken_ns)), reading) for reading in self._readings]
-        self._readings.clear()
-        taken.sort(key=lambda entry: entry[0])
-        samples = []
-        for sample_ns, reading in taken:
+        sent: list[tuple[str, Any]] = []
+        measured = [(min(t_ns, self._to_simulated(reading.taken_ns)), reading) for reading in self.readings]
+        self.readings.clear()
+        for sample_ns, reading in sorted(measured, key=lambda entry: entry[0]):  # none is of the future
             key = keys.sensor(self._drone, reading.sensor)
             message = STOCK[reading.sensor].message
-            samples.append((key, message(t_ns, self._next(key), max(0, sample_ns), *reading.values)))
-        return samples
-
-    def _truth(self, t_ns: int, pose: AircraftPose, turning: bool) -> tuple[str, Any]:
-        """Return the pose at the gate, extrapolated by its velocity."""
+            sent.append((key, message(t_ns, self._next(key), max(0, sample_ns), *reading.values)))
+        pose = vehicle.pose
         age_ns = max(0, min(EXTRAPOLATED_NS, t_ns - self._to_simulated(pose.taken_ns)))
         x, y, z = (p + age_ns * 1e-9 * v for p, v in zip(pose.position_m, pose.velocity_m_s, strict=True))
-        key = keys.truth(self._drone)
-        rotors = self._hover_rad_s if turning else (0.0,) * len(self._hover_rad_s)
+        rotors = (0.0,) * len(self._hover_rad_s) if vehicle.state in STANDING else self._hover_rad_s
         motion = ((x, y, z), pose.velocity_m_s, pose.q_WB, pose.w_WB_B, STILL, rotors)
-        return key, flight_messages.Truth(t_ns, self._next(key), *motion)
+        key = keys.truth(self._drone)
+        sent.append((key, flight_messages.Truth(t_ns, self._next(key), *motion)))
+        key = keys.status(self._drone)
+        status = (vehicle.state, vehicle.battery_percent, False, commander, len(sent))
+        sent.append((key, flight_messages.Status(t_ns, self._next(key), *status)))
+        return sent
 
     def _next(self, key: str) -> int:
         self._seq[key] = self._seq.get(key, -1) + 1
@@ -375,9 +361,6 @@ def hover_speed(drone: Drone, rotors: int, gravity_m_s2: float) -> float:
 
 class AircraftSocket(asyncio.DatagramProtocol):
     """A UDP socket to one port of the aircraft.
-
-    Args:
-        receive: called with each datagram.
 
     Attributes:
         fault: why the newest datagram could not be delivered, such as that nobody listens; empty for none.
@@ -402,9 +385,15 @@ class AircraftSocket(asyncio.DatagramProtocol):
                 to = channel.host, channel.port
                 self._transport, _ = await loop.create_datagram_endpoint(lambda: self, remote_addr=to, local_addr=local)
             except OSError as error:
-                if error.errno != errno.EADDRINUSE or time.monotonic() > until_s:
-                    raise RunError(_not_opened(channel, error)) from error
-                await asyncio.sleep(AGAIN_S)
+                if error.errno == errno.EADDRINUSE and time.monotonic() <= until_s:
+                    await asyncio.sleep(AGAIN_S)
+                    continue
+                why = error.strerror or str(error)
+                if error.errno in (errno.EADDRINUSE, errno.EACCES):
+                    advice = "give another --local-port, or end who has it"
+                    raise RunError(f"UDP port {channel.local_port} here cannot be had: {why}; {advice}") from error
+                advice = "give the address of the aircraft"
+                raise RunError(f"{channel.host}:{channel.port} cannot be reached: {why}; {advice}") from error
 
     def send(self, datagram: bytes) -> None:
         if self._transport is not None:
@@ -422,9 +411,73 @@ class AircraftSocket(asyncio.DatagramProtocol):
         self.fault = getattr(exc, "strerror", None) or str(exc)
 
 
-def _not_opened(channel: UdpChannel, error: OSError) -> str:
-    """Return why there is no socket for a channel, and what to do."""
-    why = error.strerror or str(error)
-    if error.errno in (errno.EADDRINUSE, errno.EACCES):
-        return f"UDP port {channel.local_port} here cannot be had: {why}; give another --local-port, or end who has it"
-    return f"{channel.host}:{channel.port} cannot be reached: {why}; give the address of the aircraft"
+def udp_channel(address: str, local_port: int = 0) -> UdpChannel:
+    """Return the channel of `udp://HOST:PORT`.
+
+    Raises:
+        RunError: it has another form.
+    """
+    try:
+        parts = urlsplit(address)
+        port = parts.port
+    except ValueError:
+        parts, port = urlsplit(""), None
+    if parts.scheme != "udp" or not parts.hostname or not port:
+        raise RunError(f"the address is {address!r}; must be udp://HOST:PORT, such as udp://192.168.1.20:14580")
+    return UdpChannel(parts.hostname, port, local_port)
+
+
+def position(text: str) -> Vector:
+    """Return the position of `X,Y,Z`.
+
+    Raises:
+        RunError: it has another form.
+    """
+    try:
+        x, y, z = map(float, _POSITION.split(text.strip()))
+    except ValueError:
+        x = y = z = math.nan
+    if not all(map(math.isfinite, (x, y, z))):
+        raise RunError(f"--origin is {text!r}; must be X,Y,Z in metres, such as 0,0,0")
+    return x, y, z
+
+
+def aircraft_host(text: str) -> str:
+    """Return the host of an aircraft whose ports are fixed.
+
+    Raises:
+        RunError: it is more than a host.
+    """
+    if not _HOST.fullmatch(text):
+        raise RunError(f"the address is {text!r}; must be that of a host, such as 192.168.1.12: the ports are fixed")
+    return text
+
+
+def check_host(host: str) -> None:
+    """Refuse an unknown host, before the driver replaces one that flies.
+
+    Raises:
+        RunError: it is unknown.
+    """
+    try:
+        socket.getaddrinfo(host, None)
+    except (OSError, UnicodeError) as error:
+        raise RunError(f"the address is that of {host!r}, which is no host that is known here") from error
+
+
+def check_run(info: Info, process: str, drone: str) -> None:
+    """Refuse a drone that takes no driver, a process of another name, and a run without the pace of the wall clock.
+
+    Raises:
+        RunError: one of these.
+    """
+    bodies = {each.name: each.body for each in info.drones}
+    if drone not in bodies:
+        raise RunError(f"{process}: drone is {drone!r}; must be one of {', '.join(bodies)}")
+    if bodies[drone] != "external":
+        raise RunError(f"{process}: {drone} is simulated; a driver needs `body: external` of it in the scenario")
+    if info.mode != "realtime":
+        raise RunError(f"{process}: the run is in lockstep; a driver needs one that is started with --realtime")
+    if process != f"{DRIVER}.{drone}":
+        needed = f"must be {DRIVER}.{drone}; give the certificate of that process"
+        raise RunError(f"{process}: the name of the driver of {drone} {needed}")

@@ -12,7 +12,7 @@ from zsim.contract import flight_messages, keys, messages
 from zsim.math import frames as rotations
 from zsim.math.rotation import LEVEL, Vector
 from zsim.sensors.sensor import Mount
-from zsim_agents.estimation.dead_reckoning import madgwick_step
+from zsim_agents.estimation.strapdown import madgwick_step
 
 BETA_RAD_S = 0.02  # of Madgwick's filter: levels within seconds, and is little disturbed by manoeuvres
 UNIT_SLACK = 0.01  # of a quaternion's length; an estimator of positions alone may publish zeros
@@ -22,13 +22,7 @@ ModeName = Literal["takeoff", "land", "emergency", "reset"]
 
 
 class CommandSender:
-    """Sends commands to a drone under the name of a process, numbered by key.
-
-    Args:
-        drone: its name.
-        source: process name under which commands are sent.
-        put: publishes a message on a key.
-    """
+    """Sends commands to a drone under the name of a process, numbered by key."""
 
     def __init__(self, drone: str, source: str, put: Callable[[str, Any], None]) -> None:
         self._source = source
@@ -37,7 +31,6 @@ class CommandSender:
         self._seq: dict[str, int] = {}
 
     def mode(self, t_ns: int, mode: ModeName) -> None:
-        """Take off, land, stop the rotors at once, or leave the emergency."""
         self._send("mode", flight_messages.Mode, t_ns, mode)
 
     def velocity(
@@ -72,10 +65,7 @@ class OnboardState:
 
     The attitude is that of the drone's estimator or, if none runs, of Madgwick's filter on the drone's own IMU, whose
     heading is 0 at the start, like that of the aircraft at power-on. The position is integrated from the optical flow.
-
-    Args:
-        imu: pose of the IMU in the body.
-        mag: pose of the magnetometer.
+    `imu` and `mag` are the poses of these sensors in the body.
 
     Attributes:
         imu, mag, baro, flow, status, estimate: newest, in the axes of the body; None before the first.
@@ -111,17 +101,40 @@ class OnboardState:
         message = message if q_BS is None else _rotated(message, q_BS)
         match message:
             case messages.Imu():
-                self._on_imu(message)
+                before, self.imu = self.imu, message
+                if self.estimate is None and before is not None:
+                    dt = (message.t_sample_ns - before.t_sample_ns) * 1e-9
+                    if 0.0 < dt < STEP_S_MAX:
+                        rate, force = message.gyro_rad_s, message.accel_m_s2
+                        self.attitude = madgwick_step(self.attitude, rate, force, BETA_RAD_S, dt)
             case messages.Mag():
                 self.mag = message
             case messages.Baro():
-                self._on_baro(message)
+                self.baro = message
+                if self._ground_baro_m is not None:
+                    self.altitude_m = max(0.0, message.altitude_m - self._ground_baro_m)
+            case messages.Sonar(valid=True):
+                cosine = float(rotations.rotation_matrix(self.attitude)[2, 2])
+                self.altitude_m = message.range_m * max(0.0, cosine)
+                self._ground_baro_m = None
             case messages.Sonar():
-                self._on_sonar(message)
+                if self._ground_baro_m is None and self.baro is not None:
+                    self._ground_baro_m = self.baro.altitude_m - self.altitude_m
             case messages.Flow():
-                self._on_flow(message)
+                before, self.flow = self.flow, message
+                if before is not None:
+                    dt = (message.t_sample_ns - before.t_sample_ns) * 1e-9
+                    yaw, (vx, vy, _) = float(rotations.heading(self.attitude)), message.velocity_m_s
+                    self._x_m += dt * (vx * math.cos(yaw) - vy * math.sin(yaw))
+                    self._y_m += dt * (vx * math.sin(yaw) + vy * math.cos(yaw))
             case flight_messages.Estimate():
-                self._on_estimate(message)
+                if abs(math.hypot(*message.orientation_wxyz) - 1.0) < UNIT_SLACK:
+                    self.estimate = message
+                    self.attitude = message.orientation_wxyz
+                position = next((position for t_ns, position in self._positions if t_ns == message.t_ns), None)
+                if position is not None:
+                    x, y, z = message.position_m
+                    self.origin_m = (x - position[0], y - position[1], z - position[2])
             case flight_messages.Status():
                 self.status = message
                 self._positions.append((message.t_ns, self.position_m))
@@ -130,43 +143,6 @@ class OnboardState:
     @property
     def position_m(self) -> Vector:
         return self._x_m, self._y_m, self.altitude_m
-
-    def _on_imu(self, imu: messages.Imu) -> None:
-        before, self.imu = self.imu, imu
-        if self.estimate is None and before is not None:
-            dt = (imu.t_sample_ns - before.t_sample_ns) * 1e-9
-            if 0.0 < dt < STEP_S_MAX:
-                self.attitude = madgwick_step(self.attitude, imu.gyro_rad_s, imu.accel_m_s2, BETA_RAD_S, dt)
-
-    def _on_baro(self, baro: messages.Baro) -> None:
-        self.baro = baro
-        if self._ground_baro_m is not None:
-            self.altitude_m = max(0.0, baro.altitude_m - self._ground_baro_m)
-
-    def _on_sonar(self, sonar: messages.Sonar) -> None:
-        if sonar.valid:
-            self.altitude_m = sonar.range_m * max(0.0, float(rotations.rotation_matrix(self.attitude)[2, 2]))
-            self._ground_baro_m = None
-        elif self._ground_baro_m is None and self.baro is not None:
-            self._ground_baro_m = self.baro.altitude_m - self.altitude_m
-
-    def _on_flow(self, flow: messages.Flow) -> None:
-        before, self.flow = self.flow, flow
-        if before is None:
-            return
-        dt = (flow.t_sample_ns - before.t_sample_ns) * 1e-9
-        yaw, (vx, vy, _) = float(rotations.heading(self.attitude)), flow.velocity_m_s
-        self._x_m += dt * (vx * math.cos(yaw) - vy * math.sin(yaw))
-        self._y_m += dt * (vx * math.sin(yaw) + vy * math.cos(yaw))
-
-    def _on_estimate(self, estimate: flight_messages.Estimate) -> None:
-        if abs(math.hypot(*estimate.orientation_wxyz) - 1.0) < UNIT_SLACK:
-            self.estimate = estimate
-            self.attitude = estimate.orientation_wxyz
-        position = next((position for t_ns, position in self._positions if t_ns == estimate.t_ns), None)
-        if position is not None:
-            x, y, z = estimate.position_m
-            self.origin_m = (x - position[0], y - position[1], z - position[2])
 
 
 def warm_up() -> None:

@@ -47,12 +47,7 @@ class FlightLimits(NamedTuple):
     ceiling_m: float = math.inf
 
     def limited(self, velocity_m_s: Sequence[float], position_m: Sequence[float] | None) -> tuple[float, float, float]:
-        """Return a velocity [m/s; W] within the limits that does not lead through the fence.
-
-        Args:
-            velocity_m_s: that is asked for [W].
-            position_m: of the aircraft [W]; None if it is not known: then no fence acts.
-        """
+        """Return a velocity [m/s; W] within the limits that does not lead through the fence, if a position is known."""
         x, y, z = velocity_m_s
         speed = math.hypot(x, y)
         share = min(1.0, self.speed_m_s / speed) if speed else 1.0
@@ -68,7 +63,6 @@ class FlightLimits(NamedTuple):
         return x, y, min(z, _approach(self.ceiling_m - position_m[2]))
 
     def yaw_rate(self, yaw_rate_rad_s: float) -> float:
-        """Return a yaw rate [rad/s] within the limit."""
         return max(-self.yaw_rate_rad_s, min(self.yaw_rate_rad_s, yaw_rate_rad_s))
 
     def is_breached(self, position_m: Sequence[float]) -> bool:
@@ -85,14 +79,8 @@ def _approach(distance_m: float) -> float:
 class Failsafe:
     """The phases of a flight, by what is commanded and who is silent.
 
-    Args:
-        silence: of the scenario.
-        limits: that hold whatever is commanded.
-        armed: whether it begins armed.
-
     Attributes:
         armed: whether commands are obeyed.
-        phase: of the flight.
         commander: source of the last setpoint.
         reason: why it last left the commander's control; empty for never.
     """
@@ -146,7 +134,6 @@ class Failsafe:
     # The run
 
     def on_clock(self, now_ns: int) -> None:
-        """Note that the world is there."""
         self._clock_ns = now_ns
 
     def on_command(self, command: flight_messages.Command, now_ns: int, vehicle: AircraftState) -> str | None:
@@ -159,8 +146,11 @@ class Failsafe:
                 return self._reset(now_ns, vehicle)
             case _ if not self.armed:
                 return "its driver is not armed; an operator asks `arm` of it"
+            case flight_messages.Mode(mode="land"):
+                self._enter("landing", now_ns)
+                return None
             case flight_messages.Mode():
-                return self._on_mode(command.mode, now_ns, vehicle)
+                return self._take_off(now_ns, vehicle)
             case flight_messages.Velocity():
                 self._setpoint, self._setpoint_ns, self.commander = command, now_ns, command.source
                 return None
@@ -170,10 +160,7 @@ class Failsafe:
             case _:
                 return f"a driver does not take {type(command).__name__}; send velocity"
 
-    def _on_mode(self, mode: str, now_ns: int, vehicle: AircraftState) -> str | None:
-        if mode == "land":
-            self._enter("landing", now_ns)
-            return None
+    def _take_off(self, now_ns: int, vehicle: AircraftState) -> str | None:
         if vehicle.state != "landed":
             return f"the aircraft is {vehicle.state}; a take-off needs it landed"
         if self._is_outside(vehicle):
@@ -193,7 +180,6 @@ class Failsafe:
     # The aircraft
 
     def demand(self, now_ns: int, vehicle: AircraftState) -> Demand:
-        """Return what the aircraft is to do now."""
         self._advance(now_ns, vehicle)
         match self.phase:
             case "killed":
@@ -214,6 +200,7 @@ class Failsafe:
     def _advance(self, now_ns: int, vehicle: AircraftState) -> None:
         """Enter the next phase once the aircraft has reached it, or somebody is silent."""
         airborne = vehicle.state in AIRBORNE
+        has_had_time = now_ns - self._began_ns > LINK_LOST_S * 1e9  # to show that it obeys
         if self.phase in ("taking_off", "airborne") and vehicle.state == "emergency":
             self.reason, self._uncommanded = "the aircraft is in an emergency", True
             self._settle(now_ns)
@@ -221,44 +208,29 @@ class Failsafe:
             self._enter("airborne", now_ns)
         elif self.phase == "taking_off" and now_ns - self._began_ns > TAKEOFF_S * 1e9:
             self.land(f"the take-off took longer than {TAKEOFF_S:g} s", now_ns)
-        elif self.phase == "taking_off":
-            self._watch_bounds(now_ns, vehicle)
-        elif self.phase == "landing" and vehicle.state in STANDING and self._settled(now_ns):
+        elif self.phase == "landing" and vehicle.state in STANDING and has_had_time:
             self._settle(now_ns)
         elif self.phase == "resetting" and (vehicle.state != "emergency" or now_ns - self._began_ns > RESET_S * 1e9):
             self._enter("idle", now_ns)
         elif self.phase == "idle" and self.armed and airborne:
             self._enter("airborne", now_ns)  # a driver that is started again in flight
-        elif self.phase == "airborne":
-            self._watch(now_ns, vehicle)
-
-    def _settled(self, now_ns: int) -> bool:
-        """Return whether the aircraft has had the time to show that it obeys."""
-        return now_ns - self._began_ns > LINK_LOST_S * 1e9
+        elif self.phase == "airborne" and vehicle.state == "landed" and has_had_time:
+            self.reason, self._uncommanded = "the aircraft landed without a command", True
+            self._settle(now_ns)
+        elif self.phase == "airborne" and vehicle.state == "landing":
+            self.land("the aircraft lands by itself", now_ns)
+        elif self.phase == "airborne" and self._setpoint is not None and now_ns - self._setpoint_ns > self._land_ns:
+            self.land(f"{self.commander} is silent", now_ns)
+        elif self.phase in ("taking_off", "airborne") and self._is_outside(vehicle):
+            self.land("it is outside the fence", now_ns)
+        elif self.phase in ("taking_off", "airborne") and now_ns - max(self._clock_ns, self._began_ns) > self._land_ns:
+            self.land("the world is silent", now_ns)
 
     def _settle(self, now_ns: int) -> None:
         """Note that it is down: after a landing that nobody commanded, only an operator lets it fly again."""
         self._enter("idle", now_ns)
         if self._uncommanded:
             self.armed, self._uncommanded = False, False
-
-    def _watch(self, now_ns: int, vehicle: AircraftState) -> None:
-        if vehicle.state == "landed" and self._settled(now_ns):
-            self.reason, self._uncommanded = "the aircraft landed without a command", True
-            self._settle(now_ns)
-        elif vehicle.state == "landing":
-            self.land("the aircraft lands by itself", now_ns)
-        elif self._setpoint is not None and now_ns - self._setpoint_ns > self._land_ns:
-            self.land(f"{self.commander} is silent", now_ns)
-        else:
-            self._watch_bounds(now_ns, vehicle)
-
-    def _watch_bounds(self, now_ns: int, vehicle: AircraftState) -> None:
-        """Land outside the fence and without the world, also during a take-off."""
-        if self._is_outside(vehicle):
-            self.land("it is outside the fence", now_ns)
-        elif now_ns - max(self._clock_ns, self._began_ns) > self._land_ns:
-            self.land("the world is silent", now_ns)
 
     def _is_outside(self, vehicle: AircraftState) -> bool:
         return vehicle.pose is not None and self._limits.is_breached(vehicle.pose.position_m)

@@ -2,16 +2,112 @@
 
 import asyncio
 import contextlib
+import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 from zsim.contract import keys, messages
+from zsim.contract.framing import run_key_table
 from zsim.contract.messages import Info
-from zsim.errors import DecodeError, NoWorldError, RunError, without_figures
+from zsim.contract.run_messages import Event
+from zsim.errors import DecodeError, NoWorldError, RunError, SessionError, without_figures
+from zsim.runtime.health import HealthMeter
 from zsim.runtime.participant import Participant
-from zsim.transport.session import Session, Unanswered
-from zsim_bridges.intake import TrafficIntake
+from zsim.transport.session import RawSample, ReceivedSample, Session, Unanswered
+from zsim.transport.traffic import Passed, Traffic, samples
+
+BACKLOG = 100  # times that something arrived, a second or two of realtime
+
+
+class TrafficIntake:
+    """Messages in the order in which they passed the world; a reader that is too slow goes on with the newest.
+
+    Messages that it has not read by then are dropped: flying by old messages is worse than missing some. `news` is set
+    when there is something to read.
+    """
+
+    def __init__(self, link: Session, info: Info, health: HealthMeter, loop: asyncio.AbstractEventLoop) -> None:
+        self._traffic = Traffic(link, run_key_table(info), self._count_refused)
+        self._health = health
+        self._loop = loop
+        self._backlog: deque[Sequence[Passed]] = deque()
+        self._thread = threading.Thread(target=self._run, name="intake", daemon=True)
+        self.news = asyncio.Event()
+        for sample in link.get(keys.CLOCK):  # a world that stands, or has ended, publishes it no more
+            self._backlog.append([sample])
+        self.news.set()
+        self._thread.start()
+
+    def close(self) -> None:
+        self._traffic.close()
+        self._thread.join(1.0)
+
+    def arrivals(self) -> Iterator[list[ReceivedSample]]:
+        """Yield what has arrived so far, in the parts in which it arrived."""
+        self.news.clear()
+        for _ in range(len(self._backlog)):
+            try:
+                passed = self._backlog.popleft()
+            except IndexError:  # dropped meanwhile
+                return
+            yield list(samples(passed))
+
+    def _run(self) -> None:
+        while True:
+            try:
+                passed = self._traffic.receive()
+            except SessionError:
+                return
+            if passed:
+                if len(self._backlog) >= BACKLOG:
+                    self._health.dropped += len(self._backlog)
+                    self._backlog.clear()
+                self._health.received += 1
+                self._backlog.append(passed)
+                with contextlib.suppress(RuntimeError):  # the reader is gone
+                    self._loop.call_soon_threadsafe(self.news.set)
+
+    def _count_refused(self) -> None:
+        self._health.refused += 1
+
+
+WAITING_MAX = 10  # pictures that wait for the loop; then the oldest go
+
+
+class PictureIntake:
+    """Pictures of the cameras that somebody looks at: subscriptions come and go with the readers."""
+
+    def __init__(self, link: Session, loop: asyncio.AbstractEventLoop, take: Callable[[str, bytes], None]) -> None:
+        self._link = link
+        self._loop = loop
+        self._take = take
+        self._waiting: deque[RawSample] = deque(maxlen=WAITING_MAX)
+        self._undeclare: dict[str, Callable[[], None]] = {}
+
+    def follow(self, wanted: Iterable[str]) -> None:
+        """Subscribe to these keys, and to no others."""
+        keys = set(wanted)
+        for key in keys - set(self._undeclare):
+            try:
+                self._undeclare[key] = self._link.declare_subscriber(key, self._on_picture)
+            except SessionError:  # no right to read it: as from a camera that is off, nothing comes
+                self._undeclare[key] = lambda: None
+        for key in set(self._undeclare) - keys:
+            self._undeclare.pop(key)()
+
+    def _on_picture(self, sample: RawSample) -> None:
+        """Hand a picture over, in a thread of Zenoh's."""
+        self._waiting.append(sample)
+        with contextlib.suppress(RuntimeError):  # the loop is closed
+            self._loop.call_soon_threadsafe(self._deliver)
+
+    def _deliver(self) -> None:
+        while self._waiting:
+            sample = self._waiting.popleft()
+            self._take(sample.key, sample.payload)
+
 
 POLL_S = 0.1  # how often a stop is looked for
 REPORTED_MAX = 1000  # texts remembered, so that each is printed once
@@ -19,15 +115,7 @@ Say = Callable[[str], None]
 
 
 class VehicleServer(ABC):
-    """One run's drones on a wire.
-
-    Args:
-        link: an open session.
-        info: of the run.
-        observer: of this process in it.
-        say: prints a line.
-        options: of the wire; `rate` is the pace that is asked of the world, None for the run's own.
-    """
+    """One run's drones on a wire; `options` are the wire's, of which `rate` is the pace that is asked of the world."""
 
     def __init__(self, link: Session, info: Info, observer: Participant, say: Say, options: Any) -> None:
         self.link = link
@@ -41,10 +129,7 @@ class VehicleServer(ABC):
     def serve(
         cls, link: Session, info: Info, observer: Participant, stopped: Callable[[], bool], say: Say, options: Any
     ) -> None:
-        """Serve one run until it is over.
-
-        Args:
-            stopped: called now and then; True ends the run.
+        """Serve one run until it is over, or `stopped` returns True.
 
         Raises:
             RunError: the run keeps no pace, or a port or an address cannot be had.
@@ -53,7 +138,6 @@ class VehicleServer(ABC):
         asyncio.run(cls(link, info, observer, say, options).run(stopped))
 
     async def run(self, stopped: Callable[[], bool]) -> None:
-        """Carry messages both ways until the run is over or a stop is requested."""
         loop = asyncio.get_running_loop()
         async with contextlib.AsyncExitStack() as stack:
             await self.open(stack)
@@ -62,7 +146,7 @@ class VehicleServer(ABC):
             while not (stopped() or self.observer.end_reason):
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(intake.news.wait(), POLL_S)
-                await self.take_in(intake)
+                await self.on_arrivals(intake)
                 self.observer.tick()
 
     @abstractmethod
@@ -70,22 +154,19 @@ class VehicleServer(ABC):
         """Open the ports, and have the stack close them."""
 
     @abstractmethod
-    async def take_in(self, intake: TrafficIntake) -> None:
+    async def on_arrivals(self, intake: TrafficIntake) -> None:
         """Hand on the messages that have arrived."""
 
     @abstractmethod
-    def on_event(self, payload: bytes) -> None:
-        """Take an event of the run."""
+    def on_event(self, event: Event) -> None:
+        """Follow an event of the run."""
 
-    def on_run(self, key: str, payload: bytes) -> bool:
-        """Follow the run by its clock and events; return whether the message was one of these."""
+    def on_run(self, key: str, payload: bytes) -> None:
+        """Follow the run by its clock and events."""
         if key == keys.CLOCK:
             self.observer.update_clock(payload)
-        elif key == keys.EVENT:
-            self.on_event(payload)
-        else:
-            return False
-        return True
+        elif key == keys.EVENT and (event := self.decoded(key, payload)) is not None:
+            self.on_event(event)
 
     def decoded(self, key: str, payload: bytes) -> Any:
         """Return a message; None, and counted, if it cannot be decoded."""
@@ -96,7 +177,6 @@ class VehicleServer(ABC):
             return None
 
     def say(self, text: str) -> None:
-        """Print a line."""
         self._say(f"{self.observer.name}: {text}")
 
     def refuse(self, reason: str) -> None:
@@ -114,12 +194,6 @@ class VehicleServer(ABC):
 
 def set_pace(link: Session, info: Info, name: str, rate: float | None) -> None:
     """Ask the world for a pace, if one is given; refuse a run that has none: programs go by the wall clock.
-
-    Args:
-        link: an open session.
-        info: of the run.
-        name: of this process.
-        rate: simulated per wall seconds; None leaves the run's.
 
     Raises:
         RunError: the run goes as fast as possible, or the world refuses the pace.

@@ -31,7 +31,6 @@ class WireField(NamedTuple):
 
     @property
     def format(self) -> str:
-        """The format of the struct module."""
         return f"{self.length or ''}{'s' if self.code == 'c' else self.code}"
 
     @property
@@ -57,7 +56,6 @@ class Entry(NamedTuple):
 
 
 def read_table(text: str) -> Iterator[Entry]:
-    """Yield the entries of a table."""
     for number, name, rest in _ENTRY.findall(text):
         fields, _, extensions = rest.partition("|")
         yield Entry(int(number), name, list(_fields(fields)), list(_fields(extensions)))

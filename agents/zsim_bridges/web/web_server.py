@@ -50,16 +50,9 @@ class ServedSite(NamedTuple):
 
 
 async def start_site(app: web.Application, host: str, ports: Sequence[int], shutdown_s: float) -> ServedSite:
-    """Serve an application, on a bounded number of connections.
+    """Serve an application, on a bounded number of connections, at the first port that is free; ANY_PORT is any one.
 
-    Args:
-        app: the application.
-        host: on whose address.
-        ports: the first of them that is free; ANY_PORT for any free one.
-        shutdown_s: how long requests in progress may take at the end [wall].
-
-    Raises:
-        OSError: none of them can be opened.
+    Requests in progress may take `shutdown_s` [wall] at the end. Raises the OSError of the last port.
     """
     connections = HttpConnections()
     app.middlewares.append(connections.observe)
@@ -67,22 +60,20 @@ async def start_site(app: web.Application, host: str, ports: Sequence[int], shut
     await runner.setup()
     server = runner.server
     assert server is not None
-    try:
-        listener = await _listen(lambda: connections.protocol(server()), host, ports)
-    except OSError:
-        await runner.cleanup()
-        raise
-    return ServedSite(runner, listener)
 
+    def protocol() -> HttpConnection:
+        return HttpConnection(server(), connections)
 
-async def _listen(protocol: Callable[[], asyncio.Protocol], host: str, ports: Sequence[int]) -> asyncio.Server:
-    loop = asyncio.get_running_loop()
-    try:
-        return await loop.create_server(protocol, host, ports[0], backlog=BACKLOG)
-    except OSError as error:
-        if error.errno != errno.EADDRINUSE or len(ports) == 1:
-            raise
-    return await _listen(protocol, host, ports[1:])
+    for port in ports:
+        try:
+            listener = await asyncio.get_running_loop().create_server(protocol, host, port, backlog=BACKLOG)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE or port == ports[-1]:
+                await runner.cleanup()
+                raise
+        else:
+            return ServedSite(runner, listener)
+    raise ValueError("no port is given")
 
 
 @contextmanager
@@ -120,11 +111,7 @@ async def cancel_other_tasks() -> None:
 
 
 def check_token(process: str, host: str, token: str | None) -> None:
-    """Refuse to listen where other machines could connect without a token.
-
-    Raises:
-        RunError: the token is empty, or there is none and the host is not loopback.
-    """
+    """Raise a RunError where the token is empty, or others could connect without one."""
     if token == "":
         raise RunError(f"{process}: the token is empty; give it one, or leave ZSIM_TOKEN and --token away")
     if token is None and not is_loopback(host):
@@ -169,10 +156,6 @@ class HttpConnections:
         self._strangers: dict[HttpConnection, None] = {}  # an ordered set, by when they began to wait
         self._idle: dict[HttpConnection, None] = {}  # likewise, of known ones without a request
 
-    def protocol(self, http: asyncio.Protocol) -> "HttpConnection":
-        """Return the protocol of a new connection; `http` speaks HTTP on it."""
-        return HttpConnection(http, self)
-
     @web.middleware
     async def observe(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Keep a connection while its request is answered; to be the innermost middleware, after checks of access."""
@@ -197,9 +180,7 @@ class HttpConnections:
     ) -> None:
         """Receive the body of a request before the handler; `room` is kept for it until that is done.
 
-        Raises:
-            HTTPRequestTimeout: it did not arrive in time, or there was no room for it.
-            HTTPRequestEntityTooLarge: it is longer than the application accepts.
+        Raises aiohttp's errors of a body that is too long, did not arrive in time, or had no room.
         """
         if not request.can_read_body:
             return
@@ -278,23 +259,17 @@ class HttpConnections:
 
 
 class HttpConnection(asyncio.Protocol):
-    """One connection, between its transport and the protocol that speaks HTTP.
-
-    Attributes:
-        known: whether one of its requests was answered without an error.
-        since_s: when the first byte of its next request arrived [s, of the loop]; None before.
-        timer: closes it when the time for that request is over.
-        is_whole: whether the request in progress has arrived.
-        has_more: whether something of the next one has arrived meanwhile.
-    """
+    """One connection, between its transport and the protocol that speaks HTTP."""
 
     def __init__(self, http: asyncio.Protocol, connections: HttpConnections) -> None:
         self._http = http
         self._connections = connections
         self._transport: asyncio.Transport | None = None
-        self.known = self.is_whole = self.has_more = False
-        self.since_s: float | None = None
-        self.timer: asyncio.TimerHandle | None = None
+        self.known = False  # whether one of its requests was answered without an error
+        self.is_whole = False  # whether the request in progress has arrived
+        self.has_more = False  # whether something of the next one has arrived meanwhile
+        self.since_s: float | None = None  # when the first byte of its next request arrived [of the loop]
+        self.timer: asyncio.TimerHandle | None = None  # closes it when the time for that request is over
 
     @property
     def is_open(self) -> bool:

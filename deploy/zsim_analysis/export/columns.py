@@ -236,13 +236,10 @@ class Sighting(Struct, frozen=True):
 
 
 class TableSurvey:
-    """The tables of a selection, by a first pass over the record.
+    """The tables of a selection, by a first pass over the record: the `wanted` keys, and `kinds`, their types.
 
-    Attributes:
-        wanted: the keys.
-        pictures: number of selected messages that go into no table.
-        kinds: the message type of each key of the contract.
-        rows: messages by type, including those outside the times or unreadable; None: of foreign keys.
+    `pictures` go into no table. `rows` counts messages by type, None for foreign keys, including those outside the
+    times or unreadable.
     """
 
     def __init__(self, reader: RecordReader, selection: MessageSelection) -> None:

@@ -70,9 +70,10 @@ def convert(
     decoded = DecodedMessages(selection.messages(reader, wanted), _decode, lambda done: progress(done, total))
     rotors = _rotors(info, scenario, dict.fromkeys(subject(key) for key in wanted if key.startswith("drone/")))
     spaces: dict[str, ClusterSpace] = {}
-    for cluster in scenario.clusters if scenario else ():
-        with suppress(ValueError, NotTrustedError):
-            spaces[cluster.name] = scenario_space(scenario, cluster)
+    if scenario:
+        for cluster in scenario.clusters:
+            with suppress(ValueError, NotTrustedError):
+                spaces[cluster.name] = scenario_space(scenario, cluster)
     file = FoxgloveFile(path, rotors, spaces)
     with deferred_signals() as check:
         try:
@@ -219,7 +220,17 @@ class FoxgloveFile:
             self._log(DRONES, channels.SceneUpdateChannel, made.drones(instant.t_ns, self._rotors), instant.t_ns)
             self._log(GROUND, channels.SceneUpdateChannel, made.ground(instant.t_ns), instant.t_ns)
             self._has_static_scene = True
-        self._write_frames(instant)
+        frames: list[made.FramePose] = []
+        for name, truth in instant.truth.items():
+            frames.append((made.frame(name), truth.position_m, truth.orientation_wxyz))
+        for name, estimate in instant.estimates.items():
+            frames.append((f"{made.frame(name)}/estimate", estimate.position_m, estimate.orientation_wxyz))
+        for name, state in instant.states.items():
+            for end, values in (("", state.value), ("/desired", state.desired)):
+                if placed := made.cluster_frame(state.names, values):
+                    frames.append((f"cluster/{name}{end}", *placed))
+        if frames:
+            self._log(TF, channels.FrameTransformsChannel, made.transforms(instant.t_ns, frames), instant.t_ns)
         for name in dict.fromkeys([*instant.truth, *instant.estimates]):
             self._write_drone(instant, name)
         for name, gps in instant.gps.items():
@@ -244,17 +255,6 @@ class FoxgloveFile:
             )
         self._write_scene(instant)
 
-    def _write_frames(self, instant: Instant) -> None:
-        frames = [(made.frame(d), t.position_m, t.orientation_wxyz) for d, t in instant.truth.items()]
-        estimates = instant.estimates.items()
-        frames += [(f"{made.frame(d)}/estimate", e.position_m, e.orientation_wxyz) for d, e in estimates]
-        for name, state in instant.states.items():
-            for end, values in (("", state.value), ("/desired", state.desired)):
-                placed = made.cluster_frame(state.names, values)
-                frames += [(f"cluster/{name}{end}", *placed)] if placed else []
-        if frames:
-            self._log(TF, channels.FrameTransformsChannel, made.transforms(instant.t_ns, frames), instant.t_ns)
-
     def _write_drone(self, instant: Instant, name: str) -> None:
         at, t_ns = made.timestamp(instant.t_ns), instant.t_ns
         truth, estimate = instant.truth.get(name), instant.estimates.get(name)
@@ -275,23 +275,16 @@ class FoxgloveFile:
             kind = NumericMessageType(f"Cluster_{made.tidy(name)}", [*fields, "margin"], ("phase", "reason"))
             self.variables[name] = kind
         numbers = self.variables[name]
-        values = [*state.desired, *state.value, *self._true(instant, name, state), state.margin]
+        true = [math.nan] * len(state.names)  # unless they are known and not singular
+        space, truths = self._spaces.get(name), [instant.truth[d] for d in state.drones if d in instant.truth]
+        if space is not None and space.names == state.names and len(truths) == len(state.drones):
+            yaw = heading([truth.orientation_wxyz for truth in truths])
+            with suppress(SingularClusterError):
+                true = space.forward(np.array([truth.position_m for truth in truths]), yaw).tolist()
+        values = [*state.desired, *state.value, *true, state.margin]
         if len(values) == len(numbers.numbers):  # if the number of variables changes, only the first ones are written
             encoded = numbers.encode(values, (state.phase, state.reason))
             self._log(f"/cluster/{name}/variables", numbers, encoded, instant.t_ns)
-
-    def _true(self, instant: Instant, name: str, state: ClusterState) -> Sequence[float]:
-        """Return the true cluster variables, NaN if they are unknown or singular."""
-        unknown = [math.nan] * len(state.names)
-        space = self._spaces.get(name)
-        if space is None or space.names != state.names or not all(drone in instant.truth for drone in state.drones):
-            return unknown
-        truths = [instant.truth[drone] for drone in state.drones]
-        yaw = heading([truth.orientation_wxyz for truth in truths])
-        try:
-            return space.forward(np.array([truth.position_m for truth in truths]), yaw).tolist()
-        except SingularClusterError:
-            return unknown
 
     def _write_scene(self, instant: Instant) -> None:
         t_ns, truth = instant.t_ns, instant.truth

@@ -270,26 +270,25 @@ def arm_of(discs: Iterable[RotorDisc]) -> float:
 
 def drones(t_ns: int, rotors: Mapping[str, Sequence[RotorDisc]]) -> fox.SceneUpdate:
     """Return the drones, each in its own frame, so that they are written once; `rotors` are theirs, by name."""
-    at = timestamp(t_ns)
-    return fox.SceneUpdate(entities=[_drone(at, name, rotors[name], tint) for name, tint in colours_of(rotors).items()])
-
-
-def _drone(at: fox.Timestamp, name: str, discs: Sequence[RotorDisc], mark: str) -> fox.SceneEntity:
-    arm_m = arm_of(discs)
-    cubes, cylinders = [], []
-    for box in BODY:
-        middle, size = ([arm_m * each for each in part] for part in (box.middle, box.size))
-        cubes.append(fox.CubePrimitive(pose=pose(middle), size=vector(size), color=colour(box.colour)))
-    for disc in discs:
-        size = vector((2 * disc.radius_m, 2 * disc.radius_m, 0.03 * arm_m))
-        look: dict[str, Any] = {"bottom_scale": 1.0, "top_scale": 1.0, "color": colour(mark, 0.5)}
-        cylinders.append(fox.CylinderPrimitive(pose=pose((disc.x_m, disc.y_m, 0.2 * arm_m)), size=size, **look))
-    ends = [end for disc in discs for end in ((0.0, 0.0, 0.0), (disc.x_m, disc.y_m, 0.0))]
-    arms = _line(ends, colour(DARK), fox.LinePrimitiveLineType.LineList, 0.1 * arm_m, scale_invariant=False)
-    look = {"billboard": True, "font_size": 12.0, "scale_invariant": True, "color": colour(mark)}
-    label = fox.TextPrimitive(pose=pose((0, 0, 2 * arm_m)), text=name, **look)
-    parts: dict[str, Any] = {"cubes": cubes, "cylinders": cylinders, "lines": [arms], "texts": [label]}
-    return fox.SceneEntity(timestamp=at, id=name, frame_id=frame(name), frame_locked=True, **parts)
+    at, entities = timestamp(t_ns), []
+    for name, mark in colours_of(rotors).items():
+        discs = rotors[name]
+        arm_m = arm_of(discs)
+        cubes, cylinders = [], []
+        for box in BODY:
+            middle, size = ([arm_m * each for each in part] for part in (box.middle, box.size))
+            cubes.append(fox.CubePrimitive(pose=pose(middle), size=vector(size), color=colour(box.colour)))
+        for disc in discs:
+            size = vector((2 * disc.radius_m, 2 * disc.radius_m, 0.03 * arm_m))
+            look: dict[str, Any] = {"bottom_scale": 1.0, "top_scale": 1.0, "color": colour(mark, 0.5)}
+            cylinders.append(fox.CylinderPrimitive(pose=pose((disc.x_m, disc.y_m, 0.2 * arm_m)), size=size, **look))
+        ends = [end for disc in discs for end in ((0.0, 0.0, 0.0), (disc.x_m, disc.y_m, 0.0))]
+        arms = _line(ends, colour(DARK), fox.LinePrimitiveLineType.LineList, 0.1 * arm_m, scale_invariant=False)
+        look = {"billboard": True, "font_size": 12.0, "scale_invariant": True, "color": colour(mark)}
+        label = fox.TextPrimitive(pose=pose((0, 0, 2 * arm_m)), text=name, **look)
+        parts: dict[str, Any] = {"cubes": cubes, "cylinders": cylinders, "lines": [arms], "texts": [label]}
+        entities.append(fox.SceneEntity(timestamp=at, id=name, frame_id=frame(name), frame_locked=True, **parts))
+    return fox.SceneUpdate(entities=entities)
 
 
 def ground(t_ns: int) -> fox.SceneUpdate:

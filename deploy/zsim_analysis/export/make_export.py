@@ -7,7 +7,7 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -204,7 +204,19 @@ def placed(*targets: Path) -> Iterator[tuple[Path, ...]]:
         folder.mkdir(parents=True)
         written = tuple(folder / target.name for target in targets)
         yield written
-        _put_in_place(written, targets)
+        moves = [(new, target, new.with_name(f"{new.name}.old")) for new, target in zip(written, targets, strict=True)]
+        try:
+            for new, target, old in moves:
+                if target.exists():
+                    target.replace(old)
+                new.replace(target)
+        except BaseException:  # after a failure or Ctrl-C the old ones are back
+            for new, target, old in moves:
+                if not new.exists() and target.exists():
+                    target.replace(new)
+                if old.exists():
+                    old.replace(target)
+            raise
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno else error  # without the text that libraries add to it
         raise ReportError(f"{targets[0]}: cannot be written ({reason}); make room and export again") from error
@@ -213,20 +225,3 @@ def placed(*targets: Path) -> Iterator[tuple[Path, ...]]:
         with suppress(OSError):  # one that is not empty stays, and with it those above
             for parent in new_parents:
                 parent.rmdir()
-
-
-def _put_in_place(written: Sequence[Path], targets: Sequence[Path]) -> None:
-    """Put all files or folders in place; after a failure or Ctrl-C the old ones are back."""
-    moves = [(new, target, new.with_name(f"{new.name}.old")) for new, target in zip(written, targets, strict=True)]
-    try:
-        for new, target, old in moves:
-            if target.exists():
-                target.replace(old)
-            new.replace(target)
-    except BaseException:
-        for new, target, old in moves:
-            if not new.exists() and target.exists():
-                target.replace(new)
-            if old.exists():
-                old.replace(target)
-        raise

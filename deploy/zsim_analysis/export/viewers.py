@@ -159,12 +159,23 @@ def has_rerun() -> bool:
 def write_blueprint(path: Path, application: str, run: foxglove_file.ConvertedRun) -> None:
     """Write Rerun's blueprint of a file; `application` is the file's name without its suffix, as Rerun calls it."""
     os.environ.setdefault("RUST_LOG", "error")  # otherwise Rerun warns of the entry name derived from an odd name
+    import rerun as rr
     import rerun.blueprint as rrb
+    from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
     left = rrb.Vertical(_scene(run), rrb.TextLogView(name="log", origin=foxglove_file.LOG), row_shares=[3, 1])
     views = []
     for title, curves in plots(run):
-        series = _series(curves)
+        series: dict[Any, list[Any]] = {}  # visualizers of the curves by entity
+        for curve in curves:
+            source = VisualizerComponentMapping(
+                target="Scalars:scalars",
+                source_kind=ComponentSourceKind.SourceComponent,
+                source_component=curve.component,
+                selector=f".{curve.field}",
+            )
+            look = rr.SeriesLines(names=curve.name, colors=list(rgb(curve.colour)))
+            series.setdefault(_entity(curve.topic), []).append(look.visualizer(mappings=[source]))
         views.append(rrb.TimeSeriesView(name=title, overrides=series, contents=list(series)))
     groups = [views[i : i + TAB] for i in range(0, len(views), TAB)]
     tabs: list[Any] = [rrb.Vertical(*group, name=", ".join(str(view.name) for view in group)) for group in groups]
@@ -189,23 +200,6 @@ def plots(run: foxglove_file.ConvertedRun) -> list[Plot]:
         (f"{cluster}: {name}" if several else name, curves) for cluster, each in by_cluster for name, curves in each
     ]
     return found + drone_plots(run.topics, colours_of(run.rotors))
-
-
-def _series(curves: Sequence[Curve]) -> dict[Any, list[Any]]:
-    import rerun as rr
-    from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
-
-    series: dict[Any, list[Any]] = {}
-    for curve in curves:
-        source = VisualizerComponentMapping(
-            target="Scalars:scalars",
-            source_kind=ComponentSourceKind.SourceComponent,
-            source_component=curve.component,
-            selector=f".{curve.field}",
-        )
-        look = rr.SeriesLines(names=curve.name, colors=list(rgb(curve.colour)))
-        series.setdefault(_entity(curve.topic), []).append(look.visualizer(mappings=[source]))
-    return series
 
 
 def _scene(run: foxglove_file.ConvertedRun) -> Any:

@@ -155,15 +155,10 @@ class RecordedFlight:
 
 
 def read_flight(path: Path, answers: bool = False, motion: bool = True) -> RecordedFlight:
-    """Return the flight of a record.
+    """Return the flight of a record; raises RecordError if there is none.
 
-    Args:
-        path: of the record.
-        answers: include the drones' estimates and velocity commands.
-        motion: include all truth and status messages; otherwise those of one instant per second.
-
-    Raises:
-        RecordError: no such record.
+    With `answers` it includes the drones' estimates and velocity commands; without `motion`, the truth and status
+    messages of one instant per second only.
     """
     with RecordReader(path) as reader:
         flight = FlightReader(answers)
@@ -227,56 +222,19 @@ class _Velocity(Struct):
 
 
 class _Rows:
-    """Rows of numbers with their times, and for some messages a text each, stored compactly."""
+    """Rows of numbers with their times, and for some messages texts of each, stored compactly."""
 
     def __init__(self, width: int, kind: str) -> None:
-        self.t_ns, self.values, self._width = array("q"), array(kind), width
-        self.texts: list[str] = []
+        self.t_ns, self.values, self.width = array("q"), array(kind), width
+        self.texts: list[tuple[str, ...]] = []
 
-    def by_time(self) -> tuple[Times, np.ndarray, list[str]]:
-        """Return times (R,) [ns], ascending and unique, rows (R, width), and texts."""
-        t_ns, first = np.unique(np.array(self.t_ns, np.int64), return_index=True)
-        texts = [self.texts[i] for i in first] if self.texts else []
-        return t_ns, np.array(self.values).reshape(-1, self._width)[first], texts
-
-
-class _StateRows:
-    """States of one cluster by columns: the names in each message of a large formation outweigh its values."""
-
-    def __init__(self) -> None:
-        self._names: tuple[str, ...] = ()
-        self._drones: tuple[str, ...] = ()
-        self._clear()
-
-    def _clear(self) -> None:
-        self._times, self._value, self._desired = array("q"), array("d"), array("d")
-        self._phases: list[str] = []
-        self._reasons: list[str] = []
-
-    def add(self, state: _State) -> None:
-        """Add a state; one with another number of variables replaces all earlier ones."""
-        count = len(state.names)
-        if not len(state.value) == len(state.desired) == count > 0:
-            return
-        if count != len(self._names):
-            self._clear()
-        self._names, self._drones = state.names, state.drones
-        self._times.append(state.t_ns)
-        self._value.extend(state.value)
-        self._desired.extend(state.desired)
-        self._phases.append(intern(state.phase))
-        self._reasons.append(intern(state.reason))
-
-    def states(self, name: str, drones: tuple[str, ...], requests: list[ClusterRequest]) -> ClusterStates:
-        """Return all states by time, the last one of each instant."""
-        count = len(self._times)
-        t_ns, places = np.unique(np.array(self._times, np.int64)[::-1], return_index=True)
-        last = count - 1 - places
-        value, desired = (
-            np.array(rows).reshape(count, len(self._names))[last] for rows in (self._value, self._desired)
-        )
-        phases, reasons = ([texts[i] for i in last] for texts in (self._phases, self._reasons))
-        return ClusterStates(name, drones or self._drones, self._names, t_ns, value, desired, phases, reasons, requests)
+    def by_time(self, last: bool = False) -> tuple[Times, np.ndarray, list[tuple[str, ...]]]:
+        """Return times (R,) [ns], ascending and unique, rows (R, width), texts: the first, or last, of each instant."""
+        step, count = -1 if last else 1, len(self.t_ns)
+        t_ns, chosen = np.unique(np.array(self.t_ns, np.int64)[::step], return_index=True)
+        chosen = count - 1 - chosen if last else chosen
+        texts = [self.texts[i] for i in chosen] if self.texts else []
+        return t_ns, np.array(self.values).reshape(count, self.width)[chosen], texts
 
 
 _Handler = tuple[msgspec.msgpack.Decoder[Any], Callable[[str, Any], None]]
@@ -294,7 +252,8 @@ class FlightReader:
         self._commanders: defaultdict[str, list[tuple[int, str]]] = defaultdict(list)
         self._estimates: defaultdict[str, _Rows] = defaultdict(lambda: _Rows(3 + 3 + 1 + 1 + 36, "f"))
         self._commands: defaultdict[tuple[str, str], _Rows] = defaultdict(lambda: _Rows(3 + 1 + 1, "f"))
-        self._states: defaultdict[str, _StateRows] = defaultdict(_StateRows)
+        self._states: dict[str, _Rows] = {}
+        self._members: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {}  # names of variables, drones
         self._requests: defaultdict[str, list[ClusterRequest]] = defaultdict(list)
         self._processes: dict[str, RecordedProcess] = {}
         self._first_wall_ns: int | None = None
@@ -313,7 +272,7 @@ class FlightReader:
                 "process/bye": (Bye, self._add_process),
                 "drone/truth": (_Truth, self._add_truth),
                 "drone/sensor/status": (_Status, self._add_status),
-                "cluster/state": (_State, lambda name, message: self._states[name].add(message)),
+                "cluster/state": (_State, self._add_state),
                 "cluster/request": (ClusterRequest, lambda name, message: self._requests[name].append(message)),
             }
             if self._answers:
@@ -363,7 +322,7 @@ class FlightReader:
         rows = self._status[name]
         rows.t_ns.append(status.t_ns)
         rows.values.append(status.battery_percent)
-        rows.texts.append(status.state)
+        rows.texts.append((status.state,))
         if self._answers:
             commanders, commander = self._commanders[name], status.commander or ""
             if not commanders or commanders[-1][1] != commander:
@@ -383,6 +342,19 @@ class FlightReader:
         rows.values.extend(command.velocity_m_s)
         rows.values.extend((command.yaw_rate_rad_s, command.frame == "world"))
 
+    def _add_state(self, cluster: str, state: _State) -> None:
+        """Add a state; one with another number of variables replaces all earlier ones."""
+        if not len(state.value) == len(state.desired) == len(state.names) > 0:
+            return
+        width = 2 * len(state.names)
+        if (rows := self._states.get(cluster)) is None or rows.width != width:
+            rows = self._states[cluster] = _Rows(width, "d")
+        self._members[cluster] = state.names, state.drones
+        rows.t_ns.append(state.t_ns)
+        rows.values.extend(state.value)
+        rows.values.extend(state.desired)
+        rows.texts.append((intern(state.phase), intern(state.reason)))
+
     def _add_process(self, name: str, message: Join | Bye) -> None:
         process = self._processes.setdefault(name, RecordedProcess(name))
         if isinstance(message, Bye):
@@ -401,8 +373,17 @@ class FlightReader:
         tracks = []
         for name in [drone.name for drone in info.drones] if info else sorted(self._truth):
             t_ns, truth, _ = self._truth[name].by_time()
-            status_t_ns, battery, states = self._status[name].by_time()
+            status_t_ns, battery, texts = self._status[name].by_time()
+            states = [state for (state,) in texts]
             tracks.append(Track(name, t_ns, truth, status_t_ns, states, battery[:, 0], name in external))
+        clusters = []
+        for name, drones in members.items():
+            t_ns, values, texts = self._states.get(name, _Rows(0, "d")).by_time(last=True)
+            names, known_drones = self._members.get(name, ((), ()))
+            value, desired = np.split(values, 2, axis=1)
+            phases, reasons = [phase for phase, _ in texts], [reason for _, reason in texts]
+            about = (phases, reasons, self._requests[name])
+            clusters.append(ClusterStates(name, drones or known_drones, names, t_ns, value, desired, *about))
         estimates = {}
         for drone, rows in self._estimates.items():
             t_ns, values, _ = rows.by_time()
@@ -412,7 +393,7 @@ class FlightReader:
             info=info,
             scenario=scenario_of(info),
             tracks=tracks,
-            clusters=[self._states[name].states(name, own, self._requests[name]) for name, own in members.items()],
+            clusters=clusters,
             events=sorted(self._events, key=lambda event: (event.t_ns, event.seq)),
             processes=list(self._processes.values()),
             messages=messages,

@@ -76,7 +76,7 @@ def verdict(record: Path) -> Verdict:
 
 def shortfalls(flight: RecordedFlight, window_s: tuple[float, float]) -> list[Shortfall]:
     """Return the shortfalls of a flight, failures first; empty for one that flew its plan."""
-    lines = [*_incidents(flight), *_collisions(flight), *_missions(flight)]
+    lines = [*_incidents(flight), *_collisions_and_missions(flight)]
     lines += [line for states in flight.clusters for line in _of_cluster(states, flight, window_s)]
     lines += [*_overrides(flight), *_processes(flight)]
     if not flight.completeness.complete:
@@ -225,8 +225,11 @@ def _active_faults(drone: str, at: tuple[int, int], flight: RecordedFlight) -> s
     return f"; {', '.join(active.values())}" if active else ""
 
 
-def _collisions(flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield a line for each pair of drones, or of a drone and an obstacle, that touched."""
+def _collisions_and_missions(flight: RecordedFlight) -> Iterator[Shortfall]:
+    """Yield each pair of drones, or of a drone and an obstacle, that touched, and the missions not flown to their end.
+
+    Of the missions that a bridge reported, the newest one of each drone counts.
+    """
     pairs: dict[frozenset[object], list[Event]] = {}
     for event in flight.events:
         if event.kind == "collision":
@@ -235,10 +238,6 @@ def _collisions(flight: RecordedFlight) -> Iterator[Shortfall]:
         t_s, more = first.t_ns / 1e9, f" ({1 + len(others)} contacts in all)" if others else ""
         pair = f"{first.subject}, {first.data.get('other', 'something')}"
         yield Shortfall("collision", pair, t_s, f"{first.text} at {seconds_text(t_s)} s{more}", True)
-
-
-def _missions(flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield each drone whose newest mission, of those reported by a bridge, was not flown to its end."""
     newest = {event.subject: event for event in flight.events if event.kind == "mission"}
     for drone, event in newest.items():
         data, t_s = event.data, event.t_ns / 1e9
@@ -320,7 +319,12 @@ def _of_cluster(states: ClusterStates, flight: RecordedFlight, window_s: tuple[f
         more = f" and {len(asked) - 3} more" if len(asked) > 3 else ""
         yield _line(states, "request", asked[0].t_ns / 1e9, f"asked {first}{more}")
     if flight.scenario and cluster and plan and takeoff_s is not None:
-        yield from _not_begun(states, plan, end_s)
+        for step, due_s in (("trajectory", plan.trajectory and plan.trajectory.start_s), ("landing", plan.land_s)):
+            if due_s is not None and due_s >= end_s:
+                yield _line(states, "early", end_s, f"the run ended before its {step} at {seconds_text(due_s)} s")
+        follows = plan.trajectory is not None and plan.trajectory.start_s < end_s
+        if plan.target and not follows and _moves(states):
+            yield _line(states, "early", end_s, "the run ended before its reference was at the target")
         if not refused and (planned := _planned(states, flight.scenario, cluster, takeoff_s)):
             yield from (_trajectory_flown if plan.trajectory else _target_reached)(states, planned, plan)
     yield from _outside(states, window_s)
@@ -401,22 +405,12 @@ def _held(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
     yield _line(states, "held", span_s[0], text, float(lengths_s[~by_others].sum()) > HELD_MAX_S)
 
 
-def _not_begun(states: ClusterStates, plan: ClusterPlan, end_s: float) -> Iterator[Shortfall]:
-    """Yield the steps of the plan that were not due before the run ended."""
-    for step, due_s in (("trajectory", plan.trajectory and plan.trajectory.start_s), ("landing", plan.land_s)):
-        if due_s is not None and due_s >= end_s:
-            yield _line(states, "early", end_s, f"the run ended before its {step} at {seconds_text(due_s)} s")
-    follows = plan.trajectory is not None and plan.trajectory.start_s < end_s
+def _moves(states: ClusterStates) -> bool:
+    """Return whether the reference moves at the end, and not due to a hold or because the guard separates drones."""
     last = states.t_ns > states.t_ns[-1] - MOVES_NS
     phases = {phase for phase, row in zip(states.phases, last, strict=True) if row}
-    # moved neither due to a hold nor because the guard separates drones
-    moves = (
-        phases == {"engaged"}
-        and not states.reasons[-1]
-        and float(np.ptp(states.desired[last], axis=0).max()) > MOVES_MIN
-    )
-    if plan.target and not follows and moves:
-        yield _line(states, "early", end_s, "the run ended before its reference was at the target")
+    moved = float(np.ptp(states.desired[last], axis=0).max())
+    return phases == {"engaged"} and not states.reasons[-1] and moved > MOVES_MIN
 
 
 class PlannedReference(NamedTuple):

@@ -249,7 +249,15 @@ class TimeMarks(Struct, frozen=True):
 
 def time_marks(flight: RecordedFlight, formation: Formation | None = None) -> TimeMarks:
     """Return the marks of a flight, with the phases and the engagement of a formation."""
-    bands = [*_faults(flight), *_take_overs(flight), *(_phases(formation) if formation else ())]
+    bands = [*_faults(flight), *_take_overs(flight)]
+    if formation and formation.phases:  # those other than idle and engaged
+        phases = np.array(formation.phases)
+        starts = np.flatnonzero(np.r_[True, phases[1:] != phases[:-1]])
+        ends = np.r_[formation.t_s[starts[1:]], formation.t_s[-1]]
+        for start, end_s in zip(starts, ends, strict=True):
+            kind = ASSEMBLY.get(str(phases[start]), str(phases[start]))
+            if kind in COLOURS:
+                bands.append(Band(kind, float(formation.t_s[start]), float(end_s)))
     climbing = [track for track in flight.tracks if "taking_off" in track.states]
     takeoffs_s = [track.status_t_ns[track.states.index("taking_off")] / 1e9 for track in climbing]
     start_s = flight.first_ns / 1e9 if flight.replay_of else 0.0  # a replay may begin anywhere
@@ -262,19 +270,6 @@ def time_marks(flight: RecordedFlight, formation: Formation | None = None) -> Ti
         else:
             united.append(band)
     return TimeMarks(min(takeoffs_s, default=None), engaged_s, tuple(united), (start_s, flight.last_ns / 1e9))
-
-
-def _phases(formation: Formation) -> Iterator[Band]:
-    """Yield the phases of a formation other than idle and engaged."""
-    phases = np.array(formation.phases)
-    if not len(phases):
-        return
-    starts = np.flatnonzero(np.r_[True, phases[1:] != phases[:-1]])
-    ends = np.r_[formation.t_s[starts[1:]], formation.t_s[-1]]
-    for start, end_s in zip(starts, ends, strict=True):
-        kind = ASSEMBLY.get(str(phases[start]), str(phases[start]))
-        if kind in COLOURS:
-            yield Band(kind, float(formation.t_s[start]), float(end_s))
 
 
 def _faults(flight: RecordedFlight) -> Iterator[Band]:

@@ -308,15 +308,8 @@ def error_table(cluster: ClusterErrors) -> ErrorTable:
     single = ErrorTable(columns, rows)
     if len(cluster.errors) <= SINGLY_MAX:
         return single
-    return ErrorTable(list(GROUP_COLUMNS), list(_group_rows(cluster)), single)
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.4f}"
-
-
-def _group_rows(cluster: ClusterErrors) -> Iterator[list[str]]:
-    """Yield a row per group: its size, the root of its mean square errors, and the parameter with the largest RMS."""
+    # of each group its size, the root of its mean square errors, and the parameter with the largest RMS
+    rows = []
     groups: dict[tuple[str, str], list[str]] = {}
     for name in cluster.errors:
         kind = FRAME.get(name) or ("headings" if name.startswith("phi") else "shape")
@@ -326,7 +319,12 @@ def _group_rows(cluster: ClusterErrors) -> Iterator[list[str]]:
         true = {name: value for name in names if (value := cluster.errors[name].true_rms) is not None}
         means = (float(np.sqrt(np.mean(np.square([*each.values()])))) if each else None for each in (est, true))
         worst = max(true, key=lambda name: true[name], default="")
-        yield [f"{kind} ({measure})", str(len(names)), *map(_number, (*means, true.get(worst))), worst or "–"]
+        rows.append([f"{kind} ({measure})", str(len(names)), *map(_number, (*means, true.get(worst))), worst or "–"])
+    return ErrorTable(list(GROUP_COLUMNS), rows, single)
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4f}"
 
 
 def terminal_text(summary: RunSummary) -> Group:

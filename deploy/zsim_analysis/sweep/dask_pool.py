@@ -60,7 +60,17 @@ class DaskPool:
         pending: dict[str, Task] = {}
         try:
             with self._client:
-                self._await_workers()
+                if not self._client.nthreads():
+                    at = self._address
+                    self._say(f"waiting for workers at {at}; start `dask worker {at}` on every host")
+                    self._client.wait_for_workers(1)
+                versions = self._client.run(_version, on_error="return")
+                for worker, version in versions.items():
+                    if version != __version__:
+                        present = f"zsim {version}" if isinstance(version, str) else reason_of(version)
+                        must = f"must have zsim {__version__}"
+                        raise RunError(f"--dask {self._address}: worker {worker} has {present}; {must}")
+                self._say(f"{len(versions)} Dask worker{'s'[: len(versions) != 1]} at {self._address}")
                 flying: Any = _as_completed(loop=self._client.loop)
                 self._fill(flying, pending, tasks)
                 for future in flying:
@@ -77,17 +87,6 @@ class DaskPool:
                     self._fill(flying, pending, tasks)
         except (OSError, CancelledError) as error:  # broken links are OSErrors too
             raise RunError(f"--dask {self._address}: the cluster is gone; the same command goes on") from error
-
-    def _await_workers(self) -> None:
-        if not self._client.nthreads():
-            self._say(f"waiting for workers at {self._address}; start `dask worker {self._address}` on every host")
-            self._client.wait_for_workers(1)
-        versions = self._client.run(_version, on_error="return")
-        for worker, version in versions.items():
-            if version != __version__:
-                present = f"zsim {version}" if isinstance(version, str) else reason_of(version)
-                raise RunError(f"--dask {self._address}: worker {worker} has {present}; must have zsim {__version__}")
-        self._say(f"{len(versions)} Dask worker{'s'[: len(versions) != 1]} at {self._address}")
 
     def _fill(self, flying: Any, pending: dict[str, Task], tasks: Iterator[Task]) -> None:
         """Submit tasks up to AHEAD per thread of the cluster; new workers may join at any time."""

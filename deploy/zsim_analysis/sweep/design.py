@@ -65,20 +65,17 @@ def difference(old: SweepPlan, new: SweepPlan) -> str | None:
         keys = sorted(old.document.keys() | new.document.keys())
         other = next(key for key in keys if old.document.get(key) != new.document.get(key))
         return f"{other} of its scenario is another one"
-    whole = [[_whole(text, plan) for text in plan.vary] for plan in (old, new)]
-    if whole[0] != whole[1]:
+    fields = []  # of each plan: paths from the top of the scenario, and values
+    for plan in (old, new):
+        parts = [text.partition("=") for text in plan.vary]
+        fields.append([(whole_path(path.strip(), plan.document), values) for path, _, values in parts])
+    if fields[0] != fields[1]:
         return f"it varies {' '.join(old.vary) or 'nothing'}, not {' '.join(new.vary) or 'nothing'}"
     if old.records != new.records:
         return f"it {'keeps' if old.records else 'does not keep'} records"
     if new.runs < old.runs:
         return f"it has {old.runs} runs, more than {new.runs}"
     return None
-
-
-def _whole(text: str, plan: SweepPlan) -> str:
-    """Return a text of `--vary` with its path from the top of the scenario."""
-    path, equals, values = text.partition("=")
-    return f"{whole_path(path.strip(), plan.document)}{equals}{values}"
 
 
 def is_sweep(folder: Path) -> bool:
@@ -118,7 +115,12 @@ class Grid(Struct, frozen=True):
         names = [_cut(f"{value:g}" if isinstance(value, float) else text_of(value)) for value in self.values]
         for short in [name for name, count in Counter(names).items() if count > 1]:
             alike = [place for place, name in enumerate(names) if name == short]
-            parts = _differing([text_of(self.values[place]) for place in alike])
+            texts = parts = [text_of(self.values[place]) for place in alike]
+            if any(len(text) > SHOWN_MAX for text in texts):  # from the first word in which they differ on
+                letters = enumerate(zip(*texts, strict=False))
+                whole = next((place for place, each in letters if len(set(each)) > 1), min(map(len, texts)))
+                start = max(texts[0].rfind(mark, 0, whole) for mark in " ,[{:") + 1
+                parts = [_cut(f"…{text[start:]}" if start else text) for text in texts]
             others = {name for name in names if name != short}
             is_distinct = len({*parts, *others}) == len(parts) + len(others)
             for place, part in zip(alike, parts, strict=True):
@@ -164,8 +166,20 @@ def parse(text: str, document: Mapping[str, Any] = NOTHING) -> Axis:
             if fault := first_fault(seed, _SEED_TYPE):
                 raise ValueError(f"{fault[1]}; or give seed={PAIRED}, which draws them")
         return Seeds(paired=True, values=seeds)
-    drawn = _DRAWN.fullmatch(values)
-    return _draw(path, drawn[1], drawn[2]) if drawn else Grid(path, _grid_values(values))
+    if (drawn := _DRAWN.fullmatch(values)) is None:
+        return Grid(path, _grid_values(values))
+    kind, arguments = drawn[1], drawn[2]
+    if kind not in ("uniform", "normal"):
+        raise ValueError(f"draws by {kind}; must be uniform(low,high) or normal(mean,std)")
+    try:
+        first, second = (float(part) for part in arguments.split(","))
+    except ValueError:
+        raise ValueError(f"has {kind}({arguments[:40]}); must hold two numbers") from None
+    span = second - first if kind == "uniform" else second
+    if not (math.isfinite(first) and math.isfinite(second) and 0 < span < math.inf):
+        need = "low < high, high - low finite too" if kind == "uniform" else "std > 0"
+        raise ValueError(f"has {kind}({arguments[:40]}); must be finite numbers with {need}")
+    return Draw(path, kind, first, second)
 
 
 def _grid_values(text: str) -> tuple[Any, ...]:
@@ -181,33 +195,9 @@ def _grid_values(text: str) -> tuple[Any, ...]:
     return tuple(values)
 
 
-def _draw(path: str, kind: str, arguments: str) -> Draw:
-    if kind not in ("uniform", "normal"):
-        raise ValueError(f"draws by {kind}; must be uniform(low,high) or normal(mean,std)")
-    try:
-        first, second = (float(part) for part in arguments.split(","))
-    except ValueError:
-        raise ValueError(f"has {kind}({arguments[:40]}); must hold two numbers") from None
-    span = second - first if kind == "uniform" else second
-    if not (math.isfinite(first) and math.isfinite(second) and 0 < span < math.inf):
-        need = "low < high, high - low finite too" if kind == "uniform" else "std > 0"
-        raise ValueError(f"has {kind}({arguments[:40]}); must be finite numbers with {need}")
-    return Draw(path, kind, first, second)
-
-
 def text_of(value: Any) -> str:
     """Return a value as `--set` takes it, in one line."""
     return value if isinstance(value, str) else json.dumps(value, default=str)
-
-
-def _differing(texts: Sequence[str]) -> list[str]:
-    """Return texts from the first word in which they differ on, cut; short ones are whole."""
-    if all(len(text) <= SHOWN_MAX for text in texts):
-        return list(texts)
-    letters = enumerate(zip(*texts, strict=False))
-    whole = next((place for place, each in letters if len(set(each)) > 1), min(map(len, texts)))
-    start = max(texts[0].rfind(mark, 0, whole) for mark in " ,[{:") + 1
-    return [_cut(f"…{text[start:]}" if start else text) for text in texts]
 
 
 def _cut(text: str) -> str:
@@ -217,9 +207,7 @@ def _cut(text: str) -> str:
 def field_path(document: dict[str, Any], path: str) -> FieldPath:
     """Return the steps to a field from the top; list entries count from 0, whether given by index or by name.
 
-    Args:
-        document: raw, not changed; steps to fields that it does not have are kept as text.
-        path: as `--set` takes it.
+    Steps to fields that the raw document does not have are kept as text.
     """
     steps: list[str | int] = []
     value: Any = document
@@ -246,13 +234,10 @@ def is_inside(one: FieldPath, other: FieldPath) -> bool:
 
 
 class SweepDesign:
-    """The runs of a plan; runs and points count from 0.
+    """The runs of a plan; runs and points, which are combinations of the grid's values, count from 0.
 
-    Attributes:
-        axes: what varies.
-        points: number of combinations of the grid's values; run i flies the i-th, then the first again.
-        seeds: how they vary, None if all runs have the scenario's own.
-        paired: the n-th runs of all combinations have the same seed.
+    Run i flies the i-th point, then the first again. `seeds` says how they vary, None: all are the scenario's own;
+    `paired`: the n-th runs of all points have the same seed.
     """
 
     def __init__(self, plan: SweepPlan) -> None:
@@ -438,10 +423,7 @@ def _count_faults(design: SweepDesign, all_known: bool) -> list[str]:
 def read_document(path: Path, set_texts: list[str], **values: Any) -> tuple[dict[str, Any], list[str]]:
     """Return the raw document, as `scenario_file.load` takes it, and the faults of the overrides.
 
-    Args:
-        path: the file.
-        set_texts: texts `a.b.c=value` as given to `--set`, applied in order.
-        values: top-level fields that replace the file's, None being ignored.
+    `set_texts` are texts `a.b.c=value` of `--set`; `values` replace top-level fields of the file, unless None.
 
     Raises:
         ScenarioError: the file holds no map.

@@ -35,7 +35,7 @@ from zsim_analysis.in_process import InProcessFlight
 from zsim_analysis.reading.formation import Formation, formations_of
 from zsim_analysis.reading.recorded_flight import FlightReader, RecordedFlight
 from zsim_analysis.reading.shortfall import CRASHES
-from zsim_analysis.report.summary import RunSummary, summarise
+from zsim_analysis.report.summary import summarise
 from zsim_analysis.sweep.design import METRICS
 
 METRIC = "metrics."  # prefix of the columns of the user's metrics
@@ -89,6 +89,9 @@ class RunResult(Struct, frozen=True, kw_only=True):
     fingerprint: str = ""  # numeric; equal ones promise equal bits
 
 
+# columns with the value of the same name in the run's summary
+OF_SUMMARY = ("ended", "truth_sha256", "sim_s", "wall_s", "real_time_factor", "min_separation_m", "as_planned",
+              "window_note", "date")  # fmt: skip
 FIXED = {field.name: field.type for field in msgspec.structs.fields(RunResult)}
 
 
@@ -134,28 +137,28 @@ def fly(task: Task) -> Row:
         point=task.point,
         seed=task.scenario.seed,
         failure=reason_of(diverged) if diverged else None,
-        ended=summary.ended,
-        truth_sha256=summary.truth_sha256,
-        sim_s=summary.sim_s,
-        wall_s=summary.wall_s,
-        real_time_factor=summary.real_time_factor,
-        min_separation_m=summary.min_separation_m,
         collisions=sum(event.kind == "collision" for event in flight.events),
         crashed=any(event.kind in CRASHES for event in flight.events),
         engaged=all(engaged.get(name) is not None for name in clusters) if clusters else None,
         engaged_throughout=all(shares.get(name) == 1.0 for name in clusters) if clusters else None,
-        as_planned=summary.as_planned,
         shortfall=next((each.text for each in summary.shortfalls if each.fails), None),
         metrics_failure=metrics_failure,
         window_from_s=summary.window_s[0],
         window_to_s=summary.window_s[1],
-        window_note=summary.window_note,
-        date=summary.date,
+        **{name: getattr(summary, name) for name in OF_SUMMARY},
         **where,
     )
     columns: dict[str, float | None] = {engaged_column(name): engaged.get(name) for name in clusters}
-    errors = {} if diverged else _errors(summary, engaged)
-    return make_row(result, task.varied, {**columns, **errors, **metrics})
+    for i, (name, cluster) in enumerate([] if diverged else summary.clusters.items()):
+        # Errors by their paths in summary.json. Those of a cluster that was not engaged are None, and all of a flight
+        # that was not as planned: drones that stay on the ground, or hover instead of following a trajectory, do not
+        # hold the requested formation, and a drone that fell errs for a shorter time.
+        prefix = "errors" if i == 0 else f"clusters.{name}.errors"
+        counts = summary.as_planned and engaged[name] is not None
+        for parameter, errors in cluster.errors.items():
+            for statistic, value in msgspec.structs.asdict(errors).items():
+                columns[f"{prefix}.{parameter}.{statistic}"] = value if counts else None
+    return make_row(result, task.varied, {**columns, **metrics})
 
 
 def fly_scenario(scenario: Scenario, writer: RecordWriter | None = None) -> tuple[RecordedFlight, Exception | None]:
@@ -203,22 +206,6 @@ def engaged_s(formations: list[Formation], window_s: tuple[float, float]) -> dic
     """Return the first instant [s] of a window at which each cluster was engaged, None if it never was."""
     rows = {each.name: np.flatnonzero(each.judged(window_s)) for each in formations}
     return {each.name: float(each.t_s[rows[each.name][0]]) if len(rows[each.name]) else None for each in formations}
-
-
-def _errors(summary: RunSummary, engaged: dict[str, float | None]) -> dict[str, float | None]:
-    """Return the errors of the formations by their paths in summary.json; `errors` is the first cluster.
-
-    Those of a cluster that was not engaged are None, and all of a flight that was not as planned: drones that stay on
-    the ground, or hover instead of following a trajectory, do not hold the requested formation, and a drone that fell
-    errs for a shorter time.
-    """
-    columns: dict[str, float | None] = {}
-    for i, (name, cluster) in enumerate(summary.clusters.items()):
-        prefix, counts = "errors" if i == 0 else f"clusters.{name}.errors", engaged[name] is not None
-        for parameter, errors in cluster.errors.items():
-            for statistic, value in msgspec.structs.asdict(errors).items():
-                columns[f"{prefix}.{parameter}.{statistic}"] = value if counts and summary.as_planned else None
-    return columns
 
 
 def metrics_of(scenario: Scenario, flight: RecordedFlight) -> tuple[dict[str, float | None], str | None]:

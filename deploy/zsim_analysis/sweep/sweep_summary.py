@@ -84,10 +84,9 @@ def distribution(samples: Samples) -> Distribution | None:
     if not len(known):
         return None
     std = float(np.std(known, ddof=1)) if len(known) > 1 else math.nan
-    quantiles = (float(value) for value in np.percentile(known, [5, 50, 95]))
+    p5, median, p95, least, greatest = map(float, (*np.percentile(known, [5, 50, 95]), known.min(), known.max()))
     few = tuple(known.tolist()) if len(known) < RUNS_MIN else ()
-    ends = (float(known.min()), float(known.max()))
-    return Distribution(len(known), mean_interval(known), std, *quantiles, *ends, few)
+    return Distribution(len(known), mean_interval(known), std, p5, median, p95, least, greatest, few)
 
 
 def finite(samples: Samples) -> Samples:
@@ -378,10 +377,10 @@ def field_name(path: str) -> FieldName:
 
     For example, sensors.gps.position_m.noise is the "GPS position noise" in m.
     """
-    steps = [word or bracket for word, bracket in _STEP.findall(path)] or [path]
+    steps: list[str] = [word or bracket for word, bracket in _STEP.findall(path)] or [path]
     kept = steps[1:] if steps[0] in SECTIONS and len(steps) > (1 if steps[0] == "metrics" else 2) else steps
     kept = [f"{steps[0].removesuffix('s')} {kept[0]}", *kept[1:]] if kept[0].isdigit() else kept
-    parted = []  # words and unit of each step
+    parted: list[tuple[str, str]] = []  # words and unit of each step
     for step in kept:
         end = next((end for end in UNITS if step.endswith(end) and step != end), "")
         words = " ".join(WORDS.get(word, word) for word in step.removesuffix(end).split("_"))

@@ -337,8 +337,7 @@ def drive_mavlink(
 ) -> None:
     """Let a MAVLink vehicle (PX4, ArduPilot, or its simulator) fly as a drone of the run."""
     from zsim_bridges.mavlink.autopilot_session import AutopilotSession
-    from zsim_bridges.vehicle_links.driver import drive
-    from zsim_bridges.vehicle_links.driver_options import DriverOptions, check_host, position, udp_channel
+    from zsim_bridges.vehicle_links.driver import DriverOptions, check_host, drive, position, udp_channel
 
     options = DriverOptions(drone, *bounds, position(origin) if origin else None, None)
     channel = udp_channel(address, local_port)
@@ -368,11 +367,10 @@ def drive_ardrone(
     ] = 8,
 ) -> None:
     """Let an AR.Drone 2.0 fly as a drone of the run."""
-    from zsim_bridges.ardrone.aircraft_session import AircraftSession, AircraftSettings
-    from zsim_bridges.vehicle_links.driver import drive
-    from zsim_bridges.vehicle_links.driver_options import DriverOptions, aircraft_host, check_host, position
+    from zsim_bridges.ardrone.aircraft_session import AircraftSession
+    from zsim_bridges.vehicle_links.driver import DriverOptions, aircraft_host, check_host, drive, position
 
     options = DriverOptions(drone, *bounds, position(origin) if origin else None, yaw)
     check_host(aircraft_host(address))
-    make_session = partial(AircraftSession.of_run, host=address, settings=AircraftSettings(ultrasound=ultrasound))
+    make_session = partial(AircraftSession.of_run, host=address, ultrasound=ultrasound)
     serve_as("driver", "", partial(drive, options=options, make_session=make_session), reach, drone)

@@ -190,12 +190,6 @@ def logs(
         shown = "its progress and events are shown by `zsim up`, and are in the record"
         note(f"{role} has logged nothing; {shown}" if role == WORLD else f"{role} has logged nothing yet")
 
-    def goes_on() -> bool:
-        try:
-            return control_socket.ask(federation, "where")["out"] == where["out"]
-        except RunError:
-            return False
-
     done, last = 0, not follow
     decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")
     while True:
@@ -209,7 +203,10 @@ def logs(
         if last:
             return
         time.sleep(FOLLOW_S)
-        last = not goes_on()
+        try:
+            last = control_socket.ask(federation, "where")["out"] != where["out"]
+        except RunError:
+            last = True
 
 
 @app.command(rich_help_panel=opt.HOSTS)

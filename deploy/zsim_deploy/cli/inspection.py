@@ -28,13 +28,13 @@ PUB, ASK = "zsim.pub", "zsim.ask"
 COMMANDS = "drone/*/cmd/*"
 
 
-def list_keys(link: Session, expression: str, listen_s: float = LISTEN_S) -> list[tuple[str, str, int]]:
-    """Return (key, message, messages received) of every key with a message or an answer within `listen_s`."""
+def list_keys(link: Session, expression: str) -> list[tuple[str, str, int]]:
+    """Return (key, message, messages received) of every key with a message or an answer within LISTEN_S."""
     check_expression(expression)
     counts: Counter[str] = Counter()
     for known in (keys.INFO, keys.CLOCK, "drone/*/truth", "drone/*/estimate", "cluster/*/state"):
         counts.update({sample.key: 0 for sample in link.get(known) if keys.matches(expression, sample.key)})
-    for sample in _samples(link.subscribe(expression), time.monotonic() + listen_s):
+    for sample in _samples(link.subscribe(expression), time.monotonic() + LISTEN_S):
         counts[sample.key] += 1
     kinds = {key: messages.type_of(key) for key in counts}
     names = {key: kind.__name__ if kind else "not of the contract" for key, kind in kinds.items()}
@@ -50,14 +50,9 @@ def echo(
     timeout_s: float = math.inf,
     note: Callable[[str], None] = lambda text: None,
 ) -> int:
-    """Hand every message on an expression to `emit` until `count` have come, or the time is over; return how many
-    came.
+    """Hand the messages on an expression to `emit` until `count` came, or the time is over; return how many came.
 
-    Args:
-        count: after which it returns, None for none.
-        emit: takes key and message; payloads in hexadecimal digits where they are to be `raw`.
-        timeout_s: wall time after which it returns.
-        note: takes a line for people, such as that the key has no publisher.
+    `emit` takes key and message, its payload in hexadecimal digits if `raw`; `note` takes lines for people.
     """
     subscription = link.subscribe(expression)
     until_s, number = time.monotonic() + timeout_s, 0
@@ -175,26 +170,19 @@ def _samples(subscription: Subscription, until_s: float) -> Iterator[ReceivedSam
 
 
 class Published(NamedTuple):
-    """What became of commands that were sent by hand.
-
-    Attributes:
-        refused: how many of them the world refused, as far as its events say.
-        reason: of the first refusal.
-        note: why nothing is known of them, empty if it is.
-    """
+    """What became of commands that were sent by hand."""
 
     sent: int
-    refused: int = 0
-    reason: str = ""
-    note: str = ""
+    refused: int = 0  # how many of them the world refused, as far as its events say
+    reason: str = ""  # of the first refusal
+    note: str = ""  # why nothing is known of them, empty if it is
 
 
 def publish(link: Session, info: messages.Info, key: str, text: str, count: int, rate_hz: float) -> Published:
     """Publish a JSON text as the command of its key, `count` times, and wait for what becomes of it.
 
-    t_ns, seq and source are filled in. RunError where it is no JSON, not the message of that key, or no key of a drone
-    of
-    the run that takes commands.
+    t_ns, seq and source are filled in. RunError where it is no JSON, not the message of that key, or no key of a
+    drone of the run that takes commands.
     """
     _refuse_wildcards(key, "pub")
     kind = messages.type_of(key)

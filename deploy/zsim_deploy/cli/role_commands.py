@@ -54,18 +54,22 @@ def world(
 def _agent_command(name: str, role: Role) -> Callable[..., None]:
     about = str(role.about)
     several_help = f"{about.capitalize()}s, or patterns: '{about}*'."
-    Several = Annotated[list[str], Argument(metavar=f"{about.upper()}...", help=several_help, show_default=False)]
-    One = Annotated[str, Argument(metavar=about.upper(), help=f"Name of the {about}.")]
 
     def start(things: list[str], reach: opt.WorldAccess) -> None:
         from zsim_deploy.roles import roles
 
         roles.agent(roles.agent_of(name, things), reach, roles.process_of(name, things))
 
-    def several(reach: opt.WorldAccess, things: Several) -> None:
+    def several(
+        reach: opt.WorldAccess,
+        things: Annotated[list[str], Argument(metavar=f"{about.upper()}...", help=several_help, show_default=False)],
+    ) -> None:
         start(things, reach)
 
-    def one(reach: opt.WorldAccess, thing: One = "main") -> None:
+    def one(
+        reach: opt.WorldAccess,
+        thing: Annotated[str, Argument(metavar=about.upper(), help=f"Name of the {about}.")] = "main",
+    ) -> None:
         start([thing], reach)
 
     return opt.participant_options(several if role.joint else one)

@@ -122,7 +122,15 @@ def conclude(outcome: Any, out: Path, report: bool) -> None:
         sys.exit(INTERRUPTED)
     if record.exists():
         try:
-            fault = _report(out) if report else _judge(record)
+            if report:
+                fault = _report(out)
+            else:
+                from zsim_analysis.reading.shortfall import marks_of, verdict
+
+                judged = verdict(record)
+                for mark, _ in marks_of(judged.shortfalls):
+                    say(mark)
+                fault = _fault_of(judged.completeness.complete, str(judged.completeness), judged.shortfalls)
         except ZsimError as error:
             if not outcome.failed:
                 raise
@@ -135,16 +143,6 @@ def conclude(outcome: Any, out: Path, report: bool) -> None:
         if (out / "logs").exists():
             note(f"logs are in {out / 'logs'}")
         raise failed(f"ended: {fault}")
-
-
-def _judge(record: Path) -> str:
-    """Print the marks of a run; return what it did not do or lacks, empty if nothing."""
-    from zsim_analysis.reading.shortfall import marks_of, verdict
-
-    judged = verdict(record)
-    for mark, _ in marks_of(judged.shortfalls):
-        say(mark)
-    return _fault_of(judged.completeness.complete, str(judged.completeness), judged.shortfalls)
 
 
 def _fault_of(complete: bool, state: str, shortfalls: "Sequence[Shortfall]") -> str:
@@ -206,7 +204,20 @@ def report(
         raise BadParameter(f"--format is {formats!r}; must be {allowed}")
     with plugin.names_only(not trust) as skipped:
         if len(directories) > 1:
-            _compare(directories, out, wanted)
+            from rich.console import Console
+
+            from zsim.runtime.progress import cell
+            from zsim_analysis.report.comparison import compare, comparison_path
+
+            for directory in directories:
+                if is_sweep(directory):
+                    why = "runs can be compared, a sweep has a report of its own"
+                    raise BadParameter(f"{directory} is a sweep; {why}")
+                record_in(directory)
+            page = out or comparison_path(directories)
+            with Console(stderr=True).status("reading the records …") as status:
+                compare(directories, page, lambda text: status.update(cell(text)), wanted)
+            say(f"report: {page}")
         elif out is not None:
             raise BadParameter("--out is for the page that compares several runs; leave it out")
         else:
@@ -235,24 +246,6 @@ def _report(folder: Path, formats: Sequence[str] = ()) -> str:
     fault = "" if is_sweep(folder) else _fault_of(summary.record.complete, summary.record.state, summary.shortfalls)
     say(f"report: {folder / 'report.html'}")
     return fault
-
-
-def _compare(directories: list[Path], out: Path | None, formats: Sequence[str]) -> None:
-    from rich.console import Console
-
-    from zsim.output_folder import record_in
-    from zsim.runtime.progress import cell
-    from zsim_analysis.report.comparison import compare, comparison_path
-    from zsim_analysis.sweep.design import is_sweep
-
-    for directory in directories:
-        if is_sweep(directory):
-            raise BadParameter(f"{directory} is a sweep; runs can be compared, a sweep has a report of its own")
-        record_in(directory)
-    page = out or comparison_path(directories)
-    with Console(stderr=True).status("reading the records …") as status:
-        compare(directories, page, lambda text: status.update(cell(text)), formats)
-    say(f"report: {page}")
 
 
 @app.command(rich_help_panel=opt.RUN)

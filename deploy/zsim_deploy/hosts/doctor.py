@@ -51,16 +51,12 @@ PATH_COLUMNS = (
 
 
 class HostReport(NamedTuple):
-    """The facts of a host by its own probe, and what asking it showed; `remedy` is how it gets another zsim.
-
-    Attributes:
-        clock_offset_s: its wall clock minus ours, good to half the round trip.
-    """
+    """The facts of a host by its own probe, and what asking it showed."""
 
     facts: dict[str, Any]
     round_trip_s: float
-    clock_offset_s: float
-    remedy: str = "run `zsim push --hosts FILE`"
+    clock_offset_s: float  # its wall clock minus ours, good to half the round trip
+    remedy: str = "run `zsim push --hosts FILE`"  # how it gets another zsim
 
 
 class NetworkPath(NamedTuple):
@@ -80,38 +76,36 @@ class CheckResult(NamedTuple):
 
 def check_hosts(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
     """Check certificates and hosts; with a placement also the paths to where the world and the routers listen."""
-    tables, faults, warnings = asyncio.run(_check_hosts(placed, places))
+
+    async def check() -> tuple[list[FittedTable], list[str], list[str]]:
+        links = {name: HostLink(name, host, placed.folder) for name, host in placed.inventory.hosts.items()}
+        pythons = {name: inv.python(host) for name, host in placed.inventory.hosts.items()}
+        try:
+            asked = (host_report(link, pythons[name], placed.word) for name, link in links.items())
+            results = await asyncio.gather(*asked, return_exceptions=True)
+            reports = {name: each for name, each in zip(links, results, strict=True) if isinstance(each, HostReport)}
+            for result in results:
+                if isinstance(result, BaseException) and not isinstance(result, ZsimError):
+                    raise result
+            faults = [str(result) for result in results if isinstance(result, ZsimError)]
+            wrong, warnings = compare_reports(reports)
+            paths: list[NetworkPath] = []  # one after the other
+            for (target, port), sources in inv.connections(placed, places).items() if places else ():
+                if target in reports:
+                    chosen = [links[name] for name in sorted(sources & set(reports))]
+                    paths += await network_paths(chosen, links[target], pythons, port)
+            cut, slow = path_faults(paths)
+            left = await asyncio.gather(*(leftovers(links[name], placed.folder) for name in reports))
+            tables = [hosts_table(reports), *([paths_table(paths)] if paths else [])]
+            return tables, [*faults, *wrong, *cut], [*warnings, *slow, *(line for lines in left for line in lines)]
+        finally:
+            for link in links.values():
+                await link.close()
+
+    tables, faults, warnings = asyncio.run(check())
     lacks = certificates.certificate_faults(placed, places, datetime.now(UTC))
     exposed = certificates.exposed_keys(placed)
     return CheckResult(tables, [*lacks, *faults], [*warnings, *([exposed] if exposed else [])])
-
-
-async def _check_hosts(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
-    links = {name: HostLink(name, host, placed.folder) for name, host in placed.inventory.hosts.items()}
-    pythons = {name: inv.python(host) for name, host in placed.inventory.hosts.items()}
-    try:
-        results = await asyncio.gather(
-            *(host_report(link, pythons[name], placed.word) for name, link in links.items()), return_exceptions=True
-        )
-        reports = {name: each for name, each in zip(links, results, strict=True) if isinstance(each, HostReport)}
-        for result in results:
-            if isinstance(result, BaseException) and not isinstance(result, ZsimError):
-                raise result
-        faults = [str(result) for result in results if isinstance(result, ZsimError)]
-        wrong, warnings = compare_reports(reports)
-        paths: list[NetworkPath] = []  # one after the other
-        for (target, port), sources in inv.connections(placed, places).items() if places else ():
-            if target in reports:
-                chosen = [links[name] for name in sorted(sources & set(reports))]
-                paths += await network_paths(chosen, links[target], pythons, port)
-        cut, slow = path_faults(paths)
-        left = await asyncio.gather(*(leftovers(links[name], placed.folder) for name in reports))
-        tables = [hosts_table(reports), *([paths_table(paths)] if paths else [])]
-        warnings = [*warnings, *slow, *(line for lines in left for line in lines)]
-        return CheckResult(tables, [*faults, *wrong, *cut], warnings)
-    finally:
-        for link in links.values():
-            await link.close()
 
 
 async def host_report(link: HostLink, python: str, hosts: str = "FILE") -> HostReport:

@@ -80,22 +80,14 @@ class EventLoopThread:
 
 
 class HostLink:
-    """One host; more connections are opened to it as one has no room for another channel.
-
-    Args:
-        base: folder of the inventory, from which relative paths count.
-
-    Attributes:
-        round_trip_s: of the last line that came back.
-        answered_s: monotonic time of it; 0 before the first.
-    """
+    """One host; more connections are opened to it as one has no room for another channel."""
 
     def __init__(self, name: str, host: Host, base: Path) -> None:
         self.name = name
         self.host = host
-        self.round_trip_s = 0.0
-        self.answered_s = 0.0
-        self._base = base
+        self.round_trip_s = 0.0  # of the last line that came back
+        self.answered_s = 0.0  # monotonic time of it; 0 before the first
+        self._base = base  # folder of the inventory, from which relative paths count
         self._channels: dict[Connection, int] = {}  # in use, by connection
         self._lock = asyncio.Lock()
 
@@ -134,9 +126,7 @@ class HostLink:
     ) -> bytes:
         """Return what a line of a POSIX shell prints; HostsError with its last line if it fails or takes too long.
 
-        Args:
-            what: the command does, for errors; its first word if not given.
-            retry: try until the host is there; the time counts from then.
+        `what` it does, for errors; `retry`: try until the host is there, the time counts from then.
         """
         async with self.channel(retry) as connection:
             try:
@@ -205,16 +195,12 @@ def _broken(name: str, error: Exception) -> HostsError:
 
 
 class HostLinks:
-    """A link to each host that takes part.
-
-    Attributes:
-        by_name: the links; a new dictionary when there is one more, for others look at it meanwhile.
-    """
+    """A link to each host that takes part."""
 
     def __init__(self, placed: InventoryFile, names: Iterable[str], loop: EventLoopThread) -> None:
         self._placed = placed
         self._loop = loop
-        self.by_name = {name: self.to(name) for name in names}
+        self.by_name = {name: self.to(name) for name in names}  # a new one when a link is added: others look at it
 
     def to(self, name: str) -> HostLink:
         """Return a new link to a host of the inventory, which is not kept."""

@@ -52,25 +52,16 @@ TRY_PORTS_S = 20.0  # wall time to start Python on a small computer
 
 
 class HostPlan:
-    """The processes of one run that zsim starts, and where; it does not change. InventoryError if one has no place.
-
-    Args:
-        run_id: names the run's folder on each host.
-        pace: options of the world: `--realtime`, `--rate R`.
-
-    Attributes:
-        processes: by name, the routers first, each after the one that it connects to.
-        remarks: on programs of the user's own, which are not started.
-    """
+    """The processes of one run that zsim starts, and where; it does not change. InventoryError if one has no place."""
 
     def __init__(self, placed: InventoryFile, scenario: Scenario, run_id: str, pace: Sequence[str] = ()) -> None:
         self.placed = placed
         self._scenario = scenario
-        self._run_id = run_id
-        self._pace = pace
+        self._run_id = run_id  # names the run's folder on each host
+        self._pace = pace  # options of the world
         in_order = sorted(inv.processes(placed, scenario, pace), key=lambda process: process.role != ROUTER)
-        self.processes = {process.name: process for process in in_order}
-        self.remarks = inv.own_programs(placed, scenario)
+        self.processes = {process.name: process for process in in_order}  # each after the one that it connects to
+        self.remarks = inv.own_programs(placed, scenario)  # on programs of the user's own, which are not started
 
     def moved(self, name: str, host: str) -> "HostPlan":
         """Return the same plan but for the host of one process."""

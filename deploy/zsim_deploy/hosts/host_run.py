@@ -175,23 +175,24 @@ class HostRun:
     @contextlib.contextmanager
     def _cleaned(self) -> Iterator[None]:
         """Clean the hosts at the end of the run, except for a record that could not be fetched."""
+
+        async def clean(link: HostLink) -> None:
+            folder, keys = shell_word(self._plan.folder(link.name)), shell_word(self._plan.keys(link.name))
+            command = f"rm -rf {folder}"
+            if self._record_stays and link.name == self._plan.host(RECORDER):
+                command = f"rm -rf {keys}; [ -e {shell_word(self._plan.record())} ] || {command}"
+            await link.run(command, timeout_s=CLEAN_S, what=f"removing {self._plan.folder(link.name)}")
+
         try:
             yield
         finally:
             try:
-                self._links.on_all(self._clean, 2 * CLEAN_S)
+                self._links.on_all(clean, 2 * CLEAN_S)
             except HostsError as error:
                 self._status.say(f"{error}\nkeys of this run may be left there; remove its folder")
             except KeyboardInterrupt:
                 self._status.say("keys of this run may be left on its hosts; `zsim up` or `zsim doctor` lists them")
                 raise
-
-    async def _clean(self, link: HostLink) -> None:
-        folder, keys = shell_word(self._plan.folder(link.name)), shell_word(self._plan.keys(link.name))
-        command = f"rm -rf {folder}"
-        if self._record_stays and link.name == self._plan.host(RECORDER):
-            command = f"rm -rf {keys}; [ -e {shell_word(self._plan.record())} ] || {command}"
-        await link.run(command, timeout_s=CLEAN_S, what=f"removing {self._plan.folder(link.name)}")
 
     # Requests
 

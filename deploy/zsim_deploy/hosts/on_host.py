@@ -95,8 +95,7 @@ def install(folder: Path, order: dict, children: CommandRunner) -> None:
     """Install wheels that lie in FOLDER/wheels, and nothing from anywhere else.
 
     Order: project and pip (names of their wheels), wheels (names of the others that are new), extras, modules (to
-    import
-    for proof), note (to keep). CommandError if pip or the proof fails, OSError where there is no room.
+    import for proof), note (to keep). CommandError if pip or the proof fails, OSError where there is no room.
     """
     environment, wheels = folder / "venv", folder / "wheels"
     fresh = _installed(environment) is None

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import getpass
+import importlib.metadata
 import json
 import os
 import re
@@ -32,7 +33,7 @@ from zsim_deploy.hosts.host_link import (
     start_sftp,
 )
 from zsim_deploy.hosts.wheelhouse import Wheel, Wheelhouse, WheelSet, wheel_target
-from zsim_deploy.inventory import MODULES, Host, InventoryFile, known_extras, needed_extras
+from zsim_deploy.inventory import MODULES, Host, InventoryFile, needed_extras
 from zsim_deploy.roles import warm_up
 
 LAUNCHER = "launcher"  # name of this machine among the hosts, in progress lines
@@ -55,21 +56,16 @@ Progress = Callable[[str, str], None]  # host, what is being done there
 async def push(
     placed: InventoryFile, names: Sequence[str], more: Iterable[str], progress: Progress, cache: Path
 ) -> dict[str, bool]:
-    """Install on hosts what their roles need; return for each host whether anything had to be done there.
+    """Install on hosts, by default on all, what their roles need; return for each whether anything had to be done
+    there.
 
-    Args:
-        names: of the hosts; all of the inventory if empty.
-        more: extras for each of them beside those of its roles.
-        progress: takes a host and what is being done there.
-        cache: folder of the wheelhouse.
-
-    InventoryError if a host is not in the inventory, or there is no such extra; HostsError with a line for each host at
-    which it failed; the others are done.
+    `more`: extras for each of them beside those of its roles; `cache`: folder of the wheelhouse. InventoryError if a
+    host or an extra is unknown; HostsError with a line for each host at which it failed; the others are done.
     """
     hosts = placed.inventory.hosts
     more = list(more)
     unknown = [f"--host {name}: must be one of {', '.join(hosts)}" for name in names if name not in hosts]
-    known = known_extras()
+    known = sorted(importlib.metadata.metadata("zsim").get_all("Provides-Extra") or [])
     unknown += [f"--extra {name}: must be one of {', '.join(known)}" for name in more if name not in known]
     if unknown:
         raise InventoryError(unknown)
@@ -103,12 +99,9 @@ async def _push_to(
 
 
 async def _install(
-    link: HostLink,
-    there: "Installer",
-    wanted: frozenset[str],
-    wheelhouse: Wheelhouse,
-    progress: Callable[[str], None],
+    link: HostLink, there: "Installer", wanted: frozenset[str], wheelhouse: Wheelhouse, progress: Callable[[str], None]
 ) -> bool:
+    """Install what is wanted; return whether anything had to be done."""
     facts = await there.ask("look", ASK_S)
     needed = await wheelhouse.wheel_set(link.name, wheel_target(link.name, facts), wanted)
     described = " ".join(("zsim", __version__, *(f"+{extra}" for extra in needed.extras)))
@@ -252,14 +245,10 @@ class Installer:
 async def open_installer(
     link: HostLink, python: str, folder: str, progress: Callable[[str], None]
 ) -> AsyncIterator[Installer]:
-    """Let the program run on a host as long as the block lasts; it alone installs there.
+    """Let the program run by a Python of a host as long as the block lasts; it alone installs there.
 
-    Args:
-        python: that runs it.
-        folder: of zsim on the host.
-        progress: takes a line on who is waited for.
-
-    HostsError if the host cannot be reached, its folder not be used or another push takes too long.
+    `folder`: of zsim on the host; `progress` takes a line on who is waited for. HostsError if the host cannot be
+    reached, its folder not be used or another push takes too long.
     """
     script = Path(on_host.__file__).read_bytes()
     start = f"import sys; exec(sys.stdin.buffer.read({len(script)}))"  # not to the end: that means to end

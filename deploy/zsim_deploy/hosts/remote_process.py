@@ -31,9 +31,8 @@ PID = "zsim-pid "  # begins the line with its process id; a login shell may prin
 class RemoteProcess:
     """A role on another host.
 
-    Args:
-        on_line: takes every line of its standard output; None sends that to the log too.
-        files: what it needs below a folder and takes away when it ends; brought again whenever it is started again.
+    `on_line` takes every line of its standard output; None sends that to the log too. `files`: what it needs below a
+    folder and takes away when it ends; brought again whenever it is started again.
     """
 
     def __init__(
@@ -174,14 +173,10 @@ class RemoteProcess:
 
 
 class ProcessLog:
-    """The log file of a process; where it cannot be written, `say` is told once, and only the last line is kept.
-
-    Attributes:
-        last: line that is not empty.
-    """
+    """The log file of a process; where it cannot be written, `say` is told once, and only the last line is kept."""
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:
-        self.last = ""
+        self.last = ""  # line that is not empty
         self._path = path
         self._say = say
         self._is_whole = True

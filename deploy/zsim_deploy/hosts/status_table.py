@@ -59,27 +59,18 @@ Row = Mapping[str, Any]
 
 
 class StatusTable(Screen):
-    """Progress of a run on several hosts; a table on a terminal, lines elsewhere.
-
-    Args:
-        choice: which rows the live table has, in which order.
-
-    Attributes:
-        members: the processes; to be given before it is shown.
-        stages_s: how long each step before the processes' start took.
-        clock_now: the world's last line on time; None before the first.
-    """
+    """Progress of a run on several hosts; a table of chosen rows on a terminal, lines elsewhere."""
 
     def __init__(self, duration_s: float, console: Console | None = None, choice: "RowChoice | None" = None) -> None:
         super().__init__(duration_s, console)
         self._choice = choice or RowChoice()
-        self.members: Sequence[Any] = ()
+        self.members: Sequence[Any] = ()  # to be given before it is shown
         self.links: dict[str, HostLink] = {}
-        self.stages_s: dict[str, float] = {}
+        self.stages_s: dict[str, float] = {}  # how long each step before the processes' start took
         self._begun_s = time.monotonic()
         self._flies = False
         self._health: dict[str, dict[str, Any]] = {}
-        self.clock_now: dict[str, Any] | None = None
+        self.clock_now: dict[str, Any] | None = None  # the world's last line on time
         self._silent: set[str] = set()
         self._live = Live(get_renderable=self._render, console=self.console, refresh_per_second=4, transient=True)
 
@@ -203,26 +194,22 @@ def _figure(value: float | None, form: str) -> str:
 
 
 class RowChoice(NamedTuple):
-    """What of a table is shown.
+    """What of a table is shown: rows by patterns of roles (`estimator.*2`), of what they work for, or of hosts."""
 
-    Attributes:
-        only: patterns of roles (`estimator.*2`), of what they work for (`drone1*`) or of hosts; all rows if empty.
-        sort: by what; as they come if None.
-    """
-
-    only: Sequence[str] = ()
-    sort: RowOrder | None = None
+    only: Sequence[str] = ()  # all rows if empty
+    sort: RowOrder | None = None  # by what; as they come if None
 
     def of(self, rows: Sequence[Row]) -> list[Any]:
         """Return the rows that are shown, in their order; of equal ones the first stays first."""
         shown = [row for row in rows if not self.only or any(_matches(pattern, row) for pattern in self.only)]
         if self.sort is None:
             return shown
+        by = self.sort.value
         if self.sort is RowOrder.ATTENTION:
             return sorted(shown, key=needs_attention)
-        if self.sort.value not in FIGURES:
-            return sorted(shown, key=lambda row: row[self.sort.value])
-        field, unknown = FIGURES[self.sort.value]
+        if by not in FIGURES:
+            return sorted(shown, key=lambda row: row[by])
+        field, unknown = FIGURES[by]
         return sorted(shown, key=lambda row: -(unknown if row.get(field) is None else row[field]))
 
     def check(self, rows: Sequence[Row]) -> None:

@@ -48,16 +48,11 @@ class UnreachableError(Exception):
 
 
 class WheelTarget(NamedTuple):
-    """What wheels must fit.
-
-    Attributes:
-        abi: such as cp311; PEP 425.
-        platforms: platform tags that run there, the best first.
-    """
+    """What wheels must fit."""
 
     version: tuple[int, int]
-    abi: str
-    platforms: tuple[str, ...]
+    abi: str  # such as cp311; PEP 425
+    platforms: tuple[str, ...]  # tags of those that run there, the best first
 
     def options(self) -> list[str]:
         """Return them as options of pip."""

@@ -22,15 +22,11 @@ class RunConsole:
     """Owns the console of a run, which goes on until the report is there and pages have copies.
 
     To be entered before the run, so that the console never outlives it. Ctrl-C ends the wait for its pages.
-
-    Attributes:
-        process: once there is one.
-        outcome: of the run, to be set; without one it was interrupted.
     """
 
     def __init__(self) -> None:
         self.process: RunProcess | None = None
-        self.outcome = Outcome("interrupted", interrupted=True)
+        self.outcome = Outcome("interrupted", interrupted=True)  # of the run, to be set
 
     def own(self, process: RunProcess) -> None:
         """Take a process that is not started yet; a former one ends."""

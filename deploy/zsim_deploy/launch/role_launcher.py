@@ -51,12 +51,9 @@ class RoleProcess(Protocol):
 
 
 class ChildProcess:
-    """A role as a child process.
+    """A role as a child process, by arguments of the `zsim` command; `logs`: folder for its standard error.
 
-    Args:
-        arguments: of the `zsim` command.
-        logs: folder for its standard error.
-        on_line: takes every line of its standard output; None sends that to the log too.
+    `on_line` takes every line of its standard output; None sends that to the log too.
     """
 
     def __init__(
@@ -148,9 +145,7 @@ class ChildProcess:
 class RoleLauncher:
     """Starts roles. To be entered by the main thread, which then waits until they can be started.
 
-    Args:
-        say: takes a line on what takes long.
-        run: what the run is known by, shown by `ps` for the fork server.
+    `say` takes a line on what takes long; `run`: by what `ps` shows the fork server.
     """
 
     def __init__(self, say: Callable[[str], None], run: str = "") -> None:
@@ -257,21 +252,18 @@ class ForkedProcess:
         self.stdin: IO[str] | None = stdin
         self.stdout = stdout
         self._code: int | None = None
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
 
     def poll(self) -> int | None:
         with self._lock:
-            return self._poll()
-
-    def _poll(self) -> int | None:
-        if self._code is None:
-            try:
-                pid, status = os.waitpid(self.pid, os.WNOHANG)
-            except ChildProcessError:
-                self._code = UNKNOWN
-            else:
-                self._code = os.waitstatus_to_exitcode(status) if pid else None
-        return self._code
+            if self._code is None:
+                try:
+                    pid, status = os.waitpid(self.pid, os.WNOHANG)
+                except ChildProcessError:
+                    self._code = UNKNOWN
+                else:
+                    self._code = os.waitstatus_to_exitcode(status) if pid else None
+            return self._code
 
     def wait(self, timeout: float | None = None) -> int:
         """Return its exit code when it has ended; subprocess.TimeoutExpired if it has not within so many seconds."""
@@ -284,7 +276,7 @@ class ForkedProcess:
 
     def kill(self) -> None:
         with self._lock, suppress(ProcessLookupError):
-            if self._poll() is None:
+            if self.poll() is None:
                 os.kill(self.pid, signal.SIGKILL)
 
 

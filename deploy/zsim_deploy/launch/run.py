@@ -1,6 +1,7 @@
 """A whole run on this host: every process of a scenario started, watched, recorded, and ended."""
 
 import contextlib
+import json
 import os
 import re
 import signal
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 from msgspec.structs import replace
 
 from zsim.errors import RecordError, RunFailedError, SessionError
@@ -41,25 +43,17 @@ PORTS_TRIED = 5  # when other runs that start at this moment take each before ou
 
 @dataclass
 class RunOptions:
-    """How to run a scenario.
-
-    Attributes:
-        launch: what is kept of it, for a run that goes on.
-        order: names of processes in the order in which they are started.
-        console: owns the console that is started; None for a run without.
-        continued: whether it goes on where an earlier launch of it was interrupted.
-        supervisor: over its processes, once they are started.
-    """
+    """How to run a scenario."""
 
     scenario: Scenario
     out: Path
-    launch: Launch
-    order: Sequence[str] = ()
-    console: RunConsole | None = None
+    launch: Launch  # what is kept of it, for a run that goes on
+    order: Sequence[str] = ()  # names of processes in the order in which they are started
+    console: RunConsole | None = None  # owns the console that is started; None for a run without
     cameras: bool = False
     detect: bool = False
-    continued: bool = False
-    supervisor: Supervisor | None = None
+    continued: bool = False  # it goes on where an earlier launch of it was interrupted
+    supervisor: Supervisor | None = None  # over its processes, once they are started
 
     def status(self) -> dict[str, Any]:
         """Return what `zsim ps` shows of the run; callable from any thread."""
@@ -200,7 +194,9 @@ def _prepare(options: RunOptions, screen: Screen) -> None:
             if not options.launch.in_process:
                 (options.out / "logs").mkdir(exist_ok=True)
             (options.out / "scenario.yaml").write_text(scenario_file.to_text(scenario))
-            run_folder.keep_launch(options.out, options.launch)
+            (options.out / JOURNAL).mkdir(exist_ok=True)
+            content = json.dumps(msgspec.to_builtins(options.launch))  # not msgspec's: a path may hold no UTF-8
+            (options.out / JOURNAL / run_folder.LAUNCH).write_text(content, "utf-8")
     screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
     for line in (*unflown_plans(scenario), no_locks(options.out)):
         if line:
@@ -280,13 +276,10 @@ def with_cameras(scenario: Scenario) -> Scenario:
 
 
 def camera_children(scenario: Scenario, cameras: bool, detect: bool) -> list[CameraChild]:
-    """Return the cameras and detectors that a scenario expects, as far as they are known by name, or that a user
-    wants.
+    """Return the cameras and detectors that a scenario expects, as far as they are known by name, or a user wants.
 
-    There is one for each drone that a name in `expect` is about, and ROLE.main for the others.
-
-    Args:
-        cameras, detect: draw the pictures of all that have cameras; find hats in the pictures of all.
+    There is one for each drone that a name in `expect` is about, and ROLE.main for the others. `cameras`, `detect`:
+    draw the pictures of all that have cameras, find hats in the pictures of all.
     """
     having = watched_drones("", scenario)
     everybody = [drone.name for drone in scenario.drones]  # a detector's cameras need not be zsim's

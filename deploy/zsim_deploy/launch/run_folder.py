@@ -81,12 +81,7 @@ def _remove_run(folder: Path) -> None:
 
 
 class Launch(msgspec.Struct, frozen=True):
-    """How a run was launched.
-
-    Attributes:
-        modules: folders in which those that its scenario names were looked for.
-        changed: texts `a.b.c=value` by which the scenario was changed against its file.
-    """
+    """How a run was launched."""
 
     run_id: str
     mode: str = "lockstep"
@@ -95,19 +90,13 @@ class Launch(msgspec.Struct, frozen=True):
     hosted: bool = False
     insecure: bool = False
     listen: str | None = None
-    modules: tuple[str, ...] = ()
-    changed: tuple[str, ...] = ()
+    modules: tuple[str, ...] = ()  # folders in which those that its scenario names were looked for
+    changed: tuple[str, ...] = ()  # texts `a.b.c=value` by which the scenario was changed against its file
 
 
 def new_launch(**how: Any) -> Launch:
     """Return a launch of a new run, with the modules that its scenario has been loaded with."""
     return Launch(uuid.uuid4().hex[:12], modules=tuple(map(str, plugin.folders())), **how)
-
-
-def keep_launch(folder: Path, launch: Launch) -> None:
-    (folder / JOURNAL).mkdir(exist_ok=True)
-    content = json.dumps(msgspec.to_builtins(launch))  # not msgspec's: a path may hold bytes that are no UTF-8
-    (folder / JOURNAL / LAUNCH).write_text(content, "utf-8")
 
 
 def forget_launch(folder: Path) -> None:

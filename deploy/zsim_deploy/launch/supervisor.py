@@ -74,22 +74,12 @@ class Outcome:
 
 
 class Supervisor:
-    """Starts the processes of a run, watches them, and leaves nothing behind.
-
-    Args:
-        processes: what the scenario says of their deaths.
-        show: takes progress.
-
-    Attributes:
-        members: to be given before `run`; the world among them.
-        lasting: the one of them that goes on after the run; the caller has to stop and close it in any case.
-        clock: the world's last; None before the first.
-    """
+    """Starts the processes of a run, watches them, and leaves nothing behind; `show` takes progress."""
 
     def __init__(self, processes: Processes, show: ProgressSink) -> None:
-        self.members: list[RunProcess] = []
-        self.lasting: RunProcess | None = None
-        self.clock: dict[str, Any] | None = None
+        self.members: list[RunProcess] = []  # to be given before `run`; the world among them
+        self.lasting: RunProcess | None = None  # goes on after the run; the caller has to stop and close it
+        self.clock: dict[str, Any] | None = None  # the world's last
         self._deaths = DeathPolicy(processes)
         self._show = show
         self._reason = ""
@@ -128,14 +118,11 @@ class Supervisor:
                 while not self._requests.empty():
                     self._requests.get()[1].cancel()
                 replaced = [*(child for child, _ in self._leaving.values()), *self._gone]
-                members = [*self._leaving_with_run(), *replaced]
+                members = [*(child for child in self.members if child is not self.lasting), *replaced]
                 with ThreadPoolExecutor(len(members)) as pool:  # one that cannot be reached does not delay the others
                     for closed in [pool.submit(member.close) for member in members]:
                         closed.result()
         return Outcome(self._reason or "ended", self._failed, self._interrupted is not None)
-
-    def _leaving_with_run(self) -> list[RunProcess]:
-        return [child for child in self.members if child is not self.lasting]
 
     def rows(self) -> list[dict[str, Any]]:
         """Return what `zsim ps` shows of each process; callable from any thread."""
@@ -234,7 +221,7 @@ class Supervisor:
             look()
             world.wait(POLL_S)
         if world.code != 0:
-            self._fail_after_end(f"the world died: {world.outcome()}")
+            self._fail(f"the world died: {world.outcome()}", after_end=True)
 
     def _restarts_world(self, world: RunProcess) -> bool:
         code = world.code
@@ -310,18 +297,15 @@ class Supervisor:
                 del self._leaving[name]
                 self._gone.append(child)
 
-    def _fail(self, reason: str) -> None:
-        self._reason, self._failed = self._reason or reason, True
-
-    def _fail_after_end(self, reason: str) -> None:
-        """Note a failure of a process that was to end with the run: it overrides an orderly end that was reported."""
-        if not self._failed and not self._interrupted:
+    def _fail(self, reason: str, after_end: bool = False) -> None:
+        """Note a failure; `after_end`: it overrides an orderly end that was reported, but no interrupt."""
+        if after_end and not self._failed and not self._interrupted:
             self._reason = ""
-        self._fail(reason)
+        self._reason, self._failed = self._reason or reason, True
 
     def _finish(self) -> None:
         """Let all processes leave; the recorder leaves last, by itself."""
-        members = self._leaving_with_run()
+        members = [child for child in self.members if child is not self.lasting]
         for child in members:
             if self._failed or self._interrupted or child.role != "recorder":
                 child.request_stop(self._reason)
@@ -330,7 +314,7 @@ class Supervisor:
                 continue
         recorder = next(child for child in members if child.role == "recorder")
         if recorder.code not in (0, None) and recorder.name not in self._dead:
-            self._fail_after_end(f"the recorder ended: {recorder.outcome()}")
+            self._fail(f"the recorder ended: {recorder.outcome()}", after_end=True)
 
     def _left_s(self) -> float:
         """Return how long the others may still take, now that the run is to end; Ctrl-C makes it shorter."""
@@ -413,15 +397,12 @@ class EndSignals:
 
     Nothing is raised for a closed terminal, as shells send that signal more than once: `hung_up` is called, and output
     goes to the file `log` from then on.
-
-    Attributes:
-        reason: why the output can no longer be seen; empty while it can.
     """
 
     def __init__(self, log: Path, hung_up: Callable[[], None]) -> None:
         self._log = log
         self._hung_up = hung_up
-        self.reason = ""
+        self.reason = ""  # why the output can no longer be seen
         self._looked_s = 0.0
 
     def __enter__(self) -> "EndSignals":

@@ -134,7 +134,7 @@ def recorder(out: Path, reach: WorldAccess) -> None:
     """Record the run of a world into a folder, whose name may contain RUN_ID; RecordError if that cannot be."""
     from zsim.output_folder import RECORD
     from zsim.record.completeness import record_completeness
-    from zsim_agents.recorder import record
+    from zsim_agents.recorder import Recorder
 
     launched, who = reach.launched, reach.who._replace(process=RECORDER)
     stop = StopChannel(launched, who)
@@ -148,7 +148,7 @@ def recorder(out: Path, reach: WorldAccess) -> None:
             say(f"recorder: {warning}")
         path = folder / RECORD
         say(f"recorder: run {info.run_id} into {path}")
-        reason = record(link, info, path, stopped=stop.stopped, say=say, deserted=stop.orphaned)
+        reason = Recorder(link, info, path, stopped=stop.stopped, say=say, deserted=stop.orphaned).run()
     say(f"recorder: {path}: {'closed' if launched else record_completeness(path)}, {reason}")
     stop.exit_if_terminated()
 
@@ -169,13 +169,7 @@ def make_folder(folder: Path) -> None:
 
 
 def router(
-    name: str,
-    endpoint: str,
-    upstream: str,
-    federation: str,
-    mode: Mode,
-    launched: str | None,
-    identity: Identity,
+    name: str, endpoint: str, upstream: str, federation: str, mode: Mode, launched: str | None, identity: Identity
 ) -> None:
     """Run a router on an endpoint until it is stopped; SessionError if port or certificate cannot be used."""
     identity = identity._replace(process=f"{ROUTER}.{name}")
@@ -201,9 +195,6 @@ class RouterLinks:
 
     A router does not know the run. A process that nobody waits for has said so in its join, or shows no token of its
     session.
-
-    Attributes:
-        watch: closes the links.
     """
 
     def __init__(self, link: Session, say: Say) -> None:
@@ -333,17 +324,17 @@ def serve_pictures(
         scenario = scenario_file.from_text(info.scenario)
         own = drones_of(scenario)
         if role == "camera":
-            from zsim_agents.cameras import camera_process
+            from zsim_agents.cameras.camera_process import CameraProcess
 
             say(f"{participant.name}: draws for {', '.join(own)}")
-            camera_process.serve(link, info, participant, stopped, scenario, own)
+            CameraProcess(link, info, participant, scenario, own).run(stopped)
         else:
-            from zsim_agents.cameras import detector_process
+            from zsim_agents.cameras.detector_process import DetectorProcess
 
             say(f"{participant.name}: looks at the pictures of {', '.join(own)}")
             hats = scenario.environment.hats
             diameter = diameter_m or (Hats() if hats is UNSET else hats).diameter_m
-            detector_process.serve(link, participant, stopped, say, own, diameter)
+            DetectorProcess(link, participant, say, own, diameter).run(stopped)
 
     def stands_for(info: Info) -> tuple[str, ...]:
         return tuple(f"{role}.{drone}" for drone in drones_of(scenario_file.from_text(info.scenario)))

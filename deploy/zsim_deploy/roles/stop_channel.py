@@ -189,18 +189,18 @@ def interruptible() -> Iterator[None]:
             raise
 
 
-def lower_priority(niceness: int = NICE) -> None:
+def lower_priority() -> None:
     """Let the world go first: make this process nicer, and the session that it leads, if it leads one.
 
     Where Linux shares processors between sessions, niceness counts within each of them only.
     """
     if hasattr(os, "nice"):
-        os.nice(niceness)
+        os.nice(NICE)
     if sys.platform != "linux" or os.getsid(0) != os.getpid():
         return
     for _ in range(TRIES):
         try:
-            AUTOGROUP.write_text(str(niceness))
+            AUTOGROUP.write_text(str(NICE))
         except BlockingIOError:
             time.sleep(AGAIN_S)
         except OSError:

@@ -49,26 +49,15 @@ def main(extras: Collection[str]) -> None:
 
 def _info(scenario: Scenario) -> Info:
     """Return the `world/info` from which agents are made without a world: their host needs no compiled kernel."""
+    time = scenario.time
+    drones = tuple(DroneInfo(drone.name, drone.model) for drone in scenario.drones)
+    clusters = tuple(ClusterInfo(cluster.name, tuple(cluster.drones)) for cluster in scenario.clusters)
     return Info(
-        t_ns=0,
-        seq=0,
-        contract=CONTRACT,
-        run_id=scenario.name,
-        federation=scenario.federation,
-        mode="lockstep",
-        rate=0.0,
-        gate_ns=round(scenario.time.gate_ms * 1e6),
-        physics_dt_ns=round(scenario.time.physics_dt_ms * 1e6),
-        command_delay_ns=0,
-        seed=scenario.seed,
-        origin=Origin(0.0, 0.0, 0.0),
-        drones=tuple(DroneInfo(drone.name, drone.model) for drone in scenario.drones),
-        clusters=tuple(ClusterInfo(cluster.name, tuple(cluster.drones)) for cluster in scenario.clusters),
-        scenario="",
-        scenario_sha256="",
-        version=__version__,
-        fingerprint="",
-    )
+        t_ns=0, seq=0, contract=CONTRACT, run_id=scenario.name, federation=scenario.federation, mode="lockstep",
+        rate=0.0, gate_ns=round(time.gate_ms * 1e6), physics_dt_ns=round(time.physics_dt_ms * 1e6),
+        command_delay_ns=0, seed=scenario.seed, origin=Origin(0.0, 0.0, 0.0), drones=drones, clusters=clusters,
+        scenario="", scenario_sha256="", version=__version__, fingerprint="",
+    )  # fmt: skip
 
 
 def formations() -> dict[str, Any]:

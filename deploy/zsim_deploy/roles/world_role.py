@@ -43,11 +43,7 @@ def world(
 ) -> None:
     """Run the world of a scenario on the endpoints until the scenario ends or the process is stopped.
 
-    Args:
-        journal: its folder.
-        all_died: whether all participants of the run have to be started again too, when it goes on from its journal.
-        changed: see `World`.
-
+    `journal`: its folder; `all_died`: all participants have to be started again too when it goes on from there.
     RunError if the journal is of another run; SessionError if an endpoint is taken, or the identity cannot be used.
     """
     from zsim.math.compiled import is_kept
@@ -105,23 +101,12 @@ class WorldProgress:
     def show(self, kind: str, message: Any, about: str) -> None:
         sink = self._sink
         if kind == "clock" and (self._clocks.spend() or message.state == "stopped"):
-            sink.clock(
-                {
-                    "t_s": message.t_ns / 1e9,
-                    "rate": message.rate,
-                    "state": message.state,
-                    "phase": about,
-                    "waiting_for": [
-                        {
-                            "name": w.name,
-                            "host": w.host,
-                            "since_wall_s": round(w.since_wall_s, 1),
-                            "held_by": w.held_by,
-                        }
-                        for w in message.waiting_for
-                    ],
-                }
-            )
+            waiting = [
+                {"name": w.name, "host": w.host, "since_wall_s": round(w.since_wall_s, 1), "held_by": w.held_by}
+                for w in message.waiting_for
+            ]
+            clock = {"t_s": message.t_ns / 1e9, "rate": message.rate, "state": message.state}
+            sink.clock({**clock, "phase": about, "waiting_for": waiting})
         elif kind == "state" and (line := self._reasons.line(about, message)):
             sink.say(line)
         elif kind == "health" and self._healths.spend(about):
@@ -142,21 +127,13 @@ class WorldProgress:
 
 
 class ReplayOptions(NamedTuple):
-    """How a record is to be played.
+    """How a record is to be played."""
 
-    Attributes:
-        choice: which part of it.
-        rate: simulated per wall seconds; 0 = as fast as possible.
-        expect: names of the processes that are waited for.
-        endpoints: on which others connect.
-        federation: None for that of the record.
-    """
-
-    choice: "PlaybackRange"
-    rate: float
-    expect: tuple[str, ...]
-    endpoints: tuple[str, ...]
-    federation: str | None = None
+    choice: "PlaybackRange"  # which part of it
+    rate: float  # simulated per wall seconds; 0 = as fast as possible
+    expect: tuple[str, ...]  # names of the processes that are waited for
+    endpoints: tuple[str, ...]  # on which others connect
+    federation: str | None = None  # None for that of the record
 
 
 def play(place: Path, options: ReplayOptions, who: Identity) -> None:

@@ -25,7 +25,7 @@ from zsim.record import Completeness, RecordReader, RecordWriter, completeness, 
 from zsim.record.completeness import GateGap
 from zsim.record.mcap_layout import places
 from zsim_agents import recorder
-from zsim_agents.recorder import record
+from zsim_agents.recorder import Recorder
 
 GATE_NS = 20_000_000
 INFO = Info(
@@ -37,8 +37,26 @@ IMU = keys.sensor("d1", "imu")
 Pair = tuple[str, bytes]
 
 
+def recorder_of(link: Any, info: Info, path: Path, say: Any = lambda text: None) -> Recorder:
+    return Recorder(link, info, path, say=say)
+
+
+def record(link: Any, path: Path, info: Info = INFO, say: Any = lambda text: None) -> None:
+    """Record a run that a link brings to its end."""
+    assert recorder_of(link, info, path, say).run() == RUN_ENDED
+
+
+def on_record(path: Path, *wanted: str) -> list[Pair]:
+    """Return all messages in the order of their times, or those of some keys as they were written."""
+    with RecordReader(path) as reader:
+        return [(each.key, each.payload) for each in reader.messages(wanted or None, by_time=not wanted)]
+
+
 def pair(key: str, message: Struct) -> Pair:
     return key, messages.encode(message)
+
+
+LAST = dict([pair(keys.INFO, INFO)])
 
 
 def clock(gate: int, state: str = "running", seq: int | None = None) -> Pair:
@@ -68,14 +86,13 @@ def recorded(
 ) -> list[Pair]:
     """Record a run that answers replays, has last values, and sends batches; return what is in the record."""
     link, left = FakeLink(), iter(answers)
-    link.last = dict([pair(keys.INFO, INFO)]) | (last or {})
+    link.last = LAST | (last or {})
     link.on_request = lambda key, args: next(left, page([]))  # the world has no more of the gates before the last one
     for passed in (*batches, [clock(99, "stopped")]):
         link.deliver(keys.BATCH, encode_batch(passed))
-    assert record(link, INFO, path) == "the run ended"  # type: ignore[arg-type]
+    record(link, path)
     assert next(left, None) is None
-    with RecordReader(path) as reader:
-        return [(message.key, message.payload) for message in reader.messages()]
+    return on_record(path)
 
 
 def stamps(found: list[Pair], key: str) -> list[int]:
@@ -90,21 +107,17 @@ def test_a_late_recorder_writes_what_it_hears_twice_once(tmp_path: Path):
     assert stamps(found, keys.CLOCK) == [*range(9), 99]
 
 
-@pytest.mark.parametrize("kept", [True, False])
-def test_which_run_it_is_is_on_record_however_late_the_recorder_comes(tmp_path: Path, kept: bool):
+def test_which_run_it_is_is_on_record_however_late_the_recorder_comes(tmp_path: Path):
     """The replay has lost the world's first words; what the hub still answers comes as it is, once."""
-    info_entry = pair(keys.INFO, INFO)
-    found = recorded(tmp_path / "run.mcap", [page(gates(7))], gates(8), last=dict([info_entry] if kept else []))
-    assert found[0] == info_entry
+    found = recorded(tmp_path / "run.mcap", [page(gates(7))], gates(8))
+    assert found[0] == pair(keys.INFO, INFO)
     assert [key for key, _ in found].count(keys.INFO) == 1
 
 
 def test_the_newest_faults_are_on_record_once(tmp_path: Path):
     first, second, third = (pair(keys.FAULTS, Faults(gate * GATE_NS, gate, ())) for gate in (1, 5, 8))
     for number, passed in enumerate(([*gates(7)], [first, *gates(2), second, *gates(7)])):
-        found = recorded(
-            tmp_path / f"{number}.mcap", [page(passed)], [third, *gates(8)], last=dict([second, pair(keys.INFO, INFO)])
-        )
+        found = recorded(tmp_path / f"{number}.mcap", [page(passed)], [third, *gates(8)], last=dict([second]))
         assert stamps(found, keys.FAULTS) == ([5, 8], [1, 5, 8])[number]
 
 
@@ -128,16 +141,11 @@ def test_a_gate_whose_columns_lead_outside_is_refused(tmp_path: Path):
         (good.which, good.stamps, np.array([5, good.ends[1]])),
         (good.which[:0], good.stamps[:0], good.ends[:0]),
     ):
-        bundle = GateMessages(GATE_NS, 1, TABLE, which, stamps_, ends, good.buffer)
-        bad.append(_packed(bundle))
+        columns = [column.astype("<i8").tobytes() for column in (which, stamps_, ends)]
+        bad.append(msgspec.msgpack.encode([GATE_NS, 1, *columns, bytes(good.buffer)]))
     batches = [[(keys.GATE, payload)] for payload in bad]
     found = recorded(tmp_path / "run.mcap", [page(gates(0))], gates(1), *batches, gates(2), whole(3))
     assert stamps(found, IMU) == [0, 1, 2, 3]
-
-
-def _packed(b: GateMessages) -> bytes:
-    columns = [column.astype("<i8").tobytes() for column in (b.which, b.stamps, b.ends)]
-    return msgspec.msgpack.encode([b.t_ns, b.seq, *columns, bytes(b.buffer)])
 
 
 def test_the_newest_of_a_long_replay_is_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -146,15 +154,19 @@ def test_the_newest_of_a_long_replay_is_remembered(tmp_path: Path, monkeypatch: 
     assert stamps(found, IMU) == list(range(11))
 
 
-def test_all_pages_of_a_replay_are_written(tmp_path: Path):
-    pages = [page(gates(0, 1), more=4), page(gates(2, 3), more=8), page(gates(4))]
-    assert stamps(recorded(tmp_path / "run.mcap", pages, gates(5)), IMU) == [0, 1, 2, 3, 4, 5]
-
-
-@pytest.mark.parametrize("first", [UNANSWERED, page(gates(0), more=2)], ids=["nothing", "a page"])
-def test_what_is_not_answered_is_asked_for_again(tmp_path: Path, first: ControlAnswer):
-    answers = [first, UNANSWERED, page(gates(0, 1))]
-    assert stamps(recorded(tmp_path / "run.mcap", answers, gates(2)), IMU) == [0, 1, 2]
+@pytest.mark.parametrize(
+    "answers",
+    [
+        [page(gates(0), more=4), page(gates(1), more=8), page(gates(2))],
+        [UNANSWERED, UNANSWERED, page(gates(0, 1, 2))],
+        [page(gates(0), more=2), UNANSWERED, page(gates(0, 1, 2))],
+    ],
+    ids=["in pages", "not at once", "a page at first"],
+)
+def test_all_pages_of_a_replay_are_written_and_what_is_not_answered_asked_for_again(
+    tmp_path: Path, answers: list[ControlAnswer]
+):
+    assert stamps(recorded(tmp_path / "run.mcap", answers, gates(3)), IMU) == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("key", [keys.CLOCK, keys.EVENT, IMU, "process/x.y/join", "of/somebody"])
@@ -171,7 +183,7 @@ def test_what_a_record_has_no_room_for_is_counted_and_told(tmp_path: Path, monke
     link.on_request = lambda key, args: page([])
     link.deliver(keys.BATCH, encode_batch([imu(0), clock(0), imu(1), clock(1, "stopped")]))
     link.deliver("view/drones", b"\x81\xa4t_ns\x01")
-    made: Any = recorder.Recorder(link, INFO, tmp_path / "run.mcap", "recorder", lambda: False, lines.append)  # type: ignore[arg-type]
+    made = recorder_of(link, INFO, tmp_path / "run.mcap", lines.append)
     assert made.run() == RUN_ENDED
     assert made.health.refused == 3
     (line,) = lines
@@ -219,7 +231,7 @@ def test_one_that_is_started_again_goes_on_with_the_record(tmp_path: Path):
 def test_what_its_last_chunk_lacks_is_asked_for(tmp_path: Path, cut: int):
     path = tmp_path / "run.mcap"
     died(path, [pair(keys.INFO, INFO), *gates(0, 1, 2)], cut)
-    found = recorded(path, [page(gates(0, 1, 2, 3))], gates(4), last=dict([pair(keys.INFO, INFO)]))
+    found = recorded(path, [page(gates(0, 1, 2, 3))], gates(4))
     assert stamps(found, IMU) == list(range(5))
 
 
@@ -238,7 +250,7 @@ def test_news_of_a_join_of_its_own_process_that_it_did_not_publish_are_answered_
 
     link.on_publish = admit
     link.on_request = lambda key, args: page([])
-    record(link, INFO, tmp_path / "run.mcap")  # type: ignore[arg-type]
+    record(link, tmp_path / "run.mcap")
     assert len({join.incarnation for join in link.published_on("process/recorder/join")} - {7}) == 2
 
 
@@ -254,7 +266,7 @@ def test_the_record_of_another_run_is_left_alone(tmp_path: Path):
 def test_a_disk_that_is_full_while_it_joins_is_a_bye(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The world has its join then: without a bye it would wait for a recorder that is started again."""
     link = FakeLink()
-    link.last = dict([pair(keys.INFO, INFO)])
+    link.last = LAST
     link.on_request = lambda key, args: page(gates(0))
 
     write_all = record_writer.write_all
@@ -266,7 +278,7 @@ def test_a_disk_that_is_full_while_it_joins_is_a_bye(tmp_path: Path, monkeypatch
 
     monkeypatch.setattr(record_writer, "write_all", write)
     with refused(RecordError, "run.mcap", os.strerror(errno.ENOSPC)) as full:
-        record(link, INFO, tmp_path / "run.mcap")  # type: ignore[arg-type]
+        record(link, tmp_path / "run.mcap")
     (join,) = link.published_on("process/recorder/join")
     (bye,) = link.published_on("process/recorder/bye")
     assert (bye.reason, bye.incarnation) == (str(full.value), join.incarnation)
@@ -290,11 +302,10 @@ def test_what_passed_while_its_link_was_lost_is_asked_for(tmp_path: Path):
             link.cut(False)
             link.cut(True)
 
-    link.last = dict([pair(keys.INFO, INFO)])
+    link.last = LAST
     link.on_request, link.on_publish = answer, cut
-    assert record(link, INFO, path) == RUN_ENDED  # type: ignore[arg-type]
-    with RecordReader(path) as reader:
-        found = [(message.key, message.payload) for message in reader.messages()]
+    record(link, path)
+    found = on_record(path)
     assert stamps(found, IMU) == list(range(5))
     assert stamps(found, keys.CLOCK) == [*range(6)]
     first, second = link.published_on("process/recorder/join")
@@ -305,11 +316,9 @@ def test_gates_that_did_not_come_are_asked_for_and_stand_before_what_came_after_
     """No link was lost as far as anybody noticed: the batch of gate 3 went nowhere."""
     path, strange = tmp_path / "run.mcap", ("drone/d1/cmd/velocity", b"of gate 5")
     answers = [page(gates(0, 1)), page([*gates(1, 2, 3), strange, *gates(4)])]
-    last = dict([pair(keys.INFO, INFO)])
-    found = recorded(path, answers, gates(2), [strange, *whole(4)], whole(5), [clock(6)], last=last)
+    found = recorded(path, answers, gates(2), [strange, *whole(4)], whole(5), [clock(6)])
     assert stamps(found, IMU) == list(range(6))
-    with RecordReader(path) as reader:
-        written = [message.key for message in reader.messages([keys.CLOCK, strange[0]], by_time=False)]
+    written = [key for key, _ in on_record(path, keys.CLOCK, strange[0])]
     assert written == [*[keys.CLOCK] * 4, strange[0], *[keys.CLOCK] * 4]
 
 
@@ -317,23 +326,19 @@ def test_a_clock_of_time_that_stood_still_is_missed_by_its_number(tmp_path: Path
     """The world died just after it had published that clock: the next one knows of it."""
     path, stood = tmp_path / "run.mcap", clock(1, seq=2)
     after = [clock(1, seq=3), clock(2, seq=4)]
-    recorded(
-        path, [page(gates(0)), page([*gates(0, 1), stood, *after])], gates(1), after, last=dict([pair(keys.INFO, INFO)])
-    )
-    with RecordReader(path) as reader:
-        clocks = [messages.decode(each.key, each.payload) for each in reader.messages([keys.CLOCK], by_time=False)]
+    recorded(path, [page(gates(0)), page([*gates(0, 1), stood, *after])], gates(1), after)
+    clocks = [messages.decode(*each) for each in on_record(path, keys.CLOCK)]
     assert [(each.step, each.seq) for each in clocks[:-1]] == [(0, 0), (1, 1), (1, 2), (1, 3), (2, 4)]
 
 
 def test_gates_that_the_world_has_no_longer_are_missing_by_number(tmp_path: Path):
     """Printed in a line while the run goes on, and read off the record afterwards."""
     path, link, lines = tmp_path / "run.mcap", FakeLink(), []
-    replays, link.last = iter([page(gates(0)), page(gates(8, 9))]), dict([pair(keys.INFO, INFO)])
+    replays, link.last = iter([page(gates(0)), page(gates(8, 9))]), LAST
     link.on_request = lambda key, args: next(replays)
     for passed in (gates(1), gates(2), whole(9), whole(10), [clock(11, "stopped")]):
         link.deliver(keys.BATCH, encode_batch(passed))
-    made: Any = recorder.Recorder(link, INFO, path, "recorder", lambda: False, lines.append)  # type: ignore[arg-type]
-    assert made.run() == RUN_ENDED
+    record(link, path, say=lines.append)
     (line,) = lines
     assert has_terms(line, "recorder", "5", "0.06", "0.14")
     found = completed(path)
@@ -343,12 +348,10 @@ def test_gates_that_the_world_has_no_longer_are_missing_by_number(tmp_path: Path
 
 def test_a_world_that_is_far_ahead_changes_no_order_and_doubles_nothing(tmp_path: Path):
     """It replays gates that are on their way still, behind the ones that are missing."""
-    path, last = tmp_path / "run.mcap", dict([pair(keys.INFO, INFO)])
+    path = tmp_path / "run.mcap"
     on_their_way = [each for gate in range(5, 30) for each in whole(gate)]
-    found = recorded(path, [page(gates(0)), page(gates(20, 21, 22, 23))], on_their_way, [clock(30)], last=last)
-    with RecordReader(path) as reader:
-        written = [message.t_ns // GATE_NS for message in reader.messages([IMU], by_time=False)]
-    assert written == [0, *range(5, 30)] == stamps(found, IMU)
+    found = recorded(path, [page(gates(0)), page(gates(20, 21, 22, 23))], on_their_way, [clock(30)])
+    assert stamps(on_record(path, IMU), IMU) == [0, *range(5, 30)] == stamps(found, IMU)
     assert completed(path).gaps[0] == GateGap(4, GATE_NS, 4 * GATE_NS)
 
 
@@ -368,7 +371,7 @@ def test_the_end_of_a_run_that_passed_while_the_link_was_lost_is_asked_for(
             link.cut(True)
 
     link.on_publish = cut
-    assert record(link, info, path) == RUN_ENDED  # type: ignore[arg-type]
+    record(link, path, info)
     assert completed(path).complete
 
 
@@ -392,9 +395,8 @@ def test_what_passed_before_a_link_was_back_is_asked_for_in_realtime_though_no_c
             link.deliver(keys.BATCH, encode_batch([*gates(1, 2), clock(3, "stopped")]))
 
     link.on_publish = cut
-    assert record(link, info, path) == RUN_ENDED  # type: ignore[arg-type]
-    with RecordReader(path) as reader:
-        written = [(each.key, each.payload) for each in reader.messages([keys.EVENT, keys.CLOCK], by_time=False)]
+    record(link, path, info)
+    written = on_record(path, keys.EVENT, keys.CLOCK)
     assert [messages.decode(*each).seq for each in written if each[0] == keys.EVENT] == [0, 1, 2]
     assert [messages.decode(*each).seq for each in written if each[0] == keys.CLOCK] == [0, 1, 2, 3]
 
@@ -405,7 +407,7 @@ def test_another_run_is_not_asked_for_gates_that_are_missing(tmp_path: Path):
     link.on_request = lambda key, args: next(replays)
     link.last = dict([pair(keys.INFO, replace(INFO, run_id="other"))])
     link.deliver(keys.BATCH, encode_batch([*gates(1), *gates(4), clock(5, "stopped")]))
-    assert record(link, INFO, path) == RUN_ENDED  # type: ignore[arg-type]
+    record(link, path)
     assert completed(path).gates_missing == 2
 
 
@@ -414,8 +416,7 @@ def test_who_goes_on_with_a_record_counts_from_its_end(tmp_path: Path):
     died(path, [pair(keys.INFO, INFO), *gates(0, 1, 2)])
     link.on_request = lambda key, args: page(gates(5))
     link.deliver(keys.BATCH, encode_batch([*gates(5, 6), clock(7, "stopped")]))
-    made: Any = recorder.Recorder(link, INFO, path, "recorder", lambda: False, lines.append)  # type: ignore[arg-type]
-    assert made.run() == RUN_ENDED
+    record(link, path, say=lines.append)
     assert [has_terms(line, "2", "0.06", "0.08") for line in lines] == [False, True]
     assert completed(path).gaps == (GateGap(2, 3 * GATE_NS, 4 * GATE_NS),)
 
@@ -425,7 +426,7 @@ def test_who_goes_on_with_the_record_of_a_run_that_is_over_leaves(tmp_path: Path
     before = [pair(keys.INFO, INFO), *gates(0, 1, 2), clock(3, "stopped")]
     died(path, before)
     link.on_request = lambda key, args: page(before)
-    assert record(link, INFO, path) == RUN_ENDED  # type: ignore[arg-type]
+    record(link, path)
     assert completed(path).complete
 
 
@@ -442,7 +443,7 @@ def test_it_publishes_how_far_the_record_is_on_disk(tmp_path: Path):
     link.on_publish = look
     link.on_request = lambda key, args: page(gates(*range(60)))
     link.deliver(keys.BATCH, encode_batch([*gates(*range(59, 130)), clock(130, "stopped")]))
-    assert record(link, INFO, path) == RUN_ENDED  # type: ignore[arg-type]
+    record(link, path)
     assert on_disk[0] == (59 * GATE_NS, 59 * GATE_NS)
     assert all(done_ns == last_ns for done_ns, last_ns in on_disk)
     (join,) = link.published_on("process/recorder/join")
@@ -455,7 +456,7 @@ def test_a_batch_of_a_stranger_ends_nothing(tmp_path: Path, garbage: bytes):
     link.on_request = lambda key, args: page([])
     for payload in (garbage, encode_batch([clock(0, "stopped")])):
         link.deliver(keys.BATCH, payload)
-    made: Any = recorder.Recorder(link, INFO, tmp_path / "run.mcap", "recorder", lambda: False)  # type: ignore[arg-type]
+    made = recorder_of(link, INFO, tmp_path / "run.mcap")
     assert made.run() == RUN_ENDED
     assert made.health.refused == 1
 
@@ -468,15 +469,14 @@ FRONT, FRONT_INFO = keys.camera("d1", "front"), keys.camera_info("d1", "front")
 def filmed(path: Path, pictures: list[Struct | bytes], last: dict[str, bytes]) -> list[Pair]:
     """Record a run in which pictures are published beside what passes the world; return what is on record."""
     link = FakeLink()
-    link.last = dict([pair(keys.INFO, INFO)]) | last
+    link.last = LAST | last
     link.on_request = lambda key, args: page([])
     for picture in pictures:
         link.deliver(FRONT, picture)
     for passed in (gates(0), [clock(99, "stopped")]):
         link.deliver(keys.BATCH, encode_batch(passed))
-    record(link, INFO, path)  # type: ignore[arg-type]
-    with RecordReader(path) as reader:
-        return [(message.key, message.payload) for message in reader.messages()]
+    record(link, path)
+    return on_record(path)
 
 
 def test_pictures_are_on_record_as_published_and_how_the_camera_sees_too(tmp_path: Path):

@@ -13,7 +13,7 @@ from zsim_agents.formation.control_law import ProportionalLaw
 from zsim_agents.formation.engagement import Engagement
 from zsim_agents.formation.engagement_setup import gains_of
 from zsim_agents.formation.flight_check import GateInput, GateOutput
-from zsim_agents.formation.flight_plan import Engage, Land, MoveTo, Scheduled, TakeOff
+from zsim_agents.formation.flight_plan import MoveTo, Order, Scheduled
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 
 pytestmark = needs_octave
@@ -104,11 +104,11 @@ class Air:
 def flight() -> tuple[list[dict[str, Any]], list[GateOutput]]:
     """Fly the Python controller; return its inputs and outputs, gate by gate."""
     plan = [
-        Scheduled(5.0, TakeOff()),
-        Scheduled(5.0, Engage()),
+        Scheduled(5.0, Order.TAKE_OFF),
+        Scheduled(5.0, Order.ENGAGE),
         Scheduled(5.0, MoveTo(EQUATION_3)),
         Scheduled(60.0, MoveTo(TURNED)),
-        Scheduled(85.0, Land()),
+        Scheduled(85.0, Order.LAND),
     ]
     engagement, air = Engagement(SPACE, DRONES, GAINS, plan=plan), Air()
     gates, outputs = [], []

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import zsim
-from zsim.contract.fingerprint import join_of
+from zsim.contract.fingerprint import Membership
 from zsim.scenario import scenario_file
 from zsim_world.run.world import World
 
@@ -23,6 +23,10 @@ def git(folder: Path, *words: str) -> str:
     return done.stdout.strip()
 
 
+def head(checkout: Path) -> str:
+    return git(checkout, "rev-parse", "HEAD")
+
+
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
     (tmp_path / "checkout" / "zsim").mkdir(parents=True)
@@ -31,39 +35,28 @@ def checkout(tmp_path: Path) -> Path:
     return tmp_path / "checkout"
 
 
-def head(checkout: Path) -> str:
-    return git(checkout, "rev-parse", "HEAD")
-
-
-def test_a_checkout_has_the_commit_of_its_branch(checkout: Path) -> None:
+def test_a_checkout_and_a_worktree_have_the_commits_of_their_branches_which_may_be_packed_or_none(checkout: Path):
     first = head(checkout)
     assert zsim.commit(checkout / "zsim") == first
     git(checkout, "commit", "-q", "--allow-empty", "-m", "second")
     assert zsim.commit(checkout / "zsim") == head(checkout) != first
-
-
-def test_a_branch_may_be_packed(checkout: Path) -> None:
+    worktree = checkout.parent / "worktree"
+    git(checkout, "worktree", "add", "-q", "-b", "other", str(worktree))
+    git(worktree, "commit", "-q", "--allow-empty", "-m", "third")
+    assert zsim.commit(worktree / "zsim") == head(worktree) != head(checkout)
     git(checkout, "branch", "n/main")  # ends as the other one does
     git(checkout, "pack-refs", "--all")
     assert not (checkout / ".git" / "refs" / "heads" / "main").exists()
     assert zsim.commit(checkout / "zsim") == head(checkout)
-
-
-def test_a_commit_may_be_checked_out_without_a_branch(checkout: Path) -> None:
     git(checkout, "checkout", "-q", "--detach")
     assert zsim.commit(checkout / "zsim") == head(checkout)
 
 
-def test_a_worktree_has_a_commit_of_its_own(checkout: Path) -> None:
-    worktree = checkout.parent / "worktree"
-    git(checkout, "worktree", "add", "-q", "-b", "other", str(worktree))
-    git(worktree, "commit", "-q", "--allow-empty", "-m", "second")
-    assert zsim.commit(worktree / "zsim") == head(worktree) != head(checkout)
-
-
-def test_what_was_built_has_the_commit_of_the_build(tmp_path: Path) -> None:
+def test_what_was_built_has_the_commit_of_the_build_and_else_the_release_alone(tmp_path: Path) -> None:
     (tmp_path / zsim.COMMIT_FILE).write_text(f"{OTHER}\n")
     assert zsim.commit(tmp_path) == OTHER
+    (tmp_path / zsim.COMMIT_FILE).write_bytes((ROOT / "zsim" / zsim.COMMIT_FILE).read_bytes())
+    assert zsim.commit(tmp_path) == ""
 
 
 def test_an_archive_made_by_git_has_its_commit(checkout: Path) -> None:
@@ -77,14 +70,13 @@ def test_an_archive_made_by_git_has_its_commit(checkout: Path) -> None:
     assert zsim.commit(checkout.parent / "archive" / "zsim") == head(checkout)
 
 
-def test_without_git_there_is_the_release_alone(tmp_path: Path) -> None:
-    (tmp_path / zsim.COMMIT_FILE).write_bytes((ROOT / "zsim" / zsim.COMMIT_FILE).read_bytes())
-    assert zsim.commit(tmp_path) == ""
-
-
 def test_world_and_participants_state_the_same_version() -> None:
     assert tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"] == zsim.RELEASE
     assert re.fullmatch(rf"{re.escape(zsim.RELEASE)}(\+g[0-9a-f]{{{zsim.DIGITS}}})?", zsim.__version__)
     scenario = scenario_file.load(ROOT / "scenarios" / "step.yaml")
     world = World(scenario, "lockstep", 0.0, time.monotonic_ns)
-    assert world.info().version == zsim.__version__ == join_of("estimator.drone1", "here", "run", 1, 1).version
+    assert (
+        world.info().version
+        == zsim.__version__
+        == Membership("estimator.drone1", "here", "run", lambda kind: 0).join().version
+    )

@@ -1,7 +1,7 @@
 """The effects of faults on the arrays of a fleet: sensors, rotors and wind. Without faults they are as at the start."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -20,12 +20,11 @@ from zsim_world.vehicles.simd_firmware import ACTUATOR, sound_actuators
 
 
 class Impairment:
-    """Applies faults to a fleet's drones and to its wind.
+    """Applies faults to the drones of a fleet and to its wind.
 
     Args:
         arrays: of the fleet, before its first gate.
         drones, vehicles: their names and what they are, in scenario order.
-        sensors: of the drones.
 
     Attributes:
         rotors: names of the rotors of each drone.
@@ -52,14 +51,18 @@ class Impairment:
         """Let these faults act from now on, and no others; those that have acted before go on."""
         self._w.senses.config[:] = self._config
         self._w.boards.actuator[:] = self._sound
-        offsets = self._w.senses.fault[:, :, FAULT.offset : FAULT.hold]
-        offsets[:] = 0.0
+        self._w.senses.fault[:, :, FAULT.offset : FAULT.hold] = 0.0
         stuck: set[tuple[int, int]] = set()
         self._held = {fault.id: self._held[fault.id] for fault in acting if fault.id in self._held}
         for fault in acting:
             if fault.target in self._index:
                 self._impair(fault, self._index[fault.target], stuck)
-        self._release(stuck)
+        # sensors that have just got stuck hold their next sample, and those that no longer are, are released
+        hold = self._w.senses.fault[:, :, FAULT.hold]
+        kept = {(i, s) for i, s in stuck if hold[i, s] == ss.HOLDING}
+        hold[:] = ss.FREE
+        for place in stuck:
+            hold[place] = ss.HOLDING if place in kept else ss.ARMED
         self._gusts = tuple(fault for fault in acting if fault.kind == "gust")
 
     def blow(self, from_ns: int, until_ns: int) -> None:
@@ -94,14 +97,6 @@ class Impairment:
             offset = self._w.senses.fault[i, s, FAULT.offset + first : FAULT.offset + first + part.channel.width]
             (bias,) = fault.parameters.values()  # one number or vector, whatever its unit
             offset += np.multiply(bias, part.channel.to_si)
-
-    def _release(self, stuck: Iterable[tuple[int, int]]) -> None:
-        """Let sensors that have just got stuck hold their next sample, and release those that no longer are."""
-        hold = self._w.senses.fault[:, :, FAULT.hold]
-        kept = {(i, s) for i, s in stuck if hold[i, s] == ss.HOLDING}
-        hold[:] = ss.FREE
-        for place in stuck:
-            hold[place] = ss.HOLDING if place in kept else ss.ARMED
 
     def _impair_rotors(self, fault: Fault, i: int, how: str) -> None:
         row, which, count = self._w.boards.actuator[i], fault.parameters["rotor"], len(self._w.bodies.each)

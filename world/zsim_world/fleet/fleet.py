@@ -51,11 +51,11 @@ from zsim_world.physics.fleet_arrays import (
     vehicle_row,
 )
 from zsim_world.physics.simd import body_blocks
-from zsim_world.physics.surfaces import BALLS, SLOTS_MAX, contact_points, obstacle_rows
+from zsim_world.physics.surfaces import BALLS, POINTS, SLOTS_MAX, contact_points, obstacle_rows
 from zsim_world.run_state import IN_PLACE, PART, Saved
 from zsim_world.sensors import sensor_set
 from zsim_world.sensors.noise import NoiseTable
-from zsim_world.sensors.sampler import WHOSE, Sampled, Sampler, SensorSample, with_more
+from zsim_world.sensors.sampler import Sampled, Sampler, with_more
 from zsim_world.sensors.sensor_set import FleetSensors, fleet_sensors
 from zsim_world.sensors.sightings import PictureSightings, SightingSampler
 from zsim_world.vehicles import firmware, observer
@@ -103,20 +103,20 @@ class Fleet:
         names: in scenario order, in which drones are counted.
         rotors: how many each has.
         external: the drones that are not integrated, each with its place among them.
-        sensors: of each.
-        environment: of the scenario.
         gps_sigma_m: of each drone's fixes.
         impairment: what faults do to it.
         bodies, boards: the arrays that the kernel works on; to be read only.
         sampled: what fell due for publication in the last gate; a sighting is of the sensor behind all of `sensors`.
         sightings: among these, by the row of `sampled`.
+        closest_m: least distance between two drones over the last gate; inf for a single one.
+        collisions: the pairs of drones whose hulls began to touch in the last gate.
         touching: whether a drone's hull touched another's in the last gate, (N,).
     """
 
     SAVED: ClassVar[Saved] = {
         "_tick": int,
         "_gates": int,
-        "_least": float,
+        "closest_m": float,
         "touching": IN_PLACE,
         "arrays": IN_PLACE,
         "_streams": IN_PLACE,
@@ -124,6 +124,8 @@ class Fleet:
         "_sightings": PART,
     }
     sampled: Sampled
+    closest_m: float
+    collisions: list[tuple[int, int]]
 
     def __init__(self, scenario: Scenario) -> None:
         """Place the drones and take the samples of t = 0.
@@ -147,7 +149,7 @@ class Fleet:
         self.environment = scenario.environment
         self._noise = NoiseTable(scenario, NOISE_GATES)
         self._streams = self._noise.streams
-        self._w = initial_arrays(scenario, vehicles, self.sensors, self._noise)
+        self._w = _initial_arrays(scenario, vehicles, self.sensors, self._noise)
         self._sampler = Sampler(scenario, self.sensors, self._w.senses)
         has_some = any(drone.sensors.sightings is not UNSET and not drone.is_external for drone in scenario.drones)
         hulls = self._w.bodies.vehicle[:, VEHICLE.hull_radius]
@@ -157,21 +159,69 @@ class Fleet:
         self.bodies, self.boards = self._w.bodies, self._w.boards
         self.impairment = Impairment(self._w, self.names, vehicles, self.sensors)
         self.touching = np.zeros(self.count, dtype=bool)
-        self._hull_m = float(self.bodies.vehicle[:, VEHICLE.hull_radius].max())
+        self._hull_m = float(hulls.max())
         self._integrate(0)
         self._watch = FlightWatch(self._w, self.names, [each.name for each in scenario.environment.obstacles])
         # loads or compiles what the first command needs: in realtime no gate may wait for it
         kernel.enter(self.boards.memory[0].copy(), self.boards.belief[0].copy(), firmware.LANDED)
 
     @property
-    def has_sightings(self) -> bool:
-        """Whether any drone has them."""
-        return self._sightings is not None
+    def arrays(self) -> list[NDArray]:
+        """All arrays of the kernel but the near pairs of drones."""
+        return list(state_arrays(self._w))
+
+    def restored(self) -> None:
+        self.bodies.near.origin.fill(math.inf)  # the near pairs are found anew
+
+    # Time
+
+    def advance(self) -> None:
+        """Integrate one gate with the present setpoints.
+
+        Raises:
+            DivergedError: the state of a drone is no longer finite.
+        """
+        if self._gates % NOISE_GATES == 0:
+            self._noise.refill()
+        self._gates += 1
+        self._integrate(self._ticks)
+
+    def _integrate(self, ticks: int) -> None:
+        logged, self.closest_m, diverged, self._has_incidents = kernel.advance(self._held, ticks)
+        if diverged >= 0:
+            raise DivergedError(self.names[diverged], (self._tick + ticks) * self._tick_ns / 1e9)
+        self._tick += ticks
+        self.collisions = []
+        self.touching.fill(False)
+        if self.bodies.obstacle.size:
+            self.touching[:] = self.bodies.bumping.any(axis=1)
+        if self.closest_m < 2.0 * self._hull_m:
+            self.collisions = [(int(i), int(j)) for i, j in np.argwhere(self.bodies.touched)]
+            self.touching[np.argwhere(self.bodies.touched | self.bodies.touching).ravel()] = True
+        self.sampled = self._sampler.due(logged, self.t_ns)
+        if self._sightings:
+            self.sightings = {}
+            if sightings := self._sightings.due(self.bodies.state, self.t_ns):
+                self._insert_sightings(sightings)
+
+    def _insert_sightings(self, sightings: list[PictureSightings]) -> None:
+        """Insert sightings into the samples of the gate, after those of the same drone and time."""
+        number = len(self.sensors.names)
+        sightings.sort()
+        rows = [(number, each.drone, each.t_ns, each.t_sample_ns) for each in sightings]
+        whose, values, places = with_more(*self.sampled, np.array(rows, dtype=np.int64))
+        self.sampled = Sampled(whose, values)
+        self.sightings = dict(zip(places.tolist(), sightings, strict=True))
+
+    # What is the case
 
     @property
     def t_ns(self) -> int:
-        """Simulated time of the present state."""
         return self._tick * self._tick_ns
+
+    @property
+    def has_sightings(self) -> bool:
+        return self._sightings is not None
 
     def rotor_info(self, i: int) -> tuple[RotorInfo, ...]:
         """Return the rotors of a drone as `world/info` names them."""
@@ -187,52 +237,14 @@ class Fleet:
         """Wind at each drone in W, steady and gusts, without the downwash of others; (N, 3)."""
         return self._w.gust + self._w.wind[WIND.steady : WIND.steady + 3]
 
-    def advance(self) -> None:
-        """Integrate one gate with the present setpoints.
-
-        Raises:
-            DivergedError: the state of a drone is no longer finite.
-        """
-        if self._gates % NOISE_GATES == 0:
-            self._noise.refill()
-        self._gates += 1
-        self._integrate(self._ticks)
-
-    @property
-    def arrays(self) -> list[NDArray]:
-        """All arrays of the kernel but the near pairs of drones."""
-        return list(state_arrays(self._w))
-
-    def restored(self) -> None:
-        self.bodies.near.origin.fill(math.inf)  # the near pairs are found anew
-
-    def samples(self) -> list[SensorSample]:
-        """Return the samples published in the last gate, without sightings, by (t_ns, drone, sensor)."""
-        numbers = self.sampled.whose[:, WHOSE.sensor] < len(self.sensors.names)
-        return Sampled(self.sampled.whose[numbers], self.sampled.values[numbers]).each(self.sensors)
-
     def truth(self) -> TrueState:
-        """Return the true state now."""
         s, accel = self.bodies.state.copy(), self.bodies.accel[:, 0:3].copy()
         return TrueState(s[:, 0:3], s[:, 3:6], s[:, 6:10], s[:, 10:13], accel, s[:, STATE.size :])
-
-    def lead(self, i: int, pose: NDArray[np.float64]) -> None:
-        """Move an external drone to a pose, (STATE.size + its rotors,), from which it continues with its velocity."""
-        self.bodies.pose[self.external[i], : len(pose)] = pose
-        self.bodies.state[i, : len(pose)] = pose
 
     def status(self, i: int) -> tuple[DroneState, float, bool]:
         """Return the firmware's mode, the charge [%], and whether the hull touched another in the last gate."""
         charge = 100.0 * self.bodies.energy.item(i) / self.bodies.vehicle.item(i, VEHICLE.capacity)
         return firmware.MODES[self._mode(i)], charge, bool(self.touching[i])
-
-    def closest_m(self) -> float:
-        """Return the least distance between two drones over the last gate; inf for a single one."""
-        return self._least
-
-    def collisions(self) -> list[tuple[int, int]]:
-        """Return the pairs of drones whose hulls began to touch in the last gate."""
-        return self._began
 
     def bumps(self) -> list[tuple[int, int]]:
         """Return the pairs of drone and obstacle that began to touch in the last gate."""
@@ -241,8 +253,14 @@ class Fleet:
         return [(int(i), int(m)) for i, m in np.argwhere(self.bodies.bumped)]
 
     def incidents(self) -> list[Incident]:
-        """Return the incidents of drones in the last gate."""
         return self._watch.incidents() if self._has_incidents else []
+
+    # Commands
+
+    def lead(self, i: int, pose: NDArray[np.float64]) -> None:
+        """Move an external drone to a pose, (STATE.size + its rotors,), from which it continues with its velocity."""
+        self.bodies.pose[self.external[i], : len(pose)] = pose
+        self.bodies.state[i, : len(pose)] = pose
 
     def takeoff(self, i: int) -> str | None:
         """Start a take-off; return None, or why it is refused."""
@@ -320,7 +338,6 @@ class Fleet:
         return None
 
     def release(self, i: int) -> None:
-        """Let a drone hover that has no commander any more."""
         self.boards.setpoint[i, SETPOINT.kind] = firmware.NONE
 
     def _set(self, i: int, kind: int, values: tuple[float, ...]) -> str | None:
@@ -342,42 +359,10 @@ class Fleet:
         kernel.enter(self.boards.memory[i], self.boards.belief[i], mode)
         self._watch.note_command(i, mode)
 
-    def _integrate(self, ticks: int) -> None:
-        logged, least, diverged, self._has_incidents = kernel.advance(self._held, ticks)
-        if diverged >= 0:
-            raise DivergedError(self.names[diverged], (self._tick + ticks) * self._tick_ns / 1e9)
-        self._tick += ticks
-        self._least = least
-        self._meet(least)
-        self.sampled = self._sampler.due(logged, self.t_ns)
-        if self._sightings:
-            self._add_sightings(self._sightings.due(self.bodies.state, self.t_ns))
 
-    def _add_sightings(self, sightings: list[PictureSightings]) -> None:
-        """Insert sightings into the samples of the gate, after those of the same drone and time."""
-        self.sightings = {}
-        if not sightings:
-            return
-        number = len(self.sensors.names)
-        sightings.sort()
-        rows = [(number, each.drone, each.t_ns, each.t_sample_ns) for each in sightings]
-        more = np.array(rows, dtype=np.int64)
-        whose, values, places = with_more(*self.sampled, more)
-        self.sampled = Sampled(whose, values)
-        self.sightings = dict(zip(places.tolist(), sightings, strict=True))
-
-    def _meet(self, least: float) -> None:
-        self._began: list[tuple[int, int]] = []
-        self.touching.fill(False)
-        if self.bodies.obstacle.size:
-            self.touching[:] = self.bodies.bumping.any(axis=1)
-        if least < 2.0 * self._hull_m:
-            self._began = [(int(i), int(j)) for i, j in np.argwhere(self.bodies.touched)]
-            self.touching[np.argwhere(self.bodies.touched | self.bodies.touching).ravel()] = True
-
-
-def initial_arrays(scenario: Scenario, vehicles: Sequence[Vehicle], sensors: FleetSensors, noise: NoiseTable) -> Arrays:
-    """Return the arrays of the kernel for a scenario whose drones are these vehicles with these sensors."""
+def _initial_arrays(
+    scenario: Scenario, vehicles: Sequence[Vehicle], sensors: FleetSensors, noise: NoiseTable
+) -> Arrays:
     dt, drones, place = scenario.time.physics_dt_ms / 1000.0, scenario.drones, scenario.environment
     each = rotor_slots(vehicles)
     row = np.array([vehicle_row(vehicle, drone, place) for vehicle, drone in zip(vehicles, drones, strict=True)])
@@ -390,15 +375,28 @@ def initial_arrays(scenario: Scenario, vehicles: Sequence[Vehicle], sensors: Fle
     senses = _senses(scenario, sensors, noise)
     watched = Watched(seen=np.zeros((len(drones), SEEN.size)), found=np.zeros(len(drones), dtype=np.int64))
     watched.seen[bodies.external, SEEN.external] = 1.0
-    return Arrays(time, bodies, boards, numbers, senses, _wind(scenario), noise.gust, watched)
+    wind, row = place.wind, np.empty(WIND.size)
+    row[WIND.steady : WIND.steady + 3] = wind.steady_m_s
+    row[WIND.gust], row[WIND.correlation] = wind.gust_m_s, wind.gust_correlation
+    row[WIND.length], row[WIND.speed_min] = wind.gust_length_m, wind.gust_speed_min_m_s
+    return Arrays(time, bodies, boards, numbers, senses, row, noise.gust, watched)
 
 
 def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) -> Bodies:
     drones, n, obstacles = scenario.drones, len(scenario.drones), obstacle_rows(scenario.environment)
     each, slots = rotors.shape[1] // ROTOR.size, min(len(obstacles), SLOTS_MAX)
-    state = np.array([_standing(drone, own, each) for drone, own in zip(drones, row, strict=True)])
+    state, anchor = np.zeros((n, STATE.size + each)), np.zeros((n, POINTS, 2))
+    for i, drone in enumerate(drones):  # its feet carry its weight; from a position above the ground it falls
+        yaw = math.radians(drone.yaw_deg)
+        state[i, STATE.p_WB : STATE.p_WB + 3] = drone.position_m
+        state[i, STATE.p_WB + 2] += row[i, VEHICLE.stand_height]
+        state[i, STATE.q_WB : STATE.q_WB + 4] = quaternion_from_heading(yaw)
+        turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+        anchor[i] = np.array(drone.position_m[:2]) + contact_points(row[i])[:, :2] @ turn.T
     aero = np.array([aero_row(drone, scenario.environment) for drone in drones])
     external = np.array([i for i, drone in enumerate(drones) if drone.is_external], dtype=np.int64)
+    pairs = np.zeros((n * (n - 1) // 2, 2), dtype=np.int32)  # yet to be found, since no drone is at its origin
+    near = NearPairs(pair=pairs, number=np.zeros(1, dtype=np.int64), origin=np.full((n, 3), np.inf))
     half_decay = cast(Any, rigid_body.half_decay).py_func  # as Python: compiling it for a few numbers takes longer
     return Bodies(
         each=tuple(range(each)),
@@ -406,14 +404,14 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
         rotors=rotors,
         state=state,
         accel=np.zeros((n, 6)),
-        anchor=np.array([_anchors(drone, own) for drone, own in zip(drones, row, strict=True)]),
+        anchor=anchor,
         command=np.zeros((n, each)),
         energy=row[:, VEHICLE.capacity] * [drone.battery_percent / 100.0 for drone in drones],
         air=np.zeros((n, 3)),
         push=np.zeros((n, 3)),
         touching=np.zeros((n, n), dtype=np.int8),
         touched=np.zeros((n, n), dtype=np.int8),
-        near=near(n),
+        near=near,
         obstacle=obstacles,
         bumping=np.zeros((n, len(obstacles)), dtype=np.int8),
         bumped=np.zeros((n, len(obstacles)), dtype=np.int8),
@@ -429,18 +427,13 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
     )
 
 
-def near(n: int) -> NearPairs:
-    """Return near pairs that are yet to be found, since no drone is at its origin."""
-    pairs = np.zeros((n * (n - 1) // 2, 2), dtype=np.int32)
-    return NearPairs(pair=pairs, number=np.zeros(1, dtype=np.int64), origin=np.full((n, 3), np.inf))
-
-
 def _boards(scenario: Scenario, vehicles: Sequence[Vehicle], row: np.ndarray, rotors: np.ndarray) -> Boards:
     drones, n, each = scenario.drones, len(scenario.drones), rotors.shape[1] // ROTOR.size
     both = list(zip(vehicles, drones, strict=True))
     setting = np.array([firmware.settings(vehicle, drone) for vehicle, drone in both])
     calibration = np.array([_calibration(drone, scenario) for drone in drones])
     obstacles = obstacle_rows(scenario.environment)
+    rows = zip(drones, row, calibration, strict=True)
     mounts = calibration[:, CALIBRATION.imu_turn : CALIBRATION.imu_turn + 4]
     return Boards(
         setting=setting,
@@ -449,12 +442,7 @@ def _boards(scenario: Scenario, vehicles: Sequence[Vehicle], row: np.ndarray, ro
         setpoint=np.zeros((n, firmware.SETPOINT.size)),
         set_tick=np.zeros(n, dtype=np.int64),
         memory=np.zeros((n, firmware.MEMORY.size)),
-        belief=np.array(
-            [
-                _first_belief(drone, own, board, obstacles, each)
-                for drone, own, board in zip(drones, row, calibration, strict=True)
-            ]
-        ),
+        belief=np.array([_first_belief(drone, own, board, obstacles, each) for drone, own, board in rows]),
         actuator=sound_actuators(n, each),
         device=np.zeros((n, DEVICE.size)),
         lanes=board_blocks(row, rotors, setting, mounts),
@@ -478,21 +466,6 @@ def _senses(scenario: Scenario, sensors: FleetSensors, noise: NoiseTable) -> Sen
         exposed_whose=np.zeros((exposures, 3), dtype=np.int64),
         exposed=np.zeros((exposures, EXPOSED.size)),
     )
-
-
-def _standing(drone: Drone, row: np.ndarray, rotors: int) -> np.ndarray:
-    """Return the state of a drone whose feet carry its weight; from a position above the ground it falls."""
-    state = np.zeros(STATE.size + rotors)
-    state[STATE.p_WB : STATE.p_WB + 3] = drone.position_m
-    state[STATE.p_WB + 2] += row[VEHICLE.stand_height]
-    state[STATE.q_WB : STATE.q_WB + 4] = quaternion_from_heading(math.radians(drone.yaw_deg))
-    return state
-
-
-def _anchors(drone: Drone, row: np.ndarray) -> np.ndarray:
-    yaw = math.radians(drone.yaw_deg)
-    turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
-    return np.array(drone.position_m[:2]) + contact_points(row)[:, :2] @ turn.T
 
 
 def _first_belief(
@@ -527,12 +500,3 @@ def _calibration(drone: Drone, scenario: Scenario) -> np.ndarray:
     board[CALIBRATION.mag_bearing] = math.atan2(field[1], field[0]) if compass else math.nan
     board[CALIBRATION.sonar_min] = drone.sensors.sonar.min_m
     return board
-
-
-def _wind(scenario: Scenario) -> np.ndarray:
-    wind = scenario.environment.wind
-    row = np.empty(WIND.size)
-    row[WIND.steady : WIND.steady + 3] = wind.steady_m_s
-    row[WIND.gust], row[WIND.correlation] = wind.gust_m_s, wind.gust_correlation
-    row[WIND.length], row[WIND.speed_min] = wind.gust_length_m, wind.gust_speed_min_m_s
-    return row

@@ -56,12 +56,7 @@ class Incident(NamedTuple):
 
 
 class FlightWatch:
-    """Describes the incidents of a fleet's drones.
-
-    Args:
-        arrays: of the fleet.
-        drones, obstacles: their names.
-    """
+    """Describes the incidents of a fleet's drones; `drones` and `obstacles` are names."""
 
     def __init__(self, arrays: Arrays, drones: Sequence[str], obstacles: Sequence[str]) -> None:
         self._bodies, self._boards = arrays.bodies, arrays.boards
@@ -74,7 +69,6 @@ class FlightWatch:
         self._seen[i, SEEN.mode] = mode
 
     def incidents(self) -> list[Incident]:
-        """Return the incidents of the last gate."""
         found = []
         for i in np.flatnonzero(self._found).tolist():
             bits, name, seen = int(self._found[i]), self._names[i], self._seen[i]

@@ -66,7 +66,6 @@ def _drain(bodies: Bodies) -> None:
 
 @inlined
 def _gusts(wind: NDArray, gust: NDArray, state: NDArray, noise: NoiseRows) -> None:
-    """Advance the gusts of every drone by one step."""
     count = gust.shape[0]
     at = noise.at[STREAMS.wind] + 3 * noise.cursor[count, STREAMS.wind]
     common, loaded = vector(noise.table[count], at), vector(wind, 0) + four(wind, 3)
@@ -153,7 +152,6 @@ def _read_faulty(
 
 @inlined
 def _register(device: NDArray, s: int, value: NDArray) -> None:
-    """Pass a sample to the firmware."""
     if s == ss.IMU:
         put(device, DEVICE.accel, vector(value, 0))
         put(device, DEVICE.gyro, vector(value, 3))
@@ -237,7 +235,6 @@ def _take(
 
 @inlined
 def _note(row: NDArray, s: int, i: int, tick: int) -> None:
-    """Note sensor, drone and tick of a sample."""
     row[0], row[1], row[2] = s, i, tick
 
 

@@ -25,7 +25,6 @@ from zsim_world.physics.rigid_body import charge_percent
 from zsim_world.run_state import IN_PLACE, Saved
 from zsim_world.sensors import sampler, sensor_set
 from zsim_world.sensors.sampler import WHOSE, Sampled
-from zsim_world.sensors.sightings import PictureSightings
 from zsim_world.vehicles import firmware
 from zsim_world.vehicles.firmware import MEMORY
 
@@ -56,8 +55,6 @@ class PublicationBuffers(NamedTuple):
 
 
 class MessageRow(NamedTuple):
-    """The numbers that one message is made of."""
-
     ints: NDArray[np.int64]
     floats: NDArray[np.float64]
     bits: NDArray[np.uint64]  # the same floats
@@ -95,8 +92,6 @@ NO_PAYLOADS = UserPayloads(np.empty(0, dtype=np.uint8), np.empty(0, dtype=np.int
 
 
 class PublicationState(NamedTuple):
-    """What `publish` works on from gate to gate."""
-
     words: TextTable
     seen: PublishedArrays
     wide: PublishedState
@@ -153,8 +148,7 @@ class GatePublication:
         data = out.data[:size].tobytes()
         return GateMessages(fleet.t_ns, seq, self.table, which, stamps, ends, data, out.first.tolist())
 
-    def _payloads(self) -> "UserPayloads":
-        """Return the encoded messages of the users' sensors of this gate."""
+    def _payloads(self) -> UserPayloads:
         return self._encoder.encoded(self._fleetwide.counts) if self._encoder else NO_PAYLOADS
 
     def _number(self, commander: str | None) -> int:
@@ -173,8 +167,6 @@ class GatePublication:
 
 
 class UserMessages:
-    """Encodes the samples of users' sensors, and sightings."""
-
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
         self._seen = len(fleet.sensors.names)  # number of the sightings, behind all sensors
@@ -183,11 +175,7 @@ class UserMessages:
         self._messages = [message_type(kind.message.__name__, fields) for kind, fields in kinds]
 
     def encoded(self, counts: NDArray[np.int64]) -> UserPayloads:
-        """Return the messages of a gate.
-
-        Args:
-            counts: (N, kinds), messages that each key has had.
-        """
+        """Return the messages of a gate; counts (N, kinds) of messages that each key has had."""
         sightings = self._fleet.sightings
         if not (sightings or self._messages):
             return NO_PAYLOADS
@@ -204,8 +192,10 @@ class UserMessages:
                 s, i, t_ns, t_sample_ns = self._seen, sighting.drone, sighting.t_ns, sighting.t_sample_ns
             number = seq.get((i, s), counts.item(i, s + 2))
             seq[i, s] = number + 1
-            stamps = (t_ns, number, t_sample_ns)
-            message = self._message(s, i, stamps, values[m]) if sighting is None else _sightings(stamps, sighting)
+            if sighting is None:
+                message = self._message(s, i, (t_ns, number, t_sample_ns), values[m])
+            else:
+                message = Sightings(t_ns, number, t_sample_ns=t_sample_ns, camera=sighting.camera, seen=sighting.seen)
             payload = messages.encode(message)
             sizes[m] = len(payload)
             data += payload
@@ -232,11 +222,6 @@ class UserMessages:
             text = f"its reading makes no {kind.message.__name__} ({reason_of(error)})"
             raise UserCodeError(text, what) from error
         return self._messages[s - STOCK_SENSORS](*stamps, *fields)
-
-
-def _sightings(stamps: tuple[int, int, int], sighting: PictureSightings) -> Sightings:
-    t_ns, seq, t_sample_ns = stamps
-    return Sightings(t_ns=t_ns, seq=seq, t_sample_ns=t_sample_ns, camera=sighting.camera, seen=sighting.seen)
 
 
 @inlined

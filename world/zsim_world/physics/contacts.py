@@ -27,7 +27,6 @@ def hull_force(stiffness: float, damping: float, depth_m: float, closing_m_s: fl
 
 @inlined
 def _apart(state: NDArray, i: int, j: int) -> Vector:
-    """Return p_j - p_i [m]."""
     return (
         state[j, STATE.p_WB] - state[i, STATE.p_WB],
         state[j, STATE.p_WB + 1] - state[i, STATE.p_WB + 1],
@@ -81,7 +80,6 @@ def _touch(bodies: Bodies, i: int, j: int, d: Vector, distance: float) -> None:
 
 @inlined
 def _velocity_at(state: NDArray, r_W: Vector) -> Vector:
-    """Return the velocity in W [m/s] of a drone's point r_W from its centre."""
     return add(vector(state, STATE.v_WB), cross(rotate(four(state, STATE.q_WB), vector(state, STATE.w_WB_B)), r_W))
 
 

@@ -114,8 +114,6 @@ class NearPairs(NamedTuple):
 
 
 class Bodies(NamedTuple):
-    """The bodies of N aircraft."""
-
     each: tuple[int, ...]  # R numbers
     vehicle: NDArray  # (N, VEHICLE.size)
     rotors: NDArray  # (N, ROTOR.size * R)
@@ -144,8 +142,6 @@ class Bodies(NamedTuple):
 
 
 class Boards(NamedTuple):
-    """N navigation boards with their firmware."""
-
     setting: NDArray  # (N, firmware_settings.SETTING.size)
     gain: NDArray  # (N, observer_gains.GAIN.size)
     calibration: NDArray  # (N, observer.CALIBRATION.size)
@@ -191,8 +187,6 @@ class Watched(NamedTuple):
 
 
 class Arrays(NamedTuple):
-    """All arrays of a fleet."""
-
     time: KernelTime
     bodies: Bodies
     boards: Boards
@@ -266,7 +260,6 @@ def put_of(rotors: PerRotor, r: int, value: float) -> None:
 
 
 def rotor_slots(vehicles: Iterable[Vehicle]) -> int:
-    """Return R of a fleet."""
     slots, of_cross = CROSS_ROTORS, np.array((_Y, [-x for x in _X], _TURN))
     for vehicle in vehicles:
         cross = np.array_equal(allocation(vehicle), of_cross)

@@ -33,25 +33,21 @@ NOTHING = (0.0, 0.0, 0.0)  # N or N m
 
 @inlined
 def vector(row: Row, at: int) -> Vector:
-    """Return three numbers of a row."""
     return (row[at], row[at + 1], row[at + 2])
 
 
 @inlined
 def four(row: Row, at: int) -> Quaternion:
-    """Return four numbers of a row."""
     return (row[at], row[at + 1], row[at + 2], row[at + 3])
 
 
 @inlined
 def put(row: NDArray, at: int, a: Vector) -> None:
-    """Write three numbers into a row."""
     row[at], row[at + 1], row[at + 2] = a
 
 
 @inlined
 def put_four(row: NDArray, at: int, a: Quaternion) -> None:
-    """Write four numbers into a row."""
     row[at], row[at + 1], row[at + 2], row[at + 3] = a
 
 

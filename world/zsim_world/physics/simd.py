@@ -86,26 +86,22 @@ def _lane_aero(block: NDArray, k: int, parts: tuple[int, ...]) -> Aero:
 
 @inlined
 def lane_vector(block: NDArray, at: int, k: int) -> Vector:
-    """Return three numbers of the drone in lane k, from column `at` on."""
     return (block[LANES * at + k], block[LANES * (at + 1) + k], block[LANES * (at + 2) + k])
 
 
 @inlined
 def lane_four(block: NDArray, at: int, k: int) -> Quaternion:
-    """Return four numbers of the drone in lane k."""
     a, b, c = lane_vector(block, at, k)
     return (a, b, c, block[LANES * (at + 3) + k])
 
 
 @inlined
 def put_lane_vector(block: NDArray, at: int, k: int, a: Vector) -> None:
-    """Write three numbers of the drone in lane k."""
     block[LANES * at + k], block[LANES * (at + 1) + k], block[LANES * (at + 2) + k] = a
 
 
 @inlined
 def put_lane_four(block: NDArray, at: int, k: int, a: Quaternion) -> None:
-    """Write four numbers of the drone in lane k."""
     put_lane_vector(block, at, k, (a[0], a[1], a[2]))
     block[LANES * (at + 3) + k] = a[3]
 
@@ -124,7 +120,6 @@ def _group(group: int, each: tuple[int, ...]) -> int:
 
 @inlined
 def move(bodies: Bodies, dt: float) -> None:
-    """Integrate every drone over one tick of dt [s]."""
     count = bodies.state.shape[0]
     for first in range(0, count, LANES):
         lanes = bodies.lanes[first // LANES]
@@ -139,7 +134,6 @@ def move(bodies: Bodies, dt: float) -> None:
 
 @inlined
 def accelerate(bodies: Bodies) -> None:
-    """Compute the accelerations of every drone in its present state."""
     count = bodies.state.shape[0]
     for first in range(0, count, LANES):
         lanes = bodies.lanes[first // LANES]
@@ -202,7 +196,6 @@ def _load(bodies: Bodies, lanes: NDArray, first: int) -> bool:
 
 @inlined
 def _pose(lanes: NDArray, k: int) -> tuple[Vector, Vector, Quaternion, Vector]:
-    """Return p_WB, v_WB, q_WB, w_WB_B of the drone in lane k."""
     at = BODY_LANES.state
     p, v = lane_vector(lanes, at + STATE.p_WB, k), lane_vector(lanes, at + STATE.v_WB, k)
     return p, v, lane_four(lanes, at + STATE.q_WB, k), lane_vector(lanes, at + STATE.w_WB_B, k)
@@ -232,7 +225,6 @@ def _step_block(lanes: NDArray, each: tuple[int, ...], parts: tuple[int, ...], a
 
 @inlined
 def _accelerate_block(lanes: NDArray, each: tuple[int, ...], parts: tuple[int, ...], anchor: NDArray) -> None:
-    """Find the accelerations of all drones of the block, as in free air."""
     for k in range(LANES):
         p, v, q, w = _pose(lanes, k)
         rotors = lane_rotors(lanes, _group(BODY_ROTORS.known, each), k, each)

@@ -121,7 +121,6 @@ class Touch(NamedTuple):
 
 
 def obstacle_rows(environment: Environment) -> NDArray[np.float64]:
-    """Return the obstacles of a scenario, (M, obstacle.COLUMNS)."""
     return np.array([obstacle.row_of(each) for each in environment.obstacles]).reshape(-1, obstacle.COLUMNS)
 
 

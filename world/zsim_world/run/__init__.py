@@ -5,8 +5,7 @@ Each file uses those below it only; what an object needs of another one is passe
     world                                 one flight                playback                one replay
       ├─ commands                         commands: checked, queued, applied; commanders
       ├─ faults                           injected faults
-      └─ coordinator                      what a flight and a replay have in common
-           ├─ participants                how processes join, leave and get lost, and what each means
+      └─ coordinator                      what a flight and a replay have in common: participants, requests, time
            ├─ run_statistics              figures of the run
            ├─ barrier                     participants, and whom the world waits for
            ├─ run_clock                   simulated time and its requests

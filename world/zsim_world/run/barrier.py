@@ -19,48 +19,37 @@ from zsim_world.run_state import Saved
 
 @dataclass
 class Participant:
-    """One process that has joined, by its newest incarnation.
-
-    Attributes:
-        join: as published.
-        from_ns: first gate that it is waited for.
-        done_ns: newest gate that it has completed.
-        surplus: outputs that have arrived since its last done.
-        missing: outputs counted in its dones that have not arrived.
-        done_seq: number of its newest done, None before the first of its process.
-        lost_done: whether a done was lost, and with it the count of the outputs before it.
-        was_incomplete: whether outputs were missing at the last gate, in realtime.
-        rejoined: whether another incarnation of its name was there before.
-        repeats: whether it may publish again what was counted before.
-        successor: whether it has replaced another process that was alive.
-        since_wall_ns: when it last joined, sent a done or died.
-        joined_wall_ns: when this incarnation joined.
-        deadline_misses: dones that were late in realtime.
-        away: whether it has yet to come back to a world that was started again.
-        silent_wall_ns: when its last health came, if it has fallen silent since.
-        farewell: its bye, if that names no incarnation and so may be somebody else's; it counts when the token is lost,
-            and is taken back by the next done.
-    """
+    """One process that has joined, by its newest incarnation."""
 
     name: str
     join: Join
-    from_ns: int
-    done_ns: int = -1
-    surplus: int = 0
-    missing: int = 0
-    done_seq: int | None = None
-    lost_done: bool = False
-    was_incomplete: bool = False
-    rejoined: bool = False
-    repeats: bool = False
-    successor: bool = False
+    from_ns: int  # first gate that it is waited for
+    done_ns: int = -1  # newest gate that it has completed
+    surplus: int = 0  # outputs that have arrived since its last done
+    missing: int = 0  # outputs counted in its dones that have not arrived
+    done_seq: int | None = None  # number of its newest done, None before the first of its process
+    lost_done: bool = False  # and with it the count of the outputs before it
+    was_incomplete: bool = False  # outputs were missing at the last gate, in realtime
+    rejoined: bool = False  # another incarnation of its name was there before
+    repeats: bool = False  # it may publish again what was counted before
+    successor: bool = False  # it has replaced another process that was alive
     alive: bool = True
-    since_wall_ns: int = 0
-    joined_wall_ns: int = 0
-    deadline_misses: int = 0
-    away: bool = False
-    silent_wall_ns: int | None = None
+    since_wall_ns: int = 0  # when it last joined, sent a done or died
+    joined_wall_ns: int = 0  # when this incarnation joined
+    deadline_misses: int = 0  # dones that were late in realtime
+    away: bool = False  # it has yet to come back to a world that was started again
+    silent_wall_ns: int | None = None  # when its last health came, if it has fallen silent since
+    # its bye, if that names no incarnation and so may be somebody else's; it counts when the token is lost, and is
+    # taken back by the next done
     farewell: Bye | None = None
+
+    def __str__(self) -> str:
+        return f"{self.name} on {self.join.host} (pid {self.join.pid})"
+
+    @property
+    def place(self) -> dict[str, Any]:
+        """Return where it runs, for the data of an event."""
+        return {"host": self.join.host, "pid": self.join.pid}
 
     @property
     def is_missed(self) -> bool:
@@ -82,7 +71,6 @@ class Participant:
 
     @property
     def served_names(self) -> set[str]:
-        """Return the names of the processes whose work it does, including its own."""
         return {self.name, *self.join.serves}
 
     @property
@@ -106,22 +94,6 @@ class Participant:
         required = self.required_ns(need_ns)
         return required is not None and (self.done_ns < required or self.missing > 0 or self.lost_done)
 
-    def note_done(self, message: Done) -> None:
-        """Compare the number of a done and its count of outputs with what has arrived.
-
-        A gap in the numbers shows that a done was lost. More outputs than it counts belong to the next done.
-        """
-        if self.gating and self.done_seq is not None and message.seq > self.done_seq + 1:
-            self.lost_done = True
-        self.done_seq = message.seq if self.done_seq is None else max(message.seq, self.done_seq)
-        balance = self.surplus - self.missing - message.sent
-        self.surplus, self.missing = max(0, balance), max(0, -balance)
-
-    def note_refused_done(self, seq: int) -> None:
-        """Note the number of a refused done, if it is the next of the same process: it was not lost."""
-        if self.done_seq is not None and seq == self.done_seq + 1:
-            self.done_seq = seq
-
     def reset_counts(self) -> int:
         """Restart the counts once outputs were requested again; return how many are missing for good.
 
@@ -132,25 +104,10 @@ class Participant:
         self.missing, self.surplus, self.lost_done, self.repeats = 0, 0, False, False
         return missing
 
-    def waiting(self, wall_ns: int, held_by: tuple[str, ...] = ()) -> Waiting:
-        """Return the entry of `clock` that names it as waited for."""
-        return Waiting(self.name, self.join.host, (wall_ns - self.since_wall_ns) / 1e9, held_by)
-
-    def missed(self, wall_ns: int) -> Waiting:
-        """Return the entry of `clock` that names it as dead or silent, in realtime, where nobody is waited for."""
-        since_ns = self.since_wall_ns if not self.alive or self.silent_wall_ns is None else self.silent_wall_ns
-        return Waiting(self.name, self.join.host, (wall_ns - since_ns) / 1e9)
-
-    def entry(self) -> dict[str, Any]:
-        """Return the data of the event of its join."""
-        entry: dict[str, Any] = {
-            "incarnation": self.join.incarnation,
-            "host": self.join.host,
-            "pid": self.join.pid,
-            "from_ns": self.from_ns,
-            "done_ns": self.done_ns,
-        }
-        return {**entry, "serves": self.join.serves} if self.join.serves else entry
+    def waiting(self, wall_ns: int, held_by: tuple[str, ...] = (), since_ns: int | None = None) -> Waiting:
+        """Return the entry of `clock` that names it, as waited for since its last sign or since `since_ns`."""
+        since_ns = self.since_wall_ns if since_ns is None else since_ns
+        return Waiting(self.name, self.join.host, (wall_ns - since_ns) / 1e9, held_by)
 
 
 class Barrier:
@@ -171,9 +128,10 @@ class Barrier:
         self.participants: dict[str, Participant] = {}
 
     def expect(self, name: str) -> None:
-        """Wait for another process at the start."""
         if name not in self._expected:
             self._expected.append(name)
+
+    # Joins
 
     def join(self, name: str, message: Join, next_gate_ns: int, wall_ns: int) -> Refusal | None:
         """Admit a participant; return why it is refused.
@@ -181,8 +139,7 @@ class Barrier:
         The new incarnation of a known name continues from its progress; so does a participant that does all the work of
         others that are dead, and replaces them. The same join again changes nothing.
         """
-        refusal = self._join_refusal(name, message)
-        if refusal:
+        if refusal := self.join_refusal(name, message):
             return refusal
         former = self.participants.get(name)
         if former is not None and former.alive and former.join.incarnation == message.incarnation:
@@ -209,21 +166,18 @@ class Barrier:
 
     def takes_place(self, name: str, message: Join) -> bool:
         """Tell whether a join would replace another process."""
-        if not self.accepts(name, message):
+        if self.join_refusal(name, message):
             return False
         former = self.participants.get(name)
         return (former is not None and not former.is_process_of(message)) or bool(self.replaced(name, message))
-
-    def accepts(self, name: str, message: Join) -> bool:
-        """Tell whether a join fits the run."""
-        return self._join_refusal(name, message) is None
 
     def replaced(self, name: str, message: Join) -> list[Participant]:
         """Return the dead whose work a newcomer of another name is to do."""
         served = {name, *message.serves}
         return [p for p in self.participants.values() if not p.alive and p.name != name and p.served_names <= served]
 
-    def _join_refusal(self, name: str, message: Join) -> Refusal | None:
+    def join_refusal(self, name: str, message: Join) -> Refusal | None:
+        """Return why a join does not fit the run."""
         if name == WORLD or not keys.PROCESS_NAME.fullmatch(name):
             return Refusal("name", repr(name[:60]), f"must be a role, a dot and a name of a-z 0-9 _ . -, not {WORLD!r}")
         if message.run_id != self._run_id:
@@ -235,15 +189,22 @@ class Barrier:
     def _run_id_refusal(self, run_id: str) -> Refusal:
         return Refusal("run_id", repr(run_id[:40]), f"must be {self._run_id!r} (read world/info)")
 
+    # Dones, outputs and byes
+
     def done(self, name: str, message: Done, now_ns: int, wall_ns: int) -> Refusal | None:
-        """Note that a participant has completed the gate `done_ns`; return why the done is refused."""
+        """Note that a participant has completed the gate `done_ns`; return why the done is refused.
+
+        A gap in the numbers of its dones shows that one was lost. More outputs than a done counts belong to the next.
+        """
         participant = self.participants.get(name)
         if participant is None:
             return Refusal("join", "missing", f"must publish process/{name}/join first")
         if message.run_id != self._run_id:
             return self._run_id_refusal(message.run_id)
+        former = participant.done_seq
         if message.incarnation != participant.join.incarnation:
-            participant.note_refused_done(message.seq)
+            if former is not None and message.seq == former + 1:  # refused, it was not lost
+                participant.done_seq = message.seq
             return _incarnation_refusal(participant, str(message.incarnation))
         if message.done_ns > now_ns:
             return Refusal("done_ns", str(message.done_ns), f"must be <= {now_ns}, the newest gate")
@@ -251,8 +212,32 @@ class Barrier:
         if message.done_ns > participant.done_ns:
             participant.done_ns = message.done_ns
             participant.since_wall_ns = wall_ns
-        participant.note_done(message)
+        if participant.gating and former is not None and message.seq > former + 1:
+            participant.lost_done = True
+        participant.done_seq = message.seq if former is None else max(message.seq, former)
+        balance = participant.surplus - participant.missing - message.sent
+        participant.surplus, participant.missing = max(0, balance), max(0, -balance)
         return None
+
+    def count_output(self, name: str) -> None:
+        """Count one output of a participant that has arrived."""
+        participant = self.participants.get(name)
+        if participant is None:
+            return
+        if participant.missing:
+            participant.missing -= 1
+        else:
+            participant.surplus += 1
+
+    def give_up_late(self) -> None:
+        """At a gate in realtime, give up outputs that were missing at the gate before: they are lost.
+
+        They are not requested again, and every later gate would count as a deadline miss of their sender.
+        """
+        for participant in self.participants.values():
+            if participant.incomplete and participant.was_incomplete:
+                participant.reset_counts()
+            participant.was_incomplete = participant.incomplete
 
     def bye_refusal(self, participant: Participant, message: Bye) -> Refusal | None:
         """Return the refusal of a bye that names another run or incarnation."""
@@ -269,33 +254,22 @@ class Barrier:
 
     def take_back_bye(self, name: str) -> Refusal | None:
         """Drop the bye of a participant that goes on: it was somebody else's; return its refusal."""
-        participant = self.participants.get(name)
-        if participant is None or participant.farewell is None:
+        participant = self.participants[name]
+        if participant.farewell is None:
             return None
         participant.farewell = None
         return _incarnation_refusal(participant, "missing")
 
-    def count_output(self, name: str) -> None:
-        """Count one output of a participant that has arrived."""
-        participant = self.participants.get(name)
-        if participant is None:
-            return
-        if participant.missing:
-            participant.missing -= 1
-        else:
-            participant.surplus += 1
+    def remove(self, name: str) -> None:
+        """Remove a participant that has said bye or is dropped; it is not expected any more."""
+        removed = self.participants.pop(name, None)
+        gone = (name, *(removed.join.serves if removed else ()))
+        self._expected = [expected for expected in self._expected if expected not in gone]
 
-    def is_gating(self, name: str) -> bool:
-        """Tell whether a process gates, even one that seems dead: its outputs may arrive before it rejoins."""
-        participant = self.participants.get(name)
-        return participant is not None and participant.gating
-
-    def awaited(self) -> list[Participant]:
-        """Return the participants that must not lose any message; callable from any thread."""
-        return [p for p in list(self.participants.values()) if p.is_waited_for]
+    # Losses
 
     def mark_dead(self, name: str, wall_ns: int) -> Participant | None:
-        """Mark a participant as dead; it stays until it is removed or rejoins."""
+        """Mark a participant as dead, once; it stays until it is removed or rejoins."""
         participant = self.participants.get(name)
         if participant is None or not participant.alive:
             return None
@@ -310,13 +284,12 @@ class Barrier:
             participant.alive = participant.alive and not all_died
             participant.away = participant.is_waited_for and (participant.alive or all_died)
 
-    def away(self) -> list[Participant]:
-        """Return the participants that have not come back yet."""
-        return [p for p in self.participants.values() if p.away]
+    # Who is there, and who is waited for
 
-    def waiting_for_return(self, wall_ns: int) -> tuple[Waiting, ...]:
-        """Return the same as entries of `clock`."""
-        return tuple(participant.waiting(wall_ns) for participant in self.away())
+    def is_gating(self, name: str) -> bool:
+        """Tell whether a process gates, even one that seems dead: its outputs may arrive before it rejoins."""
+        participant = self.participants.get(name)
+        return participant is not None and participant.gating
 
     def substitute(self, name: str) -> Participant | None:
         """Return a living participant that does all the work of another as well, None if there is none."""
@@ -330,17 +303,14 @@ class Barrier:
         others = (p for p in self.participants.values() if p.name != name and p.alive)
         return {p.name: both for p in others if (both := served & p.served_names)}
 
-    def remove(self, name: str) -> Participant | None:
-        """Remove a participant that has said bye or is dropped."""
-        removed = self.participants.pop(name, None)
-        gone = (name, *(removed.join.serves if removed else ()))
-        self._expected = [expected for expected in self._expected if expected not in gone]
-        return removed
-
     def absent(self) -> list[str]:
         """Return the expected names that have not joined yet."""
         present = {name for p in self.participants.values() for name in p.served_names}
         return [name for name in self._expected if name not in present]
+
+    def away(self) -> list[Participant]:
+        """Return the participants that have not come back to a world that was started again."""
+        return [p for p in self.participants.values() if p.away]
 
     def blocking(self, need_ns: int) -> list[Participant]:
         """Return the participants whose done for `need_ns` has not arrived."""
@@ -350,18 +320,8 @@ class Barrier:
         """Return the participants whose outputs or done were lost, or are still on their way."""
         return [p for p in self.participants.values() if p.incomplete]
 
-    def give_up_late(self) -> None:
-        """At a gate in realtime, give up outputs that were missing at the gate before: they are lost.
-
-        They are not requested again, and every later gate would count as a deadline miss of their sender.
-        """
-        for participant in self.participants.values():
-            if participant.incomplete and participant.was_incomplete:
-                participant.reset_counts()
-            participant.was_incomplete = participant.incomplete
-
     def waiting_for(
-        self, need_ns: int, wall_ns: int, start_wall_ns: int, feeds: Callable[[str, str], bool] = lambda *_: False
+        self, need_ns: int, wall_ns: int, start_wall_ns: int, feeds: Callable[[str, str], bool]
     ) -> tuple[Waiting, ...]:
         """Return whom the world waits for, as entries of `clock`: first the dead, then by time without a done.
 

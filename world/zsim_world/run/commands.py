@@ -18,8 +18,8 @@ from zsim.contract.run_messages import PRIORITY_MAX, ControlRequest, Fault
 from zsim.runtime.link_faults import NEVER, RADIO, WORLD, distance_between, joins, place_of, total_delay_ns
 from zsim_world.fleet.external_drones import ExternalDrones
 from zsim_world.fleet.fleet import Fleet
+from zsim_world.run.coordinator import Coordinator
 from zsim_world.run.outbox import Refusal, too_many
-from zsim_world.run.participants import Participants
 from zsim_world.run.run_clock import Operation, number, refused_argument
 from zsim_world.run_state import Saved
 
@@ -34,8 +34,7 @@ class CommandIntake:
 
     Args:
         run: whose participants send commands.
-        fleet: the drones.
-        drivers: of the external ones among them.
+        drivers: of the external drones of the fleet.
         faults_at: returns the faults of links and radios that act in a gate.
 
     Attributes:
@@ -43,7 +42,7 @@ class CommandIntake:
     """
 
     def __init__(
-        self, run: Participants, fleet: Fleet, drivers: ExternalDrones, faults_at: Callable[[int], Sequence[Fault]]
+        self, run: Coordinator, fleet: Fleet, drivers: ExternalDrones, faults_at: Callable[[int], Sequence[Fault]]
     ) -> None:
         self._scenario, self._clock, self._barrier, self._outbox = run.scenario, run.clock, run.barrier, run.outbox
         self._budgets = run.budgets
@@ -60,16 +59,13 @@ class CommandIntake:
         gating = self._barrier.is_gating(source)  # its name was checked when it joined
         if not gating and not keys.PROCESS_NAME.fullmatch(source):
             refusal = Refusal("source", repr(source[:48]), "must be 1 to 48 of a-z 0-9 _ . -")
-            self._outbox.refuse("somebody", f"drone/{drone[:40]}/cmd/{kind}", refusal)
-            return True
+            return self._refuse("somebody", drone, kind, refusal)
         index = self._index.get(drone)
         if index is None:
             refusal = Refusal("drone", repr(drone[:40]), "must be one of `drones` in world/info")
-        else:
-            refusal = self._stamp_refusal(message, gating)
-        if index is None or refusal:
-            self._outbox.refuse(source, f"drone/{drone[:40]}/cmd/{kind}", refusal or "")
-            return True
+            return self._refuse(source, drone, kind, refusal)
+        if refusal := self._stamp_refusal(message, gating):
+            return self._refuse(source, drone, kind, refusal)
         gate_ns = message.t_ns if gating else self._clock.next_ns
         late_ns = self._link_delay_ns(drone, kind, message, gate_ns)
         if late_ns is None:
@@ -80,8 +76,7 @@ class CommandIntake:
         apply_ns = gate_ns + delay_ns + late_ns
         if not gating:  # a rerun needs the event: without it the command is not carried out
             if not self._budgets.spend(source, f"drone/{drone}/cmd/", source in self._barrier.participants):
-                self._outbox.refuse(source, f"drone/{drone}/cmd/{kind}", too_many(source))
-                return True
+                return self._refuse(source, drone, kind, too_many(source))
             fields = {name: getattr(message, name) for name in messages.fields(type(message))}
             data = {"command": kind, "apply_t_ns": apply_ns, "message": fields}
             self._outbox.event("command", drone, f"{source} sends {kind} to {drone}", data, source)
@@ -90,6 +85,10 @@ class CommandIntake:
             for command in self.queue.pop(self._clock.now_ns, self._drivers):
                 self._carry_out(command, self._clock.next_ns)
         return is_new
+
+    def _refuse(self, source: str, drone: str, kind: str, refusal: Refusal) -> bool:
+        self._outbox.refuse(source, f"drone/{drone[:40]}/cmd/{kind}", refusal)
+        return True
 
     def _stamp_refusal(self, message: Any, gating: bool) -> Refusal | None:
         now_ns = self._clock.now_ns
@@ -102,12 +101,9 @@ class CommandIntake:
         return None
 
     def _link_delay_ns(self, drone: str, kind: str, message: Any, gate_ns: int) -> int | None:
-        """Return the delay of a command by faults of its link [ns], in whole gates; None if the link loses it.
+        """Return the delay of a command by faults of its link, in whole gates; None if the link loses it.
 
-        The world is the receiver of this link.
-
-        Args:
-            gate_ns: the gate that it belongs to.
+        The world is the receiver of this link; gate_ns is the gate that the command belongs to.
         """
         acting = self._faults_at(gate_ns)
         if not acting:
@@ -119,11 +115,11 @@ class CommandIntake:
 
     def _is_lost_by_radio(self, drone: str, command: QueuedCommand, gate_ns: int) -> bool:
         """Tell whether the radio loses a command that would take effect before a gate."""
-        faults = self._faults_at(gate_ns)
-        if not faults:
+        acting = self._faults_at(gate_ns)
+        if not acting:
             return False
         targets = (WORLD, self._cluster_of.get(drone))
-        radios = [fault for fault in faults if fault.kind == RADIO and fault.target in targets]
+        radios = [fault for fault in acting if fault.kind == RADIO and fault.target in targets]
         if not radios:
             return False
         key, sender = keys.command(drone, command.kind), self._sender(drone, command.source)
@@ -144,6 +140,8 @@ class CommandIntake:
         """Return the true position of a drone [m; W], None for an unknown one."""
         i = self._index.get(drone)
         return self._fleet.bodies.state[i, :3].tolist() if i is not None else None
+
+    # At their instants
 
     def apply(self, t_ns: int) -> None:
         """Pass the commands that take effect at t_ns to the firmware."""
@@ -219,57 +217,50 @@ class CommandIntake:
 
     def operations(self) -> dict[str, Operation]:
         """Return what each `op` on `world/control` that is about commanders does."""
-        return {"acquire": self._acquire, "release": self._release, "mission": self._report_mission}
+        return dict.fromkeys(("acquire", "release", "mission"), self._operate)
 
-    def _acquire(self, request: ControlRequest) -> Refusal | None:
-        index, priority = self._requested(request), number(request.args.get("priority", 0))
+    def _operate(self, request: ControlRequest) -> Refusal | None:
+        name, priority = request.args.get("drone"), number(request.args.get("priority", 0))
+        index = self._index.get(name) if isinstance(name, str) else None
         if index is None:
             return refused_argument(request, "drone", f"one of {', '.join(self._index)}")
+        if request.op == "mission":
+            return self._report_mission(request, self._fleet.names[index])
+        if request.op == "release":
+            refusal = self.queue.release(index, request.source)
+            if refusal is None:
+                self._release_drone(index)
+            return refusal
         if priority is None or not 0 <= priority <= PRIORITY_MAX:
             return refused_argument(request, "priority", f"from 0 to {PRIORITY_MAX}")
         if not request.source:
             return Refusal("source", "empty", "must be the name under which the commands will come")
         return self.queue.acquire(index, request.source, int(priority))
 
-    def _release(self, request: ControlRequest) -> Refusal | None:
-        index = self._requested(request)
-        if index is None:
-            return refused_argument(request, "drone", f"one of {', '.join(self._index)}")
-        refusal = self.queue.release(index, request.source)
-        if refusal is None:
-            self._release_drone(index)
-        return refusal
-
-    def _report_mission(self, request: ControlRequest) -> Refusal | None:
+    def _report_mission(self, request: ControlRequest, drone: str) -> Refusal | None:
         """Publish how far the commander of a drone has flown its mission."""
-        args, index = request.args, self._requested(request)
-        if index is None:
-            return refused_argument(request, "drone", f"one of {', '.join(self._index)}")
+        args = request.args
         if args.get("state") not in MISSION_STATES:
             return refused_argument(request, "state", f"one of {', '.join(MISSION_STATES)}")
         for name in ("items", "done"):
             if type(args.get(name)) is not int or not 0 <= args[name] <= MISSION_ITEMS_MAX:
                 return refused_argument(request, name, f"a whole number from 0 to {MISSION_ITEMS_MAX}")
-        drone, reason = self._fleet.names[index], str(args.get("reason", ""))[:MISSION_REASON_MAX]
+        reason = str(args.get("reason", ""))[:MISSION_REASON_MAX]
         data = {name: args[name] for name in ("state", "items", "done")}
         data |= {"reason": reason, "failsafe": args.get("failsafe") is True}
         text = f"{drone}: mission {data['state']}, {data['done']} of {data['items']} items flown"
         self._outbox.notice("mission", drone, f"{text}: {reason}" if reason else text, data, request.source)
         return None
 
-    def _requested(self, request: ControlRequest) -> int | None:
-        name = request.args.get("drone")
-        return self._index.get(name) if isinstance(name, str) else None
-
 
 class QueuedCommand(NamedTuple):
-    """A command that takes effect at `apply_ns`."""
+    """A command that takes effect at `apply_ns`; commands are sorted by all fields but the message."""
 
     apply_ns: int
     priority: int
     source: str
     seq: int
-    drone: int
+    drone: int  # drone and kind stand last only to make the order independent of arrival
     kind: str
     message: Any
 
@@ -282,11 +273,7 @@ class Commander(NamedTuple):
 
 
 class CommandQueue:
-    """Commands that are yet to take effect, and the commander of each drone.
-
-    Args:
-        drones: names in scenario order.
-    """
+    """Commands that are yet to take effect, and the commander of each of the named drones."""
 
     SAVED: ClassVar[Saved] = {
         "_commanders": list[Commander | None],
@@ -301,13 +288,6 @@ class CommandQueue:
         self._priorities: dict[tuple[int, str], int] = {}
         self._queued: dict[int, list[QueuedCommand]] = {}  # by the instant at which they take effect
         self._recent: dict[tuple[int, str, int, str, int], Any] = {}  # messages by those fields that compare quickly
-
-    def commanders(self) -> list[str | None]:
-        """Return the name of each drone's commander."""
-        return [commander.source if commander else None for commander in self._commanders]
-
-    def _decoded(self, drone: int, kind: str, payload: bytes) -> Any:
-        return messages.decode(keys.command(self._names[drone], kind), payload)
 
     def restored(self) -> None:
         """Convert the messages, which the state holds as maps, to their types."""
@@ -329,13 +309,7 @@ class CommandQueue:
         return True
 
     def pop(self, t_ns: int, drones: Container[int] | None = None) -> list[QueuedCommand]:
-        """Return the commands that take effect up to t_ns, in the order in which they do.
-
-        Drone and kind stand last in the order only to make it independent of arrival.
-
-        Args:
-            drones: whose commands; None: of all.
-        """
+        """Return the commands that take effect up to t_ns, of all drones or of some, in the order in which they do."""
         instants = sorted([instant for instant in self._queued if instant <= t_ns])
         due = [command for instant in instants for command in sorted(self._queued.pop(instant), key=_order)]
         if drones is None:
@@ -344,6 +318,10 @@ class CommandQueue:
             if command.drone not in drones:
                 self._queued.setdefault(command.apply_ns, []).append(command)
         return [command for command in due if command.drone in drones]
+
+    def commanders(self) -> list[str | None]:
+        """Return the name of each drone's commander."""
+        return [commander.source if commander else None for commander in self._commanders]
 
     def refusal(self, command: QueuedCommand) -> Refusal | None:
         """Return why the source may not command the drone now, None if it may."""
@@ -381,8 +359,7 @@ class CommandQueue:
             return Refusal(self._names[drone], state, "only its commander can release it")
         self._commanders[drone] = None
         self._priorities.pop((drone, source), None)
-        # A setpoint that is still queued would make the source the commander again.
-        self._drop_setpoints(lambda command: (command.drone, command.source) == (drone, source))
+        self._drop_setpoints(source, [drone])  # one that is still queued would make the source the commander again
         return None
 
     def remove_source(self, source: str) -> list[int]:
@@ -392,13 +369,14 @@ class CommandQueue:
             self._commanders[drone] = None
         for drone in range(len(self._names)):
             self._priorities.pop((drone, source), None)
-        self._drop_setpoints(lambda command: command.source == source)
+        self._drop_setpoints(source, range(len(self._names)))
         return drones
 
-    def _drop_setpoints(self, unwanted: Callable[[QueuedCommand], bool]) -> None:
-        """Remove queued setpoints; a mode that was requested is still entered."""
+    def _drop_setpoints(self, source: str, drones: Container[int]) -> None:
+        """Remove the queued setpoints of a source; a mode that was requested is still entered."""
         for instant, queued in self._queued.items():
-            self._queued[instant] = [each for each in queued if each.kind == "mode" or not unwanted(each)]
+            kept = [c for c in queued if c.kind == "mode" or c.source != source or c.drone not in drones]
+            self._queued[instant] = kept
 
 
 def _command(kind: str, fields: Any) -> Any:

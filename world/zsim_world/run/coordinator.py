@@ -1,38 +1,89 @@
-"""What a flight (World) and a replay (Playback) have in common: what arrives, what is asked for, what time waits for.
+"""What a flight (World) and a replay (Playback) have in common: participants, requests, and what time waits for.
 
-No session, no clock: a runner passes on what arrives, asks whether it may go on (`may_advance`), lets it go on
-(`advance`), and publishes its outbox. Wall times are passed in.
+How processes join, report, leave and get lost, and what each means for the run. No session, no clock: a runner passes
+on what arrives, asks whether it may go on (`may_advance`), lets it go on (`advance`), and publishes its outbox. Wall
+times are passed in, monotonic.
 """
 
+import math
+import uuid
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
+from msgspec import UNSET
 
 from zsim.contract import keys, messages, run_messages
-from zsim.contract.run_messages import ControlAnswer, ControlRequest
+from zsim.contract.fingerprint import fingerprint
+from zsim.contract.run_messages import Bye, ControlAnswer, ControlRequest, Join, Waiting
+from zsim.errors import RunError, RunFailedError
 from zsim.runtime.agent import Output
-from zsim.scenario.roles import WORLD
-from zsim_world.run.barrier import Participant
-from zsim_world.run.outbox import KeyedMessage, Refusal, too_many
-from zsim_world.run.participants import Participants
-from zsim_world.run.run_clock import number
+from zsim.scenario import roles
+from zsim.scenario.roles import ROLES, WORLD, OnDeath, agent_names, lets_drop
+from zsim.scenario.scenario import Scenario
+from zsim_world.run.barrier import Barrier, Participant
+from zsim_world.run.outbox import STRANGERS_MAX, Budgets, KeyedMessage, Refusal, RunOutbox, too_many
+from zsim_world.run.run_clock import Operation, RunClock, number
+from zsim_world.run.run_statistics import RunStatistics
 
+RECORDER = "recorder"  # name and role
+START_TIMEOUT_S = 60.0  # wall; chosen, for processes that a launched run expects and does not start itself
+START_TIMEOUT_OWN_S = 600.0  # wall; chosen, for those that its launcher starts: the first start may compile for minutes
 FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # that change a flight
 ARGS_BYTES_MAX = 4000  # of arguments that an event repeats as they are; any operation needs far fewer
 
 
-class Coordinator(Participants, ABC):
+class Coordinator(ABC):
     """One run, as its participants see it.
 
+    Args:
+        rate: simulated per wall seconds to pace at; 0 = as fast as possible.
+        run_id: given by a launcher, and by tests that compare records.
+        expected: names of the processes without which the run does not start.
+
     Attributes:
+        needs_participants: whether it matters to the run who leaves or dies; not to a replay.
         refused_queries: keys beside `world/control` on which requests are answered, all with a refusal.
         external: names of the drones of which drivers publish sensors, truth and status.
+        unpaced: names of the processes that step when a driver publishes, and not at every gate.
+        is_launched: whether a launcher has started it and its processes, and not people one after the other.
+        failure: what is to be raised once the end is published, None for a run that ended well.
+        left_early: a line for each process that the run needed and that left it before the end.
+        requests: on `world/control`, all of them counted.
     """
 
+    needs_participants = True
     refused_queries: tuple[str, ...] = ()
     external: frozenset[str] = frozenset()
+    unpaced: frozenset[str] = frozenset()
+    is_launched = False
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        mode: str,
+        rate: float,
+        wall_ns: Callable[[], int],
+        run_id: str | None,
+        expected: list[str],
+    ) -> None:
+        self.scenario = scenario
+        self.run_id = run_id or uuid.uuid4().hex[:12]
+        self.clock = RunClock(scenario.time, mode, rate)
+        self.outbox = RunOutbox(lambda: self.clock.now_ns)
+        self.budgets = Budgets(lambda: self.clock.now_ns, self.clock.gate_ns)
+        self.barrier = Barrier(self.run_id, self.clock.gate_ns, expected)
+        self.statistics = RunStatistics()
+        self.failure: RunError | None = None
+        self.left_early: list[str] = []
+        self.start_wall_ns = wall_ns()
+        self.names = [drone.name for drone in scenario.drones]
+        self.requests = 0
+        self._operations: dict[str, Operation] = self.clock.operations()
+        self._data_flow = DataFlow(scenario)
+        self._expected = expected
+        self._agent_names = agent_names(scenario)
 
     @abstractmethod
     def info(self) -> messages.Info:
@@ -56,6 +107,14 @@ class Coordinator(Participants, ABC):
 
     def take_of_driver(self, drone: str, message: Any) -> str | None:
         """Take a message of an external drone's driver; return why it is refused. A replay has no drivers."""
+        return None
+
+    def release_drones(self, name: str) -> None:  # noqa: B027 - a replay has none
+        """Release the drones commanded by a process that is gone."""
+
+    def refusal_at(self, key: str) -> str | None:
+        """Return why requests on one of `refused_queries` are refused; None where another process answers there."""
+        return f"{key}: is not answered here"
 
     @property
     def now_ns(self) -> int:
@@ -67,7 +126,13 @@ class Coordinator(Participants, ABC):
         """Return why the run is over, None while it goes on."""
         return self.clock.ended
 
-    # What arrives
+    def fail(self, reason: str) -> None:
+        """End the run before its time."""
+        if self.clock.ended is None:
+            self.failure = RunFailedError(reason)
+        self.clock.stop(reason)
+
+    # What participants publish
 
     def handle(self, key: str, message: Any, wall_ns: int) -> None:
         """Take one message that a participant or anyone else published."""
@@ -77,15 +142,271 @@ class Coordinator(Participants, ABC):
             if self._handle_command(name, what[4:], message):
                 self.statistics.ages.command(message.t_ns, wall_ns)
         elif kind == "process" and what == "done":
-            self.handle_done(name, message, wall_ns)
+            if refusal := self.barrier.done(name, message, self.clock.now_ns, wall_ns):
+                self.outbox.refuse(name, key, refusal)
+            elif refusal := self.barrier.take_back_bye(name):
+                self.outbox.refuse(name, keys.process(name, "bye"), refusal)
         elif kind == "process" and what == "join":
-            self.handle_join(name, message, wall_ns)
+            self.join(name, message, wall_ns)
         elif kind == "process" and what == "bye":
-            self.handle_bye(name, message, wall_ns)
+            self._take_bye(name, message, wall_ns)
 
     def count_output(self, source: str) -> None:
         """Count an output (estimate, cluster state) of a participant."""
         self.barrier.count_output(source)
+
+    def give_up_outputs(self, name: str) -> None:
+        """Stop waiting for the outputs of a participant that are lost."""
+        missing = self.barrier.participants[name].reset_counts()
+        if missing:
+            text = f"{name}: {missing} of its outputs did not come"
+            self.outbox.notice("outputs_missing", name, text, {"missing": missing})
+
+    def join(self, name: str, message: Join, wall_ns: int) -> None:
+        """Take a process in, or refuse it; one that blocks the clock may join however often it has."""
+        barrier, outbox, counted = self.barrier, self.outbox, f"process/{name}"
+        changes, strangers = self.budgets.changes, self.budgets.strangers
+        former, replaced = barrier.participants.get(name), barrier.replaced(name, message)
+        is_known = former is not None or changes.knows(counted)
+        is_known = is_known or name in (RECORDER, *self._expected, *self._agent_names)
+        if former is None:
+            blocks = self.clock.state == "waiting" and name in self._expected
+        else:
+            blocks = former.is_waited_for and former.is_missed
+        if not is_known and not strangers.allows("join"):
+            refusal = Refusal("newcomers", f"beyond {STRANGERS_MAX} at once", "must wait: one may join each second")
+        elif not blocks and not changes.allows(counted):
+            refusal = too_many(name)
+        else:
+            refusal = barrier.join(name, message, self.clock.next_ns, wall_ns)
+        if refusal:
+            outbox.refuse(name, keys.process(name, "join"), refusal)
+            return
+        changes.spend(counted)
+        if not is_known:
+            strangers.spend("join")
+        joined, kind = barrier.participants[name], "join"
+        data = {"incarnation": joined.join.incarnation, **joined.place}
+        data |= {"from_ns": joined.from_ns, "done_ns": joined.done_ns}
+        if joined.join.serves:
+            data["serves"] = joined.join.serves
+        if former is not None and former.join.incarnation != message.incarnation:
+            kind, data["former_pid"] = "superseded" if former.alive else "restart", former.join.pid
+        outbox.event(kind, name, str(joined), data, name)
+        for dead in replaced:
+            self.release_drones(dead.name)
+        found, own = joined.join.fingerprint, fingerprint()
+        if found and found != own:
+            who = f"{name} on {joined.join.host}"
+            text = f"{who} computes with another numeric fingerprint; the same bits are not promised"
+            outbox.event("fingerprint", name, text, {"found": found, "expected": own})
+        for other, both in barrier.duplicates(name).items():
+            text = f"{name} and {other} both do the work of {', '.join(sorted(both))}; end one of them"
+            outbox.event("doubled", name, text, {"other": other})
+
+    def _take_bye(self, name: str, message: Bye, wall_ns: int) -> None:
+        """Let a participant go; a bye without incarnation counts once its token is lost as well."""
+        participant = self.barrier.participants.get(name)
+        if participant is None:
+            return
+        if refusal := self.barrier.bye_refusal(participant, message):
+            self.outbox.refuse(name, keys.process(name, "bye"), refusal)
+            return
+        is_named = UNSET not in (message.run_id, message.incarnation)
+        if is_named or not participant.alive or self.clock.ended is not None:
+            self._leave(participant, message, wall_ns)
+        else:  # of contract 1.0, or somebody else's
+            participant.farewell = message
+
+    def _leave(self, participant: Participant, bye: Bye, wall_ns: int) -> None:
+        """Remove a participant that has said bye, or that cannot continue.
+
+        The run fails if the scenario needs it and nobody else does its work. A program of somebody's own leaves when it
+        is through; the leave of a recorder ends the run.
+        """
+        name, role, barrier = participant.name, participant.join.role, self.barrier
+        if bye.failed is True and self.clock.ended is None:
+            self._cannot_continue(participant, bye.reason, wall_ns)
+            return
+        fails = (
+            self.needs_participants
+            and self.clock.ended is None
+            and self.clock.state != "waiting"
+            and role != RECORDER
+            and not participant.served_names.isdisjoint(self._agent_names)
+            and not lets_drop(self.scenario.processes.on_death, name)
+            and barrier.substitute(name) is None
+        )
+        text = f"{name} left: {bye.reason}"
+        data = {"reason": bye.reason, "run_id": self.run_id, "incarnation": participant.join.incarnation}
+        if fails:
+            text += "; a run that goes on without it fails, unless processes.on_death has drop for it"
+            self.left_early.append(f"{name} left at {self.clock.now_ns / 1e9:.2f} s, before the end: {bye.reason}")
+        self.outbox.event("leave", name, text, {**data, "fails": True} if fails else data, name)
+        barrier.remove(name)
+        self.release_drones(name)
+        self._expect_again(participant)
+        if role == RECORDER and self.needs_participants:
+            self.clock.stop(f"the recorder left: {bye.reason}")
+
+    def _cannot_continue(self, participant: Participant, reason: str, wall_ns: int) -> None:
+        """Handle the leave of a process that failed; started again, it would fail again."""
+        name, action = participant.name, self._on_death(participant)
+        action = "end" if action == "restart" else action
+        self.outbox.event("failure", name, reason, {**participant.place, "on_death": action}, name)
+        if action == "drop":
+            self._drop(name)
+            return
+        self.release_drones(name)
+        if action == "wait":
+            self.barrier.mark_dead(name, wall_ns)
+        else:
+            self.barrier.remove(name)
+            self.fail(reason)
+
+    def _expect_again(self, participant: Participant) -> None:
+        """Wait at the start again for the processes whose work a lost one was to do."""
+        if self.clock.state == "waiting":
+            for each in self._expected:
+                if each in participant.served_names:
+                    self.barrier.expect(each)
+
+    # Who is lost
+
+    def died(self, name: str, wall_ns: int) -> None:
+        """Handle the loss of a token: its process has died, or left where it has said bye."""
+        if self._has_left(name, wall_ns):
+            return
+        participant = self.barrier.mark_dead(name, wall_ns)
+        if participant is None:
+            return
+        substitute = self.barrier.substitute(name)
+        action = "drop" if substitute else self._on_death(participant)
+        then = f"{substitute.name} does its work" if substitute else f"on_death: {action}"
+        self.outbox.event("death", name, f"{participant} died; {then}", {**participant.place, "on_death": action})
+        if action == "drop":
+            self._drop(name, is_news=substitute is None)
+        elif self.clock.mode == "realtime":
+            self.release_drones(name)
+        if action == "end":
+            self.fail(f"{name} died")
+
+    def _has_left(self, name: str, wall_ns: int) -> bool:
+        """Let a process go whose bye waits for the loss of its token; return whether there is such a bye."""
+        participant = self.barrier.participants.get(name)
+        if participant is None or participant.farewell is None:
+            return False
+        self._leave(participant, participant.farewell, wall_ns)
+        return True
+
+    def _on_death(self, participant: Participant) -> OnDeath:
+        """Return what the death of a participant means."""
+        if not self.needs_participants:
+            return "drop"
+        return roles.on_death(self.scenario.processes.on_death, participant.name, participant.join.role)
+
+    def _may_return(self, participant: Participant) -> bool:
+        """Tell whether the run waits for a process that died."""
+        return self._on_death(participant) in ("restart", "wait")
+
+    def _drop(self, name: str, is_news: bool = True) -> None:
+        """Continue without a process."""
+        self.release_drones(name)
+        self.barrier.remove(name)
+        if is_news:
+            data = {"from_ns": self.clock.now_ns}
+            self.outbox.event("drop", name, f"{name} is waited for no longer", data)
+
+    def overdue(self, wall_ns: int) -> str | None:
+        """Return a process that has had its time to join, or to come back since it is dead or silent; None if none."""
+        if self.clock.state == "waiting":
+            waited_s = (wall_ns - self.start_wall_ns) / 1e9
+            for name in self.barrier.absent():
+                if waited_s > self._start_timeout_s(name):
+                    return name
+        return_s = self.scenario.processes.return_s
+        if return_s is None:
+            return None
+        for participant in self.barrier.participants.values():
+            since_ns = participant.silent_wall_ns if participant.is_waited_for else None
+            if not participant.alive:
+                since_ns = participant.since_wall_ns if self._may_return(participant) else None
+            if since_ns and wall_ns - since_ns > return_s * 1e9:
+                return participant.name
+        return None
+
+    def _start_timeout_s(self, name: str) -> float:
+        """Return how long a run waits at its start for a process that is expected [s, wall]."""
+        asked_s = self.scenario.processes.start_timeout_s
+        if asked_s is not UNSET:
+            return asked_s
+        if not self.is_launched:
+            return math.inf
+        is_started = name in self._agent_names or name.partition(".")[0] in ROLES
+        return START_TIMEOUT_OWN_S if is_started else START_TIMEOUT_S
+
+    def expired(self, name: str) -> None:
+        """End the run for a process that has not come, or not come back, in its time, or continue without it."""
+        processes = self.scenario.processes
+        participant = self.barrier.participants.get(name)
+        if participant is not None:
+            place, action = participant.place, self._on_death(participant)
+            if action not in ("drop", "end"):  # these hold for one that is silent as for one that is dead
+                role, gating = participant.join.role, processes.gating or ()
+                action = roles.on_overdue(processes.on_overdue or {}, name, role, gating)
+            text = f"{name} has not come back within {processes.return_s:g} s"
+        elif name in self.barrier.absent():
+            place, action = {"host": "", "pid": 0}, "drop" if lets_drop(processes.on_overdue or {}, name) else "end"
+            text = f"{name} has not joined within {self._start_timeout_s(name):g} s; see processes.start_timeout_s"
+        else:
+            return
+        self.outbox.event("overdue", name, text, {**place, "on_overdue": action})
+        if action == "drop":
+            self._drop(name)
+        else:
+            self.fail(text)
+
+    def silence_changed(self, name: str, since_wall_ns: int | None) -> None:
+        """Note that a process publishes its health no longer, since its last; or does again (None)."""
+        participant = self.barrier.participants.get(name)
+        if participant is None or not participant.alive:
+            return
+        participant.silent_wall_ns = since_wall_ns
+        if since_wall_ns is None:
+            self.outbox.event("silent_end", name, f"{participant} is back", participant.place)
+        else:
+            text = f"{participant} shows no sign of life; it is stopped, or its host is gone"
+            self.outbox.event("silent", name, text, participant.place)
+
+    def reader_closed(self, text: str, data: dict[str, Any]) -> None:
+        """Report a reader that took nothing, so that its link was closed; nobody waits for it."""
+        if self.budgets.strangers.spend("slow_reader"):
+            self.outbox.event("slow_reader", data["address"], text, data)
+
+    def falsely_joined(self, name: str, join: Join, fault: str) -> None:
+        """Report a withheld join without a process behind it: whoever has that place keeps it.
+
+        It is counted like a refusal, and is an event as long as there have not been too many.
+        """
+        if not self.budgets.strangers.spend("no_show"):
+            self.outbox.refusals.count += 1
+            return
+        data = {"host": join.host, "pid": join.pid, "incarnation": join.incarnation}
+        what = "takes nobody's place" if name in self.barrier.participants else "is not waited for"
+        text = f"{name} on {join.host} (pid {join.pid}) {fault}; its join {what}"
+        self.outbox.event("no_show", name, text, data)
+
+    def not_shown(self, name: str, fault: str, wall_ns: int) -> None:
+        """Undo the join of a participant that has given no sign of being there."""
+        participant = self.barrier.participants.get(name)
+        if participant is None or not participant.alive or self._has_left(name, wall_ns):
+            return
+        self.outbox.event("no_show", name, f"{participant} {fault}", participant.place)
+        if participant.rejoined:
+            self.died(name, wall_ns)
+            return
+        self._drop(name)
+        self._expect_again(participant)
 
     def await_return(self, wall_ns: int, all_died: bool) -> None:
         """Let time stand, in a world that was started again, until the participants are back or dead.
@@ -102,6 +423,7 @@ class Coordinator(Participants, ABC):
         """Answer a request on `world/control`; it is an event, unless its source has made too many of its kind.
 
         A request that changes the flight is always an event, since a rerun repeats it: beyond the budget it is refused.
+        The event repeats the arguments as they are, for the rerun, or shortened if too long.
         """
         self.requests += 1
         op, source = request.op[:40], request.source if keys.PROCESS_NAME.fullmatch(request.source) else ""
@@ -114,26 +436,27 @@ class Coordinator(Participants, ABC):
             is_event = self.outbox.refused_requests.add(source, op, answer.error) is not None
         if is_event:
             text = f"{source or 'somebody'} asks {op}: {'done' if answer.ok else answer.error}"
-            self.outbox.event("control", op, text, {"args": _shortened(request.args), "ok": answer.ok}, source)
+            args = request.args
+            if len(msgspec.msgpack.encode(args)) > ARGS_BYTES_MAX:
+                short = list(args.items())[:8]
+                args = {str(k)[:40]: value if number(value) is not None else str(value)[:80] for k, value in short}
+            self.outbox.event("control", op, text, {"args": args, "ok": answer.ok}, source)
         return answer
 
     def _answer(self, request: ControlRequest) -> ControlAnswer:
-        result = self._perform(request)
+        """Do what a request asks for."""
+        operation = self._operations.get(request.op)
+        result: Refusal | ControlAnswer | None
+        if request.source and not keys.PROCESS_NAME.fullmatch(request.source):
+            result = Refusal("source", repr(request.source[:48]), "must be 1 to 48 of a-z 0-9 _ . -")
+        elif operation is None:
+            allowed = f"must be one of {', '.join([*self._operations, 'replay'])}"
+            result = Refusal("op", repr(request.op[:40]), allowed)
+        else:
+            result = operation(request)
         if isinstance(result, ControlAnswer):
             return result
         return ControlAnswer(True) if result is None else ControlAnswer(False, str(result))
-
-    def _perform(self, request: ControlRequest) -> Refusal | ControlAnswer | None:
-        if request.source and not keys.PROCESS_NAME.fullmatch(request.source):
-            return Refusal("source", repr(request.source[:48]), "must be 1 to 48 of a-z 0-9 _ . -")
-        operation = self._operations.get(request.op)
-        if operation is None:
-            return Refusal("op", repr(request.op[:40]), f"must be one of {', '.join([*self._operations, 'replay'])}")
-        return operation(request)
-
-    def refusal_at(self, key: str) -> str | None:
-        """Return why requests on one of `refused_queries` are refused; None where another process answers there."""
-        return f"{key}: is not answered here"
 
     # Time
 
@@ -162,28 +485,28 @@ class Coordinator(Participants, ABC):
             return True
         return not participant.successor and not participant.served_names.isdisjoint(self._expected)
 
-    def waiting_for(self, wall_ns: int) -> tuple[run_messages.Waiting, ...]:
+    def waiting_for(self, wall_ns: int) -> tuple[Waiting, ...]:
         """Return whom the world waits for now."""
         if self.clock.mode == "realtime" and self.clock.state != "waiting":
             return self.missed(wall_ns)
         return self.barrier.waiting_for(self.clock.required_ns, wall_ns, self.start_wall_ns, self._data_flow.feeds)
 
-    def missed(self, wall_ns: int) -> tuple[run_messages.Waiting, ...]:
+    def missed(self, wall_ns: int) -> tuple[Waiting, ...]:
         """Return the participants that are dead, silent or not back yet in realtime, where nobody is waited for."""
         if self.clock.mode != "realtime":
             return ()
-        all_of_them = self.barrier.participants.values()
-        return tuple(p.missed(wall_ns) for p in all_of_them if p.is_missed)
+        missed = (p for p in self.barrier.participants.values() if p.is_missed)
+        return tuple(p.waiting(wall_ns, since_ns=p.silent_wall_ns if p.alive else None) for p in missed)
 
-    def waiting_to_leave(self, since_end_ns: int = 0) -> tuple[run_messages.Waiting, ...]:
+    def waiting_to_leave(self, since_end_ns: int = 0) -> tuple[Waiting, ...]:
         """Return the participants that have yet to leave, and a dead recorder that is to write the rest."""
         participants = self.barrier.participants.values()
-        waited = [p for p in participants if p.alive or (p.join.slack_ns > 0 and self.may_return(p))]
-        return tuple(run_messages.Waiting(p.name, p.join.host, since_end_ns / 1e9) for p in waited)
+        waited = [p for p in participants if p.alive or (p.join.slack_ns > 0 and self._may_return(p))]
+        return tuple(Waiting(p.name, p.join.host, since_end_ns / 1e9) for p in waited)
 
     # Publication
 
-    def clock_message(self, waiting_for: tuple[run_messages.Waiting, ...] = ()) -> run_messages.Clock:
+    def clock_message(self, waiting_for: tuple[Waiting, ...] = ()) -> run_messages.Clock:
         """Return the next message of `clock`."""
         clock, now_ns = self.clock, self.clock.now_ns
         return run_messages.Clock(
@@ -201,19 +524,36 @@ class Coordinator(Participants, ABC):
         self.clock.stop("ended")
         for participant in list(self.barrier.participants.values()):
             if participant.farewell is not None:
-                self.leave(participant, participant.farewell, 0)
+                self._leave(participant, participant.farewell, 0)
         self.outbox.event("end", WORLD, self.ended or "", self.result())
         self.clock.state = "stopped"
         self.outbox.put(keys.CLOCK, self.clock_message())
 
     def take_outbox(self) -> list[KeyedMessage]:
         """Return what is to be published, in order, and forget it."""
-        return self.outbox.take()
+        pending, self.outbox.pending = self.outbox.pending, []
+        return pending
 
 
-def _shortened(args: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments for an event: as they are, since a rerun repeats them, or shortened if too long."""
-    if len(msgspec.msgpack.encode(args)) <= ARGS_BYTES_MAX:
-        return args
-    pairs = list(args.items())[:8]
-    return {str(name)[:40]: value if number(value) is not None else str(value)[:80] for name, value in pairs}
+class DataFlow:
+    """Which processes read whose outputs, by the rights of their roles; nothing is known of an unknown role."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self._rights: dict[str, roles.Rights] = {}
+        self._known: dict[tuple[str, str], bool] = {}
+
+    def feeds(self, writer: str, reader: str) -> bool:
+        """Tell whether one process publishes what another one reads, and not the other way round as well."""
+        return self._writes_for(writer, reader) and not self._writes_for(reader, writer)
+
+    def _writes_for(self, writer: str, reader: str) -> bool:
+        pair = writer, reader
+        if pair not in self._known:
+            for name in pair:
+                if name not in self._rights:
+                    self._rights[name] = roles.rights_for(name, self._scenario)
+            reads, writes = self._rights[reader], self._rights[writer]
+            read = {*reads.reads} - {*reads.writes}  # but for its own last value
+            self._known[pair] = any(roles.permits(read, key) for key in writes.writes if "*" not in key)
+        return self._known[pair]

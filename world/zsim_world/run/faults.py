@@ -16,8 +16,8 @@ from zsim.scenario.scenario import FAULTS_MAX
 from zsim.schema.checker import show
 from zsim.sensors.sensor_catalogue import declarations
 from zsim_world.fleet.fault_effects import Impairment
+from zsim_world.run.coordinator import Coordinator
 from zsim_world.run.outbox import Refusal
-from zsim_world.run.participants import Participants
 from zsim_world.run.run_clock import Operation
 from zsim_world.run_state import PART, Saved
 
@@ -26,14 +26,10 @@ SELECTORS = ("id", "target", "kind")
 
 
 class FaultInjector:
-    """The faults of a run, applied to its fleet.
+    """The faults of a run, applied to its fleet by `effects`.
 
     A fault that is requested begins with the gate that is integrated next: nobody can have worked on that yet, so a run
     with the same faults at the same instants gives the same bits.
-
-    Args:
-        run: in which they act.
-        effects: of faults on the fleet.
     """
 
     SAVED: ClassVar[Saved] = {
@@ -46,7 +42,7 @@ class FaultInjector:
         "_effects": PART,
     }
 
-    def __init__(self, run: Participants, effects: Impairment) -> None:
+    def __init__(self, run: Coordinator, effects: Impairment) -> None:
         self._scenario, self._clock, self._barrier, self._outbox = run.scenario, run.clock, run.barrier, run.outbox
         self._effects = effects
         self._kinds = fault_kinds.kinds_of(declarations(run.scenario.drones))
@@ -88,19 +84,29 @@ class FaultInjector:
         self._effects.blow(now_ns, next_ns)
 
     def _begin_and_end(self, now_ns: int) -> None:
+        """Begin and end faults, and remove what ended before any gate that a process may still work on."""
         for fault in self.all:
+            kind = fault_kinds.KINDS.get(fault.kind)
+            is_instant = kind is not None and kind.lasts == "once"  # over as soon as it has begun
             if fault.id not in self._begun and fault.from_ns <= now_ns:
                 self._begun.add(fault.id)
                 text = "begins"
-                if _is_instant(fault):
+                if is_instant:
                     immune = self._immunity(fault.target)
                     text = f"has no effect: the process {immune}" if immune else ""
                 self._event("fault", fault, text)
             if fault.id not in self._over and _end_ns(fault) <= now_ns:
                 self._over.add(fault.id)
-                if not _is_instant(fault):
+                if not is_instant:
                     self._event("fault_end", fault, "is over")
-        self._remove_past(now_ns)
+        late_ns = self._late_ns()
+        past = [fault.id for fault in self.all if _end_ns(fault) + late_ns <= now_ns]
+        for number in past:
+            del self._faults[number]
+        self._begun.difference_update(past)
+        self._over.difference_update(past)
+        if past:
+            self._publish()
         self._next_ns = self._next_change_ns()
 
     def _immunity(self, process: str) -> str | None:
@@ -116,17 +122,6 @@ class FaultInjector:
         """Return how far behind the newest gate a process may still work: the command delay and one period."""
         periods = (p.join.period_ns for p in self._barrier.participants.values())
         return self._clock.delay_ns + max(periods, default=0)
-
-    def _remove_past(self, now_ns: int) -> None:
-        """Remove what ended before any gate that a process may still work on."""
-        late_ns = self._late_ns()
-        past = [fault.id for fault in self.all if _end_ns(fault) + late_ns <= now_ns]
-        for number in past:
-            del self._faults[number]
-        self._begun.difference_update(past)
-        self._over.difference_update(past)
-        if past:
-            self._publish()
 
     def _next_change_ns(self) -> int:
         changes, late_ns = [NEVER_NS], self._late_ns()
@@ -144,43 +139,12 @@ class FaultInjector:
 
     def _add(self, request: ControlRequest) -> ControlAnswer:
         args = {name: value for name, value in request.args.items() if value is not None}
-        refusal = self._refusal(args)
-        if refusal:
+        if refusal := self._refusal(args):
             return ControlAnswer(False, str(refusal))
         fault = self._plan(args, request.source)
         self._publish()
         self._next_ns = self._next_change_ns()
         return ControlAnswer(True, result={"id": fault.id, "from_ns": fault.from_ns, "until_ns": fault.until_ns})
-
-    def _clear(self, request: ControlRequest) -> ControlAnswer | Refusal:
-        """End the faults of an id, a target or a kind, or all."""
-        args = {name: value for name, value in request.args.items() if value is not None}
-        unknown = [name for name in args if name not in SELECTORS]
-        if unknown:
-            return Refusal(unknown[0][:40], "not known", f"allowed: {', '.join(SELECTORS)}, or nothing")
-        selected = [fault for fault in self.all if fault.id not in self._over]
-        for name, value in args.items():
-            matching = [fault for fault in selected if getattr(fault, name) == value]
-            if not matching:
-                values = dict.fromkeys(str(getattr(fault, name)) for fault in selected)
-                allowed = f"one of {', '.join(values)}" if values else "left out: there is none"
-                return Refusal(name, show(value), f"must be {allowed}")
-            selected = matching
-        for fault in selected:
-            self._end(fault, request.source)
-        if selected:
-            self._publish()
-            self._next_ns = 0  # it takes effect before the next gate
-        return ControlAnswer(True, result={"cleared": [fault.id for fault in selected]})
-
-    def _end(self, fault: Fault, source: str) -> None:
-        if fault.id in self._begun:
-            fault = msgspec.structs.replace(fault, until_ns=self._clock.now_ns)
-            self._faults[fault.id] = fault
-            self._over.add(fault.id)
-        else:
-            del self._faults[fault.id]
-        self._event("fault_clear", fault, "is cleared", source)
 
     def _refusal(self, args: Mapping[str, Any]) -> Refusal | str | None:
         """Return the first reason against a fault."""
@@ -193,14 +157,10 @@ class FaultInjector:
         known = Known(drones, clusters, processes, self._kinds, self._effects.rotors, external)
         for path, text in flaws(args, known):
             return f"{path or 'args'} {text}"
-        immune = self._immunity(args["target"]) if args["kind"] == PROCESS_KILL else None
-        if immune:
+        if args["kind"] == PROCESS_KILL and (immune := self._immunity(args["target"])):
             allowed = f"must be a process that a kill ends ({PROCESS_KILL})"
             return Refusal("target", f"{show(args['target'])}, which {immune}", allowed)
-        return self._time_refusal(args.get("at_s"))
-
-    def _time_refusal(self, at_s: float | None) -> Refusal | None:
-        now_s, end_s = self._clock.now_ns / 1e9, self._scenario.duration_s
+        at_s, now_s, end_s = args.get("at_s"), self._clock.now_ns / 1e9, scenario.duration_s
         if at_s is not None and at_s < now_s:
             return Refusal("at_s", f"{at_s:g}", f"must be >= {now_s:g}, the present, or left out")
         if at_s is not None and at_s >= end_s:
@@ -216,25 +176,38 @@ class FaultInjector:
         self._faults[fault.id] = fault
         return fault
 
+    def _clear(self, request: ControlRequest) -> ControlAnswer | Refusal:
+        """End the faults of an id, a target or a kind, or all."""
+        args = {name: value for name, value in request.args.items() if value is not None}
+        if unknown := [name for name in args if name not in SELECTORS]:
+            return Refusal(unknown[0][:40], "not known", f"allowed: {', '.join(SELECTORS)}, or nothing")
+        selected = [fault for fault in self.all if fault.id not in self._over]
+        for name, value in args.items():
+            matching = [fault for fault in selected if getattr(fault, name) == value]
+            if not matching:
+                values = dict.fromkeys(str(getattr(fault, name)) for fault in selected)
+                allowed = f"one of {', '.join(values)}" if values else "left out: there is none"
+                return Refusal(name, show(value), f"must be {allowed}")
+            selected = matching
+        for fault in selected:
+            cleared = self._faults.pop(fault.id)
+            if fault.id in self._begun:
+                cleared = msgspec.structs.replace(fault, until_ns=self._clock.now_ns)
+                self._faults[fault.id] = cleared
+                self._over.add(fault.id)
+            self._event("fault_clear", cleared, "is cleared", request.source)
+        if selected:
+            self._publish()
+            self._next_ns = 0  # it takes effect before the next gate
+        return ControlAnswer(True, result={"cleared": [fault.id for fault in selected]})
+
     # Publication
 
     def _publish(self) -> None:
-        """Publish the list, before the next gate."""
-        self._rank()
-        self._sort_links()
-        self._outbox.put(keys.FAULTS, Faults(self._clock.now_ns, self._seq, self.all))
-        self._seq += 1
+        """Publish the list, before the next gate.
 
-    def restored(self) -> None:
-        self._sort_links()
-
-    def _sort_links(self) -> None:
-        """Note which faults are of links."""
-        self._of_links = tuple(fault for fault in self.all if fault.kind in LINK_KINDS)
-        self._of_links_at.clear()
-
-    def _rank(self) -> None:
-        """Number those that are equal but for their end, and have not begun: they begin together."""
+        Faults that are equal but for their end, and have not begun, are numbered: they begin together.
+        """
         equal: Counter[tuple[str, str, int]] = Counter()
         for fault in self.all:
             if fault.id in self._begun:
@@ -243,16 +216,18 @@ class FaultInjector:
             if fault.rank != equal[start]:
                 self._faults[fault.id] = msgspec.structs.replace(fault, rank=equal[start])
             equal[start] += 1
+        self.restored()
+        self._outbox.put(keys.FAULTS, Faults(self._clock.now_ns, self._seq, self.all))
+        self._seq += 1
+
+    def restored(self) -> None:
+        """Note which faults are of links."""
+        self._of_links = tuple(fault for fault in self.all if fault.kind in LINK_KINDS)
+        self._of_links_at.clear()
 
     def _event(self, kind: str, fault: Fault, state: str, source: str = WORLD) -> None:
         text = f"{fault.kind} of {fault.target} {state}".rstrip()
         self._outbox.event(kind, fault.target, text, msgspec.structs.asdict(fault), source)
-
-
-def _is_instant(fault: Fault) -> bool:
-    """Tell whether a fault is over as soon as it has begun."""
-    kind = fault_kinds.KINDS.get(fault.kind)
-    return kind is not None and kind.lasts == "once"
 
 
 def _end_ns(fault: Fault) -> int:

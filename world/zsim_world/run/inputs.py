@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from zsim.contract import flight_messages, keys, messages, run_messages
-from zsim.contract.run_messages import ControlAnswer, ControlRequest, Join
+from zsim.contract.run_messages import ControlRequest, Join
 from zsim.errors import DecodeError
 from zsim.runtime.health import HealthMeter
 from zsim_world.run.coordinator import Coordinator
@@ -30,19 +30,26 @@ message, cluster), ("link", message, drone), and ("resumed", simulated time in n
 Sample = tuple[str, bytes]  # key and payload
 
 Handler = Callable[[Sample, int], None]
-"""Handles a message that arrived at a monotonic wall time [ns].
-
-Raises:
-    DecodeError: it is refused.
-"""
+"""Handles a message that arrived at a monotonic wall time [ns]; raises a DecodeError where it is refused."""
 
 
-class Entry(msgspec.Struct, array_like=True, tag_field="kind", tag=True):
-    """One input; wall times are monotonic."""
+class _Head(msgspec.Struct):
+    """What the world reads of messages that it only relays."""
 
-    def apply(self, run: "Run") -> ControlAnswer | None:
-        """Let the world take it; a request is answered."""
-        raise NotImplementedError
+    t_ns: int
+    seq: int
+    source: str = ""
+    controller: str = ""  # of a ClusterRequest, whose source is the client
+
+
+_decode_head = msgspec.msgpack.Decoder(_Head).decode
+
+
+def _head(key: str, payload: bytes) -> _Head:
+    try:
+        return _decode_head(payload)
+    except messages.REFUSALS as error:
+        raise DecodeError(f"{key}: {error}; must be a map with t_ns and seq") from error
 
 
 class Run:
@@ -51,11 +58,9 @@ class Run:
     Args:
         world: a flight, or a replay.
         health: counts what is received and refused.
-        note: takes every entry that a world which goes on from the journal has to apply again.
+        note: takes every entry that a world which continues from the journal has to apply again.
 
     Attributes:
-        history: of the messages that passed.
-        progress: shows progress.
         on_done: called with name, incarnation and wall time of a done before the world has it.
         on_health: called with the name of a process that has published its health.
         phase: of the cluster whose state was read last.
@@ -63,7 +68,7 @@ class Run:
     """
 
     def __init__(
-        self, world: Coordinator, health: HealthMeter, note: Callable[[Entry], None] = lambda entry: None
+        self, world: Coordinator, health: HealthMeter, note: "Callable[[Entry], None]" = lambda entry: None
     ) -> None:
         self.world = world
         self.health = health
@@ -72,13 +77,13 @@ class Run:
         self.on_done: Callable[[str, int, int], None] = lambda name, incarnation, wall_ns: None
         self.on_health: Callable[[str], None] = lambda name: None
         self.phase = ""
+        self.handlers: dict[str, Handler] = {}
         self._note = note
         self._clock = world.clock
         self._states: Counter[str] = Counter()
-        self.handlers: dict[str, Handler] = {}
 
-    def enter(self, entry: Entry) -> ControlAnswer | None:
-        """Apply an input, and note it in the journal.
+    def enter(self, entry: "Entry") -> Any:
+        """Apply an input, and note it in the journal; return the answer to a request.
 
         What ends the run before its time, and what comes after that, is not noted: `zsim run --continue` takes such an
         end back. After its last gate the world's own messages are noted as well, since they are numbered on.
@@ -90,6 +95,12 @@ class Run:
             self._note(entry)
         return answer
 
+    def call(self, method: str, *args: Any) -> Any:
+        """Call one of the world's methods in CALLS as an input."""
+        return self.enter(Called(method, args))
+
+    # Messages of others
+
     def learn_handler(self, key: str) -> Handler:
         """Return the handler of a key's messages, and remember it: the same keys come at every gate."""
         kind, (place, name, what) = messages.type_of(key), keys.parts(key)
@@ -100,11 +111,14 @@ class Run:
         elif key.startswith("process/") or keys.is_command(key):
             handler = self._hand_over
         else:
-            handler = self._keep_foreign if kind is None else _refuse_key_of_world
+            handler = self._keep_foreign if kind is None else self._refuse_key_of_world
         if len(self.handlers) >= messages.KEYS_KEPT:
             self.handlers.clear()
         self.handlers[key] = handler
         return handler
+
+    def _refuse_key_of_world(self, sample: Sample, wall_ns: int) -> None:
+        raise DecodeError(f"{sample[0]}: only the world publishes here")
 
     def _keep_foreign(self, sample: Sample, wall_ns: int) -> None:
         """Keep a message on a key outside of the contract."""
@@ -137,18 +151,15 @@ class Run:
             raise DecodeError(f"{key}: t_ns is {head.t_ns}; must be <= {self.world.now_ns}, the newest gate")
         self.history.add(key, payload, head.t_ns)
         if kind is flight_messages.ClusterState:
-            self._read_phase(key, payload)
+            if self._states[key] % PHASE_EVERY == 0:
+                state: flight_messages.ClusterState = messages.decode_as(flight_messages.ClusterState, payload, key)
+                self.phase = state.phase
+                self.progress("state", state, keys.thing(key))
+            self._states[key] += 1
         source = head.controller if kind is run_messages.ClusterRequest else head.source
         if not source and is_counted:
             source = f"{'estimator' if kind is flight_messages.Estimate else 'controller'}.{keys.thing(key)}"
         self.world.count_output(source)
-
-    def _read_phase(self, key: str, payload: bytes) -> None:
-        if self._states[key] % PHASE_EVERY == 0:
-            state: flight_messages.ClusterState = messages.decode_as(flight_messages.ClusterState, payload, key)
-            self.phase = state.phase
-            self.progress("state", state, keys.thing(key))
-        self._states[key] += 1
 
     def _take_of_driver(self, sample: Sample, wall_ns: int) -> None:
         """Keep what a driver publishes of its drone, unless the world refuses it."""
@@ -172,36 +183,16 @@ class Run:
         self.health.refused += 1
         self.world.outbox.refuse(source, key[:80], messages.fault_at(key, error))
 
-    def refuse_sample(self, sample: Sample, error: DecodeError) -> None:
-        """Refuse a message, but count it for its sender, so that its done is not taken to be short of an output."""
-        self.history.add_foreign(*sample)
-        self.refuse("somebody", sample[0], error)
-        with suppress(DecodeError):  # of an unknown sender
-            head = _head(*sample)
-            self.world.count_output(head.controller or head.source)
+
+# The entries; their wall times are monotonic
 
 
-class _Head(msgspec.Struct):
-    """What the world reads of messages that it only relays."""
+class Entry(msgspec.Struct, array_like=True, tag_field="kind", tag=True):
+    """One input."""
 
-    t_ns: int
-    seq: int
-    source: str = ""
-    controller: str = ""  # of a ClusterRequest, whose source is the client
-
-
-_decode_head = msgspec.msgpack.Decoder(_Head).decode
-
-
-def _head(key: str, payload: bytes) -> _Head:
-    try:
-        return _decode_head(payload)
-    except messages.REFUSALS as error:
-        raise DecodeError(f"{key}: {error}; must be a map with t_ns and seq") from error
-
-
-def _refuse_key_of_world(sample: Sample, wall_ns: int) -> None:
-    raise DecodeError(f"{sample[0]}: only the world publishes here")
+    def apply(self, run: Run) -> Any:
+        """Let the world take it; a request is answered."""
+        raise NotImplementedError
 
 
 class Taken(Entry, tag=0):
@@ -211,13 +202,17 @@ class Taken(Entry, tag=0):
     sample: Sample
 
     def apply(self, run: Run) -> None:
-        sample = self.sample
+        key, payload = sample = self.sample
         run.health.received += 1
         try:
-            handle = run.handlers.get(sample[0]) or run.learn_handler(sample[0])
+            handle = run.handlers.get(key) or run.learn_handler(key)
             handle(sample, self.wall_ns)
         except DecodeError as error:
-            run.refuse_sample(sample, error)
+            run.history.add_foreign(key, payload)
+            run.refuse("somebody", key, error)
+            with suppress(DecodeError):  # count it for its sender, if known, or his done would be short of an output
+                head = _head(key, payload)
+                run.world.count_output(head.controller or head.source)
 
 
 class Advanced(Entry, tag=1):
@@ -231,35 +226,7 @@ class Advanced(Entry, tag=1):
         run.world.advance(self.wall_ns)
 
 
-class Died(Entry, tag=2):
-    """The death of a process."""
-
-    wall_ns: int
-    name: str
-
-    def apply(self, run: Run) -> None:
-        run.world.died(self.name, self.wall_ns)
-
-
-class Controlled(Entry, tag=3):
-    """A request on `world/control`."""
-
-    request: ControlRequest
-
-    def apply(self, run: Run) -> ControlAnswer:
-        return run.world.control(self.request)
-
-
-class GivenUp(Entry, tag=4):
-    """The outputs of a participant that are lost."""
-
-    name: str
-
-    def apply(self, run: Run) -> None:
-        run.world.give_up_outputs(self.name)
-
-
-class Published(Entry, tag=5):
+class Published(Entry, tag=2):
     """A message of the world's own that does not follow from other inputs, such as its clock while time stands."""
 
     key: str
@@ -269,83 +236,32 @@ class Published(Entry, tag=5):
     def apply(self, run: Run) -> None:
         run.history.passed.append((self.key, self.payload))
         run.history.add(self.key, self.payload, run.world.now_ns)
-        run.world.outbox.number_from(self.key, self.seq + 1)
+        run.world.outbox.numbers[self.key] = self.seq + 1
 
 
-class Resumed(Entry, tag=6):
-    """A new process of the world that continues from here."""
-
-    wall_ns: int
-    all_died: bool
-
-    def apply(self, run: Run) -> None:
-        run.world.await_return(self.wall_ns, self.all_died)
-
-
-class Joined(Entry, tag=7):
-    """A join that was admitted."""
-
-    wall_ns: int
-    name: str
-    join: Join
-
-    def apply(self, run: Run) -> None:
-        run.world.handle(keys.process(self.name, "join"), self.join, self.wall_ns)
+CALLS: dict[str, Any] = {  # the world's methods that are inputs, with the types of their arguments
+    "await_return": tuple[int, bool],
+    "control": tuple[ControlRequest],
+    "died": tuple[str, int],
+    "expired": tuple[str],
+    "falsely_joined": tuple[str, Join, str],
+    "give_up_outputs": tuple[str],
+    "join": tuple[str, Join, int],
+    "not_shown": tuple[str, str, int],
+    "reader_closed": tuple[str, dict[str, Any]],
+    "silence_changed": tuple[str, int | None],
+}
 
 
-class FalselyJoined(Entry, tag=8):
-    """A join in the place of another process, or of a stranger, without a process behind it."""
+class Called(Entry, tag=3):
+    """A call of one of the world's methods."""
 
-    name: str
-    join: Join
-    reason: str
+    method: str
+    args: tuple[Any, ...]
 
-    def apply(self, run: Run) -> None:
-        run.world.falsely_joined(self.name, self.join, self.reason)
-
-
-class NotShown(Entry, tag=9):
-    """A participant that has given no sign of being there."""
-
-    wall_ns: int
-    name: str
-    reason: str
-
-    def apply(self, run: Run) -> None:
-        run.world.not_shown(self.name, self.reason, self.wall_ns)
+    def apply(self, run: Run) -> Any:
+        return getattr(run.world, self.method)(*msgspec.convert(self.args, CALLS[self.method]))
 
 
-class FellSilent(Entry, tag=10):
-    """A process that publishes its health no longer since a wall time, or does again (None)."""
-
-    name: str
-    since_wall_ns: int | None
-
-    def apply(self, run: Run) -> None:
-        run.world.silence_changed(self.name, self.since_wall_ns)
-
-
-class ReaderClosed(Entry, tag=11):
-    """A reader whose link was closed."""
-
-    text: str
-    data: dict[str, Any]
-
-    def apply(self, run: Run) -> None:
-        run.world.reader_closed(self.text, self.data)
-
-
-class Expired(Entry, tag=12):
-    """A process that has not come, or not come back, in its time."""
-
-    name: str
-
-    def apply(self, run: Run) -> None:
-        run.world.expired(self.name)
-
-
-_OfWorld = Advanced | Published | Resumed
-_OfOthers = Taken | Controlled | GivenUp | Joined | ReaderClosed
-_OfLosses = Died | FalselyJoined | NotShown | FellSilent | Expired
 encode = msgspec.msgpack.Encoder().encode
-decode = msgspec.msgpack.Decoder(list[_OfWorld | _OfOthers | _OfLosses]).decode
+decode = msgspec.msgpack.Decoder(list[Taken | Advanced | Published | Called]).decode

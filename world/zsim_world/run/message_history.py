@@ -48,25 +48,18 @@ class MessageHistory:
 
     Attributes:
         passed: messages that recorders have not been sent yet, in order.
+        last_values: of every key.
     """
 
     def __init__(self, keep_bytes: int = KEEP_BYTES, page_bytes: int = PAGE_BYTES) -> None:
-        self.passed: list[tuple[str, bytes]] = []  # what recorders have not been sent yet, in order
-        self._last: dict[str, bytes] = {}
+        self.passed: list[tuple[str, bytes]] = []
+        self.last_values: dict[str, bytes] = {}
         self._recent: deque[_Entry] = deque()
         self._now_ns = 0
         self._bytes = self._foreign_bytes = 0
         self._keep_bytes = keep_bytes
         self._page_bytes = page_bytes
         self._forgotten = 0
-
-    def last_values(self) -> dict[str, bytes]:
-        """Return the last value of every key."""
-        return self._last
-
-    def restore(self, last: dict[str, bytes]) -> None:
-        """Begin with these last values."""
-        self._last = last
 
     def add(self, key: str, payload: bytes, t_ns: int) -> None:
         """Keep a message; t_ns is its stamp.
@@ -75,8 +68,8 @@ class MessageHistory:
         """
         if key == keys.CLOCK:
             self._now_ns = t_ns
-        if key in self._last or len(self._last) < LAST_MAX:
-            self._last[key] = payload
+        if key in self.last_values or len(self.last_values) < LAST_MAX:
+            self.last_values[key] = payload
         self._keep(t_ns, [(key, payload)], len(payload))
 
     def add_foreign(self, key: str, payload: bytes) -> None:
@@ -91,7 +84,7 @@ class MessageHistory:
     def add_all(self, published: Pairs, t_ns: int) -> None:
         """Keep what the world itself publishes, all stamped t_ns, its newest gate."""
         self._now_ns = t_ns
-        self._last.update(published)
+        self.last_values.update(published)
         self._keep(t_ns, published, sum([len(payload) for _, payload in published]))
 
     def _keep(self, t_ns: int, passed: Pairs, size: int, foreign: bool = False) -> None:
@@ -104,18 +97,21 @@ class MessageHistory:
             self._foreign_bytes -= its_size * was_foreign
             self._forgotten += len(oldest)
 
-    def last(self, expression: str) -> list[tuple[str, bytes]]:
+    def last(self, expression: str) -> Pairs:
         """Return the last value of every key that matches an expression."""
-        if expression in self._last:
-            return [(expression, self._last[expression])]
-        return [(key, payload) for key, payload in list(self._last.items()) if keys.matches(expression, key)]
+        if expression in self.last_values:
+            return [(expression, self.last_values[expression])]
+        return [(key, payload) for key, payload in list(self.last_values.items()) if keys.matches(expression, key)]
+
+    def _each(self) -> Iterator[tuple[int, str, bytes]]:
+        for _, t_ns, passed, _, _ in self._recent:
+            for key, payload in passed:
+                yield t_ns, key, payload
 
     def page(self, from_ns: int, wanted: Callable[[str], bool], start: int = 0) -> tuple[Pairs, int | None]:
         """Return a page of the messages stamped after from_ns on keys that are wanted.
 
         Args:
-            from_ns: simulated time [ns].
-            wanted: returns whether a key is wanted.
             start: 0, or where the page before ended.
 
         Returns:
@@ -136,11 +132,6 @@ class MessageHistory:
                 return passed, number
             passed.append((key, payload))
         return passed, None
-
-    def _each(self) -> Iterator[tuple[int, str, bytes]]:
-        for _, t_ns, passed, _, _ in self._recent:
-            for key, payload in passed:
-                yield t_ns, key, payload
 
     def replay(self, args: dict[str, Any], readable: Sequence[str]) -> ControlAnswer:
         """Answer a request for a replay with a page of the history.

@@ -1,4 +1,4 @@
-"""What a run publishes, in order: messages, events among them, and refusals, which are events too; and limits of these.
+"""What a run publishes, in order: messages, events and refusals, which are events too; and limits of these.
 
 Limits count in simulated time, so that a run that is flown again from its record, or continues from its journal, allows
 the same.
@@ -29,17 +29,17 @@ class RunOutbox:
     """Messages of the world that are to be published.
 
     Args:
-        now_ns: returns the newest gate, with which events are stamped [ns].
+        now_ns: returns the newest gate, with which events are stamped.
 
     Attributes:
         pending: keys and messages in order.
-        refusals: all refusals, including those beyond the limit of events.
-        refused_requests: the same of `world/control`.
+        numbers: the `seq` of the next message on each key.
+        refusals, refused_requests: of messages and of requests on `world/control`, also those that were no event.
         left_out: number of events that were not published because there had been enough like them.
     """
 
     SAVED: ClassVar[Saved] = {
-        "_next_seq": dict[str, int],
+        "numbers": dict[str, int],
         "refusals": PART,
         "refused_requests": PART,
         "_notices": PART,
@@ -48,7 +48,7 @@ class RunOutbox:
 
     def __init__(self, now_ns: Callable[[], int]) -> None:
         self._now_ns = now_ns
-        self._next_seq: dict[str, int] = {}
+        self.numbers: dict[str, int] = {}
         self.pending: list[KeyedMessage] = []
         self.refusals = RefusalLog(now_ns)
         self.refused_requests = RefusalLog(now_ns)
@@ -59,28 +59,17 @@ class RunOutbox:
         self.pending = []  # the former world has published it
 
     def put(self, key: str, message: Any) -> None:
-        """Add a message."""
         self.pending.append((key, message))
 
-    def take(self) -> list[KeyedMessage]:
-        """Remove and return all messages."""
-        pending, self.pending = self.pending, []
-        return pending
-
     def next_seq(self, key: str) -> int:
-        """Return the number of the next message on a key."""
-        seq = self._next_seq.get(key, 0)
-        self._next_seq[key] = seq + 1
+        """Return the number of the next message on a key, and count it."""
+        seq = self.numbers.get(key, 0)
+        self.numbers[key] = seq + 1
         return seq
-
-    def number_from(self, key: str, seq: int) -> None:
-        """Let the next message on a key have this number."""
-        self._next_seq[key] = seq
 
     def event(
         self, kind: str, subject: str, text: str, data: Mapping[str, Any] | None = None, source: str = WORLD
     ) -> None:
-        """Add an event."""
         seq = self.next_seq(keys.EVENT)
         self.put(keys.EVENT, run_messages.Event(self._now_ns(), seq, kind, source, subject, text, dict(data or {})))
 
@@ -101,13 +90,7 @@ class RunOutbox:
 
 
 class Refusal(NamedTuple):
-    """Why something is refused; its text is one line.
-
-    Attributes:
-        where: the field or thing at fault.
-        actual: its value or state, as text.
-        allowed: what is allowed, or what to do.
-    """
+    """Why something is refused, in one line: the field or thing at fault, its value or state, what is allowed."""
 
     where: str
     actual: str
@@ -123,15 +106,11 @@ def too_many(source: str) -> Refusal:
 
 
 class RefusalLog:
-    """Counts refusals, and limits how many of them become events: of each source, and of all together.
-
-    Attributes:
-        count: of all of them.
-    """
+    """Counts refusals, and limits how many of them become events: of each source, and of all together."""
 
     SAVED: ClassVar[Saved] = {"count": int, "_counts": dict[tuple[str, str], dict[str, int]], "_total": PART}
 
-    def __init__(self, now_ns: Callable[[], int] = lambda: 0) -> None:
+    def __init__(self, now_ns: Callable[[], int]) -> None:
         self.count = 0
         self._total = ChangeBudget(now_ns, SECOND_NS, REFUSED_MAX)
         self._counts: dict[tuple[str, str], dict[str, int]] = {}
@@ -166,7 +145,7 @@ class ChangeBudget(RateLimit):
 
 
 class Budgets:
-    """All change budgets of a run.
+    """The change budgets of a run.
 
     Attributes:
         changes: of each source.

@@ -6,7 +6,9 @@ and can be paused, stepped and stopped. No drone can be flown.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from bisect import bisect_left
+from collections import defaultdict, deque
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -15,18 +17,19 @@ import msgspec
 import numpy as np
 
 from zsim.contract import flight_messages, keys, messages, run_messages
-from zsim.contract.flight_messages import CameraImage, CameraInfo, Sightings
+from zsim.contract.flight_messages import CameraImage, CameraInfo, Sightings, ViewDrones, ViewEstimates
 from zsim.contract.framing import KINDS, GateMessages, run_key_table
+from zsim.contract.messages import REFUSALS
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import DecodeError, RecordError
 from zsim.record import Recorded, RecordReader
+from zsim.record.record_reader import OVERLAP_NS
 from zsim.runtime.agent import Output
-from zsim.scenario.roles import OnDeath
+from zsim.scenario import roles
+from zsim.scenario.faults import PROCESS_KILL
 from zsim.scenario.scenario import Scenario
-from zsim_world.run.barrier import Participant
 from zsim_world.run.coordinator import FLIGHT_REQUESTS, Coordinator
 from zsim_world.run.outbox import Refusal
-from zsim_world.run.recorded_gates import Gate, PlaybackViews, RecordedGates, author, is_played, without_kills
 from zsim_world.run.run_clock import number, refused_argument
 
 RECORD_OVER = "the record is over"  # why a replay of the whole record ended
@@ -40,43 +43,44 @@ OF_CAMERAS = {CameraImage: "camera", CameraInfo: "camera", Sightings: "detector"
 MARKS_MAX = 400  # on a timeline; more would be narrower than a pixel
 LEFT_OUT = frozenset({"command", "end"})  # kinds of events: too many commands to be marked
 TEXT_MAX = 120  # characters
+SOURCED = (flight_messages.Command, CameraImage, CameraInfo, Sightings)  # say who published them
 
 
 class PlaybackRange(NamedTuple):
-    """What is played of a record.
+    """What is played of a record."""
 
-    Attributes:
-        from_ns, to_ns: first and last gate [ns]; None for the end.
-        keys: expressions; what matches none is not played.
-        paused: whether it stands still after its first gate.
-        holds: whether it stands still after its last one, so that one can go back, rather than end.
-    """
+    from_ns: int = 0  # first gate
+    to_ns: int | None = None  # last gate, None for the end
+    keys: tuple[str, ...] = ("**",)  # expressions; what matches none is not played
+    paused: bool = False  # stand still after the first gate
+    holds: bool = False  # stand still after the last one, so that one can go back, rather than end
 
-    from_ns: int = 0
-    to_ns: int | None = None
-    keys: tuple[str, ...] = ("**",)
-    paused: bool = False
-    holds: bool = False
+
+class _Live(NamedTuple):
+    """The processes that take part at a gate, whose outputs are not played, by all names whose work they do."""
+
+    names: set[str]
+    by_name: set[str]  # of those that declare no camera and no detector of a drone
 
 
 class Playback(Coordinator):
     """Plays a record.
 
-    Outputs that a participant publishes itself (recognised by its name, `estimator.drone1`; pictures and detections by
-    their drone) are not played.
+    Outputs that a participant publishes itself (recognised by its name, `estimator.drone1`) are not played. A camera or
+    detector is recognised by the drones that it declares, whatever its name is; one that declares none, as a program of
+    the user's own may, by its name.
 
     Args:
         reader: of the record; it stays open.
-        scenario: the one on record.
-        info: the one on record.
-        played: what is played of it.
+        scenario, info: the ones on record.
         rate: simulated per wall seconds; 0 = as fast as possible.
-        wall_ns: monotonic wall time.
         run_id: given by tests that compare.
 
     Raises:
         RecordError: there is nothing to play.
     """
+
+    needs_participants = False
 
     def __init__(
         self,
@@ -93,18 +97,21 @@ class Playback(Coordinator):
         self._played = played
         self._operations |= {"seek": self._seek, "timeline": self._timeline, "views": self._views_of_past}
         self.refused_queries = tuple(keys.cluster_control(cluster.name) for cluster in scenario.clusters)
+        self._cameras = {drone.name: drone.sensors.cameras() for drone in scenario.drones}
         self._table = run_key_table(info)
         self._kinds = len(self._table) // len(self.names)  # of messages about a drone
         self._place = {key: place for place, key in enumerate(self._table)}
-        self._views = PlaybackViews(self.names, [cluster.name for cluster in scenario.clusters])
+        of_drones = (key for name in self.names for key in (keys.truth(name), keys.status(name), keys.estimate(name)))
+        of_clusters = (keys.cluster_state(cluster.name) for cluster in scenario.clusters)
+        self._view_sources = {*of_drones, keys.VIEW_DRONES, *of_clusters}
         self._last: dict[str, bytes] = {}
         topics = reader.topics()
-        wanted = {key for key in topics if is_played(key, played.keys)}
-        self._viewed = self._views.sources & wanted
+        wanted = {key for key in topics if _is_played(key) and roles.permits(played.keys, key)}
+        self._viewed = self._view_sources & wanted
         self._recounts = any(keys.is_sensor(key) and key not in wanted for key in topics)
         self._reader = reader
-        self._plays_faults = keys.FAULTS in wanted
-        self._camera_infos = frozenset(key for key in wanted if messages.type_of(key) is CameraInfo)
+        # published only when they change, so that the last ones before the first gate are played with it
+        self._standing = {key for key in wanted if key == keys.FAULTS or messages.type_of(key) is CameraInfo}
         gate_keys = wanted | ({keys.VIEW_DRONES} & topics.keys())
         self._recorded_gates = RecordedGates(reader, self.clock.gate_ns, self.clock.delay_ns, gate_keys)
         self._wind(played.from_ns)
@@ -127,19 +134,20 @@ class Playback(Coordinator):
     # Time
 
     def advance(self, wall_ns: int) -> None:
-        """Play the next gate."""
-        gate, over = self._coming, self._over()
-        if gate is None or over:
-            self._end(over)
-            return
-        if self.clock.state == "waiting":
-            self.clock.start(gate.t_ns, self._played.paused)
-        else:
-            self.clock.advance(gate.t_ns)
-        self._play(gate, wall_ns)
-        self._read_next()
+        """Play the next gate, if there is one; stand still or end after the last one."""
+        gate = self._coming
+        if gate is not None and not self._over():
+            if self.clock.state == "waiting":
+                self.clock.start(gate.t_ns, self._played.paused)
+            else:
+                self.clock.advance(gate.t_ns)
+            self._play(gate, wall_ns)
+            self._read_next()
         if over := self._over():
-            self._end(over)
+            if self._played.holds:
+                self.clock.hold()
+            else:
+                self.clock.stop(over)
 
     def _over(self) -> str:
         """Return why there is nothing more to play; empty while there is something."""
@@ -148,18 +156,182 @@ class Playback(Coordinator):
             return RECORD_OVER
         return f"played to {to_ns / 1e9:g} s" if to_ns is not None and self._coming.t_ns > to_ns else ""
 
-    def _end(self, reason: str) -> None:
-        if self._played.holds:
-            self.clock.hold()
-        else:
-            self.clock.stop(reason)
+    def _wind(self, from_ns: int) -> None:
+        """Continue with the first gate at or after a time."""
+        self._gates = self._recorded_gates.gates(from_ns)
+        self._read_next()
+        before: list[Recorded] = []
+        if self._standing and from_ns > 0:
+            before = [m for m in self._reader.messages(self._standing, by_time=False) if m.t_ns < from_ns]
+        self._pending = list({m.key: m for m in sorted(before, key=lambda m: m.t_ns)}.values())
+
+    def _read_next(self) -> None:
+        self._coming: Gate | None = next(self._gates, None)
+        if self._coming is not None:
+            self.clock.next_ns = self._coming.t_ns
+
+    # What is played
+
+    def _live(self) -> _Live:
+        served = [each.served_names for each in self.barrier.participants.values()]
+
+        def is_of_cameras(name: str) -> bool:
+            role, _, drone = name.partition(".")
+            return role in OF_CAMERAS.values() and drone in self._cameras
+
+        by_name = {name for names in served if not any(map(is_of_cameras, names)) for name in names}
+        return _Live({name for names in served for name in names}, by_name)
+
+    def _is_replaced(self, recorded: Recorded, live: _Live) -> bool:
+        """Tell whether a participant publishes a message in place of one on record."""
+        role = OF_CAMERAS.get(messages.type_of(recorded.key))
+        if role is None:
+            return bool(live.names) and _author(recorded) in live.names
+        _, drone, what = keys.parts(recorded.key)
+        if f"{role}.{drone}" in live.names:  # of the cameras that the scenario has; where it has none, of any
+            cameras, camera = self._cameras.get(drone), what.removeprefix("camera/").removesuffix("/info")
+            if not cameras or camera == what or camera in cameras:
+                return True
+        return bool(live.by_name) and _author(recorded) in live.by_name
+
+    def _play(self, gate: Gate, wall_ns: int) -> None:
+        live, played = self._live(), [*self._pending, *gate.messages]
+        self._pending = []
+        self._last.update((m.key, m.payload) for m in gate.messages if m.key in self._view_sources)
+        for recorded in played:
+            if recorded.key == keys.FAULTS:  # they are known before the gate
+                self._publish(recorded)
+        if of_drones := [m for m in gate.messages if m.key in self._place]:
+            self.outbox.put(keys.GATE, self._gate_messages(gate.t_ns, of_drones))
+        self.statistics.gate(gate.t_ns, wall_ns)
+        self.outbox.put(keys.CLOCK, self.clock_message(self.missed(wall_ns)))
+        for recorded in played:
+            if recorded.key in self._place or recorded.key == keys.FAULTS or self._is_replaced(recorded, live):
+                continue
+            self._publish(recorded)
+
+    def _publish(self, recorded: Recorded) -> None:
+        """Publish a message again, byte by byte, except events, which are numbered anew, and kills of processes."""
+        key, payload = recorded.key, recorded.payload
+        if key == keys.EVENT:
+            with suppress(DecodeError):
+                event: run_messages.Event = messages.decode(keys.EVENT, payload)
+                if event.kind != "end":  # the replay has an end of its own
+                    self.outbox.put(key, msgspec.structs.replace(event, seq=self.outbox.next_seq(key)))
+        elif key == keys.FAULTS:
+            self.outbox.put(key, msgspec.Raw(_without_kills(payload)))
+        elif key != keys.VIEW_DRONES:
+            self.outbox.put(key, msgspec.Raw(payload))
+
+    def _gate_messages(self, t_ns: int, of_drones: list[Recorded]) -> GateMessages:
+        """Return the world's messages about its drones as the world published them: drone by drone, status last.
+
+        Each status counts the sensor messages that are played; agents would wait for the others.
+        """
+        of_drones.sort(key=lambda m: self._place[m.key] // self._kinds)
+        which = np.array([self._place[m.key] for m in of_drones])
+        first = np.searchsorted(which // self._kinds, np.arange(len(self.names) + 1)).tolist()
+        payloads = [m.payload for m in of_drones]
+        if self._recounts:
+            kinds, truth, status = (which % self._kinds).tolist(), KINDS.index("truth"), KINDS.index("status")
+            for begin, end in pairwise(first):
+                count = sum(kind != truth for kind in kinds[begin:end])
+                for m in range(begin, end):
+                    if kinds[m] == status:
+                        message = messages.decode_as(flight_messages.Status, payloads[m], "status")
+                        payloads[m] = messages.encode(msgspec.structs.replace(message, count=count))
+        pairs = list(zip([m.key for m in of_drones], payloads, strict=True))
+        stamps = [m.t_ns for m in of_drones]
+        return GateMessages.of(t_ns, t_ns // self.clock.gate_ns, self._table, pairs, stamps, first)
+
+    def views(self, seq: int) -> Sequence[Output]:
+        """Return the views but those that a participant publishes itself."""
+        live = self._live().names
+        own = {keys.estimates_view(name) for name in live}
+        own |= {keys.cluster_view(name.removeprefix("controller.")) for name in live if name.startswith("controller.")}
+        return [output for output in self._made_views(self._last, self.now_ns, seq) if output.key not in own]
+
+    def _made_views(self, last: Mapping[str, bytes], t_ns: int, seq: int) -> Iterator[Output]:
+        """Yield the views of the gate t_ns, as far as the last values of their sources go."""
+        drones = []
+        estimates: defaultdict[str, list[flight_messages.EstimateView]] = defaultdict(list)
+        for drone in self.names:
+            truth, status = _read(last, keys.truth(drone)), _read(last, keys.status(drone))
+            if truth is not None and status is not None:
+                pose = (truth.position_m, truth.orientation_wxyz, truth.rotor_rad_s)
+                about = (status.state, status.battery_percent, status.commander)
+                drones.append(flight_messages.DroneView(drone, *pose, *about))
+            estimate = _read(last, keys.estimate(drone))
+            if estimate is not None:
+                estimates[f"estimator.{drone}"].append(flight_messages.estimate_view(drone, estimate))
+        if drones:
+            wind = _read(last, keys.VIEW_DRONES)
+            wind_m_s = wind.wind_m_s if wind is not None and len(wind.wind_m_s) == len(drones) else ()
+            yield Output(keys.VIEW_DRONES, ViewDrones(t_ns, seq, tuple(drones), wind_m_s))
+        for cluster in self.scenario.clusters:
+            state = _read(last, keys.cluster_state(cluster.name))
+            if state is not None:
+                yield Output(keys.cluster_view(cluster.name), flight_messages.cluster_view(state, t_ns, seq))
+        for process, of_process in estimates.items():
+            yield Output(keys.estimates_view(process), ViewEstimates(t_ns, seq, tuple(of_process)))
+
+    def result(self) -> dict[str, Any]:
+        """Return the figures of the replay so far."""
+        statistics = self.statistics.result(self.barrier.participants.values())
+        about = {"replay_of": self._recorded.run_id, "refused": self.outbox.refusals.count}
+        return {"reason": self.ended, "last_ns": self.now_ns, **statistics, **about}
+
+    # Commands and requests
+
+    def _handle_command(self, drone: str, kind: str, message: Any) -> bool:
+        source = message.source if keys.PROCESS_NAME.fullmatch(message.source) else "somebody"
+        self.outbox.refuse(source, f"drone/{drone[:40]}/cmd/{kind}", NOT_FLYABLE)
+        return True
+
+    def refusal_at(self, key: str) -> str | None:
+        return None if f"controller.{keys.thing(key)}" in self._live().names else NOT_FLYABLE
+
+    def control(self, request: ControlRequest) -> ControlAnswer:
+        """Answer a request; `views` are asked for again and again, and are no event."""
+        return self._answer(request) if request.op == "views" else super().control(request)
+
+    def _answer(self, request: ControlRequest) -> ControlAnswer:
+        return ControlAnswer(False, NOT_FLYABLE) if request.op in FLIGHT_REQUESTS else super()._answer(request)
+
+    def _seek(self, request: ControlRequest) -> Refusal | None:
+        """Continue from another gate. Refused while anybody is waited for, who would miss what lies between."""
+        t_s = number(request.args.get("t_s"))
+        if t_s is None or not 0 <= t_s < SEEK_MAX_S:
+            return refused_argument(request, "t_s", "a time on record [s]")
+        gating = [p.name for p in self.barrier.participants.values() if p.gating]
+        if gating:
+            return Refusal(", ".join(gating), "in the lockstep", "seek needs nobody who is waited for")
+        former = self._gates, self._coming, self._pending
+        self._wind(round(t_s * 1e9))
+        if self._coming is None:
+            self._gates, self._coming, self._pending = former
+            return refused_argument(request, "t_s", "a time on record [s]")
+        self._last.clear()
+        self.statistics.rate.jump()
+        if keys.FAULTS in self._standing and not any(m.key == keys.FAULTS for m in self._pending):
+            t_ns = self._coming.t_ns
+            self._pending.append(Recorded(keys.FAULTS, messages.encode(run_messages.Faults(t_ns, 0, ())), t_ns, 0))
+        self.clock.jumps += 1
+        return None
 
     def _timeline(self, _: ControlRequest) -> ControlAnswer:
-        """Answer how far the record goes and what happened when [s]: of many events those of each kind thinned out."""
+        """Answer how far the record goes and what happened when [s]: the events but for commands, of many some."""
         last = self._reader.last(keys.CLOCK)
         first = next(self._reader.messages([keys.CLOCK]), last)
         span = {"from_s": first.t_ns / 1e9, "to_s": last.t_ns / 1e9} if first and last else {}
-        return ControlAnswer(True, result={**span, "marks": timeline_marks(self._reader)})
+        marks = []
+        for recorded in self._reader.messages([keys.EVENT]):
+            with suppress(DecodeError):
+                event: run_messages.Event = messages.decode(keys.EVENT, recorded.payload)
+                if event.kind not in LEFT_OUT:
+                    text = f"{event.subject}: {event.text}" if event.subject else event.text
+                    marks.append({"t_s": event.t_ns / 1e9, "kind": event.kind, "text": text[:TEXT_MAX]})
+        return ControlAnswer(True, result={**span, "marks": marks[:: -(-len(marks) // MARKS_MAX) or 1]})
 
     def _views_of_past(self, request: ControlRequest) -> Refusal | ControlAnswer:
         """Answer the views of instants on record, `every_s` apart, for curves and trails."""
@@ -177,203 +349,150 @@ class Playback(Coordinator):
         for seq, (t_ns, passed) in enumerate(self._recorded_gates.before(instants, self._viewed, BEFORE_NS)):
             last |= passed
             if any(key.endswith("/truth") for key in passed):  # else the record has a gap there, or has ended
-                found += [(view.key, messages.encode(view.message)) for view in self._views.views(last, t_ns, seq)]
+                found += [(key, messages.encode(message)) for key, message in self._made_views(last, t_ns, seq)]
         return ControlAnswer(True, result=found)
 
-    def control(self, request: ControlRequest) -> ControlAnswer:
-        """Answer a request; `views` are asked for again and again, and are no event."""
-        return self._answer(request) if request.op == "views" else super().control(request)
 
-    def _seek(self, request: ControlRequest) -> Refusal | None:
-        """Continue from another gate. Refused while anybody is waited for, who would miss what lies between."""
-        t_s = number(request.args.get("t_s"))
-        if t_s is None or not 0 <= t_s < SEEK_MAX_S:
-            return refused_argument(request, "t_s", "a time on record [s]")
-        gating = [p.name for p in self.barrier.participants.values() if p.gating]
-        if gating:
-            return Refusal(", ".join(gating), "in the lockstep", "seek needs nobody who is waited for")
-        former = self._gates, self._coming, self._pending_faults, self._pending_infos
-        self._wind(round(t_s * 1e9))
-        if self._coming is None:
-            self._gates, self._coming, self._pending_faults, self._pending_infos = former
-            return refused_argument(request, "t_s", "a time on record [s]")
-        self._forget(self._coming.t_ns)
-        self.clock.jumps += 1
-        return None
+class Gate(NamedTuple):
+    """The messages of a gate: stamped after the gate before, up to this one; in order of writing."""
 
-    def _forget(self, t_ns: int) -> None:
-        """Forget what was played before a jump to the gate t_ns."""
-        self._last.clear()
-        self.statistics.rate.jump()
-        if self._plays_faults and self._pending_faults is None:
-            none = messages.encode(run_messages.Faults(t_ns, 0, ()))
-            self._pending_faults = Recorded(keys.FAULTS, none, t_ns, 0)
-
-    def _wind(self, from_ns: int) -> None:
-        self._gates = self._recorded_gates.gates(from_ns)
-        self._read_next()
-        # the last list of faults, and info of each camera, before: they are published only when they change
-        before = self._last_before(from_ns, {keys.FAULTS} if self._plays_faults else set())
-        self._pending_faults: Recorded | None = before[0] if before else None
-        self._pending_infos = self._last_before(from_ns, self._camera_infos)
-
-    def _read_next(self) -> None:
-        self._coming: Gate | None = next(self._gates, None)
-        if self._coming is not None:
-            self.clock.next_ns = self._coming.t_ns
-
-    def _last_before(self, t_ns: int, wanted: Collection[str]) -> list[Recorded]:
-        """Return the last message of each key before a time."""
-        if not wanted or t_ns <= 0:
-            return []
-        before = (m for m in self._reader.messages(wanted, by_time=False) if m.t_ns < t_ns)
-        return list({m.key: m for m in sorted(before, key=lambda m: m.t_ns)}.values())
-
-    # What is played
-
-    def _live(self) -> LiveProcesses:
-        return LiveProcesses(self.scenario, self.barrier.participants.values())
-
-    def _play(self, gate: Gate, wall_ns: int) -> None:
-        live = self._live()
-        self._last.update((m.key, m.payload) for m in gate.messages if m.key in self._views.sources)
-        of_drones = [m for m in gate.messages if m.key in self._place]
-        faults = [m for m in (self._pending_faults, *gate.messages) if m is not None and m.key == keys.FAULTS]
-        self._pending_faults = None
-        for recorded in faults:  # they are known before the gate
-            self._publish(recorded)
-        if of_drones:
-            self.outbox.put(keys.GATE, self._gate_messages(gate.t_ns, of_drones))
-        self.statistics.gate(gate.t_ns, wall_ns)
-        self.outbox.put(keys.CLOCK, self.clock_message(self.missed(wall_ns)))
-        infos, self._pending_infos = self._pending_infos, []
-        for recorded in (m for m in (*infos, *gate.messages) if m.key not in self._place and m.key != keys.FAULTS):
-            if not live.replace(recorded):
-                self._publish(recorded)
-
-    def _publish(self, recorded: Recorded) -> None:
-        """Publish a message again, byte by byte, except events, which are numbered anew, and kills of processes."""
-        key, payload = recorded.key, recorded.payload
-        if key == keys.EVENT:
-            with suppress(DecodeError):
-                event: run_messages.Event = messages.decode(keys.EVENT, payload)
-                if event.kind != "end":  # the replay has an end of its own
-                    self.outbox.put(key, msgspec.structs.replace(event, seq=self.outbox.next_seq(key)))
-        elif key == keys.FAULTS:
-            self.outbox.put(key, msgspec.Raw(without_kills(payload)))
-        elif key != keys.VIEW_DRONES:
-            self.outbox.put(key, msgspec.Raw(payload))
-
-    def _gate_messages(self, t_ns: int, of_drones: list[Recorded]) -> GateMessages:
-        """Return the world's messages about its drones as the world published them: drone by drone, status last."""
-        of_drones.sort(key=lambda m: self._place[m.key] // self._kinds)
-        which = np.array([self._place[m.key] for m in of_drones])
-        first = np.searchsorted(which // self._kinds, np.arange(len(self.names) + 1)).tolist()
-        payloads = [m.payload for m in of_drones]
-        if self._recounts:
-            _recount(payloads, (which % self._kinds).tolist(), first)
-        pairs = list(zip([m.key for m in of_drones], payloads, strict=True))
-        stamps = [m.t_ns for m in of_drones]
-        return GateMessages.of(t_ns, t_ns // self.clock.gate_ns, self._table, pairs, stamps, first)
-
-    def views(self, seq: int) -> Sequence[Output]:
-        live = self._live().names
-        views = self._views.views(self._last, self.now_ns, seq)
-        return [output for output in views if not _is_of(output.key, live)]
-
-    def result(self) -> dict[str, Any]:
-        """Return the figures of the replay so far."""
-        statistics = self.statistics.result(self.barrier.participants.values())
-        about = {"replay_of": self._recorded.run_id, "refused": self.outbox.refusals.count}
-        return {"reason": self.ended, "last_ns": self.now_ns, **statistics, **about}
-
-    # What is refused, and who leaves
-
-    def _handle_command(self, drone: str, kind: str, message: Any) -> bool:
-        source = message.source if keys.PROCESS_NAME.fullmatch(message.source) else "somebody"
-        self.outbox.refuse(source, f"drone/{drone[:40]}/cmd/{kind}", NOT_FLYABLE)
-        return True
-
-    def _perform(self, request: ControlRequest) -> Refusal | ControlAnswer | None:
-        return ControlAnswer(False, NOT_FLYABLE) if request.op in FLIGHT_REQUESTS else super()._perform(request)
-
-    def refusal_at(self, key: str) -> str | None:
-        return None if f"controller.{keys.thing(key)}" in self._live().names else NOT_FLYABLE
-
-    def _after_bye(self, participant: Participant, reason: str) -> None:
-        """Go on also without a recorder."""
-
-    def _is_missed_from_now(self, participant: Participant) -> bool:
-        return False
-
-    def on_death(self, participant: Participant) -> OnDeath:
-        return "drop"
+    t_ns: int
+    messages: list[Recorded]
 
 
-def _is_of(view: str, live: set[str]) -> bool:
-    """Tell whether a participant publishes a view itself."""
-    _, kind, whose = (*view.split("/", 2), "")[:3]
-    return (kind == "cluster" and f"controller.{whose}" in live) or (kind == "estimates" and whose in live)
+class _Clock(msgspec.Struct):
+    state: str
 
 
-def _recount(payloads: list[bytes], kinds: list[int], first: list[int]) -> None:
-    """Let each status count the sensor messages that are played; agents would wait for the others."""
-    truth, status = KINDS.index("truth"), KINDS.index("status")
-    for begin, end in pairwise(first):
-        for m in range(begin, end):
-            if kinds[m] == status:
-                message = messages.decode_as(flight_messages.Status, payloads[m], "status")
-                count = sum(kind != truth for kind in kinds[begin:end])
-                payloads[m] = messages.encode(msgspec.structs.replace(message, count=count))
+class _Sourced(msgspec.Struct):
+    source: str = ""
 
 
-class LiveProcesses:
-    """The processes that take part at a gate, whose outputs are not played.
+_decode_clock = msgspec.msgpack.Decoder(_Clock).decode
+_decode_sourced = msgspec.msgpack.Decoder(_Sourced).decode
 
-    A camera or detector is recognised by the drones that it declares, whatever its name is; one that declares none, as
-    a program of the user's own may, by its name.
+
+class RecordedGates:
+    """Reads a record from any gate on.
+
+    An answer to a gate is written a few gates later, since the world runs ahead of the agents; it is played with the
+    gate of its stamp. A message whose stamp is further from where it was written (of a program that stamps nothing, or
+    in realtime) is played where it was written.
 
     Args:
-        scenario: of the record.
-        participants: alive.
-
-    Attributes:
-        names: of the processes whose work they do.
+        delay_ns: of the run's commands, by which the world may be ahead.
+        wanted: keys.
     """
 
-    def __init__(self, scenario: Scenario, participants: Iterable[Participant]) -> None:
-        served = [each.served_names for each in participants]
-        self._cameras = {drone.name: drone.sensors.cameras() for drone in scenario.drones}
-        self._by_name = {name for names in served if not any(map(self._is_of_cameras, names)) for name in names}
-        self.names = {name for names in served for name in names}
+    def __init__(self, reader: RecordReader, gate_ns: int, delay_ns: int, wanted: Collection[str]) -> None:
+        self._reader = reader
+        self._gate_ns = gate_ns
+        self._slack_ns = delay_ns + gate_ns
+        self._keys = {*wanted, keys.CLOCK}
 
-    def _is_of_cameras(self, name: str) -> bool:
-        role, _, drone = name.partition(".")
-        return role in OF_CAMERAS.values() and drone in self._cameras
+    def gates(self, from_ns: int = 0) -> Iterator[Gate]:
+        """Yield the gates from the first one at or after `from_ns` on; a gate that the record lacks is left out."""
+        for gate in self._all(from_ns):
+            if gate.t_ns >= from_ns:
+                yield gate
 
-    def replace(self, recorded: Recorded) -> bool:
-        """Tell whether one of them publishes a message in place of one on record."""
-        role = OF_CAMERAS.get(messages.type_of(recorded.key))
-        if role is None:
-            return bool(self.names) and author(recorded) in self.names
-        if f"{role}.{keys.thing(recorded.key)}" in self.names and self._is_drawn(recorded.key):
-            return True
-        return bool(self._by_name) and author(recorded) in self._by_name
+    def _all(self, from_ns: int) -> Iterator[Gate]:
+        held: dict[int, list[Recorded]] = {}
+        gates: deque[int] = deque()
+        newest = None
 
-    def _is_drawn(self, key: str) -> bool:
-        """Tell whether the scenario has a camera; where a drone has none there, any counts."""
-        _, drone, what = keys.parts(key)
-        cameras, camera = self._cameras.get(drone), what.removeprefix("camera/").removesuffix("/info")
-        return not cameras or camera == what or camera in cameras
+        def take(t_ns: int) -> Gate:
+            """Return a gate, with the messages of gates before it that the record lacks."""
+            due = sorted(gate_ns for gate_ns in held if gate_ns <= t_ns)
+            return Gate(t_ns, [recorded for gate_ns in due for recorded in held.pop(gate_ns)])
+
+        # What answers the first gate, or was sampled for it, may stand in a chunk that begins before it.
+        for recorded in self._reader.messages(self._keys, by_time=False, from_ns=max(0, from_ns - self._slack_ns)):
+            if recorded.key != keys.CLOCK:
+                due_ns = -(-recorded.t_ns // self._gate_ns) * self._gate_ns
+                if newest is not None:
+                    writing_ns = newest + self._gate_ns
+                    due_ns = due_ns if newest - self._slack_ns < due_ns <= writing_ns else writing_ns
+                held.setdefault(due_ns, []).append(recorded)
+            elif (newest is None or recorded.t_ns > newest) and _is_gate(recorded.payload):
+                newest = recorded.t_ns
+                gates.append(newest)
+                while gates[0] + self._slack_ns <= newest:
+                    yield take(gates.popleft())
+        for t_ns in gates:
+            yield take(t_ns)
+
+    def before(
+        self, instants_ns: Sequence[int], wanted: Collection[str], back_ns: int
+    ) -> Iterator[tuple[int, dict[str, bytes]]]:
+        """Yield each instant with the last payload by key since the instant before; for the first one since back_ns.
+
+        Args:
+            instants_ns: ascending.
+            wanted: keys.
+            back_ns: how far before the first instant is looked.
+        """
+        first_ns, last_ns = instants_ns[0] - back_ns, instants_ns[-1]
+        newest: list[dict[str, Recorded]] = [{} for _ in instants_ns]
+        for recorded in self._reader.messages(wanted, by_time=False, from_ns=max(0, first_ns)):
+            if recorded.t_ns > last_ns + OVERLAP_NS:
+                break
+            if first_ns <= recorded.t_ns <= last_ns:
+                of_instant = newest[bisect_left(instants_ns, recorded.t_ns)]
+                held = of_instant.get(recorded.key)
+                if held is None or held.t_ns <= recorded.t_ns:
+                    of_instant[recorded.key] = recorded
+        for t_ns, of_instant in zip(instants_ns, newest, strict=True):
+            yield t_ns, {key: recorded.payload for key, recorded in of_instant.items()}
 
 
-def timeline_marks(reader: RecordReader) -> list[dict[str, Any]]:
-    """Return the events on record, but for commands: t_s, kind and text of each; of many, evenly thinned out."""
-    marks = []
-    for recorded in reader.messages([keys.EVENT]):
-        with suppress(DecodeError):
-            event: run_messages.Event = messages.decode(keys.EVENT, recorded.payload)
-            if event.kind not in LEFT_OUT:
-                text = f"{event.subject}: {event.text}" if event.subject else event.text
-                marks.append({"t_s": event.t_ns / 1e9, "kind": event.kind, "text": text[:TEXT_MAX]})
-    return marks[:: -(-len(marks) // MARKS_MAX) or 1]
+def _is_gate(payload: bytes) -> bool:
+    """Tell whether a clock belongs to a gate: while a run waits for its start, it does not."""
+    try:
+        return _decode_clock(payload).state != "waiting"
+    except REFUSALS:
+        return False  # not the world's
+
+
+def _is_played(key: str) -> bool:
+    """Tell whether the messages of a key may be played.
+
+    A replay publishes its own info, clock and views; what is about the processes on record is left out.
+    """
+    views = (ViewDrones, flight_messages.ViewCluster, ViewEstimates)
+    anew = key in (keys.INFO, keys.CLOCK) or messages.type_of(key) in views
+    return not anew and not key.startswith("process/")
+
+
+def _author(recorded: Recorded) -> str:
+    """Return the process that published a message, empty for the world and for unknown roles."""
+    kind = messages.type_of(recorded.key)
+    if kind is flight_messages.Estimate:
+        return f"estimator.{keys.thing(recorded.key)}"
+    if kind in (flight_messages.ClusterState, run_messages.ClusterRequest):
+        return f"controller.{keys.thing(recorded.key)}"
+    if kind is None or not issubclass(kind, SOURCED):
+        return ""
+    try:
+        return _decode_sourced(recorded.payload).source
+    except REFUSALS:
+        return ""
+
+
+def _without_kills(payload: bytes) -> bytes:
+    """Return a list of faults without those that kill a process: the participants of a replay are others."""
+    try:
+        listed: run_messages.Faults = messages.decode(keys.FAULTS, payload)
+    except DecodeError:
+        return payload
+    others = tuple(fault for fault in listed.faults if fault.kind != PROCESS_KILL)
+    return payload if others == listed.faults else messages.encode(msgspec.structs.replace(listed, faults=others))
+
+
+def _read(last: Mapping[str, bytes], key: str) -> Any:
+    """Return the last message on a key, None where there is none that can be read."""
+    payload = last.get(key)
+    try:
+        return messages.decode(key, payload) if payload is not None else None
+    except DecodeError:
+        return None

@@ -15,21 +15,16 @@ Operation = Callable[[ControlRequest], Refusal | ControlAnswer | None]
 class RunClock:
     """Simulated time, and whether it may pass.
 
-    Args:
-        time: of the scenario.
-        mode: "lockstep" or "realtime".
-        rate: simulated per wall seconds to pace at; 0 = as fast as possible.
-
     Attributes:
-        gate_ns: interval of the gates [ns].
-        delay_ns: of commands [ns].
-        now_ns: the newest gate; 0 before the start too [ns].
-        next_ns: the gate after it, from which a newcomer is waited for [ns].
+        rate: simulated per wall seconds to pace at; 0 = as fast as possible.
+        delay_ns: of commands.
+        now_ns: the newest gate; 0 before the start too.
+        next_ns: the gate after it, from which a newcomer is waited for.
         state: as in the message `clock`.
         steps_allowed: gates that may still come while the run is paused.
         jumps: how often time was moved otherwise than gate by gate.
         ended: why the run is over, None while it goes on.
-        is_complete: whether it is over by itself, so that nothing of it can be gone on with.
+        is_complete: whether it is over by itself, so that nothing of it can be continued.
     """
 
     SAVED: ClassVar[Saved] = {  # of a run that has not ended
@@ -65,15 +60,11 @@ class RunClock:
     def start(self, t_ns: int, paused: bool = False) -> None:
         """Begin with the first gate, and stand still after it if `paused`."""
         self.state = "paused" if paused else "running"
-        self._set(t_ns)
+        self.advance(t_ns)
 
     def advance(self, t_ns: int) -> None:
         """Advance to a gate; while the run is paused, this uses up one step."""
         self.steps_allowed = max(0, self.steps_allowed - 1)
-        self._set(t_ns)
-
-    def _set(self, t_ns: int) -> None:
-        """Set the newest gate, and the one after it an interval later."""
         self.now_ns, self.next_ns = t_ns, t_ns + self.gate_ns
 
     def complete(self, reason: str) -> None:
@@ -94,33 +85,22 @@ class RunClock:
 
     def operations(self) -> dict[str, Operation]:
         """Return what each `op` on `world/control` that is about time does."""
-        return {
-            "pause": self._pause,
-            "resume": self._resume,
-            "step": self._step,
-            "rate": self._set_rate,
-            "stop": self._stop,
-        }
+        pausing = dict.fromkeys(("pause", "resume", "step"), self._pause_or_continue)
+        return {**pausing, "rate": self._set_rate, "stop": self._stop}
 
-    def _pause(self, _: ControlRequest) -> Refusal | None:
-        if self.state != "running":
-            return Refusal("the run", self.state, "pause needs a running one")
-        self.hold()
-        return None
-
-    def _resume(self, _: ControlRequest) -> Refusal | None:
-        if self.state != "paused":
-            return Refusal("the run", self.state, "resume needs a paused one")
-        self.state = "running"
-        return None
-
-    def _step(self, request: ControlRequest) -> Refusal | None:
-        gates = number(request.args.get("gates", 1))
+    def _pause_or_continue(self, request: ControlRequest) -> Refusal | None:
+        op, needed = request.op, "running" if request.op == "pause" else "paused"
+        gates = number(request.args.get("gates", 1)) if op == "step" else 1
         if gates is None or not 1 <= gates <= GATES_MAX or gates != int(gates):
             return refused_argument(request, "gates", f"a whole number from 1 to {GATES_MAX}")
-        if self.state != "paused":
-            return Refusal("the run", self.state, "step needs a paused one")
-        self.steps_allowed += int(gates)
+        if self.state != needed:
+            return Refusal("the run", self.state, f"{op} needs a {needed} one")
+        if op == "pause":
+            self.hold()
+        elif op == "resume":
+            self.state = "running"
+        else:
+            self.steps_allowed += int(gates)
         return None
 
     def _set_rate(self, request: ControlRequest) -> Refusal | None:

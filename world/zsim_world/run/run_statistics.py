@@ -61,20 +61,40 @@ class CommandAges:
 
 
 class RealTimeFactor:
-    """Simulated per wall seconds, over the last wall second and over the run."""
+    """Simulated per wall seconds, over the last wall second and over the run.
+
+    Attributes:
+        sim_ns: simulated time that has passed gate by gate since the first one.
+    """
 
     SAVED: ClassVar[Saved] = {
         "_marks": list[tuple[int, int]],
         "_start_wall_ns": int | None,
         "_last": tuple[int, int],
-        "_sim_ns": int,
+        "sim_ns": int,
     }
 
     def __init__(self) -> None:
         self._marks: list[tuple[int, int]] = []  # simulated and wall time; at most a second's
         self._start_wall_ns: int | None = None
         self._last = (0, 0)
-        self._sim_ns = 0
+        self.sim_ns = 0
+
+    @property
+    def wall_s(self) -> float:
+        return 0.0 if self._start_wall_ns is None else (self._last[1] - self._start_wall_ns) / 1e9
+
+    def gate(self, t_ns: int, wall_ns: int) -> None:
+        """Note when the gate t_ns was published."""
+        if self._start_wall_ns is None:
+            self._start_wall_ns = wall_ns
+        if self._marks:
+            self.sim_ns += t_ns - self._last[0]
+        self._last, marks = (t_ns, wall_ns), self._marks
+        while len(marks) > 1 and wall_ns - marks[0][1] > 1_000_000_000:
+            del marks[0]
+        if not marks or wall_ns - marks[-1][1] >= MARK_NS:
+            marks.append(self._last)
 
     def stand_still(self, wall_ns: int) -> None:
         """Exclude from the run's wall time what has passed since the last gate, until wall_ns."""
@@ -82,18 +102,6 @@ class RealTimeFactor:
             self._start_wall_ns += wall_ns - self._last[1]
             self._last = (self._last[0], wall_ns)
             self._marks = [self._last]
-
-    def gate(self, t_ns: int, wall_ns: int) -> None:
-        """Note when the gate t_ns was published."""
-        if self._start_wall_ns is None:
-            self._start_wall_ns = wall_ns
-        if self._marks:
-            self._sim_ns += t_ns - self._last[0]
-        self._last, marks = (t_ns, wall_ns), self._marks
-        while len(marks) > 1 and wall_ns - marks[0][1] > 1_000_000_000:
-            del marks[0]
-        if not marks or wall_ns - marks[-1][1] >= MARK_NS:
-            marks.append(self._last)
 
     def jump(self) -> None:
         """Note that simulated time jumps to the next gate rather than passing."""
@@ -103,16 +111,6 @@ class RealTimeFactor:
         """Return the factor over the last wall second."""
         (t0, w0), (t1, w1) = self._marks[0] if self._marks else self._last, self._last
         return (t1 - t0) / (w1 - w0) if w1 > w0 else 0.0
-
-    @property
-    def sim_s(self) -> float:
-        """Return the simulated time that has passed gate by gate since the first one."""
-        return self._sim_ns / 1e9
-
-    @property
-    def wall_s(self) -> float:
-        """Return the wall time from the first gate to the last."""
-        return 0.0 if self._start_wall_ns is None else (self._last[1] - self._start_wall_ns) / 1e9
 
 
 class RunStatistics:
@@ -143,10 +141,6 @@ class RunStatistics:
         self.ages.gate(t_ns, wall_ns)
         self.rate.gate(t_ns, wall_ns)
 
-    def separation(self, closest_m: float) -> None:
-        """Note the least distance between two drones in a gate [m]."""
-        self.closest_m = min(self.closest_m, closest_m)
-
     def deadlines(self, participants: Iterable[Participant], need_ns: int) -> None:
         """Count the participants whose done for need_ns was due, and those whose done is missing."""
         for participant in participants:
@@ -157,7 +151,7 @@ class RunStatistics:
     def result(self, participants: Iterable[Participant]) -> dict[str, Any]:
         """Return the figures of the run as far as it got."""
         by_name = {p.name: p.deadline_misses for p in participants if p.gating}
-        sim_s, wall_s = self.rate.sim_s, self.rate.wall_s
+        sim_s, wall_s = self.rate.sim_ns / 1e9, self.rate.wall_s
         return {
             "sim_s": sim_s,
             "wall_s": wall_s,

@@ -1,6 +1,6 @@
 """The world of a flight: integrates all drones, owns simulated time, applies commands and faults. No session, no clock.
 
-Participants and requests, which a replay has as well, are in `zsim_world.run.participants` and `.coordinator`.
+Participants and requests, which a replay has as well, are in `zsim_world.run.coordinator`.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -35,10 +35,8 @@ class World(Coordinator):
     """One flight.
 
     Args:
-        scenario: resolved.
         mode: "lockstep" or "realtime".
         rate: simulated per wall seconds to pace at; 0 = as fast as possible.
-        wall_ns: monotonic wall time.
         run_id: given by a launcher, and by tests that compare records.
         changed: texts `a.b.c=value` by which the scenario was changed against its file, None: not known.
 
@@ -46,11 +44,9 @@ class World(Coordinator):
         ScenarioError: it has external drones, and the mode is "lockstep".
 
     Attributes:
-        fleet: the drones.
-        drivers: what is published of the external ones among them.
+        drivers: what is published of the external drones.
         queue: of the commands, with the commander of each drone.
         faults: that are injected.
-        failure: what is to be raised once the end is published, None for a run that ended well.
     """
 
     SAVED: ClassVar[Saved] = {
@@ -92,7 +88,7 @@ class World(Coordinator):
         self._publication = GatePublication(self.fleet)
         self._hash = TruthHash(len(self._simulated))
         self._last_ns = round(scenario.duration_s * 1e9) // self.clock.gate_ns * self.clock.gate_ns
-        self.statistics.separation(self.fleet.closest_m())
+        self.statistics.closest_m = self.fleet.closest_m
 
     def info(self) -> messages.Info:
         """Return the message of `world/info`."""
@@ -161,54 +157,48 @@ class World(Coordinator):
     def advance(self, wall_ns: int) -> None:
         """Go to the next gate (or publish gate 0) and put all its messages into the outbox.
 
-        A state that is no longer finite, or a user's sensor that fails, ends the run at the gate before; see `failure`.
+        What has arrived is applied before the fleet is integrated. A state that is no longer finite, or a user's sensor
+        that fails, ends the run at the gate before; see `failure`.
         """
-        is_first = self.clock.state == "waiting"
+        clock, fleet, statistics, now_ns = self.clock, self.fleet, self.statistics, self.clock.now_ns
+        is_first = clock.state == "waiting"
         if is_first:
-            self.clock.start(self.fleet.t_ns)
+            clock.start(fleet.t_ns)
         else:
-            self._begin_gate()
+            if clock.mode == "realtime":
+                paced = [p for p in self.barrier.participants.values() if not p.served_names <= self.unpaced]
+                statistics.deadlines(paced, clock.required_ns)
+                self.barrier.give_up_late()
+            self._intake.apply(now_ns)
+            self.faults.apply(now_ns)
+            self.drivers.lead()
         try:
             if not is_first:
-                self.fleet.advance()
+                fleet.advance()
             gate = self._publication.gate(self.queue.commanders()) if self._simulated else None
-        except DivergedError as error:
-            self._fail("diverged", error.drone, error, {})
-            return
-        except UserCodeError as error:
-            self._fail("failure", WORLD, error, {"on_death": "end"})
+        except (DivergedError, UserCodeError) as error:
+            self.failure = error
+            if isinstance(error, DivergedError):
+                self.outbox.event("diverged", error.drone, str(error), {})
+            else:
+                self.outbox.event("failure", WORLD, str(error), {"on_death": "end"})
+            clock.complete(str(error))
             return
         if not is_first:
-            self.clock.advance(self.fleet.t_ns)
-            self.statistics.separation(self.fleet.closest_m())
+            clock.advance(fleet.t_ns)
+            statistics.closest_m = min(statistics.closest_m, fleet.closest_m)
             self._publish_incidents()
-        state = self.fleet.bodies.state
-        self._hash.add(self.now_ns, state[self._simulated] if self.external else state)
+        state = fleet.bodies.state
+        self._hash.add(clock.now_ns, state[self._simulated] if self.external else state)
         if gate is not None:
             self.outbox.put(keys.GATE, gate)
-        self.statistics.gate(self.now_ns, wall_ns)
+        statistics.gate(clock.now_ns, wall_ns)
         self.outbox.put(keys.CLOCK, self.clock_message(self.missed(wall_ns)))
-        if self.now_ns >= self._last_ns:
-            self.clock.complete(DURATION_OVER)
-
-    def _begin_gate(self) -> None:
-        """Apply what has arrived before the fleet is integrated to the next gate."""
-        if self.clock.mode == "realtime":
-            paced = [p for p in self.barrier.participants.values() if not p.served_names <= self.unpaced]
-            self.statistics.deadlines(paced, self.clock.required_ns)
-            self.barrier.give_up_late()
-        self._intake.apply(self.now_ns)
-        self.faults.apply(self.now_ns)
-        self.drivers.lead()
-
-    def _fail(self, kind: str, subject: str, error: DivergedError | UserCodeError, data: dict[str, Any]) -> None:
-        """End the run at the gate before this one."""
-        self.failure = error
-        self.outbox.event(kind, subject, str(error), data)
-        self.clock.complete(str(error))
+        if clock.now_ns >= self._last_ns:
+            clock.complete(DURATION_OVER)
 
     def _publish_incidents(self) -> None:
-        for i, j in self.fleet.collisions():
+        for i, j in self.fleet.collisions:
             name, other = self.names[i], self.names[j]
             self.outbox.notice("collision", name, f"{name} and {other} collide", {"other": other})
         for i, m in self.fleet.bumps():

@@ -38,7 +38,10 @@ class NoiseTable:
         names = [drone.name for drone in scenario.drones]
         streams = [[stream(scenario.seed, f"{name}/{s}") for s in (*SENSORS, "wind")] for name in names]
         common = stream(scenario.seed, "wind")
-        self._rows = np.array(_rows(scenario, gates))
+        # rows of each stream, the sample at t = 0 included
+        span = gates * scenario.time.gate_ms / 1000.0
+        rates = [max(rate_of(getattr(d.sensors, name), name) for d in scenario.drones) for name in SENSORS]
+        self._rows = np.array([math.ceil(span * rate) + 2 for rate in (*rates, BOARD_RATE_HZ)])
         widths = [[noise_width(n, channels(drone.sensors, s)) for s, n in STREAMS] for drone in scenario.drones]
         least = [2 * n + 1 for _, n in STREAMS]  # of the last row, which has no sensors
         self.width = np.array([[*row, GUST_WIDTH] for row in (*widths, least)], dtype=np.int64)
@@ -95,13 +98,6 @@ def refill(table: NDArray, at: NDArray, rows: NDArray, widths: NDArray, cursor: 
                 numbers[k] = numbers[used + k]
             fill(numbers[size - used :], streams[i, s])
             cursor[i, s] = 0
-
-
-def _rows(scenario: Scenario, gates: int) -> list[int]:
-    """Return how many rows of each stream a table needs, the sample at t = 0 included."""
-    span = gates * scenario.time.gate_ms / 1000.0
-    rates = [max(rate_of(getattr(d.sensors, name), name) for d in scenario.drones) for name in SENSORS]
-    return [math.ceil(span * rate) + 2 for rate in (*rates, BOARD_RATE_HZ)]
 
 
 WORDS = columns("StreamWords", (Field("state", "1", 2), Field("step", "1", 2)))  # of a stream, uint64: high, low

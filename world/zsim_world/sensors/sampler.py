@@ -9,7 +9,6 @@ after the gate from the truth that the kernel logged.
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from msgspec import Struct
 from numpy.typing import NDArray
 
 from zsim.errors import UserCodeError, reason_of
@@ -32,28 +31,11 @@ WHOSE = columns("WhoseColumns", (Field("sensor", "1"), Field("drone", "1"), Fiel
 VALUE_COLUMNS = 9  # of a GPS fix, with its place on the Earth
 
 
-class SensorSample(Struct, frozen=True, gc=False):
-    """One measurement; `values` as above."""
-
-    sensor: str
-    drone: int
-    t_ns: int
-    t_sample_ns: int
-    values: tuple[float, ...]
-
-
 class Sampled(NamedTuple):
     """Measurements in the order of (t_ns, drone, sensor)."""
 
     whose: NDArray[np.int64]  # (M, WHOSE.size)
     values: NDArray[np.float64]  # (M, VALUE_COLUMNS), the first ones of each kind's
-
-    def each(self, sensors: FleetSensors) -> list[SensorSample]:
-        """Return them one by one."""
-        names, sizes = sensors.names, [kind.values for kind in sensors.types]
-        sizes[sensor_set.GPS] = VALUE_COLUMNS
-        rows = zip(self.whose.tolist(), self.values.tolist(), strict=True)
-        return [SensorSample(names[s], i, t, at, tuple(row[: sizes[s]])) for (s, i, t, at), row in rows]
 
 
 NONE = Sampled(np.empty((0, WHOSE.size), dtype=np.int64), np.empty((0, VALUE_COLUMNS)))
@@ -70,13 +52,7 @@ class SampledLog(NamedTuple):
 
 
 class Sampler:
-    """Makes samples of the kernel's log, and holds back those that are delayed.
-
-    Args:
-        scenario: resolved.
-        sensors: of its drones.
-        senses: of the kernel.
-    """
+    """Makes samples of the kernel's log, and holds back those that are delayed."""
 
     SAVED: ClassVar[Saved] = {"_later": Sampled, "_user_sensors": PART}
 
@@ -105,9 +81,8 @@ class Sampler:
             value = np.concatenate((self._log.value[:logged], user_value))
             held, logged = hold(self._log._replace(whose=whose, value=value)), len(whose)
         fresh = Sampled(*stamped(held, logged, self._tick_ns))
-        return fresh if self._in_order else self._sort_out(fresh, now_ns)
-
-    def _sort_out(self, fresh: Sampled, now_ns: int) -> Sampled:
+        if self._in_order:
+            return fresh
         index = np.concatenate((self._later.whose, fresh.whose))
         values = np.concatenate((self._later.values, fresh.values))
         late = index[:, WHOSE.t] > now_ns
@@ -170,13 +145,7 @@ def with_more(whose: NDArray, values: NDArray, more: NDArray) -> tuple[NDArray, 
 
 
 class UserSensors:
-    """The users' sensors of a fleet. Each drone and sensor has a random stream, as the stock sensors have.
-
-    Args:
-        scenario: resolved.
-        sensors: of its drones.
-        senses: of the kernel.
-    """
+    """The users' sensors of a fleet. Each drone and sensor has a random stream, as the stock sensors have."""
 
     SAVED: ClassVar[Saved] = {"sensors": PART}
 
@@ -212,7 +181,8 @@ class UserSensors:
             sensor = self._sensors[s, i]
             truth = sensor.truth(senses.exposed[m], tick * self._tick_s)
             sensor.measure(truth, self._environment, values[m])
-            if read(sensor.width, values[m], senses.config[i, s], sensor.bias, senses.fault[i, s], sensor.numbers()):
+            noise = sensor.rng.standard_normal(sensor.noise_width)
+            if read(sensor.width, values[m], senses.config[i, s], sensor.bias, senses.fault[i, s], noise):
                 kept.append(m)
         return senses.exposed_whose[kept], values[kept]
 
@@ -225,13 +195,13 @@ class _UserSensor:
     def __init__(
         self, what: str, kind: SensorType, settings: Sensor, rng: np.random.Generator, config: NDArray[np.float64]
     ) -> None:
-        self._what, self._kind, self._settings, self._rng = what, kind, settings, rng
+        self._what, self._kind, self._settings, self.rng = what, kind, settings, rng
         self.width = kind.width
         models = kind.errors(settings)
         self.bias = np.zeros(2 * CHANNELS_MAX)
         self.bias[: self.width] = np.array([model.bias for model in models]) * rng.standard_normal(self.width)
-        self._numbers = noise_width(self.width, models)
-        if self._numbers > 2 * self.width + 1:
+        self.noise_width = noise_width(self.width, models)
+        if self.noise_width > 2 * self.width + 1:
             sigma = np.array([model.correlated_sigma for model in models])
             self.bias[CHANNELS_MAX : CHANNELS_MAX + self.width] = sigma * rng.standard_normal(self.width)
         self._p_BS = config[CONFIG.p_BS : CONFIG.p_BS + 3].copy()
@@ -239,11 +209,11 @@ class _UserSensor:
 
     @property
     def stream(self) -> list[int]:
-        return words(self._rng)
+        return words(self.rng)
 
     @stream.setter
     def stream(self, stream: list[int]) -> None:
-        place(self._rng, stream)
+        place(self.rng, stream)
 
     def truth(self, row: NDArray[np.float64], t_s: float) -> SensorTruth:
         """Return the truth that it is exposed to, from a row of EXPOSED."""
@@ -279,7 +249,3 @@ class _UserSensor:
         if not np.isfinite(values).all():
             numbers = [float(value) for value in values[:count]]
             raise UserCodeError(f"{name} returns {numbers}; must be finite", where)
-
-    def numbers(self) -> NDArray[np.float64]:
-        """Return the standard normal numbers of one sample, see `noise_width`."""
-        return self._rng.standard_normal(self._numbers)

@@ -92,28 +92,25 @@ def channels(sensors: Sensors, name: str) -> list[ErrorModel]:
 def config(sensors: FleetSensors) -> NDArray[np.float64]:
     """Return errors and mounts of all sensors, shape (N, S, CONFIG.size)."""
     table = np.zeros((len(sensors.settings), len(sensors.names), CONFIG.size))
-    for row, own in zip(table, sensors.settings, strict=True):
-        for s, settings in enumerate(own):
-            if settings is not None:
-                _fill(row[s], sensors.names[s], sensors.types[s], settings)
+    for of_drone, own in zip(table, sensors.settings, strict=True):
+        for row, name, kind, settings in zip(of_drone, sensors.names, sensors.types, own, strict=True):
+            if settings is None:
+                continue
+            rate = rate_of(settings, name)
+            for k, model in enumerate(kind.errors(settings)):
+                row[CONFIG.white + k] = model.white_sigma(settings.rate_hz)
+                row[CONFIG.walk + k] = model.bias_walk / math.sqrt(rate)
+                row[CONFIG.quantum + k] = model.quantum
+                if sigma := model.correlated_sigma:  # exact: Brown and Hwang, "Random signals", section 5.3
+                    decay = math.exp(-1.0 / (rate * model.correlation_time_s))
+                    row[CONFIG.correlated], row[CONFIG.decay + k] = 1.0, decay
+                    row[CONFIG.kick + k] = sigma * math.sqrt(1.0 - decay * decay)
+            row[CONFIG.p_BS : CONFIG.p_BS + 3] = settings.mount.position_m
+            row[CONFIG.q_BS : CONFIG.q_BS + 4] = quaternion_from_rpy(np.radians(settings.mount.rpy_deg))
+            row[CONFIG.drop] = ndtri(settings.dropout)
+            if isinstance(settings, SonarConfig):
+                row[CONFIG.limit_min], row[CONFIG.limit_max] = settings.min_m, settings.max_m
     return table
-
-
-def _fill(row: NDArray[np.float64], name: str, kind: SensorType, settings: Sensor) -> None:
-    rate = rate_of(settings, name)
-    for k, model in enumerate(kind.errors(settings)):
-        row[CONFIG.white + k] = model.white_sigma(settings.rate_hz)
-        row[CONFIG.walk + k] = model.bias_walk / math.sqrt(rate)
-        row[CONFIG.quantum + k] = model.quantum
-        if model.correlated_sigma:  # exact from sample to sample: Brown and Hwang, "Random signals", section 5.3
-            decay = math.exp(-1.0 / (rate * model.correlation_time_s))
-            row[CONFIG.correlated] = 1.0
-            row[CONFIG.decay + k], row[CONFIG.kick + k] = decay, model.correlated_sigma * math.sqrt(1.0 - decay * decay)
-    row[CONFIG.p_BS : CONFIG.p_BS + 3] = settings.mount.position_m
-    row[CONFIG.q_BS : CONFIG.q_BS + 4] = quaternion_from_rpy(np.radians(settings.mount.rpy_deg))
-    row[CONFIG.drop] = ndtri(settings.dropout)
-    if isinstance(settings, SonarConfig):
-        row[CONFIG.limit_min], row[CONFIG.limit_max] = settings.min_m, settings.max_m
 
 
 def noise_width(numbers: int, models: Sequence[ErrorModel]) -> int:
@@ -138,8 +135,7 @@ def schedule(sensors: FleetSensors, tick_ms: float) -> NDArray[np.int64]:
 
 def latencies(sensors: FleetSensors) -> NDArray[np.int64]:
     """Return t_ns - t_sample_ns of each drone and sensor [ns], (N, S)."""
-    ms = [[0.0 if settings is None else settings.latency_ms for settings in own] for own in sensors.settings]
-    return np.array([[round(latency * 1_000_000) for latency in own] for own in ms])
+    return np.array([[round(each.latency_ms * 1_000_000) if each else 0 for each in own] for own in sensors.settings])
 
 
 def samples_per_gate(sensors: FleetSensors, gate_ms: float) -> int:

@@ -33,21 +33,13 @@ Array = NDArray[np.float64]
 
 
 class PictureSightings(NamedTuple):
-    """The sightings in one picture.
+    """The sightings in one picture."""
 
-    Attributes:
-        t_ns: when they are published.
-        drone: whose camera.
-        t_sample_ns: the middle of the exposure.
-        camera: its name.
-        seen: in an order that does not tell whose hats they are.
-    """
-
-    t_ns: int
+    t_ns: int  # when they are published
     drone: int
-    t_sample_ns: int
+    t_sample_ns: int  # the middle of the exposure
     camera: str
-    seen: tuple[Seen, ...]
+    seen: tuple[Seen, ...]  # in an order that does not tell whose hats they are
 
 
 class Surroundings(NamedTuple):
@@ -72,22 +64,9 @@ class _Exposures(NamedTuple):
     rate_hz: float
     latency_ns: int
 
-    def at_ns(self, count: int) -> int:
-        """Return the instant of a picture."""
-        return round(count * 1e9 / self.rate_hz)
-
-    def publish(self, at_ns: int, seen: tuple[Seen, ...]) -> PictureSightings:
-        """Return the sightings in a picture of an instant."""
-        return PictureSightings(at_ns + self.latency_ns, self.drone, at_ns, self.name, seen)
-
 
 class SightingSampler:
-    """Makes the sightings of a fleet, gate by gate.
-
-    Args:
-        scenario: resolved; some drone has sightings.
-        hulls: radius of each drone's [m], (N,).
-    """
+    """Makes the sightings of a fleet, gate by gate; `hulls`: radius of each drone's [m], (N,)."""
 
     SAVED: ClassVar[Saved] = {
         "_streams": IN_PLACE,
@@ -138,7 +117,7 @@ class SightingSampler:
     def due(self, state: Array, now_ns: int) -> list[PictureSightings]:
         """Return what is due by a gate, given the state of all drones there, (N, STATE.size or more)."""
         if self._next_ns <= now_ns:
-            self._later += self._looked(state[:, : STATE.size].copy(), now_ns)
+            self._look(state[:, : STATE.size].copy(), now_ns)
         if self._next_ns <= now_ns + self._gate_ns:  # a picture before the next gate needs this state
             self._former, self._former_ns = state[:, : STATE.size].copy(), now_ns
         if not self._later:
@@ -147,26 +126,27 @@ class SightingSampler:
         self._later = [sighting for sighting in self._later if sighting.t_ns > now_ns]
         return due
 
-    def _looked(self, now: Array, now_ns: int) -> list[PictureSightings]:
-        """Return the sightings in all pictures up to a gate."""
-        pictures = sorted(self._taken(now_ns))
+    def _look(self, now: Array, now_ns: int) -> None:
+        """Take all pictures up to a gate, and keep their sightings until they are due."""
+        pictures: list[tuple[int, int]] = []  # instant and camera
+        for w, exposures in enumerate(self._exposures):
+            while self._due_ns[w] <= now_ns:
+                pictures.append((self._due_ns[w], w))
+                self._counts[w] += 1
+                self._due_ns[w] = round(self._counts[w] * 1e9 / exposures.rate_hz)
+        pictures.sort()
         self._next_ns = min(self._due_ns)
         first = not len(self._former)
         former, former_ns = (now, now_ns) if first else (self._former, self._former_ns)
         which = np.array(pictures, dtype=np.int64)
         seen: list[list[Seen]] = [[] for _ in pictures]
-        for row in look(which, former, former_ns, now, now_ns, self._held, self._streams).tolist():
-            seen[int(row[SEEN.picture])].append(_sighting(row))
-        return [self._exposures[w].publish(at_ns, tuple(of)) for (at_ns, w), of in zip(pictures, seen, strict=True)]
-
-    def _taken(self, now_ns: int) -> Iterator[tuple[int, int]]:
-        """Yield instant and camera of every picture up to a gate, and count it."""
-        due_ns, counts = self._due_ns, self._counts
-        for w, exposures in enumerate(self._exposures):
-            while due_ns[w] <= now_ns:
-                yield due_ns[w], w
-                counts[w] += 1
-                due_ns[w] = exposures.at_ns(counts[w])
+        for picture, x, y, z, range_m, sigma, sigma_m in look(
+            which, former, former_ns, now, now_ns, self._held, self._streams
+        ).tolist():
+            seen[int(picture)].append(Seen((x, y, z), range_m, sigma, sigma_m))
+        for (at_ns, w), of_picture in zip(pictures, seen, strict=True):
+            drone, name, _, latency_ns = self._exposures[w]
+            self._later.append(PictureSightings(at_ns + latency_ns, drone, at_ns, name, tuple(of_picture)))
 
 
 def _watching(scenario: Scenario) -> Iterator[tuple[int, str, Camera, SightingModel]]:
@@ -192,12 +172,6 @@ def _detector(camera: Camera, model: SightingModel, hats: Hats, light: float, rn
     row[DETECTOR.blur_share], row[DETECTOR.diameter_min] = model.blur_share, model.diameter_min_px
     row[DETECTOR.miss], row[DETECTOR.false] = model.miss, model.false_hz / camera.rate_hz
     return row
-
-
-def _sighting(row: list[float]) -> Seen:
-    """Return the sighting of a row of SEEN."""
-    _, x, y, z, range_m, sigma, sigma_m = row
-    return Seen((x, y, z), range_m, sigma, sigma_m)
 
 
 def _turned(r: Array) -> Array:
@@ -306,7 +280,6 @@ def _put(model: NDArray, to_K: Vector, range_m: float, sigma: float, sigma_m: fl
 
 @inlined
 def _range_m(model: NDArray, angle: float) -> float:
-    """Return the distance of a hat of an apparent diameter [rad]."""
     return model[DETECTOR.radius] / math.sin(0.5 * min(angle, ANGLE_MAX))
 
 

@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from zsim.contract.run_messages import Join
 from zsim.transport.link_watch import Sessions, SessionTokens
 from zsim_world.run.barrier import Participant
-from zsim_world.run.inputs import FalselyJoined, Joined, NotShown, Run
+from zsim_world.run.inputs import Run
 
 TOKEN_NS = 3_000_000_000  # wall time by which a token is there; the hub knows one behind routers within 1 s (measured)
 SHOWN_NS = 10_000_000_000  # wall time by which one whose token is not its own publishes a done; first steps take 1 s
 HELD_NS = 1_000_000_000  # wall time that time has to stand for a living process before another may replace it
 DONE_NS = 10_000_000_000  # wall time that time may stand for one that never published a done; first steps take 1 s
 LOOK_NS = 200_000_000  # wall time between two checks of those that still have to prove that they exist
-NO_TOKEN = "has no liveliness token"
 WITHHELD_MAX = 1000  # joins of strangers that wait for their tokens
+NO_TOKEN = "has no liveliness token"
 NO_DONE = "has never published a done"
 
 
@@ -36,7 +36,6 @@ class Admission:
 
     Args:
         tokens: of all processes.
-        run: that is joined.
         trusts: whether access control lets nobody join in another's name.
     """
 
@@ -58,7 +57,7 @@ class Admission:
             return
         former = self._withheld.get(name)
         if former is None and len(self._withheld) >= WITHHELD_MAX and name not in self._barrier.participants:
-            self._run.enter(FalselyJoined(name, join, NO_TOKEN))
+            self._run.call("falsely_joined", name, join, NO_TOKEN)
             return
         self._withheld[name] = _Withheld(join, former.since_ns if former else wall_ns)
         self._check(name, wall_ns)
@@ -78,7 +77,17 @@ class Admission:
         self._look_wall_ns = wall_ns
         for name in list(self._withheld):
             self._check(name, wall_ns)
-        self._check_admitted(wall_ns)
+        for name in list(self._standing_ns):  # note who has a token, and report those that have had the time
+            participant = self._barrier.participants.get(name)
+            if participant is None or not participant.alive:
+                del self._standing_ns[name]
+                continue
+            self._sessions[name] = self._sessions.get(name) or self._tokens.sessions(name)
+            has_token = self._trusts or self._tokens.is_alive(name)
+            if has_token and not _owes_done(participant):
+                del self._standing_ns[name]
+            elif not has_token and wall_ns - participant.joined_wall_ns >= TOKEN_NS:
+                self._run.call("not_shown", name, NO_TOKEN, wall_ns)
         self._count_standing(min(passed_ns, 2 * LOOK_NS), wall_ns)
 
     def _needs_no_proof(self, name: str, join: Join) -> bool:
@@ -87,7 +96,7 @@ class Admission:
 
     def _is_stranger(self, name: str, join: Join) -> bool:
         """Tell whether time would wait for a newcomer without a token that the start does not wait for."""
-        stands = (join.period_ns > 0 or join.slack_ns > 0) and self._barrier.accepts(name, join)
+        stands = (join.period_ns > 0 or join.slack_ns > 0) and not self._barrier.join_refusal(name, join)
         if not stands or name in self._barrier.participants:
             return False
         return not (self._trusts or name in self._barrier.absent() or self._tokens.is_alive(name))
@@ -97,7 +106,7 @@ class Admission:
         former, present = self._sessions.get(name, Sessions()), self._tokens.sessions(name)
         if name not in self._barrier.participants:
             former = Sessions()
-        self._run.enter(Joined(wall_ns, name, join))
+        self._run.call("join", name, join, wall_ns)
         participant = self._barrier.participants.get(name)
         if participant is not None and participant.join is join:
             self._sessions[name] = (present & former) | frozenset(sorted(present - former)[:1])  # one for each join
@@ -113,7 +122,7 @@ class Admission:
         reason = NO_DONE if self._tokens.is_alive(name) else NO_TOKEN
         if wall_ns - withheld.since_ns >= (SHOWN_NS if reason == NO_DONE else TOKEN_NS):
             del self._withheld[name]
-            self._run.enter(FalselyJoined(name, join, reason))
+            self._run.call("falsely_joined", name, join, reason)
 
     def _may_take_place(self, name: str, withheld: _Withheld, wall_ns: int) -> bool:
         """Tell whether a process is behind a join in the place of another, or the other is not there any more."""
@@ -127,29 +136,15 @@ class Admission:
         held_up = former in self._world.blocking_clock() and wall_ns - former.since_wall_ns >= HELD_NS
         return held_up or former.silent_wall_ns is not None
 
-    def _check_admitted(self, wall_ns: int) -> None:
-        """Note who has a token, and report those that have had the time and have none."""
-        for name in list(self._standing_ns):
-            participant = self._barrier.participants.get(name)
-            if participant is None or not participant.alive:
-                del self._standing_ns[name]
-                continue
-            self._sessions[name] = self._sessions.get(name) or self._tokens.sessions(name)
-            has_token = self._trusts or self._tokens.is_alive(name)
-            if has_token and not _owes_done(participant):
-                del self._standing_ns[name]
-            elif not has_token and wall_ns - participant.joined_wall_ns >= TOKEN_NS:
-                self._run.enter(NotShown(wall_ns, name, NO_TOKEN))
-
     def _count_standing(self, passed_ns: int, wall_ns: int) -> None:
         """Count how long participants have owed their first done, and report those that never publish one.
 
         In lockstep only while time waits for nobody else, since those others may be why it has not come; in realtime,
         where time waits for nobody, whenever it is due and time runs.
         """
-        if self._world.clock.mode == "realtime":
-            is_running = self._world.clock.state == "running" and not self._world.clock.is_halted
-            due = self._world.blocking() if is_running else ()
+        clock = self._world.clock
+        if clock.mode == "realtime":
+            due = self._world.blocking() if clock.state == "running" and not clock.is_halted else ()
             owing = [p for p in due if p.alive and p.name in self._standing_ns and _owes_done(p)]
         else:
             owing = self._world.blocking_clock()
@@ -159,7 +154,7 @@ class Admission:
             if not self._world.must_wait_for(participant):
                 self._standing_ns[participant.name] += passed_ns
                 if self._standing_ns[participant.name] >= DONE_NS:
-                    self._run.enter(NotShown(wall_ns, participant.name, NO_DONE))
+                    self._run.call("not_shown", participant.name, NO_DONE, wall_ns)
 
 
 def _owes_done(participant: Participant) -> bool:

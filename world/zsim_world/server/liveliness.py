@@ -13,9 +13,9 @@ import msgspec
 
 from zsim.contract import keys
 from zsim.contract.run_messages import Health, Join
-from zsim.transport.link_watch import Awaited, ClosedLink, LinkWatch, SessionTokens
+from zsim.transport.link_watch import Awaited, LinkWatch, SessionTokens
 from zsim.transport.session import Session
-from zsim_world.run.inputs import Died, FellSilent, ReaderClosed, Run
+from zsim_world.run.inputs import Run
 
 BYE_NS = 100_000_000  # wall time by which a bye may come after the loss of its process's token
 RETURN_NS = 5_000_000_000  # wall time in which a process is back at a world that was started again; 1 s measured
@@ -37,11 +37,10 @@ class _Check(NamedTuple):
 
 
 class LivelinessMonitor:
-    """Finds out which participants have died.
+    """Finds out which participants of a run have died.
 
     Args:
         link: the listening session.
-        run: in which they take part.
         take_in: reads what has arrived; a bye may be among it.
     """
 
@@ -52,7 +51,7 @@ class LivelinessMonitor:
         self._take_in = take_in
         self._lost: deque[str] = deque()  # reported by other threads: whose token seems lost
         self._checks: dict[str, _Check] = {}
-        self._health = HealthWatch(lambda name, since_ns: run.enter(FellSilent(name, since_ns)))
+        self._health = HealthWatch(lambda name, since_ns: run.call("silence_changed", name, since_ns))
         self._silent_s: dict[str, int] = {}  # of those that publish their health
 
     def token_lost(self, name: str) -> None:
@@ -60,7 +59,6 @@ class LivelinessMonitor:
         self._lost.append(name)
 
     def health_received(self, name: str) -> None:
-        """Note that a process has published its health."""
         self._silent_s[name] = 0
         self._health.received(name, time.monotonic_ns())
 
@@ -96,7 +94,10 @@ class LivelinessMonitor:
             self._report_death(name)
 
     def check_due(self) -> None:
-        """Check the processes that are due."""
+        """Check the processes that are due.
+
+        One without a token is dead; it is checked again where it has one, or one that is too new to be known.
+        """
         self._take_lost()
         now_ns = time.monotonic_ns()
         for name in self._health.look(now_ns):
@@ -105,8 +106,18 @@ class LivelinessMonitor:
                 self._health.forget(name)
         for name in [name for name, check in self._checks.items() if check.due_ns <= now_ns]:
             self._take_in()
-            if name in self._checks:  # a join that was taken in settles it
-                self._check(name, self._checks.pop(name), now_ns)
+            participant = self._barrier.participants.get(name)
+            check = self._checks.pop(name, None)
+            if participant is None or check is None:  # a join that was taken in settles it
+                continue
+            participant.away = False  # from here on it is dead, or one that does not join again
+            if keys.token(name) in self._link.tokens(keys.token(name), timeout_s=TOKENS_S):
+                if check.again:  # a successor's, or one that Zenoh has not forgotten yet
+                    self._checks[name] = _Check(now_ns + NEW_TOKEN_NS, again=False)
+            elif now_ns - participant.joined_wall_ns < NEW_TOKEN_NS:  # a new token is not always found at once
+                self._checks[name] = _Check(participant.joined_wall_ns + NEW_TOKEN_NS, check.again)
+            else:
+                self._report_death(name)
 
     def _take_lost(self) -> None:
         while self._lost:
@@ -115,22 +126,8 @@ class LivelinessMonitor:
             if participant and participant.alive:
                 self._checks[name] = _Check(time.monotonic_ns() + BYE_NS)
 
-    def _check(self, name: str, check: _Check, now_ns: int) -> None:
-        """Report the death of a process without a token; check again where it has one, or one too new to be known."""
-        participant = self._barrier.participants.get(name)
-        if participant is None:
-            return
-        participant.away = False  # from here on it is dead, or one that does not join again
-        if keys.token(name) in self._link.tokens(keys.token(name), timeout_s=TOKENS_S):
-            if check.again:  # a successor's, or one that Zenoh has not forgotten yet
-                self._checks[name] = _Check(now_ns + NEW_TOKEN_NS, again=False)
-        elif now_ns - participant.joined_wall_ns < NEW_TOKEN_NS:  # a new token is not always found at once
-            self._checks[name] = _Check(participant.joined_wall_ns + NEW_TOKEN_NS, check.again)
-        else:
-            self._report_death(name)
-
     def _report_death(self, name: str) -> None:
-        self._run.enter(Died(time.monotonic_ns(), name))
+        self._run.call("died", name, time.monotonic_ns())
 
 
 class HealthWatch:
@@ -148,7 +145,6 @@ class HealthWatch:
         self._look_wall_ns = 0
 
     def received(self, name: str, wall_ns: int) -> None:
-        """Note the health of a process."""
         self._last_wall_ns[name] = wall_ns
         if name in self._silent:
             self._silent.discard(name)
@@ -190,37 +186,29 @@ class SlowReaders:
         self.watch = LinkWatch(link, tokens, self._awaited)
 
     def _awaited(self) -> list[Awaited]:
-        awaited = self._run.world.barrier.awaited()
-        return [Awaited((each.name, *each.join.serves), each.join.pid) for each in awaited]
+        """Return those that must not lose any message; called by another thread."""
+        participants = list(self._run.world.barrier.participants.values())
+        return [Awaited((p.name, *p.join.serves), p.join.pid) for p in participants if p.is_waited_for]
 
     def report(self) -> None:
-        """Report the links that were closed since the last time."""
+        """Report the links that were closed since the last time, with what their processes read by their health."""
         while self.watch.closed:
             closed = self.watch.closed.popleft()
-            far_host = closed.address.rpartition(":")[0].strip("[]")
-            host = self._own_host if closed.process else far_host
-            reads = [expression for name in closed.names for expression in self._reads(name)]
-            self._run.enter(
-                ReaderClosed(_text(closed, host, reads), {**closed._asdict(), "host": host, "reads": reads})
-            )
-
-    def _reads(self, name: str) -> tuple[str, ...]:
-        """Return the expressions that a process subscribes to, according to its health."""
-        for _, payload in self._run.history.last(keys.process(name, "health")):
-            with suppress(msgspec.MsgspecError):
-                return _decode_health(payload).reads
-        return ()
+            host = self._own_host if closed.process else closed.address.rpartition(":")[0].strip("[]")
+            reads: list[str] = []
+            for name in closed.names:
+                for _, payload in self._run.history.last(keys.process(name, "health")):
+                    with suppress(msgspec.MsgspecError):
+                        reads += _decode_health(payload).reads
+            names = ", ".join(closed.names) or "no process of the run"
+            more = " …" if len(reads) > SHOWN else ""
+            which = f", which reads {', '.join(reads[:SHOWN])}{more}," if reads else ""
+            who = f"{closed.process or 'somebody'} at {closed.address} on {host}"
+            held = f"{closed.held_bytes / 1e6:.1f} MB"
+            text = f"{who} ({names}){which} took nothing of {held}; its link is closed ({closed.times} so far)"
+            self._run.call("reader_closed", text, {**closed._asdict(), "host": host, "reads": reads})
 
     def stuck(self) -> str:
         """Return which link takes nothing, as text."""
         named = self.watch.stuck()
         return f"the link takes nothing of {named[0]}" if named else "no link is known to be full"
-
-
-def _text(closed: ClosedLink, host: str, reads: list[str]) -> str:
-    names = ", ".join(closed.names) or "no process of the run"
-    more = " …" if len(reads) > SHOWN else ""
-    which = f", which reads {', '.join(reads[:SHOWN])}{more}," if reads else ""
-    who = f"{closed.process or 'somebody'} at {closed.address} on {host}"
-    held = f"{closed.held_bytes / 1e6:.1f} MB"
-    return f"{who} ({names}){which} took nothing of {held}; its link is closed ({closed.times} so far)"

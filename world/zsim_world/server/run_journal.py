@@ -27,7 +27,7 @@ from zsim.output_folder import take_lock
 from zsim_world.run import inputs
 from zsim_world.run.inputs import Entry
 
-VERSION = 3  # of the files, and of the states in them
+VERSION = 4  # of the files, and of the states in them
 CHECKPOINT_NS = 5_000_000_000  # simulated time between two; the history that a replay refills reaches back as far
 CHECKPOINT_WALL_NS = 1_000_000_000  # wall time between two at least: a checkpoint of 1000 drones has 20 MB
 CHECKPOINTS_KEPT = 3  # the newest may not be on disk yet, and the one before it is younger than the history
@@ -58,7 +58,6 @@ class RunJournal:
 
     Args:
         folder: of this run alone; it is made.
-        run_id, scenario_sha256: of the run.
         say: shows a line if the journal cannot be written any more.
         all_died: whether all participants of a run that is continued have to be started again.
     """
@@ -97,7 +96,6 @@ class RunJournal:
             self._guarded(lambda: _write(self._file, _framed(inputs.encode(entries))))
 
     def keep_truth(self, data: memoryview) -> None:
-        """Append bytes of the truth hash."""
         if self._is_kept:
             self._guarded(lambda: _write(self._truth, data))
 
@@ -110,14 +108,15 @@ class RunJournal:
         """Begin the next part of the journal with a state, which another thread writes."""
         self._due_ns, self._due_wall_ns = now_ns + CHECKPOINT_NS, wall_ns + CHECKPOINT_WALL_NS
         self.commit()
-        self._guarded(lambda: self._begin(self._number + 1, state))
 
-    def _begin(self, number: int, state: State) -> None:
-        former, truth_bytes = self._file, os.lseek(self._truth, 0, os.SEEK_CUR)
-        self._number = number
-        self._file = self._open_entries(number)
-        content = {"truth_bytes": truth_bytes, "state": state}
-        self._written = self._writer.submit(self._write_checkpoint, number, pack(content), former)
+        def begin() -> None:
+            former, truth_bytes = self._file, os.lseek(self._truth, 0, os.SEEK_CUR)
+            self._number += 1
+            self._file = self._open_entries(self._number)
+            content = pack({"truth_bytes": truth_bytes, "state": state})
+            self._written = self._writer.submit(self._write_checkpoint, self._number, content, former)
+
+        self._guarded(begin)
 
     def _write_checkpoint(self, number: int, content: bytes, former: int) -> None:
         """Put a checkpoint on disk after the files that it needs, and remove those that are no longer needed."""
@@ -154,7 +153,6 @@ class RunJournal:
             self.close()
 
     def close(self) -> None:
-        """Write no more."""
         with suppress(OSError):
             self.commit()
         self._writer.shutdown()
@@ -165,47 +163,42 @@ class RunJournal:
 
     def remove(self) -> None:
         """Remove a journal that is closed and whose run is over."""
-        if not self._is_kept:
-            return
-        with suppress(OSError):
-            for place in self._folder.iterdir():
-                place.unlink()
-            self._folder.rmdir()
+        if self._is_kept:
+            with suppress(OSError):
+                for place in self._folder.iterdir():
+                    place.unlink()
+                self._folder.rmdir()
 
     # Reading
 
     def open(self) -> Checkpoint | None:
         """Begin a journal, or open the one that is there; return the checkpoint to continue from, None for a start.
 
-        `entries` are the inputs since then.
+        That is the newest but one: the history is refilled from there. `entries` are the inputs since then.
 
         Raises:
             RunError: the journal there is of another run, or cannot be read.
         """
+        found = None
         if not self._is_kept:
-            return None
+            return found
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             self._truth = os.open(self._folder / "truth", os.O_RDWR | os.O_CREAT, 0o644)
             if not take_lock(self._truth):
                 raise RunError(f"{self._folder}: another world keeps its journal there; end that one")
-            found = self._newest()
+            numbers = sorted(int(place.stem) for place in self._folder.glob("*.entries"))
+            if numbers:
+                self._number = numbers[-1]
+                whole = [number for number in numbers if number == 0 or self._checkpoint(number)]
+                if not whole:
+                    raise RunError(f"{self._folder}: no checkpoint is whole; the run cannot be gone on with")
+                self._first = whole[-2] if len(whole) > 1 else whole[0]
+                found = self._checkpoint(self._first) if self._first else Checkpoint(None, 0)
             self._file = self._open_entries(self._number)
         except OSError as error:
             raise RunError(f"{self._folder}: no journal can be kept there ({error.strerror})") from error
         return found
-
-    def _newest(self) -> Checkpoint | None:
-        """Return the newest checkpoint but one: the history is refilled from there."""
-        numbers = sorted(int(place.stem) for place in self._folder.glob("*.entries"))
-        if not numbers:
-            return None
-        self._number = numbers[-1]
-        whole = [number for number in numbers if number == 0 or self._checkpoint(number)]
-        if not whole:
-            raise RunError(f"{self._folder}: no checkpoint is whole; the run cannot be gone on with")
-        self._first = whole[-2] if len(whole) > 1 else whole[0]
-        return self._checkpoint(self._first) if self._first else Checkpoint(None, 0)
 
     def _checkpoint(self, number: int) -> Checkpoint | None:
         """Return a checkpoint, None if it is not whole."""
@@ -235,46 +228,38 @@ class RunJournal:
         Raises:
             RunError: the file is of another run.
         """
-        data, end = place.read_bytes(), 0
-        for frame in _whole_frames(data):
-            if end:
-                yield frame.content
+        data, whole = place.read_bytes(), 0
+        for content, end in _whole_frames(data):
+            if whole:
+                yield content
             else:
-                self._check(frame.content, place)
-            end = frame.end
-        if end < len(data):
-            os.truncate(place, end)
-
-    def _check(self, content: bytes, place: Path) -> None:
-        try:
-            head = msgspec.msgpack.decode(content, type=_Head)
-        except REFUSALS as error:
-            raise RunError(f"{place}: is no journal of a run ({error}); name another folder") from error
-        if head != self._head:
-            raise RunError(f"{place}: is of {head}; must be of {self._head}; name another folder")
+                try:
+                    head = msgspec.msgpack.decode(content, type=_Head)
+                except REFUSALS as error:
+                    raise RunError(f"{place}: is no journal of a run ({error}); name another folder") from error
+                if head != self._head:
+                    raise RunError(f"{place}: is of {head}; must be of {self._head}; name another folder")
+            whole = end
+        if whole < len(data):
+            os.truncate(place, whole)
 
 
-class _Frame(NamedTuple):
-    content: bytes
-    end: int
-
-
-def _whole_frames(data: bytes) -> Iterator[_Frame]:
-    """Yield the frames at the beginning of a file that are whole."""
+def _whole_frames(data: bytes) -> Iterator[tuple[bytes, int]]:
+    """Yield content and end of the frames at the beginning of a file that are whole."""
     at = 0
     while len(data) - at >= _FRAME.size:
         size, check = _FRAME.unpack_from(data, at)
         content, at = data[at + _FRAME.size : at + _FRAME.size + size], at + _FRAME.size + size
         if len(content) < size or zlib.crc32(content) != check:
             return
-        yield _Frame(content, at)
+        yield content, at
 
 
 def journaled_run(folder: Path) -> str | None:
     """Return the run of which a folder has the journal, None if it has none."""
     for place in sorted(folder.glob("*.entries")):
         with suppress(OSError, *REFUSALS):
-            return msgspec.msgpack.decode(next(_whole_frames(place.read_bytes())).content, type=_Head).run_id
+            return msgspec.msgpack.decode(next(_whole_frames(place.read_bytes()))[0], type=_Head).run_id
     return None
 
 

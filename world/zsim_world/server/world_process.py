@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import Any
 
 from zsim.contract import keys, messages, run_messages
-from zsim.contract.run_messages import ControlAnswer, ControlRequest
+from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError, RunError
 from zsim.runtime.agent import Output
 from zsim.runtime.health import HealthMeter, rare_collections
@@ -20,25 +20,23 @@ from zsim.scenario import roles
 from zsim.scenario.roles import WORLD
 from zsim.transport import connection
 from zsim.transport.link_watch import SessionTokens
-from zsim.transport.session import Query, ReceivedSample, Session
+from zsim.transport.session import Query, Session
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
 from zsim_world.run.barrier import Participant
 from zsim_world.run.coordinator import Coordinator
-from zsim_world.run.inputs import Advanced, Controlled, Expired, ProgressCallback, Resumed, Run, Taken
+from zsim_world.run.inputs import Advanced, ProgressCallback, Run, Taken
 from zsim_world.run.run_clock import RunClock
 from zsim_world.run.world import World
 from zsim_world.run_state import restore
 from zsim_world.server.admission import Admission
 from zsim_world.server.liveliness import LivelinessMonitor, SlowReaders
 from zsim_world.server.run_journal import RunJournal
-from zsim_world.server.world_inputs import TICK_S, open_inputs, recover_lost
-from zsim_world.server.world_outputs import WorldOutputs
+from zsim_world.server.world_link import TICK_S, WorldOutputs, open_inputs, recover_lost
 
 CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
-HEALTH, JOIN = keys.process(WORLD, "health"), "/join"
-OWN = keys.process(WORLD, "")
+HEALTH, OWN = keys.process(WORLD, "health"), keys.process(WORLD, "")
 BYE_S = 5.0  # contract: the world waits 5 s at most for byes
 SERVE_NS = 5_000_000  # wall time after which a world that never waits looks at requests and losses
 LAG_GATES = 2  # that the slowest agent may still have before it when a series of gates begins
@@ -74,9 +72,7 @@ class WorldProcess:
 
     Args:
         link: a listening session.
-        world: what to run.
         stopped: asked at every gate, and every TICK_S; a text ends the run with it as the reason.
-        progress: shows progress.
         journal: of the run; this world continues from the one that a former world has left.
         health: of this process.
     """
@@ -122,7 +118,15 @@ class WorldProcess:
         """
         self._inputs = open_inputs(self._link, self._clock.mode == "realtime")
         self._continue()
-        self._announce()
+        if not self._history.last(keys.INFO):
+            self._outputs.publish(Output(keys.INFO, self._world.info()))
+        answered = [*roles.LAST_VALUES, keys.CONTROL, keys.replay("*"), *self._world.refused_queries]
+        answered.append(answered.pop(answered.index(keys.INFO)))  # who gets an answer there gets one everywhere
+        for expression in answered:
+            self._link.declare_queryable(expression, self._on_query)
+        self._tokens.watch()
+        self._link.on_token(keys.token("*"), self._on_token)
+        self._link.declare_process(WORLD)
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
         ticker.start()
         try:
@@ -140,19 +144,6 @@ class WorldProcess:
         if self._world.failure:
             raise self._world.failure
 
-    def _announce(self) -> None:
-        if not self._history.last(keys.INFO):
-            self._outputs.publish(Output(keys.INFO, self._world.info()))
-        answered = [*roles.LAST_VALUES, keys.CONTROL, keys.replay("*"), *self._world.refused_queries]
-        answered.append(answered.pop(answered.index(keys.INFO)))  # who gets an answer there gets one everywhere
-        for expression in answered:
-            self._link.declare_queryable(expression, self._on_query)
-        self._tokens.watch()
-        self._link.on_token(keys.token("*"), self._on_token)
-        self._link.declare_process(WORLD)
-
-    # Continuing the run of a former world
-
     def _continue(self) -> None:
         """Apply what is in the journal, without publishing anything again, then wait for all who took part.
 
@@ -165,7 +156,12 @@ class WorldProcess:
             truth = self._journal.truth(checkpoint.truth_bytes) if checkpoint else ()
             world.keep_truth(self._journal.keep_truth, truth)
         if checkpoint is not None and checkpoint.state is not None:
-            self._restore(checkpoint.state)
+            try:
+                restore(world, checkpoint.state["world"])
+                self._history.last_values = checkpoint.state["last"]
+            except (AttributeError, KeyError, TypeError, ValueError) as error:
+                text = f"the checkpoint does not fit this version of zsim ({type(error).__name__}: {error})"
+                raise RunError(f"{text}; fly the run again") from error
         if is_continued:
             for entry in self._journal.entries():
                 entry.apply(self._run)
@@ -174,30 +170,16 @@ class WorldProcess:
         self._run.progress = self._progress
         self._run.on_done, self._run.on_health = self._admission.done_received, self._liveliness.health_received
         if is_continued:
-            self._run.enter(Resumed(time.monotonic_ns(), self._journal.all_died))
+            self._run.call("await_return", time.monotonic_ns(), self._journal.all_died)
             self._liveliness.check_all()
             self._progress("resumed", world.now_ns, WORLD)
-
-    def _restore(self, state: dict[str, Any]) -> None:
-        try:
-            restore(self._world, state["world"])
-            self._history.restore(state["last"])
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            text = f"the checkpoint does not fit this version of zsim ({type(error).__name__}: {error})"
-            raise RunError(f"{text}; fly the run again") from error
-
-    def _add_checkpoint(self, wall_ns: int) -> None:
-        """Put the state of the run into the journal, now that nothing is pending."""
-        if isinstance(self._world, World) and self._journal.is_due(self._world.now_ns, wall_ns):
-            state = {"world": self._world.checkpoint(), "last": self._history.last_values()}
-            self._journal.add_checkpoint(state, self._world.now_ns, wall_ns)
 
     # The loop
 
     def _turn(self) -> None:
         former_wall_ns, self._turn_wall_ns = self._turn_wall_ns, time.monotonic_ns()
         if former_wall_ns and self._turn_wall_ns - former_wall_ns > STOOD_STILL_NS:  # the ticker begins ten a second
-            self._go_on_after_standstill(self._turn_wall_ns - former_wall_ns)
+            self._report_standstill(self._turn_wall_ns - former_wall_ns)
         self._take_in()
         if reason := self._stopped():
             self._clock.stop(reason)
@@ -217,7 +199,7 @@ class WorldProcess:
         else:
             self._stand_still(wall_ns)
 
-    def _go_on_after_standstill(self, stood_ns: int) -> None:
+    def _report_standstill(self, stood_ns: int) -> None:
         """In realtime, restart the pace after a standstill instead of catching up with the wall clock in a burst."""
         if self._clock.mode == "realtime" and self._clock.state == "running":
             self._pacer.restart()
@@ -228,38 +210,36 @@ class WorldProcess:
             self._outputs.publish(Output(keys.EVENT, event))
 
     def _take_in(self) -> None:
+        """Enter what has arrived; a join has to be admitted as well."""
         for wall_ns, sample in self._inputs.drain():
             key = sample.key
-            if not key.startswith(OWN):  # the world's own health, kept when it was published
-                self._run.enter(Taken(wall_ns, sample))
-                if key.endswith(JOIN):
-                    self._take_join(sample, wall_ns)
-
-    def _take_join(self, sample: ReceivedSample, wall_ns: int) -> None:
-        with suppress(DecodeError):  # refused already
-            join = messages.decode(sample.key, sample.payload)
-            if isinstance(join, run_messages.Join):
-                self._liveliness.before_join(keys.thing(sample.key), join)
-                self._admission.take(keys.thing(sample.key), join, wall_ns)
+            if key.startswith(OWN):  # the world's own health, kept when it was published
+                continue
+            self._run.enter(Taken(wall_ns, sample))
+            if key.endswith("/join"):
+                with suppress(DecodeError):  # refused already
+                    join = messages.decode(key, sample.payload)
+                    if isinstance(join, run_messages.Join):
+                        self._liveliness.before_join(keys.thing(key), join)
+                        self._admission.take(keys.thing(key), join, wall_ns)
 
     def _advance(self, wall_ns: int, late_ns: int) -> None:
+        """Go to the next gate; publish it, the views now and then, and put checkpoints into the journal."""
+        world = self._world
         late = self._clock.mode == "realtime" and late_ns > self._clock.gate_ns / self._clock.rate
         self._run.enter(Advanced(wall_ns, late))
         self._outputs.gather()
-        self._add_checkpoint(wall_ns)
+        if isinstance(world, World) and self._journal.is_due(world.now_ns, wall_ns):  # nothing is pending now
+            state = {"world": world.checkpoint(), "last": self._history.last_values}
+            self._journal.add_checkpoint(state, world.now_ns, wall_ns)
         if not self._pipelining.continues():
             self._outputs.send()
-        if self._world.failure is None:
-            self._publish_view(wall_ns)
+        if world.failure is None and wall_ns - self._view_wall_ns >= VIEW_PERIOD_NS:
+            self._view_wall_ns = wall_ns
+            for key, message in world.views(self._view_seq):
+                self._link.put(key, message)
+            self._view_seq += 1
         self.health.step(time.monotonic_ns() - wall_ns)
-
-    def _publish_view(self, wall_ns: int) -> None:
-        if wall_ns - self._view_wall_ns < VIEW_PERIOD_NS:
-            return
-        self._view_wall_ns = wall_ns
-        for key, message in self._world.views(self._view_seq):
-            self._link.put(key, message)
-        self._view_seq += 1
 
     def _stand_still(self, wall_ns: int) -> None:
         """Publish the clock once a second while time stands still, and wait for an input."""
@@ -289,17 +269,18 @@ class WorldProcess:
 
         A world that was started again after the end of its run first waits for all who have yet to come back.
         """
-        while self._world.barrier.away() and self._stopped() is None:
+        world, away = self._world, self._world.barrier.away
+        while away() and self._stopped() is None:
             self._wait_at_end()
             self._outputs.flush()
-            self._publish_clock(self._turn_wall_ns, self._world.barrier.waiting_for_return)
-        self._world.publish_end()
+            self._publish_clock(self._turn_wall_ns, lambda wall_ns: tuple(p.waiting(wall_ns) for p in away()))
+        world.publish_end()
         self._outputs.flush()
         end_ns = self._clock_wall_ns = time.monotonic_ns()
-        while time.monotonic_ns() - end_ns < BYE_S * 1e9 and self._world.waiting_to_leave():
+        while time.monotonic_ns() - end_ns < BYE_S * 1e9 and world.waiting_to_leave():
             self._wait_at_end()
             self._outputs.put_batch()
-            self._publish_clock(self._turn_wall_ns, lambda wall_ns: self._world.waiting_to_leave(wall_ns - end_ns))
+            self._publish_clock(self._turn_wall_ns, lambda wall_ns: world.waiting_to_leave(wall_ns - end_ns))
         self._outputs.flush()
         self._turn_wall_ns = 0
 
@@ -318,7 +299,7 @@ class WorldProcess:
             self._outputs.flush()
         self._liveliness.check_due()
         if self._world.ended is None and (name := self._world.overdue(time.monotonic_ns())):
-            self._run.enter(Expired(name))
+            self._run.call("expired", name)
         self._readers.report()
         self._admission.check_due(time.monotonic_ns())
         if self.health.due():
@@ -328,7 +309,10 @@ class WorldProcess:
             self._run.progress("health", health, WORLD)
 
     def _serve(self, query: Query) -> None:
-        """Answer a query: with last values, a part of the history, or as a request."""
+        """Answer a query: with last values, a part of the history, or as a request.
+
+        A request comes on `world/control`, or for a replay on the process's own key, by which access control knows it.
+        """
         expression = query.expression
         process = keys.thing(expression) if keys.matches(keys.replay("*"), expression) else None
         if expression in self._world.refused_queries:
@@ -339,7 +323,16 @@ class WorldProcess:
                 query.answer(ControlAnswer(ok=False, error=reason))
         elif expression == keys.CONTROL or process is not None:
             try:
-                answer = self._answer(query.request(), process)
+                request = query.request()
+                if request.op == "replay":
+                    readable = ("**",)
+                    if process is not None and self._link.guarded:
+                        readable = roles.rights_for(process, self._world.scenario).reads
+                    answer = self._history.replay(request.args, readable)
+                elif process is not None:
+                    answer = ControlAnswer(ok=False, error=f"op is {request.op[:40]!r}; must be replay")
+                else:
+                    answer = self._run.call("control", request)
             except DecodeError as error:
                 answer = ControlAnswer(ok=False, error=str(error))
             self._journal.commit()
@@ -348,19 +341,6 @@ class WorldProcess:
             for key, payload in self._history.last(expression):
                 query.reply(key, payload)
             query.end()
-
-    def _answer(self, request: ControlRequest, process: str | None) -> ControlAnswer:
-        """Answer a request on `world/control`, or of a process on its own key, by which access control knows it."""
-        if request.op == "replay":
-            readable = ("**",)
-            if process is not None and self._link.guarded:
-                readable = roles.rights_for(process, self._world.scenario).reads
-            return self._history.replay(request.args, readable)
-        if process is not None:
-            return ControlAnswer(ok=False, error=f"op is {request.op[:40]!r}; must be replay")
-        answer = self._run.enter(Controlled(request))
-        assert answer is not None
-        return answer
 
     # What other threads bring
 
@@ -386,11 +366,7 @@ class WorldProcess:
 
 
 class Pacer:
-    """Computes when gates are due by the wall clock.
-
-    Args:
-        clock: of the run, with the rate to pace at.
-    """
+    """Computes when gates are due by the wall clock, at the rate of the run's clock."""
 
     def __init__(self, clock: RunClock) -> None:
         self._clock = clock
@@ -422,10 +398,7 @@ class Pipelining:
 
     Where agents may lag several gates behind, time is delayed until the slowest agent has nearly caught up; then gates
     follow one another until its done is required again. No agent idles meanwhile: the first of these gates comes while
-    agents still work on the last ones before it.
-
-    Args:
-        world: in lockstep, as fast as it can; any other is never delayed.
+    agents still work on the last ones before it. Only a world in lockstep that goes as fast as it can is delayed.
     """
 
     def __init__(self, world: Coordinator) -> None:
@@ -467,10 +440,7 @@ class Pipelining:
 class TurnWatch:
     """Tells a turn of the loop that does not end (a put that does not return) from a process that was stopped.
 
-    It is asked on a thread of its own, which a put does not block.
-
-    Args:
-        now_ns: monotonic wall time.
+    It is asked on a thread of its own, which a put does not block. Its times are monotonic.
     """
 
     def __init__(self, now_ns: int) -> None:
@@ -482,7 +452,6 @@ class TurnWatch:
         """Return for how long a turn has been stuck, once every STUCK_NS; None where there is nothing to report.
 
         Args:
-            now_ns: monotonic wall time.
             turn_ns: when the turn began, 0 when there is none.
         """
         if now_ns - self._looked_ns > STOPPED_NS:

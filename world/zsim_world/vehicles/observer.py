@@ -372,7 +372,6 @@ class ObserverDesign(NamedTuple):
 
 
 def gain_row(vehicle: Vehicle, drone: Drone, environment: Environment) -> Array:
-    """Return the gains of one drone, shape (GAIN.size,)."""
     s, walks = drone.sensors, vehicle.firmware
     field = math.hypot(*environment.magnetic_field_ut[:2])
     gyro = _sigma(scaled(s.imu.gyro_deg_s, DEG), s.imu.rate_hz, "gyro")
@@ -409,36 +408,29 @@ def _within(sigma: float, name: str) -> float:
 
 @lru_cache(maxsize=256)
 def _gains(d: ObserverDesign) -> Array:
+    c, g = d.drag_1_s, d.gravity_m_s2
+    across = np.array([[-c, g, 0, 1], [0, 0, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]], dtype=float)
+    walks = np.array([0.0, d.tilt_walk, d.gyro_walk, d.disturbance_walk])
+    horizontal = steady_gains(across, walks, [([-c, 0, 0, 1], *d.accel), ([1, 0, 0, 0], *d.flow)])
+
+    up = np.array([[0, 1, 0, 0], [0, -c, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]], dtype=float)
+    walks = np.array([0.0, 0.0, d.lift_walk, d.accel_walk])
+    moving = [([0, -c, 1, 1], *d.accel), ([0, 1, 0, 0], *d.flow)]
+    by_baro = steady_gains(up, walks, [*moving, ([1, 0, 0, 0], *d.baro)])
+    by_sonar = steady_gains(up, walks, [*moving, ([1, 0, 0, 0], *d.sonar)])
+
+    turning = np.array([[0, 1], [0, 0]], dtype=float)
+    by_mag = steady_gains(turning, np.array([d.tilt_walk, d.gyro_walk]), [([1, 0], *d.mag)])
+
     row = np.empty(GAIN.size)
-    row[GAIN.accel_v : GAIN.lift_z] = _across(d).ravel()
-    row[GAIN.lift_z : GAIN.sonar_z] = _upwards(d, d.baro).ravel()
-    row[GAIN.sonar_z : GAIN.baro_zero] = _upwards(d, d.sonar)[2]
+    row[GAIN.accel_v : GAIN.lift_z] = horizontal.ravel()
+    row[GAIN.lift_z : GAIN.sonar_z] = by_baro.ravel()
+    row[GAIN.sonar_z : GAIN.baro_zero] = by_sonar[2]
     row[GAIN.baro_zero] = 1.0 / (10.0 * d.baro[1])  # ten seconds
-    row[GAIN.mag_psi : GAIN.mag_rate + 1] = _turning(d)[0]
+    row[GAIN.mag_psi : GAIN.mag_rate + 1] = by_mag[0]
     row = np.array([float(f"{x:.9g}") for x in row])  # nine digits: the same bits whatever the BLAS
     row.setflags(write=False)
     return row
-
-
-def _across(d: ObserverDesign) -> Array:
-    c = d.drag_1_s
-    a = np.array([[-c, d.gravity_m_s2, 0, 1], [0, 0, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]], dtype=float)
-    walks = np.array([0.0, d.tilt_walk, d.gyro_walk, d.disturbance_walk])
-    return steady_gains(a, walks, [([-c, 0, 0, 1], *d.accel), ([1, 0, 0, 0], *d.flow)])
-
-
-def _upwards(d: ObserverDesign, height: Meter) -> Array:
-    """Return the gains of accelerometer, flow and height sensor."""
-    c = d.drag_1_s
-    a = np.array([[0, 1, 0, 0], [0, -c, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]], dtype=float)
-    walks = np.array([0.0, 0.0, d.lift_walk, d.accel_walk])
-    moving = [([0, -c, 1, 1], *d.accel), ([0, 1, 0, 0], *d.flow)]
-    return steady_gains(a, walks, [*moving, ([1, 0, 0, 0], *height)])
-
-
-def _turning(d: ObserverDesign) -> Array:
-    a = np.array([[0, 1], [0, 0]], dtype=float)
-    return steady_gains(a, np.array([d.tilt_walk, d.gyro_walk]), [([1, 0], *d.mag)])
 
 
 def steady_gains(a: Array, walks: Array, meters: list[tuple[list[float], float, float]]) -> Array:

@@ -96,7 +96,6 @@ def _rotors(lanes: NDArray, group: int, k: int, each: tuple[int, ...]) -> PerRot
 
 @inlined
 def steer(time: KernelTime, bodies: Bodies, boards: Boards) -> None:
-    """Let the firmware of every drone see and act."""
     count, each = bodies.state.shape[0], bodies.each
     for first in range(0, count, LANES):
         lanes, last, driven = boards.lanes[first // LANES], min(first + LANES, count), False

@@ -1,6 +1,6 @@
 """Ground and sky as one grey picture, which a map turns into colours: warping one channel costs a third of three.
 
-Greys up to LIGHTEST are the ground's, from HAZE on the sky's. The ground is a square tile about W's origin, repeated,
+Greys up to 150 are the ground's, from HAZE on the sky's. The ground is a square tile about W's origin, repeated,
 in levels of decreasing resolution: coarser ones are drawn far away to avoid aliasing.
 """
 
@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim_agents.cameras.rendering.scene import CameraMotion, View
-from zsim_agents.cameras.rendering.shapes import SHIFT
+from zsim_agents.cameras.rendering.scene import SHIFT, CameraMotion, View
 
 Grey = NDArray[np.uint8]
 Array = NDArray[np.float64]
@@ -26,8 +25,7 @@ FACTORS = (1, 4, 20, 100)  # of the texels of each level over the finest
 WINDOW = (3000, 2000, 1500, 1000)  # texels of a side that are kept of each level: 60 m, 160 m, 600 m, 2 km
 MINIFIED_MAX = 2.0  # texels that a pixel may be deep on the ground before a coarser level is drawn
 HEIGHT_MIN_M = 0.03  # m, of a camera over the ground
-DARKEST, LIGHTEST, HAZE = 0, 150, 176  # greys
-SHADOW = 34  # greys darker, chosen
+HAZE = 176  # grey
 ZENITH = 0.6  # sine of the elevation from which on the sky is the bluest; chosen
 SKY_SLOPE = (255 - HAZE) / ZENITH  # greys of the sky for a sine of 1
 COLOURS = {  # B, G, R by grey; chosen: dry grass, white lines, a hazy blue sky
@@ -41,8 +39,7 @@ COLOURS = {  # B, G, R by grey; chosen: dry grass, white lines, a hazy blue sky
 
 
 class Level(NamedTuple):
-    """A level of the ground, with its texel size, the distance up to which it may be drawn [m], and the homography
-    from (x, y, 1) of W [m] to texels, whose centres are at whole numbers, (3, 3)."""
+    """A level of the ground: how far it may be drawn [m], the homography (3, 3) from (x, y, 1) of W to texels."""
 
     texels: Grey
     texel_m: float
@@ -54,7 +51,7 @@ class Ground:
     """A ground in levels.
 
     Args:
-        tile: greys up to LIGHTEST, a square whose side is a multiple of 100; its middle is W's origin, its top north.
+        tile: greys up to 150, a square whose side is a multiple of 100; its middle is W's origin, its top north.
         texel_m: the side of one of its texels.
     """
 
@@ -124,11 +121,18 @@ class Backdrop:
         height_m = max(float(motion.p_WK[2]), HEIGHT_MIN_M)
         to_W = motion.R_WK @ self._K_inv  # a pixel (u, v, 1) to its ray in W
         down = (-to_W[2]).tolist()  # descent of a ray with z = 1 in K
-        limits = [math.inf, *(height_m / self._reach(level, height_m) for level in self._ground.levels)]
+        limits = [math.inf]
+        for level in self._ground.levels:  # a pixel at distance s covers a depth of s^2 / (f h) on the ground
+            reach_m = math.sqrt(MINIFIED_MAX * level.texel_m * self._focal_px * height_m)
+            limits.append(height_m / min(reach_m, 0.7 * level.reach_m))
         least, most = _extremes(self._size, down)
         first = next((i for i, limit in enumerate(limits[1:]) if least >= limit), None)
         if first is None:
-            self._draw_sky(down)
+            a, b, c = (-SKY_SLOPE * each for each in down)  # the sky, bluer the higher
+            rows = _rows(half_plane(self._size, (a, b, c), 0.0), self._size)
+            if rows is not None:
+                upwards = np.float32(b) * self._row_numbers[slice(*rows)] + np.float32(c + HAZE)
+                cv2.convertScaleAbs(upwards + np.float32(a) * self._columns, dst=self.grey[slice(*rows)])
             ground = half_plane(self._size, down, 0.0)
             if len(ground) >= 3:
                 cv2.fillConvexPoly(self.grey, _fixed(ground), self._ground.mean, cv2.LINE_AA, SHIFT)
@@ -147,18 +151,6 @@ class Backdrop:
         first, end = _rows(half_plane(self._size, down, 0.0), self._size) or (0, 0)
         return slice(max(0, first - room), min(self._size[1], end + room)) if first < end else slice(0, 0)
 
-    def _reach(self, level: Level, height_m: float) -> float:
-        """Return how far a level is drawn [m]: a pixel at distance s covers a depth of s^2 / (f h) on the ground."""
-        return min(math.sqrt(MINIFIED_MAX * level.texel_m * self._focal_px * height_m), 0.7 * level.reach_m)
-
-    def _draw_sky(self, down: Sequence[float]) -> None:
-        """Draw the sky, bluer the higher, in the rows that show some."""
-        a, b, c = (-SKY_SLOPE * each for each in down)
-        rows = _rows(half_plane(self._size, (a, b, c), 0.0), self._size)
-        if rows is not None:
-            upwards = np.float32(b) * self._row_numbers[slice(*rows)] + np.float32(c + HAZE)
-            cv2.convertScaleAbs(upwards + np.float32(a) * self._columns, dst=self.grey[slice(*rows)])
-
     def _draw_level(self, level: Level, to_ground: Array, down: Sequence[float], least: float, most: float) -> None:
         """Draw a level in the rows that are near enough for it and not all near enough for a finer one."""
         part = half_plane(self._size, down, least)
@@ -171,21 +163,16 @@ class Backdrop:
             return
         warp = level.place @ to_ground
         warp[:, 2] += v0 * warp[:, 1]
-        out = self.grey[v0:v1]
-        if _extremes(self._size, down)[0] >= least:  # all of the picture
-            self._warp(level, warp, out)
+        is_all = _extremes(self._size, down)[0] >= least
+        out, mask = self.grey[v0:v1], self._mask[v0:v1]
+        drawn, flags = out if is_all else self._scratch[v0:v1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        size = self._size[0], v1 - v0
+        cv2.warpPerspective(level.texels, warp, size, drawn, flags, cv2.BORDER_CONSTANT, self._ground.mean)
+        if is_all:
             return
-        drawn, mask = self._scratch[v0:v1], self._mask[v0:v1]
-        self._warp(level, warp, drawn)
         mask.fill(0)
         cv2.fillConvexPoly(mask, _fixed([(u, v - v0) for u, v in part]), 255, cv2.LINE_8, SHIFT)
         cv2.copyTo(drawn, mask, out)
-
-    def _warp(self, level: Level, warp: Array, out: Grey) -> None:
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        size = out.shape[1], out.shape[0]
-        value = self._ground.mean
-        cv2.warpPerspective(level.texels, warp, size, out, flags, cv2.BORDER_CONSTANT, value)
 
 
 def _fixed(points: Points) -> NDArray[np.int32]:

@@ -14,7 +14,7 @@ from zsim.scenario.obstacle import nearest
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import Lens, camera_pose, lens_of
 from zsim_agents.cameras.rendering.backdrop import Backdrop, Ground, colour_map, meadow
-from zsim_agents.cameras.rendering.drones import SEEN_M, DroneImager
+from zsim_agents.cameras.rendering.foreground import SEEN_M, DroneImager, draw_obstacle
 from zsim_agents.cameras.rendering.scene import (
     CameraMotion,
     DroneStates,
@@ -23,7 +23,6 @@ from zsim_agents.cameras.rendering.scene import (
     camera_motion,
     motion_blur_kernels,
 )
-from zsim_agents.cameras.rendering.shapes import draw_obstacle
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -36,12 +35,10 @@ MIX = 0x9E3779B97F4A7C15  # 2^64 over the golden ratio, whose multiples spread (
 
 
 class Renderer:
-    """One camera of one drone.
+    """One camera of one drone, the scene's `carrier`.
 
     Args:
-        carrier: index of the drone that carries the camera.
-        seed: of the noise.
-        name: of the noise's random stream, e.g. "drone1/front".
+        seed, name: of the noise's random stream, e.g. "drone1/front".
         ground: None for a meadow with lines every metre.
     """
 
@@ -52,7 +49,7 @@ class Renderer:
         self._camera, self._scene, self._carrier = camera, scene, carrier
         self._exposure_s = camera.exposure_ms * 1e-3
         self._pose = camera_pose(camera)
-        self._view = _view(lens_of(camera))
+        self._view = view_of(lens_of(camera))
         self._brightness = scene.light * gain
         self._colours = colour_map(self._brightness)
         self._imager = DroneImager(self._view, scene, carrier, self._exposure_s, self._brightness)
@@ -92,11 +89,19 @@ class Renderer:
             if kind == "obstacle":
                 draw_obstacle(picture, self._view, self._scene.obstacles[which], motion, self._brightness)
             elif kind == "hat":
-                self._draw_false_hat(picture, np.array([self._scene.hats.false_m[which]]), motion)
+                centre_K = motion.points_K(np.array([self._scene.hats.false_m[which]]))
+                if centre_K[0, 2] > 0:
+                    way_K = motion.rates_K(centre_K, np.zeros(3)) * self._exposure_s
+                    for image in self._imager.hats(centre_K, way_K, motion).values():
+                        image.draw(picture)
             else:
                 for layer in drones[which][1]:
                     layer.draw(picture)
-        self._blur_lens(picture)
+        sigma_px = self._camera.blur_px
+        if sigma_px >= 0.2:  # less is less than a pixel's own width
+            side = 3 if sigma_px <= 0.7 else 2 * math.ceil(2.5 * sigma_px) + 1
+            kernel = cv2.getGaussianKernel(side, sigma_px)
+            cv2.sepFilter2D(picture, -1, kernel, kernel, dst=picture, borderType=cv2.BORDER_REPLICATE)
         if self._noise is not None:
             self._noise.add(picture, number)
         return picture
@@ -117,21 +122,6 @@ class Renderer:
         if len(part):
             cv2.filter2D(part, -1, kernel, dst=part, borderType=cv2.BORDER_REPLICATE)
 
-    def _draw_false_hat(self, picture: Picture, place_W: Array, motion: CameraMotion) -> None:
-        centre_K = motion.points_K(place_W)
-        if centre_K[0, 2] > 0:
-            way_K = motion.rates_K(centre_K, np.zeros(3)) * self._exposure_s
-            for image in self._imager.hats(centre_K, way_K, motion).values():
-                image.draw(picture)
-
-    def _blur_lens(self, picture: Picture) -> None:
-        sigma_px = self._camera.blur_px
-        if sigma_px < 0.2:
-            return  # less than a pixel's own width
-        side = 3 if sigma_px <= 0.7 else 2 * math.ceil(2.5 * sigma_px) + 1
-        kernel = cv2.getGaussianKernel(side, sigma_px)
-        cv2.sepFilter2D(picture, -1, kernel, kernel, dst=picture, borderType=cv2.BORDER_REPLICATE)
-
 
 class _Noise:
     """The noise of a sensor, made once and laid over each picture at another offset; sigma in grey levels."""
@@ -146,7 +136,6 @@ class _Noise:
         self._under = np.clip(-levels, 0, 255).astype(np.uint8)
 
     def add(self, picture: Picture, number: int) -> None:
-        """Add the noise to the picture with this number."""
         bits = ((number * 4 + 1) * MIX ^ self._key * MIX >> 7) & (2**64 - 1)
         v, u = bits >> 40 & (MARGIN - 1), bits >> 52 & (MARGIN - 1)
         height, width = self._shape
@@ -157,9 +146,7 @@ class _Noise:
         cv2.subtract(picture, under, dst=picture)
 
 
-@cache
-def _view(lens: Lens) -> View:
-    return View(lens)
+view_of = cache(View)
 
 
 def _pinhole(view: View) -> tuple[View, tuple[Picture, Picture]]:
@@ -170,4 +157,4 @@ def _pinhole(view: View) -> tuple[View, tuple[Picture, Picture]]:
     width, height = (int(2 * math.ceil(side + 2)) for side in np.minimum(half, most))
     flat = Lens(lens.fx, lens.fy, (width - 1) / 2, (height - 1) / 2, 0, 0, 0, 0, 0, width, height)
     at = (view.plane * (lens.fx, lens.fy) + (flat.cx, flat.cy)).astype(np.float32)
-    return _view(flat), cv2.convertMaps(at[..., 0], at[..., 1], cv2.CV_16SC2)  # type: ignore[return-value]
+    return view_of(flat), cv2.convertMaps(at[..., 0], at[..., 1], cv2.CV_16SC2)  # type: ignore[return-value]

@@ -34,6 +34,7 @@ SUN_W = np.array(
 BLUR_MAX_PX = 24.0  # px of motion blur; longer motions are blurred like this
 SAMPLES_PER_PX = 8  # of a motion-blur kernel
 ORIGIN = np.zeros(3)
+SHIFT = 4  # fractional bits of OpenCV's coordinates: sixteenths of a pixel
 
 
 class DroneLook(NamedTuple):
@@ -77,7 +78,6 @@ def scene_of(info: Info, scenario: Scenario) -> Scene:
 
 
 def default_look(has_hat: bool = True) -> DroneLook:
-    """Return the appearance of an AR.Drone."""
     return _look(DroneInfo("", ""), has_hat)
 
 
@@ -123,7 +123,6 @@ class View:
     """A lens with its precomputed rays.
 
     Attributes:
-        distorts: whether the lens has any distortion.
         plane: intersections of the pixels' rays with the plane z = 1 of K, (height, width, 2).
         rays: unit vectors of K through the centres of the pixels, (height, width, 3).
     """
@@ -161,7 +160,6 @@ class View:
 
 
 def has_pixels(box: list[int]) -> bool:
-    """Tell whether a box is not empty."""
     return box[0] < box[2] and box[1] < box[3]
 
 

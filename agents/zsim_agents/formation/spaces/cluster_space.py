@@ -4,8 +4,7 @@ Robot space is r = (x_i, y_i, z_i, theta_i), i = 1..n, positions in W [m], headi
 has as many variables: where the formation is, how it is turned, how each robot is turned relative to it, and its
 shape. Velocities are related by c_dot = J(r) r_dot (Mas, Curi, Sanchez Pena, eqs. 1, 2).
 
-Order of this file: the base class, checks of a user's own class, distances and names, mathematics of the cluster frame
-C with Z-Y-X Euler angles, in plain floats and compiled, because a gate has microseconds.
+The mathematics of the cluster frame C, with Z-Y-X Euler angles, is compiled, because a gate has microseconds.
 """
 
 from __future__ import annotations
@@ -43,17 +42,12 @@ class ClusterSpace(ABC):
     class a scenario names; it is made by `for_places`.
 
     Args:
-        n: number of robots.
         names: of the variables, 4 n, pitch among them. The beginning of a name gives its kind: p, q, rho are lengths, w
             departures in metres, roll, yaw, phi, azimuth angles that wrap, pitch, beta, elevation angles that do not.
         spread_text: the quantity that `spread` measures, in words for messages.
 
-    Raises:
-        ValueError: other names.
-
     Attributes:
         size: number of cluster variables, 4 n.
-        names: their names in the order of c; lengths in metres, angles in radians.
         angular: (4n,) bool, true for the angles that wrap (roll, yaw, phi_i, azimuth_k).
         in_radians: (4n,) bool, true for all angles, also those that do not wrap (pitch, beta, elevation_k).
         period: (4n,) of the angles that wrap, 2 pi, and 0 for all else.
@@ -68,8 +62,8 @@ class ClusterSpace(ABC):
         self.size = 4 * n
         self.names = tuple(names)
         if len(self.names) != self.size or "pitch" not in self.names:
-            names_text = f"{len(self.names)} variables of {n} robots: {_listed(self.names)}"
-            raise ValueError(f"{type(self).__name__} has {names_text}; must have {self.size}, pitch among them")
+            found = f"{len(self.names)} variables of {n} robots: {_listed(self.names)}"
+            raise ValueError(f"{type(self).__name__} has {found}; must have {self.size}, pitch among them")
         self.spread_text = spread_text
         stems = [_stem(name) for name in names]
         self.angular = np.array([stem in {"roll", "yaw", "phi", "azimuth"} for stem in stems])
@@ -108,19 +102,11 @@ class ClusterSpace(ABC):
 
     @abstractmethod
     def jacobian(self, p_W: Array, yaw: Array) -> Array:
-        """Return J (4n, 4n) with c_dot = J r_dot; r_dot ordered (vx, vy, vz, yaw rate) robot by robot, W.
-
-        Raises:
-            SingularClusterError: as in `forward`.
-        """
+        """Return J (4n, 4n) with c_dot = J r_dot; r_dot ordered (vx, vy, vz, yaw rate) robot by robot, W."""
 
     @abstractmethod
     def inverse_jacobian(self, c: Array) -> Array:
-        """Return J^-1 (4n, 4n) with r_dot = J^-1 c_dot, in closed form.
-
-        Raises:
-            SingularClusterError: as in `inverse`.
-        """
+        """Return J^-1 (4n, 4n) with r_dot = J^-1 c_dot, in closed form."""
 
     @abstractmethod
     def spread(self, c: Array) -> float:
@@ -140,9 +126,8 @@ class ClusterSpace(ABC):
     def margin(self, c: Array) -> float:
         """Return the distance to singularity [m]: spread(c) cos(pitch).
 
-        It is zero exactly where J^-1 is singular (robots 1, 2, 3 in line or two of them in one place, a further robot
-        on the z axis through robot 1, or pitch at 90 degrees), and a length: how far one robot may move before a level
-        formation becomes singular.
+        Zero exactly where J^-1 is singular (robots 1, 2, 3 in line or two of them in one place, a further robot on the
+        z axis through robot 1, or pitch at 90 degrees): how far one robot may move before that, in a level formation.
         """
         return self.measures(c)[1]
 
@@ -174,21 +159,14 @@ class ClusterSpace(ABC):
         return near
 
     def index(self, name: str) -> int:
-        """Return the place of a variable in c.
-
-        Raises:
-            ValueError: there is no such variable.
-        """
+        """Return the place of a variable in c; ValueError: there is none of that name."""
         if name not in self.names:
             raise ValueError(f"variable {name[:40]!r} is unknown; allowed: {_listed(self.names)}")
         return self.names.index(name)
 
 
 def checked(space: ClusterSpace) -> ClusterSpace:
-    """Make every method of a user's space refuse results that are not finite numbers of the right shape.
-
-    The methods then raise UserCodeError, which names class, method and value.
-    """
+    """Make every method of a user's space refuse, by a UserCodeError, what is no finite number of the right shape."""
     n, size = space.n, space.size
     shapes: dict[str, tuple[tuple[int, ...], ...]] = {
         "forward": ((size,),),
@@ -278,7 +256,6 @@ def _stem(name: str) -> str:
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Return names for a line of text, abbreviated where there are many."""
     if len(names) <= NAMES_SHOWN:
         return ", ".join(names)
     return ", ".join((*names[: NAMES_SHOWN - 1], f"… {names[-1]}")) + f" ({len(names)})"
@@ -286,7 +263,7 @@ def _listed(names: Sequence[str]) -> str:
 
 @portable
 def wrap_angle(angle: float) -> float:
-    """Return the angle wrapped to [-pi, pi]."""
+    """Return the angle in [-pi, pi]."""
     return angle - TAU * np.rint(angle / TAU)
 
 
@@ -297,13 +274,11 @@ def row(table: Array, i: int) -> Vector:
 
 @portable
 def put(J: Array, first: int, column: int, v: Vector) -> None:
-    """Write v into a column of J, from row first on."""
     J[first, column], J[first + 1, column], J[first + 2, column] = v
 
 
 @portable
 def centroid(p_W: Array) -> Vector:
-    """Return the mean of positions (n, 3)."""
     n = p_W.shape[0]
     x, y, z = row(p_W, 0)
     for i in range(1, n):
@@ -328,11 +303,7 @@ def euler_axes_C(roll: float, pitch: float) -> Matrix:
 
 
 def euler_rates(roll: float, pitch: float) -> Array:
-    """Return T (3, 3) with (roll', pitch', yaw') = T w_WC_C.
-
-    Raises:
-        SingularClusterError: pitch is at 90 degrees.
-    """
+    """Return T (3, 3) with (roll', pitch', yaw') = T w_WC_C; SingularClusterError: pitch is at 90 degrees."""
     sr, cr = math.sin(roll), math.cos(roll)
     sp, cp = math.sin(pitch), math.cos(pitch)
     if cp < LENGTH_MIN_M:

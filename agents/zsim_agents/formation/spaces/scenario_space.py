@@ -30,8 +30,7 @@ def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
 
     Raises:
         ValueError: the template is in one line.
-        DocumentError: a user's class cannot be loaded; the line names its module.
-        UserCodeError: a user's class cannot be made.
+        DocumentError, UserCodeError: a user's class cannot be loaded; or made.
     """
     starts = _starts(scenario, cluster.drones)
     if not cluster.groups:
@@ -67,11 +66,7 @@ def _starts(scenario: Scenario, drones: Sequence[str]) -> Array:
 
 
 def cluster_space(n: int) -> ClusterSpace:
-    """Return the space of n robots called triad: the paper's at n = 3, its generalisation otherwise.
-
-    Raises:
-        ValueError: n is not from 2 to 64.
-    """
+    """Return the space of n robots, 2 to 64, called triad: the paper's at n = 3, its generalisation otherwise."""
     if not 2 <= n <= ROBOTS_MAX:
         raise ValueError(f"a cluster of {n} robots is not possible; allowed: 2 to {ROBOTS_MAX}")
     return PairCluster() if n == 2 else TriadCluster(n)
@@ -87,8 +82,7 @@ class _Group(NamedTuple):
     """Where a group stands in the whole.
 
     Attributes:
-        robots: its robots among all.
-        rows: their 4n_k entries in r, four each.
+        robots, rows: its robots among all; their 4n_k entries in r, four each.
         body, rest: places of BODY and of all else in its own c.
         own: places of the rest in the c of the whole.
         at: places of its body in the r of the parent, four each.
@@ -108,13 +102,7 @@ class NestedCluster(ClusterSpace):
 
     phi_k of the parent is the yaw of group k relative to that of the parent, NAME.phi_i the heading of a robot relative
     to the yaw of its group. The origin is the mean of the groups' centroids. The chain rule gives both Jacobians.
-
-    Args:
-        parent: cluster space of m robots.
-        groups: m pairs of name and cluster space, in the order of the robots.
-
-    Raises:
-        ValueError: the number of groups is not m.
+    `groups` are names and spaces in the order of the robots, as many as the parent has robots.
     """
 
     def __init__(self, parent: ClusterSpace, groups: Sequence[tuple[str, ClusterSpace]]) -> None:
@@ -149,7 +137,6 @@ class NestedCluster(ClusterSpace):
         return p_W, yaw
 
     def jacobian(self, p_W: Array, yaw: Array) -> Array:
-        """Return J: rows of the groups, and rows of the parent times those of the groups' bodies."""
         J, body = np.zeros((self.size, self.size)), np.zeros((self.parent.size, self.size))
         bodies = np.empty((self.parent.n, 4))
         for k, group in enumerate(self._groups):
@@ -180,7 +167,6 @@ class NestedCluster(ClusterSpace):
         return r_dot
 
     def specimen(self, apart_m: float) -> Array:
-        """Return specimens of the groups, far from each other."""
         c = np.zeros(self.size)
         widest_m = apart_m
         for group in self._groups:

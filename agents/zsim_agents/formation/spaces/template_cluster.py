@@ -9,8 +9,6 @@ frame by its n-th part only.
 Attitudes by best fit: Horn, Closed-form solution of absolute orientation using unit quaternions, J. Opt. Soc. Am. A 4
 (1987), section 4; the same rotation as Kabsch's (1976), and never a reflection. As a formation's frame: Belta, Kumar,
 Abstraction and control for groups of robots, IEEE Trans. Robotics 20 (2004).
-
-Order of this file: the space, the rotation that fits points best, modes of shape, small matrices.
 """
 
 from __future__ import annotations
@@ -46,10 +44,7 @@ class TemplateCluster(ClusterSpace):
     """c = (x_c, y_c, z_c, roll, pitch, yaw, phi_1..phi_n, w_1..w_{3n-6}); w in metres rms over the robots.
 
     w_1 is growth: robots move outwards, by w_1 in the root mean square. Then come the stretches and shears that the
-    template has room for (`shape_modes`).
-
-    Args:
-        places_m: (n, 3) the template, n >= 3; its origin does not matter.
+    template has room for (`shape_modes`). The origin of the template's places (n, 3), n >= 3, does not matter.
 
     Raises:
         ValueError: fewer than three places, or all in one line.
@@ -133,7 +128,6 @@ class TemplateCluster(ClusterSpace):
         return r_dot.ravel()
 
     def specimen(self, apart_m: float) -> Array:
-        """Return the template itself, wide enough."""
         c = np.zeros(self.size)
         distance = np.linalg.norm(self.t_C[:, None] - self.t_C, axis=2)[np.triu_indices(self.n, 1)].min()
         radius_m = math.sqrt(float((self.t_C**2).sum()) / self.n)
@@ -172,8 +166,7 @@ class TemplateCluster(ClusterSpace):
         values = np.linalg.eigvalsh(G)
         return math.sqrt(values[-1] / values[0]) if values[0] > 0.0 else math.inf
 
-    def _places_C(self, c: Array) -> Array:
-        """Return the places of the robots from the centroid (n, 3) [m; C]."""
+    def _places_C(self, c: Array) -> Array:  # (n, 3) [m], from the centroid
         return self.t_C + self._modes.dot(c[self._shape :]).reshape(self.n, 3)
 
     def _fitted(self, p_W: Array) -> tuple[Array, Array, Array]:
@@ -195,13 +188,9 @@ def _root(E: Array, n: int) -> Array:
 def fitted_rotation(H: Array) -> tuple[float, Array]:
     """Return how well the rotation is defined, and the rotation R (3, 3) that maximises the sum of b_i . R t_i.
 
-    Args:
-        H: (3, 3), the sum of t_i b_i^T.
-
-    Returns:
-        The gap, half of the difference of the two greatest eigenvalues of Horn's matrix [unit of H]: the smallest
-        eigenvalue of tr(S) I - S, S = sum of R^T b_i t_i^T. It is zero where several rotations fit equally well, or
-        H is not finite.
+    H (3, 3) is the sum of t_i b_i^T. The first is the gap, half of the difference of the two greatest eigenvalues of
+    Horn's matrix [unit of H]: the smallest eigenvalue of tr(S) I - S, S = sum of R^T b_i t_i^T. It is zero where
+    several rotations fit equally well, or H is not finite.
     """
     K = np.empty((4, 4))
     if not put_horn_matrix(H, K):

@@ -3,8 +3,6 @@
 Robots 1, 2, 3 give the frame C and the triangle (p, q, beta); each further robot k adds its distance rho, azimuth and
 elevation, seen from robot 1 in C. The origin is the centroid of all robots. Two robots are a rod with a direction and
 a length, without roll.
-
-Order of this file: the triad, its compiled mathematics from robots to c and back and of J^-1, the rows of J, the pair.
 """
 
 from __future__ import annotations
@@ -168,7 +166,6 @@ def triad_inverse_jacobian(c: Array, J_inv: Array) -> bool:
 
 @portable
 def put_shape_rates(J_inv: Array, c: Array, R_WC: Matrix) -> None:
-    """Write the columns of the shape variables into J^-1."""
     n = c.size // 4
     at = 6 + n
     triangle_C = triangle_rates(c[at], c[at + 1], c[at + 2])
@@ -195,7 +192,6 @@ def add_rate(J_inv: Array, robot: int, column: int, rate_W: Vector) -> None:
 
 @portable
 def triad_spread(c: Array) -> float:
-    """Return the least of sin(beta) min(p, q) and rho_k cos(elevation_k)."""
     at = 6 + c.size // 4
     least = math.sin(c[at + 2]) * min(c[at], c[at + 1])
     for first in range(at + 3, c.size, 3):
@@ -280,14 +276,12 @@ def triangle_rates(p: float, q: float, beta: float) -> tuple[Matrix, Matrix]:
 
 @portable
 def spherical(d_C: Vector) -> Vector:
-    """Return distance, azimuth and elevation of a vector."""
     flat = math.sqrt(d_C[0] * d_C[0] + d_C[1] * d_C[1])
     return norm(d_C), math.atan2(d_C[1], d_C[0]), math.atan2(d_C[2], flat)
 
 
 @portable
 def spherical_place(rho: float, azimuth: float, elevation: float) -> Vector:
-    """Return (x, y, z) of distance, azimuth and elevation."""
     flat = rho * math.cos(elevation)
     return flat * math.cos(azimuth), flat * math.sin(azimuth), rho * math.sin(elevation)
 
@@ -381,7 +375,6 @@ def pair_forward(p_W: Array, yaw: Array, c: Array) -> None:
 
 @portable
 def pair_inverse(c: Array, p_W: Array, yaw: Array) -> None:
-    """Write positions (2, 3) and headings (2,)."""
     half_W = scaled(column(matrix_from_rpy(0.0, c[3], c[4]), 0), c[7] / 2)
     for k in range(3):
         p_W[0, k], p_W[1, k] = c[k] + half_W[k], c[k] - half_W[k]

@@ -168,9 +168,6 @@ def test_an_external_drone_is_drawn_where_its_last_pose_leads_to() -> None:
         bodies = kept.bodies(gate * GATE_NS)
         assert bodies is not None
         assert bodies.p_WB[1, 0] == pytest.approx(x)
-
-
-def test_external_drones_alone_are_drawn_at_the_gates_of_their_drivers() -> None:
     kept = TruthHistory(2, GATE_NS, 5 * GATE_NS, {0: STANDING, 1: STANDING})
     kept.add(1, truth(3, 10.0))
     bodies = kept.bodies(3 * GATE_NS)

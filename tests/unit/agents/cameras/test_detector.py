@@ -12,8 +12,8 @@ from refused import has_terms
 from zsim.sensors.camera import Camera, FrontCamera, PictureError, frame_of
 from zsim.sensors.camera_model import camera_pose, lens_of
 from zsim_agents.cameras.detector import HatDetector, decoded
+from zsim_agents.cameras.rendering.foreground import AMBIENT, ball_images
 from zsim_agents.cameras.rendering.scene import View
-from zsim_agents.cameras.rendering.shapes import AMBIENT, ball_images
 
 ASSOCIATED_RAD = 0.03  # rad, within which a sighting is that of the hat
 
@@ -59,18 +59,19 @@ def test_the_range_errs_by_no_more_than_so_much_at_any_range(ranges_m: Any, rms:
     assert np.sqrt((of_all[:, 4] ** 2).mean()) < rms
 
 
-@pytest.mark.parametrize("fields", [{"light": 0.15}, {"rate_rad_s": 0.7}])
-def test_sigmas_hold_at_dusk_and_when_the_body_turns(fields: Any) -> None:
-    of_all = errors(FRONT, 120, seed=5, ranges_m=(1.5, 6.0), **fields)
-    assert len(of_all) > 100
+@pytest.mark.parametrize(
+    ("camera", "fields"),
+    [
+        (FRONT, {"light": 0.15}),
+        (FRONT, {"rate_rad_s": 0.7}),
+        (FrontCamera(distortion=(-0.28, 0.09, 0.0, 0.0, 0.0)), {}),
+    ],
+)
+def test_sigmas_hold_at_dusk_when_the_body_turns_and_behind_a_lens_that_distorts(camera: Camera, fields: Any) -> None:
+    of_all = errors(camera, 120, seed=5, ranges_m=(1.5, 6.0), **fields)
+    assert len(of_all) > 95
     assert np.sqrt((of_all[:, 1:3] ** 2).mean()) < 1.5
     assert np.sqrt((of_all[:, 3] ** 2).mean()) < 1.5
-
-
-def test_a_distorting_lens_makes_no_difference() -> None:
-    of_all = errors(FrontCamera(distortion=(-0.28, 0.09, 0.0, 0.0, 0.0)), 100, seed=6, ranges_m=(1.5, 6.0))
-    assert len(of_all) > 80
-    assert np.sqrt((of_all[:, 1:4] ** 2).mean()) < 1.4
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0), (0.8, 0.0), (-0.78, 0.38)])
@@ -112,14 +113,9 @@ def test_nothing_is_seen_where_no_hat_is() -> None:
         assert detector().seen(drawn.picture(0, 1.0, bodies([(2, 3, 4)], [(0.1, -0.1, yaw)]))) == ()
 
 
-def test_a_hat_that_the_edge_of_the_picture_cuts_is_left_out() -> None:
-    camera = replace(FRONT, noise=0.0)
-    edge = 320 / lens_of(camera).fx  # tangent of the angle to it
-    assert detector().seen(renderer(camera).picture(0, 1.0, bodies([(0, 0, 5), (2.16, 2 * edge, 4.8)]))) == ()
-
-
-def test_a_hat_too_small_for_an_honest_range_is_left_out() -> None:
-    drawn = renderer(replace(FRONT, noise=0.0))
+def test_a_hat_that_the_edge_of_the_picture_cuts_or_too_small_for_an_honest_range_is_left_out() -> None:
+    drawn, edge = renderer(replace(FRONT, noise=0.0)), 320 / lens_of(FRONT).fx  # tangent of the angle to it
+    assert detector().seen(drawn.picture(0, 1.0, bodies([(0, 0, 5), (2.16, 2 * edge, 4.8)]))) == ()
     seen = [detector().seen(drawn.picture(0, 1.0, bodies([(0, 0, 5), (away, 0, 4.5)]))) for away in (8, 18)]
     assert [*map(len, seen)] == [1, 0]
 
@@ -136,11 +132,6 @@ def test_any_picture_is_taken(kind: str) -> None:
         picture[::8] = picture[1::8] = (134, 0, 226)
     for seen in detector().seen(picture):
         assert np.isfinite([*seen.direction_B, seen.range_m, seen.sigma_range_m, seen.sigma_direction_rad]).all()
-
-
-def test_a_picture_of_another_size_is_refused() -> None:
-    with pytest.raises(ValueError, match="320 x 240"):
-        detector().seen(np.zeros((240, 320, 3), np.uint8))
 
 
 def test_orange_red_and_purple_balls_are_no_hats() -> None:

@@ -6,18 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from pictures import (
-    BOTTOM,
-    CLEAN,
-    FRONT,
-    bodies,
-    has_magenta,
-    hat_pixel,
-    looks,
-    magenta_centre,
-    renderer,
-    scene,
-)
+from pictures import BOTTOM, CLEAN, FRONT, bodies, has_magenta, hat_pixel, looks, magenta_centre, renderer, scene
 
 from zsim.math.frames import quaternion_from_rpy, rotation_matrix
 from zsim.scenario.obstacle import row_of
@@ -25,7 +14,7 @@ from zsim.scenario.scenario import Obstacle
 from zsim.sensors.camera import FrontCamera, Hats
 from zsim.sensors.camera_model import lens_of
 from zsim.sensors.sensor import Mount
-from zsim_agents.cameras.rendering.backdrop import LIGHTEST, Ground
+from zsim_agents.cameras.rendering.backdrop import Ground
 
 CENTRE_PX = 0.5  # what the issue asks for
 AHEAD = bodies([(0, 0, 5), (4, 0.5, 4.6)])
@@ -50,32 +39,29 @@ def test_a_hat_is_where_the_lens_projects_it(distortion: Any) -> None:
     assert found > 25
 
 
-def test_a_hat_of_a_turned_and_shifted_camera_is_where_the_lens_projects_it() -> None:
-    mount = Mount(position_m=(0.1, -0.05, 0.06), rpy_deg=(20.0, -10.0, 15.0))
-    camera = FrontCamera(**CLEAN, mount=mount)
-    where = bodies([(0, 0, 5), (4, 1.3, 4.4)], [(0.1, 0.05, 0.1), (0, 0, 2)])
-    off = magenta_centre(draw(camera, where)) - hat_pixel(camera, where)
-    assert np.abs(off).max() < CENTRE_PX
+TURNED = Mount(position_m=(0.1, -0.05, 0.06), rpy_deg=(20.0, -10.0, 15.0))
 
 
-def test_the_bottom_camera_sees_a_hat_below() -> None:
-    camera = replace(BOTTOM, **CLEAN)
-    where = bodies([(0, 0, 8), (0.5, -0.4, 5)])
+@pytest.mark.parametrize(
+    ("camera", "where"),
+    [
+        (FrontCamera(**CLEAN, mount=TURNED), bodies([(0, 0, 5), (4, 1.3, 4.4)], [(0.1, 0.05, 0.1), (0, 0, 2)])),
+        (replace(BOTTOM, **CLEAN), bodies([(0, 0, 8), (0.5, -0.4, 5)])),
+    ],
+    ids=["turned and shifted", "bottom"],
+)
+def test_a_hat_of_another_camera_is_where_the_lens_projects_it(camera: Any, where: Any) -> None:
     assert np.abs(magenta_centre(draw(camera, where)) - hat_pixel(camera, where)).max() < CENTRE_PX
 
 
 def test_the_same_inputs_give_the_same_bits_and_another_seed_or_number_does_not() -> None:
-    first = draw()
-    assert (draw() == first).all()
-    assert (draw(number=1) != first).any()
-    assert (draw(seed=2) != first).any()
-
-
-def test_a_renderer_keeps_nothing_of_the_pictures_before() -> None:
     drawn = renderer()
     first = drawn.picture(0, 1.0, AHEAD).copy()
     drawn.picture(1, 1.1, bodies([(0, 0, 2), (2, 0.5, 2)], [(0.3, 0.2, 0.5), (0, 0, 0)]))
-    assert (drawn.picture(0, 1.0, AHEAD) == first).all()
+    assert (drawn.picture(0, 1.0, AHEAD) == first).all()  # it keeps nothing of the pictures before
+    assert (draw() == first).all()
+    assert (draw(number=1) != first).any()
+    assert (draw(seed=2) != first).any()
 
 
 def test_noise_has_the_deviation_that_was_set() -> None:
@@ -121,21 +107,18 @@ def test_the_ground_is_blurred_by_the_speed_over_it() -> None:
     assert along < across
 
 
-def test_an_obstacle_before_a_hat_hides_it_and_one_behind_does_not() -> None:
-    for x, hidden in ((2.0, True), (7.0, False)):
-        box = Obstacle(name="wall", shape="box", position_m=(x, 0, 0), size_m=(0.2, 6, 9))
-        picture = draw(of=scene(obstacles=(tuple(row_of(box)),)))
-        assert has_magenta(picture) is not hidden
-
-
 @pytest.mark.parametrize(
-    "shape", [{"shape": "cylinder", "radius_m": 0.6, "height_m": 9.0}, {"shape": "sphere", "radius_m": 0.8}]
+    ("obstacle", "hides"),
+    [
+        ({"shape": "box", "position_m": (2, 0, 0), "size_m": (0.2, 6, 9)}, True),
+        ({"shape": "box", "position_m": (7, 0, 0), "size_m": (0.2, 6, 9)}, False),
+        ({"shape": "cylinder", "position_m": (2.0, 0.27, 0.0), "radius_m": 0.6, "height_m": 9.0}, True),
+        ({"shape": "sphere", "position_m": (2.0, 0.27, 4.8), "radius_m": 0.8}, True),
+    ],
 )
-def test_round_obstacles_hide_too(shape: Any) -> None:
-    z = 0.0 if shape["shape"] == "cylinder" else 4.8
-    post = Obstacle(name="post", position_m=(2.0, 0.27, z), **shape)
-    assert has_magenta(draw())
-    assert not has_magenta(draw(of=scene(obstacles=(tuple(row_of(post)),))))
+def test_an_obstacle_before_a_hat_hides_it_and_one_behind_does_not(obstacle: Any, hides: bool) -> None:
+    row = tuple(row_of(Obstacle(name="wall", **obstacle)))
+    assert has_magenta(draw(of=scene(obstacles=(row,)))) is not hides
 
 
 def test_a_nearer_drone_hides_the_hat_of_a_farther_one() -> None:
@@ -173,7 +156,7 @@ SQUARE_M, INNER = 0.15, (8, 6)
 
 
 def board() -> Ground:
-    tile = np.full((1000, 1000), LIGHTEST, np.uint8)
+    tile = np.full((1000, 1000), 150, np.uint8)
     side = round(SQUARE_M / 0.005)
     for i in range(INNER[0] + 1):
         for j in range(INNER[1] + 1):

@@ -10,9 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from zsim.math.rotation import LEVEL, Quaternion, Vector, heading, matrix, subtract
-from zsim_agents.estimation import dead_reckoning
-from zsim_agents.estimation.dead_reckoning import madgwick_step
+from zsim_agents.estimation import strapdown
+from zsim_agents.estimation.filter_state import Reckoning
 from zsim_agents.estimation.kalman_update import predicted_covariance
+from zsim_agents.estimation.strapdown import madgwick_step
 
 G = 9.80665  # m/s^2
 DT, GATE_S = 0.005, 0.02  # s
@@ -42,21 +43,14 @@ def triple(values) -> Vector:
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.36, 0.48, 0.8)])
-def test_a_constant_rate_turns_by_rate_times_time(axis):
+def test_a_constant_rate_turns_about_the_body_s_axis_by_rate_times_time(axis):
     rate, steps = 3.0, 400  # rad/s; 2 s
-    q = LEVEL
-    w = (rate * axis[0], rate * axis[1], rate * axis[2])
-    for _ in range(steps):
-        q = madgwick_step(q, w, ZERO, 0.1, DT)
-    expected = Rotation.from_rotvec(np.array(axis) * rate * steps * DT)
-    assert (as_rotation(q) * expected.inv()).magnitude() < 1e-9
-
-
-def test_body_rates_multiply_on_the_right():
     start = Rotation.from_euler("ZYX", [100.0, 20.0, -30.0], degrees=True)
-    q = madgwick_step(quaternion(start), (10.0, -20.0, 30.0), ZERO, 0.0, DT)
-    expected = start * Rotation.from_rotvec(np.array([10.0, -20.0, 30.0]) * DT)
-    assert (as_rotation(q) * expected.inv()).magnitude() < 1e-12
+    q = quaternion(start)
+    for _ in range(steps):
+        q = madgwick_step(q, triple(np.multiply(rate, axis)), ZERO, 0.1, DT)
+    expected = start * Rotation.from_rotvec(np.array(axis) * rate * steps * DT)
+    assert (as_rotation(q) * expected.inv()).magnitude() < 1e-9
 
 
 def test_the_gradient_is_the_derivative_of_the_objective():
@@ -72,7 +66,7 @@ def test_the_gradient_is_the_derivative_of_the_objective():
         q /= np.linalg.norm(q)
         h = 1e-6
         numeric = [(objective(q + h * e, f) - objective(q - h * e, f)) / (2 * h) for e in np.eye(4)]
-        assert dead_reckoning.gravity_gradient(tuple(q), tuple(f)) == pytest.approx(numeric, abs=1e-8)
+        assert strapdown.gravity_gradient(tuple(q), tuple(f)) == pytest.approx(numeric, abs=1e-8)
 
 
 def test_the_accelerometer_levels_by_two_beta_and_keeps_the_heading():
@@ -89,8 +83,8 @@ def test_the_accelerometer_levels_by_two_beta_and_keeps_the_heading():
 
 def test_under_noise_the_tilt_decays_with_the_levelling_time():
     sigma, levelling = 0.35 / G, 2.0  # rad, s
-    beta = dead_reckoning.beta_for(levelling, sigma)
-    assert dead_reckoning.levelling_time_s(beta, sigma) == pytest.approx(levelling)
+    beta = strapdown.beta_for(levelling, sigma)
+    assert strapdown.levelling_time_s(beta, sigma) == pytest.approx(levelling)
     rng = np.random.default_rng(3)
     left = []
     for _ in range(40):
@@ -101,16 +95,12 @@ def test_under_noise_the_tilt_decays_with_the_levelling_time():
     assert np.mean(left) == pytest.approx(0.02 * math.exp(-1.0), rel=0.15)
 
 
-def test_without_gain_or_force_only_the_gyroscope_counts():
+def test_without_gain_or_force_only_the_gyroscope_counts_and_the_length_stays_one():
     q = quaternion(Rotation.from_rotvec([0.3, 0.0, 0.0]))
     by_gyro = madgwick_step(q, (0.0, 0.0, 1.0), ZERO, 0.5, DT)
     assert madgwick_step(q, (0.0, 0.0, 1.0), (1.0, 2.0, 9.0), 0.0, DT) == by_gyro
-    assert dead_reckoning.levelling_time_s(0.0, 0.03) == math.inf
-
-
-def test_the_length_stays_one_over_many_steps():
+    assert strapdown.levelling_time_s(0.0, 0.03) == math.inf
     rng = np.random.default_rng(4)
-    q = LEVEL
     for w, f in zip(rng.normal(size=(5000, 3)), rng.normal(size=(5000, 3)), strict=True):
         q = madgwick_step(q, tuple(w), tuple(f), 0.2, DT)
     assert math.fsum(x * x for x in q) == pytest.approx(1.0, abs=1e-14)
@@ -118,7 +108,7 @@ def test_the_length_stays_one_over_many_steps():
 
 PATH = """
 import numpy as np
-from zsim_agents.estimation.dead_reckoning import reckon
+from zsim_agents.estimation.strapdown import reckon
 rng = np.random.default_rng(5)
 zero = (0.0, 0.0, 0.0)
 state = (zero, zero, (1.0, 0.0, 0.0, 0.0), zero, zero, zero)
@@ -145,14 +135,14 @@ def test_compiled_and_plain_python_give_the_same_bits():
 def test_the_transition_is_the_derivative_of_dead_reckoning():
     dt, f_B = 0.005, (0.5, -0.3, 10.5)  # s, m/s^2
 
-    def reckoned(error) -> dead_reckoning.Reckoning:
+    def reckoned(error) -> Reckoning:
         """One step of a drone whose state and biases are off by `error`."""
         w, x, y, z = (Rotation.from_rotvec(error[6:9]) * ATTITUDE).as_quat(scalar_first=True).tolist()
         gyro_bias, accel_bias = triple(error[9:12]), triple(error[12:15])
         rate, force = subtract(RATE, gyro_bias), subtract(f_B, accel_bias)
-        a = dead_reckoning.acceleration((w, x, y, z), force, G)
+        a = strapdown.acceleration((w, x, y, z), force, G)
         start = (triple(P_W + error[0:3]), triple(V_W + error[3:6]), (w, x, y, z), a, rate, force)
-        return dead_reckoning.reckon(start, f_B, RATE, accel_bias, gyro_bias, 0.0, G, dt)
+        return strapdown.reckon(start, f_B, RATE, accel_bias, gyro_bias, 0.0, G, dt)
 
     nominal = reckoned(np.zeros(15))
 
@@ -165,38 +155,31 @@ def test_the_transition_is_the_derivative_of_dead_reckoning():
     numeric = np.stack([(off(h * e) - off(-h * e)) / (2.0 * h) for e in np.eye(15)], 1)
     F = np.eye(15)
     R = matrix(nominal[2])
-    dead_reckoning.write_transition(F, triple(ATTITUDE.apply(f_B)), R, math.inf, True, dt)
+    strapdown.write_transition(F, triple(ATTITUDE.apply(f_B)), R, math.inf, True, dt)
     # The velocity's dependence on the gyroscope's bias is of second order in dt and left out.
     assert F[:9] == pytest.approx(numeric, abs=2e-4)
     assert F[6:9, 9:12] == pytest.approx(numeric[6:9, 9:12], abs=1e-5)
     assert F[9:] == pytest.approx(np.eye(15)[9:])
-
-
-def test_madgwick_pull_shortens_tilt_but_not_heading_errors():
-    F = np.eye(12)
-    dead_reckoning.write_transition(F, (0.0, 0.0, G), matrix(LEVEL), 2.0, False, 0.02)
+    F = np.eye(12)  # Madgwick's pull shortens errors of the tilt, but not of the heading
+    strapdown.write_transition(F, (0.0, 0.0, G), matrix(LEVEL), 2.0, False, 0.02)
     assert np.diag(F)[6:9] == pytest.approx([math.exp(-0.01), math.exp(-0.01), 1.0], abs=1e-4)
 
 
-def test_white_acceleration_becomes_a_random_walk_of_velocity():
+def test_white_acceleration_becomes_a_random_walk_of_velocity_and_biases_gain_theirs():
     accel_variance, tilt_variance = 0.35**2 * 4 * 0.005**2, 1e-9  # over a gate: m^2/s^2 of four samples, rad^2
     rest = (ZERO, ZERO, LEVEL, ZERO, ZERO, (0.0, 0.0, G))
     P, variances = np.zeros((12, 12)), (accel_variance, tilt_variance, tilt_variance)
     for _ in range(500):
         F, Q = np.eye(12), np.zeros((12, 12))
-        dead_reckoning.write_prediction(F, Q, np.zeros(12), rest, ZERO, G, 60.0, False, variances, GATE_S)
+        strapdown.write_prediction(F, Q, np.zeros(12), rest, ZERO, G, 60.0, False, variances, GATE_S)
         P = predicted_covariance(P, F, Q)
     density = 0.35**2 * 0.005  # m^2/s^3, of white noise at 200 Hz
     assert P[5, 5] == pytest.approx(density * 10.0, rel=1e-6)
     assert P[2, 2] == pytest.approx(density * 10.0**3 / 3.0, rel=1e-3)
     assert density * 10.0 < P[3, 3] < density * 10.0 + tilt_variance / GATE_S * G**2 * 10.0**3 / 3.0
-
-
-def test_bias_states_gain_their_random_walk():
-    rest = (ZERO, ZERO, LEVEL, ZERO, ZERO, (0.0, 0.0, G))
     walk = np.array([0.0] * 9 + [1e-10] * 3 + [1e-4] * 3 + [0.0])
     F, Q = np.eye(16), np.zeros((16, 16))
-    dead_reckoning.write_prediction(F, Q, walk, rest, ZERO, G, 60.0, True, (1e-4, 1e-9, 1e-9), GATE_S)
+    strapdown.write_prediction(F, Q, walk, rest, ZERO, G, 60.0, True, (1e-4, 1e-9, 1e-9), GATE_S)
     gained = np.diag(predicted_covariance(np.zeros((16, 16)), F, Q))[9:]
     assert gained == pytest.approx(walk[9:] * GATE_S, abs=1e-18)
 
@@ -207,7 +190,7 @@ def test_the_sigma_of_the_heading_agrees_with_samples():
     P = np.zeros((12, 12))
     P[6:9, 6:9] = root @ root.T
     q = tuple(ATTITUDE.as_quat(scalar_first=True).tolist())
-    yaw, sigma = dead_reckoning.heading_and_sigma(q, P)
+    yaw, sigma = strapdown.heading_and_sigma(q, P)
     turned = Rotation.from_rotvec(rng.normal(size=(20_000, 3)) @ root.T) * ATTITUDE
     samples = turned.as_euler("ZYX")[:, 0] - yaw
     assert yaw == pytest.approx(math.radians(120.0))

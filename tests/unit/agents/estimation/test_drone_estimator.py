@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from synthetic_flight import GATE_S, Flight, Reading, estimator, fly, readings, scenario
 
-from zsim_agents.estimation.dead_reckoning import levelling_time_s
 from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.filter_setup import LEVELLING_S, madgwick_beta
 from zsim_agents.estimation.filter_state import Rows
+from zsim_agents.estimation.strapdown import levelling_time_s
 
 NAN, INF = math.nan, math.inf
 AIDING = ("gps", "mag", "baro", "sonar", "flow")
@@ -51,13 +51,18 @@ def nees(flight: Flight, estimates, after_s: float) -> float:
     return float(np.mean(np.einsum("ni,ni->n", error, np.linalg.solve(P, error[:, :, None])[:, :, 0])))
 
 
-def test_a_flight_is_followed_to_the_sensors_limits():
+def test_a_flight_is_followed_to_the_sensors_limits_in_plain_numbers():
     _, flight, _, estimates = flown(end_s=40.0)
     (east, north, up), velocity, heading = rms(flight, estimates, 20.0)
     assert max(east, north) < 0.45  # m; sigma is 0.2 m and wanders slowly
     assert up < 0.03
     assert velocity < 0.04  # m/s
     assert heading < 0.01  # rad
+    end = estimates[-1][1]
+    vectors = (end.position_m, end.velocity_m_s, end.orientation_wxyz, end.covariance, end.gyro_bias_rad_s)
+    assert {type(x) for vector in (*vectors, (end.yaw_rad, end.yaw_sigma_rad)) for x in vector} == {float}
+    assert {type(n) for pair in end.sensors.values() for n in pair} == {int}
+    assert end.yaw_rad == pytest.approx(Rotation.from_quat(end.orientation_wxyz, scalar_first=True).as_euler("ZYX")[0])
 
 
 @pytest.mark.parametrize(
@@ -72,9 +77,8 @@ def test_a_flight_is_followed_to_the_sensors_limits():
 )
 def test_the_covariance_tells_the_truth(sections):
     of = scenario(**sections, yaw_deg=0.0)
-    seeds, end_s = range(6), 25.0
-    means = []
-    for seed in seeds:
+    end_s, means = 25.0, []
+    for seed in range(6):
         flight = Flight(seed)
         flight.yaw_start = 0.0
         means.append(nees(flight, fly(estimator(of), readings(flight, of, seed, end_s), end_s), 12.0))
@@ -215,20 +219,20 @@ def test_without_a_magnetometer_the_heading_is_the_one_it_was_set_down_with():
     assert estimates[-1][1].sensors["mag"] == (0, 0)
 
 
-def test_a_gyro_bias_is_found():
-    of, _, coming, _ = flown(seed=10, end_s=0.1, preset="ardrone2")
-    flight, bias = Flight(10), (0.002, -0.003, 0.0015)  # rad/s; the preset's sigma is 0.0017
+def test_a_gyro_bias_is_found_and_the_covariance_stays_positive_and_symmetric():
+    quiet = {"gyro_deg_s": {"noise": 0.06, "bias": 0.0, "bias_walk": 0.0, "quantum": 0.0}}
+    bias = (0.002, -0.003, 0.0015)  # rad/s; the preset's sigma is 0.0017
     coming = [
-        r._replace(values=(r.values[0], tuple(w + b for w, b in zip(r.values[1], bias, strict=True))))
-        if r.sensor == "imu"
-        else r
-        for r in readings(flight, scenario(preset="ardrone2", sensors={"imu": QUIET_GYRO}), 10, 40.0)
+        r._replace(values=(r.values[0], tuple(np.add(r.values[1], bias).tolist()))) if r.sensor == "imu" else r
+        for r in readings(Flight(10), scenario(preset="ardrone2", sensors={"imu": quiet}), 10, 40.0)
     ]
-    end = fly(estimator(of), coming, 40.0)[-1][1]
+    estimates = fly(estimator(scenario(preset="ardrone2")), coming, 40.0)
+    for _, estimate in estimates[::50]:
+        P = covariance(estimate)
+        assert (P == P.T).all()
+        assert np.linalg.eigvalsh(P).min() > 0.0
+    end = estimates[-1][1]
     assert end.gyro_bias_rad_s == pytest.approx(bias, abs=3e-4)
-
-
-QUIET_GYRO = {"gyro_deg_s": {"noise": 0.06, "bias": 0.0, "bias_walk": 0.0, "quantum": 0.0}}
 
 
 def test_late_fixes_are_compared_with_the_past():
@@ -253,10 +257,7 @@ def test_late_fixes_are_compared_with_the_past():
 
 
 def test_latencies_of_all_sensors_are_made_good():
-    late = {name: {"latency_ms": 80.0} for name in AIDING} | {
-        "gps": {"latency_ms": 300.0},
-        "imu": {"latency_ms": 10.0},
-    }
+    late = {name: {"latency_ms": {"gps": 300.0, "imu": 10.0}.get(name, 80.0)} for name in (*AIDING, "imu")}
     _, flight, _, estimates = flown(seed=11, end_s=30.0, sensors=late)
     _, velocity, heading = rms(flight, estimates, 15.0)
     assert velocity < 0.045  # m/s
@@ -290,13 +291,9 @@ def test_mounts_are_taken_off():
 
 
 def test_biases_of_aiding_sensors_widen_the_covariance():
-    biased = {
-        "gps": {"position_m": {"noise": 2.0, "bias": 3.0}},
-        "baro": {"altitude_m": {"noise": 0.1, "bias": 2.0}},
-    }
-    seeds = range(20, 28)
+    biased = {"gps": {"position_m": {"noise": 2.0, "bias": 3.0}}, "baro": {"altitude_m": {"noise": 0.1, "bias": 2.0}}}
     ends = []
-    for seed in seeds:
+    for seed in range(20, 28):
         _, flight, _, estimates = flown(seed=seed, end_s=12.0, sensors=biased)
         ends.append(nees(flight, estimates[-1:], 0.0))
         assert math.sqrt(covariance(estimates[-1][1])[0, 0]) > 2.9
@@ -311,9 +308,7 @@ def test_a_warm_start_goes_on_where_it_was(preset: str):
     core = estimator(of)
     core.warm_start(unbroken[at][1])
     resumed = fly(core, coming, 30.0, from_s=20.0)
-    apart = np.array(
-        [np.subtract(a.position_m, b.position_m) for (_, a), (_, b) in zip(resumed, unbroken[at + 1 :], strict=True)]
-    )
+    apart = np.array([a.position_m for _, a in resumed]) - np.array([b.position_m for _, b in unbroken[at + 1 :]])
     assert np.linalg.norm(apart, axis=1).max() < 0.15  # m
     assert np.linalg.norm(apart[0]) < 0.02
     assert rms(flight, resumed)[1] < 0.06
@@ -321,8 +316,11 @@ def test_a_warm_start_goes_on_where_it_was(preset: str):
     assert nees(flight, resumed, 20.0) < chi2.ppf(0.999, 6)
 
 
-def test_a_cold_start_in_flight_converges():
+def test_a_cold_start_in_flight_converges_and_without_any_imu_the_others_still_place_the_drone():
     of, flight, coming, _ = flown(seed=3, end_s=30.0)
+    blind = fly(estimator(of), [r for r in coming if r.sensor != "imu"], 20.0)
+    assert rms(flight, blind, 10.0)[0].max() < 2.0
+    assert blind[-1][1].sensors["imu"] == (0, 0)
     estimates = fly(estimator(of), coming, 30.0, from_s=20.0)
     assert rms(flight, estimates, 22.0)[1] < 0.05  # m/s
     assert np.abs(errors(flight, estimates, 23.0)[2]).max() < 0.03
@@ -342,13 +340,6 @@ def test_without_an_imu_the_covariance_grows_and_comes_back():
     assert sigma(29.0) < 0.05
     assert nees(flight, [(t, e) for t, e in estimates.items() if 15.0 < t < 20.0], 0.0) < 6.0 * 3.0
     assert rms(flight, list(estimates.items()), 25.0)[1] < 0.05
-
-
-def test_without_any_imu_the_other_sensors_still_place_the_drone():
-    of, flight, coming, _ = flown(seed=15, end_s=20.0)
-    estimates = fly(estimator(of), [r for r in coming if r.sensor != "imu"], 20.0)
-    assert rms(flight, estimates, 10.0)[0].max() < 2.0
-    assert estimates[-1][1].sensors["imu"] == (0, 0)
 
 
 def test_nothing_at_all_gives_a_wide_finite_estimate():
@@ -371,26 +362,6 @@ def test_a_jump_of_gps_is_refused_at_first_and_believed_when_it_stays():
     east = errors(flight, estimates)[0][:, 0]
     assert np.abs(east[: round(24.0 / GATE_S)]).max() < 2.5
     assert east[-1] == pytest.approx(30.0, abs=2.0)
-
-
-def test_the_covariance_stays_positive_and_symmetric():
-    _, _, _, estimates = flown(seed=17, end_s=30.0, preset="ardrone2")
-    for _, estimate in estimates[::50]:
-        P = covariance(estimate)
-        assert (P == P.T).all()
-        assert np.linalg.eigvalsh(P).min() > 0.0
-
-
-def test_the_estimate_is_plain_python():
-    _, _, _, estimates = flown(seed=18, end_s=1.0)
-    end = estimates[-1][1]
-    vectors = (end.position_m, end.velocity_m_s, end.orientation_wxyz, end.covariance, end.gyro_bias_rad_s)
-    numbers = [x for vector in vectors for x in vector] + [end.yaw_rad, end.yaw_sigma_rad]
-    assert {type(x) for x in numbers} == {float}
-    assert len(end.covariance) == 36
-    assert {type(n) for pair in end.sensors.values() for n in pair} == {int}
-    yaw = Rotation.from_quat(end.orientation_wxyz, scalar_first=True).as_euler("ZYX")[0]
-    assert end.yaw_rad == pytest.approx(yaw)
 
 
 def test_the_gain_follows_the_accelerometer():

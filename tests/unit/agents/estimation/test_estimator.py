@@ -70,13 +70,9 @@ def test_it_estimates_one_only_where_its_driver_has_brought_a_status(estimator: 
         assert tuple(each.name for each in shown.estimates) == coming  # type: ignore[attr-defined]
     last = estimates["d1"]
     assert last.seq == 68  # counted without gaps
+    estimator.deliver(100 * GATE_NS, brought("d0", 100) + brought("d1", 100)[:-1])  # without its status
+    assert [key for key, _ in estimator.step(100 * GATE_NS)] == [keys.estimate("d0")]
     np.testing.assert_allclose(last.position_m, (4.0, 0.0, 0.0), atol=0.3)
-
-
-def test_a_sensor_without_a_status_is_no_estimate(estimator: Estimator):
-    step(estimator, 0, "d0", "d1")
-    estimator.deliver(GATE_NS, brought("d0", 1) + brought("d1", 1)[:-1])
-    assert [key for key, _ in estimator.step(GATE_NS)] == [keys.estimate("d0")]
 
 
 # Without numba

@@ -4,10 +4,9 @@ import math
 
 import numpy as np
 import pytest
-from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter
+from filterpy.kalman import ExtendedKalmanFilter
 from scipy.stats import chi2
 
-from zsim.math.compiled import COMPILES
 from zsim_agents.estimation.filter_setup import innovation_limits
 from zsim_agents.estimation.kalman_update import predicted_covariance, stacked_update
 
@@ -64,20 +63,6 @@ def test_an_innovation_outside_of_its_gate_changes_nothing():
     assert np.array_equal(after, before)
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_used_one_after_another_they_are_the_same_as_together(seed: int):
-    """Independent measurements need no stack: filterpy's linear filter takes them row by row."""
-    P, H, variance, y = problem(seed, 12, 7)
-    reference = KalmanFilter(12, 1)
-    reference.x, reference.P = np.zeros(12), P.copy()
-    for row in range(7):
-        reference.update(y[row], variance[row], H[row : row + 1])
-    blocks = np.array([(i, 1) for i in range(7)])
-    _, x, updated, _ = stacked_update(P, H, variance, y, blocks, LIMITS, np.zeros(7))
-    assert x == pytest.approx(reference.x, rel=1e-9, abs=1e-11)
-    assert updated == pytest.approx(reference.P, rel=1e-9, abs=1e-9 * np.abs(P).max())
-
-
 @pytest.mark.parametrize(("size", "inside"), [(1, True), (1, False), (3, True), (3, False), (6, True), (6, False)])
 def test_a_gate_is_the_quantile_of_chi_square(size: int, inside: bool):
     P, H, variance = np.eye(12), np.eye(size, 12), np.full(size, 0.25)
@@ -98,7 +83,3 @@ def test_what_is_not_a_number_is_refused(bad: float):
     assert not used
     assert not x.any()
     assert (updated == P).all()
-
-
-def test_it_is_compiled_where_numba_is():
-    assert hasattr(stacked_update, "py_func") == COMPILES

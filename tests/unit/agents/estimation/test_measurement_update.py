@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from synthetic_flight import GATE_S, Flight, estimator, readings, scenario
 
 from zsim.math.rotation import LEVEL, matrix
-from zsim_agents.estimation.dead_reckoning import corrected
 from zsim_agents.estimation.filter_state import NOMINAL, SETTING, Rows, reckoning
 from zsim_agents.estimation.measurement_update import (
     correct,
@@ -19,6 +18,7 @@ from zsim_agents.estimation.measurement_update import (
     write_mag,
     write_sonar,
 )
+from zsim_agents.estimation.strapdown import corrected
 
 ZERO = (0.0, 0.0, 0.0)
 ARM, W = (0.11, -0.07, 0.05), (3.7, -2.0, 1.5)  # m, rad/s

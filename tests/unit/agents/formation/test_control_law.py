@@ -36,20 +36,14 @@ def offset(**changes):
     return c
 
 
-def test_at_the_reference_robots_rest():
+def test_the_cluster_rests_at_the_reference_and_moves_by_feed_forward_and_gain():
     command = command_at(GOAL, GOAL)
     assert np.abs(command.v_W).max() < 1e-12
     assert (command.factor, command.guarded, command.alarmed) == (1.0, (), ())
-
-
-def test_the_cluster_moves_by_feed_forward_and_gain():
     rate = np.array([0.1, -0.2, 0.05, 0, 0, 0.02, 0, 0, 0, 0.03, 0, 0])
     c = offset(x_c=-0.3, yaw=0.1, p=-0.2, beta=0.05)
     expected = rate + 0.6 * SPACE.difference(GOAL, c)
     assert cluster_rate(c, command_at(c, GOAL, rate)) == pytest.approx(expected, abs=1e-12)
-
-
-def test_yaw_errors_are_taken_the_short_way():
     c, c_des = offset(yaw=3.0 - math.pi / 2), offset(yaw=-3.0 - math.pi / 2)
     assert cluster_rate(c, command_at(c, c_des))[5] == pytest.approx(0.6 * (2 * math.pi - 6.0))
 
@@ -94,11 +88,7 @@ def test_the_integral_grows_with_the_error_up_to_its_clamp():
         command_at(c, GOAL, law=law)
     assert law.integral[[0, 5]] == pytest.approx([GAINS.integral_max_m_s, GAINS.integral_max_rad_s])
     law.reset()
-    assert not law.integral.any()
-
-
-def test_the_integral_stands_still_while_robots_are_saturated_or_guarded():
-    law, near = ProportionalLaw(SPACE, GAINS), offset(p=-1.5, q=-1.5)  # robots 2 and 3 at 1.9 m
+    near = offset(p=-1.5, q=-1.5)  # robots 2 and 3 at 1.9 m: saturated or guarded, it stands still
     assert command_at(offset(x_c=-50.0), GOAL, law=law).factor < 1.0
     assert command_at(near, near - 0.01, law=law).guarded
     assert not law.integral.any()

@@ -63,10 +63,6 @@ class Lame(TriadCluster):
         return r_dot
 
 class Named(TriadCluster):
-    def __init__(self, n):
-        super().__init__(n)
-        self.places = None
-
     @classmethod
     def for_places(cls, places_m):
         made = cls(len(places_m))
@@ -102,14 +98,11 @@ def scenario(**cluster: Any) -> Scenario:
     )
 
 
-def test_a_law_of_the_user_s_own_flies(module: str) -> None:
+def test_a_law_of_the_user_s_own_flies_and_without_a_name_the_stock_one(module: str) -> None:
     made = scenario(law=f"{module}:Still")
     law = engagement_of(made, made.clusters[0]).law
     assert type(law).__name__ == "Still"
     assert law.gains.k_1_s == made.clusters[0].gains.proportional_1_s
-
-
-def test_without_a_name_the_stock_law_flies_and_the_text_stays() -> None:
     plain, named = scenario(), scenario(law="proportional")
     for made in (plain, named):
         assert type(engagement_of(made, made.clusters[0]).law) is ProportionalLaw
@@ -121,6 +114,8 @@ def test_a_space_of_the_user_s_own_gets_the_places_of_its_robots(module: str) ->
     made = scenario(space=f"{module}:Named", template_m="[[1, 0, 0], [0, 1, 0], [0, -1, 0]]")
     space: Any = engagement_of(made, made.clusters[0]).space
     assert space.places.tolist() == [[1, 0, 0], [0, 1, 0], [0, -1, 0]]
+    with refused(ValueError, "11", "2"):  # without the names that it needs
+        TriadCluster(2)
 
 
 @pytest.mark.parametrize(
@@ -170,11 +165,6 @@ def test_every_law_is_saturated_and_knows_when_it_is_followed(speed_m_s: float, 
     assert command.v_W[:, 0] == pytest.approx(min(speed_m_s, law.gains.speed_max_m_s))
 
 
-def test_a_space_without_the_names_that_it_needs_is_refused() -> None:
-    with refused(ValueError, "11", "2"):
-        TriadCluster(2)
-
-
 # Plans
 
 WAY = "[{at_s: 0, values: {x_c: 0, z_c: 3}}, {at_s: %g, values: {x_c: %g}}, {at_s: %g, values: {x_c: 0}}]"
@@ -219,16 +209,14 @@ def test_a_trajectory_that_is_too_fast_is_refused_with_the_factor_that_fits() ->
     assert refusal(pair(way(30, 10 * factor(text)))) == ""
     assert refusal(pair(way(30, 10 * factor(text) / 1.2))) != ""
     assert refusal(pair(way(7, 10))) == ""
-
-
-def test_a_drone_that_is_slower_than_its_controller_asks_sets_the_limit() -> None:
-    slow = pair(way(7, 10), limits={"horizontal_speed_m_s": 0.5})
+    slow = pair(way(7, 10), limits={"horizontal_speed_m_s": 0.5})  # than its controller asks
     assert factor(refusal(slow)) == pytest.approx(1.5 * 0.7 / 0.5 / 0.8, rel=0.01)
 
 
 def test_an_expression_is_judged_over_its_time() -> None:
     turns = "{{takeoff_s: 2, trajectory: {{start_s: 20, expressions: {{x_c: 0, y_c: 0, z_c: 3, yaw: {}*t}}}}}}"
     assert refusal(pair(turns.format(0.1))) == ""
+    assert refusal(pair(way(30, 10).replace("takeoff_s: 2, ", ""))) == ""  # without a take-off it is not judged
     assert factor(refusal(pair(turns.format(2)))) > 1.0
 
 
@@ -271,7 +259,3 @@ def test_a_place_that_is_not_allowed_is_refused_in_a_target_and_on_a_trajectory(
     assert other.startswith("clusters[0].plan.trajectory: ")
     for each in (text, other):
         assert has_terms(each, *terms)
-
-
-def test_a_plan_without_a_take_off_and_drones_that_make_no_formation_yet_are_not_judged() -> None:
-    assert refusal(pair(way(30, 10).replace("takeoff_s: 2, ", ""))) == ""

@@ -8,7 +8,6 @@ import os
 import re
 import struct
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
 from zsim_analysis.reading.shortfall import percent_text, span_text
 from zsim_analysis.report.figure_style import thinned
-from zsim_analysis.report.make_report import figures, judge, make_report, page, write_page, write_report
+from zsim_analysis.report.make_report import judge, make_report, page, write_page, write_report
 from zsim_analysis.report.paper import PAPER_TABLE_1
 from zsim_analysis.report.summary import COLUMNS, PAPER_COLUMN, RunSummary, table, terminal_text
 
@@ -278,28 +277,13 @@ def test_a_flood_of_events_does_not_hide_a_restart(tmp_path):
     assert "4900 × refused" in page(summary, [])
 
 
-class Links(HTMLParser):
-    """Collects everything in a page that a browser would fetch or run."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: list[str] = []
-        self.scripts = 0
-
-    def handle_starttag(self, tag, attrs):
-        self.scripts += tag == "script"
-        self.found += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "action", "data")]
-
-
 def test_the_page_asks_nothing_of_the_network_and_runs_nothing(run):
     directory, _ = run
     text = (directory / "report.html").read_text()
-    links = Links()
-    links.feed(text)
-    assert len([link for link in links.found if link.startswith("data:image/png;base64,")]) == len(FIGURES)
-    assert all(link.startswith("data:") for link in links.found)
-    assert links.scripts == 0
-    assert not re.search(r"https?:|@import|url\(", text)
+    links = re.findall(r"""\b(?:src|href|srcset|action|data)\s*=\s*["']([^"']*)""", text)
+    assert len([link for link in links if link.startswith("data:image/png;base64,")]) == len(FIGURES)
+    assert all(link.startswith("data:") for link in links)
+    assert not re.search(r"https?:|@import|url\(|<script", text)
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
     assert 'name="viewport"' in text
     assert len(re.findall(r'<img src="[^"]+" alt="[^"]+" width="\d+" height="\d+">', text)) == len(FIGURES)
@@ -389,21 +373,19 @@ def test_several_clusters_have_a_table_and_figures_each(tmp_path):
     assert (tmp_path / "figures" / "figure_8_shape_main.png").exists()
 
 
-@pytest.mark.parametrize("form", ["run", "page"])
-def test_a_report_is_not_written_through_a_link(tmp_path: Path, form: str) -> None:
+@pytest.mark.parametrize("name", ["figures", "report-figures"])
+def test_a_report_is_not_written_through_a_link(tmp_path: Path, name: str) -> None:
     """Who sends a run's folder could have its report replace, and remove, files elsewhere."""
     elsewhere, folder = tmp_path / "elsewhere", tmp_path / "run"
     elsewhere.mkdir()
     folder.mkdir()
     (elsewhere / "drones.svg").write_text("mine")
-    link = folder / ("figures" if form == "run" else "report-figures")
+    link = folder / name
     link.symlink_to(elsewhere)
-    synthetic_record.write(tmp_path / "run.mcap", flown())
-    drawings = figures(*judge(tmp_path / "run.mcap"))
     with refused(ReportError, str(link), "link"):
-        if form == "run":
-            write_report(folder, b"{}", drawings, lambda _: "", lambda _: None)
+        if name == "figures":
+            write_report(folder, b"{}", (), lambda _: "", lambda _: None)
         else:
-            write_page(folder / "report.html", drawings, lambda _: "", lambda _: None)
+            write_page(folder / "report.html", (), lambda _: "", lambda _: None)
     assert [path.name for path in elsewhere.iterdir()] == ["drones.svg"]
     assert list(folder.iterdir()) == [link]

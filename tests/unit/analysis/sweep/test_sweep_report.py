@@ -63,9 +63,8 @@ def figures_in(folder: Path) -> set[str]:
     return {path.stem for path in (folder / "figures").iterdir()}
 
 
-@pytest.mark.parametrize("vary", ["seed", "duration_s=1,2,3"])
-def test_figures_of_a_sweep_show_something(tmp_path: Path, vary: str) -> None:
-    of = plan("seed", *({vary} - {"seed"}), runs=12)
+def test_figures_of_a_sweep_show_something(tmp_path: Path) -> None:
+    of = plan("seed", "duration_s=1,2,3", runs=12)
     report_of(tmp_path, of, flown(of))
     for path in (tmp_path / "figures").glob("*.png"):
         assert matplotlib.image.imread(path).std() > 0.01

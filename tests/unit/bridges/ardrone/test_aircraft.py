@@ -7,6 +7,7 @@ from ardrone_aircraft import PILOT, PlayedAircraft
 from ardrone_readers import configuration_entries
 
 from zsim.contract import flight_messages, messages
+from zsim.math.frames import quaternion_from_rpy
 from zsim.math.rotation import LEVEL
 from zsim_bridges.ardrone import at_commands, navdata
 from zsim_bridges.ardrone.navdata import FULL_TAGS, GPS_TAG, StateBit
@@ -85,10 +86,8 @@ class TestNavdata:
         played.aircraft.update(messages.Sonar(0, 0, 0, 1.5, True))
         played.aircraft.update(messages.Flow(0, 0, 0, (1.0, 0.5, 0.25), 1.0))
         played.aircraft.update(flight_messages.Truth(0, 0, ZEROS, ZEROS, LEVEL, ZEROS, ZEROS, (503.0,) * 4))
-        nose_down_left_turned_left = _quaternion(roll=-0.1, pitch=0.2, yaw=0.3)
-        estimate = flight_messages.Estimate(
-            0, 0, ZEROS, ZEROS, nose_down_left_turned_left, 0.3, (0.0,) * 36, 0.0, ZEROS, {}
-        )
+        w, x, y, z = quaternion_from_rpy((-0.1, 0.2, 0.3)).tolist()  # left side down, nose down, turned left
+        estimate = flight_messages.Estimate(0, 0, ZEROS, ZEROS, (w, x, y, z), 0.3, (0.0,) * 36, 0.0, ZEROS, {})
         played.flown_gates(1)
         played.aircraft.update(estimate)
         played.flown_gates(1)
@@ -229,14 +228,3 @@ def test_there_is_an_end_to_texts_about_what_is_no_command(played: PlayedAircraf
         played.aircraft.on_at(b"AT*NAME%d=1\r" % k)
     assert len(played.refusals) == 1000
     assert len(set(played.refusals)) == 21
-
-
-def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    cr, sr, cp, sp = math.cos(roll / 2), math.sin(roll / 2), math.cos(pitch / 2), math.sin(pitch / 2)
-    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )

@@ -7,9 +7,8 @@ import pytest
 from fake_aircraft import FIELD_UT, STEP_NS, FakeAircraft
 
 from zsim.math.frames import heading
-from zsim_bridges.ardrone.aircraft_session import AircraftSession, AircraftSettings, NavdataReadings
-from zsim_bridges.vehicle_links.aircraft_readings import AircraftPose
-from zsim_bridges.vehicle_links.vehicle_session import Demand
+from zsim_bridges.ardrone.aircraft_session import AircraftSession, NavdataReadings
+from zsim_bridges.vehicle_links.vehicle_session import AircraftPose, Demand
 
 ORIGIN = (-34.603, -58.368, 25.0)
 S = 1_000_000_000
@@ -20,8 +19,8 @@ class Loop:
 
     def __init__(self, delay_s: float = 0.0, yaw: float = 1.0, ultrasound: int = 8) -> None:
         self.aircraft = FakeAircraft(yaw)
-        readings, settings = NavdataReadings(ORIGIN, (0.0, 0.0, 0.0), FIELD_UT), AircraftSettings(ultrasound=ultrasound)
-        self.session = AircraftSession("127.0.0.2", readings, settings)
+        readings = NavdataReadings(ORIGIN, (0.0, 0.0, 0.0), FIELD_UT)
+        self.session = AircraftSession("127.0.0.2", readings, ultrasound)
         self.now_ns = 100 * S
         self._delay_ns = round(delay_s * S)
         self._under_way: list[tuple[int, int, bytes]] = []
@@ -139,7 +138,7 @@ def test_a_kill_is_not_taken_back_by_its_repetition_where_the_link_is_slow():
 def test_readings_have_our_units_and_axes():
     loop = Loop(yaw=0.0)
     loop.run(6)
-    newest = {reading.sensor: reading.values for reading in loop.session.take_readings()}
+    newest = {reading.sensor: reading.values for reading in loop.session.readings.take()}
     accel, gyro = newest["imu"]
     assert accel == pytest.approx((0.0, 0.0, 9.80665))
     assert gyro[:2] == pytest.approx((math.radians(1), math.radians(-2)))
@@ -147,14 +146,14 @@ def test_readings_have_our_units_and_axes():
     assert newest["baro"] == pytest.approx((100_000, 0))
     assert newest["gps"][3] == pytest.approx((0, 0, 0), abs=1e-3)
     assert newest["gps"][5:] == (2.0, 3, 9)
-    assert loop.session.take_readings() == []
+    assert loop.session.readings.take() == []
 
 
 def test_a_slow_sensor_is_read_when_it_measures_and_not_with_each_packet():
     loop = Loop()
     loop.run(10)
     count = {"imu": 0, "gps": 0, "mag": 0}
-    for reading in loop.session.take_readings():
+    for reading in loop.session.readings.take():
         if reading.sensor in count:
             count[reading.sensor] += 1
     assert count["imu"] > 1500

@@ -6,7 +6,6 @@ from zsim_bridges.ardrone.configuration import (
     KEPT_MAX,
     Configuration,
     ConfigurationError,
-    CustomList,
     format_configuration,
     format_custom_list,
 )
@@ -61,7 +60,7 @@ def test_levels_have_values_of_their_own(configuration: Configuration):
     assert configuration.number("control:altitude_max") == 900.0  # common
     configuration.set("custom:profile_id", "11111111")
     assert configuration.number(TILT) == pytest.approx(0.1)
-    assert configuration.custom_list().profiles == {"00000000": "default", "11111111": "a pilot", "33333333": ""}
+    assert configuration.custom_list()["profiles"] == {"00000000": "default", "11111111": "a pilot", "33333333": ""}
     assert configuration.is_current("00000000", "11111111", "22222222")
 
 
@@ -69,9 +68,9 @@ def test_levels_are_deleted(configuration: Configuration):
     for identifier in ("aa", "bb", "cc"):
         configuration.set("custom:session_id", identifier)
     configuration.set("custom:session_id", "-aa")
-    assert list(configuration.custom_list().sessions) == ["00000000", "bb", "cc"]
+    assert list(configuration.custom_list()["sessions"]) == ["00000000", "bb", "cc"]
     configuration.set("custom:session_id", "-all")
-    assert list(configuration.custom_list().sessions) == ["00000000"]
+    assert list(configuration.custom_list()["sessions"]) == ["00000000"]
     assert configuration.is_current("00000000", "00000000", "00000000")
 
 
@@ -108,6 +107,6 @@ def test_the_texts_of_the_control_port():
     entries = {"general:navdata_demo": "TRUE", "leds:leds_anim": "0,0,0", "network:owner_mac": ""}
     text = format_configuration(entries)
     assert text == b"general:navdata_demo = TRUE\nleds:leds_anim = 0,0,0\nnetwork:owner_mac = \n\0"
-    kept = CustomList({"01234567": "a program"}, {"11223344": "somebody, else"}, {})
+    kept = {"applis": {"01234567": "a program"}, "profiles": {"11223344": "somebody, else"}, "sessions": {}}
     text = format_custom_list(kept)
     assert text == b"[applis]\r01234567,a program\r[profiles]\r11223344,somebody, else\r[sessions]\r\0"

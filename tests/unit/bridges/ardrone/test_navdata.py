@@ -10,39 +10,9 @@ from zsim_bridges.ardrone import navdata
 from zsim_bridges.ardrone.navdata import FULL_TAGS, GPS_TAG, LAYOUTS, NavdataError, NavdataTemplate, StateBit
 
 BOOTSTRAP = bytes.fromhex("88776655100c804f0100000000000000ffff0800a6020000")  # captured from an aircraft
-SIZES = {
-    0: 148,
-    1: 8,
-    2: 52,
-    3: 46,
-    4: 16,
-    5: 12,
-    6: 88,
-    7: 16,
-    8: 24,
-    9: 76,
-    10: 56,
-    11: 16,
-    12: 44,
-    13: 92,
-    14: 108,
-    15: 364,
-    16: 328,
-    17: 8,
-    18: 40,
-    19: 65,
-    20: 12,
-    21: 18,
-    22: 75,
-    23: 56,
-    24: 72,
-    25: 32,
-    26: 8,
-    GPS_TAG: 216,
-    28: 6,
-    29: 32,
-    0xFFFF: 8,
-}  # bytes, of the structures of the SDK
+_SIZES = "148 8 52 46 16 12 88 16 24 76 56 16 44 92 108 364 328 8 40 65 12 18 75 56 72 32 8 216 6 32"
+SIZES = {tag: int(size) for tag, size in enumerate(_SIZES.split())} | {navdata.CHECKSUM_TAG: 8}
+"""Bytes, of the structures of the SDK."""
 OPTIONS = tuple(tag for tag in LAYOUTS if tag != navdata.CHECKSUM_TAG)
 
 
@@ -58,17 +28,9 @@ def test_the_packet_of_a_real_aircraft():
     assert packet.bootstrap
     assert packet.sequence == 1
     assert packet.options == {}
-    assert packet.state == (
-        StateBit.ALTITUDE_CONTROL
-        | StateBit.NAVDATA_DEMO
-        | StateBit.NAVDATA_BOOTSTRAP
-        | StateBit.PIC_VERSION_OK
-        | StateBit.AT_THREAD
-        | StateBit.NAVDATA_THREAD
-        | StateBit.VIDEO_THREAD
-        | StateBit.ACQUISITION_THREAD
-        | StateBit.COM_WATCHDOG
-    )
+    modes = StateBit.ALTITUDE_CONTROL | StateBit.NAVDATA_DEMO | StateBit.NAVDATA_BOOTSTRAP | StateBit.COM_WATCHDOG
+    threads = StateBit.AT_THREAD | StateBit.NAVDATA_THREAD | StateBit.VIDEO_THREAD | StateBit.ACQUISITION_THREAD
+    assert packet.state == modes | threads | StateBit.PIC_VERSION_OK
 
 
 def test_sizes():

@@ -1,15 +1,18 @@
 """What REF and PCMD make a drone do."""
 
 import math
+from collections.abc import Callable
 
 import pytest
 from ardrone_aircraft import HOVER, PlayedAircraft, tilt_share
 
 from zsim.contract import messages
+from zsim.contract.flight_messages import DroneState
 from zsim_bridges.ardrone import at_commands
-from zsim_bridges.ardrone.navdata import Hovering, StateBit
+from zsim_bridges.ardrone.navdata import LOST_COM, MAGNETO_CALIBRATION, StateBit
 
 INDOOR_DEG = math.degrees(0.20944)
+Step = Callable[[PlayedAircraft], None]
 
 
 @pytest.fixture
@@ -22,94 +25,73 @@ def airborne(played: PlayedAircraft) -> PlayedAircraft:
     return played.airborne()
 
 
-class TestTakeOffAndLanding:
-    def test_a_single_ref_takes_off_once(self, played: PlayedAircraft):
+def ref(takes_off: bool, emergency: bool = False) -> Step:
+    return lambda played: played.ref(takes_off, emergency)
+
+
+def gates(count: int, state: DroneState | None = None) -> Step:
+    return lambda played: played.gates(count, state)
+
+
+def flown(count: int, state: DroneState | None = None) -> Step:
+    """Let gates pass while the pilot's program shows that it is there."""
+    return lambda played: played.flown_gates(count, state)
+
+
+TAKE_OFF, LAND, STOP = ref(takes_off=True), ref(takes_off=False), ref(takes_off=False, emergency=True)
+TAKE_OFF_AND_STOP = ref(takes_off=True, emergency=True)
+HELD = [
+    step for state in ("landed", "taking_off", "hovering", "landing", "landed") for step in (TAKE_OFF, gates(1, state))
+]
+MODES: dict[str, tuple[list[Step], list[str]]] = {
+    "a single REF takes off once": ([TAKE_OFF, flown(40, "taking_off")], ["takeoff"]),
+    "one that is held does not take off again after a landing": (HELD, ["takeoff"]),
+    "a take-off that is lost is asked for again, then given up": ([TAKE_OFF, flown(200, "landed")], ["takeoff"] * 3),
+    "a take-off is withdrawn; the first is on its way": ([TAKE_OFF, LAND, flown(100, "landed")], ["takeoff", "land"]),
+    "bits alone count": ([lambda played: played.at(at_commands.Ref(0, 512))], ["takeoff"]),
+    "a reset is asked for again while it is not done": ([gates(1, "emergency"), STOP, flown(30)], ["reset", "reset"]),
+    "and no more once it is": ([gates(1, "emergency"), STOP, flown(30, "landed")], ["reset"]),
+}
+MODES_IN_THE_AIR: dict[str, tuple[list[Step], list[str]]] = {
+    "a single REF lands": ([LAND, LAND, flown(30, "landing")], ["land"]),
+    "a take-off while it lands waits for the ground": (
+        [LAND, flown(2, "landing"), TAKE_OFF, flown(2, "landing")],
+        ["land"],
+    ),
+    "and comes there": ([LAND, flown(2, "landing"), TAKE_OFF, flown(2), gates(1, "landed")], ["land", "takeoff"]),
+    "the emergency is toggled by the rise of its bit": ([TAKE_OFF_AND_STOP] * 5, ["emergency"]),
+    "and the reset": (
+        [TAKE_OFF_AND_STOP, gates(1, "emergency"), TAKE_OFF_AND_STOP, LAND, STOP],
+        ["emergency", "reset"],
+    ),
+    "a landing does not come before the emergency": ([STOP, LAND], ["emergency"]),
+    "the take-off bit that was held does not take off after a reset": (
+        [gates(1, "emergency"), TAKE_OFF_AND_STOP, gates(1, "landed"), TAKE_OFF, flown(5, "landed")],
+        ["reset"],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", [*MODES, *MODES_IN_THE_AIR])
+def test_modes_that_are_asked_of_the_drone(name: str):
+    played = PlayedAircraft()
+    if name in MODES:
         played.gates()
-        played.ref(takes_off=True)
-        assert played.modes() == ["takeoff"]
-        played.flown_gates(40, "taking_off")
-        assert played.modes() == []
+    else:
+        played.airborne()
+    steps, modes = MODES.get(name) or MODES_IN_THE_AIR[name]
+    for step in steps:
+        step(played)
+    assert played.modes() == modes
 
-    def test_a_ref_that_is_held_takes_off_once_and_not_again_after_a_landing(self, played: PlayedAircraft):
-        played.gates()
-        for state in ("landed", "taking_off", "hovering", "landing", "landed", "landed"):
-            played.ref(takes_off=True)
-            played.gates(1, state)
-        assert played.modes() == ["takeoff"]
 
-    def test_a_take_off_that_is_lost_is_asked_for_again_and_then_given_up(self, played: PlayedAircraft):
-        played.gates()
-        played.ref(takes_off=True)
-        played.flown_gates(200, "landed")
-        assert played.modes() == ["takeoff"] * 3
-
-    def test_a_take_off_is_withdrawn(self, played: PlayedAircraft):
-        played.gates()
-        played.ref(takes_off=True)
-        played.ref(takes_off=False)
-        played.flown_gates(100, "landed")
-        assert played.modes() == ["takeoff", "land"]  # the first one is on its way
-
-    def test_a_take_off_while_it_lands_waits_for_the_ground(self, airborne: PlayedAircraft):
-        airborne.ref(takes_off=False)
-        airborne.flown_gates(2, "landing")
-        airborne.ref(takes_off=True)
-        airborne.flown_gates(2, "landing")
-        assert airborne.modes() == ["land"]
-        airborne.gates(1, "landed")
-        assert airborne.modes() == ["takeoff"]
-
-    def test_a_single_ref_lands(self, airborne: PlayedAircraft):
-        airborne.ref(takes_off=False)
-        airborne.ref(takes_off=False)
-        assert airborne.modes() == ["land"]
-        airborne.flown_gates(30, "landing")
-        assert airborne.modes() == []
-
-    def test_bits_alone_count(self, played: PlayedAircraft):
-        played.gates()
-        played.at(at_commands.Ref(0, 512))
-        assert played.modes() == ["takeoff"]
-
-    def test_nothing_is_done_before_the_drone_is_there(self, played: PlayedAircraft):
-        played.ref(takes_off=True)
-        assert played.sent == []
-        assert "no status yet" in played.refusals[0]
+def test_nothing_is_done_before_the_drone_is_there(played: PlayedAircraft):
+    played.ref(takes_off=True)
+    assert played.sent == []
+    assert "no status yet" in played.refusals[0]
 
 
 class TestEmergency:
-    def test_it_is_toggled_by_the_rise_of_its_bit(self, airborne: PlayedAircraft):
-        for _ in range(5):
-            airborne.ref(takes_off=True, emergency=True)
-        assert airborne.modes() == ["emergency"]
-        airborne.gates(1, "emergency")
-        airborne.ref(takes_off=True, emergency=True)
-        assert airborne.modes() == []
-        airborne.ref(takes_off=False)
-        airborne.ref(takes_off=False, emergency=True)
-        assert airborne.modes() == ["reset"]
-
-    def test_a_landing_does_not_come_before_it(self, airborne: PlayedAircraft):
-        airborne.ref(takes_off=False, emergency=True)
-        airborne.ref(takes_off=False)
-        assert airborne.modes() == ["emergency"]
-
-    def test_a_reset_is_asked_for_again_while_it_is_not_done(self, played: PlayedAircraft):
-        played.gates(1, "emergency")
-        played.ref(takes_off=False, emergency=True)
-        played.flown_gates(30, "emergency")
-        assert played.modes() == ["reset", "reset"]
-        played.flown_gates(30, "landed")
-        assert played.modes() == []
-
-    def test_the_take_off_bit_that_was_held_does_not_take_off_afterwards(self, airborne: PlayedAircraft):
-        airborne.gates(1, "emergency")
-        airborne.ref(takes_off=True, emergency=True)
-        airborne.gates(1, "landed")
-        airborne.ref(takes_off=True)
-        airborne.flown_gates(5, "landed")
-        assert airborne.modes() == ["reset"]
-
     def test_the_state_word_has_who_caused_it(self, airborne: PlayedAircraft):
         airborne.listen()
         airborne.ref(takes_off=False, emergency=True)
@@ -245,7 +227,7 @@ class TestSilence:
         airborne.listen()  # it is sent no more
         airborne.gates(5)
         assert StateBit.COM_LOST in airborne.packet().state
-        assert airborne.packet().options[0].ctrl_state == 4 << 16 | Hovering.LOST_COM
+        assert airborne.packet().options[0].ctrl_state == 4 << 16 | LOST_COM
         airborne.gates(92)
         assert airborne.modes() == []
         airborne.gates(3)
@@ -334,7 +316,7 @@ class TestCalibration:
         airborne.config("general:navdata_demo", "TRUE")
         airborne.at(at_commands.Calibrate(0, 0))
         airborne.flown_gates(10, "flying")
-        assert airborne.packet().options[0].ctrl_state == 4 << 16 | Hovering.MAGNETO_CALIBRATION
+        assert airborne.packet().options[0].ctrl_state == 4 << 16 | MAGNETO_CALIBRATION
 
     def test_a_pilot_who_steers_ends_it(self, airborne: PlayedAircraft):
         airborne.at(at_commands.Calibrate(0, 0))

@@ -3,9 +3,9 @@
 import asyncio
 import contextlib
 import socket
-from collections.abc import Awaitable, Callable
 
 import pytest
+from in_loop import in_loop
 from refused import has_terms, refused
 
 from zsim.errors import RunError
@@ -25,15 +25,9 @@ HERE = AllowedHosts("127.0.0.2", frozenset())
 NAMES = ["drone1", "drone2"]
 
 
-def test_addresses_follow_the_first():
-    assert drone_addresses("127.0.0.254", [*NAMES, "drone3"]) == {
-        "drone1": "127.0.0.254",
-        "drone2": "127.0.0.255",
-        "drone3": "127.0.1.0",
-    }
-
-
-def test_addresses_by_name_leave_the_others_out():
+def test_addresses_follow_the_first_or_are_given_by_name():
+    addresses = {"drone1": "127.0.0.254", "drone2": "127.0.0.255", "drone3": "127.0.1.0"}
+    assert drone_addresses("127.0.0.254", [*NAMES, "drone3"]) == addresses
     assert drone_addresses("drone2=192.168.1.5", NAMES) == {"drone2": "192.168.1.5"}
 
 
@@ -59,11 +53,8 @@ def test_peers_are_names_or_addresses():
         peer_addresses(["no.such.host.invalid"])
 
 
-def test_on_loopback_everybody_of_this_host_is_obeyed():
+def test_on_loopback_everybody_of_this_host_is_obeyed_elsewhere_those_that_were_named_alone():
     assert HERE.allow(HOME)
-
-
-def test_elsewhere_those_that_were_named_alone():
     assert ELSEWHERE.allow("192.0.2.9")
     assert not ELSEWHERE.allow("192.0.2.10")
     assert not ELSEWHERE.allow(HOME)
@@ -83,83 +74,71 @@ class Refusals(list[str]):
         self.came.set()
 
 
-def run(test: Callable[[Refusals], Awaitable[None]]) -> None:
-    async def within() -> None:
-        await asyncio.wait_for(test(Refusals()), 60.0)
-
-    asyncio.run(within())
+@pytest.fixture
+def refusals() -> Refusals:
+    return Refusals()
 
 
-def test_a_stranger_s_datagrams_are_counted_and_not_taken():
-    async def test(refusals: Refusals) -> None:
-        taken: list[bytes] = []
-        port = DatagramPort(ELSEWHERE, lambda data, _: taken.append(data), refusals.add)
-        number = await port.open(HOME, 0)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-            stranger.sendto(b"AT*REF=1,290718208\r", (HOME, number))
-            await refusals.came.wait()
-        await port.close()
-        assert taken == []
-        assert len(refusals) == 1
-        assert has_terms(refusals[0], "127.0.0.1", "--peer")
-
-    run(test)
-
-
-def test_a_datagram_of_this_host_is_taken_on_loopback():
-    async def test(refusals: Refusals) -> None:
-        taken: asyncio.Queue[bytes] = asyncio.Queue()
-        port = DatagramPort(HERE, lambda data, _: taken.put_nowait(data), refusals.add)
-        number = await port.open(HOME, 0)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as pilot:
-            pilot.sendto(b"hello", (HOME, number))
-            assert await taken.get() == b"hello"
-        await port.close()
-        assert refusals == []
-
-    run(test)
-
-
-def test_a_stranger_s_connection_is_ended_and_counted():
-    async def test(refusals: Refusals) -> None:
-        port = StreamPort(ELSEWHERE, read_until_end, refusals.add)
-        reader, writer = await asyncio.open_connection(HOME, await port.open(HOME, 0))
-        with contextlib.suppress(ConnectionError):
-            assert await reader.read(1) == b""
-        writer.close()
-        await port.close()
-        assert len(refusals) == 1
-        assert has_terms(refusals[0], "127.0.0.1", "--peer")
-
-    run(test)
-
-
-def test_there_is_an_end_to_connections():
-    async def test(refusals: Refusals) -> None:
-        port = StreamPort(HERE, read_until_end, refusals.add)
-        number = await port.open(HOME, 0)
-        connections = [await asyncio.open_connection(HOME, number) for _ in range(CONNECTIONS_MAX + 1)]
+@in_loop
+async def test_a_stranger_s_datagrams_are_counted_and_not_taken(refusals: Refusals) -> None:
+    taken: list[bytes] = []
+    port = DatagramPort(ELSEWHERE, lambda data, _: taken.append(data), refusals.add)
+    number = await port.open(HOME, 0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.sendto(b"AT*REF=1,290718208\r", (HOME, number))
         await refusals.came.wait()
-        assert len(port.writers) <= CONNECTIONS_MAX
-        assert "connections already" in refusals[0]
-        await port.close()
-        for _, writer in connections:
-            writer.close()
-
-    run(test)
+    await port.close()
+    assert taken == []
+    assert len(refusals) == 1
+    assert has_terms(refusals[0], "127.0.0.1", "--peer")
 
 
-def test_what_is_broadcast_comes_to_all():
-    async def test(refusals: Refusals) -> None:
-        port = StreamPort(HERE, read_until_end, refusals.add)
-        number = await port.open(HOME, 0)
-        connections = [await asyncio.open_connection(HOME, number) for _ in range(2)]
-        while len(port.writers) < 2:
-            await asyncio.sleep(0)
-        port.broadcast(b"news")
-        for reader, writer in connections:
-            assert await reader.readexactly(4) == b"news"
-            writer.close()
-        await port.close()
+@in_loop
+async def test_a_datagram_of_this_host_is_taken_on_loopback(refusals: Refusals) -> None:
+    taken: asyncio.Queue[bytes] = asyncio.Queue()
+    port = DatagramPort(HERE, lambda data, _: taken.put_nowait(data), refusals.add)
+    number = await port.open(HOME, 0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as pilot:
+        pilot.sendto(b"hello", (HOME, number))
+        assert await taken.get() == b"hello"
+    await port.close()
+    assert refusals == []
 
-    run(test)
+
+@in_loop
+async def test_a_stranger_s_connection_is_ended_and_counted(refusals: Refusals) -> None:
+    port = StreamPort(ELSEWHERE, read_until_end, refusals.add)
+    reader, writer = await asyncio.open_connection(HOME, await port.open(HOME, 0))
+    with contextlib.suppress(ConnectionError):
+        assert await reader.read(1) == b""
+    writer.close()
+    await port.close()
+    assert len(refusals) == 1
+    assert has_terms(refusals[0], "127.0.0.1", "--peer")
+
+
+@in_loop
+async def test_there_is_an_end_to_connections(refusals: Refusals) -> None:
+    port = StreamPort(HERE, read_until_end, refusals.add)
+    number = await port.open(HOME, 0)
+    connections = [await asyncio.open_connection(HOME, number) for _ in range(CONNECTIONS_MAX + 1)]
+    await refusals.came.wait()
+    assert len(port.writers) <= CONNECTIONS_MAX
+    assert "connections already" in refusals[0]
+    await port.close()
+    for _, writer in connections:
+        writer.close()
+
+
+@in_loop
+async def test_what_is_broadcast_comes_to_all(refusals: Refusals) -> None:
+    port = StreamPort(HERE, read_until_end, refusals.add)
+    number = await port.open(HOME, 0)
+    connections = [await asyncio.open_connection(HOME, number) for _ in range(2)]
+    while len(port.writers) < 2:
+        await asyncio.sleep(0)
+    port.broadcast(b"news")
+    for reader, writer in connections:
+        assert await reader.readexactly(4) == b"news"
+        writer.close()
+    await port.close()

@@ -2,19 +2,20 @@
 
 import asyncio
 import struct
-from collections.abc import Awaitable, Callable
 from typing import NamedTuple
 
 import pytest
 import synthetic_pictures
 from ardrone_readers import pyardrone_reads
+from in_loop import in_loop
 
 from zsim.contract.flight_messages import CameraImage
 from zsim_bridges.ardrone import video
 from zsim_bridges.ardrone.ports import AllowedHosts
 from zsim_bridges.ardrone.video import (
     IDR_EVERY,
-    FrameType,
+    IDR_FRAME,
+    P_FRAME,
     VideoEncoder,
     VideoError,
     VideoFrame,
@@ -113,70 +114,66 @@ class Stream:
         return Header(number, t_ms, header[30]), await self._reader.readexactly(size)
 
 
-def run(test: Callable[[VideoServer, Callable[[], Awaitable[Stream]], list[str]], Awaitable[None]]) -> None:
-    async def served() -> None:
-        refusals: list[str] = []
-        server = VideoServer(AllowedHosts("127.0.0.2", frozenset()), refusals.append)
-        number = await server.port.open(HOME, 0)
+class Served:
+    """A video server on a port of loopback."""
 
-        async def connect() -> Stream:
-            before = len(server.port.writers)
-            stream = Stream(*await asyncio.open_connection(HOME, number))
-            while len(server.port.writers) == before:
-                await asyncio.sleep(0)
-            return stream
+    def __init__(self) -> None:
+        self.refusals: list[str] = []
+        self.server = VideoServer(AllowedHosts("127.0.0.2", frozenset()), self.refusals.append)
 
-        try:
-            await asyncio.wait_for(test(server, connect, refusals), 60.0)
-        finally:
-            server.close()
-            await server.port.close()
+    async def __aenter__(self) -> "Served":
+        self._port = await self.server.port.open(HOME, 0)
+        return self
 
-    asyncio.run(served())
+    async def __aexit__(self, *_: object) -> None:
+        self.server.close()
+        await self.server.port.close()
+
+    async def connect(self) -> Stream:
+        before = len(self.server.port.writers)
+        stream = Stream(*await asyncio.open_connection(HOME, self._port))
+        while len(self.server.port.writers) == before:
+            await asyncio.sleep(0)
+        return stream
 
 
-def test_a_connection_begins_with_an_idr_frame():
-    async def test(server: VideoServer, connect, _: list[str]) -> None:
-        first = await connect()
-        server.on_picture(picture(60, t_ms=100))
+@in_loop
+async def test_a_connection_begins_with_an_idr_frame() -> None:
+    async with Served() as served:
+        first = await served.connect()
+        served.server.on_picture(picture(60, t_ms=100))
         header, data = await first.frame()
-        assert header.frame_type == FrameType.IDR
-        assert header.timestamp_ms == 100
-        server.on_picture(picture(80))
-        assert (await first.frame())[0].frame_type == FrameType.P
-        second = await connect()
-        server.on_picture(picture(100))
+        assert (header.frame_type, header.timestamp_ms) == (IDR_FRAME, 100)
+        served.server.on_picture(picture(80))
+        assert (await first.frame())[0].frame_type == P_FRAME
+        second = await served.connect()
+        served.server.on_picture(picture(100))
         for stream in (first, second):
             header, data = await stream.frame()
-            assert header.frame_type == FrameType.IDR
-            assert header.frame_number == 2
+            assert (header.frame_type, header.frame_number) == (IDR_FRAME, 2)
             assert shades([data])
             stream.writer.close()
 
-    run(test)
 
-
-def test_nothing_is_encoded_while_nobody_is_connected():
-    async def test(server: VideoServer, connect, _: list[str]) -> None:
-        server.on_picture(picture(60))
-        assert not server.is_watched
-        stream = await connect()
-        server.on_picture(picture(60))
+@in_loop
+async def test_nothing_is_encoded_while_nobody_is_connected() -> None:
+    async with Served() as served:
+        served.server.on_picture(picture(60))
+        assert not served.server.is_watched
+        stream = await served.connect()
+        served.server.on_picture(picture(60))
         assert (await stream.frame())[0].frame_number == 0
         stream.writer.close()
 
-    run(test)
 
-
-def test_a_picture_that_cannot_be_read_is_counted_and_the_next_one_comes():
-    async def test(server: VideoServer, connect, refusals: list[str]) -> None:
-        stream = await connect()
-        server.on_picture(picture(0, data=b"\xff\xd8\xff" + bytes(100)))
-        while not refusals:
+@in_loop
+async def test_a_picture_that_cannot_be_read_is_counted_and_the_next_one_comes() -> None:
+    async with Served() as served:
+        stream = await served.connect()
+        served.server.on_picture(picture(0, data=b"\xff\xd8\xff" + bytes(100)))
+        while not served.refusals:
             await asyncio.sleep(0)
-        server.on_picture(picture(60))
-        assert (await stream.frame())[0].frame_type == FrameType.IDR
-        assert "picture" in refusals[0]
+        served.server.on_picture(picture(60))
+        assert (await stream.frame())[0].frame_type == IDR_FRAME
+        assert "picture" in served.refusals[0]
         stream.writer.close()
-
-    run(test)

@@ -5,13 +5,13 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
+import pytest
 from fake_gui import Control, Gui
 from refused import has_terms, without_tags
 
 from zsim_bridges.console import scene
-from zsim_bridges.console.console_page import ControlForm, PageForms
+from zsim_bridges.console.console_page import ControlForm, DroneForm, PageForms
 from zsim_bridges.console.control_desk import LOST_S, RUN, ControlDesk
-from zsim_bridges.console.drone_forms import DroneForm
 from zsim_bridges.console.run_condition import RunCondition
 
 NAMES = ["drone1", "drone2"]
@@ -76,7 +76,7 @@ def test_a_page_that_is_closed_while_it_is_drawn_ends_nothing_of_the_others():
     pages.open(1)
     pages.open(2)
     pages.figures[1].removed = True
-    forms.show_figures(lambda _: "", lambda drone: f"figures of {drone}")
+    forms.show([], {}, lambda drone: f"figures of {drone}", [])
     assert (pages.figures[1].shown, pages.figures[2].shown) == ("", "figures of drone1")
     assert forms.chosen(1) == ""
     assert forms.chosen(2) == "drone1"
@@ -117,8 +117,12 @@ class Desk(ControlDesk):
 ONE, TWO = "operator 1 (10.0.0.4)", "operator 2 (10.0.0.7)"
 
 
-def test_one_page_is_in_control_and_the_others_see_it():
-    desk = Desk()
+@pytest.fixture
+def desk() -> Desk:
+    return Desk()
+
+
+def test_one_page_is_in_control_and_the_others_see_it(desk: Desk):
     assert desk.use(4, "main") == ""
     assert desk.use(4, "main") == ""
     assert has_terms(desk.use(7, "main"), ONE, "main", "Control")
@@ -131,8 +135,7 @@ def test_one_page_is_in_control_and_the_others_see_it():
     assert desk.refusal(4, "") == ""
 
 
-def test_control_is_asked_for_and_granted_or_kept():
-    desk = Desk()
+def test_control_is_asked_for_and_granted_or_kept(desk: Desk):
     desk.use(4, "main")
     desk.ask(7, "main")
     assert [page for page, _ in desk.told] == [4]
@@ -149,8 +152,7 @@ def test_control_is_asked_for_and_granted_or_kept():
     assert has_terms(desk.refusal(4, "main"), TWO)
 
 
-def test_a_page_that_is_lost_loses_what_another_one_asks_for():
-    desk = Desk()
+def test_a_page_that_is_lost_loses_what_another_one_asks_for(desk: Desk):
     desk.use(4, "main")
     desk.use(4, RUN)
     desk.ask(7, "main")
@@ -164,8 +166,7 @@ def test_a_page_that_is_lost_loses_what_another_one_asks_for():
     assert desk.holdings(7, [RUN])[0].silent_s > LOST_S  # others see that it stands still
 
 
-def test_a_page_that_is_closed_releases_and_the_one_that_asks_has_it():
-    desk = Desk()
+def test_a_page_that_is_closed_releases_and_the_one_that_asks_has_it(desk: Desk):
     desk.use(4, "main")
     desk.use(4, RUN)
     desk.ask(7, "main")
@@ -175,8 +176,7 @@ def test_a_page_that_is_closed_releases_and_the_one_that_asks_has_it():
     assert desk.holders() == ["", ""]
 
 
-def test_a_page_that_asks_and_is_closed_is_not_given_control():
-    desk = Desk()
+def test_a_page_that_asks_and_is_closed_is_not_given_control(desk: Desk):
     desk.use(4, "main")
     desk.ask(7, "main")
     desk.close(7)

@@ -19,13 +19,12 @@ from zsim_agents.formation.flight_check import (
     HELD_ON_REQUEST,
     READY_TO_ENGAGE,
     REJOINING,
-    EngagementLimits,
+    SHAPE,
     place_fault,
 )
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
-from zsim_bridges.console.console_page import SWITCHES, ConsolePage
-from zsim_bridges.console.drone_forms import DRONE_MODES, DroneForm
+from zsim_bridges.console.console_page import DRONE_MODES, SWITCHES, ConsolePage, DroneForm
 from zsim_bridges.console.formation_form import OPERATIONS, REST_S, STILL_S, FormationForm
 from zsim_bridges.console.operator_input import slider_ranges
 from zsim_bridges.console.picture import FlightPreview
@@ -34,6 +33,7 @@ from zsim_bridges.console.run_forms import DURATION_S, FaultForm, FleetForm, Run
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
 LATER_S = 1e9  # on the wall: long after any move
+WAYPOINTS = "waypoints [s, m, deg]"
 
 
 class FakeCommandClient:
@@ -108,7 +108,9 @@ def test_the_run_is_asked_for_what_the_button_says(
     assert {name: type(value) for name, value in asked.items()} == {name: type(value) for name, value in args.items()}
 
 
-@pytest.mark.parametrize(("label", "mode"), [("Take off", "takeoff"), ("Reset", "reset")])
+@pytest.mark.parametrize(
+    ("label", "mode"), [("Take off", "takeoff"), ("Reset", "reset"), ("Land", "land"), ("Emergency", "emergency")]
+)
 def test_the_chosen_drone_alone_gets_its_mode_and_another_page_chooses_for_itself(bench: Bench, label: str, mode: str):
     other: Any = Gui()
     form = DroneForm(bench.gui, bench.client, bench.names)
@@ -116,10 +118,13 @@ def test_the_chosen_drone_alone_gets_its_mode_and_another_page_chooses_for_itsel
     bench.gui.at["drone"].put(bench.names[1])
     other.at["drone"].put(bench.names[2])
     button = bench.gui.at[f"{label} {bench.names[0]}"]
-    assert button.label == f"{label} {bench.names[1]}"
-    button.put(None)
-    assert form.chosen == bench.names[1]
-    assert bench.client.asked == [((bench.names[1],), mode)]
+    assert (button.label, form.chosen) == (f"{label} {bench.names[1]}", bench.names[1])
+    if isinstance(button, OrderHtml):  # the page makes an order of it
+        hold = {"zsim-hold": "1"} if mode == "emergency" else {}
+        assert button.order == {"zsim-order": mode, "drone": bench.names[1], **hold}
+    else:
+        button.put(None)
+        assert bench.client.asked == [((bench.names[1],), mode)]
 
 
 def test_a_command_is_for_all_that_are_selected_and_would_not_refuse_it(bench: Bench):
@@ -183,26 +188,18 @@ def test_all_formations_and_all_drones_of_none_take_off(bench: Bench, led: bool,
     assert bench.client.asked == [*formations * led, *[(("d5", "d6"), "takeoff")] * single]
 
 
-@pytest.mark.parametrize(("label", "op", "held"), [("Land", "land", False), ("Emergency", "emergency", True)])
-def test_the_chosen_drone_alone_is_ordered_to_land_or_stop(bench: Bench, label: str, op: str, held: bool):
-    DroneForm(bench.gui, bench.client, bench.names)
-    button: Any = bench.gui.at[f"{label} {bench.names[0]}"]
-    bench.gui.at["drone"].put(bench.names[1])
-    assert button.label == f"{label} {bench.names[1]}"
-    hold = {"zsim-hold": "1"} if held else {}
-    assert button.order == {"zsim-order": op, "drone": bench.names[1], **hold}
-
-
-def test_an_order_is_given_to_a_world_that_is_silent(bench: Bench):
+def test_a_drone_is_offered_what_its_state_takes_and_orders_in_a_silent_world_too(bench: Bench):
     bench.formation().offer(flown(silent_s=79.0))
-    form = DroneForm(bench.gui, bench.client, bench.names)
-    form.refresh(flown(silent_s=79.0))
-    name = bench.names[0]
-    locked = {label: bench.gui.at[label].disabled for label in ("Hold", "Land", f"Land {name}", f"Emergency {name}")}
-    assert not any(locked.values())
-    form.refresh(flown(ended="the run ended"))
-    assert bench.gui.at[f"Land {name}"].disabled
-    assert not bench.gui.at[f"Emergency {name}"].disabled
+    form, name = DroneForm(bench.gui, bench.client, bench.names), bench.names[0]
+
+    def offered(**run: Any) -> set[str]:
+        form.refresh(flown(**run))
+        return {label for label in DRONE_MODES.values() if not bench.gui.at[f"{label} {name}"].disabled}
+
+    assert offered() == {"Land", "Return", "Emergency"}
+    assert offered(silent_s=79.0) == {"Land", "Emergency"}
+    assert not any(bench.gui.at[label].disabled for label in ("Hold", "Land"))
+    assert offered(ended="the run ended") == {"Emergency"}
 
 
 def mixed() -> Scenario:
@@ -270,27 +267,26 @@ def test_a_take_off_is_offered_of_drones_that_can_rise(bench: Bench, states: tup
     assert button.disabled is off
     assert ("reset" in (button.hint or "")) is ("emergency" in states)
     assert fleet_refusals(run)["takeoff"] == (button.hint or "")
-
-
-def test_all_take_off_while_one_of_them_can():
-    run = flown("idle", drones={"d1": "emergency", "d2": "landed"}, members={"main": ("d1",)})
-    assert has_terms(fleet_refusals(run)["takeoff"], "d1", "reset")
-    assert fleet_refusals(run, ["d2"])["takeoff"] == ""
-    stopped = RunCondition(drones={"d2": "emergency"})
-    assert has_terms(fleet_refusals(stopped, ["d2"])["takeoff"], "d2", "reset")
+    stopped = flown("idle", drones={"d1": "emergency", "d2": "landed"}, members={"main": ("d1",)})
+    for run, single, terms in (
+        (stopped, [], ("d1", "reset")),
+        (stopped, ["d2"], ()),  # one of them can
+        (RunCondition(drones={"d2": "emergency"}), ["d2"], ("d2", "reset")),
+    ):
+        refusal = fleet_refusals(run, single)["takeoff"]
+        assert has_terms(refusal, *terms) if terms else refusal == ""
 
 
 @pytest.mark.parametrize(
-    ("run", "there"),
+    ("phase", "reason", "there"),
     [
-        (flown("engaged"), False),
-        (flown("held", HELD_ON_REQUEST), False),
-        (flown("held", "roll of the formation is 60.0 deg"), True),
+        ("engaged", "", False),
+        ("held", HELD_ON_REQUEST, False),
+        ("held", "roll of the formation is 60.0 deg", True),
     ],
 )
-def test_rejoin_is_there_while_a_fault_holds_the_formation(bench: Bench, run: RunCondition, there: bool):
-    form = bench.formation()
-    form.offer(run)
+def test_rejoin_is_there_while_a_fault_holds_the_formation(bench: Bench, phase: str, reason: str, there: bool):
+    bench.formation().offer(flown(phase, reason))
     button = bench.gui.at["Rejoin"]
     assert (button.visible, button.disabled and button.visible) == (there, False)
 
@@ -305,16 +301,12 @@ def test_pause_becomes_resume(bench: Bench):
         form.refresh(RunCondition(clock=clock))
         assert (bench.gui.at["Resume"].visible, bench.gui.at["Pause"].visible) == (paused, not paused)
         assert bench.gui.at["Step"].disabled is not paused
-
-
-@pytest.mark.parametrize(
-    "run", [{"clock": "paused", "at_end": True}, {"clock": "stopped", "ended": "the record is over"}]
-)
-def test_a_replay_at_its_end_is_not_offered_to_go_on(bench: Bench, run: dict[str, Any]):
-    RunForm(bench.gui, bench.client, 1.0).refresh(RunCondition(replayed=True, **run))
-    assert bench.gui.at["Step"].disabled
-    assert all(bench.gui.at[label].disabled for label in ("Pause", "Resume") if bench.gui.at[label].visible)
-    assert has_terms(bench.gui.at["Step"].hint, "record")
+    at_end = RunCondition("paused", replayed=True, at_end=True)
+    for run in (at_end, at_end._replace(clock="stopped", ended="the record is over")):
+        form.refresh(run)  # a replay at its end is not offered to go on
+        assert bench.gui.at["Step"].disabled
+        assert all(bench.gui.at[label].disabled for label in ("Pause", "Resume") if bench.gui.at[label].visible)
+        assert has_terms(bench.gui.at["Step"].hint, "record")
 
 
 def test_all_drones_that_stopped_are_reset_at_once(bench: Bench):
@@ -325,14 +317,6 @@ def test_all_drones_that_stopped_are_reset_at_once(bench: Bench):
     assert bench.gui.at["Reset all"].visible
     bench.gui.press("Reset all")
     assert bench.client.asked == [(("drone1", "drone3"), "reset")]
-
-
-def test_a_drone_is_offered_what_its_state_takes_and_always_its_emergency(bench: Bench):
-    form = DroneForm(bench.gui, bench.client, bench.names)
-    form.refresh(flown())
-    name = bench.names[0]
-    locked = {label: bench.gui.at[f"{label} {name}"].disabled for label in ("Take off", "Land", "Emergency", "Reset")}
-    assert locked == {"Take off": True, "Land": False, "Emergency": False, "Reset": True}
 
 
 def test_a_slider_shows_a_value_out_of_its_range_as_it_is_and_does_not_ask_for_it(bench: Bench):
@@ -356,36 +340,27 @@ def test_a_slider_shows_a_value_out_of_its_range_as_it_is_and_does_not_ask_for_i
 def test_waypoints_begin_where_the_formation_is_in_the_units_of_the_page(bench: Bench):
     form = bench.formation()
     form.refresh(bench.view(x_c=3.0, z_c=2.5, yaw=math.pi / 2), LATER_S)
-    assert has_terms(bench.gui.at["waypoints [s, m, deg]"].value, "0:", "x_c = 3", "z_c = 2.5", "yaw = 90")
+    assert has_terms(bench.gui.at[WAYPOINTS].value, "0:", "x_c = 3", "z_c = 2.5", "yaw = 90")
     bench.gui.press("Fly the waypoints")
     ((_, op, args),) = bench.client.asked
     assert op == "trajectory"
     assert args["waypoints"][1]["values"]["yaw"] == pytest.approx(math.pi / 2)
 
 
-WAYPOINTS = "waypoints [s, m, deg]"
-
-
 def test_waypoints_follow_the_formation_until_somebody_edits_them(bench: Bench):
-    form, text = bench.formation(), bench.gui.at[WAYPOINTS]
-    form.refresh(bench.view(x_c=-1.43), LATER_S)
-    form.refresh(bench.view(x_c=5.0), LATER_S)
-    assert has_terms(text.value, "x_c = 5")
+    form, text, shown = bench.formation(), bench.gui.at[WAYPOINTS], []
+    for x_c in (-1.43, 5.0, 5.05, 5.05):  # they stand still in the noise of an estimate, and end where it does
+        form.refresh(bench.view(x_c=x_c), LATER_S)
+        shown.append(text.value)
+    assert has_terms(shown[1], "x_c = 5")
+    assert shown[1] == shown[2]
+    assert has_terms(shown[3], "x_c = 5.05")
     text.put("20: x_c = 7")
     form.refresh(bench.view(x_c=9.0), LATER_S)
     assert text.value == "20: x_c = 7"
     bench.gui.press("Waypoints from here")
     form.refresh(bench.view(x_c=11.0), LATER_S)
     assert has_terms(text.value, "x_c = 11")
-
-
-def test_waypoints_stand_still_in_the_noise_of_an_estimate_and_end_where_the_formation_does(bench: Bench):
-    form, text, shown = bench.formation(), bench.gui.at[WAYPOINTS], []
-    for x_c in (5.0, 5.05, 5.05):
-        form.refresh(bench.view(x_c=x_c), LATER_S)
-        shown.append(text.value)
-    assert shown[0] == shown[1]
-    assert has_terms(shown[2], "x_c = 5.05")
 
 
 # Faults
@@ -516,13 +491,9 @@ def test_sliders_that_rest_are_sent_together_and_once(bench: Bench):
     form.send(LATER_S)
     form.send(LATER_S + REST_S)
     assert bench.client.asked == [(bench.cluster.name, "target", {"values": {"p": 5.0, "z_c": 4.0}})]
-
-
-def test_a_slider_that_the_console_moves_asks_for_nothing(bench: Bench):
-    form = bench.formation()
-    bench.gui.at["p [m]"].put(5.0, NOBODY)
-    form.send(LATER_S)
-    assert bench.client.asked == []
+    bench.gui.at["p [m]"].put(6.0, NOBODY)  # the console moves it
+    form.send(LATER_S + 2 * REST_S)
+    assert len(bench.client.asked) == 1
 
 
 def test_sliders_follow_the_formation_but_for_those_that_somebody_moves(bench: Bench):
@@ -540,8 +511,15 @@ def test_sliders_follow_the_formation_but_for_those_that_somebody_moves(bench: B
 
 
 def test_a_move_lasts_as_long_as_is_asked_for_and_is_told_in_the_units_of_the_page(bench: Bench):
-    form = bench.formation()
-    bench.gui.at["over [s]"].value = 20.0
+    form, over = bench.formation(), bench.gui.at["over [s]"]
+    for over_s in (-5.0, 3601.0):
+        over.value = over_s
+        form.send(LATER_S)  # nothing was asked for
+        form.request_target({"p": 5.0})
+        assert bench.client.asked == []
+        assert has_terms(bench.outcomes.pop().refusal, "over", f"{over_s:g} s", "0 to 3600")
+        assert bench.outcomes == []
+    over.value = 20.0
     form.request_target({"p": 5.0, "yaw": 180.0})
     values = {"p": 5.0, "yaw": pytest.approx(math.pi)}
     assert bench.client.asked == [(bench.cluster.name, "target", {"values": values, "over_s": 20.0})]
@@ -565,7 +543,7 @@ def test_a_number_out_of_range_is_refused_and_its_limit_is_flown_when_it_is_type
 @pytest.mark.parametrize("side", ["p", "q"])
 def test_the_least_side_that_a_slider_offers_is_no_refusal_of_rounding(bench: Bench, side: str):
     low = next(each.low for each in slider_ranges(bench.space, bench.cluster, bench.scenario) if each.name == side)
-    gains, shape = gains_of(bench.cluster.gains), EngagementLimits().shape
+    gains, shape = gains_of(bench.cluster.gains), SHAPE
     c = bench.space.specimen(4.0)
     c[bench.space.index(side)], c[bench.space.index("z_c")] = low, 8.0
     refused = []
@@ -573,17 +551,6 @@ def test_the_least_side_that_a_slider_offers_is_no_refusal_of_rounding(bench: Be
         c[bench.space.index("x_c")], c[bench.space.index("yaw")] = -50.0 + 0.5 * step, 0.03 * step
         refused.append(place_fault(bench.space, c, gains, shape))
     assert set(refused) == {None}
-
-
-@pytest.mark.parametrize("over_s", [-5.0, 3601.0])
-def test_a_time_out_of_range_is_refused_with_the_move(bench: Bench, over_s: float):
-    form = bench.formation()
-    bench.gui.at["over [s]"].value = over_s
-    form.send(LATER_S)
-    assert bench.outcomes == []  # nothing was asked for
-    form.request_target({"p": 5.0})
-    assert bench.client.asked == []
-    assert has_terms(bench.outcomes[0].refusal, "over", f"{over_s:g} s", "0 to 3600")
 
 
 def test_of_many_variables_the_others_are_moved_one_at_a_time():
@@ -604,7 +571,7 @@ def test_trajectories_are_flown_as_they_are_typed(bench: Bench):
     bench.formation()
     bench.gui.at["expressions [m, deg]"].value = "x_c = R*cos(0.1*t)\nyaw = 6*t\nR = 5"
     bench.gui.press("Fly the expressions")
-    bench.gui.at["waypoints [s, m, deg]"].value = "20: x_c = 5"
+    bench.gui.at[WAYPOINTS].value = "20: x_c = 5"
     bench.gui.press("Fly the waypoints")
     name = bench.cluster.name
     assert bench.client.asked == [
@@ -613,20 +580,17 @@ def test_trajectories_are_flown_as_they_are_typed(bench: Bench):
     ]
 
 
-def test_the_trajectory_of_the_scenario_is_flown_as_it_stands_there():
-    bench = Bench("trajectory")
+def test_the_trajectory_of_the_scenario_is_flown_as_it_stands_there_and_one_that_is_none_is_not(bench: Bench):
+    planned = Bench("trajectory")
+    planned.formation()
+    planned.gui.press("Fly the scenario's")
+    of = planned.cluster.plan.trajectory
+    assert of is not None
+    assert of.expressions
+    args = {"expressions": of.expressions, "constants": of.constants}
+    assert planned.client.asked == [(planned.cluster.name, "trajectory", args)]
     bench.formation()
-    bench.gui.press("Fly the scenario's")
-    planned = bench.cluster.plan.trajectory
-    assert planned is not None
-    asked = {"expressions": planned.expressions, "constants": planned.constants}
-    assert planned.expressions
-    assert bench.client.asked == [(bench.cluster.name, "trajectory", asked)]
-
-
-def test_a_trajectory_that_is_none_is_told_and_not_sent(bench: Bench):
-    bench.formation()
-    bench.gui.at["waypoints [s, m, deg]"].value = "soon"
+    bench.gui.at[WAYPOINTS].value = "soon"
     bench.gui.press("Fly the waypoints")
     assert bench.client.asked == []
     assert bench.outcomes[0].request == f"{bench.cluster.name}: trajectory"

@@ -1,12 +1,16 @@
-"""Trails and curves: how far they go back, and what a record adds."""
+"""Trails and curves: how far they go back, what a record adds, and what a plot shows of them."""
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from fake_gui import Gui
 
-from zsim_bridges.console import picture as pic
+from zsim.contract.flight_messages import EstimateView
+from zsim.math import frames
+from zsim.scenario import scenario_file
 from zsim_bridges.console.histories import (
     HISTORY_POINTS_MAX,
     INTERVAL_S,
@@ -17,20 +21,14 @@ from zsim_bridges.console.histories import (
     CanvasTrails,
     VariableHistory,
 )
+from zsim_bridges.console.operator_input import SliderRange
+from zsim_bridges.console.picture import DronePoses
+from zsim_bridges.console.variable_plots import STEPS_PER_WINDOW, WINDOWS_S, AxisRange, FlightHistory, VariablePlots
 
-SCENARIOS = Path(__file__).parents[4] / "scenarios"
-LEVEL = (1.0, 0.0, 0.0, 0.0)
-RNG = np.random.default_rng(4)
+CLUSTER = scenario_file.load(Path(__file__).parents[4] / "scenarios" / "step.yaml").clusters[0]
+RANGES = [SliderRange(name, "m", 0.0, 9.0, 0.1) for name in ("x_c", "y_c", "z_c", "p")]
 
-
-def some_attitudes(count: int) -> np.ndarray:
-    q = RNG.normal(size=(count, 4))
-    return q / np.linalg.norm(q, axis=1, keepdims=True)
-
-
-def drones(p_W: np.ndarray, q_WB: np.ndarray, t_ns: int = 0) -> pic.DronePoses:
-    names = tuple(f"drone{i}" for i in range(len(p_W)))
-    return pic.DronePoses(t_ns, names, p_W, q_WB, np.full((len(p_W), 4), 300.0), np.zeros(3))
+# Trails
 
 
 def test_a_trail_goes_back_as_far_as_is_chosen():
@@ -90,10 +88,20 @@ def test_trails_of_a_record_are_there_on_both_sides_of_what_was_read_last():
     assert len(trails.segments(19.9, here)[0]) == 0
 
 
+# Curves
+
+
+def curve(*points: tuple[float, float, float, Any], around: bool = False) -> VariableHistory:
+    """Return the history of one variable, of points (t [s], desired, estimated, true)."""
+    history = VariableHistory(1, around)
+    for t_s, desired, estimated, true in points:
+        history.add(t_s, (desired,), (estimated,), None if true is None else np.array([true]))
+    return history
+
+
 def test_curves_of_a_record_stand_around_the_shown_instant():
-    history = VariableHistory(1, around=True)
-    for t_s in (*np.arange(100.0, 110.0, INTERVAL_S), *np.arange(80.0, 90.0, INTERVAL_S), 105.01):
-        history.add(t_s, (t_s,), (t_s,), None)
+    pieces = (*np.arange(100.0, 110.0, INTERVAL_S), *np.arange(80.0, 90.0, INTERVAL_S), 105.01)
+    history = curve(*((t_s, t_s, t_s, None) for t_s in pieces), around=True)
     t, desired, *_ = history.curves(0, angular=False, span_s=60.0, at_s=95.0)
     assert (t[0], t[-1], len(t)) == (80.0, 109.75, 80)
     assert (desired == t).all()
@@ -117,38 +125,136 @@ def test_curves_keep_the_last_minutes():
     assert np.isnan(true[0])
 
 
-def test_curves_of_a_fast_run_go_back_no_further():
-    history = VariableHistory(1)
-    for k in range(100):
-        history.add(k * SPAN_S / 10, (1.0,), (2.0,), None)
-    t, *_ = history.curves(0, angular=False)
+def test_curves_of_a_fast_run_go_back_no_further_and_a_window_shows_the_newest():
+    t, *_ = curve(*((k * SPAN_S / 10, 1.0, 2.0, None) for k in range(100))).curves(0, angular=False)
     assert len(t) == 11
     assert t[-1] - t[0] == pytest.approx(SPAN_S)
+    t, desired, *_ = curve(*((float(k), 1.0, 2.0, None) for k in range(100))).curves(0, angular=False, span_s=20.0)
+    assert t.tolist() == list(range(79, 100))
+    assert len(desired) == 21
 
 
-def test_an_angle_that_goes_round_breaks_the_curve():
-    history = VariableHistory(1)
-    for k, angle in enumerate((3.0, 3.1, 3.2, 3.3)):
-        history.add(k * 1.0, (angle,), (0.0,), None)
-    _, desired, _, _ = history.curves(0, angular=True)
+def test_an_angle_that_goes_round_breaks_the_curve_and_errors_are_from_what_is_desired():
+    turning = curve(*((float(k), angle, 0.0, None) for k, angle in enumerate((3.0, 3.1, 3.2, 3.3))))
+    _, desired, _, _ = turning.curves(0, angular=True)
     assert np.isnan(desired[2])
     assert desired[3] == pytest.approx(math.degrees(3.3) - 360)
-
-
-def test_errors_are_counted_from_what_is_desired():
-    history = VariableHistory(1)
-    for k, yaw in enumerate((3.0, 3.1, -3.1)):
-        history.add(float(k), (3.1,), (yaw,), np.array([yaw - 0.1]))
-    _, desired, estimated, true = history.curves(0, angular=True, less=0)
+    apart = curve(*((float(k), 3.1, yaw, yaw - 0.1) for k, yaw in enumerate((3.0, 3.1, -3.1))))
+    _, desired, estimated, true = apart.curves(0, angular=True, less=0)
     assert desired == pytest.approx([0.0, 0.0, 0.0])
     assert np.radians(estimated) == pytest.approx([-0.1, 0.0, math.tau - 6.2])
     assert np.radians(true) == pytest.approx([-0.2, -0.1, math.tau - 6.3])
 
 
-def test_a_window_shows_the_newest_of_the_curves():
-    history = VariableHistory(1)
-    for k in range(100):
-        history.add(float(k), (1.0,), (2.0,), None)
-    t, desired, *_ = history.curves(0, angular=False, span_s=20.0)
-    assert t.tolist() == list(range(79, 100))
-    assert len(desired) == 21
+# Plots
+
+
+def poses(t_s: float) -> DronePoses:
+    """drone1 at (1, 2, 3), turned by 30 degrees and rolled by 6; drone2 is not in the view."""
+    p_W = np.array([(1.0, 2.0, 3.0), (math.nan,) * 3, (7.0, 8.0, 9.0)])
+    q_WB = frames.quaternion_from_rpy(np.radians([(6.0, 0.0, 30.0)] * 3))
+    return DronePoses(round(t_s * 1e9), tuple(CLUSTER.drones), p_W, q_WB, np.zeros((3, 8)), np.zeros(3))
+
+
+def filled(seconds: int) -> FlightHistory:
+    flights = FlightHistory(CLUSTER.drones)
+    estimate = EstimateView("drone1", (1.5, 2.0, 3.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), math.radians(32.0), 0.1, {})
+    for t in range(seconds):
+        flights.add(poses(float(t)), {"drone1": estimate})
+    return flights
+
+
+class Plotted:
+    """Plots of a formation and its drones, whose flight of some seconds is known."""
+
+    def __init__(self, seconds: int = 100) -> None:
+        self.gui: Any = Gui()
+        self.flights = filled(seconds)
+        self.plots = VariablePlots(self.gui, CLUSTER, RANGES, self.flights)
+        self.choice = self.gui.at["variables"]
+
+    def choose(self, drone: str) -> None:
+        self.choice.put(next(each for each in self.choice.options if each.startswith(drone)))
+
+
+def test_every_drone_has_its_flight_true_and_estimated():
+    flights = filled(3)
+    shown = {each.label.partition(" ")[0]: each for each in flights.variables("drone1")}
+    last = {name: [c[-1] for c in each.history.curves(each.column, each.angular)[1:]] for name, each in shown.items()}
+    assert last["x"][1:] == pytest.approx([1.5, 1.0])
+    assert last["yaw"][1:] == pytest.approx([32.0, 30.0])
+    assert last["roll"][2] == pytest.approx(6.0)
+    assert math.isnan(last["roll"][1])
+    gone = flights.variables("drone2")[0]
+    assert np.isnan(gone.history.curves(gone.column, False)[3]).all()
+
+
+def test_any_variable_of_any_drone_can_be_chosen_with_its_error_and_its_window():
+    shown = Plotted()
+    assert len(shown.choice.options) == 1 + 2 + 2 * len(CLUSTER.drones)
+    shown.choose("drone1")
+    shown.plots.draw()
+    assert [plot.visible for plot in shown.gui.plots] == [True] * 3
+    assert shown.gui.plots[0].data[2][-1] == pytest.approx(1.5)
+    shown.gui.at["Errors"].value = True
+    window = shown.gui.at["window"]
+    window.value = window.options[-1]
+    shown.plots.draw()
+    assert shown.gui.plots[0].data[2][-1] == pytest.approx(0.5)
+    assert np.ptp(shown.gui.plots[0].data[0]) < SPAN_S / 2
+
+
+def test_plots_that_stand_still_keep_what_they_show():
+    shown = Plotted()
+    shown.choice.value = shown.choice.options[-1]
+    shown.plots.draw()
+    shown.plots.draw()
+    shown.gui.at["Stand still"].value = True
+    before = shown.gui.plots[0].data
+    shown.flights.add(poses(100.0), {})
+    shown.plots.draw()
+    assert shown.gui.plots[0].data is before
+
+
+def test_the_time_axis_holds_all_points_and_moves_on_by_whole_steps():
+    span_s = WINDOWS_S[0]
+    ends = np.arange(1.0, 900.0, 0.5)
+    times = [np.array([max(0.0, end - span_s), end]) for end in ends]
+    found = [AxisRange.of_times(t, span_s) for t in times]
+    assert all(each.low <= t[0] and t[-1] <= each.high for each, t in zip(found, times, strict=True))
+    assert max(each.high - each.low for each in found) <= span_s * (1.0 + 2.0 / STEPS_PER_WINDOW)
+    assert len(set(found)) == math.ceil(ends[-1] / (span_s / STEPS_PER_WINDOW))
+
+
+def test_values_have_a_range_of_their_own_where_a_curve_is_not_known_at_all():
+    unknown, known = np.full(3, np.nan), np.array([np.nan, -1.0, 4.0])
+    assert AxisRange.of_values((unknown, unknown)) is None
+    assert AxisRange.of_values((known, known)) is None
+    found = AxisRange.of_values((unknown, known, known + 0.5))
+    assert found is not None
+    assert found.low < -1.0 < 4.5 < found.high
+
+
+def test_a_plot_is_made_anew_only_where_its_time_axis_moves_on():
+    shown = Plotted(10)
+    shown.choose("drone1")
+    scales = shown.gui.plots[0].scales
+    low, high = scales["x"]["range"]
+    shown.flights.add(poses(10.0), {})
+    shown.plots.draw()
+    assert shown.gui.plots[0].scales is scales
+    assert low <= shown.gui.plots[0].data[0][-1] == 10.0 <= high
+    shown.flights.add(poses(high + 1.0), {})
+    shown.plots.draw()
+    assert shown.gui.plots[0].scales["x"]["range"][1] > high
+
+
+def test_what_is_chosen_is_shown_though_nothing_is_drawn_any_more_and_without_points_has_no_curve():
+    shown = Plotted()
+    shown.choose("drone3")
+    assert shown.gui.plots[0].data[3][-1] == pytest.approx(7.0)
+    shown.gui.at["Errors"].put(True)
+    assert shown.gui.plots[0].data[3][-1] == pytest.approx(0.0)
+    empty = Plotted(0)
+    empty.choice.put(empty.choice.options[-1])
+    assert all(np.isnan(plot.data[1:]).all() for plot in empty.gui.plots)

@@ -96,43 +96,54 @@ class Cockpit:
         return self
 
 
-def test_a_drone_that_nobody_flies_is_taken_and_flown_while_the_stick_is_held():
-    cockpit = Cockpit().flying()
-    assert cockpit.client.taken == ["drone2"]
-    cockpit.control.steer(PAGE, FORWARD)
-    assert cockpit.after(STALE_S / 2) == [pytest.approx((1.0, 0.0, 0.0))] * 5
-    assert cockpit.control.steer(PAGE, None).text == "hovers"
-    cockpit.control.tick()
-    assert cockpit.client.sent[-1] == ("drone2", STILL)  # at once, not with the next command
-    assert cockpit.after(1.0) == [STILL] * 20  # and on: a firmware that gets nothing lands
-    assert {drone for drone, _ in cockpit.client.sent} == {"drone2"}
+@pytest.fixture
+def cockpit() -> Cockpit:
+    return Cockpit()
 
 
-def test_a_page_that_falls_silent_leaves_its_drone_hovering_and_then_gives_it_back():
-    cockpit = Cockpit().flying()
-    cockpit.control.steer(PAGE, FORWARD)
-    velocities = cockpit.after(STALE_S + 0.5)
+@pytest.fixture
+def flown() -> Cockpit:
+    return Cockpit().flying()
+
+
+def test_a_drone_that_nobody_flies_is_taken_and_flown_while_the_stick_is_held(flown: Cockpit):
+    assert flown.client.taken == ["drone2"]
+    flown.control.steer(PAGE, FORWARD)
+    assert flown.after(STALE_S / 2) == [pytest.approx((1.0, 0.0, 0.0))] * 5
+    assert flown.control.steer(PAGE, None).text == "hovers"
+    flown.control.tick()
+    assert flown.client.sent[-1] == ("drone2", STILL)  # at once, not with the next command
+    assert flown.after(1.0) == [STILL] * 20  # and on: a firmware that gets nothing lands
+    assert {drone for drone, _ in flown.client.sent} == {"drone2"}
+
+
+def test_a_page_that_is_silent_or_lost_lets_its_drone_hover_and_gives_it_back(flown: Cockpit):
+    flown.control.steer(PAGE, FORWARD)
+    velocities = flown.after(STALE_S + 0.5)
     assert velocities[-1] == STILL
     assert velocities.count(STILL) == pytest.approx(10, abs=1)
-    cockpit.after(GONE_S)
-    assert cockpit.client.given_back == ["drone2"]
-    assert cockpit.control.answer(PAGE).state == "none"
-    assert cockpit.after(1.0) == []
+    flown.after(GONE_S)
+    assert flown.client.given_back == ["drone2"]
+    assert flown.control.answer(PAGE).state == "none"
+    assert flown.after(1.0) == []
 
 
-def test_a_connection_that_is_lost_lets_the_drone_hover_at_once():
-    cockpit = Cockpit().flying()
+def test_a_connection_that_is_lost_lets_the_drone_hover_at_once_and_has_it_back_by_its_request(cockpit: Cockpit):
+    assert cockpit.control.take(PAGE, "drone2", False, "one").state == "flying"
+    cockpit.see("drone2", commander=NAME)
     cockpit.control.steer(PAGE, FORWARD)
     cockpit.after(0.1)
     cockpit.control.lose(PAGE)
     cockpit.control.tick()
     assert cockpit.client.sent[-1] == ("drone2", STILL)
+    assert cockpit.control.take(OTHER, "drone2", False, "one").state == "flying"
+    assert cockpit.control.answer(PAGE).state == "none"
+    cockpit.control.lose(OTHER)
     assert set(cockpit.after(GONE_S + 1.0)) == {STILL}
     assert cockpit.client.given_back == ["drone2"]
 
 
-def test_a_drone_of_a_formation_is_flown_only_when_it_is_taken_over():
-    cockpit = Cockpit()
+def test_a_drone_of_a_formation_is_flown_only_when_it_is_taken_over(cockpit: Cockpit):
     cockpit.see("drone2", commander="controller.main")
     refused = cockpit.control.take(PAGE, "drone2", over=False)
     assert (refused.state, refused.over) == ("none", True)
@@ -140,6 +151,11 @@ def test_a_drone_of_a_formation_is_flown_only_when_it_is_taken_over():
     assert cockpit.client.taken == []
     assert cockpit.control.steer(PAGE, FORWARD).state == "none"
     assert cockpit.after(1.0) == []
+    cockpit.client.refusal = "drone2: flown by 'console.2' with priority 10"
+    answer = cockpit.control.take(PAGE, "drone2", over=True)  # the world refuses it
+    assert (answer.state, answer.text) == ("none", cockpit.client.refusal)
+    assert cockpit.after(1.0) == []
+    cockpit.client.refusal = ""
     assert cockpit.control.take(PAGE, "drone2", over=True).state == "flying"
 
 
@@ -153,8 +169,9 @@ def test_a_drone_of_a_formation_is_flown_only_when_it_is_taken_over():
     ],
     ids=["landed", "unseen", "replay", "too fast"],
 )
-def test_what_cannot_be_flown_is_refused_with_its_reason(sight: dict, run: dict, terms: tuple[str, ...]):
-    cockpit = Cockpit()
+def test_what_cannot_be_flown_is_refused_with_its_reason(
+    sight: dict, run: dict, terms: tuple[str, ...], cockpit: Cockpit
+):
     cockpit.see("drone2", **sight)
     cockpit.run = RunSight(**run)
     answer = cockpit.control.take(PAGE, "drone2", over=True)
@@ -163,16 +180,7 @@ def test_what_cannot_be_flown_is_refused_with_its_reason(sight: dict, run: dict,
     assert cockpit.client.taken == []
 
 
-def test_what_the_world_refuses_is_not_flown():
-    cockpit = Cockpit()
-    cockpit.client.refusal = "drone2: flown by 'console.2' with priority 10"
-    answer = cockpit.control.take(PAGE, "drone2", over=True)
-    assert (answer.state, answer.text) == ("none", cockpit.client.refusal)
-    assert cockpit.after(1.0) == []
-
-
-def test_a_request_that_is_repeated_is_carried_out_once():
-    cockpit = Cockpit()
+def test_a_request_that_is_repeated_is_carried_out_once(cockpit: Cockpit):
     cockpit.client.waiting = []
     for _ in range(3):
         assert cockpit.control.take(PAGE, "drone2", True, "one").state == "taking"
@@ -186,16 +194,7 @@ def test_a_request_that_is_repeated_is_carried_out_once():
     assert cockpit.client.taken == ["drone2"]
 
 
-def test_a_page_that_has_connected_anew_has_its_drone_back_by_the_request():
-    cockpit = Cockpit()
-    assert cockpit.control.take(PAGE, "drone2", False, "one").state == "flying"
-    cockpit.control.lose(PAGE)
-    assert cockpit.control.take(OTHER, "drone2", False, "one").state == "flying"
-    assert cockpit.control.answer(PAGE).state == "none"
-
-
-def test_a_drone_is_asked_for_again_of_a_world_that_has_not_answered_and_says_for_how_long():
-    cockpit = Cockpit()
+def test_a_drone_is_asked_for_again_of_a_world_that_has_not_answered_and_says_for_how_long(cockpit: Cockpit):
     cockpit.client.waiting = []
     cockpit.control.take(PAGE, "drone2", True, "one")
     cockpit.run = RunSight(silence="the world has not answered for 5 s")
@@ -214,32 +213,22 @@ def test_a_drone_is_asked_for_again_of_a_world_that_has_not_answered_and_says_fo
     assert cockpit.control.answer(PAGE).state == "flying"
 
 
-def test_a_console_that_stood_still_says_so_where_it_gives_a_drone_back():
-    cockpit = Cockpit().flying()
-    cockpit.control.steer(PAGE, FORWARD)
-    cockpit.after(0.5)
-    cockpit.now_s += 29.0
-    cockpit.control.tick()
-    assert has_terms(cockpit.control.answer(PAGE).text, "console", "29 s")
+def test_a_console_that_stood_still_says_so_where_it_gives_a_drone_back(flown: Cockpit):
+    flown.control.steer(PAGE, FORWARD)
+    flown.after(0.5)
+    flown.now_s += 29.0
+    flown.control.tick()
+    assert has_terms(flown.control.answer(PAGE).text, "console", "29 s")
 
 
-def test_a_place_is_flown_to_at_the_height_that_was_confirmed():
-    cockpit = Cockpit().flying()
-    answer = cockpit.control.go(PAGE, 3.0, 0.0, 7.0)
-    assert answer.goal == (3.0, 0.0, 7.0)
-    assert cockpit.after(PERIOD_S)[0][2] > 0.0
+def test_one_drone_is_flown_from_one_page_and_a_page_flies_one_drone(flown: Cockpit):
+    assert has_terms(flown.control.take(OTHER, "drone2", over=True).text, "drone2", "another page")
+    assert flown.control.take(PAGE, "drone1", over=False).state == "flying"
+    flown.control.tick()
+    assert flown.client.given_back == ["drone2"]
 
 
-def test_one_drone_is_flown_from_one_page_and_a_page_flies_one_drone():
-    cockpit = Cockpit().flying()
-    assert has_terms(cockpit.control.take(OTHER, "drone2", over=True).text, "drone2", "another page")
-    assert cockpit.control.take(PAGE, "drone1", over=False).state == "flying"
-    cockpit.control.tick()
-    assert cockpit.client.given_back == ["drone2"]
-
-
-def test_a_page_that_gives_up_before_the_answer_gives_the_drone_back_twice_rather_than_never():
-    cockpit = Cockpit()
+def test_a_page_that_gives_up_before_the_answer_gives_the_drone_back_twice_rather_than_never(cockpit: Cockpit):
     cockpit.client.waiting = []
     assert cockpit.control.take(PAGE, "drone2", over=False).state == "taking"
     assert cockpit.after(0.5) == []
@@ -252,76 +241,72 @@ def test_a_page_that_gives_up_before_the_answer_gives_the_drone_back_twice_rathe
 
 
 @pytest.mark.parametrize("end", ["landing", "mode", "commander", "silent"])
-def test_what_ends_a_flight_gives_the_drone_back_and_says_why(end: str):
-    cockpit = Cockpit().flying()
-    cockpit.control.steer(PAGE, None)
-    cockpit.after(SETTLED_S + PERIOD_S)
-    cockpit.control.steer(PAGE, FORWARD)
+def test_what_ends_a_flight_gives_the_drone_back_and_says_why(end: str, flown: Cockpit):
+    flown.control.steer(PAGE, None)
+    flown.after(SETTLED_S + PERIOD_S)
+    flown.control.steer(PAGE, FORWARD)
     if end == "landing":
-        cockpit.see("drone2", state="landing")
+        flown.see("drone2", state="landing")
     elif end == "mode":
-        cockpit.client.modes += 1
+        flown.client.modes += 1
     elif end == "commander":
-        cockpit.see("drone2", commander="console.2")
+        flown.see("drone2", commander="console.2")
     else:
-        cockpit.run = RunSight(off="the world has not answered for 2 s")
-    assert cockpit.after(2 * PERIOD_S) == []
-    assert cockpit.client.given_back == ["drone2"]
-    answer = cockpit.control.answer(PAGE)
+        flown.run = RunSight(off="the world has not answered for 2 s")
+    assert flown.after(2 * PERIOD_S) == []
+    assert flown.client.given_back == ["drone2"]
+    answer = flown.control.answer(PAGE)
     assert answer.state == "none"
     assert answer.text
 
 
-def test_a_drone_whose_last_command_came_after_the_release_is_given_back_again():
+def test_a_drone_whose_last_command_came_after_the_release_is_given_back_again(flown: Cockpit):
     """The world makes whoever commands a drone that nobody flies its commander; a silent one would be landed."""
-    cockpit = Cockpit().flying()
-    cockpit.control.leave(PAGE)
-    cockpit.after(PERIOD_S)
-    assert cockpit.client.given_back == ["drone2"]
-    cockpit.after(SETTLED_S + PERIOD_S)
-    assert cockpit.client.given_back == ["drone2"] * 2
-    cockpit.see("drone2", commander=None)
-    cockpit.after(3 * SETTLED_S)
-    assert cockpit.client.given_back == ["drone2"] * 2
+    flown.control.leave(PAGE)
+    flown.after(PERIOD_S)
+    assert flown.client.given_back == ["drone2"]
+    flown.after(SETTLED_S + PERIOD_S)
+    assert flown.client.given_back == ["drone2"] * 2
+    flown.see("drone2", commander=None)
+    flown.after(3 * SETTLED_S)
+    assert flown.client.given_back == ["drone2"] * 2
 
 
-def test_a_run_that_stands_still_is_sent_nothing_and_a_slow_one_a_command_for_each_gate():
-    cockpit = Cockpit().flying()
-    cockpit.run = RunSight(paused=True)
-    assert cockpit.after(1.0) == []
-    cockpit.run = RunSight(rate=0.1)  # a gate of 20 ms each 0.2 s
-    cockpit.control.steer(PAGE, None)
-    assert 7 <= len(cockpit.after(2.0)) <= 10
+def test_a_run_that_stands_still_is_sent_nothing_and_a_slow_one_a_command_for_each_gate(flown: Cockpit):
+    flown.run = RunSight(paused=True)
+    assert flown.after(1.0) == []
+    flown.run = RunSight(rate=0.1)  # a gate of 20 ms each 0.2 s
+    flown.control.steer(PAGE, None)
+    assert 7 <= len(flown.after(2.0)) <= 10
 
 
-def test_a_drone_is_sent_to_a_place_at_its_height_and_the_stick_ends_that():
-    cockpit = Cockpit().flying()
-    cockpit.see("drone2", pose=DronePose((0.0, 0.0, 4.0), math.pi / 2))
-    answer = cockpit.control.go(PAGE, 0.0, 20.0)
+def test_a_drone_is_sent_to_a_place_at_its_height_and_the_stick_ends_that(flown: Cockpit):
+    flown.see("drone2", pose=DronePose((0.0, 0.0, 4.0), math.pi / 2))
+    assert flown.control.go(PAGE, 3.0, 0.0, 7.0).goal == (3.0, 0.0, 7.0)  # a height that was confirmed
+    assert flown.after(PERIOD_S)[0][2] > 0.0
+    answer = flown.control.go(PAGE, 0.0, 20.0)
     assert answer.state == "flying"
     assert has_terms(answer.text, "0.0", "20.0", "4.0")
-    assert cockpit.after(0.2) == [pytest.approx((1.5, 0.0, 0.0))] * 4
-    cockpit.control.steer(PAGE, None)  # the page is there, its dead-man key is not held
-    assert cockpit.after(0.1)[-1] != STILL
-    cockpit.control.steer(PAGE, FORWARD)
-    cockpit.control.steer(PAGE, None)
-    assert set(cockpit.after(0.2)) == {STILL}
+    assert flown.after(0.2) == [pytest.approx((1.5, 0.0, 0.0))] * 4
+    flown.control.steer(PAGE, None)  # the page is there, its dead-man key is not held
+    assert flown.after(0.1)[-1] != STILL
+    flown.control.steer(PAGE, FORWARD)
+    flown.control.steer(PAGE, None)
+    assert set(flown.after(0.2)) == {STILL}
 
 
-def test_a_place_outside_of_the_fence_or_without_an_estimate_is_refused():
-    cockpit = Cockpit().flying()
-    assert has_terms(cockpit.control.go(PAGE, 80.0, 0.0).text, "x", "80.0", "50")
-    cockpit.see("drone2", pose=None)
-    assert has_terms(cockpit.control.go(PAGE, 8.0, 0.0).text, "drone2")
-    cockpit.control.steer(PAGE, FORWARD)
-    assert set(cockpit.after(0.2)) == {STILL}
+def test_a_place_outside_of_the_fence_or_without_an_estimate_is_refused(flown: Cockpit):
+    assert has_terms(flown.control.go(PAGE, 80.0, 0.0).text, "x", "80.0", "50")
+    flown.see("drone2", pose=None)
+    assert has_terms(flown.control.go(PAGE, 8.0, 0.0).text, "drone2")
+    flown.control.steer(PAGE, FORWARD)
+    assert set(flown.after(0.2)) == {STILL}
 
 
-def test_nothing_flies_on_when_the_run_is_left():
-    cockpit = Cockpit().flying()
-    with cockpit.control.running():
+def test_nothing_flies_on_when_the_run_is_left(flown: Cockpit):
+    with flown.control.running():
         pass
-    assert cockpit.client.given_back == ["drone2"]
+    assert flown.client.given_back == ["drone2"]
 
 
 FENCE = Geofence((-50.0, -50.0, 1.0), (50.0, 50.0, 30.0))
@@ -330,7 +315,7 @@ MIDDLE = DronePose((0.0, 0.0, 5.0), math.pi / 2)
 deflections = st.floats(-1.0, 1.0)
 
 
-def test_the_fence_is_around_all_starts_and_below_the_lowest_ceiling():
+def test_the_fence_is_around_all_starts_and_keeps_drones_within():
     drones = [
         {"name": "one", "position_m": [0, 10, 0]},
         {"name": "two", "position_m": [-20, 0, 0], "limits": {"altitude_m": 12}},
@@ -338,14 +323,10 @@ def test_the_fence_is_around_all_starts_and_below_the_lowest_ceiling():
     fence = geofence_of(scenario_file.resolve({"name": "t", "duration_s": 1, "drones": drones}, "t.yaml"))
     assert fence == Geofence((-70.0, -50.0, 1.0), (50.0, 60.0, 12.0))
 
-
-def test_a_place_outside_is_refused_with_its_axis_and_the_limits():
     assert FENCE.refusal(50.0, -50.0) == ""
     assert has_terms(FENCE.refusal(50.1, 0.0), "x", "50.1", "-50", "50")
     assert has_terms(FENCE.refusal(0.0, -60.0), "y", "-60.0", "-50", "50")
 
-
-def test_a_drone_slows_down_before_the_fence_and_comes_back_from_beyond_it():
     assert FENCE.within((2.0, -2.0, 1.0), (49.5, 0.0, 30.0)) == (0.5, -2.0, 0.0)
     assert FENCE.within((2.0, 0.0, -1.0), (60.0, 0.0, 0.5)) == (0.0, 0.0, 0.0)
     assert FENCE.within((-2.0, 0.0, 1.0), (60.0, 0.0, 0.5)) == (-2.0, 0.0, 1.0)
@@ -363,19 +344,15 @@ def test_a_stick_never_asks_for_more_than_the_drone_s_limits(
     assert abs(flown.yaw_rate_rad_s) <= math.radians(30.0)
 
 
-def test_a_stick_is_in_the_heading_frame():
+def test_a_velocity_is_in_the_heading_frame_and_within_the_fence():
     flown = stick_velocity(Stick(1.0, 0.0, 0.0, 0.5, 1.5), MIDDLE, LIMITS, FENCE)
     assert flown.velocity_m_s == pytest.approx((1.5, 0.0, 0.0))
     assert flown.yaw_rate_rad_s == pytest.approx(math.radians(15.0))
 
-
-def test_the_fence_holds_whatever_the_heading():
-    """It looks north at the fence in the north: nothing is left of forward, all of left."""
+    # it looks north at the fence in the north: nothing is left of forward, all of left
     flown = stick_velocity(Stick(1.0, 1.0, 0.0, 0.0, 1.0), DronePose((0.0, 50.0, 5.0), math.pi / 2), LIMITS, FENCE)
     assert flown.velocity_m_s == pytest.approx((0.0, math.sqrt(0.5), 0.0), abs=1e-9)
 
-
-def test_to_a_place_a_drone_flies_straight_and_slows_down_there():
     far = velocity_to((30.0, 40.0, 5.0), MIDDLE, LIMITS, FENCE)
     assert turned_about_up(far.velocity_m_s, MIDDLE.yaw_rad) == pytest.approx((0.9, 1.2, 0.0))
     near = velocity_to((0.5, 0.0, 5.5), MIDDLE, LIMITS, FENCE)

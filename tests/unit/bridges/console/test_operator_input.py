@@ -11,22 +11,9 @@ from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_agents.formation.trajectory import ExpressionTrajectory
 from zsim_bridges.console import operator_input
-from zsim_bridges.console import picture as pic
 from zsim_bridges.console.operator_input import primary_variables, slider_ranges
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
-LEVEL = (1.0, 0.0, 0.0, 0.0)
-RNG = np.random.default_rng(4)
-
-
-def some_attitudes(count: int) -> np.ndarray:
-    q = RNG.normal(size=(count, 4))
-    return q / np.linalg.norm(q, axis=1, keepdims=True)
-
-
-def drones(p_W: np.ndarray, q_WB: np.ndarray, t_ns: int = 0) -> pic.DronePoses:
-    names = tuple(f"drone{i}" for i in range(len(p_W)))
-    return pic.DronePoses(t_ns, names, p_W, q_WB, np.full((len(p_W), 4), 300.0), np.zeros(3))
 
 
 def test_every_variable_has_a_range_in_its_unit():

@@ -67,6 +67,11 @@ class Desk:
         self.book.on_event(Event(self.now_ns, 0, kind, "console.1", subject, "", data))
 
 
+@pytest.fixture
+def desk() -> Desk:
+    return Desk()
+
+
 @pytest.mark.parametrize(
     ("op", "of", "sent"),
     [
@@ -78,15 +83,15 @@ class Desk:
         ("hold", {"cluster": "main"}, [("main", "hold")]),
     ],
 )
-def test_an_order_concerns_whom_it_names_and_is_carried_out_once(op: str, of: dict[str, str], sent: list[Any]):
-    desk = Desk()
+def test_an_order_concerns_whom_it_names_and_is_carried_out_once(
+    op: str, of: dict[str, str], sent: list[Any], desk: Desk
+):
     for _ in range(5):
         assert desk.place(op, **of)["state"] == "sent"
     assert desk.client.sent == sent
 
 
-def test_what_has_another_id_is_another_order():
-    desk = Desk()
+def test_what_has_another_id_is_another_order(desk: Desk):
     desk.place("emergency", drone="drone1")
     desk.place("emergency", "two", drone="drone1")
     desk.place("emergency", "", drone="drone1")
@@ -94,8 +99,7 @@ def test_what_has_another_id_is_another_order():
     assert len(desk.client.sent) == 4
 
 
-def test_an_emergency_is_repeated_until_every_drone_has_stopped():
-    desk = Desk()
+def test_an_emergency_is_repeated_until_every_drone_has_stopped(desk: Desk):
     desk.place("emergency")
     for name in DRONES:
         desk.end(name, "emergency")
@@ -113,8 +117,7 @@ def test_an_emergency_is_repeated_until_every_drone_has_stopped():
     assert desk.after(SHOWN_S) == {}
 
 
-def test_one_attempt_at_a_time_is_under_way_and_none_at_a_world_that_is_silent():
-    desk = Desk()
+def test_one_attempt_at_a_time_is_under_way_and_none_at_a_world_that_is_silent(desk: Desk):
     desk.silent_s = 3.0
     order = desk.place("emergency", drone="drone1")
     assert desk.client.sent == [("drone1", "emergency")]  # at once: it may be heard yet
@@ -130,8 +133,7 @@ def test_one_attempt_at_a_time_is_under_way_and_none_at_a_world_that_is_silent()
     assert len(desk.client.sent) == 2
 
 
-def test_a_stamp_that_grew_old_is_sent_anew_and_what_else_is_refused_is_told():
-    desk = Desk()
+def test_a_stamp_that_grew_old_is_sent_anew_and_what_else_is_refused_is_told(desk: Desk):
     desk.place("emergency", drone="drone1")
     desk.end("drone1", "emergency")
     desk.happen("refused", "drone/drone1/cmd/mode", reason="age is 12000 ms; must be <= 200 ms")
@@ -145,8 +147,7 @@ def test_a_stamp_that_grew_old_is_sent_anew_and_what_else_is_refused_is_told():
     assert len(desk.client.sent) == 2
 
 
-def test_the_event_of_a_mode_confirms_it_but_of_a_drone_that_the_world_only_hands_it_to():
-    desk = Desk()
+def test_the_event_of_a_mode_confirms_it_but_of_a_drone_that_the_world_only_hands_it_to(desk: Desk):
     desk.place("land", drone="drone1")
     desk.place("land", "two", drone="drone3")
     desk.happen("mode", "drone1", mode="land")
@@ -156,16 +157,14 @@ def test_the_event_of_a_mode_confirms_it_but_of_a_drone_that_the_world_only_hand
     assert desk.after(0.1, drone3="landing")["state"] == "confirmed"
 
 
-def test_what_was_shown_before_an_order_does_not_confirm_it():
-    desk = Desk()
+def test_what_was_shown_before_an_order_does_not_confirm_it(desk: Desk):
     desk.states["drone1"] = "landing"
     desk.place("land", drone="drone1")
     desk.book.update(desk.states, desk.now_ns, paused=False)
     assert desk.book.rows()[0]["state"] == "sent"
 
 
-def test_a_paused_run_has_the_order_and_is_not_sent_it_again():
-    desk = Desk()
+def test_a_paused_run_has_the_order_and_is_not_sent_it_again(desk: Desk):
     desk.place("emergency", drone="drone1")
     desk.end("drone1", "emergency")
     desk.happen("command", "drone1", message={"mode": "emergency"})
@@ -176,8 +175,7 @@ def test_a_paused_run_has_the_order_and_is_not_sent_it_again():
     assert has_terms(order["reason"], "paused")
 
 
-def test_a_controller_that_answers_confirms_or_refuses_and_one_that_does_not_is_asked_again():
-    desk = Desk()
+def test_a_controller_that_answers_confirms_or_refuses_and_one_that_does_not_is_asked_again(desk: Desk):
     desk.place("hold")
     told = desk.end("main", "hold", "no answer came within 5 s", unanswered=True)
     assert not told
@@ -195,8 +193,7 @@ def test_a_controller_that_answers_confirms_or_refuses_and_one_that_does_not_is_
     assert has_terms(order["reason"], "main", "ground")
 
 
-def test_what_a_silent_controller_did_all_the_same_counts():
-    desk = Desk()
+def test_what_a_silent_controller_did_all_the_same_counts(desk: Desk):
     desk.place("hold")
     assert desk.after(0.1, main="held")["state"] == "sent"  # it may be held by a fault
     desk.end("main", "hold", "no answer", unanswered=True)
@@ -204,8 +201,7 @@ def test_what_a_silent_controller_did_all_the_same_counts():
     assert desk.after(0.1, main="held")["state"] == "confirmed"
 
 
-def test_a_later_order_replaces_what_it_contradicts_and_never_an_emergency():
-    desk = Desk()
+def test_a_later_order_replaces_what_it_contradicts_and_never_an_emergency(desk: Desk):
     desk.place("hold")
     desk.place("land", "two")
     desk.place("emergency", "three")
@@ -215,8 +211,7 @@ def test_a_later_order_replaces_what_it_contradicts_and_never_an_emergency():
     assert {row["id"]: row["state"] for row in desk.book.rows()}["three"] == "sent"
 
 
-def test_a_reset_ends_the_repetition_of_an_emergency():
-    desk = Desk()
+def test_a_reset_ends_the_repetition_of_an_emergency(desk: Desk):
     desk.place("emergency", drone="drone1")
     desk.end("drone1", "emergency")
     desk.client.send_mode(["drone1"], "reset")
@@ -232,16 +227,14 @@ def test_a_reset_ends_the_repetition_of_an_emergency():
         (OrderRequest("hold", cluster="nobody"), ("'nobody'",)),
     ],
 )
-def test_what_concerns_nobody_or_another_run_is_refused(request_: OrderRequest, terms: tuple[str, ...]):
-    desk = Desk()
+def test_what_concerns_nobody_or_another_run_is_refused(request_: OrderRequest, terms: tuple[str, ...], desk: Desk):
     order = desk.book.place(request_)
     assert order["state"] == "refused"
     assert has_terms(order["reason"], *terms)
     assert desk.client.sent == []
 
 
-def test_a_run_that_is_over_refuses_what_it_has_not_confirmed():
-    desk = Desk()
+def test_a_run_that_is_over_refuses_what_it_has_not_confirmed(desk: Desk):
     desk.place("emergency")
     desk.refusal = "the run is over: 330 s were flown"
     order = desk.after(0.1)

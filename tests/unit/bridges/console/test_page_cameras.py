@@ -2,7 +2,6 @@
 
 import math
 import re
-from collections.abc import Callable
 from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
@@ -16,9 +15,8 @@ from zsim_bridges.console.page_cameras import (
     DISTANCE_MIN_M,
     FAR_M,
     OFFSET_M,
-    CameraFollow,
-    CameraFrustums,
     CameraView,
+    PageCameras,
     drone_index,
     fit_distance_m,
     frustum_pose,
@@ -27,6 +25,7 @@ from zsim_bridges.console.picture import DronePoses, drone_on_ray
 
 FRONT, BOTTOM = synthetic_camera.info_of("front"), synthetic_camera.info_of("bottom")
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+UP_W = np.array([0.0, 0.0, 1.0])
 AHEAD_K, DOWN_K = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
 
 
@@ -35,15 +34,13 @@ def drones(x_m: float = 0.0) -> DronePoses:
     return DronePoses(0, ("drone1", "drone2"), p_W, np.tile(LEVEL, (2, 1)), np.zeros((2, 4)), np.zeros(3))
 
 
-def test_a_front_camera_looks_where_its_drone_looks():
+def test_cameras_look_where_their_drone_does():
     north = frames.quaternion_from_heading(np.array(math.pi / 2))
     p_WK, q_WK = frustum_pose(FRONT, np.array([1.0, 2.0, 3.0]), north)
     assert p_WK == pytest.approx((1.0 - 0.0, 2.162, 3.012))
     assert frames.rotate(q_WK, AHEAD_K) == pytest.approx((0.0, 1.0, 0.0), abs=1e-9)
     assert frames.rotate(q_WK, DOWN_K) == pytest.approx((0.0, 0.0, -1.0), abs=1e-9)
 
-
-def test_a_bottom_camera_looks_down_with_ahead_at_the_top_of_its_picture():
     p_WK, q_WK = frustum_pose(BOTTOM, np.array([0.0, 0.0, 3.0]), LEVEL)
     assert p_WK == pytest.approx((0.0, 0.0, 2.97))
     assert frames.rotate(q_WK, AHEAD_K) == pytest.approx((0.0, 0.0, -1.0), abs=1e-9)
@@ -61,11 +58,11 @@ def test_only_a_drone_in_the_view_has_a_place(camera: str, index: int | None):
 class Page:
     """A page of viser's that notes its frusta; its camera looks north from 6 m south of the origin, 2 m above it."""
 
-    def __init__(self, client_id: int) -> None:
+    def __init__(self, client_id: int, aspect: float = 1.5) -> None:
         self.client_id = client_id
         self.camera = SimpleNamespace(
             position=np.array([0.0, -6.0, 2.0]), look_at=np.array([0.0, 0.0, 2.0]),
-            up_direction=np.array([0.0, 0.0, 1.0]), fov=math.radians(75), aspect=1.5,
+            up_direction=UP_W, fov=math.radians(75), aspect=aspect,
         )  # fmt: skip
         self.atomic = nullcontext
         self.html = ""
@@ -88,37 +85,58 @@ class Page:
         assert found is not None
         return found[1]
 
+    @property
+    def distance_m(self) -> float:
+        return float(np.linalg.norm(self.camera.position - self.camera.look_at))
 
-class Server:
-    """A viser server with pages that come and go."""
+    def shows(self, p_W: np.ndarray) -> bool:
+        """Return whether it has all points within its picture."""
+        camera = self.camera
+        back = (camera.position - camera.look_at) / self.distance_m
+        right = np.cross(UP_W, back)
+        away = (p_W - camera.position) @ np.column_stack((right / np.linalg.norm(right), np.cross(back, right), -back))
+        half = math.tan(camera.fov / 2) * away[:, 2]
+        return bool((np.abs(away[:, 0]) <= half * camera.aspect).all() and (np.abs(away[:, 1]) <= half).all())
+
+
+class Pages:
+    """Pages that come and go, and their cameras."""
 
     def __init__(self) -> None:
-        self.comes: Callable[[Any], None] = lambda _: None
-        self.goes: Callable[[Any], None] = lambda _: None
+        self.there: dict[int, Any] = {}
+        self.calls: dict[str, Any] = {}
+        server: Any = SimpleNamespace(
+            on_client_connect=lambda call: self.calls.update(come=call),
+            on_client_disconnect=lambda call: self.calls.update(go=call),
+            get_clients=lambda: self.there,
+        )
+        self.cameras = PageCameras(server)
 
-    def on_client_connect(self, act: Callable[[Any], None]) -> None:
-        self.comes = act
+    def come(self, page: Page) -> Page:
+        self.there[page.client_id] = page
+        self.calls["come"](page)
+        return page
 
-    def on_client_disconnect(self, act: Callable[[Any], None]) -> None:
-        self.goes = act
-
-
-@pytest.fixture
-def server() -> Server:
-    return Server()
-
-
-@pytest.fixture
-def frustums(server: Any) -> CameraFrustums:
-    return CameraFrustums(server)
+    def go(self, page: Page) -> None:
+        self.calls["go"](page)
 
 
 @pytest.fixture
-def pages(server: Server, frustums: CameraFrustums) -> list[Page]:
-    made = [Page(1), Page(2)]
-    for page in made:
-        server.comes(page)
+def followed() -> Pages:
+    return Pages()
+
+
+@pytest.fixture
+def pages(followed: Pages) -> list[Page]:
+    made = [followed.come(Page(number)) for number in (1, 2)]
+    for page in made:  # as the cameras stood before they were aimed
+        page.camera.position, page.camera.look_at = np.array([0.0, -6.0, 2.0]), np.array([0.0, 0.0, 2.0])
     return made
+
+
+@pytest.fixture
+def frustums(followed: Pages) -> PageCameras:
+    return followed.cameras
 
 
 def shown(camera: str, number: int = 1) -> Any:
@@ -131,96 +149,87 @@ def shown(camera: str, number: int = 1) -> Any:
 
 
 def test_a_page_shows_the_frustum_that_was_clicked_on_it_and_the_others_do_not(
-    frustums: CameraFrustums, pages: list[Page]
+    frustums: PageCameras, pages: list[Page]
 ):
-    frustums.choose(pages[0].key, "drone1/front")
-    frustums.draw(drones(5.0), shown)
+    frustums.show_frustum(pages[0].key, "drone1/front")
+    frustums.draw_frusta(drones(5.0), shown)
     (node,) = pages[0].nodes
     assert pages[1].nodes == []
     assert node.position == pytest.approx((5.162, 0.0, 2.012))
     assert (node._format, node._image_data) == ("jpeg", b"JPEG 1")
     assert node.aspect == pytest.approx(16 / 9)
-    frustums.draw(drones(6.0), lambda camera: shown(camera, 2))
+    frustums.draw_frusta(drones(6.0), lambda camera: shown(camera, 2))
     assert pages[0].nodes == [node]
     assert node.position[0] == pytest.approx(6.162)
     assert node._image_data == b"JPEG 2"
 
 
-def test_a_frustum_that_is_in_view_leaves_its_page_s_camera_alone(frustums: CameraFrustums, pages: list[Page]):
-    frustums.choose(pages[0].key, "drone1/front")
-    frustums.draw(drones(1.0), shown)
-    assert pages[0].camera.position.tolist() == [0.0, -6.0, 2.0]
-
-
-def test_a_frustum_that_appears_out_of_view_is_brought_into_it_once(frustums: CameraFrustums, pages: list[Page]):
-    frustums.choose(pages[0].key, "drone1/front")
-    frustums.draw(drones(50.0), shown)
+def test_a_frustum_that_appears_out_of_view_is_brought_into_it_once(frustums: PageCameras, pages: list[Page]):
+    frustums.show_frustum(pages[1].key, "drone1/front")
+    frustums.draw_frusta(drones(1.0), shown)
+    assert pages[1].camera.position.tolist() == [0.0, -6.0, 2.0]
+    frustums.show_frustum(pages[0].key, "drone1/front")
+    frustums.draw_frusta(drones(50.0), shown)
     camera = pages[0].camera
     assert camera.look_at == pytest.approx((50.162, 0.0, 2.012))
     assert camera.position[1] == pytest.approx(-np.linalg.norm(OFFSET_M))
     assert pages[1].camera.look_at.tolist() == [0.0, 0.0, 2.0]
-    frustums.draw(drones(90.0), lambda name: shown(name, 2))
+    frustums.draw_frusta(drones(90.0), lambda name: shown(name, 2))
     assert camera.look_at[0] == pytest.approx(50.162)
 
 
-def test_another_click_hides_it(frustums: CameraFrustums, pages: list[Page]):
-    frustums.choose(pages[0].key, "drone1/front")
-    frustums.draw(drones(), shown)
-    frustums.choose(pages[0].key, "")
-    frustums.draw(drones(), shown)
-    assert pages[0].nodes == []
-
-
-def test_another_camera_takes_its_place(frustums: CameraFrustums, pages: list[Page]):
+def test_another_camera_takes_its_place_and_another_click_hides_it(frustums: PageCameras, pages: list[Page]):
     for camera in ("drone1/front", "drone1/bottom"):
-        frustums.choose(pages[0].key, camera)
-        frustums.draw(drones(), shown)
+        frustums.show_frustum(pages[0].key, camera)
+        frustums.draw_frusta(drones(), shown)
     (node,) = pages[0].nodes
     assert node.aspect == pytest.approx(4 / 3)
 
-
-@pytest.mark.parametrize("camera", ["drone2/front", "elsewhere", "drone9/front"])
-def test_a_camera_without_a_picture_or_a_place_has_none(frustums: CameraFrustums, pages: list[Page], camera: str):
-    frustums.choose(pages[0].key, camera)
-    frustums.draw(drones(), shown)
-    frustums.draw(None, shown)
+    frustums.show_frustum(pages[0].key, "drone1/front")
+    frustums.draw_frusta(drones(), shown)
+    frustums.show_frustum(pages[0].key, "")
+    frustums.draw_frusta(drones(), shown)
     assert pages[0].nodes == []
 
 
-def test_nobody_chooses_for_a_page_without_its_key(frustums: CameraFrustums, pages: list[Page]):
+@pytest.mark.parametrize("camera", ["drone2/front", "elsewhere", "drone9/front"])
+def test_a_camera_without_a_picture_or_a_place_has_none(frustums: PageCameras, pages: list[Page], camera: str):
+    frustums.show_frustum(pages[0].key, camera)
+    frustums.draw_frusta(drones(), shown)
+    frustums.draw_frusta(None, shown)
+    assert pages[0].nodes == []
+
+
+def test_nobody_chooses_for_a_page_without_its_key(frustums: PageCameras, pages: list[Page]):
     for key in ("", "guessed", pages[0].key[:-1]):
-        frustums.choose(key, "drone1/front")
-    frustums.draw(drones(), shown)
+        frustums.show_frustum(key, "drone1/front")
+    frustums.draw_frusta(drones(), shown)
     assert [page.nodes for page in pages] == [[], []]
     assert pages[0].key != pages[1].key
 
 
-def test_a_page_that_has_gone_is_forgotten(frustums: CameraFrustums, pages: list[Page], server: Server):
-    frustums.choose(pages[0].key, "drone1/front")
-    server.goes(pages[0])
-    frustums.draw(drones(), shown)
-    assert pages[0].nodes == []
-    frustums.choose(pages[0].key, "drone1/front")
-    frustums.draw(drones(), shown)
-    assert pages[0].nodes == []
-
-
-def test_a_run_that_is_over_leaves_none(frustums: CameraFrustums, pages: list[Page]):
-    frustums.choose(pages[1].key, "drone1/front")
-    frustums.draw(drones(), shown)
-    frustums.clear()
+def test_a_page_or_run_that_has_gone_leaves_no_frustum(frustums: PageCameras, pages: list[Page], followed: Pages):
+    frustums.show_frustum(pages[1].key, "drone1/front")
+    frustums.draw_frusta(drones(), shown)
+    frustums.clear_frusta()
     assert pages[1].nodes == []
 
+    frustums.show_frustum(pages[0].key, "drone1/front")
+    followed.go(pages[0])
+    frustums.draw_frusta(drones(), shown)
+    assert pages[0].nodes == []
+    frustums.show_frustum(pages[0].key, "drone1/front")
+    frustums.draw_frusta(drones(), shown)
+    assert pages[0].nodes == []
 
-def test_a_click_in_a_scene_is_for_its_page_and_told_once(frustums: CameraFrustums, pages: list[Page]):
+
+def test_clicks_are_for_their_page_and_told_once(frustums: PageCameras, pages: list[Page], followed: Pages):
     frustums.click(2, "drone1")
     assert frustums.take_click(pages[0].key) == ""
     assert [frustums.take_click(pages[1].key) for _ in range(2)] == ["drone1", ""]
 
-
-def test_a_click_on_a_page_that_has_gone_is_forgotten(frustums: CameraFrustums, pages: list[Page], server: Server):
     frustums.click(1, "drone1")
-    server.goes(pages[0])
+    followed.go(pages[0])
     frustums.click(1, "drone1")
     assert frustums.take_click(pages[0].key) == ""
 
@@ -242,71 +251,22 @@ def test_a_click_is_on_the_drone_that_its_ray_hits(direction: tuple[float, ...],
     names = ("near", "behind", "far", "distant", "gone")
     poses = DronePoses(0, names, p_W, np.tile(LEVEL, (5, 1)), np.zeros((5, 4)), np.zeros(3))
     assert drone_on_ray(poses, np.full(5, 0.3), (0.0, 0.0, 10.0), direction) == drone
+    nobody = poses._replace(p_W=np.full((5, 3), math.nan))
+    assert drone_on_ray(nobody, np.ones(5), (0.0, 0.0, 10.0), direction) is None
 
 
-def test_without_drones_a_click_is_on_none():
-    poses = DronePoses(0, ("gone",), np.full((1, 3), math.nan), LEVEL[None], np.zeros((1, 4)), np.zeros(3))
-    assert drone_on_ray(poses, np.ones(1), (0.0, 0.0, 10.0), (0.0, 0.0, -1.0)) is None
-
-
-UP_W = np.array([0.0, 0.0, 1.0])
 TRIANGLE = np.array([(0.0, 3.5, 15.0), (-3.5, -3.5, 15.0), (3.5, -3.5, 15.0)])
-
-
-class FollowingPage:
-    """A page of viser's, with its camera."""
-
-    def __init__(self, number: int, aspect: float = 1.6) -> None:
-        self.client_id = number
-        self.atomic = nullcontext
-        self.camera = SimpleNamespace(
-            position=np.array([9.0, 0.0, 0.0]), look_at=np.zeros(3), up_direction=UP_W, fov=1.31, aspect=aspect
-        )
-
-    @property
-    def distance_m(self) -> float:
-        return float(np.linalg.norm(self.camera.position - self.camera.look_at))
-
-    def shows(self, p_W: np.ndarray) -> bool:
-        """Return whether it has all points within its picture."""
-        camera = self.camera
-        back = (camera.position - camera.look_at) / self.distance_m
-        right = np.cross(UP_W, back)
-        away = (p_W - camera.position) @ np.column_stack((right / np.linalg.norm(right), np.cross(back, right), -back))
-        half = math.tan(camera.fov / 2) * away[:, 2]
-        return bool((np.abs(away[:, 0]) <= half * camera.aspect).all() and (np.abs(away[:, 1]) <= half).all())
-
-
-class Pages:
-    """Pages that come and go."""
-
-    def __init__(self) -> None:
-        self.there: dict[int, Any] = {}
-        self.calls: dict[str, Any] = {}
-        server: Any = SimpleNamespace(
-            on_client_connect=lambda call: self.calls.update(come=call),
-            on_client_disconnect=lambda call: self.calls.update(go=call),
-            get_clients=lambda: self.there,
-        )
-        self.follow = CameraFollow(server)
-
-    def come(self, page: FollowingPage) -> FollowingPage:
-        self.there[page.client_id] = page
-        self.calls["come"](page)
-        return page
-
-    def go(self, page: FollowingPage) -> None:
-        self.calls["go"](page)
 
 
 @pytest.mark.parametrize("aspect", [0.5, 1.0, 2.2])
 @pytest.mark.parametrize("direction", ["reset", "top", "side"])
 @pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
-def test_a_formation_is_in_view_whatever_its_size_and_the_page_s(aspect: float, direction: str, scale: float):
-    pages = Pages()
-    page = pages.come(FollowingPage(1, aspect))
-    pages.follow.choose(1, follows=True, fits=True, direction=direction)
-    pages.follow.follow(scale * TRIANGLE)
+def test_a_formation_is_in_view_whatever_its_size_and_the_page_s(
+    aspect: float, direction: str, scale: float, followed: Pages
+):
+    page = followed.come(Page(1, aspect))
+    followed.cameras.look(1, follows=True, fits=True, direction=direction)
+    followed.cameras.follow(scale * TRIANGLE)
     assert page.shows(scale * TRIANGLE)
     assert page.distance_m >= DISTANCE_MIN_M
 
@@ -316,86 +276,75 @@ def test_a_hidden_page_has_a_camera_all_the_same():
     assert math.isfinite(distance_m)
 
 
-def test_cameras_follow_from_the_start_and_go_back_where_a_formation_grows():
-    pages = Pages()
-    page = pages.come(FollowingPage(1))
+def test_cameras_follow_and_keep_their_direction(followed: Pages):
+    page = followed.come(Page(1))
     for t in range(60):
         flown = (1.0 + t / 10) * TRIANGLE + np.array((t, -t, 0.0))
-        pages.follow.follow(flown)
+        followed.cameras.follow(flown)
         assert page.shows(flown)
     before_m = page.distance_m
-    pages.follow.follow(TRIANGLE)
+    followed.cameras.follow(TRIANGLE)
     assert page.distance_m < before_m
 
 
-def test_a_camera_keeps_the_direction_that_its_page_gave_it():
-    pages = Pages()
-    page = pages.come(FollowingPage(1))
-    pages.follow.follow(TRIANGLE)
+def test_a_camera_keeps_the_direction_that_its_page_gave_it(followed: Pages):
+    page = followed.come(Page(1))
+    followed.cameras.follow(TRIANGLE)
     page.camera.position = page.camera.look_at + np.array((0.0, page.distance_m, 0.0))
-    pages.follow.follow(TRIANGLE + np.array((40.0, 0.0, 0.0)))
+    followed.cameras.follow(TRIANGLE + np.array((40.0, 0.0, 0.0)))
     back = (page.camera.position - page.camera.look_at) / page.distance_m
     assert back == pytest.approx((0.0, 1.0, 0.0), abs=1e-9)
     assert page.camera.look_at[0] == pytest.approx(40.0)
 
 
-def test_a_formation_that_hovers_moves_no_camera():
-    pages = Pages()
-    page = pages.come(FollowingPage(1))
-    pages.follow.follow(TRIANGLE)
+def test_a_formation_that_hovers_moves_no_camera(followed: Pages):
+    page = followed.come(Page(1))
+    followed.cameras.follow(TRIANGLE)
     before = page.camera.position.copy()
-    pages.follow.follow(TRIANGLE + np.array((0.1, 0.0, 0.05)))
+    followed.cameras.follow(TRIANGLE + np.array((0.1, 0.0, 0.05)))
     assert page.camera.position.tolist() == before.tolist()
 
 
-def test_who_zooms_keeps_the_distance_and_who_does_not_follow_the_place():
-    pages = Pages()
-    zoomed, still = pages.come(FollowingPage(1)), pages.come(FollowingPage(2))
-    pages.follow.follow(TRIANGLE)
+def test_who_zooms_keeps_the_distance_and_who_does_not_follow_the_place(followed: Pages):
+    zoomed, still = followed.come(Page(1)), followed.come(Page(2))
+    followed.cameras.follow(TRIANGLE)
     zoomed.camera.position = zoomed.camera.look_at + np.array((0.0, -2.0, 0.0))
-    pages.follow.choose(1, follows=True, fits=False)
-    pages.follow.choose(2, follows=False, fits=True)
+    followed.cameras.look(1, follows=True, fits=False)
+    followed.cameras.look(2, follows=False, fits=True)
     place = still.camera.look_at.tolist()
-    pages.follow.follow(TRIANGLE + np.array((40.0, 0.0, 0.0)))
+    followed.cameras.follow(TRIANGLE + np.array((40.0, 0.0, 0.0)))
     assert zoomed.distance_m == pytest.approx(2.0)
     assert zoomed.camera.look_at[0] == pytest.approx(40.0)
     assert still.camera.look_at.tolist() == place
-    pages.follow.restart()  # another run: everybody looks there
-    pages.follow.follow(TRIANGLE + np.array((80.0, 0.0, 0.0)))
+    followed.cameras.restart()  # another run: everybody looks there
+    followed.cameras.follow(TRIANGLE + np.array((80.0, 0.0, 0.0)))
     assert still.camera.look_at[0] == pytest.approx(80.0)
 
 
-def test_who_follows_again_after_a_zoom_has_all_in_view_from_the_fitting_distance():
-    pages = Pages()
-    page = pages.come(FollowingPage(1))
-    pages.follow.follow(TRIANGLE)
+def test_who_follows_again_after_a_zoom_has_all_in_view_from_the_fitting_distance(followed: Pages):
+    page = followed.come(Page(1))
+    followed.cameras.follow(TRIANGLE)
     fitting_m = page.distance_m
     page.camera.position = page.camera.look_at + 1.3 * (page.camera.position - page.camera.look_at)
-    pages.follow.choose(1, follows=True, fits=False)
-    pages.follow.follow(TRIANGLE)
+    followed.cameras.look(1, follows=True, fits=False)
+    followed.cameras.follow(TRIANGLE)
     assert page.distance_m == pytest.approx(1.3 * fitting_m)
-    pages.follow.choose(1, follows=True, fits=True)
-    pages.follow.follow(TRIANGLE)
+    followed.cameras.look(1, follows=True, fits=True)
+    followed.cameras.follow(TRIANGLE)
     assert page.distance_m == pytest.approx(fitting_m)
 
 
-def test_a_page_that_went_before_it_was_known_is_forgotten():
-    pages = Pages()
-    gone = FollowingPage(1)
-    pages.go(gone)
-    pages.calls["come"](gone)
-    before = gone.camera.position.tolist()
-    pages.follow.choose(1, follows=True, fits=True, direction="top")
-    pages.follow.follow(TRIANGLE)
-    assert gone.camera.position.tolist() == before
-
-
-def test_without_drones_no_camera_moves():
-    pages = Pages()
-    page = pages.come(FollowingPage(1))
-    before = page.camera.position.tolist()
-    pages.follow.follow(np.zeros((0, 3)))
-    assert page.camera.position.tolist() == before
+def test_nothing_moves_a_camera_without_drones_or_of_a_page_that_went_before_it_was_known(followed: Pages):
+    there, gone = followed.come(Page(2)), Page(1)
+    before = there.camera.position.tolist()
+    followed.cameras.follow(np.zeros((0, 3)))
+    followed.go(gone)
+    followed.calls["come"](gone)
+    before_gone = gone.camera.position.tolist()
+    followed.cameras.look(1, follows=True, fits=True, direction="top")
+    assert there.camera.position.tolist() == before
+    followed.cameras.follow(TRIANGLE)
+    assert gone.camera.position.tolist() == before_gone
 
 
 NORTHWARDS = CameraView(np.zeros(3), np.array([0.0, 2.0, 0.0]), np.array([0.0, 0.0, 1.0]), math.radians(90), 1.5)

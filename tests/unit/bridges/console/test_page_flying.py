@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -28,13 +29,13 @@ class Returns:
     def __init__(self) -> None:
         self.said: list[Any] = []
         self.notes: list[tuple[str, str]] = []
-        self.requests = 0
+        self.requests: Counter[str] = Counter()
         self.answer = FlightAnswer("drone1", "taking")
         self.is_sent = False
         self.sight = DroneSight("flying", "console.1", DronePose((5.0, 5.0, 10.0), 0.0))
         self.view = ViewCluster(0, 0, "engaged", NAMES, (5.0, -5.0, 15.0), (5.0, -5.0, 15.0), "")
         client: Any = SimpleNamespace(
-            request_cluster=self._request, requests_to=lambda _: self.requests,
+            request_cluster=self._request, cluster_requests=self.requests,
             send_mode=lambda drones, mode: self.said.append((mode, drones)),
         )  # fmt: skip
         control: Any = SimpleNamespace(
@@ -51,7 +52,7 @@ class Returns:
         )
 
     def _request(self, cluster: str, op: str, **args: Any) -> None:
-        self.requests += 1
+        self.requests[cluster] += 1
         self.said.append((op, args))
 
     def _go(self, page: Any, x_m: float, y_m: float) -> None:
@@ -119,7 +120,7 @@ def test_a_formation_that_does_not_return_any_more_does_not_land(returns: Return
     returns.fly_to(1.0, -1.0)
     assert returns.tick() == []
     if how == "request":
-        returns.requests += 1
+        returns.requests["main"] += 1
     elif how == "elsewhere":
         returns.fly_to(4.0, -4.0)
     elif how == "held":

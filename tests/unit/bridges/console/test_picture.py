@@ -10,10 +10,13 @@ from refused import has_terms
 
 from zsim.contract.flight_messages import DroneView, EstimateView, ViewCluster, ViewDrones
 from zsim.math import frames
+from zsim.presentation import drone_colours, rgb
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
+from zsim_bridges.console import airframe
 from zsim_bridges.console import picture as pic
 from zsim_bridges.console.picture import PreviewError, preview_of
+from zsim_bridges.console.scene import DARK, LIGHT, LUMINANCE_MIN, lightened, linear, luminance
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -25,12 +28,7 @@ def some_attitudes(count: int) -> np.ndarray:
     return q / np.linalg.norm(q, axis=1, keepdims=True)
 
 
-def drones(p_W: np.ndarray, q_WB: np.ndarray, t_ns: int = 0) -> pic.DronePoses:
-    names = tuple(f"drone{i}" for i in range(len(p_W)))
-    return pic.DronePoses(t_ns, names, p_W, q_WB, np.full((len(p_W), 4), 300.0), np.zeros(3))
-
-
-def test_a_view_becomes_arrays():
+def test_a_view_becomes_arrays_in_which_drones_keep_their_places():
     views = tuple(DroneView(f"d{i}", (i, 2.0, 3.0), LEVEL, (1.0, 2.0, 3.0, 4.0), "flying", 80.0) for i in range(2))
     found = pic.drone_poses(ViewDrones(7, 0, views, ((1.0, 0.0, 0.0), (3.0, 0.0, 0.0))), ("d0", "d1"))
     assert found.t_ns == 7
@@ -39,8 +37,6 @@ def test_a_view_becomes_arrays():
     assert found.rotor.tolist() == [[1, 2, 3, 4, 0, 0, 0, 0]] * 2
     assert found.wind_W.tolist() == [2, 0, 0]
 
-
-def test_a_view_of_some_drones_keeps_their_places():
     some = tuple(
         DroneView(name, (1.0, 2.0, 3.0), LEVEL, (1.0, 2.0, 3.0, 4.0), "flying", 80.0) for name in ("d2", "stranger")
     )
@@ -90,14 +86,10 @@ def test_an_ellipsoid_is_the_covariance_at_two_sigma():
     axes = frames.rotation_matrix(balls.wxyz)[0]
     assert axes @ np.diag(balls.half_m[0] / 2) ** 2 @ axes.T == pytest.approx(P)
 
-
-def test_what_an_ellipsoid_holds_is_said_rightly():
     samples = np.linalg.norm(RNG.normal(size=(200_000, 3)), axis=1)
     assert pytest.approx(float((samples < pic.SIGMAS).mean()), abs=0.004) == pic.SHARE_WITHIN
     assert f"{pic.SHARE_WITHIN:.0%}" == "74%"
 
-
-def test_without_estimates_there_are_no_ellipsoids():
     balls = pic.ellipsoids([])
     assert balls.p_W.shape == (0, 3)
     assert balls.wxyz.shape == (0, 4)
@@ -117,7 +109,7 @@ def test_ghosts_stand_where_the_formation_is_to_be(name: str):
     assert pic.ghosts(space, msgspec.structs.replace(view, phase="idle")) is None
 
 
-def test_a_triangle_is_drawn_with_its_sides_and_its_corner():
+def test_a_formation_is_drawn_with_its_sides_and_its_corner():
     p_W = np.array([(0.0, 0.0, 2.0), (3.0, 0.0, 2.0), (0.0, 4.0, 2.0)])
     found = pic.formation_shape(cluster_space(3), p_W, np.zeros(3))
     assert found is not None
@@ -127,13 +119,9 @@ def test_a_triangle_is_drawn_with_its_sides_and_its_corner():
     assert found.corner[1] == "β 90.0°"
     assert found.p_c == pytest.approx(p_W.mean(axis=0))
 
-
-def test_a_formation_in_line_has_no_frame():
     line = np.array([(0.0, 0.0, 2.0), (3.0, 0.0, 2.0), (6.0, 0.0, 2.0)])
     assert pic.formation_shape(cluster_space(3), line, np.zeros(3)) is None
 
-
-def test_a_pair_has_one_side():
     found = pic.formation_shape(cluster_space(2), np.array([(0.0, 0.0, 2.0), (3.0, 0.0, 2.0)]), np.zeros(2))
     assert found is not None
     assert [side.name for side in found.sides] == ["p 3.00 m"]
@@ -153,15 +141,13 @@ def changed(**values: float) -> np.ndarray:
     return c
 
 
-def test_the_way_to_a_target_begins_where_the_formation_is_and_ends_there():
+def test_a_preview_shows_the_way_and_its_figures():
     preview = preview_of(SPACE, "target", {"values": {"x_c": BASE[0] + 3.0, "yaw_deg": 90.0}}, BASE, APART_M)
     assert np.allclose(preview.paths_W[:, 0], SPACE.inverse(BASE)[0])
     goal = changed(x_c=BASE[0] + 3.0, yaw=np.pi / 2)
     assert np.allclose(preview.paths_W[:, -1], SPACE.inverse(goal)[0])
     assert "less than" not in preview.text
 
-
-def test_the_way_of_a_trajectory_has_its_beginning_and_its_figures():
     waypoints = [
         {"at_s": 0.0, "values": {"x_c": 1.0, "z_c": 8.0}},
         {"at_s": 20.0, "values": {"x_c": 21.0, "z_c": 12.0}},
@@ -172,8 +158,6 @@ def test_the_way_of_a_trajectory_has_its_beginning_and_its_figures():
     # a cubic from rest to rest is 1.5 times as fast in its middle as on the whole: 1.5 * hypot(20, 4) / 20
     assert has_terms(preview.text, "20 s", "heights 8.0 to 12.0 m", "1.5 m/s at most")
 
-
-def test_drones_that_would_come_too_near_are_named():
     preview = preview_of(SPACE, "target", {"values": {"p": 1.0}}, BASE, APART_M)
     assert has_terms(preview.text, "1.0 m apart", "less than the 2 m")
 
@@ -190,3 +174,28 @@ def test_what_no_formation_can_fly_has_no_preview(op: str, args: dict[str, objec
     with pytest.raises(PreviewError) as refused:
         preview_of(SPACE, op, args, BASE, APART_M)
     assert finding in str(refused.value)
+
+
+# Colours of the scene's lines
+
+CONTRAST_MIN = 2.3  # of what is drawn with the ground; text, which is finer, needs 4.5 (WCAG 2.2)
+
+
+def test_colours_of_lines_are_in_linear_light() -> None:
+    """Half of the light of white is 188 of 255 in sRGB."""
+    assert linear(np.array([[0, 188, 255], [5, 10, 128]])).tolist() == [[0, 128, 255], [0, 1, 55]]
+
+
+@pytest.mark.parametrize("ground", [LIGHT[0], DARK[0]])
+@pytest.mark.parametrize("part", ["cross", "hull", "rotor"])
+def test_drones_are_seen_on_the_ground_of_both_themes(ground: tuple[int, int, int], part: str):
+    light, dark = sorted((luminance(airframe.COLOURS[part]), luminance(ground)), reverse=True)
+    assert (light + 0.05) / (dark + 0.05) > CONTRAST_MIN
+
+
+@pytest.mark.parametrize("count", [3, 30])
+def test_trails_are_seen_on_dark_ground_and_light_ones_are_as_they_were(count: int):
+    for colour in map(rgb, drone_colours(count)):
+        seen = lightened(colour)
+        assert (luminance(seen) + 0.05) / (luminance(DARK[0]) + 0.05) > CONTRAST_MIN
+        assert luminance(colour) < LUMINANCE_MIN or list(seen) == list(colour)

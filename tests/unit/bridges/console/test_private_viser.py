@@ -2,32 +2,14 @@
 
 import asyncio
 import threading
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import msgspec
-import numpy as np
 import pytest
 
-from zsim_bridges.console import picture as pic
 from zsim_bridges.console.page_server import OPERATOR, VIEWER
 from zsim_bridges.console.private_viser import AnyThreadEvent, PageControls, PrivateViser, ViewerCamera, is_permitted
-
-SCENARIOS = Path(__file__).parents[4] / "scenarios"
-LEVEL = (1.0, 0.0, 0.0, 0.0)
-RNG = np.random.default_rng(4)
-
-
-def some_attitudes(count: int) -> np.ndarray:
-    q = RNG.normal(size=(count, 4))
-    return q / np.linalg.norm(q, axis=1, keepdims=True)
-
-
-def drones(p_W: np.ndarray, q_WB: np.ndarray, t_ns: int = 0) -> pic.DronePoses:
-    names = tuple(f"drone{i}" for i in range(len(p_W)))
-    return pic.DronePoses(t_ns, names, p_W, q_WB, np.full((len(p_W), 4), 300.0), np.zeros(3))
-
 
 CAMERA = msgspec.to_builtins(
     ViewerCamera((1, 0, 0, 0), (1.0, 2.5, 3.0), 1.3, 0.01, 1000, 600, 800, (0, 0, 0), (0, 0, 1))

@@ -20,12 +20,12 @@ from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import console_tables
 from zsim_bridges.console import scene as stages
 from zsim_bridges.console.command_client import RequestOutcome
+from zsim_bridges.console.console_server import RunPage, picture_rate_hz
 from zsim_bridges.console.orders import OrderRequest
-from zsim_bridges.console.page_cameras import CameraFollow, CameraFrustums
+from zsim_bridges.console.page_cameras import PageCameras
 from zsim_bridges.console.picture import drone_poses
 from zsim_bridges.console.private_viser import PrivateViser
 from zsim_bridges.console.run_condition import drone_refusals
-from zsim_bridges.console.run_page import RunPage, picture_rate_hz
 from zsim_bridges.console.time_monitor import TimeMonitor
 
 STEP = Path(__file__).parents[4] / "scenarios" / "step.yaml"
@@ -93,9 +93,7 @@ class Seen:
             run_id="r1", rate=1.0, mode="lockstep", drones=drones, scenario=scenario, replay_of="", gate_ns=20_000_000
         )
         server.get_clients = lambda: {0: None} if watched else {}
-        self.show = RunPage(
-            server, self.link, info, self.observer, CameraFollow(server), CameraFrustums(server), 1000.0
-        )
+        self.show = RunPage(server, self.link, info, self.observer, PageCameras(server), 1000.0)
 
     def draw(self, *samples: tuple[str, Any]) -> dict[str, Any]:
         """Say something, draw a picture, and return what is shown."""
@@ -160,13 +158,6 @@ def test_a_drone_is_taken_from_a_page_and_given_back(seen: Seen):
     assert ("world/control", "acquire", {"drone": NAMES[1], "priority": 10}) in seen.link.asked
 
 
-def test_a_whole_formation_is_shown(seen: Seen):
-    state = seen.draw(drones(*NAMES), cluster())
-    assert [drone["name"] for drone in state["drones"]] == list(NAMES)
-    assert state["clusters"][0]["true"]["p"] == pytest.approx(4.0)
-    assert state["t_s"] == pytest.approx(0.02)
-
-
 @pytest.mark.parametrize("watched", [True, False])
 def test_a_replay_of_some_drones_is_shown_as_far_as_it_goes(viser: PrivateViser, watched: bool):
     seen = Seen(viser.server, watched)
@@ -178,21 +169,12 @@ def test_a_replay_of_some_drones_is_shown_as_far_as_it_goes(viser: PrivateViser,
     seen.show.close()
 
 
-def test_a_run_that_nobody_watched_leaves_its_last_picture(viser: PrivateViser):
-    seen = Seen(viser.server, watched=False)
-    seen.draw(drones(*NAMES), cluster())
-    page = seen.show._page
-    assert seen.show.state()["drones"][0]["state"] == "flying"
-    assert "engaged" in page.phases.content
-    seen.show.close()
-
-
 def test_a_drone_that_is_missing_is_hidden_and_the_others_keep_their_places(viser: PrivateViser):
     stage = stages.SceneNodes(viser.server, DRONES, ARMS_M, 3, 1)
     found = drone_poses(drones(NAMES[2])[1], NAMES)
     stage.drones(found, 0.05)
     stage.wind(found)
-    ((_, frames),) = stage._airframes.nodes
+    ((_, frames),) = stage._airframes
     p_W = np.asarray(frames.batched_positions)
     assert p_W[2].tolist() == [0.0, 3.0, 2.0]
     assert p_W[0].tolist() == p_W[1].tolist() == list(stages.HIDDEN)
@@ -200,6 +182,9 @@ def test_a_drone_that_is_missing_is_hidden_and_the_others_keep_their_places(vise
     assert stage._wind.visible
     stage.wind(drone_poses(drones()[1], NAMES))
     assert not stage._wind.visible
+    stage.trails(np.ones((2, 2, 3)), np.array([0, 1]))
+    stage.trails(np.zeros((0, 2, 3)), np.zeros(0, dtype=np.int64))  # a replay has gone back
+    assert (np.asarray(stage._trail_node.points)[..., 2] < -100.0).all()
 
 
 def test_each_drone_is_drawn_with_the_rotors_that_it_has(viser: PrivateViser):
@@ -208,7 +193,7 @@ def test_each_drone_is_drawn_with_the_rotors_that_it_has(viser: PrivateViser):
     six = DroneInfo(NAMES[2], "mine", tuple(RotorInfo(f"r{k}", x, y, 1, 0.05) for k, (x, y) in enumerate(ends)))
     stage = stages.SceneNodes(viser.server, (*DRONES[:2], six), ARMS_M, 3, 1)
     stage.drones(drone_poses(drones(*NAMES)[1], NAMES), 0.05)
-    assert [owners.tolist() for owners, _ in stage._airframes.nodes] == [[0, 1], [2]]
+    assert [owners.tolist() for owners, _ in stage._airframes] == [[0, 1], [2]]
     places = np.asarray(stage._rotors._node.batched_positions)
     assert len(places) == 4 + 4 + 6
     np.testing.assert_allclose(places[8:, :2] - (0.0, 3.0), ends, atol=1e-6)
@@ -220,7 +205,11 @@ def test_views_of_another_controller_are_left_out(seen: Seen):
     state = seen.draw(drones(*NAMES), cluster(names=fewer), cluster("strange"))
     assert state["clusters"] == []
     assert seen.observer.health.refused == 2
-    assert [each["name"] for each in seen.draw(cluster())["clusters"]] == [CLUSTER]
+    state = seen.draw(cluster())
+    assert [each["name"] for each in state["clusters"]] == [CLUSTER]
+    assert [drone["name"] for drone in state["drones"]] == list(NAMES)
+    assert state["clusters"][0]["true"]["p"] == pytest.approx(4.0)
+    assert state["t_s"] == pytest.approx(0.02)
 
 
 def test_estimates_of_strangers_are_left_out(seen: Seen):
@@ -229,13 +218,6 @@ def test_estimates_of_strangers_are_left_out(seen: Seen):
     view = ViewEstimates(20_000_000, 0, (*strangers, mine))
     state = seen.draw(drones(*NAMES), (keys.estimates_view("estimator.drone1"), view))
     assert state["drones"][0]["sigma_m"] == pytest.approx(2.0)
-
-
-def test_trails_go_when_a_replay_goes_back(viser: PrivateViser):
-    stage = stages.SceneNodes(viser.server, DRONES, ARMS_M, 3, 1)
-    stage.trails(np.ones((2, 2, 3)), np.array([0, 1]))
-    stage.trails(np.zeros((0, 2, 3)), np.zeros(0, dtype=np.int64))
-    assert (np.asarray(stage._trail_node.points)[..., 2] < -100.0).all()
 
 
 def test_trails_of_a_replay_that_goes_back_before_anybody_looks_go_too(viser: PrivateViser):
@@ -403,15 +385,6 @@ def test_no_take_off_of_a_drone_that_is_empty_or_on_its_back(
     assert any(each[0] == NAMES[1] for each in alarmed(seen))
 
 
-def test_accepted_and_done_are_told_apart(seen: Seen):
-    seen.show._on_outcome(RequestOutcome("main: engage", "", CLUSTER, "engage"))
-    kinds = [event.kind for event in seen.show.views.log.newest]
-    assert kinds == ["accepted"]
-    seen.draw(drones(*NAMES), cluster())
-    kinds = [event.kind for event in seen.show.views.log.newest]
-    assert kinds == ["done", "accepted"]
-
-
 def test_obstacles_stand_where_the_scenario_says(viser: PrivateViser):
     obstacles = scenario_file.from_text(OBSTACLES).environment.obstacles
     added: dict[str, Any] = {}
@@ -431,17 +404,23 @@ def test_obstacles_stand_where_the_scenario_says(viser: PrivateViser):
     }
 
 
-def test_a_slider_that_was_moved_just_before_its_page_closed_is_sent_now_or_never(viser: PrivateViser):
+def test_a_run_that_nobody_watched_leaves_its_last_picture_and_sends_what_was_moved_now_or_never(viser: PrivateViser):
     seen = Seen(viser.server, watched=False)
     sent: list[float] = []
     for form in seen.show._page.forms.values():
         form.send = sent.append  # type: ignore[method-assign]
-    seen.draw(drones(*NAMES))
+    seen.draw(drones(*NAMES), cluster())
     assert len(sent) == 1
+    assert seen.show.state()["drones"][0]["state"] == "flying"
+    assert "engaged" in seen.show._page.phases.content
     seen.show.close()
 
 
 def test_what_formations_were_asked_for_is_among_the_events_and_refusals_on_every_page(seen: Seen):
+    seen.show._on_outcome(RequestOutcome("main: engage", "", CLUSTER, "engage"))
+    assert [event.kind for event in seen.show.views.log.newest] == ["accepted"]
+    seen.draw(drones(*NAMES), cluster())
+    assert [event.kind for event in seen.show.views.log.newest] == ["done", "accepted"]
     seen.show._server.get_clients = dict  # type: ignore[assignment]  # nobody looks
     for outcome in (
         RequestOutcome("main: takeoff", "", "main", "takeoff"),
@@ -449,7 +428,7 @@ def test_what_formations_were_asked_for_is_among_the_events_and_refusals_on_ever
         RequestOutcome("main", "not yet"),
     ):
         seen.show._on_outcome(outcome)
-    found = [(event.kind, event.text) for event in seen.show.views.log.newest]
+    found = [(event.kind, event.text) for event in seen.show.views.log.newest][:2]
     assert [kind for kind, _ in found] == ["refused", "accepted"]
     assert found[0][1] == "main: not yet"
     assert has_terms(found[1][1], "main", "takeoff")

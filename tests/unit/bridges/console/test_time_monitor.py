@@ -1,5 +1,6 @@
 """What the console receives of a run: its time, or silence; estimators, alive or dead; faults; the texts on them."""
 
+import math
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -11,12 +12,14 @@ from zsim.contract import keys, messages
 from zsim.contract.flight_messages import DroneView, EstimateView, LinkState, ViewDrones, ViewEstimates
 from zsim.contract.messages import DroneInfo
 from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health, Waiting
+from zsim.math import frames
 from zsim.runtime.participant import Participant
 from zsim_bridges.console import console_tables
+from zsim_bridges.console.console_server import console_state
 from zsim_bridges.console.console_tables import TableRows
 from zsim_bridges.console.run_condition import RunCondition, page_head
-from zsim_bridges.console.run_page import console_state
-from zsim_bridges.console.time_monitor import BEAT_S, SILENT_S, TimeMonitor
+from zsim_bridges.console.run_monitor import FlightMeter
+from zsim_bridges.console.time_monitor import BEAT_S, SILENT_S, RecordPlayer, TimeMonitor
 from zsim_bridges.console.view_buffer import ReceivedEstimate, ViewBuffer
 
 S = 1_000_000_000  # ns
@@ -77,6 +80,9 @@ class MonitoredRun:
             self.wall_s += BEAT_S
             self.monitor._awake.beat()
 
+    def state(self) -> dict[str, Any]:
+        return console_state("r1", self.views, self.monitor, {})
+
     def deliver(self, *samples: tuple[str, Any]) -> None:
         for key, message in samples:
             self.link.say(sample(key, message))
@@ -111,11 +117,15 @@ def health(process: str = "estimator.drone1", lag_ns: int = 0) -> tuple[str, Hea
     return keys.process(process, "health"), Health(0, 0, "estimator", "lab", 1, {}, lag_ns, 0, 0, 0)
 
 
+@pytest.fixture
+def monitored() -> MonitoredRun:
+    return MonitoredRun()
+
+
 # The run's time
 
 
-def test_a_stamp_is_of_the_present_however_fast_the_run():
-    monitored = MonitoredRun(stamp_age_s=0.1)
+def test_a_stamp_is_of_the_present_however_fast_the_run(monitored: MonitoredRun):
     monitored.link.now = clock(1 * S, rate=4.0)
     assert monitored.monitor.now_ns() == 1 * S
     monitored.link.now = clock(2 * S, rate=4.0)
@@ -124,48 +134,33 @@ def test_a_stamp_is_of_the_present_however_fast_the_run():
     monitored.wall_s += 0.01
     assert monitored.monitor.now_ns() == 2 * S
     assert monitored.link.asked == 2
-
-
-def test_where_no_stamp_is_too_old_nobody_is_asked():
-    monitored = MonitoredRun(stamp_age_s=float("inf"))
-    monitored.wall_s += 1000.0
-    assert monitored.monitor.now_ns() == 0
-    assert monitored.link.asked == 0
-
-
-def test_a_stamp_is_given_also_where_the_world_answers_nothing():
-    monitored = MonitoredRun()
-    monitored.link.now = clock(1 * S)
-    monitored.monitor.poll()
-    monitored.link.now = None
+    monitored.link.now = None  # the world answers nothing
     monitored.wall_s += 60.0
-    assert monitored.monitor.now_ns() == 1 * S
+    assert monitored.monitor.now_ns() == 2 * S
+    careless = MonitoredRun(stamp_age_s=float("inf"))
+    careless.wall_s += 1000.0
+    assert (careless.monitor.now_ns(), careless.link.asked) == (0, 0)
 
 
 @pytest.mark.parametrize("garbage", [b"", b"\xc1", b"\x80", messages.encode(drones(0)[1])])
-def test_a_foreign_answer_is_no_clock(garbage: bytes):
-    monitored = MonitoredRun()
-    monitored.link.now = garbage
-    monitored.monitor.poll()
-    assert monitored.monitor.clock is None
-    assert monitored.observer.health.refused == 1
-    monitored.link.now = clock(3 * S)
-    monitored.monitor.poll()
-    monitored.link.now = garbage
-    monitored.monitor.poll()
-    assert monitored.monitor.clock == clock(3 * S)
-
-
-def test_the_end_of_a_run_is_heard():
-    for now, over in ((clock(0, run_id="r2"), "another run"), (clock(0, state="stopped"), "the run ended")):
-        monitored = MonitoredRun()
-        monitored.link.now = now
+def test_a_foreign_answer_is_no_clock(garbage: bytes, monitored: MonitoredRun):
+    for answer, known in ((garbage, None), (clock(3 * S), clock(3 * S)), (garbage, clock(3 * S))):
+        monitored.link.now = answer
         monitored.monitor.poll()
-        assert over in monitored.observer.end_reason
+        assert monitored.monitor.clock == known
+    assert monitored.observer.health.refused == 2
 
 
-def test_silence_of_the_world_is_told_and_for_how_long():
-    monitored = MonitoredRun()
+@pytest.mark.parametrize(
+    ("now", "over"), [(clock(0, run_id="r2"), "another run"), (clock(0, state="stopped"), "the run ended")]
+)
+def test_the_end_of_a_run_is_heard(now: Clock, over: str, monitored: MonitoredRun):
+    monitored.link.now = now
+    monitored.monitor.poll()
+    assert over in monitored.observer.end_reason
+
+
+def test_silence_of_the_world_is_told_and_for_how_long(monitored: MonitoredRun):
     with monitored.monitor.polling():
         monitored.run_for(SILENT_S - 0.1)
         assert monitored.monitor.silent_s == 0.0
@@ -177,15 +172,13 @@ def test_silence_of_the_world_is_told_and_for_how_long():
         monitored.link.now = None
         monitored.monitor.poll()
         monitored.run_for(5.0)
-        shown = console_state("r1", monitored.views, monitored.monitor, {})
-        assert shown["clock"] == "silent"
-        assert shown["silent_s"] == pytest.approx(5.0)
+        shown = monitored.state()
+        assert (shown["clock"], shown["silent_s"]) == ("silent", pytest.approx(5.0))
     assert monitored.monitor.silent_s == 0.0  # nobody is asked any more
-    assert console_state("r1", monitored.views, monitored.monitor, {})["clock"] == "running"
+    assert monitored.state()["clock"] == "running"
 
 
-def test_a_console_that_stood_still_itself_does_not_call_the_world_silent():
-    monitored = MonitoredRun()
+def test_a_console_that_stood_still_itself_does_not_call_the_world_silent(monitored: MonitoredRun):
     with monitored.monitor.polling():
         monitored.run_for(0.5)
         assert monitored.monitor.stall is None
@@ -200,35 +193,33 @@ def test_a_console_that_stood_still_itself_does_not_call_the_world_silent():
         assert monitored.monitor.silent_s > SILENT_S
 
 
-def test_a_silent_world_is_not_called_running():
-    head = page_head("step", RunCondition("running", silent_s=12.3), clock(7 * S), 7 * S)
-    assert head["level"] == "silent"
-    assert has_terms(head["title"], "12 s")
-    assert "running" not in head["title"]
-
-
-def test_a_world_in_which_time_stands_is_not_called_running_either():
-    stands = clock(7 * S, waiting_for=(Waiting("estimator.drone1", "lab", 40.0),))
-    head = page_head("step", RunCondition("running"), stands, 7 * S)
-    assert head["level"] == "waiting"
-    assert "running" not in head["title"]
-    assert has_terms(head["detail"], "estimator.drone1", "lab", "40 s")
-    blinks = clock(7 * S, waiting_for=(Waiting("estimator.drone1", "lab", 0.6),))
-    assert page_head("step", RunCondition("running"), blinks, 7 * S)["level"] == "running"
-
-
-def test_who_never_came_has_no_host_but_an_address_at_which_it_is_awaited():
-    waits = clock(0, state="waiting", waiting_for=(Waiting("controller.main", "", 18.0),))
-    head = page_head("step", RunCondition("waiting"), waits, 0, world="federation 'lab' on tcp/10.0.0.1:7447")
-    assert has_terms(head["detail"], "controller.main (18 s)", "'lab'", "tcp/10.0.0.1:7447")
-    assert " on (" not in head["detail"]
+@pytest.mark.parametrize(
+    ("run", "waiting", "level", "terms"),
+    [
+        (RunCondition("running", silent_s=12.3), (), "silent", ("12 s",)),
+        (RunCondition("running"), (Waiting("estimator.drone1", "lab", 40.0),), "waiting", ("on lab (40 s)",)),
+        (
+            RunCondition("running"),
+            (Waiting("estimator.drone1", "lab", 0.6),),
+            "running",
+            ("running", "estimator.drone1"),
+        ),
+        (RunCondition("waiting"), (Waiting("controller.main", "", 18.0),), "waiting", ("main (18 s) in 'lab'",)),
+    ],
+)
+def test_only_a_world_in_which_time_goes_is_called_running(
+    run: RunCondition, waiting: tuple[Waiting, ...], level: str, terms: tuple[str, ...]
+):
+    head = page_head("step", run, clock(7 * S, state=run.clock, waiting_for=waiting), 7 * S, world="'lab'")
+    assert head["level"] == level
+    assert all(term in head["title"] + head["detail"] for term in terms)
+    assert ("running" in head["title"]) == (level == "running")
 
 
 def test_a_replay_is_named_as_one():
     emergency = RunCondition("paused", replayed=True, drones={"drone1": "emergency"})
     head = page_head("step", emergency, clock(15 * S), 15 * S, record_s=(10.0, 20.0))
-    assert head["replay"]
-    assert head["level"] == "paused"  # of a record nobody has to act: no red head
+    assert (head["level"], head["replay"]) == ("paused", True)  # of a record nobody has to act: no red head
     assert has_terms(head["title"], "REPLAY", "15.0 of 20.0 s", "50 %")
     flight = page_head("step", emergency._replace(replayed=False), clock(S), S)
     assert (flight["level"], flight["replay"]) == ("emergency", False)
@@ -237,8 +228,7 @@ def test_a_replay_is_named_as_one():
 # Estimators
 
 
-def test_a_dead_estimator_is_not_shown_as_a_healthy_one():
-    monitored = MonitoredRun()
+def test_a_dead_estimator_is_not_shown_as_a_healthy_one(monitored: MonitoredRun):
     for second in range(3):
         monitored.deliver(drones(second * S), estimate(second * S, used=5 * second), health())
         monitored.words.sensor_table("drone1")
@@ -252,41 +242,33 @@ def test_a_dead_estimator_is_not_shown_as_a_healthy_one():
     assert has_terms(without_tags(shown), "no estimate", "2.0 s")
     assert "Hz" not in shown
     assert not monitored.views.estimates()["drone1"].fresh
-    assert console_state("r1", monitored.views, monitored.monitor, {})["drones"][0]["sigma_m"] is None
+    assert monitored.state()["drones"][0]["sigma_m"] is None
 
 
-def test_in_a_fast_run_a_view_may_be_seconds_older_than_another():
-    monitored = MonitoredRun()
-    monitored.deliver(estimate(1 * S), health())
-    monitored.wall_s += 0.05
-    monitored.deliver(drones(9 * S))
-    assert monitored.views.estimates()["drone1"].fresh
-    assert monitored.words.drone_rows()[0].drone.lag_ms == 0.0
-
-
-def test_in_a_slow_run_a_view_may_be_seconds_old():
-    monitored = MonitoredRun()
-    monitored.deliver(estimate(1 * S))
-    monitored.wall_s += 9.0
-    monitored.deliver(drones(1 * S + S // 2))
-    assert monitored.views.estimates()["drone1"].fresh
-
-
-def test_what_was_believed_before_a_replay_went_back_is_left_out():
-    monitored = MonitoredRun()
-    monitored.deliver(drones(60 * S), estimate(60 * S))
-    monitored.wall_s += 5.0
-    monitored.deliver(drones(10 * S))
-    assert monitored.views.estimates() == {}
+@pytest.mark.parametrize(
+    ("estimated_s", "waited_s", "seen_s", "fresh"),
+    [
+        (1.0, 0.05, 9.0, True),  # in a fast run a view may be seconds older than another
+        (1.0, 9.0, 1.5, True),  # in a slow run a view may be seconds old
+        (60.0, 5.0, 10.0, None),  # a replay has gone back
+    ],
+)
+def test_an_estimate_is_of_the_present_by_its_time_or_by_when_it_came(
+    monitored: MonitoredRun, estimated_s: float, waited_s: float, seen_s: float, fresh: bool | None
+):
+    monitored.deliver(estimate(round(estimated_s * S)), health())
+    monitored.wall_s += waited_s
+    monitored.deliver(drones(round(seen_s * S)))
+    found = monitored.views.estimates().get("drone1")
+    assert (found and found.fresh) == fresh
+    assert monitored.words.drone_rows()[0].drone.lag_ms == (None if fresh is None else 0.0)
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_of_two_estimators_of_one_drone_the_later_is_shown(order: tuple[int, int]):
-    monitored = MonitoredRun()
+def test_of_two_estimators_of_one_drone_the_later_is_shown(order: tuple[int, int], monitored: MonitoredRun):
     samples = (estimate(1 * S, "estimator.old", used=1), estimate(2 * S, "estimator.new", used=2))
-    monitored.deliver(
-        drones(2 * S), *(samples[i] for i in order), health("estimator.new", 3_000_000), health("estimator.old")
-    )
+    healths = health("estimator.new", 3_000_000), health("estimator.old")
+    monitored.deliver(drones(2 * S), *(samples[i] for i in order), *healths)
     assert monitored.views.estimates()["drone1"].process == "estimator.new"
     assert monitored.words.drone_rows()[0].gps == "2 / 0"
     assert monitored.words.drone_rows()[0].drone.lag_ms == 3.0
@@ -301,20 +283,17 @@ def test_a_covariance_that_is_none_has_no_sigma():
 # Faults and refusals
 
 
-def test_faults_are_shown_on_a_drone_while_they_act():
+def test_faults_are_shown_on_a_drone_while_they_act(monitored: MonitoredRun):
     planned = Fault(1, "gps_bias", "drone1", {}, 20 * S)
     acting = Fault(2, "gps_dropout", "drone1", {}, 5 * S, 15 * S)
     ended = Fault(3, "motor", "drone1", {}, 0, 10 * S)
-    monitored = MonitoredRun()
     monitored.deliver(drones(10 * S), (keys.FAULTS, Faults(0, 0, (planned, acting, ended))))
-    assert monitored.words.drone_rows()[0].faults == ("gps_dropout",)
-    assert monitored.words.drone_rows()[1].faults == ()
-    shown = console_state("r1", monitored.views, monitored.monitor, {})["faults"]
+    assert [row.faults for row in monitored.words.drone_rows()] == [("gps_dropout",), ()]
+    shown = monitored.state()["faults"]
     assert [(fault["from_s"], fault["until_s"]) for fault in shown] == [(20.0, None), (5.0, 15.0), (0.0, 10.0)]
 
 
-def test_faults_that_were_heard_are_not_replaced_by_an_older_answer():
-    monitored = MonitoredRun()
+def test_faults_that_were_heard_are_not_replaced_by_an_older_answer(monitored: MonitoredRun):
     newer = Fault(2, "gps_dropout", "drone1", {}, 0)
     monitored.link.last, monitored.link.meanwhile = Faults(0, 0, ()), Faults(0, 1, (newer,))
     monitored.views.open()
@@ -322,11 +301,9 @@ def test_faults_that_were_heard_are_not_replaced_by_an_older_answer():
     assert monitored.views.faults == (newer,)
 
 
-def test_the_console_hears_what_is_refused_of_its_own():
-    monitored = MonitoredRun()
+def test_the_console_hears_what_is_refused_of_its_own(monitored: MonitoredRun):
     for kind, source in (("refused", "console.2"), ("command", "console.1"), ("refused", "console.1")):
-        event = Event(0, 0, kind, source, "drone/drone1/cmd/mode", "no")
-        monitored.link.tell(sample(keys.EVENT, event))
+        monitored.link.tell(sample(keys.EVENT, Event(0, 0, kind, source, "drone/drone1/cmd/mode", "no")))
     assert [(event.kind, event.source) for event in monitored.refused] == [("refused", "console.1")]
     assert monitored.views.answered_commands("drone1") == 2
 
@@ -340,23 +317,127 @@ def link(state: Any, **figures: float | None) -> tuple[str, LinkState]:
     return keys.link("drone2"), LinkState(0, 0, "driver.drone2", "<10.0.0.7>", state, **numbers, refused=3)
 
 
-def test_of_an_external_drone_the_link_of_its_driver_is_shown():
-    monitored = MonitoredRun()
+def test_of_an_external_drone_the_link_of_its_driver_is_shown(monitored: MonitoredRun):
     monitored.deliver(drones(1 * S))
     plain, external = monitored.words.drone_rows()
-    assert plain.link == ("", "")
-    assert external.link[1] == console_tables.AMBER
-    for state, colour in (
-        ("connected", console_tables.BLUE),
-        ("armed", console_tables.GREEN),
-        ("lost", console_tables.RED),
-    ):
+    assert (plain.link, external.link[1]) == (("", ""), console_tables.AMBER)
+    colours = {"connected": console_tables.BLUE, "armed": console_tables.GREEN, "lost": console_tables.RED}
+    for state, colour in colours.items():
         monitored.deliver(link(state, age_ms=12.3, loss_percent=0.4))
         text, shown = monitored.words.drone_rows()[1].link
         assert shown == colour
         assert has_terms(text, state, "12 ms", "0 %", "3")
-    html = console_tables.drone_table(monitored.words.drone_rows())
-    assert "&lt;10.0.0.7&gt;" in html
+    assert "&lt;10.0.0.7&gt;" in console_tables.drone_table(monitored.words.drone_rows())
     monitored.wall_s += 10.0
     text, shown = monitored.words.drone_rows()[1].link
     assert (shown, "10 s" in text) == (console_tables.RED, True)
+
+
+# Figures of flight
+
+
+def view(t_s: float, x_m: float, battery: float = 80.0) -> ViewDrones:
+    w, x, y, z = frames.quaternion_from_heading([math.radians(90.0)])[0].tolist()
+    return ViewDrones(
+        int(t_s * S), 0, (DroneView("drone1", (x_m, 0.0, 2.0 + t_s), (w, x, y, z), (), "flying", battery),)
+    )
+
+
+def test_figures_of_flight_come_from_where_a_drone_was():
+    meter = FlightMeter()
+    for step in range(10):
+        meter.update(view(0.1 * step, 0.2 * step))
+    figures = meter.figures["drone1"]
+    assert figures.speed_m_s == pytest.approx(math.hypot(2.0, 1.0))
+    assert figures.climb_m_s == pytest.approx(1.0)
+    assert figures.heading_deg == pytest.approx(90.0)
+    assert figures.battery_left_s is None
+    meter.update(view(40.0, 0.0, 70.0))
+    assert meter.figures["drone1"].battery_left_s == pytest.approx(70.0 / 0.25)
+    meter.update(view(1.0, 50.0))  # a replay that goes back begins anew
+    assert meter.figures["drone1"].speed_m_s == 0.0
+
+
+# The time of a replay
+
+
+def player(state: str, is_replay: bool = True) -> tuple[RecordPlayer, list[Any]]:
+    """Return a player that has loaded its timeline, and what it requests."""
+    asked: list[Any] = []
+    client: Any = SimpleNamespace(
+        timeline=lambda: {"from_s": 0.0, "to_s": 9.0, "marks": []},
+        seek=lambda t_s, step: asked.append(("seek", t_s, step)),
+        request_world=lambda op, **args: asked.append((op, args)),
+    )
+    monitor: Any = SimpleNamespace(clock=None)
+    monitor.poll = lambda: setattr(monitor, "clock", SimpleNamespace(state=state, t_ns=8 * 10**9))
+    made = RecordPlayer(client, monitor, is_replay)
+    made.load()
+    return made, asked
+
+
+@pytest.mark.parametrize(
+    ("state", "op", "value", "request_"),
+    [
+        ("running", "pause", 1.0, ("pause", {})),
+        ("running", "resume", 1.0, ("resume", {})),
+        ("running", "step", 1.0, ("step", {"gates": 1})),
+        ("running", "rate", 0.5, ("rate", {"value": 0.5})),
+        ("running", "seek", 4.0, ("seek", 4.0, False)),
+        ("stopped", "seek", 4.0, ("seek", 4.0, False)),
+        ("paused", "seek", 4.0, ("seek", 4.0, True)),  # it shows where it was put
+    ],
+)
+def test_a_replay_is_asked_for_what_its_page_asks(state: str, op: str, value: float, request_: Any):
+    made, asked = player(state)
+    assert asked == ([("seek", 8.0, True)] if state == "paused" else [])  # the last instant again, for this console
+    made.play(op, value)
+    assert asked[-1] == request_
+    flight, asked = player(state, is_replay=False)
+    flight.play(op, value)
+    assert (flight.timeline, flight.state(RunCondition("running")), asked) == ({}, {}, [])
+
+
+@pytest.mark.parametrize(
+    ("run", "refused"),
+    [
+        (RunCondition("running", replayed=True), {"resume", "step"}),
+        (RunCondition("paused", replayed=True), {"pause"}),
+        (RunCondition("paused", replayed=True, at_end=True), {"pause", "resume", "step"}),
+        (RunCondition("stopped", replayed=True, ended="it is over"), {"pause", "resume", "step", "rate", "seek"}),
+    ],
+)
+def test_the_timeline_has_what_would_be_refused(run: RunCondition, refused: set[str]):
+    refusals = player("paused")[0].state(run)["refusals"]
+    assert {op for op, reason in refusals.items() if reason} == refused
+
+
+def test_a_record_is_read_around_the_shown_instant_the_nearest_first():
+    asked: list[tuple[float, float]] = []
+    tasks: list[Any] = []
+    client: Any = SimpleNamespace(
+        timeline=lambda: {"from_s": 0.0, "to_s": 1000.0},
+        past_views=lambda from_s, to_s, every_s: asked.append((from_s, to_s)) or [(from_s, to_s)],
+        read=lambda act: tasks.append(act) or True,
+    )
+    monitor: Any = SimpleNamespace(clock=None, poll=lambda: None)
+    made = RecordPlayer(client, monitor, True)
+    made.load()
+
+    def read(t_s: float) -> list[float]:
+        asked.clear()
+        made.fill(t_s)
+        made.fill(t_s)  # it is read once at a time
+        while tasks:
+            tasks.pop()()
+        return [from_s for from_s, _ in asked]
+
+    begun = read(505.0)
+    assert begun[0] == 500.0
+    assert set(begun[1:3]) == {490.0, 510.0}
+    assert (min(begun), max(begun)) == (320.0, 590.0)
+    assert read(505.0) == []
+    assert read(515.0) == [600.0]
+    assert read(5.0)[0] == 0.0
+    assert read(505.0)[0] == 500.0  # it was forgotten, so far away
+    assert made.take() == [(500.0, 509.875)]

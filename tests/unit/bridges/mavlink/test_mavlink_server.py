@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import typer
+from in_loop import in_loop
 from mavlink_drone import ORIGIN, SCENARIO
 
 from zsim.contract.run_messages import ControlAnswer
@@ -24,9 +25,8 @@ from zsim_bridges.mavlink.mavlink_server import (
     MavlinkOptions,
     MavlinkServer,
     Peers,
-    Served,
+    ServedVehicle,
     VehiclePort,
-    VehiclePorts,
 )
 from zsim_bridges.mavlink.mission import MissionReport
 from zsim_bridges.vehicle_links.server import set_pace
@@ -63,11 +63,11 @@ def program() -> Iterator[socket.socket]:
         yield opened
 
 
-def vehicle_ports(program: socket.socket, received: list[Received]) -> VehiclePorts:
+def served_vehicle(program: socket.socket, received: list[Received]) -> ServedVehicle:
     port = VehiclePort(("127.0.0.1", 0), program.getsockname(), None, received.append)
-    ports = VehiclePorts([port], Link(1, 1))
-    ports.open(asyncio.get_running_loop(), time.monotonic)
-    return ports
+    port.open(asyncio.get_running_loop(), time.monotonic)
+    vehicle: Any = None
+    return ServedVehicle(vehicle, [port], Link(1, 1))
 
 
 @pytest.mark.parametrize("is_taken", [True, False])
@@ -77,16 +77,14 @@ def test_a_port_that_cannot_be_had_is_refused_with_the_option_to_change(program:
         VehiclePort(local, GCS, None, print)
 
 
-def test_messages_go_together_in_datagrams_and_those_out_of_range_are_counted(program: socket.socket) -> None:
+@in_loop
+async def test_messages_go_together_in_datagrams_and_those_out_of_range_are_counted(program: socket.socket) -> None:
     many = [dialect.Statustext(6, f"{i:050}") for i in range(50)]
 
-    async def send() -> None:
-        ports = vehicle_ports(program, [])
-        ports.send([*many[:25], dialect.Heartbeat(type=300), *many[25:]])
-        assert ports.refused()["unsent"] == 1
-        ports.close(asyncio.get_running_loop())
-
-    asyncio.run(send())
+    served = served_vehicle(program, [])
+    served.send([*many[:25], dialect.Heartbeat(type=300), *many[25:]])
+    assert served.refused()["unsent"] == 1
+    served.ports[0].close(asyncio.get_running_loop())
     parser, read = Parser(), []
     while len(read) < len(many):
         data = program.recv(65_536)
@@ -95,21 +93,18 @@ def test_messages_go_together_in_datagrams_and_those_out_of_range_are_counted(pr
     assert read == many
 
 
-def test_what_a_program_sends_is_read_and_what_is_damaged_is_counted(program: socket.socket) -> None:
-    async def receive() -> None:
-        received: list[Received] = []
-        ports = vehicle_ports(program, received)
-        good = Link(255, 190).pack(dialect.Heartbeat(type=6))
-        for data in (good[:-1] + bytes([good[-1] ^ 1]), good):
-            program.sendto(data, ports._ports[0]._socket.getsockname())
-        async with asyncio.timeout(10.0):
-            while not received:
-                await asyncio.sleep(0)
-        assert received == [Received(dialect.Heartbeat(type=6), 255, 190, 0, False)]
-        assert ports.refused()["bad_crc"] == 1
-        ports.close(asyncio.get_running_loop())
-
-    asyncio.run(receive())
+@in_loop
+async def test_what_a_program_sends_is_read_and_what_is_damaged_is_counted(program: socket.socket) -> None:
+    received: list[Received] = []
+    served = served_vehicle(program, received)
+    good = Link(255, 190).pack(dialect.Heartbeat(type=6))
+    for data in (good[:-1] + bytes([good[-1] ^ 1]), good):
+        program.sendto(data, served.ports[0]._socket.getsockname())
+    while not received:
+        await asyncio.sleep(0)
+    assert received == [Received(dialect.Heartbeat(type=6), 255, 190, 0, False)]
+    assert served.refused()["bad_crc"] == 1
+    served.ports[0].close(asyncio.get_running_loop())
 
 
 def server_of(link: Any, first_system_id: int = 1, run_id: str = "r") -> MavlinkServer:
@@ -119,8 +114,8 @@ def server_of(link: Any, first_system_id: int = 1, run_id: str = "r") -> Mavlink
     return MavlinkServer(link, info, observer, lambda _: None, options)
 
 
-def close(served: Served) -> None:
-    for port in served.ports._ports:
+def close(served: ServedVehicle) -> None:
+    for port in served.ports:
         port._socket.close()
 
 
@@ -129,7 +124,7 @@ def test_vehicles_of_two_simulations_are_told_apart_by_one_ground_station() -> N
     for run_id, first in (("one", 1), ("two", 11)):
         served = server_of(SimpleNamespace(put=lambda *_: None), first, run_id)._served["drone1"]
         vehicle = served.vehicle
-        heartbeat = served.ports._link.pack(dialect.Heartbeat())
+        heartbeat = served.link.pack(dialect.Heartbeat())
         addresses.add(next(iter(Parser().feed(heartbeat))).system_id)
         assert vehicle._parameters.values["MAV_SYS_ID"] == first
         version: Any = vehicle._version()
@@ -148,7 +143,7 @@ def test_how_far_a_mission_was_flown_is_reported_to_the_world_in_order() -> None
     served = server._served["drone1"]
     reports = [MissionReport("active", 5, 3), MissionReport("aborted", 5, 3, "it left its geofence", failsafe=True)]
     served.vehicle.flight.mission.reports += reports
-    server._report_mission(served)
+    server.report_mission(served.vehicle)
     server._requests.shutdown()
     close(served)
     assert [(key, op, source) for key, op, source, *_ in asked] == [("world/control", "mission", "mavlink.main")] * 2

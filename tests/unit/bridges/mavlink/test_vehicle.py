@@ -13,7 +13,7 @@ from zsim.contract.flight_messages import Mode as ModeCommand
 from zsim.contract.flight_messages import Velocity
 from zsim.contract.run_messages import Event
 from zsim_bridges.mavlink import dialect
-from zsim_bridges.mavlink.enums import FENCE, FORCE, Cmd, MavFrame, MissionResult, Result, TypeMask
+from zsim_bridges.mavlink.dialect import FENCE, FORCE, Cmd, MavFrame, MissionResult, Result, TypeMask
 from zsim_bridges.mavlink.personality import COPTER_MODES, PX4_MODES, FlightMode
 
 NAN = math.nan
@@ -508,7 +508,7 @@ def test_events_about_the_drone_and_a_low_battery_are_texts() -> None:
         ("collision", "world", "drone2", {"other": "drone1"}),
         ("refused", "mavlink.main", "drone/drone1/cmd/mode", {"reason": "it is cold"}),
     ):
-        drone.vehicle.on_event(Event(0, 0, kind, source, subject, "", data))
+        drone.vehicle.watch.on_event(Event(0, 0, kind, source, subject, "", data))
     drone.battery_percent = 15.0
     drone.step(100)
     texts = ["Fault rotor_efficiency", "Collision with drone2", "Refused: it is cold", "Low battery: 15 %"]

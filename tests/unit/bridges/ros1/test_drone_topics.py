@@ -1,121 +1,251 @@
-"""What a cmd_vel means, by the rules of ardrone_autonomy's driver."""
+"""ardrone_autonomy's units, signs and frames by physical examples, and what a cmd_vel means by its rules."""
 
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 from refused import has_terms
+from scipy.spatial.transform import Rotation
 
-from zsim.contract import flight_messages
-from zsim_bridges.ros1 import tcpros
-from zsim_bridges.ros1.drone_topics import REPEAT_NS, DriverCommands, TiltCommand, tilt_of
+from zsim.contract import flight_messages, messages
+from zsim_bridges.ros1 import drone_topics, tcpros
+from zsim_bridges.ros1.drone_topics import REPEAT_NS, DriverCommands, DriverFrames, TiltCommand, ros1_name, tilt_of
+from zsim_bridges.vehicle_links.drone_link import OnboardState
 
-GATE_NS = 20_000_000
+T_NS, GATE_NS = 61_040_000_000, 20_000_000
+FRAMES = DriverFrames("drone1")
+ZERO, STILL = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
 Vector3 = tcpros.message_class("geometry_msgs/Vector3")
+
+
+def xyz(vector: Any) -> tuple[float, float, float]:
+    return vector.x, vector.y, vector.z
+
+
+def attitude(roll_deg: float = 0.0, pitch_deg: float = 0.0, yaw_deg: float = 0.0) -> flight_messages.Quaternion:
+    w, x, y, z = Rotation.from_euler("ZYX", [yaw_deg, pitch_deg, roll_deg], degrees=True).as_quat(scalar_first=True)
+    return float(w), float(x), float(y), float(z)
+
+
+def estimate(q: flight_messages.Quaternion) -> flight_messages.Estimate:
+    return flight_messages.Estimate(T_NS, 0, (5.0, 6.0, 7.0), ZERO, q, 0.0, (0.0,) * 36, 0.0, ZERO, {})
+
+
+def aircraft(state: Any = "hovering", **angles: float) -> OnboardState:
+    """An aircraft 1.234 m over the ground, on its way forward, left and up."""
+    own = OnboardState()
+    own.update(estimate(attitude(**angles)))
+    own.attitude = attitude()
+    own.update(messages.Sonar(T_NS, 0, T_NS, 1.234, True))
+    own.attitude = attitude(**angles)
+    own.update(messages.Imu(T_NS, 0, T_NS, (0.0, 0.0, 9.80665), (0.1, 0.2, 0.3)))
+    own.update(messages.Mag(T_NS, 0, T_NS, (3.0, 0.0, -4.0)))
+    own.update(messages.Baro(T_NS, 0, T_NS, 101_325.4, 0.0))
+    own.update(messages.Flow(T_NS, 0, T_NS, (1.0, 0.25, 0.5), 1.0))
+    own.update(flight_messages.Status(T_NS, 0, state, 87.5, False, None, 1))
+    return own
+
+
+def without_sensors() -> OnboardState:
+    own = OnboardState()
+    own.update(flight_messages.Status(0, 0, "landed", 100.0, False, None, 1))
+    return own
+
+
+def on_wire(kind: str, message: Any) -> Any:
+    """Return a message as a node reads it."""
+    return tcpros.deserialize(kind, tcpros.serialize(kind, message))
+
+
+def navdata(state: Any = "hovering", **angles: float) -> Any:
+    return on_wire("ardrone_autonomy/Navdata", drone_topics.navdata(3, aircraft(state, **angles), FRAMES))
+
+
+@pytest.mark.parametrize(("t_ns", "stamp"), [(12_340_000_005, (12, 340_000_005)), (0, (0, 0)), (-5_000_000, (0, 0))])
+def test_a_time_is_seconds_and_nanoseconds_and_none_is_before_the_start(t_ns, stamp):
+    time = drone_topics.ros_time(t_ns)
+    assert (time.sec, time.nanosec) == stamp
+
+
+def test_names_have_letters_digits_and_underscores():
+    assert ros1_name("drone-1.a") == "drone_1_a"
+
+
+def test_navdata_has_the_units_of_the_driver():
+    message = navdata()
+    assert message.batteryPercent == 87.5
+    assert message.altd == 1234  # mm
+    assert (message.vx, message.vy, message.vz) == (1000.0, 250.0, 500.0)  # mm/s, forward, left, up
+    assert (message.ax, message.ay, message.az) == (0.0, 0.0, 1.0)  # g
+    assert message.pressure == 101_325  # Pa
+    assert (message.magX, message.magY, message.magZ) == (10, 0, -13)  # 0.3 uT each
+    assert message.tm == pytest.approx(61_040_000.0)  # us
+    assert message.tags_count == 0
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (61, 40_000_000)
+    assert (message.header.frame_id, message.header.seq) == ("drone1/ardrone_base_link", 3)
+
+
+def test_right_side_down_nose_down_and_counter_clockwise_are_positive():
+    assert navdata(roll_deg=10.0).rotX == pytest.approx(10.0)
+    assert navdata(pitch_deg=7.0).rotY == pytest.approx(7.0)
+    assert Rotation.from_euler("ZYX", [0, 7.0, 0], degrees=True).apply([1.0, 0.0, 0.0])[2] < 0  # the nose
+    assert navdata(yaw_deg=90.0).rotZ == pytest.approx(90.0)
+
+
+@pytest.mark.parametrize(
+    ("state", "number"), [("landed", 2), ("flying", 3), ("hovering", 4), ("taking_off", 6), ("landing", 8), ("emergency", 0)]
+)  # fmt: skip
+def test_states_have_the_numbers_of_the_sdk(state, number):
+    assert navdata(state).state == number
+
+
+def test_an_aircraft_that_has_said_little_has_navdata_too():
+    message = on_wire("ardrone_autonomy/Navdata", drone_topics.navdata(0, without_sensors(), FRAMES))
+    assert (message.altd, message.vx, message.pressure, message.az) == (0, 0.0, 0, 0.0)
+
+
+def test_an_imu_tells_specific_force_rate_and_attitude():
+    own = aircraft(yaw_deg=90.0)
+    assert own.imu is not None
+    message = on_wire("sensor_msgs/Imu", drone_topics.imu(0, own.imu, own.attitude, FRAMES))
+    assert message.linear_acceleration.z == pytest.approx(9.80665)
+    assert xyz(message.angular_velocity) == (0.1, 0.2, 0.3)
+    assert (message.orientation.w, message.orientation.z) == pytest.approx((math.sqrt(0.5), math.sqrt(0.5)))
+
+
+@pytest.mark.parametrize(("field", "direction"), [((3.0, 0.0, -4.0), (0.6, 0.0, -0.8)), (ZERO, ZERO)])
+def test_the_magnetic_field_is_a_direction(field, direction):
+    message = drone_topics.mag(0, messages.Mag(T_NS, 0, T_NS - 5_000_000, field), FRAMES)
+    assert xyz(message.vector) == pytest.approx(direction)
+    assert message.header.stamp.nanosec == 35_000_000  # of the sample, not of its arrival
+
+
+@pytest.mark.parametrize(("fix", "status"), [(3, 0), (0, -1)])
+def test_a_fix_is_where_and_how_well(fix, status):
+    gps = messages.Gps(T_NS, 0, T_NS - 100_000_000, -34.6, -58.4, 31.0, ZERO, ZERO, 2.0, fix, 9)
+    message = on_wire("sensor_msgs/NavSatFix", drone_topics.fix(0, gps, FRAMES))
+    assert (message.latitude, message.longitude, message.altitude) == (-34.6, -58.4, 31.0)
+    assert message.status.status == status
+    assert message.position_covariance.tolist() == [4.0, 0, 0, 0, 4.0, 0, 0, 0, 4.0]
+
+
+def test_odometry_is_the_aircraft_s_own():
+    message = on_wire("nav_msgs/Odometry", drone_topics.odometry(0, aircraft(), FRAMES))
+    assert (message.header.frame_id, message.child_frame_id) == ("drone1/odom", "drone1/ardrone_base_link")
+    assert message.pose.pose.position.z == pytest.approx(1.234)
+    assert (message.twist.twist.linear.x, message.twist.twist.linear.y) == (1.0, 0.25)
+
+
+def test_ground_truth_is_in_the_world():
+    truth = flight_messages.Truth(
+        T_NS, 0, (1.0, 2.0, 3.0), (0.0, 4.0, 0.0), attitude(yaw_deg=90.0), (1.0, 0.0, 0.5), ZERO, STILL
+    )  # fmt: skip
+    message = drone_topics.ground_truth(0, truth, FRAMES)
+    assert message.header.frame_id == "world"
+    assert xyz(message.pose.pose.position) == (1.0, 2.0, 3.0)
+    assert xyz(message.twist.twist.linear) == (0.0, 4.0, 0.0)
+    assert xyz(message.twist.twist.angular) == pytest.approx((0.0, 1.0, 0.5))  # rolling about the nose, to the north
+
+
+def test_transforms_lead_from_the_world_to_where_the_estimator_believes_it_to_be():
+    own = aircraft(yaw_deg=30.0)
+    own.update(estimate(attitude(yaw_deg=30.0)))
+    to_base, to_odom = on_wire("tf2_msgs/TFMessage", drone_topics.transforms(0, own, FRAMES)).transforms
+    assert (to_odom.header.frame_id, to_odom.child_frame_id) == ("world", "drone1/odom")
+    assert (to_base.header.frame_id, to_base.child_frame_id) == ("drone1/odom", "drone1/ardrone_base_link")
+    place = [xyz(t.transform.translation) for t in (to_odom, to_base)]
+    assert np.sum(place, axis=0) == pytest.approx([5.0, 6.0, 7.0])
+
+
+def test_transforms_without_an_estimator_end_at_odom():
+    (only,) = drone_topics.transforms(0, without_sensors(), FRAMES).transforms
+    assert only.header.frame_id == "drone1/odom"
+
+
+# Commands
 
 
 def twist(*, x: float = 0.0, y: float = 0.0, z: float = 0.0, wx: float = 0.0, wy: float = 0.0, wz: float = 0.0) -> Any:
     return tcpros.message_class("geometry_msgs/Twist")(linear=Vector3(x, y, z), angular=Vector3(wx, wy, wz))
 
 
-def status(state: Any, gate: int) -> flight_messages.Status:
-    return flight_messages.Status(gate * GATE_NS, gate, state, 100.0, False, None, 1)
+class Pilot:
+    """Commands of a drone, and what they send."""
 
-
-class Drone:
-    """A pilot, and what it sends."""
-
-    def __init__(self) -> None:
+    def __init__(self, state: Any = "flying", gate: int = 0) -> None:
         self.sent: list[tuple[str, Any]] = []
-        self.pilot = DriverCommands("drone1", "ros1.main", lambda key, message: self.sent.append((key, message)))
+        self.commands = DriverCommands("drone1", "ros1.main", lambda key, message: self.sent.append((key, message)))
+        self.gates(state, gate, 1)
 
     def gates(self, state: Any, first: int, count: int) -> list[Any]:
         """Let some gates pass; return what is sent meanwhile."""
         self.sent.clear()
         for gate in range(first, first + count):
-            self.pilot.on_status(status(state, gate))
+            self.commands.on_status(flight_messages.Status(gate * GATE_NS, gate, state, 100.0, False, None, 1))
         return [message for _, message in self.sent]
 
 
-def test_forward_left_up_and_counter_clockwise_are_positive():
-    assert tilt_of(twist(x=0.1, y=0.2, z=0.3, wz=0.4)) == TiltCommand(0.1, 0.2, 0.3, 0.4, False)
-
-
-def test_shares_end_at_one():
-    assert tilt_of(twist(x=3.0, y=-7.0, z=1.5, wz=-1.5)) == TiltCommand(1.0, -1.0, 1.0, -1.0, False)
-
-
-def test_all_zero_is_hovering():
-    assert tilt_of(twist()).hover
-    assert tilt_of(twist(x=9e-7)).hover
-    assert not tilt_of(twist(x=2e-6)).hover
-
-
-@pytest.mark.parametrize("components", [{"wx": 1.0}, {"wy": -0.5}])
-def test_a_tilt_rate_of_any_size_only_switches_hovering_off(components):
-    assert tilt_of(twist(**components)) == TiltCommand(0.0, 0.0, 0.0, 0.0, False)
+@pytest.mark.parametrize(
+    ("components", "expected"),
+    [
+        ({"x": 0.1, "y": 0.2, "z": 0.3, "wz": 0.4}, TiltCommand(0.1, 0.2, 0.3, 0.4, False)),
+        ({"x": 3.0, "y": -7.0, "z": 1.5, "wz": -1.5}, TiltCommand(1.0, -1.0, 1.0, -1.0, False)),
+        ({}, TiltCommand(0.0, 0.0, 0.0, 0.0, True)),
+        ({"x": 9e-7}, TiltCommand(9e-7, 0.0, 0.0, 0.0, True)),
+        ({"x": 2e-6}, TiltCommand(2e-6, 0.0, 0.0, 0.0, False)),
+        ({"wx": 1.0}, TiltCommand(0.0, 0.0, 0.0, 0.0, False)),  # a tilt rate only switches hovering off
+        ({"wy": -0.5}, TiltCommand(0.0, 0.0, 0.0, 0.0, False)),
+    ],
+)
+def test_a_cmd_vel_is_shares_forward_left_up_and_counter_clockwise_or_hovering(components, expected):
+    assert tilt_of(twist(**components)) == expected
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("component", ["x", "y", "z", "wx", "wy", "wz"])
 def test_what_is_not_finite_is_refused(component, number):
-    drone = Drone()
-    drone.gates("flying", 0, 1)
+    pilot = Pilot()
     with pytest.raises(ValueError, match="cmd_vel"):
-        drone.pilot.on_cmd_vel(twist(**{component: number}))
-    assert drone.gates("flying", 1, 50) == []
+        pilot.commands.on_cmd_vel(twist(**{component: number}))
+    assert pilot.gates("flying", 1, 50) == []
 
 
 def test_a_cmd_vel_holds_until_the_next():
-    drone = Drone()
-    drone.gates("flying", 0, 1)
-    drone.pilot.on_cmd_vel(twist(x=0.5))
-    sent = drone.gates("flying", 1, 101)
-    every = REPEAT_NS // GATE_NS
-    assert [m.t_ns // GATE_NS for m in sent] == list(range(1, 102, every))
+    pilot = Pilot()
+    assert pilot.gates("flying", 0, 1) == []  # nobody is flown before a node wants it
+    pilot.commands.on_cmd_vel(twist(x=0.5))
+    sent = pilot.gates("flying", 1, 101)
+    assert [m.t_ns // GATE_NS for m in sent] == list(range(1, 102, REPEAT_NS // GATE_NS))
     assert {(m.forward, m.hover) for m in sent} == {(0.5, False)}
     assert [m.seq for m in sent] == list(range(len(sent)))
-    drone.pilot.on_cmd_vel(twist())
-    assert {(m.forward, m.hover) for m in drone.gates("flying", 102, 20)} == {(0.0, True)}
+    pilot.commands.on_cmd_vel(twist(x=0.7))
+    pilot.commands.on_cmd_vel(twist())
+    assert {(m.forward, m.hover) for m in pilot.gates("flying", 102, 20)} == {(0.0, True)}
 
 
-def test_nobody_is_flown_before_somebody_asks():
-    assert Drone().gates("hovering", 0, 100) == []
-
-
-def test_a_fast_node_is_heard_once_a_gate():
-    drone = Drone()
-    drone.gates("flying", 0, 1)
-    for n in range(10):
-        drone.pilot.on_cmd_vel(twist(x=n / 10))
-    assert [m.forward for m in drone.gates("flying", 1, 1)] == [0.9]
-
-
-def test_what_is_asked_on_the_way_up_is_flown_when_it_hovers():
-    drone = Drone()
-    drone.gates("taking_off", 0, 1)
-    drone.pilot.on_cmd_vel(twist(z=0.5))
-    assert drone.gates("taking_off", 1, 10) == []
-    assert [m.up for m in drone.gates("hovering", 11, 1)] == [0.5]
+def test_what_is_wanted_on_the_way_up_is_flown_when_it_hovers():
+    pilot = Pilot("taking_off")
+    pilot.commands.on_cmd_vel(twist(z=0.5))
+    assert pilot.gates("taking_off", 1, 10) == []
+    assert [m.up for m in pilot.gates("hovering", 11, 1)] == [0.5]
 
 
 @pytest.mark.parametrize("state", ["landing", "landed", "emergency"])
 def test_a_drone_that_came_down_does_not_go_on(state):
-    drone = Drone()
-    drone.gates("flying", 0, 1)
-    drone.pilot.on_cmd_vel(twist(x=1.0))
-    assert drone.gates("flying", 1, 1) != []
-    assert drone.gates(state, 2, 10) == []
-    drone.pilot.on_cmd_vel(twist(x=1.0))
-    assert drone.gates("hovering", 12, 10) == []
+    pilot = Pilot()
+    pilot.commands.on_cmd_vel(twist(x=1.0))
+    assert pilot.gates("flying", 1, 1) != []
+    assert pilot.gates(state, 2, 10) == []
+    pilot.commands.on_cmd_vel(twist(x=1.0))
+    assert pilot.gates("hovering", 12, 10) == []
 
 
-def test_modes_are_asked_for_under_our_name():
-    drone = Drone()
-    drone.gates("landed", 7, 1)
-    drone.pilot.take_off()
-    drone.pilot.land()
-    assert [(key, m.mode, m.seq, m.t_ns, m.source) for key, m in drone.sent] == [
+def test_modes_are_sent_under_our_name():
+    pilot = Pilot("landed", 7)
+    pilot.commands.send_mode("takeoff")
+    pilot.commands.send_mode("land")
+    assert [(key, m.mode, m.seq, m.t_ns, m.source) for key, m in pilot.sent] == [
         ("drone/drone1/cmd/mode", "takeoff", 0, 7 * GATE_NS, "ros1.main"),
         ("drone/drone1/cmd/mode", "land", 1, 7 * GATE_NS, "ros1.main"),
     ]
@@ -123,16 +253,12 @@ def test_modes_are_asked_for_under_our_name():
 
 @pytest.mark.parametrize(("state", "mode"), [("flying", "emergency"), ("landed", "emergency"), ("emergency", "reset")])
 def test_reset_toggles_the_emergency(state, mode):
-    drone = Drone()
-    drone.gates(state, 0, 1)
-    drone.pilot.reset()
-    assert drone.sent[-1][1].mode == mode
+    pilot = Pilot(state)
+    pilot.commands.reset()
+    assert pilot.sent[-1][1].mode == mode
 
 
 def test_only_a_drone_that_stands_is_trimmed():
-    drone = Drone()
-    assert "not there" in (drone.pilot.trim_refusal() or "")
-    drone.gates("flying", 0, 1)
-    assert has_terms(drone.pilot.trim_refusal() or "", "landed")
-    drone.gates("landed", 1, 1)
-    assert drone.pilot.trim_refusal() is None
+    assert "not there" in (DriverCommands("drone1", "ros1.main", lambda *_: None).trim_refusal() or "")
+    assert has_terms(Pilot("flying").commands.trim_refusal() or "", "landed")
+    assert Pilot("landed").commands.trim_refusal() is None

@@ -7,13 +7,14 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from in_loop import in_loop
 from refused import has_terms
 from ros1_master import Master
 
 from zsim.errors import RunError
 from zsim_bridges.ros1 import master_api, tcpros
-from zsim_bridges.ros1.master_api import master_address, own_address
-from zsim_bridges.ros1.node import Ros1Node
+from zsim_bridges.ros1.master_api import own_address
+from zsim_bridges.ros1.node import PublishedTopic, Ros1Node
 
 PATIENCE_S = 20.0
 TWIST, EMPTY = "geometry_msgs/Twist", "std_msgs/Empty"
@@ -33,6 +34,11 @@ class Graph:
 
     def node(self, name: str) -> Ros1Node:
         return Ros1Node(name, self.master.uri, "127.0.0.1", self.lines.append)
+
+    def publishing(self) -> tuple[Ros1Node, PublishedTopic]:
+        """Return a node `/a` that publishes `/t`."""
+        node = self.node("/a")
+        return node, node.publish("/t", TWIST, 10)
 
     def restart(self) -> None:
         """Let the master forget everything."""
@@ -89,20 +95,18 @@ def subscriber(topic: str, md5: str = "*") -> dict[str, str]:
     return {"callerid": "/tester", "topic": topic, "md5sum": md5, "type": TWIST, "tcp_nodelay": "1"}
 
 
-def test_what_one_publishes_the_other_takes(graph):
-    async def run() -> list[float]:
-        received: list[float] = []
-        a, b = graph.node("/a"), graph.node("/b")
-        b.subscribe("/t", TWIST, lambda message: received.append(message.linear.x))
-        topic = a.publish("/t", TWIST, 10)
-        async with b.running(), a.running():
-            await until(lambda: len(topic.links) == 1)
-            for n in range(5):
-                topic.publish(lambda _, n=n: twist(float(n)))
-            await until(lambda: len(received) == 5)
-        return received
-
-    assert asyncio.run(run()) == [0.0, 1.0, 2.0, 3.0, 4.0]
+@in_loop
+async def test_what_one_publishes_the_other_takes(graph) -> None:
+    received: list[float] = []
+    a, b = graph.node("/a"), graph.node("/b")
+    b.subscribe("/t", TWIST, lambda message: received.append(message.linear.x))
+    topic = a.publish("/t", TWIST, 10)
+    async with b.running(), a.running():
+        await until(lambda: len(topic.links) == 1)
+        for n in range(5):
+            topic.publish(lambda _, n=n: twist(float(n)))
+        await until(lambda: len(received) == 5)
+    assert received == [0.0, 1.0, 2.0, 3.0, 4.0]
     assert graph.master.graph.publishers["/t"] == []
     assert graph.master.graph.subscribers["/t"] == []
 
@@ -113,33 +117,26 @@ def test_nothing_is_made_where_nobody_listens(graph):
     assert topic.sent == 0
 
 
-def test_sequence_numbers_count_what_was_published(graph):
-    async def run() -> list[int]:
-        asked: list[int] = []
-        a = graph.node("/a")
-        topic = a.publish("/t", TWIST, 10)
-        async with a.running():
-            _, writer = await connect(await graph.port("/t"), subscriber("/t"))
-            await until(lambda: len(topic.links) == 1)
-            for _ in range(3):
-                topic.publish(lambda seq: asked.append(seq) or twist(0.0))
-            writer.close()
-        return asked
-
-    assert asyncio.run(run()) == [0, 1, 2]
+@in_loop
+async def test_sequence_numbers_count_what_was_published(graph) -> None:
+    asked: list[int] = []
+    a, topic = graph.publishing()
+    async with a.running():
+        _, writer = await connect(await graph.port("/t"), subscriber("/t"))
+        await until(lambda: len(topic.links) == 1)
+        for _ in range(3):
+            topic.publish(lambda seq: asked.append(seq) or twist(0.0))
+        writer.close()
+    assert asked == [0, 1, 2]
 
 
-def test_a_subscriber_is_told_type_and_definition(graph):
-    async def run() -> dict[str, str]:
-        a = graph.node("/a")
-        a.publish("/t", TWIST, 10)
-        async with a.running():
-            reader, writer = await connect(await graph.port("/t"), subscriber("/t"))
-            header = await tcpros.read_header(reader)
-            writer.close()
-            return header
-
-    header = asyncio.run(run())
+@in_loop
+async def test_a_subscriber_is_told_type_and_definition(graph) -> None:
+    a, _ = graph.publishing()
+    async with a.running():
+        reader, writer = await connect(await graph.port("/t"), subscriber("/t"))
+        header = await tcpros.read_header(reader)
+        writer.close()
     assert header["type"] == TWIST
     assert header["md5sum"] == "9f195f881246fdfa2798d1d3eebca84a"
     assert header["callerid"] == "/a"
@@ -156,99 +153,88 @@ def test_a_subscriber_is_told_type_and_definition(graph):
         ({"service": "/none", "callerid": "/tester", "md5sum": "*"}, ("service", "[/none]")),
     ],
 )
-def test_who_wants_something_else_is_refused_as_ros_does(graph, header, terms):
-    async def run() -> str:
-        a = graph.node("/a")
-        a.publish("/t", TWIST, 10)
-        async with a.running():
-            reader, writer = await connect(await graph.port("/t"), header)
-            answer = await tcpros.read_header(reader)
-            assert await reader.read() == b""  # and hung up
-            writer.close()
-            return answer["error"]
-
-    assert has_terms(asyncio.run(run()), *terms)
+@in_loop
+async def test_who_wants_something_else_is_refused_as_ros_does(graph, header, terms) -> None:
+    a, _ = graph.publishing()
+    async with a.running():
+        reader, writer = await connect(await graph.port("/t"), header)
+        answer = await tcpros.read_header(reader)
+        assert await reader.read() == b""  # and hung up
+        writer.close()
+    assert has_terms(answer["error"], *terms)
 
 
 @pytest.mark.parametrize("garbage", [b"GET / HTTP/1.1\r\n\r\n", b"\xff" * 64, b"\x04\0\0\0\x00\x00\x00\x00", b"\x00"])
-def test_garbage_ends_its_own_connection_only(graph, garbage):
-    async def run() -> None:
-        a = graph.node("/a")
-        topic = a.publish("/t", TWIST, 10)
-        async with a.running():
-            port = await graph.port("/t")
-            reader, writer = await connect(port, subscriber("/t"))
-            await tcpros.read_header(reader)
-            other, nonsense = await asyncio.open_connection("127.0.0.1", port)
-            nonsense.write(garbage)
-            nonsense.write_eof()
-            await other.read()
-            nonsense.close()
-            topic.publish(lambda _: twist(7.0))
-            assert tcpros.deserialize(TWIST, await tcpros.read_frame(reader)).linear.x == 7.0
-            writer.close()
-
-    asyncio.run(run())
+@in_loop
+async def test_garbage_ends_its_own_connection_only(graph, garbage) -> None:
+    a, topic = graph.publishing()
+    async with a.running():
+        port = await graph.port("/t")
+        reader, writer = await connect(port, subscriber("/t"))
+        await tcpros.read_header(reader)
+        other, nonsense = await asyncio.open_connection("127.0.0.1", port)
+        nonsense.write(garbage)
+        nonsense.write_eof()
+        await other.read()
+        nonsense.close()
+        topic.publish(lambda _: twist(7.0))
+        assert tcpros.deserialize(TWIST, await tcpros.read_frame(reader)).linear.x == 7.0
+        writer.close()
 
 
-def test_a_subscriber_that_does_not_read_loses_the_oldest_and_holds_up_nobody(graph):
+@in_loop
+async def test_a_subscriber_that_does_not_read_loses_the_oldest_and_holds_up_nobody(graph) -> None:
     text, string = "x" * 100_000, tcpros.message_class("std_msgs/String")
-
-    async def run() -> None:
-        a = graph.node("/a")
-        topic = a.publish("/t", "std_msgs/String", 5)
-        async with a.running():
-            port = await graph.port("/t")
-            lazy = socket.create_connection(("127.0.0.1", port))
-            lazy.sendall(tcpros.encode_header(subscriber("/t")))
-            reader, writer = await connect(port, subscriber("/t"))
-            await tcpros.read_header(reader)
-            await until(lambda: len(topic.links) == 2)
-            for n in range(200):
-                topic.publish(lambda _, n=n: string(data=f"{n:04d}{text}"))
-                assert (await tcpros.read_frame(reader))[4:8] == b"%04d" % n
-            stuck = max(topic.links, key=lambda outlet: outlet.lost)
-            assert stuck.lost > 0
-            assert sum(outlet.lost for outlet in topic.links) == stuck.lost  # the other lost nothing
-            lazy.close()
-            await until(lambda: len(topic.links) == 1)
-            writer.close()
-
-    asyncio.run(run())
+    a = graph.node("/a")
+    topic = a.publish("/t", "std_msgs/String", 5)
+    async with a.running():
+        port = await graph.port("/t")
+        lazy = socket.create_connection(("127.0.0.1", port))
+        lazy.sendall(tcpros.encode_header(subscriber("/t")))
+        reader, writer = await connect(port, subscriber("/t"))
+        await tcpros.read_header(reader)
+        await until(lambda: len(topic.links) == 2)
+        for n in range(200):
+            topic.publish(lambda _, n=n: string(data=f"{n:04d}{text}"))
+            assert (await tcpros.read_frame(reader))[4:8] == b"%04d" % n
+        stuck = max(topic.links, key=lambda outlet: outlet.lost)
+        assert stuck.lost > 0
+        assert sum(outlet.lost for outlet in topic.links) == stuck.lost  # the other lost nothing
+        lazy.close()
+        await until(lambda: len(topic.links) == 1)
+        writer.close()
 
 
-def test_a_publisher_that_sends_garbage_is_told_of_once_and_heard_again(graph):
-    async def run() -> list[Any]:
-        received: list[Any] = []
+@in_loop
+async def test_a_publisher_that_sends_garbage_is_told_of_once_and_heard_again(graph) -> None:
+    received: list[Any] = []
 
-        def take(message: Any) -> None:
-            if message.linear.x < 0:
-                raise ValueError("negative")
-            received.append(message.linear.x)
+    def take(message: Any) -> None:
+        if message.linear.x < 0:
+            raise ValueError("negative")
+        received.append(message.linear.x)
 
-        node, server = graph.node("/b"), None
-        node.subscribe("/t", TWIST, take)
+    node, server = graph.node("/b"), None
+    node.subscribe("/t", TWIST, take)
 
-        async def publish(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            await tcpros.read_header(reader)
-            writer.write(tcpros.encode_header(tcpros.publisher_header(tcpros.topic_type_of("/t", TWIST), "/bad")))
-            negative, good = (tcpros.serialize(TWIST, twist(x)) for x in (-1.0, 5.0))
-            for payload in (b"short", negative, b"x" * 49, good):
-                writer.write(tcpros.frame(payload))
-            await writer.drain()
-            await reader.read()
-            writer.close()
+    async def publish(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await tcpros.read_header(reader)
+        writer.write(tcpros.encode_header(tcpros.publisher_header(tcpros.topic_type_of("/t", TWIST), "/bad")))
+        negative, good = (tcpros.serialize(TWIST, twist(x)) for x in (-1.0, 5.0))
+        for payload in (b"short", negative, b"x" * 49, good):
+            writer.write(tcpros.frame(payload))
+        await writer.drain()
+        await reader.read()
+        writer.close()
 
-        server = await asyncio.start_server(publish, "127.0.0.1", 0)
-        port = server.sockets[0].getsockname()[1]
-        with Slave(port) as uri:
-            graph.master.graph.publishers["/t"].append(uri)
-            async with node.running():
-                await until(lambda: received == [5.0])
-        server.close()
-        return graph.lines
-
-    lines = [line for line in asyncio.run(run()) if "is refused" in line]
+    server = await asyncio.start_server(publish, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    with Slave(port) as uri:
+        graph.master.graph.publishers["/t"].append(uri)
+        async with node.running():
+            await until(lambda: received == [5.0])
+    server.close()
+    lines = [line for line in graph.lines if "is refused" in line]
     assert len(lines) == 1
     assert "/bad" in lines[0]
 
@@ -264,114 +250,102 @@ class Slave(Master):
         return self.uri
 
 
-def test_another_type_under_the_same_name_is_refused_and_told(graph):
-    async def run() -> None:
-        a, b = graph.node("/a"), graph.node("/b")
-        a.publish("/t", EMPTY, 10)
-        b.subscribe("/t", TWIST, lambda _: pytest.fail("taken"))
-        async with a.running(), b.running():
-            await until(lambda: graph.has_line("/t: what"))
-
-    asyncio.run(run())
+@in_loop
+async def test_another_type_under_the_same_name_is_refused_and_told(graph) -> None:
+    a, b = graph.node("/a"), graph.node("/b")
+    a.publish("/t", EMPTY, 10)
+    b.subscribe("/t", TWIST, lambda _: pytest.fail("taken"))
+    async with a.running(), b.running():
+        await until(lambda: graph.has_line("/t: what"))
     assert graph.has_line("datatype/md5sum")
 
 
-def test_a_node_waits_for_its_master_and_registers_again_with_one_that_forgot(graph):
-    async def run() -> None:
-        node = graph.node("/a")
-        node.publish("/t", TWIST, 10)
-        graph.master.stop()
-        async with node.running():
-            await until(lambda: graph.has_line("waiting for a ROS master"))
-            graph.master = Master(graph.master.port)
-            await until(lambda: "/a" in graph.master.graph.nodes)
-            await until(lambda: graph.has_line("/a: registered with"))
-            graph.restart()
-            await until(lambda: graph.has_line("/a: registered again"))
-            assert len(graph.master.graph.publishers["/t"]) == 1
-
-    asyncio.run(run())
+@in_loop
+async def test_a_node_waits_for_its_master_and_registers_again_with_one_that_forgot(graph) -> None:
+    node = graph.node("/a")
+    node.publish("/t", TWIST, 10)
+    graph.master.stop()
+    async with node.running():
+        await until(lambda: graph.has_line("waiting for a ROS master"))
+        graph.master = Master(graph.master.port)
+        await until(lambda: "/a" in graph.master.graph.nodes)
+        await until(lambda: graph.has_line("/a: registered with"))
+        graph.restart()
+        await until(lambda: graph.has_line("/a: registered again"))
+        assert len(graph.master.graph.publishers["/t"]) == 1
 
 
-def test_connections_outlive_a_master(graph):
-    async def run() -> None:
-        received: list[float] = []
-        a, b = graph.node("/a"), graph.node("/b")
-        topic = a.publish("/t", TWIST, 10)
-        b.subscribe("/t", TWIST, lambda message: received.append(message.linear.x))
-        async with a.running(), b.running():
-            await until(lambda: len(topic.links) == 1)
-            graph.restart()
-            await until(lambda: sum("registered again" in line for line in graph.lines) == 2)
-            topic.publish(lambda _: twist(1.0))
-            await until(lambda: received == [1.0])
-            assert len(topic.links) == 1
-
-    asyncio.run(run())
+@in_loop
+async def test_connections_outlive_a_master(graph) -> None:
+    received: list[float] = []
+    a, b = graph.node("/a"), graph.node("/b")
+    topic = a.publish("/t", TWIST, 10)
+    b.subscribe("/t", TWIST, lambda message: received.append(message.linear.x))
+    async with a.running(), b.running():
+        await until(lambda: len(topic.links) == 1)
+        graph.restart()
+        await until(lambda: sum("registered again" in line for line in graph.lines) == 2)
+        topic.publish(lambda _: twist(1.0))
+        await until(lambda: received == [1.0])
+        assert len(topic.links) == 1
 
 
-def test_a_publisher_that_went_and_came_back_is_heard_again(graph):
-    async def run() -> None:
-        received: list[float] = []
-        b = graph.node("/b")
-        b.subscribe("/t", TWIST, lambda message: received.append(message.linear.x))
-        async with b.running():
-            for n in range(2):
-                a = graph.node("/a")
-                topic = a.publish("/t", TWIST, 10)
-                async with a.running():
-                    await until(lambda topic=topic: len(topic.links) == 1)
-                    topic.publish(lambda _, n=n: twist(float(n)))
-                    await until(lambda n=n: len(received) == n + 1)
-
-    asyncio.run(run())
+@in_loop
+async def test_a_publisher_that_went_and_came_back_is_heard_again(graph) -> None:
+    received: list[float] = []
+    b = graph.node("/b")
+    b.subscribe("/t", TWIST, lambda message: received.append(message.linear.x))
+    async with b.running():
+        for n in range(2):
+            a = graph.node("/a")
+            topic = a.publish("/t", TWIST, 10)
+            async with a.running():
+                await until(lambda topic=topic: len(topic.links) == 1)
+                topic.publish(lambda _, n=n: twist(float(n)))
+                await until(lambda n=n: len(received) == n + 1)
 
 
-def test_what_a_node_said_just_before_it_left_is_heard(graph):
+@in_loop
+async def test_what_a_node_said_just_before_it_left_is_heard(graph) -> None:
     """A node that publishes a landing and ends has left the graph before its bytes have been read."""
+    received: list[float] = []
+    node = graph.node("/b")
+    node.subscribe("/t", TWIST, lambda message: received.append(message.linear.x))
+    left = asyncio.Event()
 
-    async def run() -> None:
-        received: list[float] = []
-        node = graph.node("/b")
-        node.subscribe("/t", TWIST, lambda message: received.append(message.linear.x))
-        left = asyncio.Event()
+    async def publish(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await tcpros.read_header(reader)
+        writer.write(tcpros.encode_header(tcpros.publisher_header(tcpros.topic_type_of("/t", TWIST), "/a")))
+        await left.wait()
+        writer.write(tcpros.frame(tcpros.serialize(TWIST, twist(3.0))))
+        writer.close()
 
-        async def publish(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            await tcpros.read_header(reader)
-            writer.write(tcpros.encode_header(tcpros.publisher_header(tcpros.topic_type_of("/t", TWIST), "/a")))
-            await left.wait()
-            writer.write(tcpros.frame(tcpros.serialize(TWIST, twist(3.0))))
-            writer.close()
-
-        server = await asyncio.start_server(publish, "127.0.0.1", 0)
-        with Slave(server.sockets[0].getsockname()[1]) as uri:
-            graph.master.graph.publishers["/t"].append(uri)
-            async with node.running():
-                subscription = node._subscribed["/t"]
-                await until(lambda: subscription.connected != {})
-                await call(graph.master.graph.nodes["/b"], "publisherUpdate", "/t", [])
-                left.set()
-                await until(lambda: received == [3.0])
-                await until(lambda: subscription._tasks == {})
-        server.close()
-
-    asyncio.run(run())
-
-
-def test_a_node_that_ends_while_it_registers_leaves_nothing_behind(graph):
-    async def run() -> None:
-        node = graph.node("/a")
-        topics = [f"/t{n}" for n in range(50)]
-        for topic in topics:
-            node.publish(topic, TWIST, 10)
+    server = await asyncio.start_server(publish, "127.0.0.1", 0)
+    with Slave(server.sockets[0].getsockname()[1]) as uri:
+        graph.master.graph.publishers["/t"].append(uri)
         async with node.running():
-            await until(lambda: graph.master.graph.publishers[topics[0]] != [])
-        assert [topic for topic in topics if graph.master.graph.publishers[topic]] == []
+            subscription = node.subscribed["/t"]
+            await until(lambda: subscription.connected != {})
+            await call(graph.master.graph.nodes["/b"], "publisherUpdate", "/t", [])
+            left.set()
+            await until(lambda: received == [3.0])
+            await until(lambda: subscription._tasks == {})
+    server.close()
 
-    asyncio.run(run())
+
+@in_loop
+async def test_a_node_that_ends_while_it_registers_leaves_nothing_behind(graph) -> None:
+    node = graph.node("/a")
+    topics = [f"/t{n}" for n in range(50)]
+    for topic in topics:
+        node.publish(topic, TWIST, 10)
+    async with node.running():
+        await until(lambda: graph.master.graph.publishers[topics[0]] != [])
+    assert [topic for topic in topics if graph.master.graph.publishers[topic]] == []
 
 
-def test_a_service_answers_and_refuses(graph):
+@in_loop
+async def test_a_service_answers_and_refuses(graph) -> None:
     reasons = iter([None, "the drone flies"])
 
     async def ask(port: int, request: bytes = b"") -> tuple[int, bytes]:
@@ -384,72 +358,64 @@ def test_a_service_answers_and_refuses(graph):
         writer.close()
         return ok, answer
 
-    async def run() -> None:
-        a = graph.node("/a")
-        a.serve("/s", lambda: next(reasons))
-        async with a.running():
-            await until(lambda: "/s" in graph.master.graph.services)
-            port = int(graph.master.graph.services["/s"].rsplit(":", 1)[1])
-            assert await ask(port, b"too much") == (0, b"the request has 8 bytes; must have none")
-            assert await ask(port) == (1, b"")
-            assert await ask(port) == (0, b"the drone flies")
-
-    asyncio.run(run())
+    a = graph.node("/a")
+    a.serve("/s", lambda: next(reasons))
+    async with a.running():
+        await until(lambda: "/s" in graph.master.graph.services)
+        port = int(graph.master.graph.services["/s"].rsplit(":", 1)[1])
+        assert await ask(port, b"too much") == (0, b"the request has 8 bytes; must have none")
+        assert await ask(port) == (1, b"")
+        assert await ask(port) == (0, b"the drone flies")
     assert graph.master.graph.services == {}
 
 
-def test_a_service_can_be_asked_for_its_type_and_asked_again_and_again(graph):
-    async def run() -> None:
-        a = graph.node("/a")
-        a.serve("/s", lambda: None)
-        async with a.running():
-            await until(lambda: "/s" in graph.master.graph.services)
-            port = int(graph.master.graph.services["/s"].rsplit(":", 1)[1])
-            asked = {"callerid": "/tester", "service": "/s", "md5sum": "*"}
-            reader, writer = await connect(port, asked | {"probe": "1"})
-            assert (await tcpros.read_header(reader))["request_type"] == "std_srvs/EmptyRequest"
-            assert await reader.read() == b""
-            writer.close()
-            reader, writer = await connect(port, asked | {"persistent": "1"})
-            await tcpros.read_header(reader)
-            for _ in range(3):
-                writer.write(tcpros.frame(b""))
-                assert await reader.readexactly(5) == b"\x01\0\0\0\0"
-            writer.close()
-
-    asyncio.run(run())
+@in_loop
+async def test_a_service_can_be_asked_for_its_type_and_asked_again_and_again(graph) -> None:
+    a = graph.node("/a")
+    a.serve("/s", lambda: None)
+    async with a.running():
+        await until(lambda: "/s" in graph.master.graph.services)
+        port = int(graph.master.graph.services["/s"].rsplit(":", 1)[1])
+        asked = {"callerid": "/tester", "service": "/s", "md5sum": "*"}
+        reader, writer = await connect(port, asked | {"probe": "1"})
+        assert (await tcpros.read_header(reader))["request_type"] == "std_srvs/EmptyRequest"
+        assert await reader.read() == b""
+        writer.close()
+        reader, writer = await connect(port, asked | {"persistent": "1"})
+        await tcpros.read_header(reader)
+        for _ in range(3):
+            writer.write(tcpros.frame(b""))
+            assert await reader.readexactly(5) == b"\x01\0\0\0\0"
+        writer.close()
 
 
-def test_the_slave_api_tells_what_ros_s_tools_ask(graph):
-    async def run() -> None:
-        a = graph.node("/a")
-        topic = a.publish("/t", TWIST, 10)
-        a.subscribe("/in", EMPTY, lambda _: None)
-        async with a.running():
-            uri = await graph.uri("/t")
-            reader, writer = await connect(await graph.port("/t"), subscriber("/t"))
-            await tcpros.read_header(reader)
-            topic.publish(lambda _: twist(1.0))
-            await tcpros.read_frame(reader)
-            await until(lambda: topic.links[0].sent > 0)
-            assert (await call(uri, "getPublications"))[2] == [["/t", TWIST]]
-            assert (await call(uri, "getSubscriptions"))[2] == [["/in", EMPTY]]
-            assert (await call(uri, "getBusInfo"))[2] == [[0, "/tester", "o", "TCPROS", "/t", True]]
-            assert (await call(uri, "getBusStats"))[2] == [[["/t", 52, [[0, 52, 1, True]]]], [], []]
-            assert (await call(uri, "getMasterUri"))[2] == graph.master.uri
-            assert (await call(uri, "getName"))[2] == "/a"
-            assert (await call(uri, "getPid"))[0] == 1
-            assert (await call(uri, "requestTopic", "/none", [["TCPROS"]]))[0] == -1
-            assert (await call(uri, "requestTopic", "/t", [["UDPROS"]]))[0] == 0
-            assert (await call(uri, "paramUpdate", "/use_sim_time", True))[0] == -1
-            assert (await call(uri, "publisherUpdate", "/none", []))[0] == 1
-            with pytest.raises(xmlrpc.client.Fault):
-                await call(uri, "requestTopic")
-            with pytest.raises(xmlrpc.client.Fault):
-                await call(uri, "_update", "/in", [])
-            writer.close()
-
-    asyncio.run(run())
+@in_loop
+async def test_the_slave_api_tells_what_ros_s_tools_ask(graph) -> None:
+    a, topic = graph.publishing()
+    a.subscribe("/in", EMPTY, lambda _: None)
+    async with a.running():
+        uri = await graph.uri("/t")
+        reader, writer = await connect(await graph.port("/t"), subscriber("/t"))
+        await tcpros.read_header(reader)
+        topic.publish(lambda _: twist(1.0))
+        await tcpros.read_frame(reader)
+        await until(lambda: topic.links[0].sent > 0)
+        assert (await call(uri, "getPublications"))[2] == [["/t", TWIST]]
+        assert (await call(uri, "getSubscriptions"))[2] == [["/in", EMPTY]]
+        assert (await call(uri, "getBusInfo"))[2] == [[0, "/tester", "o", "TCPROS", "/t", True]]
+        assert (await call(uri, "getBusStats"))[2] == [[["/t", 52, [[0, 52, 1, True]]]], [], []]
+        assert (await call(uri, "getMasterUri"))[2] == graph.master.uri
+        assert (await call(uri, "getName"))[2] == "/a"
+        assert (await call(uri, "getPid"))[0] == 1
+        assert (await call(uri, "requestTopic", "/none", [["TCPROS"]]))[0] == -1
+        assert (await call(uri, "requestTopic", "/t", [["UDPROS"]]))[0] == 0
+        assert (await call(uri, "paramUpdate", "/use_sim_time", True))[0] == -1
+        assert (await call(uri, "publisherUpdate", "/none", []))[0] == 1
+        with pytest.raises(xmlrpc.client.Fault):
+            await call(uri, "requestTopic")
+        with pytest.raises(xmlrpc.client.Fault):
+            await call(uri, "_update", "/in", [])
+        writer.close()
 
 
 @pytest.mark.parametrize(
@@ -463,51 +429,42 @@ def test_the_slave_api_tells_what_ros_s_tools_ask(graph):
         b"GET / HTTP/1.1\r\n\r\n",
     ],
 )
-def test_garbage_at_the_slave_api_is_answered_or_not_and_that_is_all(graph, garbage, capfd):
-    async def run() -> None:
-        a = graph.node("/a")
-        a.publish("/t", TWIST, 10)
-        async with a.running():
-            uri = await graph.uri("/t")
-            reader, writer = await asyncio.open_connection("127.0.0.1", int(uri.strip("/").rsplit(":", 1)[1]))
-            writer.write(garbage)
-            writer.write_eof()
-            await reader.read()
-            writer.close()
-            assert (await call(uri, "getName"))[2] == "/a"
-
-    asyncio.run(run())
+@in_loop
+async def test_garbage_at_the_slave_api_is_answered_or_not_and_that_is_all(graph, garbage, capfd) -> None:
+    a, _ = graph.publishing()
+    async with a.running():
+        uri = await graph.uri("/t")
+        reader, writer = await asyncio.open_connection("127.0.0.1", int(uri.strip("/").rsplit(":", 1)[1]))
+        writer.write(garbage)
+        writer.write_eof()
+        await reader.read()
+        writer.close()
+        assert (await call(uri, "getName"))[2] == "/a"
     assert capfd.readouterr().err == ""
 
 
-def test_a_node_that_is_asked_to_stop_says_by_whom(graph):
-    async def run() -> str:
-        a = graph.node("/a")
-        a.publish("/t", TWIST, 10)
-        async with a.running():
-            await call(await graph.uri("/t"), "shutdown", "user request")
-            return a.shutdown_reason
-
-    assert has_terms(asyncio.run(run()), "/tester", "user request")
+@in_loop
+async def test_a_node_that_is_asked_to_stop_says_by_whom(graph) -> None:
+    a, _ = graph.publishing()
+    async with a.running():
+        await call(await graph.uri("/t"), "shutdown", "user request")
+    assert has_terms(a.shutdown_reason, "/tester", "user request")
 
 
-def test_a_node_whose_name_is_taken_ends_and_leaves_the_other_registered(graph):
-    async def run() -> str:
-        a = graph.node("/a")
-        a.publish("/t", TWIST, 10)
-        async with a.running():
-            await until(lambda: "/a" in graph.master.graph.nodes)
-            graph.master.graph.nodes["/a"] = "http://127.0.0.1:1/"
-            await until(lambda: a.shutdown_reason != "")
-        return a.shutdown_reason
-
-    assert has_terms(asyncio.run(run()), "another", "http://127.0.0.1:1/")
+@in_loop
+async def test_a_node_whose_name_is_taken_ends_and_leaves_the_other_registered(graph) -> None:
+    a, _ = graph.publishing()
+    async with a.running():
+        await until(lambda: "/a" in graph.master.graph.nodes)
+        graph.master.graph.nodes["/a"] = "http://127.0.0.1:1/"
+        await until(lambda: a.shutdown_reason != "")
+    assert has_terms(a.shutdown_reason, "another", "http://127.0.0.1:1/")
 
 
 @pytest.mark.parametrize("uri", ["127.0.0.1:11311", "https://x:1", "http://", "http://x:99999", ""])
 def test_what_is_no_master_is_refused(uri):
     with pytest.raises(RunError, match=repr(uri)):
-        master_address(uri)
+        own_address(uri)
 
 
 def test_we_are_reached_as_ros_s_own_variables_say_or_from_where_we_reach_the_master():

@@ -1,40 +1,56 @@
-"""The bridge's parts between the keys and the topics: what is published from what, and what is let go."""
+"""The bridge between the keys and the topics: what is published from what, which pictures are read, what is let go."""
 
 import asyncio
 import threading
-from typing import Any, cast
+from typing import Any
 
+import numpy as np
 import pytest
 from fake_link import FakeLink
 from ros1_drone import GATE_NS, Drone, Subscriber, scenario, status
+from synthetic_pictures import AHEAD, FRONT_P_BK, NO_JPEG, image, info, jpeg
 
-from zsim.contract import flight_messages, keys, messages
+from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.framing import GateMessages, encode_batch, key_table
 from zsim.errors import RunError, SessionError
 from zsim.runtime.health import HealthMeter
 from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
-from zsim.transport.session import ReceivedSample
-from zsim_bridges.intake import TrafficIntake
+from zsim.transport.session import RawSample, ReceivedSample
 from zsim_bridges.ros1 import tcpros
 from zsim_bridges.ros1.node import Ros1Node
-from zsim_bridges.ros1.ros1_bridge import Ros1Bridge, check_names
+from zsim_bridges.ros1.ros1_bridge import Ros1Bridge
+from zsim_bridges.vehicle_links.server import WAITING_MAX, PictureIntake, TrafficIntake
 
-LEVEL, ZERO, STILL = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
+ZERO, STILL = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
+OWN, ACTIVE = "/quad_1/ardrone/{}/{}", "/quad_1/ardrone/{}"
+IMAGE, INFO = "image_raw/compressed", "camera_info"
+FRONT = keys.camera("quad-1", "front")
 
 
-def truth(t_ns: int) -> flight_messages.Truth:
-    return flight_messages.Truth(
-        t_ns, 0, (1e3, 2e3, 3e3), (4.0, 5.0, 6.0), (0.0, 1.0, 0.0, 0.0), (7.0, 8.0, 9.0), ZERO, STILL
-    )
+class Bench:
+    """A bridge without a graph."""
+
+    def __init__(self, *drones: str) -> None:
+        drone_infos = tuple(messages.DroneInfo(name, "ardrone2") for name in drones or ("quad-1",))
+        about = messages.Info(
+            0, 0, 1, "run", "zsim", "lockstep", 0.0, GATE_NS, 5_000_000, GATE_NS, 1, messages.Origin(0.0, 0.0, 0.0),
+            drone_infos, (), scenario_file.to_text(scenario()), "", "", "",
+        )  # fmt: skip
+        link: Any = FakeLink()
+        self.lines: list[str] = []
+        self.observer = Participant(link, about, "ros1.main")
+        self.node = Ros1Node("/zsim", "http://127.0.0.1:1", "127.0.0.1", self.lines.append)
+        self.bridge = Ros1Bridge(link, about, self.observer, self.node, self.lines.append)
 
 
 def test_the_namespace_is_the_drone_s_name_as_ros_can_write_it():
-    assert "/quad_1/ardrone/navdata" in Drone().node._published
-    assert set(Drone().node._subscribed) == {
+    node = Drone().node
+    assert "/quad_1/ardrone/navdata" in node.published
+    assert set(node.subscribed) == {
         f"/quad_1/{topic}" for topic in ("cmd_vel", "ardrone/takeoff", "ardrone/land", "ardrone/reset")
     }
-    assert set(Drone().node._services) == {"/quad_1/ardrone/flattrim", "/quad_1/ardrone/togglecam"}
+    assert set(node.services) == {"/quad_1/ardrone/flattrim", "/quad_1/ardrone/togglecam"}
 
 
 def test_a_gate_is_navdata_odometry_and_transforms():
@@ -48,33 +64,34 @@ def test_a_gate_is_navdata_odometry_and_transforms():
 
 def test_truth_is_on_ground_truth_alone():
     """Whatever the truth says, nothing else that is published changes with it."""
-    topics = ["navdata", "odometry", "imu", "mag"]
-    ros_messages: list[list[Any]] = []
-    for whole in (False, True):
+    topics = [
+        f"/quad_1/{topic}" for topic in ("ardrone/navdata", "ardrone/odometry", "ardrone/imu", "ardrone/mag", "fix")
+    ]
+    published: list[list[str]] = []
+    for with_truth in (False, True):
         drone = Drone()
-        subscribers = [
-            *(drone.subscriber(f"/quad_1/ardrone/{topic}") for topic in topics),
-            drone.subscriber("/tf"),
-            drone.subscriber("/quad_1/fix"),
-        ]
+        subscribers = [drone.subscriber(topic) for topic in ("/tf", *topics)]
         ground_truth = drone.subscriber("/quad_1/ground_truth/state")
         for gate in range(1, 5):
             t_ns = gate * GATE_NS
             drone.deliver(messages.Imu(t_ns, gate, t_ns, (0.0, 0.0, 9.8), (0.1, 0.0, 0.0)))
             drone.deliver(messages.Mag(t_ns, gate, t_ns, (1.0, 2.0, 3.0)))
             drone.deliver(messages.Flow(t_ns, gate, t_ns, (1.0, 0.0, 0.0), 1.0))
-            if whole:
-                drone.deliver(truth(t_ns))
+            if with_truth:
+                position, velocity, rate = (1e3, 2e3, 3e3), (4.0, 5.0, 6.0), (7.0, 8.0, 9.0)
+                drone.deliver(
+                    flight_messages.Truth(t_ns, 0, position, velocity, (0.0, 1.0, 0.0, 0.0), rate, ZERO, STILL)
+                )
             drone.deliver(status(t_ns))
-        assert len(ground_truth.ros_messages) == (4 if whole else 0)
-        ros_messages.append([repr(subscriber.ros_messages) for subscriber in subscribers])
-    assert ros_messages[0] == ros_messages[1]
+        assert len(ground_truth.ros_messages) == (4 if with_truth else 0)
+        published.append([repr(subscriber.ros_messages) for subscriber in subscribers])
+    assert published[0] == published[1]
 
 
 def test_a_take_off_that_a_node_publishes_is_sent_to_the_drone():
     drone = Drone()
     drone.deliver(status(GATE_NS))
-    drone.node._subscribed["/quad_1/ardrone/takeoff"]._callback(tcpros.message_class("std_msgs/Empty")())
+    drone.node.subscribed["/quad_1/ardrone/takeoff"].callback(tcpros.message_class("std_msgs/Empty")())
     ((key, command),) = drone.sent
     assert key == "drone/quad-1/cmd/mode"
     assert (command.mode, command.source, command.t_ns) == ("takeoff", "ros1.main", GATE_NS)
@@ -82,36 +99,32 @@ def test_a_take_off_that_a_node_publishes_is_sent_to_the_drone():
 
 
 def test_drones_that_ros_cannot_tell_from_each_other_are_refused():
-    check_names(["drone1", "drone2"])
     with pytest.raises(RunError, match=r"'quad-1'.*'quad\.1'.*'quad_1'"):
-        check_names(["drone1", "quad-1", "quad.1"])
+        Bench("drone1", "quad-1", "quad.1")
+
+
+def test_the_clock_is_simulated_time():
+    bench = Bench()
+    clock = Subscriber(bench.node, "/clock")
+    t_ns = 61_040_000_000
+    bench.bridge.forward(keys.CLOCK, messages.encode(run_messages.Clock(t_ns, 0, "run", 3052, "running", 1.0)))
+    (message,) = clock.ros_messages
+    assert (message.clock.sec, message.clock.nanosec) == (61, 40_000_000)
 
 
 def test_numbers_beyond_the_fields_of_ros_are_refused_and_told_once_and_the_next_are_passed_on():
-    command: list[str] = []
-    info: Any = messages.Info(
-        0, 0, 1, "run", "zsim", "lockstep", 0.0, GATE_NS, 5_000_000, GATE_NS, 1, messages.Origin(0.0, 0.0, 0.0),
-        (messages.DroneInfo("quad-1", "ardrone2"),), (), scenario_file.to_text(scenario()), "", "", "",
-    )  # fmt: skip
-    observer = Participant(cast(Any, FakeLink()), info, "ros1.main")
-    node = Ros1Node("/zsim", "http://127.0.0.1:1", "127.0.0.1", command.append)
-    bridge = Ros1Bridge(cast(Any, FakeLink()), info, observer, node, command.append)
-    navdata = Subscriber(node, "/quad_1/ardrone/navdata")
-
-    def gate(n: int, range_m: float) -> None:
-        t_ns = n * GATE_NS
-        sonar = messages.Sonar(t_ns, n, t_ns, range_m, True)
-        bridge.forward(keys.sensor("quad-1", "sonar"), messages.encode(sonar))
-        bridge.forward(keys.status("quad-1"), messages.encode(status(t_ns)))
-
-    gate(1, 1e30)
-    gate(2, 1e30)
-    bridge.forward(keys.status("quad-1"), b"garbage")
-    gate(3, 1.5)
+    bench = Bench()
+    navdata = Subscriber(bench.node, "/quad_1/ardrone/navdata")
+    for gate, range_m in ((1, 1e30), (2, 1e30), (3, 1.5)):
+        t_ns = gate * GATE_NS
+        sonar = messages.Sonar(t_ns, gate, t_ns, range_m, True)
+        bench.bridge.forward(keys.sensor("quad-1", "sonar"), messages.encode(sonar))
+        bench.bridge.forward(keys.status("quad-1"), messages.encode(status(t_ns)))
+    bench.bridge.forward(keys.status("quad-1"), b"garbage")
     assert [message.altd for message in navdata.ros_messages] == [1500]
-    assert observer.health.refused == 3
-    assert len(command) == 1
-    assert "drone/quad-1/sensor/status" in command[0]
+    assert bench.observer.health.refused == 3
+    (line,) = bench.lines
+    assert "drone/quad-1/sensor/status" in line
 
 
 class Link:
@@ -141,22 +154,22 @@ class Link:
 
 
 def test_who_is_too_slow_goes_on_with_the_newest_gates(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("zsim_bridges.intake.BACKLOG", 3)
-    info: Any = type(
+    monkeypatch.setattr("zsim_bridges.vehicle_links.server.BACKLOG", 3)
+    about: Any = type(
         "Info", (), {"drones": [messages.DroneInfo("drone1", "ardrone2")], "own_sensors": (), "sightings": False}
     )()
     table = key_table(["drone1"])
 
     def payload(gate: int) -> bytes:
-        command = [(keys.status("drone1"), messages.encode(status(gate * GATE_NS)))]
-        bundle = GateMessages.of(gate * GATE_NS, gate, table, command)
+        samples = [(keys.status("drone1"), messages.encode(status(gate * GATE_NS)))]
+        bundle = GateMessages.of(gate * GATE_NS, gate, table, samples)
         return encode_batch([(keys.GATE, bundle.pack()), (keys.CLOCK, b"clock %d" % gate)])
 
     link: Any = Link([payload(gate) for gate in range(5)] + [b"no batch"])
 
     async def run() -> tuple[list[Any], HealthMeter]:
         health = HealthMeter("ros1")
-        intake = TrafficIntake(link, info, health, asyncio.get_running_loop())
+        intake = TrafficIntake(link, about, health, asyncio.get_running_loop())
         await asyncio.to_thread(link.emptied.wait, 10.0)
         await asyncio.wait_for(intake.news.wait(), 10.0)
         found = list(intake.arrivals())
@@ -164,6 +177,123 @@ def test_who_is_too_slow_goes_on_with_the_newest_gates(monkeypatch: pytest.Monke
         return found, health
 
     found, health = asyncio.run(run())
-    assert [[key for key, _ in command] for command in found] == [[keys.status("drone1"), keys.CLOCK]] * 2
-    assert [command[1][1] for command in found] == [b"clock 3", b"clock 4"]
+    assert [[key for key, _ in samples] for samples in found] == [[keys.status("drone1"), keys.CLOCK]] * 2
+    assert [samples[1][1] for samples in found] == [b"clock 3", b"clock 4"]
     assert (health.dropped, health.refused, health.received) == (3, 1, 5)
+
+
+# Cameras
+
+
+def picture_subscribers(drone: Drone) -> dict[str, Subscriber]:
+    """Return a subscriber to every topic of the cameras."""
+    topics = [OWN.format(camera, leaf) for camera in ("front", "bottom") for leaf in (IMAGE, INFO)]
+    return {topic: drone.subscriber(topic) for topic in [*topics, ACTIVE.format(IMAGE), ACTIVE.format(INFO)]}
+
+
+def test_a_picture_is_on_its_camera_s_topic_and_on_the_active_one() -> None:
+    drone = Drone()
+    subscribers = picture_subscribers(drone)
+    drone.topics.cameras.publish("front", image(GATE_NS))
+    counts = {topic: len(s.ros_messages) for topic, s in subscribers.items() if s.ros_messages}
+    assert counts == {OWN.format("front", IMAGE): 1, ACTIVE.format(IMAGE): 1}
+    (got,) = subscribers[OWN.format("front", IMAGE)].ros_messages
+    assert (got.header.stamp.sec, got.header.stamp.nanosec) == (0, 16_000_000)  # of the exposure
+    assert (got.header.frame_id, got.format) == ("quad_1/ardrone_base_frontcam", "jpeg")
+    assert bytes(got.data) == jpeg()
+
+
+def test_togglecam_makes_the_other_camera_the_active_one_and_again_the_first() -> None:
+    drone = Drone()
+    subscribers = picture_subscribers(drone)
+    for _ in range(2):
+        assert drone.node.services["/quad_1/ardrone/togglecam"].act() is None
+        for camera in ("front", "bottom"):
+            drone.topics.cameras.publish(camera, image(0))
+    frames = [message.header.frame_id for message in subscribers[ACTIVE.format(IMAGE)].ros_messages]
+    assert frames == ["quad_1/ardrone_base_bottomcam", "quad_1/ardrone_base_frontcam"]
+
+
+def test_how_a_camera_sees_comes_with_each_picture_and_its_stamp() -> None:
+    drone = Drone()
+    subscribers = picture_subscribers(drone)
+    drone.topics.cameras.learn("front", info())
+    for number in (1, 2):
+        drone.topics.cameras.publish("front", image(number * GATE_NS))
+    got = subscribers[OWN.format("front", INFO)].ros_messages
+    images = subscribers[OWN.format("front", IMAGE)].ros_messages
+    assert [m.header.stamp for m in got] == [m.header.stamp for m in images]
+    assert (got[0].width, got[0].height, got[0].distortion_model) == (info().width, info().height, "plumb_bob")
+    assert (tuple(got[0].K), tuple(got[0].D)) == (info().K, info().D)
+    np.testing.assert_array_equal(got[0].P.reshape(3, 4)[:, :3], np.reshape(info().K, (3, 3)))
+    np.testing.assert_array_equal(got[0].P.reshape(3, 4)[:, 3], np.zeros(3))
+
+
+def test_the_cameras_are_in_the_tree_of_frames() -> None:
+    drone = Drone()
+    tf = drone.subscriber("/tf")
+    drone.topics.cameras.learn("front", info())
+    drone.deliver(status(0))
+    (found,) = [t for t in tf.ros_messages[0].transforms if t.child_frame_id == "quad_1/ardrone_base_frontcam"]
+    assert found.header.frame_id == "quad_1/ardrone_base_link"
+    moved, turned = found.transform.translation, found.transform.rotation
+    assert (moved.x, moved.y, moved.z) == FRONT_P_BK
+    assert (turned.w, turned.x, turned.y, turned.z) == AHEAD
+
+
+@pytest.mark.parametrize(
+    ("topic", "wanted"),
+    [
+        (OWN.format("front", IMAGE), ["front"]),
+        (OWN.format("bottom", INFO), ["bottom"]),
+        (ACTIVE.format(IMAGE), ["front"]),
+        ("/quad_1/ardrone/imu", []),
+    ],
+)
+def test_a_camera_is_read_while_somebody_subscribes(topic: str, wanted: list[str]) -> None:
+    bench = Bench()
+    assert bench.bridge.wanted_pictures() == []
+    Subscriber(bench.node, topic)
+    assert bench.bridge.wanted_pictures() == [keys.camera("quad-1", camera) for camera in wanted]
+
+
+def test_subscriptions_come_and_go_with_those_who_look() -> None:
+    link: Any = FakeLink()
+    received: list[tuple[str, bytes]] = []
+
+    async def look() -> None:
+        intake = PictureIntake(link, asyncio.get_running_loop(), lambda key, payload: received.append((key, payload)))
+        for number, wanted in enumerate(([], [FRONT], [])):
+            intake.follow(wanted)
+            intake.follow(wanted)
+            link.deliver(FRONT, image(number, number))
+            await asyncio.sleep(0)
+
+    asyncio.run(look())
+    assert received == [(FRONT, messages.encode(image(1, 1)))]
+
+
+def test_a_loop_that_is_busy_gets_the_newest() -> None:
+    link: Any = FakeLink()
+    received: list[int] = []
+
+    async def look() -> None:
+        loop = asyncio.get_running_loop()
+        intake = PictureIntake(link, loop, lambda key, payload: received.append(messages.decode(key, payload).seq))
+        for number in range(3 * WAITING_MAX):
+            intake._on_picture(RawSample("PUT", FRONT, messages.encode(image(0, number)), "", None))
+        await asyncio.sleep(0)
+
+    asyncio.run(look())
+    assert received == list(range(2 * WAITING_MAX, 3 * WAITING_MAX))
+
+
+@pytest.mark.parametrize("payload", [b"\xc1", messages.encode(image(0, 0, NO_JPEG))])
+def test_what_is_no_picture_is_counted_and_not_published(payload: bytes) -> None:
+    bench = Bench()
+    subscriber = Subscriber(bench.node, OWN.format("front", IMAGE))
+    bench.bridge.forward(FRONT, payload)
+    bench.bridge.forward("drone/quad-1/camera/side", messages.encode(image(0)))
+    assert bench.observer.health.refused == 2
+    bench.bridge.forward(FRONT, messages.encode(image(0)))
+    assert len(subscriber.ros_messages) == 1

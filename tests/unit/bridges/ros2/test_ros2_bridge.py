@@ -18,13 +18,10 @@ from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.transport.session import RawSample, ReceivedSample
 from zsim.transport.zenoh_settings import Mode
-from zsim_bridges.ros2 import conversions, rmw_zenoh
+from zsim_bridges.ros2 import rmw_zenoh, ros_types, topics
 from zsim_bridges.ros2.rmw_zenoh import Attachment, Endpoint, NodeId, RosContext
-from zsim_bridges.ros2.ros2_bridge import Ros2Bridge
-from zsim_bridges.ros2.ros_types import RosTypes
-from zsim_bridges.ros2.source_keys import SAMPLES_MAX, CallbackQueue
+from zsim_bridges.ros2.ros2_bridge import SAMPLES_MAX, CallbackQueue, Ros2Bridge
 
-TYPES = RosTypes()
 READER = NodeId(0, "abc", 1, "/", "reader")
 WALL_NS = 1_700_000_000_000_000_000
 BESIDE = Attachment(7, 1, bytes(range(16))).packed()
@@ -138,23 +135,23 @@ class Bench:
         self.lines: list[str] = []
         self.observer = Participant(self.link, self.info, "ros2.main")
         self.bridge = Ros2Bridge(self.link, self.info, self.observer, self.lines.append, wall_ns)
-        self.bridge.advertise_run(RosContext(self.link, 0, TYPES, wall_ns, self.bridge.count_refused))
+        self.bridge.advertise_run(RosContext(self.link, 0, wall_ns, self.bridge.count_refused))
 
     def turn(self) -> None:
         self.bridge.process(0.0)
 
     def reader(self, topic: str, kind: str, alive: bool = True) -> None:
         """Let a subscription come or go."""
-        endpoint = Endpoint("MS", topic, rmw_zenoh.dds_name(kind), TYPES.hash(kind))
+        endpoint = Endpoint("MS", topic, rmw_zenoh.dds_name(kind), ros_types.type_hash(kind))
         self.link.on_token_of(rmw_zenoh.endpoint_token(READER, 2, endpoint, rmw_zenoh.DEFAULT), alive)
         self.turn()
 
     def key(self, topic: str, kind: str) -> str:
-        return rmw_zenoh.data_key(0, topic, rmw_zenoh.dds_name(kind), TYPES.hash(kind))
+        return rmw_zenoh.data_key(0, topic, rmw_zenoh.dds_name(kind), ros_types.type_hash(kind))
 
     def publish(self, topic: str, kind: str, message: Any, attachment: bytes = BESIDE) -> None:
         """Let a ROS node publish."""
-        payload = message if isinstance(message, bytes) else TYPES.encode(message, kind)
+        payload = message if isinstance(message, bytes) else ros_types.encode(message, kind)
         self.link.deliver(self.key(topic, kind), payload, attachment)
         self.turn()
 
@@ -170,8 +167,8 @@ def wall_ns() -> int:
 
 
 def twist(*numbers: float) -> Any:
-    vector = TYPES.message_class("geometry_msgs/msg/Vector3")
-    return TYPES.message_class(TWIST)(vector(*numbers[:3]), vector(*numbers[3:]))
+    vector = ros_types.message_class("geometry_msgs/msg/Vector3")
+    return ros_types.message_class(TWIST)(vector(*numbers[:3]), vector(*numbers[3:]))
 
 
 def imu(t_ns: int) -> bytes:
@@ -188,7 +185,7 @@ def test_a_topic_is_read_and_converted_only_while_somebody_subscribes() -> None:
     bench.turn()
     (first, payload, beside), (_, _, later) = bench.link.sent
     assert first == bench.key("/drone_1/imu", IMU)
-    assert TYPES.decode(payload, IMU).header.frame_id == "drone_1/imu_link"
+    assert ros_types.decode(payload, IMU).header.frame_id == "drone_1/imu_link"
     (token,) = (each for each in bench.link.tokens if "/%drone_1%imu/" in each)
     sent = rmw_zenoh.attachment_of(beside)
     assert sent == (1, WALL_NS, rmw_zenoh.gid_of(token))
@@ -237,7 +234,7 @@ def test_a_twist_becomes_a_velocity_in_the_heading_frame_at_the_newest_gate() ->
 
 
 def test_modes_and_the_emergency_button() -> None:
-    bench, empty = Bench(), TYPES.message_class(EMPTY)()
+    bench, empty = Bench(), ros_types.message_class(EMPTY)()
     status = keys.status("drone-1")
     bench.publish("/drone_1/takeoff", EMPTY, empty)
     bench.publish("/drone_1/land", EMPTY, empty)
@@ -294,7 +291,7 @@ def test_a_service_asks_the_controller_and_echoes_who_asked() -> None:
     assert bench.link.asked == [("cluster/m.x/control", "engage", "ros2.main", {})]
     ((key, payload, beside),) = query.replies
     assert key == bench.key("/cluster/m_x/engage", TRIGGER)
-    response = TYPES.decode(payload, "std_srvs/srv/Trigger_Response")
+    response = ros_types.decode(payload, "std_srvs/srv/Trigger_Response")
     assert not response.success
     assert has_terms(response.message, "phase", "idle", "engaged")
     assert rmw_zenoh.attachment_of(beside) == (7, WALL_NS, bytes(range(16)))
@@ -321,15 +318,15 @@ def test_a_summary_of_a_gate_has_what_was_told_up_to_it() -> None:
         bench.link.deliver(status_key, messages.encode(status))
     bench.turn()
     navdata = [payload for key, payload, _ in bench.link.sent if "Navdata" in key]
-    assert [TYPES.decode(each, "zsim_msgs/msg/Navdata").az for each in navdata] == pytest.approx([0.0, 1.0, 2.0])
+    assert [ros_types.decode(each, "zsim_msgs/msg/Navdata").az for each in navdata] == pytest.approx([0.0, 1.0, 2.0])
 
 
 def test_frames_that_never_move_are_kept_for_who_comes_later() -> None:
     ((key, payload, _),) = Bench().link.kept
     assert key == rmw_zenoh.data_key(
-        0, "/tf_static", "tf2_msgs::msg::dds_::TFMessage_", TYPES.hash("tf2_msgs/msg/TFMessage")
+        0, "/tf_static", "tf2_msgs::msg::dds_::TFMessage_", ros_types.type_hash("tf2_msgs/msg/TFMessage")
     )
-    children = {each.child_frame_id for each in TYPES.decode(payload, "tf2_msgs/msg/TFMessage").transforms}
+    children = {each.child_frame_id for each in ros_types.decode(payload, "tf2_msgs/msg/TFMessage").transforms}
     assert {"drone_1/odom", "drone2/odom", "drone_1/sonar_link", "drone2/imu_link"} <= children
 
 
@@ -345,10 +342,10 @@ def test_samples_that_nobody_takes_go_the_oldest_first_and_acts_never() -> None:
     for k in range(5):
         inbox.add_sample("key", bytes([k]))
         inbox.add_task(lambda k=k: done.append(k))
-    taken = inbox.pop_all(0.0)
-    for act in taken.tasks:
+    tasks, samples = inbox.pop_all(0.0)
+    for act in tasks:
         act()
-    assert [payload for _, payload in taken.samples] == [b"\2", b"\3", b"\4"]
+    assert [payload for _, payload in samples] == [b"\2", b"\3", b"\4"]
     assert (done, inbox.dropped) == ([0, 1, 2, 3, 4], 2)
     assert inbox.pop_all(0.0) == ([], [])
 
@@ -376,7 +373,7 @@ FRONT_INFO = keys.camera_info("drone-1", "front")
 def published(bench: Bench, topic: str, kind: str) -> list[Any]:
     """Return what was published on a topic."""
     key = bench.key(topic, kind)
-    return [TYPES.decode(payload, kind) for at, payload, _ in bench.link.sent if at == key]
+    return [ros_types.decode(payload, kind) for at, payload, _ in bench.link.sent if at == key]
 
 
 def test_a_picture_is_on_its_camera_s_topic_with_its_bytes_and_the_time_of_exposure() -> None:
@@ -415,7 +412,7 @@ def test_togglecam_makes_the_other_camera_the_active_one() -> None:
             bench.link.deliver(key, messages.encode(image(20_000_000)))
         bench.turn()
         (reply,) = bench.ask("/drone_1/ardrone/togglecam").replies
-        assert TYPES.decode(reply[1], f"{TRIGGER}_Response").success
+        assert ros_types.decode(reply[1], f"{TRIGGER}_Response").success
     frames = [m.header.frame_id for m in published(bench, "/drone_1/ardrone/image_raw/compressed", IMAGE)]
     assert frames == ["drone_1/front_camera_optical_frame", "drone_1/bottom_camera_optical_frame"]
 
@@ -434,9 +431,10 @@ def test_what_is_no_picture_is_refused_and_the_next_is_passed_on(payload: bytes)
 def test_the_cameras_of_the_scenario_are_among_the_frames_that_never_move() -> None:
     text = PAIR.replace("preset: paper", "preset: paper, front_camera: {}, bottom_camera: {}")
     drone = scenario_file.resolve(msgspec.yaml.decode(text.encode())).drones[0]
-    poses = {pose.child: pose for pose in conversions.static_frames("d", drone.sensors)}
-    ahead, down = poses["d/front_camera_optical_frame"], poses["d/bottom_camera_optical_frame"]
-    assert ahead.parent == down.parent == "d/base_link"
-    assert ahead.position_m == drone.sensors.cameras()["front"].mount.position_m
-    assert rotate(ahead.orientation_wxyz, (0.0, 0.0, 1.0)) == pytest.approx((1.0, 0.0, 0.0), abs=1e-12)
-    assert rotate(down.orientation_wxyz, (0.0, 0.0, 1.0)) == pytest.approx((0.0, 0.0, -1.0), abs=1e-12)
+    frames = {frame.child_frame_id: frame for frame in topics.static_transforms("d", drone.sensors)}
+    for camera, direction in (("front", (1.0, 0.0, 0.0)), ("bottom", (0.0, 0.0, -1.0))):
+        frame = frames[f"d/{camera}_camera_optical_frame"]
+        p, q = frame.transform.translation, frame.transform.rotation
+        assert frame.header.frame_id == "d/base_link"
+        assert (p.x, p.y, p.z) == drone.sensors.cameras()[camera].mount.position_m
+        assert rotate((q.w, q.x, q.y, q.z), (0.0, 0.0, 1.0)) == pytest.approx(direction, abs=1e-12)

@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 from fake_link import FakeLink
+from in_loop import in_loop
 from refused import has_terms
 
 from zsim.contract import flight_messages, keys, messages
@@ -16,17 +17,28 @@ from zsim.errors import RunError
 from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim_bridges.vehicle_links import driver
-from zsim_bridges.vehicle_links.aircraft_readings import AircraftPose, AircraftReadings, Reading
-from zsim_bridges.vehicle_links.driver import AircraftSocket, DriverProcess, ExternalDrone, hover_speed
-from zsim_bridges.vehicle_links.driver_options import (
+from zsim_bridges.vehicle_links.driver import (
+    AircraftSocket,
     DriverOptions,
+    DriverProcess,
+    ExternalDrone,
     aircraft_host,
     check_host,
     check_run,
+    hover_speed,
     position,
     udp_channel,
 )
-from zsim_bridges.vehicle_links.vehicle_session import AircraftState, Demand, LinkFigures, UdpChannel, VehicleSession
+from zsim_bridges.vehicle_links.vehicle_session import (
+    AircraftPose,
+    AircraftReadings,
+    AircraftState,
+    Demand,
+    LinkFigures,
+    Reading,
+    UdpChannel,
+    VehicleSession,
+)
 
 SCENARIO = """
 name: one
@@ -54,7 +66,7 @@ class Session(VehicleSession):
 
     def receive(self, channel: int, datagram: bytes, now_ns: int) -> None:
         self.state = AircraftState(datagram.decode(), 50.0, AircraftPose(now_ns, (1.0, 2.0, 3.0)), now_ns)  # type: ignore[arg-type]
-        self._readings.readings.append(Reading("sonar", now_ns, (3.0, True)))
+        self.readings.readings.append(Reading("sonar", now_ns, (3.0, True)))
 
     def advance(self, now_ns: int, demand: Demand) -> Iterator[tuple[int, bytes]]:
         yield 0, demand.action.encode()
@@ -155,171 +167,148 @@ class Flight:
         return pytest.fail("no answer")
 
 
-def fly(test: Any) -> None:
-    asyncio.run(test())
-
-
-def test_a_gate_is_published_when_the_world_reaches_it():
-    async def test() -> None:
-        async with Flight(armed=False) as flight:
-            for _ in range(3):
-                await flight.gate()
-            statuses = flight.link.published_on(keys.status("drone2"))
-            assert [status.t_ns for status in statuses] == [GATE_NS, 2 * GATE_NS, 3 * GATE_NS]
-            assert {status.state for status in statuses} == {"landed"}
-            assert flight.link.published_on(keys.sensor("drone2", "sonar"))
-            while flight.links()[-1:] != ["connected"]:
-                await flight.aircraft.next()
-            assert flight.links() in (["connected"], ["waiting", "connected"])
-
-    fly(test)
-
-
-def test_it_flies_when_it_is_armed_and_lands_what_flies_before_it_leaves():
-    async def test() -> None:
-        async with Flight(armed=False) as flight:
+@in_loop
+async def test_a_gate_is_published_when_the_world_reaches_it() -> None:
+    async with Flight(armed=False) as flight:
+        for _ in range(3):
             await flight.gate()
-            flight.take_off()
-            assert (await flight.answered("arm")).ok
-            assert flight.aircraft.demands == ["none"]  # what was commanded before is forgotten
-            flight.take_off()
-            await flight.aircraft.until("take_off")
-            flight.aircraft.state = "hovering"
-            await flight.aircraft.until("hold")
-            velocity = flight_messages.Velocity(0, 0, "controller.main", (1.0, 0.0, 0.0), 0.0, "world")
-            flight.command("velocity", velocity)
-            await flight.aircraft.until("fly")
-            assert not (await flight.answered("disarm")).ok
-            flight.stop = True
-            await flight.aircraft.until("land")
-        assert any("lands" in line for line in flight.lines)
-        assert sum("not obeyed" in line for line in flight.lines) == 1
-
-    fly(test)
+        statuses = flight.link.published_on(keys.status("drone2"))
+        assert [status.t_ns for status in statuses] == [GATE_NS, 2 * GATE_NS, 3 * GATE_NS]
+        assert {status.state for status in statuses} == {"landed"}
+        assert flight.link.published_on(keys.sensor("drone2", "sonar"))
+        while flight.links()[-1:] != ["connected"]:
+            await flight.aircraft.next()
+        assert flight.links() in (["connected"], ["waiting", "connected"])
 
 
-def test_kill_reaches_the_aircraft_at_once_and_shows():
-    async def test() -> None:
-        async with Flight(armed=True) as flight:
-            flight.aircraft.state = "flying"
-            await flight.aircraft.until("hold")
-            assert (await flight.answered("kill")).ok
-            await flight.aircraft.until("kill")
-            await flight.gate()
-            assert flight.link.published_on(keys.status("drone2"))[-1].state == "emergency"
-
-    fly(test)
-
-
-def test_a_stop_of_the_motors_goes_on_after_the_run_until_they_stand():
-    async def test() -> None:
-        async with Flight(armed=True) as flight:
-            flight.aircraft.state = "flying"
-            await flight.aircraft.until("hold")
-            assert (await flight.answered("kill")).ok
-            flight.stop = True
-            for _ in range(20):
-                await flight.aircraft.next()
-            assert not flight.task.done()
-            assert flight.aircraft.demands[-1] == "kill"
-            flight.aircraft.state = "landed"
-            await asyncio.wait_for(flight.task, 30)
-
-    fly(test)
+@in_loop
+async def test_it_flies_when_it_is_armed_and_lands_what_flies_before_it_leaves() -> None:
+    async with Flight(armed=False) as flight:
+        await flight.gate()
+        flight.take_off()
+        assert (await flight.answered("arm")).ok
+        assert flight.aircraft.demands == ["none"]  # what was commanded before is forgotten
+        flight.take_off()
+        await flight.aircraft.until("take_off")
+        flight.aircraft.state = "hovering"
+        await flight.aircraft.until("hold")
+        velocity = flight_messages.Velocity(0, 0, "controller.main", (1.0, 0.0, 0.0), 0.0, "world")
+        flight.command("velocity", velocity)
+        await flight.aircraft.until("fly")
+        assert not (await flight.answered("disarm")).ok
+        flight.stop = True
+        await flight.aircraft.until("land")
+    assert any("lands" in line for line in flight.lines)
+    assert sum("not obeyed" in line for line in flight.lines) == 1
 
 
-def test_who_cannot_land_is_left_to_a_person_with_a_line(monkeypatch: pytest.MonkeyPatch):
+@in_loop
+async def test_kill_reaches_the_aircraft_at_once_and_shows() -> None:
+    async with Flight(armed=True) as flight:
+        flight.aircraft.state = "flying"
+        await flight.aircraft.until("hold")
+        assert (await flight.answered("kill")).ok
+        await flight.aircraft.until("kill")
+        await flight.gate()
+        assert flight.link.published_on(keys.status("drone2"))[-1].state == "emergency"
+
+
+@in_loop
+async def test_a_stop_of_the_motors_goes_on_after_the_run_until_they_stand() -> None:
+    async with Flight(armed=True) as flight:
+        flight.aircraft.state = "flying"
+        await flight.aircraft.until("hold")
+        assert (await flight.answered("kill")).ok
+        flight.stop = True
+        for _ in range(20):
+            await flight.aircraft.next()
+        assert not flight.task.done()
+        assert flight.aircraft.demands[-1] == "kill"
+        flight.aircraft.state = "landed"
+        await asyncio.wait_for(flight.task, 30)
+
+
+@in_loop
+async def test_who_cannot_land_is_left_to_a_person_with_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(driver, "LANDING_S", 0.1)
-
-    async def test() -> None:
-        async with Flight(armed=True) as flight:
-            flight.aircraft.state = "flying"
-            await flight.aircraft.until("hold")
-            flight.aircraft.state, flight.stop = "landing", True
-            await asyncio.wait_for(flight.task, 30)
-            assert has_terms(flight.lines[-1], ME, "landing", "by hand")
-
-    fly(test)
+    async with Flight(armed=True) as flight:
+        flight.aircraft.state = "flying"
+        await flight.aircraft.until("hold")
+        flight.aircraft.state, flight.stop = "landing", True
+        await asyncio.wait_for(flight.task, 30)
+        assert has_terms(flight.lines[-1], ME, "landing", "by hand")
 
 
-def test_an_aircraft_that_does_not_show_itself_is_reported_once_with_the_reason(monkeypatch: pytest.MonkeyPatch):
+@in_loop
+async def test_an_aircraft_that_does_not_show_itself_is_reported_once_with_the_reason(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(driver, "PATIENCE_S", 0.0)
-
-    async def test() -> None:
-        link, lines = FakeLink(), []
-        observer = Participant(link, info(), ME)  # type: ignore[arg-type]
-        stopped = iter([False] * 30)
-        args: Any = link, info(), observer, DriverOptions("drone2"), Session(9), lines.append
-        await DriverProcess(*args).run(lambda: next(stopped, True))
-        (hint,) = (line for line in lines if "127.0.0.1:9" in line)
-        assert has_terms(hint, ME, "address")
-
-    fly(test)
+    link, lines = FakeLink(), []
+    observer = Participant(link, info(), ME)  # type: ignore[arg-type]
+    stopped = iter([False] * 30)
+    args: Any = link, info(), observer, DriverOptions("drone2"), Session(9), lines.append
+    await DriverProcess(*args).run(lambda: next(stopped, True))
+    (hint,) = (line for line in lines if "127.0.0.1:9" in line)
+    assert has_terms(hint, ME, "address")
 
 
-def test_the_port_of_a_driver_that_is_replaced_is_awaited():
-    async def test() -> None:
-        loop = asyncio.get_running_loop()
-        former, _ = await loop.create_datagram_endpoint(asyncio.DatagramProtocol, local_addr=("0.0.0.0", 0))
-        channel = UdpChannel("127.0.0.1", 9, former.get_extra_info("sockname")[1])
-        own = AircraftSocket(print)
-        opening = loop.create_task(own.open(channel))
-        await asyncio.sleep(0)
-        former.close()
-        await asyncio.wait_for(opening, 30)
-        own.close()
-
-    fly(test)
+@in_loop
+async def test_the_port_of_a_driver_that_is_replaced_is_awaited() -> None:
+    loop = asyncio.get_running_loop()
+    former, _ = await loop.create_datagram_endpoint(asyncio.DatagramProtocol, local_addr=("0.0.0.0", 0))
+    channel = UdpChannel("127.0.0.1", 9, former.get_extra_info("sockname")[1])
+    own = AircraftSocket(print)
+    opening = loop.create_task(own.open(channel))
+    await asyncio.sleep(0)
+    former.close()
+    await asyncio.wait_for(opening, 30)
+    own.close()
 
 
 @pytest.mark.parametrize("taken", [True, False])
-def test_a_socket_that_cannot_be_had_is_refused_with_what_to_change(monkeypatch: pytest.MonkeyPatch, taken: bool):
-    async def test() -> None:
-        monkeypatch.setattr(driver, "FORMER_S", 0.0)
-        loop = asyncio.get_running_loop()
-        other, _ = await loop.create_datagram_endpoint(asyncio.DatagramProtocol, local_addr=("0.0.0.0", 0))
-        port = other.get_extra_info("sockname")[1] if taken else 0
-        session = Session(9)
-        session.channels = (UdpChannel("127.0.0.1" if taken else "nowhere.invalid", 9, port),)
-        link = FakeLink()
-        observer = Participant(link, info(), ME)  # type: ignore[arg-type]
-        args: Any = link, info(), observer, DriverOptions("drone2"), session, print
-        with pytest.raises(RunError, match=f"{port}.*--local-port" if taken else "nowhere.invalid.*address"):
-            await DriverProcess(*args).run(lambda: True)
-        other.close()
+@in_loop
+async def test_a_socket_that_cannot_be_had_is_refused_with_what_to_change(
+    monkeypatch: pytest.MonkeyPatch, taken: bool
+) -> None:
+    monkeypatch.setattr(driver, "FORMER_S", 0.0)
+    loop = asyncio.get_running_loop()
+    other, _ = await loop.create_datagram_endpoint(asyncio.DatagramProtocol, local_addr=("0.0.0.0", 0))
+    port = other.get_extra_info("sockname")[1] if taken else 0
+    session = Session(9)
+    session.channels = (UdpChannel("127.0.0.1" if taken else "nowhere.invalid", 9, port),)
+    link = FakeLink()
+    observer = Participant(link, info(), ME)  # type: ignore[arg-type]
+    args: Any = link, info(), observer, DriverOptions("drone2"), session, print
+    with pytest.raises(RunError, match=f"{port}.*--local-port" if taken else "nowhere.invalid.*address"):
+        await DriverProcess(*args).run(lambda: True)
+    other.close()
 
-    fly(test)
 
-
-def test_a_driver_whose_place_another_has_taken_does_not_land_the_aircraft():
-    async def test() -> None:
-        async with Flight(armed=True) as flight:
-            flight.aircraft.state = "flying"
-            await flight.aircraft.until("hold")
-            data = {"incarnation": 7, "host": flight.link.host, "pid": 1, "from_ns": 0}
-            flight.link.deliver(keys.EVENT, Event(0, 0, "superseded", ME, ME, "", data))
-            await asyncio.wait_for(flight.task, 30)
-            assert flight.aircraft.demands[-1] == "hold"
-
-    fly(test)
+@in_loop
+async def test_a_driver_whose_place_another_has_taken_does_not_land_the_aircraft() -> None:
+    async with Flight(armed=True) as flight:
+        flight.aircraft.state = "flying"
+        await flight.aircraft.until("hold")
+        data = {"incarnation": 7, "host": flight.link.host, "pid": 1, "from_ns": 0}
+        flight.link.deliver(keys.EVENT, Event(0, 0, "superseded", ME, ME, "", data))
+        await asyncio.wait_for(flight.task, 30)
+        assert flight.aircraft.demands[-1] == "hold"
 
 
 BAD = {"an unknown op": ("fly", "arm, disarm, kill"), "no text": (7, "op")}
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_what_is_no_request_is_answered_with_the_reason(name: str):
+@in_loop
+async def test_what_is_no_request_is_answered_with_the_reason(name: str) -> None:
     op, term = BAD[name]
-
-    async def test() -> None:
-        async with Flight(armed=False) as flight:
-            answer = await flight.answered(op)
-            assert not answer.ok
-            assert term in answer.error
-            flight.link.deliver(keys.accepted("drone2", "velocity"), b"garbage")
-            assert (await flight.answered("arm")).ok
-
-    fly(test)
+    async with Flight(armed=False) as flight:
+        answer = await flight.answered(op)
+        assert not answer.ok
+        assert term in answer.error
+        flight.link.deliver(keys.accepted("drone2", "velocity"), b"garbage")
+        assert (await flight.answered("arm")).ok
 
 
 def test_what_cannot_be_driven_is_refused():
@@ -353,16 +342,14 @@ def test_addresses_and_places():
             check_host(bad)
 
 
-def test_the_link_is_a_message_of_the_contract():
-    async def test() -> None:
-        async with Flight(armed=False) as flight:
-            while not flight.links():
-                await flight.aircraft.next()
-            (first, *_) = flight.link.published_on(keys.link("drone2"))
-            assert messages.decode(keys.link("drone2"), messages.encode(first)) == first
-            assert (first.source, first.loss_percent, first.round_trip_ms) == (ME, 1.0, None)
-
-    fly(test)
+@in_loop
+async def test_the_link_is_a_message_of_the_contract() -> None:
+    async with Flight(armed=False) as flight:
+        while not flight.links():
+            await flight.aircraft.next()
+        (first, *_) = flight.link.published_on(keys.link("drone2"))
+        assert messages.decode(keys.link("drone2"), messages.encode(first)) == first
+        assert (first.source, first.loss_percent, first.round_trip_ms) == (ME, 1.0, None)
 
 
 def test_four_rotors_carry_an_ardrone_at_the_speed_of_its_hover():
@@ -391,7 +378,7 @@ def vehicle(t_ms: float) -> AircraftState:
 
 def test_a_gate_of_messages():
     drone = external()
-    drone.add([imu(18), imu(8), Reading("sonar", BEGUN_NS + 11 * MS, (1.5, True))])
+    drone.readings.extend([imu(18), imu(8), Reading("sonar", BEGUN_NS + 11 * MS, (1.5, True))])
     *samples, (truth_key, truth), (status_key, status) = drone.gate(20 * MS, vehicle(10), "controller.main")
     assert [keys.leaf(key) for key, _ in samples] == ["imu", "sonar", "imu"]
     assert [sample.t_sample_ns for _, sample in samples] == [8 * MS, 11 * MS, 18 * MS]
@@ -412,7 +399,7 @@ def test_every_message_passes_the_contract():
         "sonar": (2.0, True),
         "flow": ((0.0, 0.0, 0.0), 1.0),
     }
-    drone.add(Reading(sensor, BEGUN_NS, fields) for sensor, fields in values.items())
+    drone.readings.extend(Reading(sensor, BEGUN_NS, fields) for sensor, fields in values.items())
     gate = drone.gate(20 * MS, vehicle(0), None)
     assert len(gate) == len(values) + 2
     for key, message in gate:
@@ -421,7 +408,7 @@ def test_every_message_passes_the_contract():
 
 def test_none_is_of_the_future_nor_of_before_the_run():
     drone = external()
-    drone.add([imu(-50), imu(25)])
+    drone.readings.extend([imu(-50), imu(25)])
     (_, first), (_, second), *_ = drone.gate(20 * MS, vehicle(0), None)
     assert (first.t_sample_ns, second.t_sample_ns) == (0, 20 * MS)
 

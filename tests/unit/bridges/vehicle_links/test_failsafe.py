@@ -9,9 +9,8 @@ import pytest
 from zsim.contract.flight_messages import Ardrone, Mode, Velocity
 from zsim.math.frames import quaternion_from_heading
 from zsim.scenario.scenario import Silence
-from zsim_bridges.vehicle_links.aircraft_readings import AircraftPose
 from zsim_bridges.vehicle_links.failsafe import BRAKING_M_S2, RESET_S, TAKEOFF_S, Failsafe, FlightLimits
-from zsim_bridges.vehicle_links.vehicle_session import AircraftState
+from zsim_bridges.vehicle_links.vehicle_session import AircraftPose, AircraftState
 
 S = 1_000_000_000
 LIMITS = FlightLimits(speed_m_s=2.0, radius_m=10.0)

@@ -3,11 +3,12 @@
 import asyncio
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import AsyncExitStack, asynccontextmanager
+from functools import wraps
 from typing import Any
 
 from aiohttp import ClientSession, web
 
-from zsim_bridges.web.web_server import BODY_BYTES_MAX, SMALL_BYTES, HttpConnections
+from zsim_bridges.web.web_server import BODY_BYTES_MAX, SMALL_BYTES, HttpConnection, HttpConnections
 
 HALF = b"GET / HTTP/1.1\r\nHost: localhost\r\n"  # the head never ends
 WHOLE = HALF + b"\r\n"
@@ -45,7 +46,9 @@ async def server(
     assert http is not None
     async with AsyncExitStack() as stack:
         stack.push_async_callback(runner.cleanup)
-        listener = await asyncio.get_running_loop().create_server(lambda: connections.protocol(http()), "127.0.0.1", 0)
+        listener = await asyncio.get_running_loop().create_server(
+            lambda: HttpConnection(http(), connections), "127.0.0.1", 0
+        )
         stack.callback(listener.close)
         port = listener.sockets[0].getsockname()[1]
 
@@ -55,6 +58,14 @@ async def server(
             return reader, writer
 
         yield connect, f"http://127.0.0.1:{port}", app
+
+
+def in_loop(test: Callable[[], Coroutine[Any, Any, None]]) -> Callable[[], None]:
+    @wraps(test)
+    def run() -> None:
+        asyncio.run(test())
+
+    return run
 
 
 async def status(stream: Stream, request: bytes) -> int:
@@ -72,61 +83,53 @@ async def is_cut(stream: Stream) -> bool:
         return True
 
 
-def test_the_oldest_head_that_does_not_end_makes_room_for_the_next_connection() -> None:
-    async def test() -> None:
-        async with server() as (connect, url, _):
-            halves = []
-            for _ in range(STRANGERS + 1):
-                halves.append(await connect())
-                halves[-1][1].write(HALF)
-            assert await is_cut(halves[0])
-            async with ClientSession() as session, session.get(url) as response:
-                assert response.status == 200
-            assert await is_cut(halves[1])
-            assert await status(halves[-1], b"\r\n") == 200
-
-    asyncio.run(test())
+@in_loop
+async def test_the_oldest_head_that_does_not_end_makes_room_for_the_next_connection() -> None:
+    async with server() as (connect, url, _):
+        halves = []
+        for _ in range(STRANGERS + 1):
+            halves.append(await connect())
+            halves[-1][1].write(HALF)
+        assert await is_cut(halves[0])
+        async with ClientSession() as session, session.get(url) as response:
+            assert response.status == 200
+        assert await is_cut(halves[1])
+        assert await status(halves[-1], b"\r\n") == 200
 
 
-def test_a_head_that_does_not_end_in_time_ends_its_connection() -> None:
-    async def test() -> None:
-        async with server(request_s=0.05) as (connect, _, _):
-            half = await connect()
-            half[1].write(HALF)
-            assert await is_cut(half)
-
-    asyncio.run(test())
+@in_loop
+async def test_a_head_that_does_not_end_in_time_ends_its_connection() -> None:
+    async with server(request_s=0.05) as (connect, _, _):
+        half = await connect()
+        half[1].write(HALF)
+        assert await is_cut(half)
 
 
-def test_who_has_been_answered_makes_no_room_for_strangers() -> None:
-    async def test() -> None:
-        async with server() as (connect, _, _):
-            known, refused = await connect(), await connect()
-            assert await status(known, WHOLE) == 200
-            assert await status(refused, WHOLE.replace(b"/ ", b"/refused ")) == 401
-            for _ in range(STRANGERS + CONNECTIONS):
-                (await connect())[1].write(HALF)
-            assert await is_cut(refused)
-            assert await status(known, WHOLE) == 200
-
-    asyncio.run(test())
+@in_loop
+async def test_who_has_been_answered_makes_no_room_for_strangers() -> None:
+    async with server() as (connect, _, _):
+        known, refused = await connect(), await connect()
+        assert await status(known, WHOLE) == 200
+        assert await status(refused, WHOLE.replace(b"/ ", b"/refused ")) == 401
+        for _ in range(STRANGERS + CONNECTIONS):
+            (await connect())[1].write(HALF)
+        assert await is_cut(refused)
+        assert await status(known, WHOLE) == 200
 
 
-def test_a_request_under_way_is_answered_however_many_connections_there_are() -> None:
-    async def test() -> None:
-        async with server() as (connect, _, app):
-            busy = []
-            for _ in range(CONNECTIONS):
-                busy.append(await connect())
-                busy[-1][1].write(WHOLE.replace(b"/ ", b"/wait "))
-                await app[STARTED].acquire()
-            late = await connect()
-            late[1].write(HALF)
-            assert await is_cut(late)
-            app[RELEASE].set()
-            assert [await status(stream, b"") for stream in busy] == [200] * CONNECTIONS
-
-    asyncio.run(test())
+@in_loop
+async def test_a_request_under_way_is_answered_however_many_connections_there_are() -> None:
+    async with server() as (connect, _, app):
+        busy = []
+        for _ in range(CONNECTIONS):
+            busy.append(await connect())
+            busy[-1][1].write(WHOLE.replace(b"/ ", b"/wait "))
+            await app[STARTED].acquire()
+        late = await connect()
+        late[1].write(HALF)
+        assert await is_cut(late)
+        app[RELEASE].set()
+        assert [await status(stream, b"") for stream in busy] == [200] * CONNECTIONS
 
 
 # Bodies
@@ -138,55 +141,47 @@ def head_of(size: int, path: str = "/") -> bytes:
     return b"POST %s HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % (path.encode(), size)
 
 
-def test_a_request_whose_body_does_not_end_is_answered_and_its_connection_closed() -> None:
-    async def scenario() -> None:
-        async with server(request_s=SHORT_S) as (connect, _, _):
-            slow, known = await connect(), await connect()
-            assert await status(known, WHOLE) == 200
-            for stream in (slow, known):  # who was answered before may not take longer
-                assert await status(stream, head_of(100) + b"half") == 408
-            for reader, _ in (slow, known):
-                await reader.read()  # to the end of the connection
-
-    asyncio.run(scenario())
+@in_loop
+async def test_a_request_whose_body_does_not_end_is_answered_and_its_connection_closed() -> None:
+    async with server(request_s=SHORT_S) as (connect, _, _):
+        slow, known = await connect(), await connect()
+        assert await status(known, WHOLE) == 200
+        for stream in (slow, known):  # who was answered before may not take longer
+            assert await status(stream, head_of(100) + b"half") == 408
+        for reader, _ in (slow, known):
+            await reader.read()  # to the end of the connection
 
 
-def test_a_known_connection_does_not_begin_requests_that_never_end() -> None:
-    async def scenario() -> None:
-        async with server(request_s=SHORT_S) as (connect, _, _):
-            reader, writer = known = await connect()
-            assert await status(known, WHOLE) == 200
-            writer.write(HALF)
-            assert await reader.read() == b""
-
-    asyncio.run(scenario())
+@in_loop
+async def test_a_known_connection_does_not_begin_requests_that_never_end() -> None:
+    async with server(request_s=SHORT_S) as (connect, _, _):
+        reader, writer = known = await connect()
+        assert await status(known, WHOLE) == 200
+        writer.write(HALF)
+        assert await reader.read() == b""
 
 
-def test_large_bodies_wait_for_room_and_small_ones_do_not() -> None:
-    async def scenario() -> None:
-        size = 2 * SMALL_BYTES
-        async with server(body_bytes_max=size) as (connect, _, app):
-            first, second, small = await connect(), await connect(), await connect()
-            first[1].write(head_of(size, "/wait") + bytes(size))
-            await app[STARTED].acquire()
-            waiting = asyncio.create_task(status(second, head_of(size) + bytes(size)))
-            for _ in range(3):
-                assert await status(small, head_of(SMALL_BYTES) + bytes(SMALL_BYTES)) == 200
-            assert not waiting.done()
-            app[RELEASE].set()
-            assert await waiting == 200
-
-    asyncio.run(scenario())
+@in_loop
+async def test_large_bodies_wait_for_room_and_small_ones_do_not() -> None:
+    size = 2 * SMALL_BYTES
+    async with server(body_bytes_max=size) as (connect, _, app):
+        first, second, small = await connect(), await connect(), await connect()
+        first[1].write(head_of(size, "/wait") + bytes(size))
+        await app[STARTED].acquire()
+        waiting = asyncio.create_task(status(second, head_of(size) + bytes(size)))
+        for _ in range(3):
+            assert await status(small, head_of(SMALL_BYTES) + bytes(SMALL_BYTES)) == 200
+        assert not waiting.done()
+        app[RELEASE].set()
+        assert await waiting == 200
 
 
-def test_or_are_refused_when_there_is_none_in_their_time() -> None:
-    async def scenario() -> None:
-        size = 2 * SMALL_BYTES
-        async with server(request_s=SHORT_S, body_bytes_max=size) as (connect, _, app):
-            first, second = await connect(), await connect()
-            first[1].write(head_of(size, "/wait") + bytes(size))
-            await app[STARTED].acquire()
-            assert await status(second, head_of(size) + bytes(size)) == 408
-            app[RELEASE].set()
-
-    asyncio.run(scenario())
+@in_loop
+async def test_or_are_refused_when_there_is_none_in_their_time() -> None:
+    size = 2 * SMALL_BYTES
+    async with server(request_s=SHORT_S, body_bytes_max=size) as (connect, _, app):
+        first, second = await connect(), await connect()
+        first[1].write(head_of(size, "/wait") + bytes(size))
+        await app[STARTED].acquire()
+        assert await status(second, head_of(size) + bytes(size)) == 408
+        app[RELEASE].set()

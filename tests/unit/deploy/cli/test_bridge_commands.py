@@ -11,7 +11,7 @@ from refused import has_terms, refused
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from zsim.errors import RunError, install_command
-from zsim_bridges.ros2.ros_types import MESSAGES, RosTypes
+from zsim_bridges.ros2.ros_types import MESSAGES, type_hash
 from zsim_deploy.cli.bridge_commands import console, gateway, ros1, ros2
 
 
@@ -19,11 +19,11 @@ def test_the_package_has_the_types_that_go_over_the_wire(tmp_path: Path, capsys:
     ros2(write_package=tmp_path)
     package = tmp_path / "zsim_msgs"
     assert has_terms(capsys.readouterr().out, str(package), "colcon")
-    store, types = get_typestore(Stores.ROS2_KILTED), RosTypes()
+    store = get_typestore(Stores.ROS2_KILTED)
     for path in package.glob("msg/*.msg"):
         name = f"zsim_msgs/msg/{path.stem}"
         store.register(get_types_from_msg(path.read_text(), name))
-        assert store.hash_rihs01(name) == types.hash(name)
+        assert store.hash_rihs01(name) == type_hash(name)
         assert f'"msg/{path.name}"' in (package / "CMakeLists.txt").read_text()
     assert {f"zsim_msgs/msg/{path.stem}" for path in package.glob("msg/*.msg")} == MESSAGES.keys()
     assert "<name>zsim_msgs</name>" in (package / "package.xml").read_text()

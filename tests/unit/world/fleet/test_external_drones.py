@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from continued import continue_from
+from fleet_samples import samples_of
 from refused import has_terms
 
 from zsim.contract import keys
@@ -89,7 +90,7 @@ def test_the_others_fly_to_the_same_bits_beside_it():
         led.take("d1", truth(mixed.t_ns, p=(300.0, 0.0, 5.0)), mixed.t_ns)
         advance(mixed, led)
     np.testing.assert_array_equal(plain.bodies.state[0], mixed.bodies.state[0])
-    assert [s for s in plain.samples() if s.drone == 0] == mixed.samples()
+    assert [s for s in samples_of(plain) if s.drone == 0] == samples_of(mixed)
 
 
 def test_the_world_publishes_nothing_of_it():
@@ -111,7 +112,7 @@ def test_a_fleet_of_external_drones_alone_goes_on():
     GatePublication(fleet)
     drones.take("d0", truth(0, p=(0.0, 0.0, 3.0)), 0)
     advance(fleet, drones, 5)
-    assert fleet.closest_m() == pytest.approx(math.hypot(4.0 - 0.1, 0.05, 3.025 - 0.058), abs=0.01)
+    assert fleet.closest_m == pytest.approx(math.hypot(4.0 - 0.1, 0.05, 3.025 - 0.058), abs=0.01)
 
 
 BAD: tuple[tuple[dict[str, Any], str], ...] = (

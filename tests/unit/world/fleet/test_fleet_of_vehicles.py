@@ -93,7 +93,7 @@ def test_vehicles_of_different_size_and_rotors_fly_side_by_side():
     closest = math.inf
     for _ in range(20):
         fly(flight, 1.0, (0.5, 0.0, 0.0))
-        closest = min(closest, flight.closest_m())
+        closest = min(closest, flight.closest_m)
     for i in range(3):
         np.testing.assert_allclose(velocity_ahead(flight, i), (0.5, 0.0, 0.0), atol=0.25)
     assert flight.rotors == [4, 4, 6]

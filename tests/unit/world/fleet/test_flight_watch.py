@@ -91,16 +91,17 @@ def test_a_drone_that_is_flown_onto_the_ground_touches_it_in_flight_once_until_i
     assert incidents_of(fleet, 4.0) == []
 
 
+BOX = {"obstacles": [{"name": "box", "shape": "box", "position_m": [10, 0, 0], "size_m": [2, 2, 0.5]}]}
+
+
 def test_a_drone_that_is_flown_onto_an_obstacle_touches_it_in_flight():
-    box = {"name": "box", "shape": "box", "position_m": [10, 0, 0], "size_m": [2, 2, 0.5]}
-    fleet = airborne(environment={"obstacles": [box]})
+    fleet = airborne(environment=BOX)
     fleet.bodies.state[0, STATE.p_WB : STATE.p_WB + 3] = 10.0, 0.0, 1.5
     assert ("touchdown", 0, {"other": "box"}) in descend(fleet, 5.0)
 
 
 def test_a_hard_hit_on_an_obstacle_names_it():
-    box = {"name": "box", "shape": "box", "position_m": [10, 0, 0], "size_m": [2, 2, 0.5]}
-    fleet = airborne(environment={"obstacles": [box]})
+    fleet = airborne(environment=BOX)
     fleet.bodies.state[0, STATE.p_WB : STATE.p_WB + 3] = 10.0, 0.0, 2.0
     fleet.emergency(0)
     ((kind, drone, data),) = incidents_of(fleet, 1.0)
@@ -164,6 +165,6 @@ def test_an_operator_s_emergency_in_the_air_is_an_event_with_its_source():
             ask(world, "d0", "takeoff")
         elif k == 100:
             ask(world, "d0", "emergency")
-        events += [m for _, m in world.outbox.take() if isinstance(m, Event) and m.kind == "emergency"]
+        events += [m for _, m in world.take_outbox() if isinstance(m, Event) and m.kind == "emergency"]
     (event,) = events
     assert (event.subject, event.source, event.data) == ("d0", "console.1", {"cause": "command"})

@@ -57,11 +57,14 @@ def listed(made: World) -> list[list[int]]:
 
 
 def test_what_the_scenario_plans_is_published_at_the_start_begun_and_ended():
-    made = world("[{kind: gps_dropout, target: d1, at_s: 0.04, for_s: 0.06}, {kind: mag_stuck, target: d2}]")
+    kill = "{kind: process_kill, target: estimator.d1, at_s: 0.02}"  # it has no end
+    made = world(
+        f"[{{kind: gps_dropout, target: d1, at_s: 0.04, for_s: 0.06}}, {{kind: mag_stuck, target: d2}}, {kill}]"
+    )
     key, message = made.outbox.pending[0]
-    assert (key, [(f.id, f.source) for f in message.faults]) == (keys.FAULTS, [(1, "scenario"), (2, "scenario")])
+    assert (key, [(f.id, f.source) for f in message.faults]) == (keys.FAULTS, [(i, "scenario") for i in (1, 2, 3)])
     go(made, 8)
-    assert events(made) == [(0, "fault", 2), (2, "fault", 1), (5, "fault_end", 1)]
+    assert events(made) == [(0, "fault", 2), (1, "fault", 3), (2, "fault", 1), (5, "fault_end", 1)]
 
 
 def test_an_event_says_all_of_a_fault():
@@ -70,19 +73,10 @@ def test_an_event_says_all_of_a_fault():
     add(made, "baro_bias", value_m=2, for_s=1)
     go(made, 1)
     event = next(m for k, m in made.take_outbox() if k == keys.EVENT and m.kind == "fault")
-    assert isinstance(event, Event)
     assert event.subject == "d1"
     assert has_terms(event.text, "baro_bias", "d1")
-    assert event.data == {
-        "id": 1,
-        "kind": "baro_bias",
-        "target": "d1",
-        "parameters": {"value_m": 2.0},
-        "from_ns": 2 * GATE_NS,
-        "until_ns": 52 * GATE_NS,
-        "source": "tester.one",
-        "rank": 0,
-    }
+    what = {"id": 1, "kind": "baro_bias", "target": "d1", "parameters": {"value_m": 2.0}, "rank": 0}
+    assert event.data == {**what, "from_ns": 2 * GATE_NS, "until_ns": 52 * GATE_NS, "source": "tester.one"}
 
 
 def test_a_requested_fault_is_published_before_the_gate_that_nobody_has_seen_yet():
@@ -116,12 +110,6 @@ def test_nothing_is_kept_of_what_has_left_the_list():
     go(made, 8)
     assert made.faults.all == ()
     assert made.faults._begun == made.faults._over == set()
-
-
-def test_a_kill_has_no_end():
-    made = world("[{kind: process_kill, target: estimator.d1, at_s: 0.04}]")
-    go(made, 8)
-    assert events(made) == [(2, "fault", 1)]
 
 
 def joined(made: World, name: str, period_gates: int, fingerprint: str = "x") -> None:
@@ -176,21 +164,21 @@ def test_a_planned_kill_of_who_does_not_die_says_so():
     assert has_terms(texts[0], "process_kill", "estimator.d1", "no effect")
 
 
-def ranks(made: World) -> dict[int, int]:
-    return {fault.id: fault.rank for fault in made.faults.all}
-
-
 def test_equal_faults_are_numbered_by_who_begins_and_keep_that():
     """So the same faults planned from the events of their beginning draw the same."""
+
+    def ranks() -> dict[int, int]:
+        return {fault.id: fault.rank for fault in made.faults.all}
+
     cut = {"kind": "link_loss", "target": "world/controller.main", "probability": 0.5}
     made = world()
     for more in ({"for_s": 0.04}, {}, {"at_s": 0.02}, {}):
         add(made, **{**cut, **more})
-    assert ranks(made) == {1: 0, 2: 1, 3: 0, 4: 2}
+    assert ranks() == {1: 0, 2: 1, 3: 0, 4: 2}
     ask(made, "fault_clear", id=2)
-    assert ranks(made) == {1: 0, 3: 0, 4: 1}
+    assert ranks() == {1: 0, 3: 0, 4: 1}
     go(made, 8)
-    assert ranks(made) == {3: 0, 4: 1}
+    assert ranks() == {3: 0, 4: 1}
 
 
 def test_what_links_carry_is_what_acts():

@@ -46,14 +46,8 @@ def test_a_replay_brings_what_was_stamped_later_in_order_of_arrival():
         history.add(IMU, b"%d" % t_ns, t_ns)
         history.add("drone/d2/truth", b"other", t_ns)
     assert [payload for _, payload in since(history, 1, ["drone/d1/**"])] == [b"3", b"2", b"4"]
-    assert since(history, 4, ["**"]) == []
-    assert since(history, -1, []) == []
-
-
-def test_a_message_that_several_expressions_take_comes_once():
-    history = MessageHistory()
-    history.add(IMU, b"x", 5)
-    assert since(history, 0, ["drone/**", "**", IMU]) == [(IMU, b"x")]
+    assert since(history, 4, ["**"]) == since(history, -1, []) == []
+    assert len(since(history, 3, ["drone/**", "**", IMU])) == 2  # each once
 
 
 def test_what_is_older_than_the_window_is_forgotten():
@@ -98,6 +92,7 @@ def test_strangers_push_nothing_out_and_have_room_again_when_theirs_is_forgotten
 def test_pages_bring_everything_once_and_in_order():
     history = MessageHistory(page_bytes=10)
     published = [(IMU, bytes([number]) * (number % 5 + 1)) for number in range(50)]
+    published += [(IMU, b"x" * 30), (IMU, b"y")]  # longer than a page
     for number, (key, payload) in enumerate(published):
         history.add(key, payload, number)
         history.add("drone/d2/truth", b"another's", number)
@@ -105,13 +100,6 @@ def test_pages_bring_everything_once_and_in_order():
     first, _ = history.page(-1, lambda key: key == IMU)
     assert sum(len(payload) for _, payload in first) <= 10
     assert first == published[: len(first)]
-
-
-def test_a_page_brings_what_alone_is_longer_than_a_page():
-    history = MessageHistory(page_bytes=10)
-    for payload in (b"x" * 30, b"y"):
-        history.add(IMU, payload, 0)
-    assert since(history, -1, [IMU]) == [(IMU, b"x" * 30), (IMU, b"y")]
 
 
 def test_a_page_goes_on_where_the_last_one_ended_when_the_oldest_is_forgotten_meanwhile():

@@ -1,5 +1,7 @@
 """What a run measures of itself: ages of commands, and the rate of its clock."""
 
+from typing import Any
+
 import pytest
 
 from zsim_world.run.run_statistics import GATES_KEPT, CommandAges, RealTimeFactor, RunStatistics
@@ -15,8 +17,11 @@ GATE_NS = 20 * MS
         ([(0, 0)], [(7, 5)], None),
         ([(0, 100), (GATE_NS, 120)], [(0, 103), (GATE_NS, 121)], (2.0, 2.98, 3.0)),
         ([(0, 0)], [(0, age_ms) for age_ms in range(101)], (50.0, 99.0, 100.0)),
+        ([(gate, gate) for gate in range(GATES_KEPT + 1)], [(0, 10)], None),
+        ([(gate, gate) for gate in range(GATES_KEPT + 1)], [(1, 11)], (10.0, 10.0, 10.0)),
+        ([(0, 5), (0, 9), *((g, g) for g in range(1, 2 * GATES_KEPT))], [(GATES_KEPT, GATES_KEPT + 1)], (1.0,) * 3),
     ],
-    ids=["none", "of no gate", "of two gates", "many"],
+    ids=["none", "of no gate", "of two gates", "many", "of a forgotten gate", "of the oldest", "published twice"],
 )
 def test_the_age_of_a_command_is_counted_from_the_gate_that_it_answers(
     gates: list[tuple[int, int]], commands: list[tuple[int, int]], summary: tuple[float, ...] | None
@@ -30,16 +35,6 @@ def test_the_age_of_a_command_is_counted_from_the_gate_that_it_answers(
     assert ages.summary_ms() == (pytest.approx(wanted) if wanted else None)
 
 
-def test_old_gates_are_forgotten():
-    ages = CommandAges()
-    for gate in range(GATES_KEPT + 1):
-        ages.gate(gate, gate)
-    ages.command(0, 10)
-    assert ages.summary_ms() is None
-    ages.command(1, 10)
-    assert ages.summary_ms() is not None
-
-
 def test_old_ages_are_forgotten(monkeypatch):
     monkeypatch.setattr("zsim_world.run.run_statistics.AGES_KEPT", 2)
     ages = CommandAges()
@@ -49,30 +44,28 @@ def test_old_ages_are_forgotten(monkeypatch):
     assert ages.summary_ms() == pytest.approx({"p50": 1.5, "p99": 1.99, "max": 2.0})
 
 
-def test_a_gate_published_twice_is_still_known():
-    ages = CommandAges()
-    ages.gate(0, 5 * MS)
-    ages.gate(0, 9 * MS)
-    for gate in range(1, 2 * GATES_KEPT):
-        ages.gate(gate, gate)
-    ages.command(GATES_KEPT, GATES_KEPT + MS)
-    assert ages.summary_ms() == pytest.approx({"p50": 1.0, "p99": 1.0, "max": 1.0})
-
-
 def test_the_rate_is_simulated_per_wall_time_over_the_last_second():
     rate = RealTimeFactor()
-    assert rate.now() == 0.0
-    assert rate.wall_s == 0.0
+    assert (rate.now(), rate.wall_s) == (0.0, 0.0)
     rate.gate(0, 7_000 * MS)
     assert rate.now() == 0.0
     for gate in range(1, 101):
         rate.gate(gate * GATE_NS, 7_000 * MS + gate * 5 * MS)
-    assert rate.now() == pytest.approx(4.0)
-    assert rate.wall_s == pytest.approx(0.5)
+    assert (rate.now(), rate.wall_s) == pytest.approx((4.0, 0.5))
     for gate in range(101, 301):
         rate.gate(gate * GATE_NS, 7_500 * MS + (gate - 100) * 10 * MS)
     assert rate.now() == pytest.approx(2.0, rel=0.02)
     assert rate.wall_s == pytest.approx(2.5)
+
+
+@pytest.mark.parametrize(
+    ("wall_ms", "now"), [([0, 5_000, 10_000, 15_000], 0.004), ([5, 5], 0.0)], ids=["rare gates", "a standing clock"]
+)
+def test_any_wall_clock_gives_a_rate(wall_ms: list[int], now: float):
+    rate = RealTimeFactor()
+    for gate, wall in enumerate(wall_ms):
+        rate.gate(gate * GATE_NS, wall * MS)
+    assert rate.now() == pytest.approx(now)
 
 
 def test_time_that_jumps_does_not_pass():
@@ -84,8 +77,7 @@ def test_time_that_jumps_does_not_pass():
         t_s = 300 + number if number < 6 else number - 5
         rate.gate(t_s * 1_000 * MS, number * 500 * MS)
         assert rate.now() == pytest.approx(0.0 if number in (0, 6) else 2.0)
-    assert rate.sim_s == pytest.approx(9.0)
-    assert rate.wall_s == pytest.approx(5.0)
+    assert (rate.sim_ns / 1e9, rate.wall_s) == pytest.approx((9.0, 5.0))
 
 
 def test_simulated_time_passes_from_before_a_stand_to_the_gate_after_it():
@@ -94,23 +86,7 @@ def test_simulated_time_passes_from_before_a_stand_to_the_gate_after_it():
     rate.gate(GATE_NS, 20 * MS)
     rate.stand_still(5_000 * MS)
     rate.gate(2 * GATE_NS, 5_010 * MS)
-    assert rate.sim_s == pytest.approx(2 * GATE_NS / 1e9)
-    assert rate.wall_s == pytest.approx(0.03)
-    assert rate.now() == pytest.approx(2.0)
-
-
-def test_gates_further_apart_than_a_second_still_have_a_rate():
-    rate = RealTimeFactor()
-    for gate in range(4):
-        rate.gate(gate * GATE_NS, gate * 5_000 * MS)
-    assert rate.now() == pytest.approx(0.004)
-
-
-def test_a_wall_clock_that_stands_gives_no_rate():
-    rate = RealTimeFactor()
-    rate.gate(0, 5)
-    rate.gate(GATE_NS, 5)
-    assert rate.now() == 0.0
+    assert (rate.sim_ns, rate.wall_s, rate.now()) == (2 * GATE_NS, pytest.approx(0.03), pytest.approx(2.0))
 
 
 class Owing:
@@ -128,17 +104,16 @@ class Owing:
 
 
 def test_the_result_counts_who_was_late_and_how_near_drones_came():
-    measured, late, quick = RunStatistics(), Owing("late", 2), Owing("quick", 0)
+    measured = RunStatistics()
+    both: list[Any] = [Owing("late", 2), Owing("quick", 0)]
     for need_ns in (-1, 0, 1, 2):
-        measured.deadlines([late, quick], need_ns)  # type: ignore[list-item]
-        measured.separation(2.5 - need_ns)
+        measured.deadlines(both, need_ns)
     measured.world_misses += 1
     for t_ns, wall_ns in ((0, 0), (2_000_000_000, 500_000_000)):
         measured.gate(t_ns, wall_ns)
-    result = measured.result([late, quick])  # type: ignore[list-item]
-    assert result["real_time_factor"] == 4.0
-    assert result["deadlines"] == 6
+    result = measured.result(both)
+    assert (result["real_time_factor"], result["deadlines"], result["deadline_misses"]) == (4.0, 6, 3)
     assert result["deadline_misses_by"] == {"late": 2, "quick": 0, "world": 1}
-    assert result["deadline_misses"] == 3
-    assert result["closest_m"] == 0.5
-    assert RunStatistics().result([])["closest_m"] is None
+    assert result["closest_m"] is None
+    measured.closest_m = 0.5
+    assert measured.result(both)["closest_m"] == 0.5

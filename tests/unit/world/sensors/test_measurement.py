@@ -23,6 +23,7 @@ from zsim_world.sensors.equations import (
 
 NOWHERE, STILL = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 STRAIGHT = (1.0, 0.0, 0.0, 0.0)
+SITE = Site(9.8, (0.0, 20.0, -10.0))
 
 
 def body(p=NOWHERE, v=STILL, q=STRAIGHT, w=STILL, a=STILL, alpha=STILL):
@@ -35,54 +36,52 @@ def mounted(p=NOWHERE, q=STRAIGHT, range_max=6.0):
     return MountedSensor((float(p[0]), float(p[1]), float(p[2])), q, range_max)
 
 
-SITE = Site(9.8, (0.0, 20.0, -10.0))
-
-
 def turn(roll=0.0, pitch=0.0, yaw=0.0):
     return tuple(quaternion_from_rpy((roll, pitch, yaw)).tolist())
 
 
-def test_imu_at_rest_feels_gravity_upwards():
-    f, w = imu(body(), mounted((0.1, 0.2, 0.3)), SITE)
-    np.testing.assert_allclose(f, (0, 0, 9.8))
-    np.testing.assert_allclose(w, 0)
+LEFT = turn(yaw=math.pi / 2)
+SINE, COSINE = 9.8 * math.sin(0.1), 9.8 * math.cos(0.1)
+# sensor, truth, mount, values worked out by hand
+CASES: dict[str, tuple[Any, BodyTruth, MountedSensor, Any]] = {
+    "at rest, gravity is felt upwards": (imu, body(), mounted((0.1, 0.2, 0.3)), ((0, 0, 9.8), STILL)),
+    # a real landed packet: theta +2.97 deg, accel x +80 mg
+    "nose up: specific force along the nose": (imu, body(q=turn(pitch=-0.1)), mounted(), ((SINE, 0, COSINE), STILL)),
+    "spinning at 3 rad/s about z, faster by 2 rad/s^2, 0.1 m ahead": (
+        imu, body(a=(0, 0, -9.8), w=(0, 0, 3), alpha=(0, 0, 2)), mounted((0.1, 0, 0)), ((-0.9, 0.2, 0), (0, 0, 3)),
+    ),
+    "a board turned a quarter to the left: ahead is to its right": (
+        imu, body(a=(1, 0, -9.8), w=(0.5, 0, 0)), mounted(q=LEFT), ((0, -1, 0), (0, -0.5, 0)),
+    ),
+    "an antenna off the centre": (
+        gps, body((1, 2, 3), (1, 0, 0), LEFT, (0, 0, 2)), mounted((0.1, 0, 0.05)), ((1.0, 2.1, 3.05), (0.8, 0, 0)),
+    ),
+    "the field turns against the body": (mag, body(q=LEFT), mounted(), ((20, 0, -10), STILL)),
+    "and against the mount": (mag, body(q=LEFT), mounted(q=LEFT), ((0, -20, -10), STILL)),
+    "the barometer's height is that of its mount": (
+        baro, body((0, 0, 5), q=turn(pitch=-math.pi / 2)), mounted((0.2, 0, 0)), ((5.2, 0, 0), STILL),
+    ),
+    "a beam from its mount": (sonar, body((0, 0, 2)), mounted((0, 0, -0.05)), ((1.95, 1, 0), STILL)),
+    "a slanted beam": (sonar, body((0, 0, 2), q=turn(0.3)), mounted(), ((2 / math.cos(0.3), 1, 0), STILL)),
+    "an upright beam of a slanted body": (
+        sonar, body((0, 0, 2), q=turn(0.3)), mounted(q=turn(-0.3)), ((2.0, 1, 0), STILL),
+    ),
+    "no echo from afar": (sonar, body((0, 0, 6.1)), mounted(), ((6.0, 0, 0), STILL)),
+    "no echo from aside": (sonar, body((0, 0, 1), q=turn(1.2)), mounted(), ((6.0, 0, 0), STILL)),
+    "no echo from above": (sonar, body((0, 0, 1), q=turn(3.0)), mounted(), ((6.0, 0, 0), STILL)),
+    "flow is in the heading frame": (
+        flow, body(v=(1, 2, 0.5), q=turn(0.2, -0.1, math.pi / 2)), mounted(),
+        ((2.0, -1.0, 0.5), (math.cos(0.2) * math.cos(0.1), 0, 0)),
+    ),
+    "flow of a turning sensor": (flow, body(q=LEFT, w=(0, 0, 2)), mounted((0.1, 0, 0)), ((0, 0.2, 0), (1, 0, 0))),
+    "upside down flow sees nothing": (flow, body(q=turn(roll=3.0)), mounted(), (STILL, STILL)),
+}  # fmt: skip
 
 
-def test_imu_signs_as_on_the_aircraft():
-    """Nose up: specific force along the nose (a real landed packet: theta +2.97 deg, accel x +80 mg)."""
-    f, _ = imu(body(q=turn(pitch=-0.1)), mounted(), SITE)
-    assert f[0] == pytest.approx(9.8 * math.sin(0.1))
-
-
-def test_imu_lever_arm_by_hand():
-    """Spinning at 3 rad/s about z, speeding up by 2 rad/s^2, 0.1 m ahead: -0.9 m/s^2 along x, +0.2 along y."""
-    f, _ = imu(body(a=(0, 0, -9.8), w=(0, 0, 3), alpha=(0, 0, 2)), mounted((0.1, 0, 0)), SITE)
-    np.testing.assert_allclose(f, (-0.9, 0.2, 0.0), atol=1e-12)
-
-
-def test_imu_mount_turned_by_a_quarter():
-    """A board turned a quarter to the left: what is forward for the body is to the board's right."""
-    f, w = imu(body(a=(1, 0, -9.8), w=(0.5, 0, 0)), mounted(q=turn(yaw=math.pi / 2)), SITE)
-    np.testing.assert_allclose(f, (0, -1, 0), atol=1e-12)
-    np.testing.assert_allclose(w, (0, -0.5, 0), atol=1e-12)
-
-
-def test_gps_is_that_of_the_antenna():
-    p, v = gps(body((1, 2, 3), (1, 0, 0), turn(yaw=math.pi / 2), (0, 0, 2)), mounted((0.1, 0, 0.05)), SITE)
-    np.testing.assert_allclose(p, (1.0, 2.1, 3.05))
-    np.testing.assert_allclose(v, (1 - 0.2, 0, 0), atol=1e-12)
-
-
-def test_mag_turns_against_body_and_mount():
-    x = body(q=turn(yaw=math.pi / 2))
-    np.testing.assert_allclose(mag(x, mounted(), SITE)[0], (20, 0, -10), atol=1e-12)
-    turned, _ = mag(x, mounted(q=turn(yaw=math.pi / 2)), SITE)
-    np.testing.assert_allclose(turned, (0, -20, -10), atol=1e-12)
-
-
-def test_barometer_height_is_that_of_its_mount():
-    height, _ = baro(body((0, 0, 5), q=turn(pitch=-math.pi / 2)), mounted((0.2, 0, 0)), SITE)
-    assert height[0] == pytest.approx(5.2)
+@pytest.mark.parametrize("name", CASES)
+def test_a_sensor_measures_what_its_mount_is_exposed_to(name: str):
+    sensor, truth, mount, expected = CASES[name]
+    np.testing.assert_allclose(sensor(truth, mount, SITE), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -100,44 +99,15 @@ def test_pressure_is_finite_at_any_height():
     assert pressures == sorted(pressures, reverse=True)
 
 
-def beam(p, q=STRAIGHT, p_BS=NOWHERE, q_BS=STRAIGHT):
-    """Return distance and echo of a sonar with a range of 6 m."""
-    (distance, echo, _), _ = sonar(body(p, q=q), mounted(p_BS, q_BS), SITE)
-    return distance, echo
-
-
-def test_sonar_measures_along_its_beam():
-    assert beam((0, 0, 2), p_BS=(0, 0, -0.05)) == (pytest.approx(1.95), 1.0)
-    assert beam((0, 0, 2), turn(roll=0.3)) == (pytest.approx(2.0 / math.cos(0.3)), 1.0)
-    assert beam((0, 0, 2), turn(roll=0.3), q_BS=turn(roll=-0.3)) == (pytest.approx(2.0), 1.0)
-
-
-def test_sonar_has_no_echo_from_afar_or_aside():
-    assert beam((0, 0, 6.1)) == (6.0, 0.0)
-    assert beam((0, 0, 1), turn(roll=1.2)) == (6.0, 0.0)
-    assert beam((0, 0, 1), turn(roll=3.0)) == (6.0, 0.0)
-
-
-def test_flow_is_in_the_heading_frame():
-    q = turn(roll=0.2, pitch=-0.1, yaw=math.pi / 2)
-    v, (quality, _, _) = flow(body(v=(1, 2, 0.5), q=q), mounted(), SITE)
-    np.testing.assert_allclose(v, (2.0, -1.0, 0.5), atol=1e-12)
-    assert quality == pytest.approx(math.cos(0.2) * math.cos(0.1))
-    moved, _ = flow(body(q=turn(yaw=math.pi / 2), w=(0, 0, 2)), mounted((0.1, 0, 0)), SITE)
-    np.testing.assert_allclose(moved, (0, 0.2, 0), atol=1e-12)
-
-
-def test_flow_upside_down_sees_nothing():
-    _, (quality, _, _) = flow(body(q=turn(roll=3.0)), mounted(), SITE)
-    assert quality == 0.0
-
-
 @pytest.mark.parametrize(
-    ("value", "quantum", "shown"), [(1.26, 0.5, 1.5), (-1.26, 0.5, -1.5), (1.24, 0.5, 1.0), (1.26, 0.0, 1.26)]
+    ("value", "bias", "white", "quantum", "shown"),
+    [
+        (1.26, 0.0, 0.0, 0.5, 1.5),
+        (-1.26, 0.0, 0.0, 0.5, -1.5),
+        (1.24, 0.0, 0.0, 0.5, 1.0),
+        (1.26, 0.0, 0.0, 0.0, 1.26),
+        (1.0, 0.2, 0.1, 0.5, 1.5),
+    ],
 )
-def test_reading_rounds_to_the_quantum(value, quantum, shown):
-    assert rounded(value, 0.0, 0.0, quantum) == shown
-
-
-def test_reading_adds_bias_and_noise_before_rounding():
-    assert rounded(1.0, 0.2, 0.1, 0.5) == 1.5
+def test_a_reading_is_rounded_to_the_quantum_after_bias_and_noise(value, bias, white, quantum, shown):
+    assert rounded(value, bias, white, quantum) == shown

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fleet_samples import samples_of
 
 from zsim.contract.run_messages import Fault
 from zsim.errors import RunError
@@ -41,7 +42,7 @@ def values(flying: Fleet, name: str, gates: int, drone: int = 0) -> np.ndarray:
     found = []
     for _ in range(gates):
         flying.advance()
-        found += [sample.values for sample in flying.samples() if (sample.sensor, sample.drone) == (name, drone)]
+        found += [sample.values for sample in samples_of(flying) if (sample.sensor, sample.drone) == (name, drone)]
     return np.array(found)
 
 
@@ -160,8 +161,8 @@ def test_no_other_sample_changes_with_a_users_sensor():
     for _ in range(20):
         without.advance()
         with_it.advance()
-        stock = [sample for sample in with_it.samples() if sample.sensor not in ("my_uwb", "pitot")]
-        assert stock == without.samples()
+        stock = [sample for sample in samples_of(with_it) if sample.sensor not in ("my_uwb", "pitot")]
+        assert stock == samples_of(without)
 
 
 def test_messages_come_in_order_and_are_counted():

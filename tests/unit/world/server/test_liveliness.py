@@ -80,12 +80,16 @@ def test_one_that_publishes_is_not() -> None:
     assert "death" not in case.events()
 
 
-@pytest.mark.parametrize(("pid", "kinds"), [(8, ["death", "restart"]), (7, ["superseded"])])
+@pytest.mark.parametrize(
+    ("is_lost", "pid", "kinds"),
+    [(True, 8, ["death", "restart"]), (True, 7, ["superseded"]), (False, 8, ["superseded"])],
+)
 def test_who_joins_in_place_of_one_whose_token_went_had_no_need_to_wait_for_its_death(
-    pid: int, kinds: list[str]
+    is_lost: bool, pid: int, kinds: list[str]
 ) -> None:
     case = Case("estimator.d1", GATE_NS)
-    case.liveliness.token_lost(case.name)
+    if is_lost:
+        case.liveliness.token_lost(case.name)
     case.join(incarnation=2, pid=pid)
     assert case.events()[1:] == kinds
 
@@ -97,12 +101,6 @@ def test_a_join_that_arrives_while_a_token_is_checked_settles_it(monkeypatch: py
     case.liveliness.token_lost(case.name)
     case.liveliness.check_due()
     assert case.events()[1:] == ["death", "restart"]
-
-
-def test_who_joins_in_place_of_one_that_lives_takes_over() -> None:
-    case = Case("estimator.d1", GATE_NS)
-    case.join(incarnation=2, pid=8)
-    assert case.events()[1:] == ["superseded"]
 
 
 S = 1_000_000_000

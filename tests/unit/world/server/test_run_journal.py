@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from zsim.errors import RunError
-from zsim_world.run.inputs import Advanced, Died, Entry, Taken
+from zsim_world.run.inputs import Advanced, Called, Entry, Taken
 from zsim_world.server import run_journal
 from zsim_world.server.run_journal import RunJournal, journaled_run
 
@@ -25,7 +25,11 @@ def written(folder: Path, checkpoints: int = 0, **options: Any) -> list[Entry]:
     assert kept.open() is None
     for number in range(checkpoints + 1):
         for name in ("a", "b"):
-            new = [Taken(number, (f"key/{name}", b"\x00\xff")), Advanced(number, name == "b"), Died(number, name)]
+            new = [
+                Taken(number, (f"key/{name}", b"\x00\xff")),
+                Advanced(number, name == "b"),
+                Called("died", (name, number)),
+            ]
             for entry in new:
                 kept.note(entry)
             kept.commit()

@@ -15,7 +15,7 @@ from zsim.contract.framing import decode_batch
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Done, Event, Health, Join
 from zsim.errors import DecodeError
 from zsim.runtime.health import HealthMeter
-from zsim.scenario import roles, scenario_file
+from zsim.scenario import scenario_file
 from zsim.schema.message import Message
 from zsim_world.fleet.fleet import DivergedError
 from zsim_world.run.world import DURATION_OVER, World
@@ -95,24 +95,19 @@ def test_a_request_of_somebody_without_a_name_is_refused():
     assert made.control(ControlRequest("stop", {}, "")).ok
 
 
-def test_states_are_shown_with_the_name_of_their_cluster():
-    made, link, shown = world(), FakeLink(), []
-    link.deliver(STATE, state(0))
-    run(made, link, progress=lambda kind, message, about: shown.append((kind, about)))
-    assert shown.count(("state", "main")) == 1
-
-
-def test_healths_are_shown_with_the_name_of_the_process():
+def test_states_and_healths_are_shown_with_the_name_of_their_cluster_or_process():
     made, link, shown = world(), FakeLink(), []
     health = Health(0, 0, "estimator", "h", 1, {}, 0, 0, 0, 0, received=7)
+    link.deliver(STATE, state(0))
     link.deliver("process/estimator.d1/health", health)
     seconds = iter(range(1000))
     meter = HealthMeter("world", lambda: float(next(seconds)))
     run(made, link, progress=lambda *args: shown.append(args), health=meter)
+    assert [about for kind, _, about in shown if kind == "state"] == ["main"]
     healths = [args[1:] for args in shown if args[0] == "health"]
     assert healths[0] == (health, "estimator.d1")
     assert {name for _, name in healths[1:]} == {"world"}
-    assert healths[-1][0].received == 1
+    assert healths[-1][0].received == 2
 
 
 # What cameras say
@@ -130,26 +125,22 @@ def test_how_a_camera_sees_is_kept_and_handed_on_and_its_pictures_are_not():
     assert [key for key in passed if key in (FRONT_INFO, FRONT, DETECTIONS)] == [FRONT_INFO, DETECTIONS]
 
 
-def test_the_world_answers_how_a_camera_sees():
-    assert any(keys.matches(expression, FRONT_INFO) for expression in roles.LAST_VALUES)
-    assert not any(keys.matches(expression, FRONT) for expression in roles.LAST_VALUES)
-
-
-@pytest.mark.parametrize(("key", "message"), [(FRONT_INFO, image(0)), (DETECTIONS, info()), (FRONT_INFO, info(10**12))])
+@pytest.mark.parametrize(
+    ("key", "message"),
+    [
+        (FRONT_INFO, image(0)),
+        (DETECTIONS, info()),
+        (FRONT_INFO, info(10**12)),
+        (keys.sensor("d1", keys.SIGHTINGS), sightings(0)),  # the world's own
+    ],
+)
 def test_what_a_camera_cannot_say_changes_nothing(key: str, message: Message):
     made, link = world(), FakeLink()
-    link.deliver(key, info() if key == FRONT_INFO else sightings(0))
     link.deliver(key, message)
     process = run(made, link)
     assert process.health.refused == 1
     assert [event.subject for event in events(link, "refused")] == [key]
-    assert process._history.last(key) != [(key, messages.encode(message))]
-
-
-def test_sightings_of_the_world_itself_are_nobodys_to_publish():
-    made, link = world(), FakeLink()
-    link.deliver(keys.sensor("d1", keys.SIGHTINGS), sightings(0))
-    assert run(made, link).health.refused == 1
+    assert process._history.last(key) == []
 
 
 def test_pictures_of_a_replay_are_on_their_key_alone():

@@ -10,13 +10,13 @@ from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.vehicles.observer import BELIEF
 
-PRESETS = [
-    {"preset": "paper"},
-    {"preset": "paper", "as_printed": True},
-    {"preset": "ardrone2"},
-]
-NAMES = ["paper", "as_printed", "ardrone2"]
+PRESETS = {
+    "paper": {"preset": "paper"},
+    "as_printed": {"preset": "paper", "as_printed": True},
+    "ardrone2": {"preset": "ardrone2"},
+}
 GATE_S = 0.02
+each_preset = pytest.mark.parametrize("sensors", PRESETS.values(), ids=PRESETS)
 
 
 def fleet(count=1, sensors=None, gust=0.5, steady=(0.0, 0.0, 0.0), seed=1, **drone):
@@ -68,7 +68,7 @@ def in_heading_frame(truth, i=0):
     return np.array([c * vx + s * vy, c * vy - s * vx, vz])
 
 
-@pytest.mark.parametrize("sensors", PRESETS, ids=NAMES)
+@each_preset
 def test_every_preset_takes_off_flies_a_pattern_at_15_m_and_lands(sensors):
     flight = fleet(3, sensors)
     for i in range(3):
@@ -97,18 +97,13 @@ def test_every_preset_takes_off_flies_a_pattern_at_15_m_and_lands(sensors):
     assert not flight.truth().rotor_rad_s.any() or flight.truth().rotor_rad_s.max() < 1e-3
 
 
-def test_takeoff_rises_evenly_and_without_a_leap():
+def test_takeoff_rises_evenly_and_landing_is_gentle():
     flight = fleet(gust=0.0)
     flight.takeoff(0)
     track = run(flight, 8.0)
-    height = np.array([truth.position_m[0, 2] for truth in track])
-    climb = np.array([truth.velocity_m_s[0, 2] for truth in track])
-    assert height.max() < 1.25
-    assert climb.max() < 1.2
+    assert max(truth.position_m[0, 2] for truth in track) < 1.25
+    assert max(truth.velocity_m_s[0, 2] for truth in track) < 1.2
     assert np.abs([truth.position_m[0, :2] for truth in track]).max() < 0.25
-
-
-def test_landing_is_gentle():
     flight = airborne()
     flight.land(0)
     track = run(flight, 8.0)
@@ -137,7 +132,7 @@ def test_hover_holds_against_a_steady_wind():
     assert np.linalg.norm(end.velocity_m_s[0]) < 0.2
 
 
-@pytest.mark.parametrize("sensors", PRESETS, ids=NAMES)
+@each_preset
 def test_velocity_step(sensors):
     flight = airborne(1, sensors, gust=0.0, climb_to=8.0)
     track = run(flight, 6.0, every(flight, (2.0, 0.0, 0.0)))
@@ -218,16 +213,9 @@ def test_rotor_setpoint_goes_to_the_rotors_within_their_limits():
 def test_silence_of_the_commander_hovers_then_lands():
     flight = airborne()
     assert flight.set_velocity(0, (0.3, 0.0, 0.0), 0.0) is None
-    run(flight, 0.46)
-    assert states(flight) == ["flying"]
-    run(flight, 0.06)
-    assert states(flight) == ["hovering"]
-    run(flight, 1.92)
-    assert states(flight) == ["hovering"]
-    run(flight, 0.1)
-    assert states(flight) == ["landing"]
-    run(flight, 8.0)
-    assert states(flight) == ["landed"]
+    for seconds, state in ((0.46, "flying"), (0.06, "hovering"), (1.92, "hovering"), (0.1, "landing"), (8.0, "landed")):
+        run(flight, seconds)
+        assert states(flight) == [state]
 
 
 def test_a_new_setpoint_ends_the_silence_and_a_release_never_lands():
@@ -273,15 +261,12 @@ def test_a_drone_on_its_back_does_not_take_off():
     assert "upright" in str(flight.takeoff(0))
 
 
-def test_low_battery_lands_and_forbids_a_takeoff():
+def test_low_battery_lands_and_forbids_a_takeoff_and_an_empty_one_stops_the_rotors():
     flight = airborne(battery_percent=12.0)
     run(flight, 60.0)
     assert states(flight) == ["landed"]
     assert 3.0 < flight.status(0)[1] < 5.0
     assert "%" in str(flight.takeoff(0))
-
-
-def test_an_empty_battery_stops_the_rotors():
     flight = fleet(battery_percent=0.0)
     run(flight, 1.0)
     assert flight.status(0)[1] == 0.0
@@ -298,59 +283,41 @@ def test_it_flies_on_its_flow_and_not_on_truth():
 
 
 HEAVY = {
-    "mass_kg": 1.5,
-    "inertia_kg_m2": [0.015, 0.016, 0.03],
-    "arm_m": 0.25,
-    "thrust_n_s2": 1.6e-5,
-    "torque_nm_s2": 3.0e-7,
-    "rotor_time_constant_s": 0.06,
-    "rotor_min_rad_s": 150.0,
-    "rotor_max_rad_s": 800.0,
-    "drag_n_s_m": 0.4,
-    "battery_mah": 5000.0,
-}
+    "mass_kg": 1.5, "inertia_kg_m2": [0.015, 0.016, 0.03], "arm_m": 0.25, "thrust_n_s2": 1.6e-5, "torque_nm_s2": 3.0e-7,
+    "rotor_time_constant_s": 0.06, "rotor_min_rad_s": 150.0, "rotor_max_rad_s": 800.0, "drag_n_s_m": 0.4, "battery_mah": 5000.0,
+}  # fmt: skip
 LIGHT = {
-    "mass_kg": 0.05,
-    "inertia_kg_m2": [3e-5, 3e-5, 5e-5],
-    "arm_m": 0.06,
-    "thrust_n_s2": 4.0e-8,
-    "torque_nm_s2": 2.4e-10,
-    "rotor_time_constant_s": 0.02,
-    "rotor_min_rad_s": 300.0,
-    "rotor_max_rad_s": 2600.0,
-    "drag_n_s_m": 0.02,
-}
+    "mass_kg": 0.05, "inertia_kg_m2": [3e-5, 3e-5, 5e-5], "arm_m": 0.06, "thrust_n_s2": 4.0e-8, "torque_nm_s2": 2.4e-10,
+    "rotor_time_constant_s": 0.02, "rotor_min_rad_s": 300.0, "rotor_max_rad_s": 2600.0, "drag_n_s_m": 0.02,
+}  # fmt: skip
+MOUNT = {"position_m": [0.03, -0.02, 0.01], "rpy_deg": [5.0, -8.0, 90.0]}
+TURNED = {"preset": "ardrone2", "imu": {"mount": MOUNT}, "mag": {"mount": MOUNT}}
+LOSSY = {"preset": "paper", "imu": {"dropout": 0.05}, "flow": {"dropout": 0.3}, "sonar": {"dropout": 0.3}}
 
 
-@pytest.mark.parametrize("aircraft", [HEAVY, LIGHT], ids=["heavy", "light"])
-def test_another_aircraft_flies_too(aircraft):
-    flight = airborne(2, **aircraft)
-    track = run(flight, 6.0, every(flight, (1.0, 0.0, 0.2)))
+@pytest.mark.parametrize(
+    ("sensors", "aircraft", "velocity", "atol"),
+    [
+        (None, HEAVY, (1.0, 0.0, 0.2), 0.15),
+        (None, LIGHT, (1.0, 0.0, 0.2), 0.15),
+        (TURNED, {}, (1.0, -0.5, 0.0), 0.12),
+        (LOSSY, {}, (0.5, 0.0, 0.0), 0.25),
+    ],
+    ids=["heavy", "light", "a turned and shifted board", "lost samples"],
+)
+def test_another_aircraft_or_board_flies_too(sensors, aircraft, velocity, atol):
+    flight = airborne(2, sensors, **aircraft)
+    track = run(flight, 6.0, every(flight, velocity))
+    assert states(flight) == ["flying"] * 2
     mean = np.mean([in_heading_frame(truth) for truth in track[-100:]], axis=0)
-    np.testing.assert_allclose(mean, (1.0, 0.0, 0.2), atol=0.15)
+    np.testing.assert_allclose(mean, velocity, atol=atol)
     for i in range(2):
         flight.land(i)
-    run(flight, 12.0)
+    run(flight, 14.0)
     assert states(flight) == ["landed"] * 2
 
 
-def test_it_flies_with_a_turned_and_shifted_board():
-    mount = {"position_m": [0.03, -0.02, 0.01], "rpy_deg": [5.0, -8.0, 90.0]}
-    sensors = {"preset": "ardrone2", "imu": {"mount": mount}, "mag": {"mount": mount}}
-    flight = airborne(2, sensors)
-    track = run(flight, 6.0, every(flight, (1.0, -0.5, 0.0)))
-    mean = np.mean([in_heading_frame(truth) for truth in track[-100:]], axis=0)
-    np.testing.assert_allclose(mean, (1.0, -0.5, 0.0), atol=0.12)
-
-
-def test_it_flies_with_lost_samples():
-    sensors = {"preset": "paper", "imu": {"dropout": 0.05}, "flow": {"dropout": 0.3}, "sonar": {"dropout": 0.3}}
-    flight = airborne(2, sensors)
-    run(flight, 10.0, every(flight, (0.5, 0.0, 0.0)))
-    assert states(flight) == ["flying"] * 2
-
-
-@pytest.mark.parametrize("sensors", PRESETS, ids=NAMES)
+@each_preset
 def test_belief_agrees_with_truth(sensors):
     """Tilt within a degree, heading within three, velocity and height as the sensors allow."""
     flight = airborne(3, sensors, climb_to=12.0)

@@ -12,8 +12,11 @@ from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim_world.vehicles import observer
 from zsim_world.vehicles.observer import GAIN
 
-PRESETS = [{"preset": "paper"}, {"preset": "paper", "as_printed": True}, {"preset": "ardrone2"}]
-NAMES = ["paper", "as_printed", "ardrone2"]
+PRESETS = {
+    "paper": {"preset": "paper"},
+    "as_printed": {"preset": "paper", "as_printed": True},
+    "ardrone2": {"preset": "ardrone2"},
+}
 
 
 def row_of(sensors, **drone):
@@ -22,7 +25,7 @@ def row_of(sensors, **drone):
     return observer.gain_row(ARDRONE2, scenario.drones[0], scenario.environment)
 
 
-@pytest.mark.parametrize("sensors", PRESETS, ids=NAMES)
+@pytest.mark.parametrize("sensors", PRESETS.values(), ids=PRESETS)
 def test_observer_gains_make_a_stable_filter_over_its_true_schedule(sensors):
     """Errors of the horizontal design model shrink over one second of 200 accelerometer and 15 flow samples."""
     row = row_of(sensors)

@@ -25,13 +25,10 @@ def _asked_anew():
     fingerprint.cache_clear()
 
 
-def test_it_is_sixteen_hex_digits():
-    assert re.fullmatch(r"[0-9a-f]{16}", fingerprint())
-
-
 def test_another_process_has_the_same():
     command = [sys.executable, "-c", "from zsim.contract.fingerprint import fingerprint; print(fingerprint())"]
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == fingerprint()
+    assert re.fullmatch(r"[0-9a-f]{16}", fingerprint())
 
 
 def test_it_is_made_of_what_the_last_bit_depends_on():
@@ -40,11 +37,13 @@ def test_it_is_made_of_what_the_last_bit_depends_on():
     assert all(found.values())
 
 
-@pytest.mark.parametrize("package", PACKAGES)
-def test_another_version_of_a_package_is_another_fingerprint(package: str, monkeypatch: pytest.MonkeyPatch):
-    here = fingerprint()
-    known = module._version
+@pytest.mark.parametrize("package", [*PACKAGES, "processor"])
+def test_another_version_of_a_package_or_processor_is_another_fingerprint(
+    package: str, monkeypatch: pytest.MonkeyPatch
+):
+    here, known, features = fingerprint(), module._version, module._cpu_features()
     monkeypatch.setattr(module, "_version", lambda name: "0.0.0" if name == package else known(name))
+    monkeypatch.setattr(module, "_cpu_features", lambda: "00000000" if package == "processor" else features)
     parts.cache_clear()
     fingerprint.cache_clear()
     assert fingerprint() != here
@@ -69,14 +68,6 @@ def test_a_blas_that_another_package_brings_is_none_of_it(library: str, counts: 
     assert (fingerprint() != here) == counts
 
 
-def test_another_processor_is_another_fingerprint(monkeypatch: pytest.MonkeyPatch):
-    here = fingerprint()
-    monkeypatch.setattr(module, "_cpu_features", lambda: "00000000")
-    parts.cache_clear()
-    fingerprint.cache_clear()
-    assert fingerprint() != here
-
-
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="names of cores of x86")
 @pytest.mark.parametrize("core", ["Haswell", "Sandybridge"])
 def test_blas_for_another_processor_is_another_fingerprint(core: str):
@@ -86,16 +77,12 @@ def test_blas_for_another_processor_is_another_fingerprint(core: str):
     assert done.stdout.strip() == f"openblas-{core}"
 
 
-def test_where_the_c_library_is_unknown_the_system_stands_for_it(monkeypatch: pytest.MonkeyPatch):
+def test_what_is_not_there_is_left_out_and_the_system_stands_for_an_unknown_c_library(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(module.platform, "libc_ver", lambda: ("", ""))
     monkeypatch.setattr(module.platform, "system", lambda: "Darwin")
-    parts.cache_clear()
-    assert parts()["libc"] == "Darwin"
-
-
-def test_a_package_that_is_not_there_is_left_out(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(module, "PACKAGES", ("numpy", "no-such-package"))
     parts.cache_clear()
+    assert parts()["libc"] == "Darwin"
     assert "no-such-package" not in parts()
 
 
@@ -124,10 +111,7 @@ def test_the_bytes_are_the_contract_s():
             numbers = [float(x) for array in arrays for x in array[drone]]
             wanted.update(struct.pack("<q13d", t_ns, *numbers))
     assert digest(states) == wanted.hexdigest()
-
-
-def test_nothing_flown_is_the_hash_of_nothing():
-    assert TruthHash(DRONES).hexdigest() == hashlib.sha256(b"").hexdigest()
+    assert digest([]) == hashlib.sha256(b"").hexdigest()
 
 
 def test_layout_and_byte_order_of_the_arrays_do_not_matter():

@@ -23,54 +23,33 @@ def names(module: str) -> set[str]:
 
 def test_the_sources_of_a_kernel_are_all_that_its_module_imports():
     """Where a function is compiled, what it calls and the constants that it names are too, wherever they come from."""
-    assert {"dead_reckoning", "strapdown", "compiled"} <= names("zsim_agents.estimation.estimator_bank")
+    assert {"kalman_update", "strapdown", "compiled"} <= names("zsim_agents.estimation.estimator_bank")
     pytest.importorskip("numba")
-    flown = {
-        "kernel",
-        "firmware",
-        "rigid_body",
-        "simd",
-        "rotation",
-        "vehicle",
-        "obstacle",
-        "sensor_set",
-        "compiled",
-    }
+    flown = {"kernel", "firmware", "rigid_body", "simd", "rotation", "vehicle", "obstacle", "sensor_set", "compiled"}
     assert flown <= names("zsim_world.fleet.kernel")
     assert "kernel" not in names("zsim_world.sensors.noise")
 
 
-def test_the_digest_changes_with_each_file(tmp_path: Path):
-    files = [tmp_path / name for name in ("a.py", "b.py", "c.py")]
+def test_the_digest_changes_with_the_text_of_each_file_and_not_with_the_folders(tmp_path: Path):
     digests = set()
-    for changed in (None, *files):
-        for number, file in enumerate(files):
-            file.write_text(f"# {number}{' changed' if file == changed else ''}\n")
-        compiled.digest.__globals__["_text"].cache_clear()
+    for case, texts in enumerate((("a", "b"), ("A", "b"), ("a", "B"), ("b", "a"))):
+        files = [tmp_path / str(case) / name for name in ("one.py", "two.py")]
+        files[0].parent.mkdir()
+        for file, text in zip(files, texts, strict=True):
+            file.write_text(text)
         digests.add(compiled.digest(files))
-    assert len(digests) == len(files) + 1
-
-
-def test_the_digest_does_not_change_with_the_folders(tmp_path: Path):
-    digests = set()
-    for first, second in (("a", "b"), ("b", "a")):
-        files = [tmp_path / folder / name for folder, name in ((first, "one.py"), (second, "two.py"))]
-        for file in files:
-            file.parent.mkdir(exist_ok=True)
-            file.write_text(f"# {file.name}\n")
-        digests.add(compiled.digest(files))
-    assert len(digests) == 1
+    assert len(digests) == 3
 
 
 ASK = """
 import numpy as np
-from zsim_agents.estimation.filter_state import moment
-print(moment(np.zeros(20))[:2])
+from zsim_agents.estimation.joint_filter import place_of
+print(place_of(np.ones(20)))
 """
 
 
 def test_a_change_of_what_is_called_reaches_the_caller(tmp_path: Path):
-    """`filter_state.moment` calls `dead_reckoning.vector`: numba's own cache would go on with the old one."""
+    """`joint_filter.place_of` calls `filter_state.vector`: numba's own cache would go on with the old one."""
     pytest.importorskip("numba")
     shutil.copytree(
         ROOT / "agents" / "zsim_agents", tmp_path / "zsim_agents", ignore=shutil.ignore_patterns("__pycache__")
@@ -81,12 +60,12 @@ def test_a_change_of_what_is_called_reaches_the_caller(tmp_path: Path):
         run = [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(tmp_path)!r}){ASK}"]
         return subprocess.run(run, env=environment, capture_output=True, text=True, check=True).stdout.strip()
 
-    assert ask() == "(0.0, (0.0, 0.0, 0.0))"
-    called = tmp_path / "zsim_agents" / "estimation" / "dead_reckoning.py"
-    text = called.read_text()
-    assert text.count("return float(row[at]),") == 1
-    called.write_text(text.replace("return float(row[at]),", "return 1.0 + float(row[at]),"))
-    assert ask() == "(0.0, (1.0, 0.0, 0.0))"
+    assert ask() == "(1.0, 1.0, 1.0)"
+    called = tmp_path / "zsim_agents" / "estimation" / "filter_state.py"
+    text, line = called.read_text(), "return float(row[at]), float(row[at + 1]), float(row[at + 2])\n"
+    assert text.count(line) == 1
+    called.write_text(text.replace(line, line.replace("return ", "return 1.0 + ")))
+    assert ask() == "(2.0, 1.0, 1.0)"
 
 
 def test_a_kernel_is_known_to_be_kept_once_it_was_compiled(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
@@ -129,19 +108,13 @@ def test_tuples_are_held_after_their_class_was_renamed(tmp_path: Path):
 ROW = columns("Row", (Field("p_WB", "m", 3), Field("energy", "J"), Field("q_WB", "1", 4)))
 
 
-def test_fields_stand_one_after_the_other():
-    assert (ROW.p_WB, ROW.energy, ROW.q_WB, ROW.size) == (0, 3, 4, 8)
-
-
-def test_two_fields_of_one_name_are_refused():
-    with pytest.raises(ValueError, match="p_WB"):
-        columns("Row", (Field("p_WB", "m", 3), Field("p_WB", "m", 3)))
-
-
 @portable
 def total(row):
     return row[ROW.energy] + row[ROW.q_WB]
 
 
-def test_compiled_code_reads_them():
+def test_fields_stand_one_after_the_other_and_compiled_code_reads_them():
+    assert (ROW.p_WB, ROW.energy, ROW.q_WB, ROW.size) == (0, 3, 4, 8)
     assert total(np.arange(8.0)) == 7.0
+    with pytest.raises(ValueError, match="p_WB"):
+        columns("Row", (Field("p_WB", "m", 3), Field("p_WB", "m", 3)))

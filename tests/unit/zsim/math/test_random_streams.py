@@ -11,10 +11,6 @@ def draws(seed: int, name: str, count: int = 8) -> list[float]:
     return stream(seed, name).standard_normal(count).tolist()
 
 
-def test_a_stream_is_the_same_whenever_it_is_made():
-    assert draws(1, "drone1/imu") == draws(1, "drone1/imu")
-
-
 def test_the_key_of_a_stream_is_the_hash_of_its_name():
     """First 16 bytes of `printf drone1/imu | sha256sum`, as four little-endian words."""
     digest = "047952e0fcbae3f73afb993fb46be5c8"

@@ -88,15 +88,11 @@ def team() -> tuple[Member, Member, AgentGroup]:
     return first, last, AgentGroup([first, last], HOLD_NS)
 
 
-def test_a_group_reads_what_its_members_do_not_tell_each_other():
+def test_a_group_reads_what_its_members_do_not_tell_each_other_and_has_the_name_of_the_last():
     _, _, group = team()
     assert group.reads == group.gate_keys == (keys.status("d1"),)
     assert group.counted == ("d1",)
     assert group.writes == (keys.estimate("d1"), keys.cluster_state("main"))
-
-
-def test_it_goes_by_the_name_of_the_last_and_stands_for_the_others():
-    _, _, group = team()
     assert (group.name, group.role, group.period_ns) == ("controller.main", "controller", GATE_NS)
     assert group.serves == ("estimator.d1", "estimator.d2")
 
@@ -108,6 +104,11 @@ def test_a_member_hears_in_the_same_gate_what_those_before_it_said():
     assert first.notes == [(keys.status("d1"), GATE_NS, 0), GATE_NS]
     assert last.notes == [(keys.estimate("d1"), GATE_NS, 0), (keys.status("d1"), GATE_NS, 0), GATE_NS]
     assert [output.key for output in outputs] == [keys.estimate("d1"), keys.cluster_state("main")]
+    decisions: list[Any] = [message for _, message in outputs]
+    assert [message.reason for message in decisions] == [
+        "controller.main of estimator.d1",
+        "controller.main of controller.main",
+    ]
 
 
 @pytest.mark.parametrize("resumed", [False, True])
@@ -138,13 +139,6 @@ def test_what_closes_the_gate_of_one_is_held_for_another_who_only_reads_it(resum
     ]
 
 
-def test_members_that_wait_for_each_other_are_refused():
-    first = Member("talk.a", [keys.cluster_state("b")], keys.cluster_state("a"))
-    second = Member("talk.b", [keys.cluster_state("a")], keys.cluster_state("b"))
-    with refused(RunError, "gate_keys", "talk.a", "talk.b", "each other"):
-        AgentGroup([first, second], HOLD_NS)
-
-
 def test_inputs_come_in_the_order_of_time_key_and_number():
     _, last, group = team()
     for t_ns, seq in ((2 * GATE_NS, 3), (GATE_NS, 2), (GATE_NS, 1)):
@@ -154,17 +148,10 @@ def test_inputs_come_in_the_order_of_time_key_and_number():
     assert statuses == [(GATE_NS, 1), (GATE_NS, 2), (2 * GATE_NS, 3)]
 
 
-def test_what_members_say_has_the_source_of_the_process():
-    _, _, group = team()
-    decisions: list[Any] = [message for _, message in group.step(GATE_NS)]
-    assert [message.reason for message in decisions] == [
-        "controller.main of estimator.d1",
-        "controller.main of controller.main",
-    ]
-
-
 def test_requests_and_last_values_go_to_whom_they_belong():
     first, last, group = team()
+    group.rehearse()
+    assert (first.rehearsed, last.rehearsed) == (True, True)
     assert group.control_keys() == (CLUSTER,)
     assert group.control(CLUSTER, ControlRequest("hold", {}, "console.1")).result == "hold"
     assert group.warm_start_keys() == (keys.estimate("d1"), keys.cluster_state("main"))
@@ -175,21 +162,24 @@ def test_requests_and_last_values_go_to_whom_they_belong():
     assert [message.seq for _, message in group.step(GATE_NS)] == [42, 0]  # type: ignore[attr-defined]
 
 
-def test_everybody_rehearses():
-    first, last, group = team()
-    group.rehearse()
-    assert first.rehearsed
-    assert last.rehearsed
-
-
-def test_members_of_different_periods_are_refused():
-    slow = Member("controller.main", [], "a", 2 * GATE_NS)
-    fast = Member("estimator.d1", [], "b")
-    pattern = r"period_ns of a group's members is estimator\.d1 20000000, controller\.main 40000000; must be the same"
-    with pytest.raises(RunError, match=pattern):
-        AgentGroup([fast, slow], HOLD_NS)
-
-
-def test_nobody_is_no_group():
-    with refused(RunError, "group", "members", "one"):
-        AgentGroup([], HOLD_NS)
+@pytest.mark.parametrize(
+    ("members", "terms"),
+    [
+        ([], ("group", "members", "one")),
+        (
+            [Member("estimator.d1", [], "b"), Member("controller.main", [], "a", 2 * GATE_NS)],
+            ("period_ns", "estimator.d1 20000000", "controller.main 40000000", "same"),
+        ),
+        (
+            [
+                Member("talk.a", [keys.cluster_state("b")], keys.cluster_state("a")),
+                Member("talk.b", [keys.cluster_state("a")], keys.cluster_state("b")),
+            ],
+            ("gate_keys", "talk.a", "talk.b", "each other"),
+        ),
+    ],
+    ids=["nobody", "different periods", "waiting for each other"],
+)
+def test_what_cannot_be_a_group_is_refused(members: list[Member], terms: tuple[str, ...]):
+    with refused(RunError, *terms):
+        AgentGroup(members, HOLD_NS)

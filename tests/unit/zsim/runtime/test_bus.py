@@ -363,8 +363,3 @@ def test_what_cannot_be_sent_ends_its_sender_with_class_gate_key_and_field(retur
     (bye,) = [message for _, message in hub.handled if isinstance(message, Bye)]
     assert (bye.failed, bye.reason) == (True, line)
     assert [message.done_ns for _, message in hub.handled if isinstance(message, Done)] == [0, GATE_NS]
-
-
-def test_only_what_the_world_counts_is_counted():
-    hub, _ = fly(2, team())
-    assert {message.sent for key, message in hub.handled if key == keys.process("controller.main", "done")} == {2}

@@ -29,6 +29,9 @@ def test_a_reason_that_lasts_is_told_once():
     assert lines_of(reasons, WAITS, 0, REASON_NS) == []
     (line,) = lines_of(reasons, WAITS, REASON_NS, 10 * REASON_NS)
     assert has_terms(line, "5.00", "main", "engaged", WAITS)
+    for t_ns in (0, REASON_NS):  # each cluster has its own
+        lines = [reasons.line(cluster, state(t_ns, WAITS)) for cluster in ("a", "b")]
+    assert [line and line.split()[2] for line in lines] == ["a,", "b,"]
 
 
 def test_a_reason_that_passes_is_not_told():
@@ -42,13 +45,6 @@ def test_other_numbers_are_the_same_reason():
     reasons, times = HoldReasons(), range(0, 2 * REASON_NS, GATE_NS)
     lines = [reasons.line("main", state(t_ns, f"drone2 is at z = {t_ns / 1e12:.3f} m")) for t_ns in times]
     assert len([line for line in lines if line]) == 1
-
-
-def test_each_cluster_has_its_own():
-    reasons = HoldReasons()
-    for t_ns in (0, REASON_NS):
-        lines = [reasons.line(cluster, state(t_ns, WAITS)) for cluster in ("a", "b")]
-    assert [line and line.split()[2] for line in lines] == ["a,", "b,"]
 
 
 def test_equal_events_are_one_line_with_their_count():
@@ -77,6 +73,7 @@ ESCAPES = "\x1b]0;title\x07\x1b[2Ka\x9b1m\r\u202eb"
 def test_codes_that_a_terminal_acts_on_are_shown_and_not_sent():
     output = io.StringIO()
     screen = progress.Screen(10.0, Console(file=output))
+    assert printable("one\n\ttwo: Zürich, 東京 ×") == "one\n\ttwo: Zürich, 東京 ×"
     screen.say(ESCAPES)
     screen.event({"t_s": 1.0, "kind": "death", "text": f"estimator.d1 on {ESCAPES}"})
     waiting = {"name": "a", "host": ESCAPES, "since_wall_s": 1.0}
@@ -84,10 +81,6 @@ def test_codes_that_a_terminal_acts_on_are_shown_and_not_sent():
     assert len(output.getvalue().splitlines()) == 3
     assert output.getvalue().replace("\n", "").isprintable()
     assert output.getvalue().count(r"\x1b]0;title\x07\x1b[2Ka\x9b1m\r\u202eb") == 3
-
-
-def test_tabs_lines_and_other_alphabets_are_left():
-    assert printable("one\n\ttwo: Zürich, 東京 ×") == "one\n\ttwo: Zürich, 東京 ×"
 
 
 @pytest.mark.parametrize("is_slow", [True, False])

@@ -125,12 +125,6 @@ def test_an_unknown_kind_names_all_kinds_and_hides_nothing_else():
     assert has_terms(text, "[]", "map", "kind", "target")
 
 
-def test_links_of_others_and_of_one_s_own_processes_are_taken():
-    for target in ("console.1/world", "my.filter/controller.main", "estimator.drone1/estimator.drone2"):
-        assert list(flaws(sound("link_cut", target=target), KNOWN)) == []
-    assert list(flaws(sound("process_kill", target="my.filter"), KNOWN)) == []
-
-
 @pytest.mark.parametrize(
     "name",
     ["my.filter", "pilot", "estimator2.drone1", "my_estimator.drone1", "controllers.main", "control.main", "contr.x"],
@@ -141,14 +135,18 @@ def test_a_name_of_one_s_own_is_taken_before_it_has_joined(name: str):
         assert list(flaws(sound("link_cut", target=target, one_way=True), KNOWN)) == []
 
 
-def test_a_name_that_looks_mistyped_is_taken_of_one_that_takes_part():
-    known = Known(("drone1",), ("main",), ("controler.main",))
-    assert list(flaws(sound("link_cut", target="world/controler.main"), known)) == []
-
-
-def test_one_way_from_one_outside_of_the_lockstep_is_taken():
-    for target in ("console.1/world", "recorder/controller.main"):
-        assert list(flaws(sound("link_cut", target=target, one_way=True), KNOWN)) == []
+@pytest.mark.parametrize(
+    "given",
+    [
+        *(sound("link_cut", target=f"{a}/world", one_way=one_way) for a in ("console.1", "recorder") for one_way in (True, False)),
+        *(sound("link_cut", target=target) for target in ("my.filter/controller.main", "estimator.drone1/estimator.drone2")),
+        sound("process_kill", target="my.filter"),
+        sound("link_cut", target="world/controler.main"),  # it looks mistyped, and takes part
+    ],
+    ids=lambda given: given["target"],
+)  # fmt: skip
+def test_links_and_processes_that_can_be_are_taken(given: dict[str, Any]):
+    assert list(flaws(given, KNOWN._replace(processes=("my.filter", "controler.main")))) == []
 
 
 def test_a_kill_of_who_would_not_hear_of_it_is_a_flaw():

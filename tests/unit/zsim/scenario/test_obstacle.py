@@ -73,17 +73,8 @@ def scenario(*obstacles: Any, **more: Any) -> Scenario:
 
 @pytest.mark.parametrize("given", [BOX, PILLAR, BALL], ids=lambda o: o["shape"])
 def test_a_drone_that_flies_into_an_obstacle_does_not_get_through(given: dict[str, Any]):
-    fleet = Fleet(scenario(given))
-    solid = row_of(
-        resolve(
-            {
-                "name": "t",
-                "duration_s": 1,
-                "drones": [{"name": "x", "position_m": [0, 0, 0]}],
-                "environment": {"obstacles": [given]},
-            }
-        ).environment.obstacles[0]
-    )
+    flown = scenario(given)
+    fleet, solid = Fleet(flown), row_of(flown.environment.obstacles[0])
     assert fleet.takeoff(0) is None
     began, depths = [], []
     for gate in range(600):

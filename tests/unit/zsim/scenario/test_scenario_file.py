@@ -91,31 +91,14 @@ def only(lines: list[str]) -> str:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
-def test_every_scenario_of_the_house_is_valid(path: Path):
-    scenario = scenario_file.load(path)
-    assert scenario.drones
-
-
-def test_the_paper_s_two_tests_are_there():
-    assert {"step.yaml", "trajectory.yaml"} <= {path.name for path in FILES}
-
-
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
 def test_the_resolved_text_is_the_same_scenario(path: Path):
     scenario = scenario_file.load(path)
     text = scenario_file.to_text(scenario)
     again = scenario_file.from_text(text)
     assert again == scenario
     assert scenario_file.to_text(again) == text
+    assert yaml.safe_load(text)["drones"][0]["mass_kg"] == scenario.drones[0].mass_kg
     assert scenario_file.sha256(text) == hashlib.sha256(text.encode()).hexdigest()
-
-
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
-def test_the_resolved_text_is_yaml_to_others(path: Path):
-    scenario = scenario_file.load(path)
-    plain = yaml.safe_load(scenario_file.to_text(scenario))
-    assert [entry["name"] for entry in plain["drones"]] == [entry.name for entry in scenario.drones]
-    assert plain["drones"][0]["mass_kg"] == scenario.drones[0].mass_kg
 
 
 # What resolving gives
@@ -128,16 +111,6 @@ def test_defaults_are_the_ardrone_in_buenos_aires():
     assert scenario.environment.latitude_deg == -34.603
     assert scenario.time.gate_ms == 20.0
     assert scenario.federation == "zsim"
-
-
-def test_things_are_found_by_name():
-    scenario = scenario_file.load(STEP)
-    assert scenario.drone("drone2").name == "drone2"
-    assert scenario.cluster("main").drones == ["drone1", "drone2", "drone3"]
-    with pytest.raises(KeyError):
-        scenario.drone("drone9")
-    with pytest.raises(KeyError):
-        scenario.cluster("other")
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
@@ -158,19 +131,11 @@ def test_the_drone_s_sensors_win_over_the_scenario_s_and_those_over_the_preset()
     assert (second.sensors.gps.position_m.noise, second.sensors.gps.position_m.bias) == (0.5, 0.1)
     assert second.sensors.gps.rate_hz == 5.0
     assert second.sensors.imu.accel_m_s2.noise == 0.35
-
-
-def test_a_drone_may_have_a_preset_of_its_own():
-    drones = [drone("a"), drone("b", 2.0, sensors={"preset": "ardrone2"})]
+    drones[0]["sensors"], drones[1]["sensors"] = {"as_printed": True}, {"preset": "ardrone2"}
     first, second = scenario_file.resolve(document(drones=drones, sensors={"preset": "paper"})).drones
     assert (first.sensors.preset, second.sensors.preset) == ("paper", "ardrone2")
+    assert (first.sensors.imu.accel_m_s2.noise, first.sensors.imu.gyro_deg_s.noise) == (0.35 * G_M_S2, 0.01)
     assert second.sensors.imu.accel_m_s2.noise == PRESETS["ardrone2"]["imu"]["accel_m_s2"]["noise"]
-
-
-def test_the_paper_s_accelerometer_as_printed_is_0_35_g():
-    sensors = scenario_file.load(STEP, ["sensors.as_printed=true"]).drones[0].sensors
-    assert sensors.imu.accel_m_s2.noise == 0.35 * G_M_S2
-    assert sensors.imu.gyro_deg_s.noise == 0.01
 
 
 def test_resolving_leaves_the_document_as_it_was():
@@ -184,32 +149,28 @@ def named(scenario: Scenario) -> str:
     return scenario_file.sha256(scenario_file.to_text(scenario))
 
 
-def test_a_body_that_is_not_given_stands_in_no_resolved_text():
+def test_a_body_is_external_where_it_is_given_and_its_faults_are_refused():
     plain = scenario_file.resolve(document())
-    assert "body" not in scenario_file.to_text(plain)
-    assert plain.external() == []
-    external = scenario_file.resolve(document(drones=[drone("a"), drone("b", x=5.0, body="external")]))
+    assert ("body" in scenario_file.to_text(plain), plain.external()) == (False, [])
+    fault = {"kind": "gps_noise", "target": "b", "factor": 2.0}
+    drones = [drone("a"), drone("b", x=5.0, body="external")]
+    assert_faults(faults_of(document(drones=drones, faults=[fault])), ("faults[0].target", "'b'", "external"))
+    external = scenario_file.resolve(document(drones=drones, faults=[{**fault, "target": "a"}]))
     assert external.external() == ["b"]
     assert scenario_file.from_text(scenario_file.to_text(external)) == external
 
 
-def test_faults_of_a_body_that_is_external_are_refused():
-    fault = {"kind": "gps_noise", "target": "b", "factor": 2.0}
-    drones = [drone("a"), drone("b", x=5.0, body="external")]
-    assert_faults(faults_of(document(drones=drones, faults=[fault])), ("faults[0].target", "'b'", "external"))
-    assert scenario_file.resolve(document(drones=drones, faults=[{**fault, "target": "a"}]))
-
-
-def test_whole_numbers_and_floats_are_the_same_scenario():
-    whole, floats = document(duration_s=10), document(duration_s=10.0)
-    assert named(scenario_file.resolve(whole)) == named(scenario_file.resolve(floats))
-
-
 @pytest.mark.parametrize(
-    "override", ["seed=2", "drones.drone1.mass_kg=0.4290001", "environment.wind.gust_correlation=0.4999999999999999"]
+    ("override", "is_other"),
+    [
+        ("seed=2", True),
+        ("wind.gust_correlation=0.4999999999999999", True),
+        ("seed=1", False),
+        ("duration_s=330.0", False),
+    ],
 )
-def test_any_change_is_another_hash(override: str):
-    assert named(scenario_file.load(STEP, [override])) != named(scenario_file.load(STEP))
+def test_a_change_and_no_other_way_to_write_it_is_another_hash(override: str, is_other: bool):
+    assert (named(scenario_file.load(STEP, [override])) != named(scenario_file.load(STEP))) == is_other
 
 
 LIKE_OTHERS = ["1e3", "1e-3", "1.5", "010", "0x1F", "1_000", "1:30", "yes", "null", "~", "#", "nan", ".inf"]
@@ -230,14 +191,6 @@ def test_any_text_and_number_survives_world_info(expressions: dict[str, str], nu
     again = scenario_file.from_text(scenario_file.to_text(scenario))
     assert again == scenario
     assert [x.hex() for x in again.environment.wind.steady_m_s] == [float(x).hex() for x in numbers[1:]]
-
-
-def test_numbers_with_an_exponent_are_numbers(tmp_path: Path):
-    path = tmp_path / "own.yaml"
-    path.write_text("name: own\nduration_s: 1e1\ndrones: [{name: a, position_m: [1e-1, +2E0, .5]}]\n")
-    scenario = scenario_file.load(path)
-    assert scenario.duration_s == 10.0
-    assert scenario.drones[0].position_m == (0.1, 2.0, 0.5)
 
 
 def test_a_file_with_a_byte_order_mark_is_read(tmp_path: Path):
@@ -334,10 +287,6 @@ def test_what_is_not_known_hints_at_what_is_like_it(override: str, meant: str) -
     assert any(has_terms(line, "mean", meant, "allowed") for line in caught.value.faults)
 
 
-def test_an_override_may_leave_out_the_name_of_a_section():
-    assert scenario_file.load(STEP, ["wind.gust_m_s=0.25"]).environment.wind.gust_m_s == 0.25
-
-
 def test_values_are_yaml():
     overrides = [
         "drones.drone1.position_m=[0, 9.5, 0]",
@@ -350,17 +299,12 @@ def test_values_are_yaml():
     assert scenario.cluster("main").plan.takeoff_s is None
 
 
-def test_a_drone_named_by_a_number_is_found_by_its_name():
-    drones = [drone("2"), drone("1", 2.0), drone("0", 4.0)]
-    raw = document(drones=drones)
-    assert scenario_file.apply_override(raw, "drones.0.mass_kg=0.5", yaml.safe_load) is None
-    assert raw["drones"][2]["mass_kg"] == 0.5
-
-
-def test_a_name_with_dots_stands_between_brackets():
-    raw = document(drones=[drone("uav.1"), drone("uav.2", 2.0)])
-    assert scenario_file.apply_override(raw, "drones[uav.2].mass_kg=0.5", yaml.safe_load) is None
-    assert raw["drones"][1]["mass_kg"] == 0.5
+def test_a_drone_named_by_a_number_or_with_dots_is_found_by_its_name():
+    drones = [drone("2"), drone("1", 2.0)]
+    for name, path in (("0", "drones.0.mass_kg"), ("uav.2", "drones[uav.2].mass_kg")):
+        raw = document(drones=[*drones[:2], drone(name, 4.0)])
+        assert scenario_file.apply_override(raw, f"{path}=0.5", yaml.safe_load) is None
+        assert raw["drones"][2]["mass_kg"] == 0.5
 
 
 SYNTAX = ("a.b.c=value",)
@@ -371,12 +315,9 @@ SYNTAX = ("a.b.c=value",)
     [
         ("", SYNTAX),
         ("seed", SYNTAX),
-        ("=1", SYNTAX),
         ("a..b=1", SYNTAX),
         (".a=1", SYNTAX),
-        ("a.=1", SYNTAX),
         ("a[0=1", SYNTAX),
-        ("a]0=1", SYNTAX),
         ("a[]=1", SYNTAX),
         ("drones.9.mass_kg=1", ("9", "0", "2", "drone1", "drone2", "drone3")),
         ("drones.-1.mass_kg=1", ("-1", "0", "2", "drone1", "drone2", "drone3")),
@@ -388,14 +329,10 @@ SYNTAX = ("a.b.c=value",)
         ("seed.x=1", ("seed", "1", "map", "list")),
         ("seed.x.y=1", ("seed", "1", "map", "list")),
         ("seed=[1", ("line 1", "YAML")),
-        ("seed={", ("line 1", "YAML")),
-        ("seed=*a", ("line 1", "YAML")),
         ("seed=&a [*a]", ("aliases",)),
         ("seed=" + "9" * 5000, ("YAML",)),
         ("seed=" + "[" * 1500, ("'seed=[[[…", "nested")),
         ("seed=!!python/name:os.system", ("YAML",)),
-        ("seed=!!map [1]", ("YAML",)),
-        ("seed=\x00", ("YAML",)),
     ],
     ids=lambda text: text[:24],
 )
@@ -438,86 +375,42 @@ def test_any_override_is_applied_or_told(text: str):
 # Faults of one field
 
 
-def test_the_fault_of_a_drone_in_full():
-    line = only(faults_in(STEP, "drones.drone3.mass_kg=-1.4"))
-    assert has_terms(line, "step.yaml", "drones[2].mass_kg", "-1.4", ">", "0", "<=", "100", "'drone3'")
-
-
 def test_the_fault_of_a_cluster_in_full():
     line = only(faults_in(STEP, "clusters.main.gains.proportional_1_s=3"))
     said = "clusters[0].gains.proportional_1_s is 3; must be > 0 and <= 2 (cluster 'main')"
     assert line == f"step.yaml: {said}"
 
 
-@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf], ids=repr)
-@pytest.mark.parametrize(
-    "path",
-    [
-        "duration_s",
-        "environment.height_m",
-        "environment.wind.gust_m_s",
-        "drones.drone1.yaw_deg",
-        "drones.drone1.mass_kg",
-        "clusters.main.plan.takeoff_s",
-        "sensors.imu.rate_hz",
-        "time.gate_ms",
-    ],
-)
-def test_numbers_that_are_not_finite_are_refused(path: str, number: float):
-    text = {"nan": ".nan", "inf": ".inf", "-inf": "-.inf"}[repr(number)]
-    field = path.rpartition(".")[2]
-    (line,) = faults_in(STEP, f"{path}={text}")
-    assert line.split()[1].endswith(field)
-    assert has_terms(line, repr(number), "finite")
-
-
 @pytest.mark.parametrize(
     ("path", "value", "allowed"),
     [
         ("duration_s", "0", "> 0 and <= 1e+06"),
-        ("duration_s", "2e6", "> 0 and <= 1e+06"),
         ("drones.drone1.mass_kg", "0", "> 0 and <= 100"),
+        ("drones.drone1.mass_kg", "9" * 4000, "must be"),
+        ("sensors.imu.rate_hz", ".nan", "finite"),
+        ("clusters.main.plan.takeoff_s", "-.inf", "finite"),
         ("drones.drone1.position_m", "[1e300, 0, 0]", ">= -100000 and <= 100000"),
         ("drones.drone1.inertia_kg_m2", "[0, 1, 1]", "> 0"),
         ("drones.drone1.battery_percent", "101", ">= 0 and <= 100"),
         ("environment.wind.gust_m_s", "-0.5", ">= 0"),
         ("environment.wind.steady_m_s", "[1e300, 0, 0]", "<= 1e+09"),
         ("environment.wind.gust_correlation", "1.5", ">= 0 and <= 1"),
-        ("environment.gravity_m_s2", "-9.8", "> 0"),
         ("environment.latitude_deg", "91", ">= -90 and <= 90"),
         ("sensors.gps.dropout", "2", ">= 0 and <= 1"),
         ("sensors.gps.latency_ms", "-1", ">= 0 and <= 10000"),
-        ("sensors.mag.field_ut.noise", "-0.1", ">= 0"),
-        ("seed", "-1", ">= 0"),
         ("seed", str(2**62 + 1), "<= 4611686018427387904"),
         ("time.command_delay_gates", "0", ">= 1 and <= 50"),
         ("clusters.main.gains.separation_min_m", "-1", ">= 0"),
-        ("silence.hover_s", "0", "> 0"),
     ],
 )
 def test_limits_are_quoted(path: str, value: str, allowed: str):
     assert allowed in only(faults_in(STEP, f"{path}={value}"))
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("name", "Step"),
-        ("name", "a/b"),
-        ("name", "x" * 33),
-        ("federation", "a b"),
-        ("federation", '"a\\n"'),
-        ("name", "''"),
-    ],
-)
-def test_names_are_of_the_contract(name: str, value: str):
-    assert has_terms(only(faults_in(STEP, f"{name}={value}")), name, "[a-z0-9_.-]{1,32}")
-
-
-@pytest.mark.parametrize("digits", [19, 400, 4000])
-def test_huge_whole_numbers_are_a_fault_and_no_crash(digits: int):
-    for path in ("seed", "duration_s", "drones.drone1.mass_kg"):
-        assert "must be" in only(faults_in(STEP, f"{path}={'9' * digits}"))
+@pytest.mark.parametrize("value", ["Step", "a/b", "x" * 33, '"a\\n"', "''"])
+def test_names_are_of_the_contract(value: str):
+    for field in ("name", "federation"):
+        assert has_terms(only(faults_in(STEP, f"{field}={value}")), field, "[a-z0-9_.-]{1,32}")
 
 
 @pytest.mark.parametrize(
@@ -603,6 +496,9 @@ def test_a_fault_that_all_drones_share_is_told_once():
         ({"clusters": [{"name": "c", "drones": ["drone1", "drone9"]}]}, ("clusters[0].drones[1]", "'drone9'")),
         ({"clusters": [{"name": "c", "drones": ["drone1", "drone1"]}]}, ("clusters[0].drones[1]", "'drone1'", "'c'")),
         ({"clusters": [{"name": "c", "drones": ["drone1"]}]}, ("clusters[0].drones", "1", "2", "64")),
+        ({"clusters": [{"name": "c", "drones": ["drone1", "drone2"]}, {"name": "d", "drones": ["drone2", "drone3"]}]}, ("clusters[1].drones[0]", "'drone2'", "'c'")),
+        ({"clusters": [{"name": "c", "drones": ["drone1", "drone2"], "plan": {"trajectory": {}}}]}, ("expressions", "waypoints", "'c'")),
+        ({"clusters": [{"name": "c", "drones": ["drone1", "drone2"], "plan": {"trajectory": {"expressions": {"x_c": "t"}, "waypoints": [{"at_s": 0, "values": {"x_c": 1}}]}}}]}, ("expressions", "waypoints")),
         ({"clusters": [{"name": "c", "drones": [f"d{k}" for k in range(65)]}]}, ("65", "2", "64")),
         (clustered(groups=[{"name": "a", "size": 6}]), ("clusters[0].groups", "1", "none", "2")),
         (clustered(groups=[{"name": "a", "size": 2}, {"name": "b", "size": 3}]), ("clusters[0].groups", "5", "6")),
@@ -628,26 +524,6 @@ def test_faults_of_groups_are_told_together_and_those_between_faulty_fields_left
         *((f"clusters[0].groups[1].template_m[{place}]", "[0, 0]") for place in range(4)),
         ("clusters[0].groups[2].name", "'b'", "groups[1]"),
     )
-
-
-def test_two_clusters_share_neither_a_name_nor_a_drone():
-    clusters = [{"name": "c", "drones": ["drone1", "drone2"]}, {"name": "c", "drones": ["drone2", "drone3"]}]
-    lines = faults_of(document(clusters=clusters))
-    assert has_terms(lines[0], "step.yaml", "clusters[1].name", "'c'", "clusters[0]", "unique")
-    assert has_terms(lines[1], "step.yaml", "clusters[1].drones[0]", "'drone2'", "'c'")
-    assert len(lines) == 2
-
-
-@pytest.mark.parametrize(
-    "trajectory",
-    [
-        {},
-        {"expressions": {"x_c": "t"}, "waypoints": [{"at_s": 0, "values": {"x_c": 1}}]},
-    ],
-)
-def test_a_trajectory_is_expressions_or_waypoints(trajectory: dict[str, Any]):
-    clusters = [{"name": "c", "drones": ["drone1", "drone2"], "plan": {"trajectory": trajectory}}]
-    assert has_terms(only(faults_of(document(clusters=clusters))), "expressions", "waypoints", "'c'")
 
 
 def test_waypoints_go_forward_in_time():
@@ -708,24 +584,16 @@ def test_a_cluster_s_drones_are_not_judged_while_a_drone_s_name_is_unknown():
         ("", ("empty", "map")),
         ("just words", ("'just words'", "map")),
         ("- 1\n- 2\n", ("[1, 2]", "map")),
-        ("a: [1", ("YAML",)),
         ("a: 1\nb: 2\na: 3\n", ("line 3", "YAML", "'a'", "twice")),
-        ("a: b: c", ("line 1", "YAML")),
-        ("\ta: 1", ("line 1", "YAML")),
         ("a: 1\n---\nb: 2\n", ("YAML",)),
         ("a: &x [1]\nb: *x\n", ("line 2", "YAML", "aliases")),
         ("a: &a [x]\n" + "".join(f"b{i}: &b{i} [*a, *a]\n" for i in range(20)), ("aliases",)),
         ("[" * 500_000, ("nested",)),
-        ("{a: " * 200_000, ("nested",)),
-        ("- " * 300_000, ("nested",)),
         ("a: " + "9" * 900_000, ("YAML",)),
         ("a: !!python/object/apply:os.system [ls]", ("line 1", "YAML", "tags")),
-        ("a: !!map [1]", ("line 1", "YAML", "tags")),
-        ("a: !!timestamp x", ("line 1", "YAML", "tags")),
         ("? [1, 2]\n: 3", ("line 1", "YAML")),
         ("a: \x07", ("YAML",)),
         (b"\xff\xfe\x00", ("text", "0", "YAML", "UTF-8")),
-        (b"a: \xe9", ("text", "3", "YAML", "UTF-8")),
         ("#" * (FILE_SIZE_MAX + 1), ("larger", str(FILE_SIZE_MAX))),
     ],
     ids=lambda text: repr(text[:12]),
@@ -740,9 +608,6 @@ def test_a_path_that_cannot_be_read_is_one_line(tmp_path: Path):
     assert has_terms(only(faults_in(tmp_path / "none.yaml")), "read", os.strerror(errno.ENOENT))
     assert has_terms(only(faults_in(tmp_path)), "read", os.strerror(errno.EISDIR))
     assert has_terms(only(faults_in("a\0b")), "path")
-
-
-def test_a_file_without_end_is_not_read_to_its_end():
     assert has_terms(only(faults_in("/dev/zero")), "larger", str(FILE_SIZE_MAX))
 
 
@@ -811,6 +676,8 @@ def test_a_shared_vehicle_is_what_every_drone_says_itself():
 
 
 def test_a_drone_s_own_field_wins_over_the_shared_vehicle_s():
+    scenario = scenario_file.load(STEP, ["vehicle.mass_kg=0.5"])
+    assert [each.mass_kg for each in scenario.drones] == [0.5] * 3
     vehicle = {"mass_kg": 0.5, "battery_mah": 1500, "limits": {"tilt_deg": 12, "altitude_m": 30}}
     drones = [drone("a"), drone("b", 2.0, mass_kg=0.48, limits={"tilt_deg": 9})]
     a, b = scenario_file.resolve(document(drones=drones, vehicle=vehicle)).drones
@@ -843,11 +710,6 @@ def test_a_fault_of_the_shared_vehicle_is_told_once_by_its_path(vehicle: Any, pa
     with pytest.raises(ScenarioError) as raised:
         scenario_file.resolve(document(vehicle=vehicle))
     assert [line.split()[1] for line in raised.value.faults] == [path]
-
-
-def test_a_field_of_the_shared_vehicle_is_set_by_its_path():
-    scenario = scenario_file.load(SCENARIOS / "step.yaml", ["vehicle.mass_kg=0.5"])
-    assert [each.mass_kg for each in scenario.drones] == [0.5] * 3
 
 
 @pytest.mark.parametrize(

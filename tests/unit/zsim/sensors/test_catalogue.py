@@ -53,12 +53,14 @@ def test_the_stock_sensors_are_those_of_a_scenario():
 
 def test_a_section_is_resolved_with_the_defaults_of_its_module():
     made = scenario(my_uwb=UWB, second={"my_uwb": {"rate_hz": 5, "range_m": {"bias": 0.3}}})
-    first: dict[str, Any]
-    second: dict[str, Any]
-    first, second = ({name: settings for name, _, settings in d.sensors.sections()} for d in made.drones)
-    assert (first["my_uwb"].rate_hz, second["my_uwb"].rate_hz) == (10.0, 5.0)
-    assert first["my_uwb"].anchor_m == second["my_uwb"].anchor_m == (1.0, 2.0, 3.0)
-    assert (second["my_uwb"].range_m.noise, second["my_uwb"].range_m.bias) == (0.0, 0.3)
+    first: Any
+    second: Any
+    first, second = (
+        next(settings for name, _, settings in d.sensors.sections() if name == "my_uwb") for d in made.drones
+    )
+    assert (first.rate_hz, second.rate_hz) == (10.0, 5.0)
+    assert first.anchor_m == second.anchor_m == (1.0, 2.0, 3.0)
+    assert (second.range_m.noise, second.range_m.bias) == (0.0, 0.3)
 
 
 def test_the_resolved_text_is_read_without_the_module(monkeypatch: pytest.MonkeyPatch):
@@ -98,10 +100,6 @@ def test_a_faulty_section_is_named_once(sensors: dict[str, Any], where: str):
     assert paths(**sensors) == [where]
 
 
-def test_one_name_is_one_kind_of_message():
-    assert paths(a=UWB, second={"a": {"module": "airspeed"}})[0].startswith("drones[1].sensors.a")
-
-
 def module(path: Path, name: str, text: str) -> dict[str, str]:
     """Write a module with a sensor of one number; return its section."""
     head = """
@@ -123,10 +121,11 @@ CONFIG = (
 MINE = "class Mine(Sample, frozen=True):\n    {}: Number\n"
 
 
-def test_two_messages_of_one_name_have_the_same_fields(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_one_name_is_one_kind_of_message_and_has_the_same_fields(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     one, other = (module(tmp_path, f"named_{x}", MINE.format(x) + CONFIG) for x in "ab")
     assert scenario(p=one, q=one).drones[0].sensors is not None
+    assert paths(a=UWB, second={"a": {"module": "airspeed"}})[0].startswith("drones[1].sensors.a")
     assert paths(p=one, q=other) == [f"drones[{drone}].sensors.q.declared.message" for drone in (0, 1)]
 
 
@@ -168,14 +167,9 @@ def test_messages_are_known_wherever_the_info_of_the_run_is():
     assert messages.encoding(key) == "application/msgpack;Ranged"
     with pytest.raises(DecodeError, match="range_m"):
         messages.decode(key, messages.encode(kind(1, 0, 1, float("nan"), (1.0, 2.0, 3.0), 7, True)))
+    assert key_table(["d1", "d2"], ["my_uwb"]).index("drone/d1/sensor/my_uwb") == 8
     assert message_type("Ranged", fields, "test_ranger") is kind
     assert "drone/*/sensor/test_ranger" not in messages.types_by_shape()
-
-
-def test_keys_of_users_sensors_follow_those_of_their_drone():
-    table = key_table(["d1", "d2"], ["my_uwb"])
-    assert len(table) == 2 * 9
-    assert table.index("drone/d1/sensor/my_uwb") == 8
 
 
 @pytest.mark.parametrize("numbers", [[], [1.0], [1.0, 2.0, 3.0, 4.0, 5.0]])

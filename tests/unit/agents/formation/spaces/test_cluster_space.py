@@ -75,15 +75,10 @@ def random_robots(space: ClusterSpace, rng: np.random.Generator, margin_min_m: f
 
 
 @pytest.mark.parametrize("kind", SPACES)
-def test_names_are_unique_and_as_many_as_robot_variables(kind):
-    space = SPACES[kind]()
-    assert space.size == 4 * space.n == len(set(space.names))
-    assert [space.index(name) for name in space.names] == list(range(space.size))
-
-
-@pytest.mark.parametrize("kind", SPACES)
 def test_forward_and_inverse_undo_each_other(kind):
     space, rng = SPACES[kind](), np.random.default_rng(1)
+    assert space.size == 4 * space.n == len(set(space.names))
+    assert [space.index(name) for name in space.names] == list(range(space.size))
     for _ in range(200):
         p_W, yaw = random_robots(space, rng)
         c = space.forward(p_W, yaw)
@@ -156,6 +151,11 @@ def test_robots_without_a_frame_are_refused(kind, value):
     for method in (space.forward, space.jacobian):
         with pytest.raises(SingularClusterError):
             method(p_W, yaw)
+    if kind == "nested triads":  # in any group
+        p_W, yaw = random_robots(space, np.random.default_rng(5))
+        p_W[3:6] = p_W[3]
+        with pytest.raises(SingularClusterError):
+            space.forward(p_W, yaw)
 
 
 @pytest.mark.parametrize(
@@ -172,14 +172,6 @@ def test_robots_without_a_frame_are_refused(kind, value):
 def test_singular_formations_are_refused_by_name(space, method, arguments, terms):
     with refused(SingularClusterError, *terms):
         getattr(space, method)(*arguments)
-
-
-def test_robots_without_a_frame_are_refused_in_any_group():
-    space = triads()
-    p_W, yaw = random_robots(space, np.random.default_rng(5))
-    p_W[3:6] = p_W[3]
-    with pytest.raises(SingularClusterError):
-        space.forward(p_W, yaw)
 
 
 @pytest.mark.parametrize(
@@ -239,15 +231,10 @@ def test_units_follow_from_names_in_any_space():
     assert {unit(name) for name in angles} == {"rad"}
 
 
-def test_robot_2_is_left_and_robot_3_right_of_robot_1():
-    c = cluster_space(3).forward(TRIANGLE, np.zeros(3))
-    assert c[3:6] == pytest.approx([0.0, 0.0, math.pi / 2])
-    mirrored = cluster_space(3).forward(TRIANGLE[[0, 2, 1]], np.zeros(3))
-    assert abs(mirrored[3]) == pytest.approx(math.pi)
-
-
-def test_roll_lowers_the_right_and_pitch_lowers_robot_1():
+def test_robot_2_is_left_roll_lowers_the_right_and_pitch_lowers_robot_1():
     space = cluster_space(3)
+    assert space.forward(TRIANGLE, np.zeros(3))[3:6] == pytest.approx([0.0, 0.0, math.pi / 2])
+    assert abs(space.forward(TRIANGLE[[0, 2, 1]], np.zeros(3))[3]) == pytest.approx(math.pi)
     c = np.array([0, 0, 10, 0.1, 0, 0, 0, 0, 0, 4, 4, 0.8])
     z = space.inverse(c)[0][:, 2]
     assert z[1] > z[0] > z[2]
@@ -266,12 +253,6 @@ def test_the_template_itself_has_no_departures_and_w_1_is_its_growth():
     assert np.abs(space.inverse(expected)[0] - (RING * 7.5 / 6.0 + (1.0, 2.0, 3.0))).max() < 1e-13
 
 
-def test_stretches_come_after_growth_and_shears_after_those():
-    space = TemplateCluster(np.random.default_rng(3).normal(size=(8, 3)) * (5.0, 3.0, 2.0))
-    for axis in np.eye(3):  # each stretch of an axis is made of the first three modes
-        assert np.abs(space.modes_C.reshape(24, 18).T[3:] @ (space.t_C * axis).ravel()).max() < 1e-12
-
-
 @pytest.mark.parametrize("n", TEMPLATES)
 def test_modes_neither_move_nor_turn_the_template_and_are_orthogonal(n):
     t = centred(np.random.default_rng(n).normal(size=(n, 3)))
@@ -279,6 +260,8 @@ def test_modes_neither_move_nor_turn_the_template_and_are_orthogonal(n):
     assert np.abs(N.T @ N - n * np.eye(3 * n - 6)).max() < 1e-12
     assert np.abs(turns(t).reshape(3, -1) @ N).max() < 1e-12
     assert np.abs(N.reshape(n, 3, -1).sum(axis=0)).max() < 1e-12
+    for axis in np.eye(3) if n > 3 else ():  # each stretch of an axis is made of the first three modes
+        assert np.abs(N.T[3:] @ (t * axis).ravel()).max() < 1e-11
 
 
 def test_no_robot_of_a_template_is_privileged():
@@ -290,11 +273,8 @@ def test_no_robot_of_a_template_is_privileged():
     other = TemplateCluster(places[order]).forward(p_W[order], np.zeros(10))
     assert np.abs(c[:6] - other[:6]).max() < 1e-13
     assert np.linalg.norm(c[16:]) == pytest.approx(np.linalg.norm(other[16:]))
-
-
-def test_a_reflection_is_not_answered_by_a_reflection():
-    t = centred(np.random.default_rng(7).normal(size=(6, 3)))
-    _, R = fitted_rotation(t.T @ (t * (1.0, 1.0, -1.0)))
+    t = centred(places)
+    _, R = fitted_rotation(t.T @ (t * (1.0, 1.0, -1.0)))  # a reflection is not answered by a reflection
     assert np.linalg.det(R) == pytest.approx(1.0)
 
 

@@ -28,16 +28,21 @@ def space(n: int, **cluster: Any) -> ClusterSpace:
     return scenario_space(made, made.clusters[0])
 
 
-@pytest.mark.parametrize(("n", "kind"), [(2, PairCluster), (3, TriadCluster), (4, TriadCluster), (5, TemplateCluster)])
-def test_the_default_is_a_triad_up_to_four_and_a_template_from_five_on(n: int, kind: type[ClusterSpace]):
-    assert type(space(n)) is kind
-    assert space(n).n == n
-
-
-def test_the_scenario_chooses():
-    assert type(space(8, space="triad")) is TriadCluster
-    assert type(space(3, space="template")) is TemplateCluster
-    assert type(space(3, template_m=[[0, 0, 0], [3, 0, 0], [0, 3, 0]])) is TemplateCluster
+@pytest.mark.parametrize(
+    ("n", "cluster", "kind"),
+    [
+        (2, {}, PairCluster),
+        (3, {}, TriadCluster),
+        (4, {}, TriadCluster),
+        (5, {}, TemplateCluster),
+        (8, {"space": "triad"}, TriadCluster),
+        (3, {"space": "template"}, TemplateCluster),
+        (3, {"template_m": [[0, 0, 0], [3, 0, 0], [0, 3, 0]]}, TemplateCluster),
+    ],
+)
+def test_the_default_is_a_triad_up_to_four_and_a_template_from_five_on(n: int, cluster: Any, kind: type[ClusterSpace]):
+    assert type(space(n, **cluster)) is kind
+    assert space(n, **cluster).n == n
 
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 90.0, -30.0])
@@ -57,24 +62,19 @@ def test_a_template_that_is_given_is_in_the_formation_s_axes():
     assert np.abs(made.t_C - (np.array(places) - np.mean(places, axis=0))).max() < 1e-15
 
 
-def test_groups_are_the_next_drones_each():
-    groups = [{"name": "a", "size": 3}, {"name": "b", "size": 5}]
-    made = space(8, groups=groups)
+def test_groups_are_the_next_drones_each_and_the_robots_of_a_template_of_groups_their_centroids():
+    starts = np.array([(x, y, 0.0) for x, y in STARTS])
+    made = space(8, groups=[{"name": "a", "size": 3}, {"name": "b", "size": 5}])
     assert isinstance(made, NestedCluster)
     assert type(made.parent) is PairCluster
     assert made.names[:8] == made.parent.names
     assert {"a.beta", "b.w_9", "b.phi_5"} <= set(made.names)
-    starts = np.array([(x, y, 0.0) for x, y in STARTS])
     c = made.forward(starts, np.full(8, np.pi / 2))
     assert c[:2] == pytest.approx((starts[:3].mean(axis=0) + starts[3:].mean(axis=0))[:2] / 2)
-
-
-def test_the_robots_of_a_template_of_groups_are_their_centroids():
     groups = [{"name": name, "size": size} for name, size in (("a", 2), ("b", 3), ("c", 2))]
     made = space(7, groups=groups, space="template")
     assert isinstance(made, NestedCluster)
     assert isinstance(made.parent, TemplateCluster)
-    starts = np.array([(x, y, 0.0) for x, y in STARTS])
     centres = np.array([starts[first:after].mean(axis=0) for first, after in ((0, 2), (2, 5), (5, 7))])
     seen = (centres - centres.mean(axis=0)) @ np.array([(0, -1, 0), (1, 0, 0), (0, 0, 1)])
     assert np.abs(made.parent.t_C - seen).max() < 1e-12

@@ -8,8 +8,8 @@ from synthetic_pictures import NO_JPEG, image, jpeg
 
 from zsim.contract import keys, messages
 from zsim.transport.session import RawSample
-from zsim_bridges.web import picture_streams
-from zsim_bridges.web.picture_streams import BOUNDARY, PictureFeed, PictureFeeds, part
+from zsim_bridges.gateway import client_streams
+from zsim_bridges.gateway.client_streams import BOUNDARY, PictureFeed, PictureFeeds, picture_part
 
 FRONT = keys.camera("d1", "front")
 MS = 1_000_000
@@ -83,7 +83,7 @@ def test_what_is_no_picture_is_refused_and_not_shown(payload: bytes) -> None:
 
 
 def test_a_hundred_who_look_cost_one_subscription_and_it_ends_after_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(picture_streams, "LINGER_S", 0.0)
+    monkeypatch.setattr(client_streams, "LINGER_S", 0.0)
     publisher = Publisher()
 
     async def look() -> list[int]:
@@ -121,7 +121,7 @@ def test_pictures_of_another_run_are_forgotten() -> None:
 
 
 def test_a_part_ends_with_the_boundary() -> None:
-    head, _, rest = part(image(20 * MS)).partition(b"\r\n\r\n")
+    head, _, rest = picture_part(image(20 * MS)).partition(b"\r\n\r\n")
     assert rest == jpeg() + f"\r\n--{BOUNDARY}\r\n".encode()
     assert b"Content-Length: %d" % len(jpeg()) in head
     assert b"X-Timestamp: 0.016000" in head

@@ -10,17 +10,14 @@ from federation import ONE
 
 from zsim.contract import flight_messages, messages
 from zsim.contract.flight_messages import Quaternion
-from zsim.math.frames import quaternion_from_rpy, rotate
+from zsim.math.frames import quaternion_from_rpy, quaternion_multiply, rotate
 from zsim.scenario import scenario_file
 from zsim.schema.message import Vector3
 from zsim.sensors.sensor import ErrorModel, Mount
 from zsim.sensors.sensor_catalogue import Sensors
-from zsim_bridges.ros2 import conversions, rmw_zenoh, topics
-from zsim_bridges.ros2.drone_cameras import DroneCameras
-from zsim_bridges.ros2.ros_types import RosTypes
-from zsim_bridges.ros2.topics import NavdataSummary
+from zsim_bridges.ros2 import rmw_zenoh, ros_types, topics
+from zsim_bridges.ros2.topics import DroneCameras, NavdataSummary
 
-TYPES = RosTypes()
 SENSORS = scenario_file.from_text(ONE).drones[0].sensors
 T_NS = 3_020_000_000
 NORTH: Quaternion = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))  # x forward is north
@@ -49,8 +46,8 @@ def xyz(vector: Any) -> list[float]:
 
 
 def all_topics() -> dict[str, topics.Topic]:
-    drone = topics.drone_topics("drone1", "drone1", SENSORS, TYPES)
-    cluster = topics.cluster_topics("main", "main", TYPES)
+    drone = topics.drone_topics("drone1", "drone1", SENSORS)
+    cluster = topics.cluster_topics("main", "main")
     run = topics.run_topics(topics.RosNames({"drone1": "drone1"}, {"main": "main"}))
     cameras = DroneCameras("drone1", "drone1").topics()
     return {topic.name: topic for topic in (*run, *drone, *cameras, *cluster)}
@@ -59,8 +56,8 @@ def all_topics() -> dict[str, topics.Topic]:
 def convert(topic: str, message: Any) -> Any:
     """Return what a topic makes of a message on its first source, after a way through CDR."""
     found = all_topics()[topic]
-    made = found.convert(found.sources[0], message)
-    return TYPES.decode(TYPES.encode(made, found.kind), found.kind)
+    converted = found.convert(found.sources[0], message)
+    return ros_types.decode(ros_types.encode(converted, found.kind), found.kind)
 
 
 def test_samples_are_stamped_with_the_time_for_which_they_hold() -> None:
@@ -73,15 +70,15 @@ def test_samples_are_stamped_with_the_time_for_which_they_hold() -> None:
 
 def test_times_before_the_start_are_written_as_ros_writes_them() -> None:
     """A sample may hold for a time before the start: seconds go down, nanoseconds stay positive."""
-    stamp = conversions.stamp(-20_000_000)
+    stamp = topics.stamp(-20_000_000)
     assert (stamp.sec, stamp.nanosec) == (-1, 980_000_000)
 
 
 def test_covariances_are_those_of_the_scenario() -> None:
     error = ErrorModel(noise=0.3, density=0.02, quantum=0.1)
-    assert conversions.variance(error, 100.0) == pytest.approx(0.09 + 0.04 + 0.01 / 12)
+    assert topics.variance(error, 100.0) == pytest.approx(0.09 + 0.04 + 0.01 / 12)
     imu = convert("/drone1/imu", messages.Imu(T_NS, 0, T_NS, (0.0, 0.0, 9.81), (0.0, 0.0, 0.0)))
-    gyro = math.radians(math.sqrt(conversions.variance(SENSORS.imu.gyro_deg_s, SENSORS.imu.rate_hz)))
+    gyro = math.radians(math.sqrt(topics.variance(SENSORS.imu.gyro_deg_s, SENSORS.imu.rate_hz)))
     assert imu.angular_velocity_covariance.reshape(3, 3) == pytest.approx(np.eye(3) * gyro**2)
 
 
@@ -130,7 +127,7 @@ def test_odometry_turns_as_its_attitudes_do(rate: Vector3) -> None:
     angle = math.hypot(*half)
     first = quaternion(0.1, -0.2, 3.0)
     turn = [math.cos(angle), *(math.sin(angle) / angle * each if angle else 0.0 for each in half)]
-    second = conversions.quaternion_multiply(first, turn)
+    second = quaternion_multiply(first, turn)
     maker.update("", estimate(T_NS, first))
     for q in (second, -second):
         maker.update("", estimate(T_NS, first))
@@ -140,19 +137,20 @@ def test_odometry_turns_as_its_attitudes_do(rate: Vector3) -> None:
 
 def test_into_body_is_the_inverse_of_the_frames_rotation() -> None:
     q = quaternion(0.3, -0.4, 2.0)
-    assert rotate(q, conversions.into_body(q, (1.0, 2.0, 3.0))) == pytest.approx([1.0, 2.0, 3.0])
+    assert rotate(q, topics.into_body(q, (1.0, 2.0, 3.0))) == pytest.approx([1.0, 2.0, 3.0])
 
 
 def test_sonar_frame_looks_along_the_beam_of_a_turned_mount() -> None:
     """ROS's range finders look along x; this sonar is tilted by 30 deg about y, its beam from down to the front."""
     mount = Mount(position_m=(0.1, 0.0, -0.02), rpy_deg=(0.0, -30.0, 0.0))
     spec = _with_sonar(mount)
-    placed = {pose.child: pose for pose in conversions.static_frames("drone1", spec)}
-    sonar = placed["drone1/sonar_link"]
-    assert sonar.position_m == (0.1, 0.0, -0.02)
-    beam = rotate(sonar.orientation_wxyz, (1.0, 0.0, 0.0))
+    placed = {frame.child_frame_id: frame for frame in topics.static_transforms("drone1", spec)}
+    sonar = placed["drone1/sonar_link"].transform
+    assert xyz(sonar.translation) == [0.1, 0.0, -0.02]
+    q = sonar.rotation
+    beam = rotate((q.w, q.x, q.y, q.z), (1.0, 0.0, 0.0))
     assert beam == pytest.approx([math.sin(math.radians(30)), 0.0, -math.cos(math.radians(30))])
-    assert placed["drone1/odom"].parent == "map"
+    assert placed["drone1/odom"].header.frame_id == "map"
 
 
 def _with_sonar(mount: Mount) -> Sensors:
@@ -207,7 +205,7 @@ def test_battery_comes_each_second_and_state_when_it_changes_too() -> None:
 
 def test_navdata_is_in_the_drivers_units_and_signs() -> None:
     """Right side down, nose down and counter-clockwise are positive; g, mm, mm/s, deg, Pa, us."""
-    navdata = NavdataSummary(TYPES.message_class("zsim_msgs/msg/Navdata"), "base")
+    navdata = NavdataSummary("base")
     converted: dict[str, Any] = {
         "imu": messages.Imu(T_NS, 0, T_NS, (0.0, -4.903325, 9.80665), (0.0, 0.0, 0.0)),
         "baro": messages.Baro(T_NS, 0, T_NS, 101_325.4, 0.0),
@@ -223,11 +221,11 @@ def test_navdata_is_in_the_drivers_units_and_signs() -> None:
     assert (made.rot_x, made.rot_y, made.rot_z) == pytest.approx(tuple(np.degrees([0.1, 0.2, 0.3])))
     assert (made.ax, made.ay, made.az) == pytest.approx((0.0, -0.5, 1.0))
     assert (made.vx, made.vy, made.tm) == (1500.0, -500.0, 3_020_000.0)
-    assert TYPES.encode(made, "zsim_msgs/msg/Navdata")
+    assert ros_types.encode(made, "zsim_msgs/msg/Navdata")
 
 
 def test_navdata_of_a_drone_that_has_told_nothing_yet() -> None:
-    navdata = NavdataSummary(TYPES.message_class("zsim_msgs/msg/Navdata"), "base")
+    navdata = NavdataSummary("base")
     made: Any = navdata.update("drone/drone1/sensor/status", status(0, "emergency"))
     assert (made.state, made.pressure, made.altd) == (0, 0, 0)
     assert math.isnan(made.rot_x)

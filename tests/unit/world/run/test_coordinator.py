@@ -8,16 +8,17 @@ from msgspec import UNSET
 from refused import has_terms
 
 from zsim.contract import keys
-from zsim.contract.run_messages import Bye, Done, Event, Join
+from zsim.contract.run_messages import Bye, ControlRequest, Done, Event, Join
 from zsim.errors import RunFailedError, ScenarioError
+from zsim.runtime.health import HealthMeter
 from zsim.scenario import scenario_file
 from zsim_world.run import inputs
-from zsim_world.run.inputs import Expired
-from zsim_world.run.participants import DataFlow
+from zsim_world.run.coordinator import DataFlow
+from zsim_world.run.inputs import Called, Run
 from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
-ME = "estimator.d1"
+ME, OWN = "estimator.d1", "fence.main"
 RETURN_NS = 2_000_000_000
 SCENARIO = """
 name: one
@@ -27,29 +28,39 @@ processes: {expect: [], PROCESSES}
 """
 
 
-def world(processes: str, mode: str = "lockstep") -> World:
+def join(made: World, name: str, incarnation: int = 1, period_ns: int = GATE_NS, **more: Any) -> None:
+    message = Join(0, 0, "run1", incarnation, name.split(".")[0], "h", 7, period_ns, **more)
+    made.handle(keys.process(name, "join"), message, 0)
+
+
+def say_bye(made: World, name: str = ME, reason: str = "enough", **of: Any) -> None:
+    made.handle(keys.process(name, "bye"), Bye(0, 0, reason, **of), 5)
+
+
+def world(processes: str = "on_death: {}", mode: str = "lockstep") -> World:
     """Return a world that ME has taken part in since wall time 0, and whose time stands for ME."""
     made = World(scenario_file.from_text(SCENARIO.replace("PROCESSES", processes)), mode, run_id="run1")
-    made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 1, "estimator", "h", 7, GATE_NS), 0)
+    join(made, ME)
     while made.may_advance():
         made.advance(0)
     made.take_outbox()
     return made
 
 
+def news(made: World) -> list[Event]:
+    return [message for _, message in made.take_outbox() if isinstance(message, Event)]
+
+
 def events(made: World) -> list[tuple[str, str]]:
     """Return kinds and subjects of the events since the last look."""
-    taken = [message for _, message in made.take_outbox()]
-    return [(message.kind, message.subject) for message in taken if isinstance(message, Event)]
+    return [(event.kind, event.subject) for event in news(made)]
 
 
 def test_one_that_died_is_overdue_after_its_time_and_not_before() -> None:
     made = world("return_s: 2")
     assert made.overdue(10 * RETURN_NS) is None
     made.died(ME, 1)
-    assert made.overdue(RETURN_NS + 1) is None
-    assert made.overdue(RETURN_NS + 2) == ME
-
+    assert (made.overdue(RETURN_NS + 1), made.overdue(RETURN_NS + 2)) == (None, ME)
     made.expired(ME)
     assert events(made) == [("death", ME), ("overdue", ME)]
     assert has_terms(made.ended or "", ME, "2")
@@ -77,7 +88,7 @@ def test_or_goes_on_without_it(whose: str) -> None:
 @pytest.mark.parametrize("name", ["camera.main", "detector.d1"])
 def test_one_for_which_no_gate_waits_ends_nothing_by_staying_away(name: str) -> None:
     made = world("return_s: 2")
-    made.handle(keys.process(name, "join"), Join(0, 0, "run1", 2, name.split(".")[0], "h", 8, 0), 0)
+    join(made, name, 2, period_ns=0)
     made.died(name, 1)
     made.expired(name)
     assert events(made)[-3:] == [("death", name), ("overdue", name), ("drop", name)]
@@ -88,8 +99,7 @@ def test_one_for_which_no_gate_waits_ends_nothing_by_staying_away(name: str) -> 
 def test_one_that_is_stopped_is_overdue_too_and_on_death_says_what_it_means(on_death: str, ends: bool) -> None:
     made = world(f"return_s: 2, on_death: {{estimator: {on_death}}}")
     made.silence_changed(ME, 5)
-    assert made.overdue(RETURN_NS + 5) is None
-    assert made.overdue(RETURN_NS + 6) == ME
+    assert (made.overdue(RETURN_NS + 5), made.overdue(RETURN_NS + 6)) == (None, ME)
     made.expired(ME)
     assert (made.ended is not None) is ends
 
@@ -99,14 +109,30 @@ def test_nobody_overdue_is_waited_for() -> None:
         scenario_file.from_text(SCENARIO.replace("PROCESSES", "return_s: 1, on_overdue: {estimator: wait}"))
 
 
-def test_the_journal_has_it() -> None:
-    assert inputs.decode(inputs.encode([Expired(ME)])) == [Expired(ME)]
+@pytest.mark.parametrize(
+    ("method", "args"),
+    [
+        ("await_return", (5, True)),
+        ("control", (ControlRequest("acquire", {"drone": "d1"}, "me.x"),)),
+        ("died", (ME, 1)),
+        ("expired", (ME,)),
+        ("falsely_joined", (ME, Join(0, 0, "run1", 2, "estimator", "h", 8, GATE_NS), "no token")),
+        ("give_up_outputs", (ME,)),
+        ("join", (ME, Join(0, 0, "run1", 2, "estimator", "h", 8, GATE_NS), 5)),
+        ("not_shown", (ME, "no token", 5)),
+        ("reader_closed", ("text", {"address": "a", "names": ["b"]})),
+        ("silence_changed", (ME, 5)),
+    ],
+)
+def test_a_loss_a_join_and_a_request_are_the_same_from_the_journal(method: str, args: tuple[Any, ...]) -> None:
+    assert method in inputs.CALLS
+    (entry,) = inputs.decode(inputs.encode([Called(method, args)]))
+    made, again = world("return_s: 2"), world("return_s: 2")
+    assert getattr(made, method)(*args) == Run(again, HealthMeter("world")).enter(entry)
+    assert news(made) == news(again)
 
 
 # One that never comes
-
-WAITED_NS = 61_000_000_000
-OWN = "fence.main"
 
 
 def waiting(processes: str, is_launched: bool = True) -> World:
@@ -135,9 +161,8 @@ def test_one_that_never_joins_is_overdue_after_its_time(
 
 def test_one_that_the_launcher_starts_may_compile_first() -> None:
     made = waiting("on_death: {}")
-    made.handle(keys.process(OWN, "join"), Join(0, 0, "run1", 1, "fence", "h", 7, GATE_NS), 0)
-    assert made.overdue(WAITED_NS) is None
-    assert made.overdue(601_000_000_000) == ME
+    join(made, OWN)
+    assert (made.overdue(61 * 10**9), made.overdue(601 * 10**9)) == (None, ME)
 
 
 def test_then_the_run_fails_and_names_it() -> None:
@@ -151,7 +176,7 @@ def test_then_the_run_fails_and_names_it() -> None:
 
 def test_or_begins_without_it_where_the_scenario_says_so() -> None:
     made = waiting("start_timeout_s: 5, on_overdue: {fence: drop}")
-    made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 1, "estimator", "h", 7, GATE_NS), 0)
+    join(made, ME)
     assert not made.may_advance()
     made.expired(OWN)
     assert [kind for kind, name in events(made) if name == OWN] == ["overdue", "drop"]
@@ -159,7 +184,7 @@ def test_or_begins_without_it_where_the_scenario_says_so() -> None:
     assert made.failure is None
 
 
-# One that cannot go on
+# One that cannot go on, and who leaves
 
 
 @pytest.mark.parametrize(
@@ -175,51 +200,39 @@ def test_one_that_cannot_go_on_is_named_and_on_death_says_what_follows(
     on_death: str, kinds: list[str], ends: bool, waits: bool
 ) -> None:
     made = world(f"on_death: {{estimator: {on_death}}}")
-    made.handle(keys.process(ME, "bye"), Bye(0, 0, "mine:Law.rates raised", True, "run1", 1), 5)
+    say_bye(made, reason="mine:Law.rates raised", failed=True, run_id="run1", incarnation=1)
     assert [kind for kind, name in events(made) if name == ME] == kinds
     assert made.ended == ("mine:Law.rates raised" if ends else None)
     assert (made.failure is not None) is ends
     assert made.may_advance() is not (ends or waits)
 
 
-# Who leaves
-
-
-def say_bye(made: World, reason: str = "enough", **of: Any) -> None:
-    made.handle(keys.process(ME, "bye"), Bye(0, 0, reason, **of), 5)
-
-
-def texts(made: World) -> list[tuple[str, str]]:
-    """Return kinds and texts of the events since the last look."""
-    return [(each.kind, each.text) for _, each in made.take_outbox() if isinstance(each, Event)]
-
-
 @pytest.mark.parametrize(
     ("of", "wrong"),
     [
-        ({"run_id": "run1", "incarnation": 2}, ("process/estimator.d1/bye", "incarnation", "2", "1")),
-        ({"run_id": "run0", "incarnation": 1}, ("process/estimator.d1/bye", "run_id", "'run0'", "'run1'")),
-        ({"incarnation": 2}, ("process/estimator.d1/bye", "incarnation", "2", "1")),
-        ({"run_id": "run0"}, ("process/estimator.d1/bye", "run_id", "'run0'", "'run1'")),
+        ({"run_id": "run1", "incarnation": 2}, ("incarnation", "2", "1")),
+        ({"run_id": "run0", "incarnation": 1}, ("run_id", "'run0'", "'run1'")),
+        ({"incarnation": 2}, ("incarnation", "2", "1")),
+        ({"run_id": "run0"}, ("run_id", "'run0'", "'run1'")),
     ],
 )
 @pytest.mark.parametrize("failed", [UNSET, True])
 def test_a_bye_of_another_incarnation_or_run_is_refused(
     of: dict[str, Any], wrong: tuple[str, ...], failed: Any
 ) -> None:
-    made = world("on_death: {}")
+    made = world()
     say_bye(made, failed=failed, **of)
-    ((kind, text),) = texts(made)
-    assert kind == "refused"
-    assert has_terms(text, *wrong)
+    (event,) = news(made)
+    assert event.kind == "refused"
+    assert has_terms(event.text, f"process/{ME}/bye", *wrong)
     assert made.barrier.participants[ME].alive
     assert made.ended is None
 
 
 def test_a_late_bye_of_a_former_incarnation_ends_nothing() -> None:
-    made = world("on_death: {}")
+    made = world()
     made.died(ME, 1)
-    made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 2, "estimator", "h", 8, GATE_NS), 2)
+    join(made, ME, 2)
     say_bye(made, run_id="run1", incarnation=1)
     assert [kind for kind, _ in events(made)] == ["death", "restart", "refused"]
     assert made.barrier.participants[ME].join.incarnation == 2
@@ -237,7 +250,7 @@ def test_a_bye_without_an_incarnation_counts_when_the_token_is_gone_as_well(fail
 
 @pytest.mark.parametrize("is_over", [False, True])
 def test_or_when_nobody_ever_showed_a_token_or_the_run_is_over(is_over: bool) -> None:
-    made = world("on_death: {}")
+    made = world()
     say_bye(made)
     made.publish_end() if is_over else made.not_shown(ME, "has no liveliness token", 6)
     assert events(made) == [("leave", ME), *[("end", "world")] * is_over]
@@ -247,12 +260,12 @@ def test_or_when_nobody_ever_showed_a_token_or_the_run_is_over(is_over: bool) ->
 
 def test_who_says_done_after_such_a_bye_has_not_said_it() -> None:
     """A living estimator that somebody else says bye for takes part as before, and its death is a death."""
-    made = world("on_death: {}")
+    made = world()
     say_bye(made)
     made.handle(keys.process(ME, "done"), Done(0, 0, "run1", 1, 0, 0), 6)
-    ((kind, text),) = texts(made)
-    assert kind == "refused"
-    assert has_terms(text, "process/estimator.d1/bye", "incarnation", "missing", "1")
+    (event,) = news(made)
+    assert event.kind == "refused"
+    assert has_terms(event.text, f"process/{ME}/bye", "incarnation", "missing", "1")
     made.died(ME, 7)
     assert events(made) == [("death", ME)]
 
@@ -271,10 +284,10 @@ def test_who_leaves_early_is_named_and_fails_the_run_unless_that_is_allowed(
 ) -> None:
     made = world(processes)
     if serves:
-        made.handle(keys.process("host.b", "join"), Join(0, 0, "run1", 9, "host", "h", 9, 0, serves=serves), 0)
+        join(made, "host.b", 9, period_ns=0, serves=serves)
     made.take_outbox()
     say_bye(made, run_id="run1", incarnation=1)
-    (event,) = [each for _, each in made.take_outbox() if isinstance(each, Event)]
+    (event,) = news(made)
     assert event.data == {"reason": "enough", "run_id": "run1", "incarnation": 1, **({"fails": True} if fails else {})}
     assert [has_terms(line, ME, "0.02 s", "enough") for line in made.left_early] == [True] * fails
     assert made.ended is None
@@ -283,14 +296,16 @@ def test_who_leaves_early_is_named_and_fails_the_run_unless_that_is_allowed(
     assert restored.left_early == made.left_early
 
 
-@pytest.mark.parametrize(("name", "role"), [("console.1", "console"), ("recorder", "recorder")])
-def test_who_is_not_needed_may_leave_and_a_recorder_ends_the_run(name: str, role: str) -> None:
-    made = world("on_death: {}")
-    made.handle(keys.process(name, "join"), Join(0, 0, "run1", 4, role, "h", 8, 0), 0)
-    made.handle(keys.process(name, "bye"), Bye(0, 0, "enough", UNSET, "run1", 4), 5)
+@pytest.mark.parametrize("name", ["console.1", "recorder"])
+def test_who_is_not_needed_may_leave_and_a_recorder_ends_the_run(name: str) -> None:
+    made = world()
+    join(made, name, 4, period_ns=0)
+    say_bye(made, name, run_id="run1", incarnation=4)
     assert made.left_early == []
-    assert (made.ended is not None) is (role == "recorder")
+    assert (made.ended is not None) is (name == "recorder")
 
+
+# Who is held up by whom
 
 PAIR = scenario_file.from_text("""
 name: pair
@@ -309,23 +324,19 @@ def test_estimators_feed_the_controller_and_nobody_else_anybody():
     assert pairs == {(e, reader) for e in ESTIMATORS for reader in (CONTROLLER, "planner.main")}
 
 
-def standing(*done: str) -> dict[str, tuple[str, ...]]:
-    """Return whom a world waits for, and by whom each is held up, when those given are done with a gate."""
-    world = World(PAIR, run_id="r")
-    for pid, name in enumerate((*ESTIMATORS, CONTROLLER)):
-        join = Join(0, 0, "r", pid, name.split(".")[0], "h", pid, GATE_NS)
-        world.handle(keys.process(name, "join"), join, 0)
-    while world.may_advance():
-        world.advance(0)
-    for pid, name in enumerate((*ESTIMATORS, CONTROLLER)):
-        if name in done:
-            world.handle(keys.process(name, "done"), Done(0, 0, "r", pid, 0, 0), 0)
-    return {waiting.name: waiting.held_by for waiting in world.waiting_for(10**9)}
-
-
-def test_who_lacks_an_estimate_is_a_victim():
-    assert standing("estimator.d1") == {"estimator.d2": (), CONTROLLER: ("estimator.d2",)}
-
-
-def test_who_has_them_all_is_the_cause():
-    assert standing(*ESTIMATORS) == {CONTROLLER: ()}
+@pytest.mark.parametrize(
+    ("done", "held_by"),
+    [
+        (["estimator.d1"], {"estimator.d2": (), CONTROLLER: ("estimator.d2",)}),  # the controller is a victim
+        (ESTIMATORS, {CONTROLLER: ()}),  # or the cause
+    ],
+)
+def test_who_lacks_an_estimate_is_a_victim(done: list[str], held_by: dict[str, tuple[str, ...]]):
+    made = World(PAIR, run_id="run1")
+    for name in (*ESTIMATORS, CONTROLLER):
+        join(made, name)
+    while made.may_advance():
+        made.advance(0)
+    for name in done:
+        made.handle(keys.process(name, "done"), Done(0, 0, "run1", 1, 0, 0), 0)
+    assert {waiting.name: waiting.held_by for waiting in made.waiting_for(10**9)} == held_by

@@ -1,0 +1,412 @@
+"""The gateway's HTTP server: access, and the keys as trees.
+
+RestTree: that of the Zenoh REST plugin: full keys, payloads as they are. GET and POST query, PUT and PATCH publish,
+DELETE deletes; `Accept: text/event-stream` subscribes; `?_raw` returns the first payload alone. Source: zenoh,
+plugins/zenoh-plugin-rest.
+
+JsonTree: /json/KEY without the federation's name, JSON by the schema of each message.
+GET    /json/drone/drone1/sensor/imu      the last value; of an expression, a list of {key, value}
+GET    … with Accept: text/event-stream   every value from now on
+PUT    /json/drone/drone1/cmd/velocity    {"velocity_m_s": [1, 0, 0]}; t_ns, seq and source are filled in
+POST   /json/world/control                {"op": "pause", "args": {}}
+
+CameraTree: /camera/DRONE/CAMERA, a stream of pictures; /camera/DRONE/CAMERA.jpg, the newest one.
+"""
+
+import base64
+import html
+import json
+from collections.abc import Awaitable, Callable, Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+import msgspec
+from aiohttp import web
+
+from zsim.contract import messages
+from zsim.contract.messages import REFUSALS
+from zsim.contract.run_messages import ControlRequest
+from zsim.errors import DecodeError, NoWorldError, SessionError, ZsimError
+from zsim.runtime.rate_limit import RateLimit
+from zsim.transport.session import RawSample, check_expression
+from zsim_bridges.gateway.client_messages import (
+    CACHED_VALUES,
+    JSON,
+    TEXT,
+    ClientLimit,
+    ForbiddenError,
+    MethodError,
+    TooManyError,
+    UnknownError,
+    count_request,
+    is_control_key,
+    is_reserved,
+    json_entry,
+    json_value,
+)
+from zsim_bridges.gateway.client_streams import (
+    LINE_MAX,
+    PICTURE_HEADERS,
+    ClientFactory,
+    PictureFeeds,
+    exposure_s,
+    serve_websocket,
+    stream_events,
+    stream_pictures,
+)
+from zsim_bridges.gateway.openapi import JSON_PREFIX, ONE_PICTURE, description
+from zsim_bridges.gateway.run_access import RunAccess, SharedSubscriptions
+from zsim_bridges.web import is_loopback_authority
+from zsim_bridges.web.web_server import tokens_match
+
+HTTP_RATE_HZ = 5_000.0  # requests per wall second of one address: 500 clients that ask ten times a second
+HTTP_BURST = 10_000.0
+METHODS = "GET, POST, PUT, PATCH, DELETE, OPTIONS"
+EVENT_STREAM = "text/event-stream"
+RAW, TOKEN = "_raw", "token"
+BYTES = "zenoh/bytes"  # encoding that the plugin gives a body without Content-Type
+PICTURE_S = 2.0  # wall time that the first picture is waited for; twice the period of a slow camera
+NO_PICTURE = "no picture yet; does a camera process publish there, and does time run?"
+NO_VALUE = "no value yet; is the key right, and does somebody publish it?"
+STREAM, DESCRIPTION, CAMERA = "/stream", "/openapi.json", "/camera/{drone}/{camera}"
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+_encode = msgspec.json.Encoder().encode
+_control_request = msgspec.json.Decoder(ControlRequest).decode
+
+
+class MissingTokenError(ForbiddenError):
+    """A request without the token."""
+
+
+STATUS: tuple[tuple[type[ZsimError], int], ...] = (
+    (NoWorldError, 503),
+    (TooManyError, 429),
+    (MethodError, 405),
+    (UnknownError, 404),
+    (MissingTokenError, 401),
+    (ForbiddenError, 403),
+    (DecodeError, 400),
+    (SessionError, 400),
+    (ZsimError, 500),
+)
+
+
+def application(
+    access_check: "AccessCheck", rest: "RestTree", tree: "JsonTree", cameras: "CameraTree", new_client: ClientFactory
+) -> web.Application:
+    """Return the web application of a gateway; `new_client` makes the client of a WebSocket."""
+
+    async def index(request: web.Request) -> web.Response:
+        cameras = {"camera": "/camera/DRONE/CAMERA", "picture": f"/camera/DRONE/CAMERA{ONE_PICTURE}"}
+        paths = {"description": DESCRIPTION, "json": JSON_PREFIX, "stream": STREAM, **cameras}
+        return web.json_response({"zsim": "gateway", **paths, "zenoh": "/FEDERATION/KEY"})
+
+    async def describe(request: web.Request) -> web.Response:
+        return web.json_response(description())
+
+    def not_allowed(*allowed: str) -> Handler:
+        """Return a handler that refuses all other methods of a path."""
+
+        async def refuse(request: web.Request) -> web.StreamResponse:
+            raise web.HTTPMethodNotAllowed(request.method, allowed)
+
+        return refuse
+
+    app = web.Application(middlewares=[access_check.check], client_max_size=LINE_MAX)
+    json_path, full_path = f"{JSON_PREFIX}{{key:.*}}", "/{key:.*}"
+    app.router.add_get("/", index)
+    app.router.add_get(DESCRIPTION, describe)
+    app.router.add_get(STREAM, lambda request: serve_websocket(request, new_client))
+    app.router.add_get(json_path, tree.get, allow_head=False)
+    app.router.add_put(json_path, tree.put)
+    app.router.add_post(json_path, tree.post)
+    app.router.add_route("*", json_path, not_allowed("GET", "POST", "PUT"))
+    app.router.add_get(CAMERA, cameras.get, allow_head=False)
+    for path in (STREAM, DESCRIPTION, CAMERA):
+        app.router.add_route("*", path, not_allowed("GET"))
+    app.router.add_get(full_path, rest.get, allow_head=False)
+    app.router.add_post(full_path, rest.get)
+    app.router.add_put(full_path, rest.put)
+    app.router.add_patch(full_path, rest.put)
+    app.router.add_delete(full_path, rest.delete)
+    return app
+
+
+class AccessCheck:
+    """Passes requests on or refuses them.
+
+    Args:
+        token: that every request must have; None where only this machine can connect.
+        report: prints a fault of the gateway itself.
+    """
+
+    def __init__(self, token: str | None, report: Callable[[str], None]) -> None:
+        self._token = token
+        self._report = report
+        self._limit = RateLimit(1 / HTTP_RATE_HZ, HTTP_BURST)
+
+    def is_token(self, received: str) -> bool:
+        return self._token is None or tokens_match(received, self._token)
+
+    @web.middleware
+    async def check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Refuse requests without the token, from other sites' pages, or too many; answer errors."""
+        response = await self._answer(request, handler)
+        if not response.prepared:
+            response.headers.setdefault("Access-Control-Allow-Origin", "*")
+        return response
+
+    async def _answer(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        if request.method == "OPTIONS":  # a browser's preflight request, without a token
+            allowed = {"Access-Control-Allow-Methods": METHODS, "Access-Control-Allow-Headers": "*"}
+            return web.Response(status=204, headers=allowed)
+        try:
+            count_request(self._limit, request.remote or "")
+            kind, _, token = request.headers.get("Authorization", "").partition(" ")
+            if not self.is_token(token.strip() if kind.lower() == "bearer" else request.query.get(TOKEN, "")):
+                raise MissingTokenError("no token, or a wrong one; send Authorization: Bearer TOKEN, or ?token=TOKEN")
+            if self._token is None and not _is_from_this_machine(request):
+                raise ForbiddenError(
+                    "a page of another server may not ask here; give the gateway a token, and ask with it"
+                )
+            return await handler(request)
+        except ZsimError as error:
+            status = next(status for kind, status in STATUS if isinstance(error, kind))
+            return error_response(status, str(error), error.allowed if isinstance(error, MethodError) else ())
+        except web.HTTPException as error:
+            allowed = error.allowed_methods if isinstance(error, web.HTTPMethodNotAllowed) else ()
+            text = " ".join((error.text or error.reason).split())
+            return error_response(error.status, f"{request.method} {request.path[:80]}: {text}", sorted(allowed))
+        except ConnectionError:
+            raise
+        except Exception as error:  # a fault of the gateway: other requests are served on
+            if isinstance(error, RuntimeError) and request.transport is None:  # aiohttp's for a body that is cut
+                raise ConnectionResetError("the client is gone") from error
+            self._report(f"{request.method} {request.path[:80]}: {error!r}")
+            return error_response(500, f"the gateway failed ({type(error).__name__}); its terminal says more")
+
+
+def error_response(status: int, text: str, allowed: Iterable[str] = ()) -> web.Response:
+    """Return a response that has no value but an error, and the methods that the key has."""
+    headers = {"Allow": ", ".join(allowed)} if allowed else None
+    return web.Response(status=status, body=_encode({"error": text}), content_type="application/json", headers=headers)
+
+
+def _is_from_this_machine(request: web.Request) -> bool:
+    """Return whether a program of this machine sent a request, and no page of another server: browsers give its origin.
+
+    A server on another port of this machine is another one, whose pages may be anybody's. The Host header counts too:
+    another site can let its own name resolve to this machine.
+    """
+    origin = request.headers.get("Origin")  # "null" for a sandboxed frame: any page can make one
+    try:
+        is_own = origin is None or urlsplit(origin).netloc == request.host
+        return is_own and is_loopback_authority(request.host)
+    except ValueError:
+        return False
+
+
+@dataclass(frozen=True)
+class RestTree:
+    """Handlers of the tree of full keys."""
+
+    run: Callable[[], RunAccess]  # the current one
+    subscriptions: SharedSubscriptions  # to full keys
+
+    async def get(self, request: web.Request) -> web.StreamResponse:
+        """Answer a GET or a POST."""
+        expression, accepted = _key_of(request, "/"), _first_accepted(request)
+        if any(part.startswith("@") for part in expression.split("/")):  # wildcards do not match these
+            raise ForbiddenError(
+                f"{expression[:80]}: Zenoh's own keys are not shown; must be keys without @, as zsim/**"
+            )
+        if accepted == EVENT_STREAM:
+            return await stream_events(request, self.subscriptions, expression, _sample_event)
+        samples = await self._query(request, expression)
+        if RAW in request.query:
+            if not samples:
+                return web.Response()
+            return web.Response(body=samples[0].payload, headers={"Content-Type": samples[0].encoding})
+        if accepted == "text/html":
+            texts = ((sample.key or "ERROR", sample.payload.decode(errors="replace")) for sample in samples)
+            items = "\n".join(f"<dt>{html.escape(key)}</dt>\n<dd>{html.escape(text)}</dd>\n" for key, text in texts)
+            return web.Response(text=f"<dl>\n{items}\n</dl>\n", content_type="text/html")
+        return web.json_response([described_sample(sample) for sample in samples])
+
+    async def _query(self, request: web.Request, expression: str) -> list[RawSample]:
+        body, run = await request.read(), self.run()
+        stored = [] if body else run.last_samples(expression)
+        if stored and "*" not in expression:
+            return stored
+        # What follows the `?` are Zenoh's parameters, but for the gateway's own.
+        parts = [part for part in request.query_string.split("&") if part.partition("=")[0] not in (TOKEN, "")]
+        answers = await run.query(expression, ";".join(parts), body, _encoding_of(request))
+        stored_keys = {sample.key for sample in stored}
+        return [*stored, *(answer for answer in answers if answer.kind == "ERROR" or answer.key not in stored_keys)]
+
+    async def put(self, request: web.Request) -> web.Response:
+        key, body = _key_of(request, "/"), await request.read()
+        self.run().put_full_key(key, body, _encoding_of(request))
+        return web.Response()
+
+    async def delete(self, request: web.Request) -> web.Response:
+        self.run().delete_full_key(_key_of(request, "/"))
+        return web.Response()
+
+
+@dataclass(frozen=True)
+class JsonTree:
+    """Handlers of the tree of JSON."""
+
+    run: Callable[[], RunAccess]
+    subscriptions: SharedSubscriptions  # to keys without the federation's name
+    source: str  # of control requests that name none
+
+    async def get(self, request: web.Request) -> web.StreamResponse:
+        """Answer with the last values, or with every value from now on."""
+        expression = _checked_key(request)
+        if _first_accepted(request) == EVENT_STREAM:
+            return await stream_events(request, self.subscriptions, expression, value_event)
+        last = self.run().values
+        entries = [json_entry(key, payload, last.encoding(key)) for key, payload in last.matching(expression)]
+        if "*" in expression:
+            return _as_json(entries)
+        return _as_json(entries[0]["value"]) if entries else error_response(404, f"{expression[:80]}: {NO_VALUE}")
+
+    async def put(self, request: web.Request) -> web.Response:
+        key, body = _checked_key(request), await request.read()
+        try:
+            value = msgspec.json.decode(body)
+        except REFUSALS as error:
+            raise DecodeError(f"{key[:80]}: {error}; must be JSON") from error
+        run = self.run()
+        run.put(key, value, run.defaults)
+        return _as_json({})
+
+    async def post(self, request: web.Request) -> web.Response:
+        """Send a control request to whoever answers on a key."""
+        key = _checked_key(request)
+        try:
+            control = _control_request(await request.read())
+        except REFUSALS as error:
+            raise DecodeError(f"{key[:80]}: {error}; must be a JSON object with op and args") from error
+        answer = await self.run().request(key, control.op, control.args, control.source or self.source)
+        return _as_json({"ok": answer.ok, "error": answer.error, "result": json_value(answer.result)})
+
+
+@dataclass(frozen=True)
+class CameraTree:
+    """Handlers of the pictures of cameras."""
+
+    run: Callable[[], RunAccess]
+    feeds: PictureFeeds
+    limit: ClientLimit  # in which streams count
+
+    async def get(self, request: web.Request) -> web.StreamResponse:
+        """Answer with all pictures from now on, or with the newest one alone where the path ends with `.jpg`."""
+        camera = request.match_info["camera"]
+        key = self.run().camera_key(request.match_info["drone"], camera.removesuffix(ONE_PICTURE))
+        self.limit.enter()
+        try:
+            with self.feeds.watched(key) as feed:
+                if not camera.endswith(ONE_PICTURE):
+                    return await stream_pictures(request, feed)
+                picture = feed.newest or await feed.after(-1, PICTURE_S)
+        finally:
+            self.limit.leave()
+        if picture is None:
+            return error_response(404, f"{key}: {NO_PICTURE}")
+        headers = {**PICTURE_HEADERS, "X-Timestamp": exposure_s(picture.image)}
+        return web.Response(body=picture.image.data, content_type="image/jpeg", headers=headers)
+
+
+def methods_of(key: str) -> tuple[str, ...]:
+    """Return the HTTP methods of a key: control keys take requests, reserved ones are read, clients' own take all."""
+    if is_control_key(key):
+        return ("POST",)
+    if is_reserved(key):
+        return ("GET",)
+    return ("GET", "PUT") if messages.type_of(key) else ("GET", "PUT", "POST")
+
+
+# Requests
+
+
+def _key_of(request: web.Request, prefix: str) -> str:
+    """Return the key expression in a path, or raise a DecodeError."""
+    try:
+        key = unquote(request.raw_path.partition("?")[0], errors="strict").removeprefix(prefix)
+    except UnicodeDecodeError as error:
+        raise DecodeError(f"path is {request.raw_path[:80]!r}; must be UTF-8, percent-encoded") from error
+    if not key:
+        raise DecodeError("path is '/'; must be a key expression, e.g. /zsim/world/info")
+    return key
+
+
+def _checked_key(request: web.Request) -> str:
+    """Return the key of a request, or raise a MethodError where the key has other methods."""
+    key = _key_of(request, JSON_PREFIX)
+    check_expression(key)
+    allowed = methods_of(key)
+    if request.method not in allowed:
+        raise MethodError(
+            f"{key[:80]}: {request.method} is nothing for this key; must be {' or '.join(allowed)}", allowed
+        )
+    return key
+
+
+def _encoding_of(request: web.Request) -> str:
+    """Return the Zenoh encoding of a body, or raise a DecodeError."""
+    kind = request.headers.get("Content-Type") or BYTES
+    if not (kind.isascii() and kind.isprintable()):
+        raise DecodeError(f"Content-Type is {kind[:80]!a}; must be ASCII, e.g. application/json")
+    return kind
+
+
+def _first_accepted(request: web.Request) -> str:
+    """Return the first media type that is accepted: the plugin looks at no other."""
+    return request.headers.get("Accept", "application/json").split(",")[0].split(";")[0].strip()
+
+
+# Responses
+
+
+def described_sample(sample: RawSample) -> dict[str, Any]:
+    """Return an answer or a publication as the plugin describes it."""
+    kind, payload = sample.encoding.partition(";")[0], sample.payload
+    value: Any = base64.b64encode(payload).decode() if payload else None  # what is not of its encoding: as bytes
+    try:
+        if payload and kind in JSON:
+            value = json.loads(payload)
+        elif payload and kind in TEXT:
+            value = payload.decode()
+    except (ValueError, RecursionError):
+        pass
+    key = "ERROR" if sample.kind == "ERROR" else sample.key
+    return {"key": key, "value": value, "encoding": sample.encoding, "timestamp": sample.timestamp}
+
+
+@lru_cache(maxsize=CACHED_VALUES)
+def _sample_event(sample: RawSample) -> bytes:
+    return _event(sample.kind, json.dumps(described_sample(sample)).encode())
+
+
+@lru_cache(maxsize=CACHED_VALUES)
+def value_event(sample: RawSample) -> bytes:
+    """Return a publication as an event; nothing for what is no message."""
+    deleted = {"key": sample.key, "value": None}
+    try:
+        value = json_entry(sample.key, sample.payload, sample.encoding) if sample.payload else deleted
+    except DecodeError:
+        return b""
+    return _event(sample.kind, _encode(value))
+
+
+def _event(kind: str, data: bytes) -> bytes:
+    return b"event: %b\ndata: %b\n\n" % (kind.encode(), data)
+
+
+def _as_json(value: Any) -> web.Response:
+    return web.Response(body=_encode(value), content_type="application/json")

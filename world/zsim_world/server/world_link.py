@@ -1,0 +1,224 @@
+"""The world's end of its links: subscriptions and lost outputs, and what it publishes in one go."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
+from typing import Any
+
+from zsim.contract import keys, messages
+from zsim.contract.framing import BATCH_MAX, GateMessages, Pairs, encode_batch
+from zsim.errors import DecodeError, SessionError
+from zsim.runtime.agent import Output
+from zsim.scenario.roles import WORLD
+from zsim.transport.session import ReceivedSample, Session, Subscription
+from zsim_world.run.inputs import Published, Run, Taken
+from zsim_world.server.run_journal import RunJournal
+
+TICK_S = 0.1  # how often a world that waits looks at the wall clock
+RECOVERY_S = 1.0  # a publisher that lives answers a get for its outputs within milliseconds
+REJOINED_NS = 10_000_000_000  # wall time after a rejoin in which it may take until a process can be asked
+PROCESSES, VIEWS = "process/", "view/"  # the world does not read the last
+
+
+class DirectInputs:
+    """Reads on the loop's own thread, waiting for the last subscription: fastest without a wall clock."""
+
+    def __init__(self, subscriptions: Sequence[Subscription]) -> None:
+        self._subscriptions = subscriptions
+        self._received: list[ReceivedSample] = []
+
+    def wait(self, timeout_s: float | None) -> None:
+        """Return when something has arrived, or after timeout_s; without a limit, now and then to look at the clock."""
+        if timeout_s is not None and timeout_s < TICK_S:
+            time.sleep(timeout_s)
+            return
+        sample = self._subscriptions[-1].receive()
+        if sample is not None:
+            self._received.append(sample)
+
+    def wait_for(self, wanted: set[str]) -> None:
+        """Wait until something has arrived on each of the wanted keys, or anything that is not a done."""
+        while True:
+            sample = self._subscriptions[-1].receive()
+            if sample is None:
+                return
+            self._received.append(sample)
+            wanted.discard(sample.key)
+            if not wanted or not sample.key.endswith("/done"):
+                return
+
+    def drain(self) -> Iterator[tuple[int, ReceivedSample]]:
+        """Yield what has arrived, with the monotonic wall time of its arrival [ns]."""
+        last, self._received = [*self._received, *self._subscriptions[-1].drain()], []
+        wall_ns = time.monotonic_ns()
+        for subscription in self._subscriptions[:-1]:
+            for sample in subscription.drain():
+                yield wall_ns, sample
+        for sample in last:
+            yield wall_ns, sample
+
+    def wake(self) -> None:
+        self._subscriptions[-1].wake()
+
+    def close(self) -> None:
+        """Stop reading."""
+
+
+class TimedInputs:
+    """Reads on threads of their own, so that arrivals are stamped while the loop waits for its next gate."""
+
+    def __init__(self, subscriptions: Sequence[Subscription]) -> None:
+        self._fresh = threading.Event()
+        self._arrived: list[tuple[Subscription, deque[tuple[int, ReceivedSample]]]] = [
+            (s, deque()) for s in subscriptions
+        ]
+        self._threads = [threading.Thread(target=self._pump, args=each, daemon=True) for each in self._arrived]
+        for thread in self._threads:
+            thread.start()
+
+    def _pump(self, subscription: Subscription, arrived: deque[tuple[int, ReceivedSample]]) -> None:
+        while True:
+            try:
+                sample = subscription.receive()
+            except SessionError:
+                return
+            if sample is not None:
+                arrived.append((time.monotonic_ns(), sample))
+                self._fresh.set()
+
+    def wait(self, timeout_s: float | None) -> None:
+        self._fresh.wait(TICK_S if timeout_s is None else timeout_s)
+        self._fresh.clear()
+
+    def wait_for(self, wanted: set[str]) -> None:
+        self.wait(None)
+
+    def drain(self) -> Iterator[tuple[int, ReceivedSample]]:
+        for _, arrived in self._arrived:
+            while arrived:
+                yield arrived.popleft()
+
+    def wake(self) -> None:
+        self._fresh.set()
+
+    def close(self) -> None:
+        for (subscription, _), thread in zip(self._arrived, self._threads, strict=True):
+            subscription.undeclare()
+            thread.join(timeout=2.0)
+
+
+def open_inputs(link: Session, realtime: bool) -> DirectInputs | TimedInputs:
+    """Subscribe to what others publish.
+
+    Outputs are drained first, dones last: who publishes a done has published its outputs before, on the same link.
+    """
+    subscriptions = [link.subscribe_remote((PROCESSES, VIEWS)), link.subscribe(f"{PROCESSES}**")]
+    return TimedInputs(subscriptions) if realtime else DirectInputs(subscriptions)
+
+
+def recover_lost(link: Session, run: Run) -> None:
+    """Request outputs again that a participant counted and that have not arrived, as after a cut link."""
+    world = run.world
+    for participant in world.barrier.incomplete():
+        if participant.away:
+            continue
+        if world.clock.mode == "realtime":
+            participant.lost_done = False
+            continue
+        lost: Pairs | None = None
+        key = keys.process(participant.name, "outputs")
+        try:
+            answer = link.request(key, "outputs", WORLD, timeout_s=RECOVERY_S)
+            if answer.ok:
+                lost = run.history.lost_outputs(answer.result, participant.done_ns)
+        except DecodeError as error:
+            run.refuse(participant.name, key, error)
+            lost = []
+        age_ns = time.monotonic_ns() - participant.joined_wall_ns
+        if lost is None and participant.rejoined and age_ns < REJOINED_NS:
+            continue  # it cannot be asked yet
+        for sample in lost or ():
+            run.enter(Taken(time.monotonic_ns(), sample))
+        run.call("give_up_outputs", participant.name)
+
+
+class WorldOutputs:
+    """Publishes the outbox of a world on its link.
+
+    Args:
+        on_message: called with every key and message beside those of drones.
+        journal: is written before anything is published.
+    """
+
+    def __init__(self, link: Session, run: Run, on_message: Callable[[str, Any], None], journal: RunJournal) -> None:
+        self._link = link
+        self._run = run
+        self._on_message = on_message
+        self._journal = journal
+        self._unsent: Pairs = []
+        self._gate_keys = [keys.gate(name) for name in run.world.names]
+
+    def gather(self) -> None:
+        """Encode the outbox and keep it: the messages of a gate as one, as one of each drone that is read, and each."""
+        outbox = self._run.world.take_outbox()
+        if not outbox:
+            return
+        encoded: Pairs = []
+        passed, has_subscribers = self._run.history.passed, self._link.has_subscribers
+        for key, message in outbox:
+            if type(message) is GateMessages:
+                whole = (keys.GATE, message.pack())
+                passed.append(whole)
+                if has_subscribers(keys.GATE):
+                    self._unsent.append(whole)
+                for gate_key, (first, last) in zip(self._gate_keys, pairwise(message.first), strict=True):
+                    if last > first and has_subscribers(gate_key):
+                        self._unsent.append((gate_key, message.pack(first, last)))
+                encoded += message.pairs
+            else:
+                pair = (key, messages.encode(message))
+                if keys.is_picture(key):  # of a replay: whoever wants pictures reads their keys
+                    self._unsent.append(pair)
+                    continue
+                encoded.append(pair)
+                passed.append(pair)
+        self._unsent += encoded
+        self._run.history.add_all(encoded, self._run.world.now_ns)
+        for key, message in outbox:
+            if type(message) is not GateMessages:
+                self._on_message(key, message)
+
+    def send(self) -> None:
+        """Put what was gathered in one go: readers wake once, and the transport sends few packets."""
+        self._journal.commit()
+        unsent, self._unsent = self._unsent, []
+        self._link.put_all(unsent)
+        self.put_batch()
+
+    def flush(self) -> None:
+        self.gather()
+        self.send()
+
+    def publish(self, output: Output) -> None:
+        """Publish one message beside the outbox."""
+        message: Any = output.message
+        payload = messages.encode(message)
+        self._run.enter(Published(output.key, message.seq, payload))
+        self._journal.commit()
+        self._link.put_raw(output.key, payload)
+        self.put_batch()
+        self._on_message(output.key, message)
+
+    def put_batch(self) -> None:
+        """Send the recorders, if there are any, all messages since the last time."""
+        history = self._run.history
+        passed, history.passed = history.passed, []
+        if self._link.has_subscribers(keys.BATCH):
+            for first in range(0, len(passed), BATCH_MAX):
+                self._link.put_raw(keys.BATCH, encode_batch(passed[first : first + BATCH_MAX]))
+
+    def forget(self) -> None:
+        """Drop what was gathered: the former process of the world has published it."""
+        self._unsent, self._run.history.passed = [], []
