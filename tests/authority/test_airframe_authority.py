@@ -20,9 +20,14 @@ from zsim_world.physics.fleet_arrays import STATE, VEHICLE
 # drones with other numbers of rotors or with aerodynamics have kernels of their own, each a minute's compilation
 pytestmark = pytest.mark.xdist_group("airframes")
 
+ROTORS = slice(STATE.size, STATE.size + 4)  # of drone a: the fleet has a column more, for the Iris
+
 
 def fleet_of(**drone: Any) -> Fleet:
+    """Return a fleet of one drone; where it has aerodynamics an Iris stands far away, with which one kernel does for all."""
     drones = [{"name": "a", "position_m": [0, 0, 0], **drone}]
+    if any(drone.get("aerodynamics", {}).values()):
+        drones.append({"name": "b", "position_m": [100, 0, 0], "model": "iris"})
     return Fleet(resolve({"name": "t", "duration_s": 1, "sensors": {"preset": "paper"}, "drones": drones}))
 
 
@@ -39,7 +44,7 @@ def thrown(
     """Let a drone with its rotors at a speed go through still air high up, and return the state after some gates."""
     state = fleet.bodies.state[0]
     state[:] = 0.0
-    state[2], state[3:6], state[6:10], state[13:] = 1e4, v, q, rotor
+    state[2], state[3:6], state[6:10], state[ROTORS] = 1e4, v, q, rotor
     advance(fleet, seconds)
     return fleet.bodies.state[0]
 
@@ -111,7 +116,7 @@ def test_thrust_depends_on_the_flow_past_the_rotors(coefficients: Any, v: Any, f
     for fleet in (plain, flown):
         state = fleet.bodies.state[0]
         state[:] = 0.0
-        state[2], state[3:6], state[6], state[13:] = 1e4, v, 1.0, rotor
+        state[2], state[3:6], state[6], state[ROTORS] = 1e4, v, 1.0, rotor
         fleet._integrate(0)  # the accelerations of the present state
         accel.append(fleet.bodies.accel[0, :3].copy())
     np.testing.assert_allclose(0.429 * (accel[1] - accel[0]), force, rtol=1e-9, atol=1e-12)
@@ -128,7 +133,7 @@ def test_turning_rotors_damp_a_roll_by_their_inflow() -> None:
     fleet = fleet_of(drag_n_s_m=0.0, aerodynamics={"rotor_inflow_n_s2_m": k_z})
     state = fleet.bodies.state[0]
     state[:] = 0.0
-    state[2], state[6], state[10], state[13:] = 1e4, 1.0, rate, 400.0
+    state[2], state[6], state[10], state[ROTORS] = 1e4, 1.0, rate, 400.0
     fleet._integrate(0)
     y = fleet.bodies.vehicle[0, VEHICLE.rotor_unit]
     expected = -4 * k_z * 400.0 * y * y * rate / fleet.bodies.vehicle[0, VEHICLE.inertia]
