@@ -16,7 +16,6 @@ from zsim_deploy.roles.stop_channel import lower_priority
 
 PURE = ("tests/authority/", "tests/contract/", "tests/unit/")
 LEAST = 3  # workers of which one is quiet
-NICE = 10
 
 
 def quiet_one(workers: int) -> str | None:
@@ -67,4 +66,4 @@ def pytest_configure(config: pytest.Config) -> None:
     worker = getattr(config, "workerinput", None)
     if worker and sys.platform == "linux" and worker["workerid"] == quiet_one(worker["workercount"]):
         os.setsid()
-        lower_priority(NICE)
+        lower_priority()
