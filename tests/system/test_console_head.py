@@ -53,7 +53,7 @@ class Head:
             "refusals": refusals, "alarms": [],
         }  # fmt: skip
         frame = importlib.resources.files("zsim_bridges.console.frame")
-        html = "".join(frame.joinpath(f"{part}.html").read_text("utf-8") for part in ("orders", "head_bar"))
+        html = "".join(frame.joinpath(f"{part}.html").read_text("utf-8") for part in ("layout", "orders", "head_bar"))
         page.set_default_timeout(PATIENCE_MS)
         page.add_init_script(AUDIO_JS)
         page.route(f"{ADDRESS}**", lambda route: route.fulfill(body=html, content_type="text/html"))
