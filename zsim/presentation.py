@@ -105,10 +105,13 @@ class FittedTable:
         for row in self._rows:
             cells: list[RenderableType] = []
             for place in shown:
-                kind, text = self.columns[place].kind, printable(row[place])
+                kind = self.columns[place].kind
                 is_cut = self._one_line or kind == "figure"
-                plain = Text(text, no_wrap=is_cut, overflow="ellipsis" if is_cut else "fold")
-                cells.append(NameCell(text) if kind == "name" else plain)
+                if kind == "name":
+                    cells.append(NameCell(printable(row[place])))
+                else:
+                    overflow = "ellipsis" if is_cut else "fold"
+                    cells.append(Text(printable(row[place]), no_wrap=is_cut, overflow=overflow))
             table.add_row(*cells)
         return table
 

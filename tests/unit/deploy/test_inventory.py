@@ -295,4 +295,4 @@ def test_who_calculates_has_all_that_its_bits_depend_on(extra: str) -> None:
 
     brought_along = {"llvmlite": "numba"}
     wanted = {brought_along.get(package, package) for package in PACKAGES}
-    assert wanted <= distributions([*project["dependencies"], f"zsim[{extra}]"])
+    assert wanted <= distributions([*project["dependencies"], f"{project['name']}[{extra}]"])
