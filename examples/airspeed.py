@@ -1,4 +1,4 @@
-"""A sensor of one's own: airspeed by a pitot tube along the sensor's x axis.
+"""A custom sensor: airspeed by a pitot tube along the sensor's x axis.
 
     zsim run scenarios/step.yaml --set 'sensors.pitot={module: airspeed, mount: {position_m: [0.15, 0, 0]}}'
 
@@ -36,7 +36,7 @@ def pressure(truth: SensorTruth, settings: PitotConfig, environment: Environment
 
 
 def speed(reading: Sequence[float], settings: PitotConfig, environment: Environment) -> Sequence[float]:
-    """Return the numbers of the message: the pressure, and the speed that it stands for."""
+    """Return the numbers of the message: the pressure, and the corresponding speed."""
     pascals = reading[0]
     return [pascals, math.copysign(math.sqrt(2.0 * abs(pascals) / environment.air_density_kg_m3), pascals)]
 

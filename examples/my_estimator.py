@@ -2,7 +2,7 @@
 
     zsim run scenarios/step.yaml --set estimation.algorithm=my_estimator:MyEstimator
 
-It is looked for where Python finds modules (`PYTHONPATH=examples`), and in the folder of the scenario's file. What its
+The module is found on Python's path (`PYTHONPATH=examples`) or in the folder of the scenario's file. What its
 methods get and give: `zsim_agents.estimation.drone_estimator.DroneEstimator`.
 """
 

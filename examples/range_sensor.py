@@ -1,4 +1,4 @@
-"""A sensor of one's own beside the world: ranges between two drones from their truth, with noise, in lockstep.
+"""A custom sensor as a program beside the world: ranges between two drones from their truth, with noise, in lockstep.
 
     zsim run scenarios/step.yaml --set 'processes.expect=[range.drone1]' --duration 60
     python examples/range_sensor.py tcp/127.0.0.1:7447

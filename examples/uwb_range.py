@@ -1,8 +1,8 @@
-"""A sensor of one's own: the range from a drone's UWB tag to an anchor that stands in the field.
+"""A custom sensor: the range from a drone's UWB tag to an anchor that stands in the field.
 
     zsim run scenarios/step.yaml --set 'sensors.my_uwb={module: uwb_range, anchor_m: [0, 0, 2]}'
 
-It is looked for where Python finds modules (`PYTHONPATH=examples`), and in the folder of the scenario's file. Several
+The module is found on Python's path (`PYTHONPATH=examples`) or in the folder of the scenario's file. Several
 anchors are several sensors with the same module.
 """
 

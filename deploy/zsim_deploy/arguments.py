@@ -32,7 +32,7 @@ LOOK_S = 5.0  # wall; for which a command that a person types waits for a world
 # Panels of the help
 RUN, HOSTS = "Run", "On several machines"
 ROLES = "Roles, started by hand, on any machine, in any order"
-WATCH, TRANSLATE, POKE = "Watch and steer", "Others come in", "Look and poke"
+WATCH, TRANSLATE, POKE = "Watch and steer", "Bridges and gateways", "Inspect and send"
 
 # Modules that a command needs, by the extra that brings them
 CAMERA_NEEDS = {"cameras": ("cv2",)}
@@ -130,7 +130,7 @@ Launched = Annotated[str | None, Option("--launched", hidden=True)]  # by `zsim 
 Tls = Annotated[Path | None, Option("--tls", help="Folder of this process's certificate (zsim certs init).")]
 Access = Annotated[Path | None, Option("--access", help="Zenoh's access control (zsim certs init).")]
 Host = Annotated[str | None, Option("--host", help="Name of this host, as others see it.")]
-Insecure = Annotated[bool, Option("--insecure", help="Without TLS, on a network that is nobody else's.")]
+Insecure = Annotated[bool, Option("--insecure", help="Without TLS, on a network that nobody else uses.")]
 Keys = Annotated[
     list[str] | None, Option(help="Only these keys, e.g. 'drone/*/truth'. Repeatable.", show_default=False)
 ]

@@ -21,7 +21,7 @@ from zsim.errors import printable, without_figures
 
 PERIOD_S = 0.2  # wall time between two updates
 SLOW_S = 3.0  # wall time; what is compiled already is loaded within two, unless the machine is busy
-SLOW_NOTICE = "loading what is compiled, or compiling it: once on a machine, that takes a minute"
+SLOW_NOTICE = "loading compiled code; the first time on a machine it is compiled, which takes one to three minutes"
 REPEATED_S = 10.0  # simulated time; as often as the clock is a line where there is no live one
 REASON_NS = 5_000_000_000  # simulated time; a take-off gives one reason for 3 s
 DRIVERS, COMINGS = "driver.", ("join", "leave")  # they are started by hand, by people who look here

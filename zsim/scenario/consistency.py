@@ -16,6 +16,7 @@ from zsim.scenario.faults import Known, flaws, kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
 from zsim.scenario.roles import AGENTS
 from zsim.scenario.scenario import EXTERNAL, SEA_HEIGHT_MAX_M, Scenario, space_name
+from zsim.schema import plugin
 from zsim.schema.checker import Fault, listed, show
 from zsim.schema.quantities import COULOMB_PER_MAH, G_M_S2, SEA_LEVEL_KG_M3
 from zsim.sensors.camera_model import folds, lens_of
@@ -442,7 +443,8 @@ def _injected_faults(
     kinds = kinds_of(declarations([drone for _, drone in drones]))
     rotors = {drone.name: vehicles[drone.model].rotor_names if drone.model in vehicles else () for _, drone in drones}
     external = tuple(drone.name for _, drone in drones if drone.body == EXTERNAL)
-    known = Known(tuple(_names(drones)), tuple(_names(clusters)), processes, kinds, rotors, external)
+    names = tuple(_names(drones)), tuple(_names(clusters))
+    known = Known(*names, processes, kinds, rotors, external, plugin.has_skipped())
     for index, fault in _entries(scenario.faults):
         for path, text in flaws(fault, known):
             yield f"faults[{index}]{f'.{path}' if path else ''}", text

@@ -80,6 +80,11 @@ def may_import() -> bool:
     return os.environ.get(IMPORTS) != NO_IMPORTS
 
 
+def has_skipped() -> bool:
+    """Tell whether code that the present document names was found and not imported."""
+    return bool(_SKIPPED) and not may_import()
+
+
 def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Callable[..., Any]:
     """Return the class of a name `package.module:Class`.
 

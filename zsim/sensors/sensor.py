@@ -1,4 +1,4 @@
-"""What a sensor is: its message, its settings, its channels with errors, and for a user's own one its equation.
+"""What a sensor is: its message, settings, channels with errors, and, for a user's sensor, its equation.
 
     SENSOR = SensorType(message=Airspeed, settings=AirspeedConfig, channels=(...), equation=dynamic_pressure)
 
@@ -283,5 +283,5 @@ def as_fields(numbers: Sequence[Any], fields: Mapping[str, str]) -> list[Any]:
         else:
             values.append(tuple(map(float, part)))
     if at != len(numbers) or len(values) < len(fields):
-        raise ValueError(f"is given {len(numbers)} numbers; must be given those of {', '.join(fields)}")
+        raise ValueError(f"gets {len(numbers)} numbers; must get those of {', '.join(fields)}")
     return values

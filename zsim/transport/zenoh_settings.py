@@ -112,7 +112,7 @@ def _security(identity: Identity, endpoints: Sequence[str], doing: str) -> Setti
         if not secure and not identity.insecure and tls.leaves_machine(endpoint):
             raise SessionError(
                 f"{endpoint}: is not encrypted and leaves this machine; give --tls and a tls/ endpoint (zsim certs "
-                "init makes certificates), or --insecure on a network that is nobody else's"
+                "init makes certificates), or --insecure on a network that nobody else uses"
             )
     if identity.access is not None and identity.tls is None:
         raise SessionError(f"{identity.access}: access control goes by certificate; give --tls too")

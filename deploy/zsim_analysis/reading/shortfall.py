@@ -39,6 +39,7 @@ CONTROLLER, CONSOLE = "controller.", "console"  # prefixes of names: of controll
 INCIDENTS = ("emergency", "flip", "impact", "touchdown", "battery", "landing")  # events of drones
 CRASHES = ("emergency", "flip", "impact", "touchdown")  # incidents by which a drone comes down
 ONE_HIT_NS = 500_000_000  # chosen: a touchdown within this time of an impact is part of it
+REFUSED_NS = 5_000_000_000  # chosen: a command refused within this time before a landing explains it
 LEADS = ("hold", "land", "target", "trajectory")  # requests by which a formation leaves its plan
 
 
@@ -170,7 +171,8 @@ def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
         hit, touch = first.get("impact"), first.get("touchdown")
         if hit and touch and abs(hit.t_ns - touch.t_ns) <= ONE_HIT_NS:
             del first["touchdown"]
-        parts = [_incident_text(event) for event in sorted(first.values(), key=lambda event: (event.t_ns, event.seq))]
+        in_order = sorted(first.values(), key=lambda event: (event.t_ns, event.seq))
+        parts = [_incident_text(event, _refusal_before(event, flight)) for event in in_order]
         text = f"{drone}: {', '.join(parts)}{_active_faults(drone, (events[0].t_ns, events[0].seq), flight)}"
         fails = not all(  # a landing because a program other than a controller stopped sending commands
             event.kind == "landing"
@@ -186,7 +188,20 @@ def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
             yield Shortfall("emergency", track.name, t_s, f"{track.name} ended in an emergency", True)
 
 
-def _incident_text(event: Event) -> str:
+def _refusal_before(event: Event, flight: RecordedFlight) -> str:
+    """Return why the newest refused command of a drone was refused, if that may explain an event; else empty.
+
+    Of many refusals alike only the first are events; the last of these says that further ones are only counted.
+    """
+    commands = f"drone/{event.subject}/cmd/"
+    for each in reversed(flight.events):
+        if each.kind == "refused" and each.subject.startswith(commands) and each.t_ns <= event.t_ns:
+            is_near = event.t_ns - each.t_ns < REFUSED_NS or each.text.endswith("counted only)")
+            return f"refused: {each.data.get('reason', '')}" if is_near else ""
+    return ""
+
+
+def _incident_text(event: Event, refused: str) -> str:
     at, data = f"at {seconds_text(event.t_ns / 1e9)} s", event.data
     match event.kind:
         case "emergency" if data.get("cause") == "command":
@@ -199,7 +214,7 @@ def _incident_text(event: Event) -> str:
             return f"hit {data.get('other', 'something')} at {data.get('speed_m_s', 0.0):.1f} m/s {at}"
         case "landing":
             charge = data.get("charge_percent")
-            why = f"{data.get('commander') or 'its commander'} fell silent"
+            why = f"no command from {data.get('commander') or 'its commander'} took effect{refused and f'; {refused}'}"
             return f"landed by itself {at} ({why if charge is None else f'{charge:.1f} % of charge left'})"
         case "touchdown":
             return f"touched {data.get('other', 'something')} in flight {at}"

@@ -1,4 +1,4 @@
-"""summary.json: what a run was and how well it flew; and its tables of errors, for the page and the terminal."""
+"""summary.json: what was flown, and how well; and its tables of errors, for the page and the terminal."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -232,7 +232,7 @@ def _notes(
     if not flight.completeness.complete:
         yield f"The record is {flight.completeness}."
     if flight.undecoded:
-        yield f"{flight.undecoded} messages on record are not what their key promises and were passed over."
+        yield f"{flight.undecoded} messages on record do not match the type of their key and were skipped."
     if flight.info is None:
         yield "world/info is not on record: scenario, seed and the order of the drones are not known."
     elif flight.scenario is None:

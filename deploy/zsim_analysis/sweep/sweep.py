@@ -209,7 +209,7 @@ def load(path: Path) -> SweepFolder:
     try:
         return SweepFolder(path, msgspec.json.decode((path / PLAN).read_bytes(), type=SweepPlan))
     except (OSError, msgspec.MsgspecError, ValueError) as error:
-        raise RunError(f"{path / PLAN}: cannot be read ({error}); it is to be the plan of a sweep") from error
+        raise RunError(f"{path / PLAN}: cannot be read ({error}); it should be the plan of a sweep") from error
 
 
 @contextmanager

@@ -183,7 +183,7 @@ def marks_of(summary: SweepSummary) -> list[str]:
 def notes(summary: SweepSummary) -> list[str]:
     lines = []
     if summary.finished < summary.runs:
-        lines.append(f"{summary.runs - summary.finished} runs are not finished; the same command goes on with them.")
+        lines.append(f"{summary.runs - summary.finished} runs are not finished; the same command continues with them.")
     lines += [f"{count} of {summary.finished} runs failed: {reason}" for reason, count in summary.failed.items()]
     lines += marks_of(summary)
     if summary.not_engaged:

@@ -185,7 +185,7 @@ def _record(task: Task) -> Iterator[RecordWriter | None]:
         part.mkdir(parents=True)
         (part / "scenario.yaml").write_text(scenario_file.to_text(task.scenario), encoding="utf-8")
     except OSError as error:
-        reason = f"cannot be written ({error.strerror}); make room, the same command goes on"
+        reason = f"cannot be written ({error.strerror}); free some space; the same command then continues"
         raise RecordError(f"{part}: {reason}") from error
     writer = RecordWriter(part / "run.mcap")
     try:

@@ -211,7 +211,7 @@ def logs(
 
 @app.command(rich_help_panel=opt.HOSTS)
 def restart(role: Role, federation: Federation = "zsim") -> None:
-    """Start a process of the run anew where it is; it takes over from its former self."""
+    """Restart a process of the run on its host; it takes over from its predecessor."""
     say(f"restarting {control_socket.ask(federation, 'restart', role=role)}")
 
 

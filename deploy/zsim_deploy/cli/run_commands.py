@@ -60,7 +60,7 @@ def run(
     detect: Annotated[bool, Option("--detect", help="Find hats in the cameras' pictures.")] = False,
     report: opt.Report = True,
     continue_: Annotated[
-        bool, Option("--continue", help="SCENARIO is the folder of a run that was interrupted: it goes on.")
+        bool, Option("--continue", help="SCENARIO is the folder of an interrupted run, which is continued.")
     ] = False,
     force: opt.Force = False,
     order: Annotated[str, Option(hidden=True)] = "",
@@ -155,7 +155,7 @@ def _fault_of(complete: bool, state: str, shortfalls: "Sequence[Shortfall]") -> 
 def note_skipped(names: Sequence[str]) -> None:
     """Print which code that a document names was found, and not imported."""
     for name in names:
-        note(f"note: {name} is there, and not imported: --trust runs it")
+        note(f"note: {name} was found and not imported; --trust imports it")
 
 
 @app.command(rich_help_panel=opt.RUN)
@@ -170,8 +170,8 @@ def validate(scenario: opt.ScenarioPath, set_: opt.Set = None, trust: opt.Trust 
         loaded = opt.load_scenario(scenario, set_)
         check_plans(loaded, scenario.name)
     if modules := [name for name in skipped if ":" not in name]:  # of vehicles and sensors: their numbers are in there
-        lacking = f"what it resolves to is not printed, since that has numbers of {', '.join(modules)}"
-        note(f"{scenario.name}: all else is sound; {lacking}")
+        lacking = f"the resolved scenario is not printed, since it depends on {', '.join(modules)}"
+        note(f"{scenario.name}: no errors found; {lacking}")
     else:
         print(printable(scenario_file.to_text(loaded)), end="", flush=True)
     for line in unflown_plans(loaded):
@@ -333,7 +333,7 @@ def export(
     ] = None,
     force: Annotated[bool, Option("--force", help="Replace an earlier export.")] = False,
     by_name: Annotated[
-        bool, Option("--by-name", help="A table of each drone, cluster and process: time in it only increases.")
+        bool, Option("--by-name", help="One table per drone, cluster and process, in each of which time increases.")
     ] = False,
     trust: opt.Trust = False,
 ) -> None:
@@ -413,7 +413,7 @@ def replay(
     federation: Annotated[str | None, Option(help="Name of the federation (default the record's).")] = None,
     trust: opt.Trust = False,
 ) -> None:
-    """Play a record back onto the keys: for a console, an estimator under test, any client; nobody can be flown."""
+    """Play a record back onto the keys, for a console, an estimator under test or any client; it takes no commands."""
     require("replay", REPLAY_NEEDS)
     if console:
         require("console", opt.CONSOLE_NEEDS)

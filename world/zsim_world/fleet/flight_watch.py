@@ -98,7 +98,8 @@ class FlightWatch:
         if charge < self._boards.setting[i, SETTING.low_battery]:
             data = {"cause": "battery", "charge_percent": round(charge, 2)}
             return Incident(i, "landing", f"{name} lands by itself: it has {charge:.1f} % of charge", data)
-        return Incident(i, "landing", f"{name} lands by itself: nobody has commanded it for long", {"cause": "silence"})
+        text = f"{name} lands by itself: no command has taken effect for too long"
+        return Incident(i, "landing", text, {"cause": "silence"})
 
 
 @inlined

@@ -152,6 +152,13 @@ def landing(commander: str, cause: str) -> tuple[Event, ...]:
     return (event(12.0, "landing", "drone3", cause=cause, commander=commander),)
 
 
+def refusals_before(commander: str, *at_s: float) -> tuple[Event, ...]:
+    """Return a landing at 12 s without commands, after commands of the drone, or of another one, that were refused."""
+    key = "drone/drone3/cmd/velocity"
+    refusals = (event(t_s, "refused", key, commander, reason="age is 640 ms; must be <= 500 ms") for t_s in at_s)
+    return numbered(*refusals, *landing(commander, "silence"))
+
+
 def mission(*reports: dict[str, Any]) -> tuple[Event, ...]:
     events = [event(10 + k, "mission", "drone2", "mavlink.main", items=5, **each) for k, each in enumerate(reports)]
     return numbered(*events)
@@ -212,6 +219,15 @@ CASES = {
     "failsafe": case(engaged, "mission drone2 !", "3 of 5", "geofence", "at 11 s", events=mission(ACTIVE, GEOFENCE)),
     "mission ended by its pilot": case(engaged, "mission drone2", "2 of 5", "HOLD", events=mission(HOLD)),
     "silent controller": case(engaged, "landing drone3 12 !", events=landing("controller.main", "silence")),
+    "refused controller": case(
+        engaged,
+        "landing drone3 12 !",
+        "no command from controller.main took effect; refused: age is 640 ms",
+        events=refusals_before("controller.main", 10.0),
+    ),
+    "silent long after a refusal": case(
+        engaged, "landing drone3 12 !", "took effect)", events=refusals_before("controller.main", 2.0)
+    ),
     "silent pilot": case(engaged, "landing drone3 12", events=landing("console.1", "silence")),
     "empty battery": case(engaged, "landing drone3 12 !", events=landing("console.1", "battery")),
     "flown by others": case(engaged, "override drone2", "console.1", "8 to 9.5 s", events=OVERRIDE),
