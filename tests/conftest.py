@@ -57,7 +57,8 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()  # else each search for cycles looks at all tests, for a third of a second
     gc.unfreeze = lambda: None  # which a run in this process does when it is over
-    if commands := sys.modules.get("forked_commands"):
+    commands: Any = sys.modules.get("forked_commands")
+    if commands is not None:
         commands.FIRST = commands.inherited()
 
 

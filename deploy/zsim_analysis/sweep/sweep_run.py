@@ -118,7 +118,7 @@ def fly(task: Task) -> Row:
     Raises:
         RecordError, OSError: its record cannot be written, nor could that of any other run.
     """
-    where = {"host": socket.gethostname(), "fingerprint": fingerprint()}
+    where: Row = {"host": socket.gethostname(), "fingerprint": fingerprint()}
     try:
         with _record(task) as writer:
             flight, diverged = fly_scenario(task.scenario, writer)
