@@ -322,6 +322,7 @@ def test_who_was_needed_and_leaves_early_fails_the_run(federation: Federation) -
     estimator = step.client.join("estimator.drone1", step.info, GATE_NS)
     step.event("join", "estimator.drone1")
     for gate in range(5):
+        step.see(gate * GATE_NS)
         estimator.done(gate * GATE_NS)
         step.answer(gate * GATE_NS)
     estimator.bye(4 * GATE_NS, "enough")

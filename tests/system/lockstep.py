@@ -31,8 +31,8 @@ class Lockstep:
 
     def see(self, gate_ns: int) -> None:
         """Wait for a gate."""
-        while self.now_ns < gate_ns:
-            received = self.clock.until(lambda m: m["state"] == "running")
+        if self.now_ns < gate_ns:
+            received = self.clock.until(lambda m: m["state"] == "running" and m["t_ns"] >= gate_ns)
             self.now_ns = received.message["t_ns"]
 
     def stands_at(self, t_ns: int, *names: str) -> Received:
