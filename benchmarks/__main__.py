@@ -118,10 +118,6 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-if __name__ == "__main__":
-    main()
-
-
 OURS = ("eclipse-zenoh", "filterpy", "llvmlite", "msgspec", "numba", "numpy", "scipy")
 
 
@@ -160,3 +156,7 @@ def _commit() -> str:
     command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
     found = subprocess.run(command, capture_output=True, text=True, check=False)
     return found.stdout.strip()
+
+
+if __name__ == "__main__":
+    main()
