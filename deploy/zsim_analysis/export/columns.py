@@ -175,7 +175,10 @@ def _open(name: str, names: Sequence[str], kind: str) -> Columns:
         table = np.full((len(batch.messages), len(columns)), np.nan)
         for row, message in zip(table, batch.messages, strict=True):
             content = getattr(message, name)
-            for each, value in zip(message.names, content, strict=True) if kind == "named" else content.items():
+            if kind == "named":  # of a large formation thousands: at once
+                row[[places[each].start for each in message.names]] = content
+                continue
+            for each, value in content.items():
                 row[places[each]] = value
         return table
 

@@ -197,10 +197,10 @@ def placed(*targets: Path) -> Iterator[tuple[Path, ...]]:
     Raises:
         ReportError: they cannot be written.
     """
-    new_parents = [parent for parent in targets[0].parents if not parent.exists()]
     # beside the target, so that files can be renamed; a TemporaryDirectory stays if Ctrl-C comes while it is made
-    folder = targets[0].parent / f".export-{secrets.token_hex(4)}"
+    folder, new_parents = targets[0].parent / f".export-{secrets.token_hex(4)}", list[Path]()
     try:
+        new_parents += [parent for parent in targets[0].parents if not parent.exists()]
         folder.mkdir(parents=True)
         written = tuple(folder / target.name for target in targets)
         yield written

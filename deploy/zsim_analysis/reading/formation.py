@@ -111,12 +111,14 @@ def formation(states: ClusterStates, tracks: list[Track], scenario: Scenario | N
 
     None if its controller published nothing, or variables of another convention than the scenario's.
     """
+    if not len(states.t_ns):
+        return None
     cluster = cluster_of(scenario, states.name)
     try:  # without the cluster's own space: the default of so many drones
         space = scenario_space(scenario, cluster) if scenario and cluster else cluster_space(len(states.drones))
     except (ValueError, NotTrustedError):
         return None
-    if not len(states.t_ns) or states.names != space.names:
+    if states.names != space.names:
         return None
     # on the wire, all zeros stand for unknown
     value, desired = (

@@ -1,5 +1,6 @@
 """Tables and MATLAB files: what pandas, pyarrow, scipy and Octave read is what was recorded."""
 
+import errno
 import json
 import os
 import resource
@@ -297,6 +298,11 @@ def test_an_interrupt_while_it_is_put_in_place_changes_nothing(
     assert [path.name for path in folder.iterdir()] == ["old"]
     assert file.read_text() == "old"
     assert {path.name for path in tmp_path.iterdir()} == {"folder", "file"}
+
+
+def test_a_folder_that_cannot_be_looked_for_is_a_line(tmp_path: Path) -> None:
+    with refused(ReportError, "written", os.strerror(errno.ENAMETOOLONG)), placed(tmp_path / ("x" * 300) / "csv"):
+        pass
 
 
 def test_garbage_on_record_is_left_out_and_told(run: Path, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from sweep_rows import printed
 from synthetic_record import GATE_NS, SCENARIOS, Flown
 
 from zsim.contract import keys, messages, run_messages
-from zsim.errors import RecordError, ReportError
+from zsim.errors import DocumentError, RecordError, ReportError
 from zsim.presentation import FittedTable
 from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
@@ -226,7 +226,12 @@ def test_a_cut_record_is_reported_up_to_the_cut(tmp_path):
 
 
 @pytest.mark.usefixtures("unrendered")
-def test_a_run_without_a_cluster_or_whose_cluster_published_nothing(tmp_path):
+def test_a_run_without_a_cluster_or_whose_cluster_published_nothing(tmp_path, monkeypatch):
+    """As where its controller could not load the user's space: the report does not need it either."""
+
+    def load(*_: object) -> None:
+        raise DocumentError(["space: nowhere:Space cannot be loaded"])
+
     summary = report_of(tmp_path, flown(overrides=("clusters=[]",)))
     make_report(tmp_path)
     assert summary.errors == {}
@@ -235,6 +240,7 @@ def test_a_run_without_a_cluster_or_whose_cluster_published_nothing(tmp_path):
     assert '<table class="numbers">' not in (tmp_path / "report.html").read_text()
     assert not any(isinstance(each, FittedTable) for each in terminal_text(summary).renderables)
     silent = (each for each in synthetic_record.traffic(flown()) if each[0] != keys.cluster_state("main"))
+    monkeypatch.setattr("zsim_analysis.reading.formation.scenario_space", load)
     summary = summary_of(tmp_path / "silent", silent)
     assert summary.errors == {}
     assert any(has_terms(note, "main", "no state") for note in summary.notes)
