@@ -212,7 +212,7 @@ class FlightOptions(NamedTuple):
     overrides: list[str] | None
 
     def scenario(self, elsewhere: bool = False) -> Any:
-        """Return the scenario, the classes that it names loaded here."""
+        """Return the scenario, the classes that it names loaded here; `elsewhere`: it flies on other hosts."""
         from zsim.scenario.roles import check_pace
 
         scenario = load_scenario(self.path, self.overrides, self.seed, self.duration, elsewhere)

@@ -57,7 +57,7 @@ def echo(
     raw: Annotated[bool, Option("--raw", help="Payload as hexadecimal digits.")] = False,
     timeout: Annotated[float | None, Option(callback=positive, help="Stop after so many seconds.")] = None,
 ) -> None:
-    """Print the messages on a key as JSON lines; exit code 1 where --timeout is over and they have not come."""
+    """Print the messages on a key as JSON lines; exit code 1 if they have not arrived when --timeout expires."""
     from zsim_deploy.cli import inspection
 
     def emit(name: str, message: Any) -> None:
@@ -95,7 +95,7 @@ def pub(
     count: Annotated[int, Option("--count", "-n", min=1, help="How many times.")] = 1,
     rate_hz: Annotated[float, Option(callback=positive, max=1000, help="How often per wall second.")] = 10.0,
 ) -> None:
-    """Send a command to a drone; t_ns, seq and source are filled in. Exit code 1 where the world refuses it."""
+    """Send a command to a drone; t_ns, seq and source are filled in. Exit code 1 if the world refuses it."""
     from zsim_deploy.cli import inspection
 
     with connected(reach) as (link, info):
@@ -115,7 +115,7 @@ def ask(
     op: Annotated[str, Argument(help="E.g. pause, resume, step, stop; engage, hold, land, target.")],
     args: Annotated[str, Argument(help="JSON map, e.g. '{\"gates\": 50}'.")] = "{}",
 ) -> None:
-    """Send a request to the world or a controller and print the answer. Exit code 1 where it is refused."""
+    """Send a request to the world or a controller and print the answer. Exit code 1 if it is refused."""
     from zsim_deploy.cli import inspection
 
     with connected(reach) as (link, _):
@@ -173,7 +173,7 @@ def add(
     for_: For = None,
     at: At = None,
 ) -> None:
-    """Inject a fault, e.g. `zsim fault add drone2 gps_dropout --for 10s`. Exit code 1 where the world refuses it."""
+    """Inject a fault, e.g. `zsim fault add drone2 gps_dropout --for 10s`. Exit code 1 if the world refuses it."""
     from zsim.scenario.faults import typed_parameters
 
     try:

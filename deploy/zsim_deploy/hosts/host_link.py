@@ -216,8 +216,9 @@ class HostLinks:
             self._loop.spawn(link.measure_round_trips())
 
     def on_all(self, work: Callable[[HostLink], Coroutine[Any, Any, Any]], within_s: float) -> dict[str, Any]:
-        """Run a coroutine for all hosts at once; return results by name, or raise a line for each that fails or is
-        late.
+        """Run a coroutine for all hosts at once; return results by name.
+
+        HostsError with a line for each host at which it failed or took longer.
         """
 
         async def bounded(link: HostLink) -> Any:

@@ -56,8 +56,7 @@ Progress = Callable[[str, str], None]  # host, what is being done there
 async def push(
     placed: InventoryFile, names: Sequence[str], more: Iterable[str], progress: Progress, cache: Path
 ) -> dict[str, bool]:
-    """Install on hosts, by default on all, what their roles need; return for each whether anything had to be done
-    there.
+    """Install on hosts, by default on all, what their roles need; return for each whether anything had to be done.
 
     `more`: extras for each of them beside those of its roles; `cache`: folder of the wheelhouse. InventoryError if a
     host or an extra is unknown; HostsError with a line for each host at which it failed; the others are done.

@@ -1,6 +1,6 @@
 """The roles of a run as processes: agents, recorder, router, and those that serve one run after the other.
 
-The latter (`serve_runs`) are console, gateway, bridges, drivers, cameras and detectors.
+The latter (`serve_runs`) are console, gateway, bridges, drivers, cameras and detectors. The world is in `world_role`.
 """
 
 import gc
@@ -261,7 +261,7 @@ def serve_runs(
                 info,
             ):
                 if info.run_id != served:
-                    if own_name.endswith(f".{ANY}"):
+                    if own_name == f"{role}.{ANY}":
                         taken = link.tokens(keys.token(f"{role}.$*"))
                         own_name = next(free for i in count(1) if keys.token(free := f"{role}.{i}") not in taken)
                     participant = Participant(link, info, own_name, stands_for(info), slack_ns(info))

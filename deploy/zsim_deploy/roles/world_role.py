@@ -137,8 +137,10 @@ class ReplayOptions(NamedTuple):
 
 
 def play(place: Path, options: ReplayOptions, who: Identity) -> None:
-    """Play a record until it is over or the process is stopped; RunError, RecordError, SessionError if that cannot
-    be.
+    """Play a record until it is over or the process is stopped.
+
+    RunError or RecordError if there is no record, or nothing in it to play; SessionError if an endpoint is taken, a key
+    is no expression, or the identity cannot be used.
     """
     from zsim.record.record_reader import record_notes
     from zsim_analysis.reading.recorded_run import open_run

@@ -111,8 +111,14 @@ def test_who_connects_to_whom_across_hosts(sites: InventoryFile, step: Scenario)
     routers = [process for process in inventory.processes(sites, step) if process.role == "router"]
     upstream = {process.name: process.words[process.words.index("--connect") + 1] for process in routers}
     assert upstream == {"router.site": "tls/192.168.1.10:7447", "router.yard": "tls/192.168.1.21:7448"}
-    assert list(upstream) == ["router.site", "router.yard"]  # after those that they connect to
     assert inventory.connections(sites, found) == {("lab", 7447): {"one"}, ("one", 7448): {"two"}}
+
+
+def test_routers_come_after_those_that_they_connect_to(tmp_path: Path, step: Scenario) -> None:
+    chain = {f"r{i}": {"host": "lab", "port": 8000 + i, "upstream": f"r{i + 1}"} for i in range(4)}
+    found = placed(tmp_path, routers={**chain, "r4": {"host": "one"}, "a": {"host": "two"}})
+    routers = [process.thing for process in inventory.processes(found, step) if process.role == "router"]
+    assert routers == ["a", "r4", "r3", "r2", "r1", "r0"]
 
 
 def test_a_host_that_has_a_router_only_connects_too_and_the_world_to_nobody(tmp_path: Path, step: Scenario) -> None:
