@@ -24,7 +24,7 @@ _FOOTER_LENGTH = 20
 
 
 def finish(file: FileIO) -> None:
-    """Write summary and footer at the end of a file opened for reading and writing, unbuffered; OSError if no room is left."""
+    """Write summary and footer at the end of a file opened to read and write, unbuffered; OSError if it has no room."""
     with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
         summary = _summary(source)
         data_end = layout.packed(DataEnd(layout.crc_until(source, len(source))))
