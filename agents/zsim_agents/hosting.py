@@ -32,7 +32,7 @@ def chosen(what: str, patterns: Sequence[str], known: Sequence[str]) -> list[str
 
 
 def agents_of(scenario: Scenario, patterns: Sequence[str] = ("*",)) -> list[str]:
-    """Return the process names of the agents that match, role by role: estimators first; RunError: a pattern misses."""
+    """Return the process names of the agents that match, role by role, estimators first; RunError: one matches none."""
     return chosen("host: process", patterns, agent_names(scenario))
 
 

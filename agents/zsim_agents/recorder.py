@@ -352,7 +352,7 @@ class Recorder:
                 self._others.pop(name, None)
 
     def _clock_in(self, payload: bytes) -> Clock | None:
-        """Return the clock of this run; None for a stranger's garbage."""
+        """Return the clock of this run; None for anything else that somebody published on `clock`."""
         try:
             clock = self._clock.decode(payload)
         except messages.REFUSALS:

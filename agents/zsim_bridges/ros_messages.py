@@ -1,4 +1,4 @@
-"""Messages that ROS 1 and ROS 2 have alike, made of zsim's; each bridge adds its own headers. Pure.
+"""Messages that ROS 1 and ROS 2 have in common, made from zsim's; each bridge adds its own headers. Pure.
 
 ROS has the same W (east, north, up) and B (forward, left, up) as zsim (REP 103, REP 105), and SI units; its quaternions
 end with w. Covariances are row-major; unknown ones are zero, unless the message's definition has a sign for it.
@@ -110,7 +110,7 @@ def compressed_image(head: Any, image: CameraImage) -> Any:
 def camera_info(kind: Any, head: Any, info: CameraInfo) -> Any:
     """Return what a picture's pixels mean, of a camera that is no part of a stereo pair: R = 1, P = [K 0].
 
-    `kind` is the class of sensor_msgs/CameraInfo, whose fields are named otherwise in ROS 2 (k) than in ROS 1 (K).
+    `kind` is the class of sensor_msgs/CameraInfo, whose fields have other names in ROS 2 (k) than in ROS 1 (K).
     """
     P = np.column_stack([np.reshape(info.K, (3, 3)), np.zeros(3)]).ravel()
     whole = ros.sensor_msgs__msg__RegionOfInterest(0, 0, 0, 0, False)

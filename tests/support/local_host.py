@@ -25,7 +25,7 @@ class Text:
 
 
 class LocalHost(HostLink):
-    """This machine; it greets, keeps the commands that it is given, and takes so many bytes of their input only."""
+    """This machine; it greets, keeps the commands that it is given, and takes `takes` bytes of their input at most."""
 
     def __init__(self, takes: int | None = None, base: Path = Path(), **host: Any) -> None:
         super().__init__("h1", Host(**{"address": "127.0.0.1", **host}), base)

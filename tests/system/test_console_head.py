@@ -337,6 +337,44 @@ def test_an_emergency_is_held_by_the_keyboard_too_and_a_short_press_is_none(head
     assert len(desk.orders) == 1
 
 
+def test_orders_need_no_socket(head: Head) -> None:
+    desk = OrderDesk(head)
+    desk.state = "confirmed"
+    head.page.add_init_script("window.WebSocket = class { constructor() { throw new Error('forbidden'); } };")
+    head.page.reload()
+    head.page.locator(".land").click()
+    row(head, "confirmed", "Land all")
+
+
+def test_the_socket_is_opened_again_whatever_a_part_of_the_page_does_and_what_waits_is_sent(head: Head) -> None:
+    sockets: list[Any] = []
+    sent: list[Any] = []
+
+    def serve(opened: Any) -> None:
+        sockets.append(opened)
+        opened.on_message(lambda text: sent.append(text))  # playwright marks its handlers
+
+    def wait_for(count: int, of: list[Any]) -> None:
+        until_s = time.monotonic() + PATIENCE_S
+        while len(of) < count:
+            assert time.monotonic() < until_s
+            head.page.wait_for_timeout(POLL_MS)
+
+    head.page.route_web_socket("ws://console.test/actions", serve)
+    head.page.reload()
+    wait_for(1, sockets)
+    head.page.evaluate("""zsimPage.on("close", () => {
+        zsimPage.send({ do: "go" });
+        zsimPage.send({ do: "choose" }, true);
+        throw new Error("a fault of a part");
+    })""")
+    sockets[0].close()
+    wait_for(2, sockets)
+    head.page.evaluate("zsimPage.send({ do: 'look' }, true)")
+    wait_for(2, sent)
+    assert [json.loads(each)["do"] for each in sent] == ["choose", "look"]
+
+
 def test_a_page_that_stood_still_says_so_and_blames_no_console(head: Head) -> None:
     head.show()
     head.page.evaluate(STALL_JS, STALL_MS)

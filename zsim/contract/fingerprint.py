@@ -6,7 +6,6 @@ packages, and for which processor BLAS computes: its own, unless OPENBLAS_CORETY
 
 import hashlib
 import importlib.metadata
-import os
 import platform
 from collections.abc import Callable, Iterable
 from functools import cache
@@ -14,11 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import threadpoolctl
-from msgspec import UNSET
 from numpy.typing import ArrayLike, NDArray
 
 from zsim import __version__
-from zsim.contract.run_messages import Bye, Done, Join
 
 PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "filterpy")
 COLUMNS = 13  # position, velocity, orientation, angular velocity of a drone
@@ -44,49 +41,6 @@ def fingerprint() -> str:
     """Return 16 hex digits: equal fingerprints promise equal bits."""
     text = ";".join(f"{name}={value}" for name, value in sorted(parts().items()))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-class Membership:
-    """What a process says of itself in a run: its join, dones and bye."""
-
-    def __init__(
-        self,
-        name: str,  # of the process, role.thing
-        host: str,  # that it runs on
-        run_id: str,  # of the run
-        next_seq: Callable[[str], int],  # returns the number of its next message of a kind, from 0
-        serves: tuple[str, ...] = (),  # names of processes whose work it does
-        period_ns: int = 0,  # how often it says done; 0 for never
-        slack_ns: int = 0,  # by how much the world may be ahead of the dones of one without a period; 0 for any
-        calculates: bool = True,  # whether its results depend on its arithmetic; else it states no fingerprint
-    ) -> None:
-        self._name, self._host, self._run_id, self._next_seq = name, host, run_id, next_seq
-        self._serves, self._period_ns, self._slack_ns = serves, period_ns, slack_ns
-        self._calculates = calculates
-        self.incarnation = 0  # a random number of the process; 0 where none is ever restarted
-
-    def join(self, t_ns: int = 0) -> Join:
-        return Join(
-            t_ns=t_ns,
-            seq=self._next_seq("join"),
-            run_id=self._run_id,
-            incarnation=self.incarnation,
-            role=self._name.partition(".")[0],
-            host=self._host,
-            pid=os.getpid(),
-            period_ns=self._period_ns,
-            version=__version__,
-            fingerprint=fingerprint() if self._calculates else "",
-            serves=self._serves,
-            slack_ns=self._slack_ns,
-        )
-
-    def done(self, t_ns: int, sent: int) -> Done:
-        """Return what says that a gate is done, and how many outputs were sent since the last."""
-        return Done(t_ns, self._next_seq("done"), self._run_id, self.incarnation, t_ns, sent)
-
-    def bye(self, t_ns: int, reason: str, failed: bool = False) -> Bye:
-        return Bye(t_ns, self._next_seq("bye"), reason, failed or UNSET, self._run_id, self.incarnation)
 
 
 def _version(package: str) -> str:

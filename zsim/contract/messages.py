@@ -209,7 +209,7 @@ def encoding(key: str) -> str:
 
 
 def decode(key: str, payload: bytes) -> Any:
-    """Return the message on `key`; a DecodeError for type, shape or infinity names key, field, found and allowed."""
+    """Return the message on `key`, checked for type, shape and finiteness; DecodeError says what was found where."""
     kind, read = _reader_of(key)
     if kind is None:
         raise DecodeError(f"{key:.80}: is no key of the contract; see docs/protocol.md")

@@ -28,9 +28,9 @@ class Waiting(Struct, frozen=True):
 
 
 def holding_up(state: str, waiting: Sequence[Waiting]) -> Sequence[Waiting]:
-    """Return those of the processes waited for that hold up a run, in a state of its clock: causes alone, if known.
+    """Return the processes that hold up a run whose clock is in `state`: of those waited for, the causes if known.
 
-    A running world waits for SOON_S now and then.
+    While it runs, it often waits for up to SOON_S, which holds up nothing.
     """
     late = [each for each in waiting if state == "waiting" or each.since_wall_s > SOON_S]
     return [each for each in late if not each.held_by] or late

@@ -112,7 +112,7 @@ def _kept(function: Function, options: dict[str, Any]) -> Function:
 
 
 def kernel(makes_arrays: bool = True) -> Callable[[Function], Function]:
-    """Return the decorator; `makes_arrays` is False where it and all that it calls work on the arrays given to it."""
+    """Return the decorator; `makes_arrays` is False for one that, like all it calls, only uses arrays it is given."""
     options = _EXACT if makes_arrays else {**_EXACT, **_UNCOUNTED}
     return lambda function: _kept(function, options)
 

@@ -213,7 +213,7 @@ def chunk_head(source: Source, place: RecordSpan) -> ChunkHead:
 def content_of(source: Source, place: RecordSpan) -> bytes | None:
     """Return the message records inside the chunk at a place, None if it is damaged, or larger than any of ours.
 
-    RecordError if compressed in a way that is not ours.
+    RecordError if it is compressed in a way that is not ours.
     """
     head = chunk_head(source, place)
     if head.content > place.end or head.size > CHUNK_MAX:

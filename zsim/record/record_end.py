@@ -24,7 +24,7 @@ _FOOTER_LENGTH = 20
 
 
 def finish(file: FileIO) -> None:
-    """Write summary and footer at the end of a file opened for reading and writing, unbuffered; OSError if no room."""
+    """Write summary and footer at the end of a file opened to read and write, unbuffered; OSError if it has no room."""
     with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
         summary = _summary(source)
         data_end = layout.packed(DataEnd(layout.crc_until(source, len(source))))
@@ -129,7 +129,7 @@ def repair(path: str | Path) -> bool:
 def cut_off(file: FileIO, path: Path) -> None:
     """Cut a record behind its last whole chunk, or else its header, so that it can be continued from there.
 
-    RecordError if no record; OSError if it cannot be written.
+    RecordError if it is no record; OSError if it cannot be written.
     """
     end, tail = 0, layout.opening()
     if file.seek(0, 2):

@@ -64,7 +64,7 @@ class RecordReader:
     def __init__(self, path: str | Path) -> None:
         """Open a record and look through its chunks, without decompressing them.
 
-        RecordError if no such file, no MCAP file, or the name of a channel is damaged.
+        RecordError if there is no such file, it is no MCAP file, or the name of a channel is damaged.
         """
         self.path = Path(path)
         self._counts: Counter[int] = Counter()

@@ -145,7 +145,10 @@ class RecordWriter:
         return np.array(channels, dtype=np.int64).tobytes() if all(channels) else b""
 
     def tick(self, wall_ns: int) -> None:
-        """Put the open chunk on disk when it is old; call it every 0.1 s of a monotonic clock, always."""
+        """Put the open chunk on disk when it is old; call it every 0.1 s, also while nothing arrives.
+
+        `wall_ns` is of a monotonic clock; only its own earlier values are compared with it.
+        """
         end, since_ns = self._seen
         if not self._open.size or end != self._end:
             self._seen = (self._end if self._open.size else 0, wall_ns)

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple, Protocol
 from msgspec import Struct
 
 from zsim.contract import keys, messages, run_messages
-from zsim.contract.fingerprint import Membership
 from zsim.contract.framing import GateMessages
 from zsim.errors import RunError, UserCodeError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.inbox import NEVER_NS, Inbox, RoutingTable, output_hold_ns
+from zsim.runtime.membership import Membership
 from zsim.scenario.faults import PROCESS_KILL
 
 GATES_MAX = 10  # of the world in a row, where commands are delayed by as many
@@ -61,7 +61,11 @@ class Bus:
         self._readers = RoutingTable([agent.reads for agent in agents])
         self._routes: dict[str, _Route] = {}
         self._gate_route: tuple[Sequence[str], tuple[Inbox, ...]] = ((), ())  # a table of keys, and who reads any
-        self._memberships: dict[str, Membership] = {}
+        host, run_id = socket.gethostname(), coordinator.run_id
+        self._memberships = {
+            agent.name: Membership(agent.name, host, run_id, agent.next_seq, agent.serves, agent.period_ns)
+            for agent in agents
+        }
         self._done_keys = {agent.name: keys.process(agent.name, "done") for agent in agents}
         self._t_ns = 0
         self._info: messages.Info | None = None
@@ -69,12 +73,9 @@ class Bus:
 
     def join(self) -> None:
         """Let every agent get ready and join the run."""
-        host, run_id = socket.gethostname(), self._coordinator.run_id
         for agent, _ in self._agents:
             agent.rehearse()
-            member = Membership(agent.name, host, run_id, agent.next_seq, agent.serves, agent.period_ns)
-            self._memberships[agent.name] = member
-            self._to_world(keys.process(agent.name, "join"), member.join())
+            self._to_world(keys.process(agent.name, "join"), self._memberships[agent.name].join())
         if any(agent.overhears for agent, _ in self._agents):
             hold_ns = output_hold_ns(self._coordinator.info())
             for _, inbox in self._agents:

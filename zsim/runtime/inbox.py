@@ -100,10 +100,8 @@ class Inbox:
         due_ns = t_ns + hold_ns
         if due_ns <= self.taken_ns:
             self.late += 1
-            is_old = not self._keep_late or t_ns <= self._newest.get(
-                key, ALWAYS_NS
-            )  # it, or a newer one, was handed out
-            if is_old and key not in self._uncounted:
+            handed_ns = self._newest.get(key, ALWAYS_NS)  # up to there, it or a newer one was handed out
+            if (not self._keep_late or t_ns <= handed_ns) and key not in self._uncounted:
                 return False
             self._belated[key, message.seq] = (key, message)
             return True

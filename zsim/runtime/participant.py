@@ -18,7 +18,6 @@ from collections.abc import Callable, Sequence
 from msgspec import Struct
 
 from zsim.contract import keys, messages, run_messages
-from zsim.contract.fingerprint import Membership
 from zsim.contract.framing import Pairs
 from zsim.contract.messages import ProcessEntry
 from zsim.contract.snapshot import VERSION, pack, unpack
@@ -26,6 +25,7 @@ from zsim.errors import BehindError, DecodeError, NoWorldError, RunError, Supers
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.health import HealthMeter
 from zsim.runtime.inbox import output_hold_ns
+from zsim.runtime.membership import Membership
 from zsim.transport.connection import read_info
 from zsim.transport.session import ReceivedSample, Session
 from zsim.transport.traffic import replay

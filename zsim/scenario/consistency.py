@@ -4,7 +4,7 @@ They work on the sound parts of a document (`checker.sound`): a check whose fiel
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -16,7 +16,6 @@ from zsim.scenario.faults import Known, flaws, kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
 from zsim.scenario.roles import AGENTS
 from zsim.scenario.scenario import EXTERNAL, SEA_HEIGHT_MAX_M, Scenario, space_name
-from zsim.schema import plugin
 from zsim.schema.checker import Fault, listed, show
 from zsim.schema.quantities import COULOMB_PER_MAH, G_M_S2, SEA_LEVEL_KG_M3
 from zsim.sensors.camera_model import folds, lens_of
@@ -45,11 +44,12 @@ LEAST_K1 = -4 / 27  # over the squared tangent of half the diagonal: where r + k
 SIGHTED_MAX = 12  # drones of a cluster: each of its estimators has the states of all; the cost grows by the square
 
 
-def cross_faults(scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
-    """Yield every fault between fields of a scenario, or of the parts of one that `checker.sound` gives.
-
-    `vehicles`: by model; what depends on a vehicle that is not among them is left out.
-    """
+def cross_faults(
+    scenario: Any,
+    vehicles: Mapping[str, Vehicle],  # by model; what depends on a vehicle that is not among them is left out
+    unread: Collection[str] = (),  # names of sensors that it lacks, since their modules could not be read
+) -> Iterator[Fault]:
+    """Yield every fault between fields of a scenario, or of the parts of one that `checker.sound` gives."""
     drones, clusters = _entries(scenario.drones), _entries(scenario.clusters)
     yield from _name_faults("drones", drones)
     yield from _name_faults("clusters", clusters)
@@ -67,7 +67,7 @@ def cross_faults(scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fau
     for index, cluster in clusters:
         yield from _under(f"clusters[{index}]", _shape_faults(cluster, drones))
     yield from _process_faults(scenario.processes, drones, clusters)
-    yield from _injected_faults(scenario, drones, clusters, vehicles)
+    yield from _injected_faults(scenario, drones, clusters, vehicles, unread)
     window = scenario.report and scenario.report.window_s
     if window is not None and not 0 <= window[0] < window[1]:
         yield "report.window_s", f"is {show(list(window))}; must be [start, end] with 0 <= start < end"
@@ -434,7 +434,7 @@ def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Ite
 
 
 def _injected_faults(
-    scenario: Any, drones: _Entries, clusters: _Entries, vehicles: Mapping[str, Vehicle]
+    scenario: Any, drones: _Entries, clusters: _Entries, vehicles: Mapping[str, Vehicle], unread: Collection[str]
 ) -> Iterator[Fault]:
     if any(item.name is None for _, item in [*drones, *clusters]) or not drones:
         return
@@ -444,7 +444,7 @@ def _injected_faults(
     rotors = {drone.name: vehicles[drone.model].rotor_names if drone.model in vehicles else () for _, drone in drones}
     external = tuple(drone.name for _, drone in drones if drone.body == EXTERNAL)
     names = tuple(_names(drones)), tuple(_names(clusters))
-    known = Known(*names, processes, kinds, rotors, external, plugin.has_skipped())
+    known = Known(*names, processes, kinds, rotors, external, unread)
     for index, fault in _entries(scenario.faults):
         for path, text in flaws(fault, known):
             yield f"faults[{index}]{f'.{path}' if path else ''}", text

@@ -7,7 +7,7 @@ commands are checked by the same tables. In a terminal and in the console it is 
 
 import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from difflib import SequenceMatcher
 from typing import Any, Literal, NamedTuple
 
@@ -44,8 +44,8 @@ class FaultParameter(NamedTuple):
     most: float = 1e9
     above: bool = False  # whether `least` itself is not allowed
     choices: tuple[str, ...] = ()  # of a word
-    default: Any = None  # where it is left out; `required` then says that it may not be
-    required: bool = True
+    default: Any = None  # its value where it is left out
+    required: bool = True  # whether it must not be left out
 
 
 class FaultKind(NamedTuple):
@@ -102,9 +102,6 @@ def sensor_parts(sensors: Mapping[str, SensorType | Declaration]) -> dict[str, S
             parts[part] = before._replace(width=before.width + channel.width)
             first += channel.width
     return parts
-
-
-OF_SENSORS = ("_dropout", "_stuck", "_bias", "_noise")  # how kinds of faults of a sensor end
 
 
 def _sensor_kinds(sensors: Mapping[str, SensorType | Declaration]) -> dict[str, FaultKind]:
@@ -244,7 +241,7 @@ class Known(NamedTuple):
     # of each drone; none of one whose vehicle is a module that is not read here
     rotors: Mapping[str, tuple[str, ...]] = {}
     external: tuple[str, ...] = ()  # drones whose bodies and sensors nobody simulates
-    lacks_sensors: bool = False  # whether there are sensors of modules that must not be imported
+    unread: Collection[str] = ()  # sensors whose modules are not imported, or faulty: what can fail of them is unknown
 
     def things(self) -> dict[str, tuple[str, ...]]:
         return {name: self.drones if role.about == "drone" else self.clusters for name, role in AGENTS.items()}
@@ -265,8 +262,9 @@ def flaws(fault: Any, known: Known) -> Iterator[Flaw]:
     name = fault.get("kind")
     kind = known.kinds.get(name) if isinstance(name, str) else None
     if kind is None or not isinstance(name, str):
-        if known.lacks_sensors and isinstance(name, str) and name.endswith(OF_SENSORS):
-            return  # it may be a fault of one of these
+        sensor, _, ending = name.rpartition("_") if isinstance(name, str) else ("", "", "")
+        if sensor in known.unread and ending in ("dropout", "stuck", "bias", "noise"):
+            return
         yield "kind", f"{_actual(fault, 'kind')}; must be one of {', '.join(known.kinds)}"
         return
     of = {parameter.name: parameter for parameter in kind.parameters}

@@ -77,6 +77,7 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
     misread: list[Fault] = []  # error models in units that cannot be read
     unknown: list[Fault] = []  # models that are no vehicles
     unsound: list[Fault] = []  # sensors of users
+    unread: set[str] = set()  # names of these that are faulty, or must not be imported
     vehicles = dict(vehicle_catalogue.STOCK)  # by model, as far as drones need one
 
     given = _in_channel_units(document.get("sensors"), "sensors", misread)
@@ -99,19 +100,19 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
         vehicle = _vehicle_of(drone, f"{where}.model", vehicles, unknown, imports)
         own = _in_channel_units(drone.get("sensors"), f"{where}.sensors", misread)
         own = with_defaults(usable, own) if isinstance(own, dict) else usable if own is None else own
-        own = _separated(_with_preset(own, vehicle.sensor_preset), f"{where}.sensors", unsound, imports)
+        own = _separated(_with_preset(own, vehicle.sensor_preset), f"{where}.sensors", unsound, unread, imports)
         numbers = {name: getattr(vehicle, name) for name in VEHICLE_NUMBERS}
         numbers["limits"] = msgspec.to_builtins(vehicle.limits)
         if vehicle.aerodynamics != Aerodynamics():  # else they are left out of the resolved text
             numbers["aerodynamics"] = msgspec.to_builtins(vehicle.aerodynamics)
         return {**with_defaults(numbers, drone), "sensors": own}
 
-    document = {**document, "sensors": _separated(sensors, "sensors", unsound, imports)}
+    document = {**document, "sensors": _separated(sensors, "sensors", unsound, unread, imports)}
     drones = document.get("drones")
     if isinstance(drones, list) and len(drones) <= DRONES_MAX:
         document["drones"] = [resolved_drone(drone, f"drones[{index}]") for index, drone in enumerate(drones)]
 
-    between = cross_faults(sound(document, Scenario), vehicles)
+    between = cross_faults(sound(document, Scenario), vehicles, unread)
     flaws = chain(misread, faults(document, Document), unknown, unsound, between)
     found = first_lines(chain(lines, (f"{source}: {path} {text}{_whose(document, path)}" for path, text in flaws)))
     if found:
@@ -149,12 +150,13 @@ def _with_preset(sensors: Any, default: str) -> Any:
     return with_defaults({"preset": name, **preset}, sensors)
 
 
-def _separated(section: Any, where: str, unsound: list[Fault], imports: bool) -> Any:
+def _separated(section: Any, where: str, unsound: list[Fault], unread: set[str], imports: bool) -> Any:
     """Return a `sensors:` section with the users' sensors in `own`."""
     if not isinstance(section, dict):
         return section
     rest, own, wrong = separate(section, imports)
     unsound += [(f"{where}.{path}", text) for path, text in wrong]
+    unread |= section.keys() - rest.keys() - own.keys()
     return {**rest, "own": own} if own else rest
 
 

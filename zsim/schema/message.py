@@ -15,7 +15,7 @@ Vector3 = tuple[Number, Number, Number]
 class Message(Struct, frozen=True, gc=False):
     """The first fields of every message: simulated time of publication, and a count per key from 0.
 
-    A class may have a method `fault` that returns, or not, what is wrong with a message that its types cannot express.
+    A class may have a method `fault`: it returns what is wrong with a message and no type can express, or None.
     """
 
     t_ns: Count

@@ -80,11 +80,6 @@ def may_import() -> bool:
     return os.environ.get(IMPORTS) != NO_IMPORTS
 
 
-def has_skipped() -> bool:
-    """Tell whether code that the present document names was found and not imported."""
-    return bool(_SKIPPED) and not may_import()
-
-
 def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Callable[..., Any]:
     """Return the class of a name `package.module:Class`.
 
@@ -167,7 +162,7 @@ def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
 
 
 def numbers(returned: Any) -> NDArray[np.float64]:
-    """Return what a user's code returned as an array; ValueError if it is no real numbers of a regular shape."""
+    """Return what a user's code returned as an array; ValueError if these are not real numbers of a regular shape."""
     array = np.asarray(returned)
     if array.dtype.kind not in "biuf":
         raise ValueError(f"no real numbers: {array.dtype}")

@@ -1,5 +1,6 @@
 """Sensors as declarations: message, settings with errors, channels, presets. Imports schema and math.
 
-Scenario, faults, keys, messages and the arrays of the world follow from them. What a sensor is: sensor; those there
-are: stock_sensors, camera (with camera_model, its lens), and a user's own, found by sensor_catalogue.
+Scenario, faults, keys, messages and the arrays of the world follow from them. `sensor` defines what a sensor is;
+all of them are in `stock_sensors`, `camera` (its lens in `camera_model`), and the users' modules, which
+`sensor_catalogue` finds.
 """

@@ -118,13 +118,8 @@ class LinkWatch:
         """Look at all links once, and close those that have to be."""
         now_s, queued = self._wall_s(), self._sockets.queued()
         self._backlogs = {address: self._backlogs[address] for address in queued if address in self._backlogs}
-        keeps_out = now_s < max(self._kept_out_s.values(), default=now_s)
         for address, held_bytes in queued.items():
-            is_bad = self._holds_up(address, held_bytes, now_s)
-            if not is_bad and keeps_out:
-                far = self._far_end(address, now_s)
-                is_bad = far is not None and now_s < self._kept_out_s.get(far.session, now_s)
-            if is_bad:
+            if self._holds_up(address, held_bytes, now_s) or self._is_kept_out(address, now_s):
                 self._judge(address, held_bytes, now_s)
 
     def stuck(self) -> list[str]:
@@ -152,6 +147,12 @@ class LinkWatch:
             backlog.low_s = now_s
         stall_s = STALL_S + ROUND_TRIPS * round_trip_s
         return now_s - backlog.moved_s >= stall_s or now_s - backlog.low_s >= HELD_S
+
+    def _is_kept_out(self, address: str, now_s: float) -> bool:
+        if now_s >= max(self._kept_out_s.values(), default=now_s):
+            return False
+        far = self._far_end(address, now_s)
+        return far is not None and now_s < self._kept_out_s.get(far.session, now_s)
 
     def _far_end(self, address: str, now_s: float) -> FarEnd | None:
         if now_s - self._refreshed_s >= FRESH_S:
@@ -193,8 +194,6 @@ class SessionTokens:
     A token `process/{p}` says that a process lives, but not whose it is: Zenoh names no holder, and its admin space,
     which would, can stop a router for good when it is asked (eclipse-zenoh/zenoh#2619). So each process also declares
     `process/{p}/session/{session}`.
-
-    Args:
     """
 
     def __init__(self, link: Session) -> None:

@@ -233,12 +233,12 @@ class Session:
 
     def _refusal(self, act: Act, expression: str) -> str | None:
         """Return why access control at the other end would silently drop what we do, None if it permits it."""
+        if self.permissions is None:
+            return None
         with _key_errors(expression):
-            wanted = zenoh.KeyExpr(self._prefix + expression) if self.permissions else None
-        if self.permissions is None or wanted is None:
-            return None
-        if any(zenoh.KeyExpr(each).includes(wanted) for each in self.permissions.allowed.get(act, ())):
-            return None
+            wanted = zenoh.KeyExpr(self._prefix + expression)
+            if any(zenoh.KeyExpr(each).includes(wanted) for each in self.permissions.allowed.get(act, ())):
+                return None
         return self.permissions.denial(act, expression, self._prefix)
 
     def _check(self, act: Act, expression: str) -> None:

@@ -133,9 +133,9 @@ def peer_fault(identity: Identity, endpoint: str) -> str | None:
         return _words(error, endpoint)
     except OSError:
         return None
-    context = _client(identity)
-    context.check_hostname = False
     try:
+        context = _client(identity)
+        context.check_hostname = False
         with socket.create_connection(address, PROBE_S) as plain, context.wrap_socket(plain) as link:
             there = (link.getpeercert() or {}).get("subjectAltName", ())
     except OSError:

@@ -129,7 +129,7 @@ class DetectorProcess(RunProcess):
 
 
 def _detector_of(info: CameraInfo, diameter_m: float) -> HatDetector:
-    """Return the detector of any camera; PictureError: its pictures are too large, or its intrinsics invalid."""
+    """Return a camera's detector; PictureError: its pictures are too large, or its intrinsics invalid."""
     if info.width * info.height > PIXELS_MAX:
         raise PictureError(f"{info.width} x {info.height} are too many pixels; must be at most {PIXELS_MAX}")
     fx, skew, cx, _, fy, cy, *_ = info.K

@@ -106,7 +106,7 @@ class EstimatorSet:
         return False  # its messages are to be passed one by one
 
     def estimate(self, t_s: float) -> list[StateEstimate]:
-        """Return the estimates for `t_s`, as plain numbers; UserCodeError: a class raised, or one is invalid."""
+        """Return the estimates for `t_s`, as plain numbers; UserCodeError: a class raised or gave an invalid one."""
         estimates = []
         for i, estimator in enumerate(self._estimators):
             try:

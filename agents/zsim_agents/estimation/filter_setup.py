@@ -167,10 +167,8 @@ class DroneSetup:
         imu, self._gravity = drone.sensors.imu, environment.gravity_m_s2
         self._accel_sigma = accel_sigma(imu)
         self._gyro_sigma = max(math.radians(white_sigma(imu.gyro_deg_s, imu.rate_hz)), GYRO_SIGMA_MIN)
-        self._beta, self._direction_sigma = (
-            madgwick_beta(estimation, imu, self._gravity),
-            accel_sigma(imu) / self._gravity,
-        )
+        self._beta = madgwick_beta(estimation, imu, self._gravity)
+        self._direction_sigma = self._accel_sigma / self._gravity
         self._tilt_density = tilt_density(self._beta, self._direction_sigma, self._gravity, 1.0 / imu.rate_hz)
         latency_s = max(getattr(drone.sensors, name).latency_ms for name in SENSORS) * 1e-3
         self._age_max_s = 2.0 * latency_s + 5.0 * gate_s + (LINK_S if drone.is_external else 0.0)

@@ -72,9 +72,7 @@ class PaperEstimator:
         dt = 0.0 if math.isnan(self._t_s) else t_s - self._t_s
         self._t_s = t_s
         yaw = float(frames.heading(self._q))
-        position = (
-            self._velocity_variance() * self._flow_period_s * dt
-        )  # velocities err independently, held for a period
+        position = self._velocity_variance() * self._flow_period_s * dt  # each error is held for its period
         drift = (self._gyro_sigma**2 * self._imu_period_s + self._gyro_bias**2 * DRIFT_S) * dt
         noise = np.diag([position, position, position, drift])
         self._filter.reckon(self._velocity or (0.0, 0.0, 0.0), yaw, noise, dt)

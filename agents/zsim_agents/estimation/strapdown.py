@@ -81,7 +81,10 @@ COAST_VELOCITY_DENSITY = 1.0  # m^2/s^3: 1 m/s after 1 s without an IMU
 
 @inlined
 def move(rows: Rows, i: int, t_s: float, accel: Vector, gyro: Vector) -> None:
-    """Move to the instant of an IMU sample, in S; ignore a duplicate, refuse and count a late or impossible sample."""
+    """Move to the instant of an IMU sample; ignore a duplicate, refuse and count a late or impossible sample.
+
+    `accel` is the specific force [m/s^2], `gyro` the body rate [rad/s], both in S.
+    """
     row, counts, setting, layout = rows.nominal[i], rows.counts[i], rows.setting[i], rows.layout[i]
     if not possible(accel, gyro):
         counts[COUNT.refused + IMU] += 1
@@ -371,8 +374,9 @@ def reckon(
 
     Args:
         state: at the previous sample.
-        accel: specific force of the centre of mass as measured [m/s^2; B]; less its bias, as the rate.
+        accel: specific force of the centre of mass as measured [m/s^2; B].
         gyro: body rate as measured [rad/s; B].
+        accel_bias, gyro_bias: subtracted.
         beta: Madgwick's gain [rad/s].
         gravity: length of g_W [m/s^2], along -z.
     """

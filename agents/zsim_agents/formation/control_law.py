@@ -70,7 +70,7 @@ class FormationCommand(Struct, eq=False):
     Attributes:
         v_W: velocities (n, 3) [m/s, W]; yaw_rate: (n,) [rad/s].
         factor: the common factor of the saturation, 1 where nothing is saturated.
-        guarded, alarmed: pairs of robot indices that the guard holds apart; that are nearer than the alarm threshold.
+        guarded: pairs of robot indices that the guard holds apart; alarmed: those nearer than the alarm threshold.
     """
 
     v_W: Array
@@ -214,7 +214,7 @@ class RobotLimits(NamedTuple):
     """Limits of the saturation and of the guard, for compiled code.
 
     Attributes:
-        separation_min_m, separation_alarm_m: least distance between two robots; below the other two are reported.
+        separation_min_m: least distance between two robots; separation_alarm_m: nearer ones are reported.
         guard_horizon_s: how far ahead the guard looks.
         response_s: lag of a drone's velocity loop, during which the guard expects it to keep its velocity.
     """

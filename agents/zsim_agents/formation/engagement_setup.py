@@ -76,7 +76,7 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
 
 
 def check_plan(scenario: Scenario, cluster: Cluster) -> None:
-    """Refuse a plan that `engagement_of` refuses, by a RunError; no law is rehearsed."""
+    """Raise RunError for a plan that `engagement_of` refuses; no law is rehearsed."""
     with _refusals_of(scenario, cluster):
         space = scenario_space(scenario, cluster)
         FlightPlan(space, plan_of(cluster))
@@ -132,7 +132,7 @@ def gains_of(gains: Gains) -> FormationGains:
 
 
 def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, gains: FormationGains) -> None:
-    """Refuse, by a PlanError, a plan that these drones cannot fly; without a valid formation at the start none."""
+    """Raise PlanError for a plan that these drones cannot fly; from no valid formation, it is not judged."""
     plan = cluster.plan
     if plan.takeoff_s is None or not (plan.target or plan.trajectory):
         return
@@ -147,9 +147,9 @@ def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, ga
     p_W[:, 2] += ASSEMBLY_HEIGHT_M  # above their starting places
     try:
         start = space.forward(p_W, np.radians([drone.yaw_deg for drone in drones]))
+        if shape_fault(space, start, SHAPE):
+            return
     except SingularClusterError:
-        return
-    if shape_fault(space, start, SHAPE):
         return
     rehearsal = _Rehearsal(scenario, cluster, space, gains)
     goal = start.copy()
@@ -185,7 +185,7 @@ class _Rehearsal:
         self._planner = RampPlanner(space, gains, SHAPE)
 
     def check_target(self, start: Array, goal: Array, over_s: float | None) -> None:
-        """Refuse a target that is not allowed, or too far for its time: PlanError, or TrajectoryError out of reach."""
+        """Refuse a target that is not allowed, or too far for its time; TrajectoryError: it is out of reach."""
         if fault := self._fault_at(goal):
             raise PlanError(f"plan.target: {fault}")
         home, rest = Hold(goal), np.zeros_like(start)

@@ -147,7 +147,7 @@ class FlightCheck:
 
     Attributes:
         value: (4n,) cluster of the newest estimates that had a frame, zero before any.
-        margin: its `ClusterSpace.margin`, 0 while the estimates have no frame.
+        margin: its `ClusterSpace.margin` [m], 0 while the estimates have no frame.
     """
 
     def __init__(
@@ -255,7 +255,7 @@ def all_near(p_W: Array, yaw: Array) -> bool:
 
 @portable
 def near(vectors: Array, i: int) -> bool:
-    """Tell whether row i of (n, 3) is finite and below FAR."""
+    """Tell whether row i of (n, 3) is finite and below FAR; false for NaN."""
     return abs(vectors[i, 0]) < FAR and abs(vectors[i, 1]) < FAR and abs(vectors[i, 2]) < FAR
 
 
@@ -289,7 +289,10 @@ def estimate_flaw(
 
 
 def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits, spread: float | None = None) -> str | None:
-    """Return why c, whose spread may be known, is no shape to engage in or to lead to: quantity, value and limit."""
+    """Return why c is no shape to engage in or to lead to (quantity, value and limit), or None.
+
+    `spread` is that of c, where it is known already.
+    """
     outside = first_outside(c, space.bounds)
     if outside >= 0:
         name, value, (low, high) = space.names[outside], float(c[outside]), space.bounds[outside].tolist()

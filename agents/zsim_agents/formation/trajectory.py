@@ -84,6 +84,9 @@ class ExpressionTrajectory:
         constants: user constants by name, e.g. {"f": 0.01}.
         duration_s: end of the motion, None for none.
 
+    Attributes:
+        arguments: of the constructor, by name, as plain values.
+
     Raises:
         ExpressionError, TrajectoryError: an unknown name, an expression or duration not allowed.
     """

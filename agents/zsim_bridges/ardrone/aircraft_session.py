@@ -202,7 +202,7 @@ class FlightCommands:
         self._rose_ns = -PULSES_NS  # when the emergency bit last did
 
     def advance(self, now_ns: int, demand: Demand, emergency: bool, pose: AircraftPose | None) -> Iterator[Command]:
-        """Yield the commands that are due to an aircraft with a pose, in its emergency or not; none if none are."""
+        """Yield the commands that are due; `emergency` and `pose` are the aircraft's."""
         if now_ns - self._sent_ns < (PERIOD_NS if demand == self._last else CHANGED_NS):
             return
         self._last, self._sent_ns = demand, now_ns

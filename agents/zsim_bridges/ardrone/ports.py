@@ -144,7 +144,7 @@ class DatagramPort(asyncio.DatagramProtocol):
 
 
 class StreamPort:
-    """A TCP port: `serve` serves one connection of a peer until it is over; `writers` are those of all of them."""
+    """A TCP port: `serve` serves one connection of a peer until it is over; `writers` are those of all connections."""
 
     def __init__(self, peers: AllowedHosts, serve: Serve, refuse: Refuse) -> None:
         self._peers = peers

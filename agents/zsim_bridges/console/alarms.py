@@ -169,7 +169,7 @@ def parameters_text(fault: Fault) -> str:
 
 
 class Losses:
-    """Keeps which processes and drones are lost, by `now`, the newest event about each; thread-safe."""
+    """Knows which processes and drones are lost: `now` has the newest event about each; thread-safe."""
 
     def __init__(self) -> None:
         self.now: dict[str, Event] = {}

@@ -78,7 +78,7 @@ DRONE_ICONS = {"takeoff": viser.Icon.PLANE_DEPARTURE, "return": viser.Icon.HOME,
 class ConsolePage:
     """The shared controls of one run, in two panels.
 
-    Folders are for each page's own controls.
+    Its folders are for each page's own controls.
 
     Args:
         gui: viser's; the controls of another run are removed.

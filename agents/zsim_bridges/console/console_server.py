@@ -1,6 +1,6 @@
 """The console: shows one run after the other on a viser server that only its own HTTP server can reach.
 
-A run on the page: its views as pictures, tables and plots; the operators' requests are sent.
+A `RunPage` shows one run, its views as pictures, tables and plots, and sends the operators' requests.
 """
 
 import math

@@ -283,7 +283,7 @@ class FormationForm:
 class _HeldValue(NamedTuple):
     value: float  # of a slider that was moved
     goal: float  # of the formation
-    since_s: float  # for which it is the goal [wall]
+    since_s: float  # since when that is the goal [wall]
 
 
 class VariableSlider:

@@ -193,7 +193,7 @@ class OrderBook:
     def update(self, states: Mapping[str, str], t_ns: int, *, paused: bool) -> None:
         """Settle orders that have had their effect, and repeat those that have not.
 
-        `states` of drones, and phases of formations, are of t_ns; commands accepted in a paused run have no effect yet.
+        `states`, with the phases of formations, are those at t_ns. Commands accepted in a paused run act later.
         """
         with self._lock:
             self._paused = paused

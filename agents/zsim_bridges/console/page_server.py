@@ -105,7 +105,7 @@ class RunFiles:
         self._leaves = False
 
     def shown(self, page: str, has_copies: bool) -> dict[str, Any]:
-        """Return what the head of a page, by its name, shows of them; `has_copies`: of all that it wants to keep."""
+        """Return what a page, empty where none asks, shows of them; `has_copies`: of all that it wants to keep."""
         self._looked_s.pop(page, None)
         if page and not has_copies:
             while len(self._looked_s) >= LOOKS_MAX:
@@ -149,7 +149,11 @@ class ViserBackend(NamedTuple):
 
 
 class HttpProxy:
-    """One server of pages; `token` is that of operators, None where only this machine can connect."""
+    """One server of pages; `token` is that of operators, None where only this machine can connect.
+
+    Raises:
+        RunError: others could reach it, and there is no token.
+    """
 
     def __init__(self, address: ListenAddress, token: str | None, backend: ViserBackend) -> None:
         self._address = address
@@ -171,7 +175,7 @@ class HttpProxy:
 
     @contextmanager
     def open(self) -> Iterator[None]:
-        """Serve pages on a thread of its own; a RunError: the port is taken, or the address is none of this machine."""
+        """Serve pages on a thread; a RunError says that the port is taken, or the address is not of this machine."""
         with open_on_thread(self._loop, "console server", self._open, self._close):
             yield
 

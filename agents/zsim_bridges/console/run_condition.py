@@ -111,11 +111,13 @@ def preflight_checks(drone: DroneCondition, in_formation: bool, foreign: str = "
         checks.append(Check("estimator", f"σ {sigma_m:.2f} m"))
 
     link, link_age_s = drone.link_state, drone.link_age_s
-    if drone.is_external and (link is None or link_age_s is None):
+    if not drone.is_external:
+        pass  # it has no driver, whatever somebody publishes as its link
+    elif link is None or link_age_s is None:
         checks.append(Check("link", "no driver yet", False, True))
-    elif link_age_s is not None and link_age_s > LINK_SILENT_S:
+    elif link_age_s > LINK_SILENT_S:
         checks.append(Check("link", f"its driver has been silent for {link_age_s:.0f} s", False, True))
-    elif link is not None:
+    else:
         checks.append(Check("link", link, link in ("connected", "armed"), blocks=True))
     text = f"flown by {foreign}; must be given back" if foreign else drone.commander or "free"
     return *checks, Check("control", text, not foreign, blocks=in_formation)

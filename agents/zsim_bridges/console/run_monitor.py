@@ -140,7 +140,7 @@ class FlightMeter:
     """Derives figures of each drone's flight from views of the true states."""
 
     def __init__(self) -> None:
-        # of each drone, with their simulated times [s]
+        # of each drone [m; W] and [%], with their simulated times [s]
         self._places: defaultdict[str, deque[tuple[float, tuple[float, float, float]]]]
         self._charges: defaultdict[str, deque[tuple[float, float]]]
         self._places = defaultdict(lambda: deque(maxlen=64))

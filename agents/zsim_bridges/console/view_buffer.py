@@ -102,7 +102,7 @@ class ViewBuffer:
         self.clusters: dict[str, ViewCluster] = {}
         self.estimators: dict[str, ViewEstimates] = {}  # by process
         self.healths: dict[str, Health] = {}
-        # whose bodies are external
+        # names of drones whose bodies are external
         self.external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
         self._links: dict[str, LinkState] = {}
         self.faults: tuple[Fault, ...] = ()  # injected ones, planned and active

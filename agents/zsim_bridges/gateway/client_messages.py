@@ -140,7 +140,7 @@ class MessageDefaults:
         self._next_seq: Counter[str] = Counter()
 
     def fill(self, key: str, value: Any, now_ns: int) -> Any:
-        """Return plain data with `t_ns` (the newest gate), `seq` and `source` where its message has them and it not."""
+        """Return plain data with `t_ns` (of the newest gate), `seq` and `source` added where its message has them."""
         kind = messages.type_of(key)
         if kind is None or not isinstance(value, dict):
             return value

@@ -223,7 +223,7 @@ async def stream_events(
     expression: str,
     event_of: Callable[[RawSample], bytes],
 ) -> web.StreamResponse:
-    """Send every publication on an expression until the client leaves, as `event_of` makes it; no empty one.
+    """Send every publication on an expression, as `event_of` formats it, until the client leaves; skip empty events.
 
     For errors see `SharedSubscriptions.subscribe_stream`.
     """
@@ -299,7 +299,7 @@ class PictureFeed:
 
 
 class PictureFeeds:
-    """The feeds of all cameras with clients, at present or within LINGER_S; `subscribe` returns what ends it."""
+    """The feeds of cameras with clients, now or within LINGER_S; what `subscribe` returns ends a subscription."""
 
     def __init__(
         self,

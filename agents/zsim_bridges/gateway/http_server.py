@@ -1,6 +1,6 @@
 """The gateway's HTTP server: access, and the keys as trees.
 
-RestTree: that of the Zenoh REST plugin: full keys, payloads as they are. GET and POST query, PUT and PATCH publish,
+RestTree: the tree of the Zenoh REST plugin: full keys, payloads as they are. GET and POST query, PUT and PATCH publish,
 DELETE deletes; `Accept: text/event-stream` subscribes; `?_raw` returns the first payload alone. Source: zenoh,
 plugins/zenoh-plugin-rest.
 

@@ -195,7 +195,7 @@ class RunAccess:
     async def request(
         self, key: str, op: str, args: dict[str, Any], source: str, timeout_s: float = 5.0
     ) -> ControlAnswer:
-        """Send a control request to whoever answers on a key."""
+        """Send a control request to whoever answers on a key; a TooManyError says that REQUESTS_MAX wait already."""
         if "*" in key:
             raise DecodeError(f"{key[:80]!r}: is no key; a request goes to one, without wildcards")
         self.check_known(key)
@@ -210,7 +210,7 @@ class RunAccess:
         ]
 
     async def query(self, expression: str, parameters: str, payload: bytes, encoding: str) -> list[RawSample]:
-        """Return the answers to a Zenoh get on a full expression."""
+        """Return the answers to a Zenoh get on a full expression; for errors see `request`."""
         return await self._in_thread(self.bare_link.query, expression, parameters, payload, encoding)
 
     def put_full_key(self, key: str, payload: bytes, encoding: str) -> None:
@@ -367,7 +367,7 @@ class LastValues:
         if "*" not in expression:
             matching = [expression.removeprefix(prefix)] if expression.startswith(prefix) else []
         else:
-            known = {*self._payloads, *(self._table[place] for place in list(self._of_gates))}  # filled by a thread
+            known = {*self._payloads, *(self._table[place] for place in list(self._of_gates))}  # another adds
             matching = sorted(key for key in known if keys.matches(expression, prefix + key))
         return [(key, payload) for key in matching if (payload := self._payload(key)) is not None]
 

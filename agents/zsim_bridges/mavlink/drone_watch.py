@@ -52,7 +52,7 @@ class DroneWatch:
             self._report(Severity.CRITICAL, f"Collision with {pair[1] if pair[0] == self._drone else pair[0]}")
         elif event.kind == "refused" and event.source == self._own and f"/{self._drone}/" in event.subject:
             is_overtaken = not event.subject.endswith("/mode") and self._seen.flight.target is None
-            if not is_overtaken:  # by a landing, a setpoint
+            if not is_overtaken:  # a setpoint that a landing overtook is no news
                 self._report(Severity.WARNING, f"Refused: {event.data.get('reason', event.text)}")
 
     def look(self) -> None:

@@ -91,7 +91,7 @@ Setting = Literal[
 
 
 class ParameterSpec(NamedTuple):
-    """A parameter: its value at the start and its range; fixed ones cannot be set. `unit` is in that of the setting."""
+    """A parameter: its value at the start and its range; fixed ones cannot be set. Setting = value * `unit`."""
 
     name: str
     type: ParamType

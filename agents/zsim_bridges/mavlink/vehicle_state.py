@@ -27,8 +27,6 @@ SENSORS = {
     "sonar": SensorBit.LASER_POSITION,
     "flow": SensorBit.FLOW,
 }
-
-
 ALL_HEALTHY = SensorBit(sum(SensorBit))
 
 

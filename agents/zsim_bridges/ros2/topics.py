@@ -60,6 +60,8 @@ class Topic(NamedTuple):
 
 
 class RosNames(NamedTuple):
+    """Names in ROS, by the names in the contract."""
+
     drones: dict[str, str]
     clusters: dict[str, str]
 

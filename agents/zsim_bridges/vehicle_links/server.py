@@ -115,7 +115,7 @@ Say = Callable[[str], None]
 
 
 class VehicleServer(ABC):
-    """One run's drones on a wire; `options` are the wire's, of which `rate` is the pace that is asked of the world."""
+    """One run's drones on a wire; `options` are the wire's, and `serve` asks the world for the pace of their `rate`."""
 
     def __init__(self, link: Session, info: Info, observer: Participant, say: Say, options: Any) -> None:
         self.link = link

@@ -23,7 +23,7 @@ STILL: Vector = (0.0, 0.0, 0.0)
 
 
 class AircraftPose(NamedTuple):
-    """Where an aircraft is, and how it moves: of its centre of mass, at `taken_ns` by the clock of this process."""
+    """Position and velocity [W] of an aircraft's centre of mass, its attitude and rate, at `taken_ns` by our clock."""
 
     taken_ns: int
     position_m: Vector
@@ -185,7 +185,7 @@ class Demand(NamedTuple):
 
 
 class AircraftState(NamedTuple):
-    """What is known of an aircraft; `received_ns`: when something of it arrived last, by this process's clock."""
+    """What is known of an aircraft; `received_ns`: when we last received anything from it; None for never."""
 
     state: DroneState = "landed"
     battery_percent: float = 0.0

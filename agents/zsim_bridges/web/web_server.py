@@ -50,9 +50,9 @@ class ServedSite(NamedTuple):
 
 
 async def start_site(app: web.Application, host: str, ports: Sequence[int], shutdown_s: float) -> ServedSite:
-    """Serve an application, on a bounded number of connections, at the first port that is free; ANY_PORT is any one.
+    """Serve an application on the first port that is free, ANY_PORT for any, with a bounded number of connections.
 
-    Requests in progress may take `shutdown_s` [wall] at the end. Raises the OSError of the last port.
+    Requests in progress may take `shutdown_s` [wall] at the end. Raises an OSError if no port can be opened.
     """
     connections = HttpConnections()
     app.middlewares.append(connections.observe)

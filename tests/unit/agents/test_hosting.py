@@ -120,6 +120,7 @@ def test_a_plan_that_a_controller_refuses_is_refused_in_the_same_words(assignmen
     ("override", "path"),
     [
         ("plan.target={yaw: 90}", "plan.target.yaw"),
+        ("plan.target={gap: 9}", "plan.target:"),
         ("plan.trajectory.expressions.yaw=0.1*w*t", "plan.trajectory.expressions.yaw:"),
         ("plan.trajectory={waypoints: [{at_s: 0, values: {yaw: 45}}]}", "plan.trajectory.waypoints[0].values.yaw"),
         ("plan.land_s=5", "plan.land_s"),

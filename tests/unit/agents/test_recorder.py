@@ -86,7 +86,7 @@ def recorded(
 ) -> list[Pair]:
     """Record a run that answers replays, has last values, and sends batches; return what is in the record."""
     link, left = FakeLink(), iter(answers)
-    link.last = LAST | (last or {})
+    link.last = LAST if last is None else last
     link.on_request = lambda key, args: next(left, page([]))  # the world has no more of the gates before the last one
     for passed in (*batches, [clock(99, "stopped")]):
         link.deliver(keys.BATCH, encode_batch(passed))
@@ -107,9 +107,10 @@ def test_a_late_recorder_writes_what_it_hears_twice_once(tmp_path: Path):
     assert stamps(found, keys.CLOCK) == [*range(9), 99]
 
 
-def test_which_run_it_is_is_on_record_however_late_the_recorder_comes(tmp_path: Path):
+@pytest.mark.parametrize("last", [LAST, {}], ids=["answered", "not answered"])
+def test_which_run_it_is_is_on_record_however_late_the_recorder_comes(tmp_path: Path, last: dict[str, bytes]):
     """The replay has lost the world's first words; what the hub still answers comes as it is, once."""
-    found = recorded(tmp_path / "run.mcap", [page(gates(7))], gates(8))
+    found = recorded(tmp_path / "run.mcap", [page(gates(7))], gates(8), last=last)
     assert found[0] == pair(keys.INFO, INFO)
     assert [key for key, _ in found].count(keys.INFO) == 1
 
@@ -117,7 +118,7 @@ def test_which_run_it_is_is_on_record_however_late_the_recorder_comes(tmp_path: 
 def test_the_newest_faults_are_on_record_once(tmp_path: Path):
     first, second, third = (pair(keys.FAULTS, Faults(gate * GATE_NS, gate, ())) for gate in (1, 5, 8))
     for number, passed in enumerate(([*gates(7)], [first, *gates(2), second, *gates(7)])):
-        found = recorded(tmp_path / f"{number}.mcap", [page(passed)], [third, *gates(8)], last=dict([second]))
+        found = recorded(tmp_path / f"{number}.mcap", [page(passed)], [third, *gates(8)], last=LAST | dict([second]))
         assert stamps(found, keys.FAULTS) == ([5, 8], [1, 5, 8])[number]
 
 

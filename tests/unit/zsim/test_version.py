@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import zsim
-from zsim.contract.fingerprint import Membership
+from zsim.runtime.membership import Membership
 from zsim.scenario import scenario_file
 from zsim_world.run.world import World
 

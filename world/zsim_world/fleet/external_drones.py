@@ -47,9 +47,9 @@ class ExternalDrones:
         return i in self._fleet.external
 
     def take(self, drone: str, message: Any, now_ns: int) -> str | None:
-        """Take a Truth or a Status of a driver, by the newest gate; return why it is refused.
+        """Take a Truth or a Status of a driver; return why it is refused.
 
-        Of other messages only the stamp is judged.
+        `now_ns` is the newest gate. Of other messages only the stamp is judged.
         """
         i, t_ns = self._index[drone], message.t_ns
         former = self._poses.get(i) if isinstance(message, Truth) else self._statuses.get(i)

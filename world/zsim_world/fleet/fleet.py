@@ -375,11 +375,11 @@ def _initial_arrays(
     senses = _senses(scenario, sensors, noise)
     watched = Watched(seen=np.zeros((len(drones), SEEN.size)), found=np.zeros(len(drones), dtype=np.int64))
     watched.seen[bodies.external, SEEN.external] = 1.0
-    wind, row = place.wind, np.empty(WIND.size)
-    row[WIND.steady : WIND.steady + 3] = wind.steady_m_s
-    row[WIND.gust], row[WIND.correlation] = wind.gust_m_s, wind.gust_correlation
-    row[WIND.length], row[WIND.speed_min] = wind.gust_length_m, wind.gust_speed_min_m_s
-    return Arrays(time, bodies, boards, numbers, senses, row, noise.gust, watched)
+    wind, air = place.wind, np.empty(WIND.size)
+    air[WIND.steady : WIND.steady + 3] = wind.steady_m_s
+    air[WIND.gust], air[WIND.correlation] = wind.gust_m_s, wind.gust_correlation
+    air[WIND.length], air[WIND.speed_min] = wind.gust_length_m, wind.gust_speed_min_m_s
+    return Arrays(time, bodies, boards, numbers, senses, air, noise.gust, watched)
 
 
 def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) -> Bodies:

@@ -203,7 +203,7 @@ class Barrier:
             return self._run_id_refusal(message.run_id)
         former = participant.done_seq
         if message.incarnation != participant.join.incarnation:
-            if former is not None and message.seq == former + 1:  # refused, it was not lost
+            if former is not None and message.seq == former + 1:  # it was refused, not lost
                 participant.done_seq = message.seq
             return _incarnation_refusal(participant, str(message.incarnation))
         if message.done_ns > now_ns:

@@ -210,7 +210,7 @@ class Taken(Entry, tag=0):
         except DecodeError as error:
             run.history.add_foreign(key, payload)
             run.refuse("somebody", key, error)
-            with suppress(DecodeError):  # count it for its sender, if known, or his done would be short of an output
+            with suppress(DecodeError):  # counted for its sender, if known, whose done would be short of an output
                 head = _head(key, payload)
                 run.world.count_output(head.controller or head.source)
 

@@ -34,7 +34,7 @@ class RunOutbox:
     Attributes:
         pending: keys and messages in order.
         numbers: the `seq` of the next message on each key.
-        refusals, refused_requests: of messages and of requests on `world/control`, also those that were no event.
+        refusals, refused_requests: of messages, and of requests on `world/control`; all of them, not only the events.
         left_out: number of events that were not published because there had been enough like them.
     """
 

@@ -320,7 +320,7 @@ class Playback(Coordinator):
         return None
 
     def _timeline(self, _: ControlRequest) -> ControlAnswer:
-        """Answer how far the record goes and what happened when [s]: the events but for commands, of many some."""
+        """Answer which time the record covers [s], and its events but for commands; of many, evenly thinned out."""
         last = self._reader.last(keys.CLOCK)
         first = next(self._reader.messages([keys.CLOCK]), last)
         span = {"from_s": first.t_ns / 1e9, "to_s": last.t_ns / 1e9} if first and last else {}

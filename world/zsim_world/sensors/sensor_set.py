@@ -135,7 +135,8 @@ def schedule(sensors: FleetSensors, tick_ms: float) -> NDArray[np.int64]:
 
 def latencies(sensors: FleetSensors) -> NDArray[np.int64]:
     """Return t_ns - t_sample_ns of each drone and sensor [ns], (N, S)."""
-    return np.array([[round(each.latency_ms * 1_000_000) if each else 0 for each in own] for own in sensors.settings])
+    ms = [[0.0 if each is None else each.latency_ms for each in own] for own in sensors.settings]
+    return np.array([[round(latency * 1_000_000) for latency in own] for own in ms])
 
 
 def samples_per_gate(sensors: FleetSensors, gate_ms: float) -> int:

@@ -77,7 +77,7 @@ class Admission:
         self._look_wall_ns = wall_ns
         for name in list(self._withheld):
             self._check(name, wall_ns)
-        for name in list(self._standing_ns):  # note who has a token, and report those that have had the time
+        for name in list(self._standing_ns):  # forget who has proved to exist, report who never had a token
             participant = self._barrier.participants.get(name)
             if participant is None or not participant.alive:
                 del self._standing_ns[name]

@@ -96,7 +96,8 @@ class LivelinessMonitor:
     def check_due(self) -> None:
         """Check the processes that are due.
 
-        One without a token is dead; it is checked again where it has one, or one that is too new to be known.
+        A process without a token is dead, unless it is so new that its token may not be known yet. That one is checked
+        again, and so is one that has a token.
         """
         self._take_lost()
         now_ns = time.monotonic_ns()

@@ -192,7 +192,7 @@ class RunJournal:
                 self._number = numbers[-1]
                 whole = [number for number in numbers if number == 0 or self._checkpoint(number)]
                 if not whole:
-                    raise RunError(f"{self._folder}: no checkpoint is whole; the run cannot be gone on with")
+                    raise RunError(f"{self._folder}: no checkpoint is whole; the run cannot be continued")
                 self._first = whole[-2] if len(whole) > 1 else whole[0]
                 found = self._checkpoint(self._first) if self._first else Checkpoint(None, 0)
             self._file = self._open_entries(self._number)

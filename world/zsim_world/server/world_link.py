@@ -161,7 +161,7 @@ class WorldOutputs:
         self._gate_keys = [keys.gate(name) for name in run.world.names]
 
     def gather(self) -> None:
-        """Encode the outbox and keep it: the messages of a gate as one, as one of each drone that is read, and each."""
+        """Encode the outbox and keep it; a gate as one message, as one for each drone, if read, and singly."""
         outbox = self._run.world.take_outbox()
         if not outbox:
             return

@@ -39,7 +39,10 @@ COLOURS = {  # B, G, R by grey; chosen: dry grass, white lines, a hazy blue sky
 
 
 class Level(NamedTuple):
-    """A level of the ground: how far it may be drawn [m], the homography (3, 3) from (x, y, 1) of W to texels."""
+    """A level of the ground: its texels, the side of one, and how far it is drawn [m].
+
+    `place` is the homography (3, 3) from (x, y, 1) of W [m] to texels, whose centres are at whole numbers.
+    """
 
     texels: Grey
     texel_m: float

@@ -102,11 +102,19 @@ class ClusterSpace(ABC):
 
     @abstractmethod
     def jacobian(self, p_W: Array, yaw: Array) -> Array:
-        """Return J (4n, 4n) with c_dot = J r_dot; r_dot ordered (vx, vy, vz, yaw rate) robot by robot, W."""
+        """Return J (4n, 4n) with c_dot = J r_dot; r_dot ordered (vx, vy, vz, yaw rate) robot by robot, W.
+
+        Raises:
+            SingularClusterError: as in `forward`.
+        """
 
     @abstractmethod
     def inverse_jacobian(self, c: Array) -> Array:
-        """Return J^-1 (4n, 4n) with r_dot = J^-1 c_dot, in closed form."""
+        """Return J^-1 (4n, 4n) with r_dot = J^-1 c_dot, in closed form.
+
+        Raises:
+            SingularClusterError: as in `inverse`.
+        """
 
     @abstractmethod
     def spread(self, c: Array) -> float:
@@ -166,7 +174,7 @@ class ClusterSpace(ABC):
 
 
 def checked(space: ClusterSpace) -> ClusterSpace:
-    """Make every method of a user's space refuse, by a UserCodeError, what is no finite number of the right shape."""
+    """Make all methods of a user's space raise UserCodeError for results that are not finite or of another shape."""
     n, size = space.n, space.size
     shapes: dict[str, tuple[tuple[int, ...], ...]] = {
         "forward": ((size,),),

@@ -30,7 +30,7 @@ def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
 
     Raises:
         ValueError: the template is in one line.
-        DocumentError, UserCodeError: a user's class cannot be loaded; or made.
+        DocumentError: a user's class cannot be loaded; UserCodeError: it cannot be instantiated.
     """
     starts = _starts(scenario, cluster.drones)
     if not cluster.groups:

@@ -69,9 +69,9 @@ def test_the_range_errs_by_no_more_than_so_much_at_any_range(ranges_m: Any, rms:
 )
 def test_sigmas_hold_at_dusk_when_the_body_turns_and_behind_a_lens_that_distorts(camera: Camera, fields: Any) -> None:
     of_all = errors(camera, 120, seed=5, ranges_m=(1.5, 6.0), **fields)
-    assert len(of_all) > 95
-    assert np.sqrt((of_all[:, 1:3] ** 2).mean()) < 1.5
-    assert np.sqrt((of_all[:, 3] ** 2).mean()) < 1.5
+    assert len(of_all) > 100
+    assert np.sqrt((of_all[:, 1:3] ** 2).mean()) < 1.4
+    assert np.sqrt((of_all[:, 3] ** 2).mean()) < 1.4
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0), (0.8, 0.0), (-0.78, 0.38)])

@@ -117,6 +117,7 @@ def test_what_two_detectors_find_in_one_picture_of_drone_2_counts_once(slower_fi
                 bank.receive(1, "sightings", sighted(1, PLACES[0], of_gate * GATE_NS, source), gate * GATE_S)
         estimates = bank.estimate(gate * GATE_S)
     assert estimates == flown(bank_of(), 900, {1: PLACES[0]})
+    assert estimates[1].sensors["sightings"][0] > 100
 
 
 def test_a_camera_that_the_drone_does_not_have_moves_nobody():

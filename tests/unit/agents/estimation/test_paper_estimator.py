@@ -48,7 +48,7 @@ def test_flights_are_followed_and_the_covariance_of_the_position_is_of_the_right
         of = scenario(yaw_deg=math.degrees(flight.yaw_start))  # as the drone was set down
         estimates = fly(paper(of), readings(flight, of, seed, 40.0), 40.0)
         error = errors(flight, estimates)[round(20.0 / GATE_S) :]
-        assert np.sqrt(np.mean(error[:, :3] ** 2, axis=0)).max() < 0.6  # m
+        assert np.sqrt(np.mean(error[:, :3] ** 2, axis=0)).max() < 0.5  # m
         assert np.sqrt(np.mean(error[:, 3:] ** 2, axis=0)).max() < 0.2  # m/s: of each sample of the aircraft's own
         e, P = errors(flight, estimates)[-1, :3], np.reshape(estimates[-1][1].covariance, (6, 6))[:3, :3]
         nees.append(e @ np.linalg.solve(P, e))

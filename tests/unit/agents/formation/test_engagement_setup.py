@@ -14,7 +14,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.control_law import ControlLaw, ProportionalLaw
 from zsim_agents.formation.engagement_setup import check_plan, engagement_of
-from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
+from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.spaces.triad_cluster import TriadCluster
 
@@ -211,6 +211,14 @@ def test_a_trajectory_that_is_too_fast_is_refused_with_the_factor_that_fits() ->
     assert refusal(pair(way(7, 10))) == ""
     slow = pair(way(7, 10), limits={"horizontal_speed_m_s": 0.5})  # than its controller asks
     assert factor(refusal(slow)) == pytest.approx(1.5 * 0.7 / 0.5 / 0.8, rel=0.01)
+
+
+def test_a_plan_is_not_judged_from_where_the_formation_is_singular(monkeypatch: pytest.MonkeyPatch) -> None:
+    def condition(self: ClusterSpace, c: Array) -> float:
+        raise SingularClusterError("in line")
+
+    monkeypatch.setattr(ClusterSpace, "condition", condition)
+    assert refusal(pair(way(30, 10))) == ""
 
 
 def test_an_expression_is_judged_over_its_time() -> None:

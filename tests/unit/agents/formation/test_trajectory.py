@@ -392,3 +392,8 @@ def test_a_reference_made_of_its_state_has_the_same_bits(reference):
     for t_s in np.linspace(0.0, 12.0, 49):
         for part, same in zip(reference.value(t_s), again.value(t_s), strict=True):
             assert np.array_equal(part, same)
+
+
+def test_only_references_of_this_module_have_a_state():
+    with refused(TypeError, "reference", "float"):
+        state_of(1.0)  # type: ignore[arg-type]

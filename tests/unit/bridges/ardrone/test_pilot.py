@@ -41,7 +41,9 @@ def flown(count: int, state: DroneState | None = None) -> Step:
 TAKE_OFF, LAND, STOP = ref(takes_off=True), ref(takes_off=False), ref(takes_off=False, emergency=True)
 TAKE_OFF_AND_STOP = ref(takes_off=True, emergency=True)
 HELD = [
-    step for state in ("landed", "taking_off", "hovering", "landing", "landed") for step in (TAKE_OFF, gates(1, state))
+    step
+    for state in ("landed", "taking_off", "hovering", "landing", "landed", "landed")
+    for step in (TAKE_OFF, gates(1, state))
 ]
 MODES: dict[str, tuple[list[Step], list[str]]] = {
     "a single REF takes off once": ([TAKE_OFF, flown(40, "taking_off")], ["takeoff"]),

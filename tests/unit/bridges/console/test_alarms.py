@@ -216,6 +216,8 @@ def test_the_check_of_a_fit_drone_names_all_its_points():
     checks = preflight_checks(FIT._replace(is_external=True, link_state="armed", link_age_s=0.2), True)
     assert [check.name for check in checks] == ["battery", "upright", "estimator", "link", "control"]
     assert not any(check.blocks and not check.ok for check in checks)
+    stray = FIT._replace(link_state="lost", link_age_s=9.0)  # anybody may publish the link of a drone that has none
+    assert formation_refusals(run(stray), "main")["takeoff"] == ""
     lines = preflight_lines({"drone1": checks})
     assert has_terms(without_tags(lines), "✓", "73 %", "σ 0.20 m", "armed", "free")
     assert "<b>" not in preflight_lines({"drone1": (Check("control", "<b>x</b>", False),)}).partition("</b>")[2]

@@ -237,6 +237,11 @@ def test_what_is_no_message_is_counted(watched: Run, key: str, payload: bytes):
     assert watched.health.refused == 1
 
 
+def test_a_picture_too_large_is_not_even_kept(watched: Run):
+    watched.say(keys.camera("drone1", "front"), bytes(PICTURE_BYTES_MAX + 2000))
+    assert watched.feed.state()[0]["refused"] == 1  # before anything looks at it
+
+
 # Sightings
 
 

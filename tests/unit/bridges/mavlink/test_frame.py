@@ -46,12 +46,13 @@ def damaged(version: Version) -> bytes:
         (damaged(2), "bad_crc", 1),
         (framed(bytes((1, 0, 0, 0, 1, 1)) + (50_000).to_bytes(3, "little") + b"\x07"), "unknown", 1),
         (framed(bytes((1, 0x02, 0, 0, 1, 1, 0, 0, 0, 7)), HEARTBEAT_EXTRA), "incompatible", 1),
-        (b"hello", "noise", 5),
+        (b"hello", "noise", 8),
     ],
 )
 def test_what_is_no_frame_of_ours_is_counted_and_the_next_one_is_read(data: bytes, reason: str, count: int) -> None:
     parser = Parser()
-    assert [received.message for received in parser.feed(data + Link(1, 1).pack(MESSAGES[0]))] == [MESSAGES[0]]
+    datagram = data + Link(1, 1).pack(MESSAGES[0]) + b"bye"
+    assert [received.message for received in parser.feed(datagram)] == [MESSAGES[0]]
     assert parser.refused[reason] == count
 
 

@@ -115,12 +115,12 @@ def test_the_clock_is_simulated_time():
 def test_numbers_beyond_the_fields_of_ros_are_refused_and_told_once_and_the_next_are_passed_on():
     bench = Bench()
     navdata = Subscriber(bench.node, "/quad_1/ardrone/navdata")
+    bench.bridge.forward(keys.status("quad-1"), b"garbage")
     for gate, range_m in ((1, 1e30), (2, 1e30), (3, 1.5)):
         t_ns = gate * GATE_NS
         sonar = messages.Sonar(t_ns, gate, t_ns, range_m, True)
         bench.bridge.forward(keys.sensor("quad-1", "sonar"), messages.encode(sonar))
         bench.bridge.forward(keys.status("quad-1"), messages.encode(status(t_ns)))
-    bench.bridge.forward(keys.status("quad-1"), b"garbage")
     assert [message.altd for message in navdata.ros_messages] == [1500]
     assert bench.observer.health.refused == 3
     (line,) = bench.lines

@@ -153,6 +153,11 @@ class Flight:
     def take_off(self) -> None:
         self.command("mode", flight_messages.Mode(0, 0, "controller.main", "takeoff"))
 
+    async def fly(self) -> None:
+        """Let the aircraft be in the air, where the driver holds it."""
+        self.aircraft.state = "flying"
+        await self.aircraft.until("hold")
+
     def ask(self, op: Any) -> Any:
         return self.link.ask(
             keys.driver("drone2"), msgspec.msgpack.encode({"op": op, "args": {}, "source": "operator"})
@@ -205,8 +210,7 @@ async def test_it_flies_when_it_is_armed_and_lands_what_flies_before_it_leaves()
 @in_loop
 async def test_kill_reaches_the_aircraft_at_once_and_shows() -> None:
     async with Flight(armed=True) as flight:
-        flight.aircraft.state = "flying"
-        await flight.aircraft.until("hold")
+        await flight.fly()
         assert (await flight.answered("kill")).ok
         await flight.aircraft.until("kill")
         await flight.gate()
@@ -216,8 +220,7 @@ async def test_kill_reaches_the_aircraft_at_once_and_shows() -> None:
 @in_loop
 async def test_a_stop_of_the_motors_goes_on_after_the_run_until_they_stand() -> None:
     async with Flight(armed=True) as flight:
-        flight.aircraft.state = "flying"
-        await flight.aircraft.until("hold")
+        await flight.fly()
         assert (await flight.answered("kill")).ok
         flight.stop = True
         for _ in range(20):
@@ -232,8 +235,7 @@ async def test_a_stop_of_the_motors_goes_on_after_the_run_until_they_stand() -> 
 async def test_who_cannot_land_is_left_to_a_person_with_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(driver, "LANDING_S", 0.1)
     async with Flight(armed=True) as flight:
-        flight.aircraft.state = "flying"
-        await flight.aircraft.until("hold")
+        await flight.fly()
         flight.aircraft.state, flight.stop = "landing", True
         await asyncio.wait_for(flight.task, 30)
         assert has_terms(flight.lines[-1], ME, "landing", "by hand")
@@ -288,8 +290,7 @@ async def test_a_socket_that_cannot_be_had_is_refused_with_what_to_change(
 @in_loop
 async def test_a_driver_whose_place_another_has_taken_does_not_land_the_aircraft() -> None:
     async with Flight(armed=True) as flight:
-        flight.aircraft.state = "flying"
-        await flight.aircraft.until("hold")
+        await flight.fly()
         data = {"incarnation": 7, "host": flight.link.host, "pid": 1, "from_ns": 0}
         flight.link.deliver(keys.EVENT, Event(0, 0, "superseded", ME, ME, "", data))
         await asyncio.wait_for(flight.task, 30)

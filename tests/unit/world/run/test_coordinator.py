@@ -130,6 +130,7 @@ def test_a_loss_a_join_and_a_request_are_the_same_from_the_journal(method: str, 
     made, again = world("return_s: 2"), world("return_s: 2")
     assert getattr(made, method)(*args) == Run(again, HealthMeter("world")).enter(entry)
     assert news(made) == news(again)
+    assert made.barrier.participants == again.barrier.participants
 
 
 # One that never comes

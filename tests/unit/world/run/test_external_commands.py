@@ -165,6 +165,14 @@ def test_views_and_the_hash_know_who_is_external(world: World):
     assert moved.result()["truth_sha256"] != alone.result()["truth_sha256"]
 
 
+def test_the_result_has_the_least_distance_of_the_whole_run(world: World):
+    for x_m in (4.0, 2.0, 3.0):
+        pose = Truth(world.now_ns, 0, (x_m, 0.0, 0.058), ZEROS, (1.0, *ZEROS), ZEROS, ZEROS, (300.0,) * 4)
+        assert world.take_of_driver("d2", pose) is None
+        world.advance(0)
+    assert world.result()["closest_m"] == pytest.approx(2.0, abs=0.01)
+
+
 def test_the_hash_is_that_of_the_simulated_drones():
     only = world_of(SCENARIO.replace("  - {name: d2, position_m: [4, 0, 0], body: external}\n", ""), "lockstep")
     mixed = world_of()

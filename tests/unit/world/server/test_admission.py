@@ -234,7 +234,7 @@ def test_one_that_does_not_gate_joins_at_once(case: Case) -> None:
 def test_who_never_publishes_a_done_is_dropped_but_not_while_time_stands_for_another_too(
     case: Case, keeps_up: bool
 ) -> None:
-    """Where ME does not keep up, it may be for ME that the visitor has published nothing."""
+    """Where ME does not keep up, that may be why the visitor has published nothing."""
     case.show(VISITOR, "v")
     case.join(VISITOR, pid=9, incarnation=1)
     case.fly() if keeps_up else case.advance()

@@ -104,7 +104,7 @@ def test_a_checkpoint_of_another_fleet_is_refused(tmp_path: Path):
 
 @pytest.mark.parametrize("is_complete", [True, False])
 def test_what_follows_an_end_is_noted_after_the_last_gate_only(is_complete: bool):
-    """An end before the last gate is taken back by who continues the run, whose recorder must not read of it."""
+    """Continuing a run undoes an end before its last gate; its recorder must not read of that end."""
     noted: list[Entry] = []
     run = Run(World(scenario_file.from_text(SCENARIO), run_id="run1"), HealthMeter(WORLD), noted.append)
     end = run.world.clock.complete if is_complete else run.world.clock.stop

@@ -15,7 +15,7 @@ from zsim.contract.framing import decode_batch
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Done, Event, Health, Join
 from zsim.errors import DecodeError
 from zsim.runtime.health import HealthMeter
-from zsim.scenario import scenario_file
+from zsim.scenario import roles, scenario_file
 from zsim.schema.message import Message
 from zsim_world.fleet.fleet import DivergedError
 from zsim_world.run.world import DURATION_OVER, World
@@ -121,6 +121,8 @@ def test_how_a_camera_sees_is_kept_and_handed_on_and_its_pictures_are_not():
     assert process.health.refused == 0
     assert process._history.last(FRONT_INFO) == [(FRONT_INFO, messages.encode(info()))]
     assert process._history.last(FRONT) == []
+    assert any(keys.matches(expression, FRONT_INFO) for expression in roles.LAST_VALUES)
+    assert not any(keys.matches(expression, FRONT) for expression in roles.LAST_VALUES)
     passed = [key for at, payload in link.published if at == keys.BATCH for key, _ in decode_batch(payload)]
     assert [key for key in passed if key in (FRONT_INFO, FRONT, DETECTIONS)] == [FRONT_INFO, DETECTIONS]
 

@@ -76,6 +76,11 @@ def test_heading_is_counter_clockwise_from_east():
     assert math.isclose(float(frames.heading(q)), math.pi / 2)
 
 
+def test_wrap_angle():
+    wrapped = frames.wrap_angle([math.pi, -math.pi, 3 * math.pi / 2])
+    np.testing.assert_allclose(wrapped, [-math.pi, -math.pi, -math.pi / 2])
+
+
 ORIGIN = (-34.603, -58.368, 25.0)
 
 

@@ -337,6 +337,13 @@ def test_a_steady_trickle_reaches_the_disk_without_ticks(tmp_path):
             assert len(read(path)) >= i - 5
 
 
+def test_closing_twice_does_nothing(tmp_path):
+    writer = RecordWriter(tmp_path / "run.mcap")
+    writer.close()
+    writer.close()
+    assert read(tmp_path / "run.mcap") == []
+
+
 def test_no_more_than_a_chunk_is_held_back(tmp_path):
     path, payload = tmp_path / "run.mcap", random.Random(4).randbytes(1000)
     with RecordWriter(path) as writer:

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from zsim.contract import messages
 from zsim.errors import RecordError, ZsimError
-from zsim.record import Recorded, RecordReader, RecordWriter, mcap_layout
+from zsim.record import Recorded, RecordReader, RecordWriter, mcap_layout, repair
 from zsim.record.mcap_layout import (
     CHUNK_HEAD,
     CHUNK_MAX,
@@ -224,6 +224,7 @@ def to_summary(path: Path) -> Made:
 
 
 WORKS: tuple[tuple[Callable[[Path], object], int], ...] = (
+    (repair, FLIPS),
     (to_summary, 8),
     (to_csv, 8),
     (to_foxglove, 5),

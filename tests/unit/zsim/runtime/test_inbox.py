@@ -234,6 +234,13 @@ def test_duplicates_and_latecomers_are_counted_and_refused():
     assert inbox.next_gate_ns() is None
 
 
+def test_another_number_or_time_is_another_message():
+    inbox = Inbox([STATUS])
+    for t_ns, seq in ((5, 0), (6, 0), (5, 1)):
+        assert inbox.put(IMU, imu(t_ns, seq))
+    assert [message for _, message in inbox.take(10)] == [imu(5, 0), imu(5, 1), imu(6, 0)]
+
+
 def test_a_long_backlog_is_worked_off_in_order():
     messages_sent = flight(["d1"], 300)
     inbox = Inbox([STATUS], ["d1"])

@@ -497,6 +497,7 @@ def test_a_fault_that_all_drones_share_is_told_once():
         ({"clusters": [{"name": "c", "drones": ["drone1", "drone1"]}]}, ("clusters[0].drones[1]", "'drone1'", "'c'")),
         ({"clusters": [{"name": "c", "drones": ["drone1"]}]}, ("clusters[0].drones", "1", "2", "64")),
         ({"clusters": [{"name": "c", "drones": ["drone1", "drone2"]}, {"name": "d", "drones": ["drone2", "drone3"]}]}, ("clusters[1].drones[0]", "'drone2'", "'c'")),
+        ({"drones": [drone(f"d{k}", 2.0 * k) for k in range(4)], "clusters": [{"name": "c", "drones": ["d0", "d1"]}, {"name": "c", "drones": ["d2", "d3"]}]}, ("clusters[1].name", "'c'", "clusters[0]", "unique")),
         ({"clusters": [{"name": "c", "drones": ["drone1", "drone2"], "plan": {"trajectory": {}}}]}, ("expressions", "waypoints", "'c'")),
         ({"clusters": [{"name": "c", "drones": ["drone1", "drone2"], "plan": {"trajectory": {"expressions": {"x_c": "t"}, "waypoints": [{"at_s": 0, "values": {"x_c": 1}}]}}}]}, ("expressions", "waypoints")),
         ({"clusters": [{"name": "c", "drones": [f"d{k}" for k in range(65)]}]}, ("65", "2", "64")),

@@ -11,6 +11,7 @@ from zsim.errors import DecodeError, DocumentError, ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.faults import kinds_of
 from zsim.scenario.scenario import Scenario
+from zsim.schema import plugin
 from zsim.sensors import sensor_catalogue
 from zsim.sensors.sensor import as_fields, field_types, message_type
 from zsim.sensors.sensor_catalogue import FIELDS, PRESETS, STOCK, declarations
@@ -98,6 +99,19 @@ def test_a_module_that_declares_another_message_than_the_scenario_is_refused():
 )
 def test_a_faulty_section_is_named_once(sensors: dict[str, Any], where: str):
     assert paths(**sensors) == [where]
+
+
+def test_faults_of_sensors_that_are_not_imported_are_passed_over_and_no_others():
+    def fault(kind: str) -> dict[str, Any]:
+        return {"kind": kind, "target": "d1", "at_s": 0.1}
+
+    kinds = [
+        f"{name}_{what}" for name in ("my_uwb", "other") for what in ("dropout", "stuck", "bias", "noise", "drift")
+    ]
+    with plugin.names_only():
+        assert paths(my_uwb=UWB, faults=[*map(fault, kinds)]) == [f"faults[{place}].kind" for place in range(4, 10)]
+        assert scenario(second={"my_uwb": UWB}, faults=[fault("my_uwb_bias")]).faults
+    assert paths(my_uwb={"module": "not_here"}, faults=[fault("my_uwb_stuck")]) == ["sensors.my_uwb.module"]
 
 
 def module(path: Path, name: str, text: str) -> dict[str, str]:

@@ -149,6 +149,16 @@ def test_who_comes_back_to_do_it_again_is_kept_out_for_a_while():
     assert len(case.sockets.closed) == SPARED + 1
 
 
+def test_who_is_kept_out_loses_its_other_links_in_the_same_look():
+    case, other = Case(), "192.168.1.2:41999"
+    case.link.ends[other] = case.link.ends[READER]
+    for number in range(SPARED):
+        case.sockets.held = {READER: HELD_BYTES, **({other: 0} if number == SPARED - 1 else {})}
+        while READER in case.sockets.held:
+            case.passes(LOOK_S)
+    assert case.sockets.closed == [READER] * SPARED + [other]
+
+
 def test_of_a_session_one_closed_link_is_reported_in_a_while_with_their_number():
     case = Case()
     for _ in range(SPARED - 1):

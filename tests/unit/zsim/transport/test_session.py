@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 import zenoh
 
+from zsim.errors import SessionError
 from zsim.transport.session import Session, open_session
-from zsim.transport.tls import Identity
+from zsim.transport.tls import Identity, Permissions
 
 ALONE = ("unshare", "--map-root-user", "--mount")  # Linux: mounts that nobody else sees
 WITH_SHM = "mount -t tmpfs -o {options} tmpfs /dev/shm && exec {python} -c '{code}'"
@@ -50,6 +51,13 @@ def test_a_far_end_that_takes_nothing_does_not_fail_who_leaves(monkeypatch: pyte
     with open_session({}, "zsim", Identity("here"), str):
         pass
     assert closed
+
+
+def test_permissions_that_cannot_be_read_are_an_error_of_the_session() -> None:
+    session = Session(SimpleNamespace(), "zsim", Identity("here"))  # type: ignore[arg-type]
+    session.permissions = Permissions("world", "x", {"publish": ("zsim//clock",)})
+    with pytest.raises(SessionError, match="clock"):
+        session.put_raw("clock", b"")
 
 
 class LatePublisher:

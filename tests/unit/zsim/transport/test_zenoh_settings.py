@@ -48,6 +48,5 @@ def test_what_is_only_wanted_is_raised_as_far_as_it_goes(limits: Limits) -> None
 def test_a_hub_needs_what_was_measured_and_room(clients: int, measured: int) -> None:
     assert measured < hub_files(clients) < 2 * measured + zenoh_settings.SESSION_FILES
     assert launcher_files(clients + 1, clients) >= hub_files(clients)
-    assert launcher_files(roles=3, names=clients) >= hub_files(
-        clients
-    )  # a host of many agents: its world waits for all
+    # a host of many agents: its world waits for all
+    assert launcher_files(roles=3, names=clients) >= hub_files(clients)
