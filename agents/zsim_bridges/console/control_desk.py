@@ -170,7 +170,8 @@ class ControlDesk:
         return held | {EVERY} if held else held
 
     def name_of(self, page: int) -> str:
-        return self._pages[page].name if page in self._pages else "a page"
+        known = self._pages.get(page)  # without the lock: it may close meanwhile
+        return known.name if known else "a page"
 
     def _silent_s(self, page: int) -> float:
         known = self._pages.get(page)

@@ -5,7 +5,8 @@ This is the only file that uses internals of viser 1.1 and websockets, which hav
 - refuse one page the use of a control that all pages share (`_guard_controls`),
 - find a control by its id, or the id of a control (`control_ids`, `control_id`, `PageControls`),
 - show a JPEG on a camera's frustum without decoding it (`show_jpeg`),
-- wake the event loop safely from other threads, as viser's message buffer does (`AnyThreadEvent`).
+- wake the event loop safely from other threads, as viser's message buffer does (`AnyThreadEvent`),
+- write to a page that closes meanwhile without a warning (`Buffer`).
 """
 
 import asyncio
@@ -54,15 +55,16 @@ class AnyThreadEvent(asyncio.Event):
             super().set()
 
 
-class _Buffer(AsyncMessageBuffer):
-    """viser's message buffer, which sets its event in every thread, and once more on the loop."""
+class Buffer(AsyncMessageBuffer):
+    """viser's message buffer, which sets its event in every thread, and drops writes to closed pages silently."""
 
     def __init__(self, *args: Any, **more: Any) -> None:
         super().__init__(*args, **more)
         self.message_event = AnyThreadEvent()
+        self._warned_push_after_done = True  # a page may close while a picture is drawn for it
 
 
-viser.infra._infra.AsyncMessageBuffer = _Buffer  # type: ignore[misc]
+viser.infra._infra.AsyncMessageBuffer = Buffer  # type: ignore[misc]
 
 
 class PrivateViser:

@@ -2,14 +2,23 @@
 
 import asyncio
 import threading
+import warnings
 from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import pytest
+from viser._messages import GuiUpdateMessage
 
 from zsim_bridges.console.page_server import OPERATOR, VIEWER
-from zsim_bridges.console.private_viser import AnyThreadEvent, PageControls, PrivateViser, ViewerCamera, is_permitted
+from zsim_bridges.console.private_viser import (
+    AnyThreadEvent,
+    Buffer,
+    PageControls,
+    PrivateViser,
+    ViewerCamera,
+    is_permitted,
+)
 
 CAMERA = msgspec.to_builtins(
     ViewerCamera((1, 0, 0, 0), (1.0, 2.5, 3.0), 1.3, 0.01, 1000, 600, 800, (0, 0, 0), (0, 0, 1))
@@ -120,9 +129,21 @@ def test_another_thread_marks_it_and_the_loop_wakes_who_waits():
     asyncio.run(steps())
 
 
-def test_visers_buffers_have_it():
+def test_visers_buffers_are_ours():
     made = PrivateViser()
     try:
+        assert isinstance(made.server._websock_server._broadcast_buffer, Buffer)
         assert isinstance(made.server._websock_server._broadcast_buffer.message_event, AnyThreadEvent)
     finally:
         made.close()
+
+
+def test_a_write_to_a_page_that_has_closed_is_dropped_without_a_warning():
+    async def steps() -> None:
+        buffer = Buffer(asyncio.get_running_loop(), persistent_messages=False)
+        buffer.done = True
+        buffer.push(GuiUpdateMessage("a", {"value": True}))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        asyncio.run(steps())
