@@ -22,6 +22,22 @@ IN_SIGHT = """() => ['land', 'emergency'].every(name => {
   const inside = box.left >= 0 && box.top >= 0 && box.right <= innerWidth && box.bottom <= innerHeight;
   return inside && document.elementFromPoint(box.x + box.width / 2, box.y + box.height / 2) === button;
 })"""
+FRAME_MS = 2000  # from one frame to the next: without a graphics card each takes a tenth of a second of all processors
+FEW_FRAMES_JS = f"""(() => {{
+  const request = window.requestAnimationFrame.bind(window), cancel = window.cancelAnimationFrame.bind(window);
+  const waiting = new Map();
+  let number = 0, last = 0;
+  window.requestAnimationFrame = act => {{
+    const id = ++number, wait = Math.max(0, last + {FRAME_MS} - performance.now());
+    waiting.set(id, setTimeout(() => request(now => {{
+      if (!waiting.delete(id)) return;
+      last = performance.now();
+      act(now);
+    }}), wait));
+    return id;
+  }};
+  window.cancelAnimationFrame = id => {{ clearTimeout(waiting.get(id)); waiting.delete(id); }};
+}})();"""
 POLL_MS = 100  # between two looks at what a page shows
 PATIENCE_MS = 1000 * PATIENCE_S
 HOLD_MS = 600  # of orders.html: as long a button of an emergency or a take-over is held down
@@ -129,6 +145,7 @@ def opened(browser: Any) -> Iterator[Callable[..., BrowserPage]]:
         def open_it(address: str, viewport: dict[str, int] = VIEWPORT) -> BrowserPage:
             context = browser.new_context(viewport=viewport)
             stack.callback(context.close)
+            context.add_init_script(FEW_FRAMES_JS)
             return BrowserPage(context.new_page(), address)
 
         yield open_it
