@@ -4,7 +4,7 @@ import io
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -22,22 +22,22 @@ IN_SIGHT = """() => ['land', 'emergency'].every(name => {
   const inside = box.left >= 0 && box.top >= 0 && box.right <= innerWidth && box.bottom <= innerHeight;
   return inside && document.elementFromPoint(box.x + box.width / 2, box.y + box.height / 2) === button;
 })"""
-FRAME_MS = 2000  # from one frame to the next: without a graphics card each takes a tenth of a second of all processors
-FEW_FRAMES_JS = f"""(() => {{
+FRAME_MS = 1000  # from one frame of a scene that nobody looks at to the next
+UNDRAWN_JS = f"""(() => {{
+  for (const name of ["drawArrays", "drawElements", "drawArraysInstanced", "drawElementsInstanced"])
+    WebGL2RenderingContext.prototype[name] = () => {{}};
   const request = window.requestAnimationFrame.bind(window), cancel = window.cancelAnimationFrame.bind(window);
-  const waiting = new Map();
-  let number = 0, last = 0;
+  const loops = new WeakSet(), waiting = new Map();
+  let number = 1e9;
   window.requestAnimationFrame = act => {{
-    const id = ++number, wait = Math.max(0, last + {FRAME_MS} - performance.now());
-    waiting.set(id, setTimeout(() => request(now => {{
-      if (!waiting.delete(id)) return;
-      last = performance.now();
-      act(now);
-    }}), wait));
+    if (!loops.has(act)) {{ loops.add(act); return request(act); }}
+    const id = ++number;
+    waiting.set(id, setTimeout(() => {{ waiting.delete(id); request(act); }}, {FRAME_MS}));
     return id;
   }};
-  window.cancelAnimationFrame = id => {{ clearTimeout(waiting.get(id)); waiting.delete(id); }};
+  window.cancelAnimationFrame = id => {{ cancel(id); clearTimeout(waiting.get(id)); waiting.delete(id); }};
 }})();"""
+"""Draws no scene, and slows down what asks for frame after frame: all that costs most without a graphics card."""
 POLL_MS = 100  # between two looks at what a page shows
 PATIENCE_MS = 1000 * PATIENCE_S
 HOLD_MS = 600  # of orders.html: as long a button of an emergency or a take-over is held down
@@ -137,17 +137,24 @@ class BrowserPage:
         return {str(url.hostname) for url in urls if url.scheme not in ("data", "blob")} - {"127.0.0.1"}
 
 
-@pytest.fixture
-def opened(browser: Any) -> Iterator[Callable[..., BrowserPage]]:
-    """Open an address in a browser of its own, with cookies of its own."""
+@contextmanager
+def opening(browser: Any) -> Iterator[Callable[..., BrowserPage]]:
+    """Open an address in a browser of its own, with cookies of its own; the scene is there, but drawn only if `drawn`."""
     with ExitStack() as stack:
 
-        def open_it(address: str, viewport: dict[str, int] = VIEWPORT) -> BrowserPage:
+        def open_it(address: str, viewport: dict[str, int] = VIEWPORT, drawn: bool = False) -> BrowserPage:
             context = browser.new_context(viewport=viewport)
             stack.callback(context.close)
-            context.add_init_script(FEW_FRAMES_JS)
+            if not drawn:
+                context.add_init_script(UNDRAWN_JS)
             return BrowserPage(context.new_page(), address)
 
+        yield open_it
+
+
+@pytest.fixture
+def opened(browser: Any) -> Iterator[Callable[..., BrowserPage]]:
+    with opening(browser) as open_it:
         yield open_it
 
 

@@ -197,7 +197,7 @@ def test_an_operator_sees_three_drones_and_flies_them(
     refused = opened(bare, STRIP)
     refused.wait_for_text("needs the token")
 
-    operator = opened(links["steer"])
+    operator = opened(links["steer"], drawn=True)
     assert "token" not in operator.page.url
     viewer = opened(links["look"], STRIP)
     operator.wait_for_text("running")

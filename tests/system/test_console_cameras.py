@@ -209,7 +209,7 @@ def test_pictures_and_drones_are_shown_on_a_page_that_is_loaded_again(
     role.line("console.1: in run")
     cameras = [f"drone1/{name}" for name in SETTINGS]
     with synthetic_camera.published(federation.client(), ["drone1"], rate_hz=5.0):
-        page = opened(links["steer"], LOW)
+        page = opened(links["steer"], LOW, drawn=True)
         until(page, lambda: numbers(page), lambda seen: list(seen) == cameras and None not in seen.values())
         page.page.reload()
         wait_for_pictures_and_drones(page, cameras)
@@ -225,7 +225,7 @@ def test_what_each_drone_sees_stands_below_the_scene(
     federation.run(TRIAD, "--rate", "1")
     _, links = console(federation)
     client = federation.client()
-    page = opened(links["steer"], LAPTOP)
+    page = opened(links["steer"], LAPTOP, drawn=True)
     page.until("s.drones.length == 3 && s.clock == 'running'")
     strip = page.page.locator("#zsim-cameras")
 
@@ -298,7 +298,7 @@ def test_who_may_only_look_sees_what_the_drones_see(federation: Federation, open
     federation.run(TRIAD, "--rate", "1")
     _, links = console(federation, "--token", "a-good-token")
     client = federation.client()
-    viewer = opened(links["look"], LAPTOP)
+    viewer = opened(links["look"], LAPTOP, drawn=True)
     with synthetic_camera.published(client, THREE):
         wait_until_all_change(viewer, SIX)
         viewer.page.locator(".mantine-Notification-closeButton").click()

@@ -12,7 +12,6 @@ from staged_console import StagedRun, staged_console
 pytestmark = [
     needs_browser,
     pytest.mark.soak,
-    pytest.mark.filterwarnings("ignore:Queued a "),  # of viser, where a page is closed just then
 ]
 
 GRID = Path(__file__).parents[2] / "scenarios" / "grid30.yaml"

@@ -1,19 +1,18 @@
 """Every panel of the console at the sizes of a desk's screen, of a laptop's and of a phone's."""
 
+import time
 from collections.abc import Callable, Iterator
 
 import pytest
 from chromium import needs_browser
-from console_browser import IN_SIGHT, PATIENCE_MS, SCREENS, BrowserPage
+from console_browser import IN_SIGHT, SCREENS, BrowserPage
 from page_overflow import overflow
 from staged_console import StagedRun, staged_console
+from wire import PATIENCE_S
 
-pytestmark = [
-    needs_browser,
-    pytest.mark.filterwarnings("ignore:Queued a "),  # of viser, where a page is closed just then
-]
+pytestmark = needs_browser
 
-LOOKS = 20  # at a page that is laid out anew, within the tests' patience
+LOOK_MS = 250  # between two looks at a page that is laid out anew
 TIMELINE = {"from_s": 0.0, "to_s": 400.0, "marks": [{"t_s": 20.0, "kind": "mode", "text": "take off"}]}
 FORMS, TABLES = ("Fly", "Plots", "Faults", "Run"), ("Drones", "Events")
 LONG = "link_loss of drone1/estimator.drone1 begins with a probability of 0.3, as was asked for by console.1"
@@ -83,11 +82,9 @@ def replay() -> Iterator[str]:
 
 def settled(page: BrowserPage) -> list[str]:
     """Return what is cut off once the page has had time to lay itself out."""
-    faults = overflow(page.page)
-    for _ in range(LOOKS):
-        if faults:
-            page.page.wait_for_timeout(PATIENCE_MS / LOOKS)
-            faults = overflow(page.page)
+    until_s = time.monotonic() + PATIENCE_S
+    while (faults := overflow(page.page)) and time.monotonic() < until_s:
+        page.page.wait_for_timeout(LOOK_MS)
     return faults
 
 
@@ -113,14 +110,24 @@ def test_nothing_is_cut_off_on_any_panel_at_any_size(
 
 
 @pytest.mark.slow
-def test_drones_in_an_emergency_have_all_their_figures_in_sight(opened: Callable[..., BrowserPage]) -> None:
+def test_in_an_emergency_plots_are_drawn_at_once_and_drones_have_all_their_figures_in_sight(
+    opened: Callable[..., BrowserPage],
+) -> None:
     with staged_console(StagedRun(state="emergency", drain_percent_s=DRAIN_PERCENT_S)) as address:
-        page = opened(address, SCREENS[0])
+        page = opened(address, SCREENS[1])
         page.page.locator("td", has_text="min").first.wait_for()
+
+        # plots have curves as soon as they are opened, and hold their width
+        page.select_tab("Plots")
+        page.page.wait_for_function(DRAWN_JS)
+        widths, shown_s = page.page.evaluate(WIDTHS_JS), page.state()["t_s"]
+        page.until(f"s.t_s > {shown_s + 2.0}")
+        assert page.page.evaluate(WIDTHS_JS) == widths
+
         found = {}
+        page.select_tab("Drones")
         for size in (LOW, *SCREENS[:2]):
             page.page.set_viewport_size(size)
-            page.select_tab("Drones")
             if faults := settled(page):
                 found[f"{size['width']} × {size['height']}"] = faults
         assert found == {}
@@ -164,19 +171,6 @@ def test_a_phone_shows_the_scene_above_one_panel(flight: str, opened: Callable[.
 
 
 @pytest.mark.slow
-def test_plots_have_curves_as_soon_as_they_are_opened_and_hold_their_width(
-    flight: str, opened: Callable[..., BrowserPage]
-) -> None:
-    page = opened(flight, SCREENS[1])
-    page.wait_for_text("running")
-    page.select_tab("Plots")
-    page.page.wait_for_function(DRAWN_JS)
-    widths, shown_s = page.page.evaluate(WIDTHS_JS), page.state()["t_s"]
-    page.until(f"s.t_s > {shown_s + 2.0}")
-    assert page.page.evaluate(WIDTHS_JS) == widths
-
-
-@pytest.mark.slow
 @pytest.mark.soak
 def test_a_plot_keeps_its_size_where_the_cursor_enters_it(flight: str, opened: Callable[..., BrowserPage]) -> None:
     page = opened(flight, SCREENS[1])
@@ -208,7 +202,7 @@ def test_plots_of_a_run_that_is_over_have_curves_of_any_variable(opened: Callabl
 @pytest.mark.slow
 @pytest.mark.soak
 def test_the_dark_theme_is_one_pages_and_all_of_it_is_dark(replay: str, opened: Callable[..., BrowserPage]) -> None:
-    page, other = opened(replay, SCREENS[1]), opened(replay, SCREENS[1])
+    page, other = opened(replay, SCREENS[1], drawn=True), opened(replay, SCREENS[1], drawn=True)
     for each in (page, other):
         each.wait_for_text("running")
         each.select_tab("Run")
@@ -226,7 +220,7 @@ def test_the_dark_theme_is_one_pages_and_all_of_it_is_dark(replay: str, opened: 
 @pytest.mark.slow
 @pytest.mark.soak
 def test_the_grid_is_on_the_ground_from_any_height(flight: str, opened: Callable[..., BrowserPage]) -> None:
-    page = opened(flight, SCREENS[1])
+    page = opened(flight, SCREENS[1], drawn=True)
     page.wait_for_text("running")
     page.press("Side")
     page.until_ground(lambda _, contrast: contrast > GRID_CONTRAST)

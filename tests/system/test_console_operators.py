@@ -19,7 +19,6 @@ pytestmark = [
     needs_browser,
     pytest.mark.slow,
     pytest.mark.soak,
-    pytest.mark.filterwarnings("ignore:Queued a "),  # of viser, where a page is closed just then
 ]
 
 SCREENS = ({"width": 1440, "height": 900}, {"width": 1024, "height": 768}, {"width": 390, "height": 844})

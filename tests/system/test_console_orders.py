@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from chromium import needs_browser
-from console_browser import IN_SIGHT, PATIENCE_MS, BrowserPage, console
+from console_browser import IN_SIGHT, PATIENCE_MS, BrowserPage, console, opening
 from federation import Federation
 from page_overflow import overflow
 from staged_console import StagedRun, staged_console
@@ -19,7 +19,8 @@ pytestmark = needs_browser
 
 SIZES = ({"width": 1440, "height": 900}, {"width": 1024, "height": 768}, {"width": 390, "height": 844})
 LATE_MS, LOST_MS = 1000, 3000  # as there
-STALL_MS = 5000  # of the page; above LOST_MS
+STALL_MS = 3500  # of the page; above LOST_MS
+PAST_S = 5.0  # of the staged run; nobody looks at it
 REST_MS = 1500  # after which sliders that rest are sent; above REST_S
 STALL_JS = "ms => { const until = performance.now() + ms; while (performance.now() < until); }"
 ROW = "#zsim-orders [data-state={}]"
@@ -56,7 +57,7 @@ def row(page: BrowserPage, state: str, *terms: str) -> str:
 def test_no_order_is_lost_where_page_console_or_world_stand_still(
     federation: Federation, opened: Callable[..., BrowserPage]
 ) -> None:
-    federation.run(TRIAD, "--rate", "2")
+    federation.run(TRIAD, "--rate", "1")
     role, links = console(federation)
     page = opened(links["steer"], SIZES[1])
     head = page.page.locator("#zsim-head")
@@ -122,10 +123,13 @@ def test_no_order_is_lost_where_page_console_or_world_stand_still(
 
 
 @pytest.fixture(scope="module")
-def staged() -> Iterator[tuple[StagedRun, str]]:
-    run = StagedRun()
-    with staged_console(run) as address:
-        yield run, address
+def staged(browser: Any) -> Iterator[tuple[StagedRun, BrowserPage]]:
+    """A run, and a page of it that the tests of this file share; each leaves it as it was."""
+    run = StagedRun(past_s=PAST_S)
+    with staged_console(run) as address, opening(browser) as open_it:
+        page = open_it(address, SIZES[1])
+        page.wait_for_text("running")
+        yield run, page
 
 
 def asked(run: StagedRun, op: str) -> list[dict[str, Any]]:
@@ -134,11 +138,9 @@ def asked(run: StagedRun, op: str) -> list[dict[str, Any]]:
 
 @pytest.mark.slow
 def test_what_is_typed_is_asked_for_or_refused_and_never_changed_to_a_limit(
-    staged: tuple[StagedRun, str], opened: Callable[..., BrowserPage]
+    staged: tuple[StagedRun, BrowserPage],
 ) -> None:
-    run, address = staged
-    page = opened(address, SIZES[1])
-    page.wait_for_text("running")
+    run, page = staged
     for place, name, typed, limit in ((0, "x_c", "100", "50"), (2, "z_c", "300", "30")):
         field = page.page.locator(".mantine-Slider-root + * input").nth(place)
         field.fill(typed)
@@ -162,15 +164,14 @@ def test_what_is_typed_is_asked_for_or_refused_and_never_changed_to_a_limit(
     page.page.wait_for_timeout(LATE_MS)
     assert asked(run, "rate") == [{"value": -1.0}]
     picture(page, "limits")
+    page.select_tab("Fly")
 
 
 @pytest.mark.slow
 def test_a_confirmation_names_drone_place_and_height_and_its_marker_stays(
-    staged: tuple[StagedRun, str], opened: Callable[..., BrowserPage]
+    staged: tuple[StagedRun, BrowserPage],
 ) -> None:
-    run, address = staged
-    page = opened(address, SIZES[1])
-    page.wait_for_text("running")
+    run, page = staged
     page.page.locator("#zsim-flight .map").click()
     page.page.wait_for_function(SEES)
     run.commander = "controller.main"
@@ -207,16 +208,15 @@ def test_a_confirmation_names_drone_place_and_height_and_its_marker_stays(
     flown = page.page.evaluate(MARKER_JS)
     assert (flown["x"], flown["y"], flown["z"]) == (marker["x"], marker["y"], marker["z"])
     page.page.locator("#zsim-flight .leave").click()
+    page.page.locator("#zsim-flight .map").click()
     run.commander = None
 
 
 @pytest.mark.slow
 def test_an_order_that_a_page_repeats_is_carried_out_once(
-    staged: tuple[StagedRun, str], opened: Callable[..., BrowserPage]
+    staged: tuple[StagedRun, BrowserPage],
 ) -> None:
-    run, address = staged
-    page = opened(address, SIZES[1])
-    page.wait_for_text("running")
+    run, page = staged
     bodies: list[dict[str, Any]] = []
 
     def lose(route: Any) -> None:
@@ -236,3 +236,4 @@ def test_an_order_that_a_page_repeats_is_carried_out_once(
     assert len(bodies) == 4
     assert len({body["id"] for body in bodies}) == 1
     assert len(asked(run, "hold")) == held + 1
+    page.page.unroute_all()

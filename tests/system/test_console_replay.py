@@ -9,10 +9,7 @@ from console_browser import SCREENS, BrowserPage
 from page_overflow import overflow
 from staged_console import StagedRun, staged_console
 
-pytestmark = [
-    needs_browser,
-    pytest.mark.filterwarnings("ignore:Queued a "),  # of viser, where a page is closed just then
-]
+pytestmark = needs_browser
 
 TIMELINE = {"from_s": 0.0, "to_s": 400.0, "marks": [{"t_s": 20.0, "kind": "emergency", "text": "rotors stopped"}]}
 AT_S = 300.0  # where the replay is when the page is opened
