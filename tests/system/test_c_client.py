@@ -38,24 +38,25 @@ Build = Callable[..., Path]
 
 @pytest.fixture(scope="module")
 def build(tmp_path_factory: pytest.TempPathFactory) -> Build:
-    """Compile a program with the client, strictly; each with the same flags once."""
+    """Compile a program with the client, strictly; each, and the client, with the same flags once."""
     folder = tmp_path_factory.mktemp("c")
     built: dict[tuple[str, ...], Path] = {}
 
-    def compile_it(source: str, *flags: str) -> Path:
-        if (source, *flags) not in built:
-            program = folder / f"{Path(source).stem}-{len(built)}"
-            files = [str(ROOT / source), str(HERE / "zsim.c")]
-            done = subprocess.run(
-                [str(GCC), *STRICT, *flags, f"-I{HERE}", *files, "-lm", "-o", str(program)],
-                capture_output=True,
-                text=True,
-            )
-            assert done.returncode == 0, done.stderr
-            built[source, *flags] = program
-        return built[source, *flags]
+    def compile_it(source: Path, *flags: str) -> Path:
+        if (str(source), *flags) not in built:
+            made = folder / f"{source.stem}-{len(built)}.o"
+            output(GCC, *STRICT, *flags, f"-I{HERE}", "-c", source, "-o", made)
+            built[str(source), *flags] = made
+        return built[str(source), *flags]
 
-    return compile_it
+    def link(source: str, *flags: str) -> Path:
+        parts = [compile_it(each, *flags) for each in (ROOT / source, HERE / "zsim.c")]
+        program = parts[0].with_suffix("")
+        if not program.exists():
+            output(GCC, *flags, *parts, "-lm", "-o", program)
+        return program
+
+    return link
 
 
 def output(*command: object, **options: object) -> str:

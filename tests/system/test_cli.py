@@ -34,7 +34,7 @@ class Terminal:
 
 
 def test_looking_at_a_run_and_asking_its_controller(federation: Federation) -> None:
-    run = federation.run(PAIR, "--rate", "3", "--duration", "1000")
+    run = federation.run(PAIR, "--rate", "2", "--duration", "1000")
     client = federation.client()
     client.subscribe("clock").until(lambda m: m["t_ns"] > 5.5e9)
     terminal = Terminal(federation)
@@ -59,7 +59,7 @@ def test_looking_at_a_run_and_asking_its_controller(federation: Federation) -> N
     state.until(lambda m: m["phase"] == "held")
     assert terminal("ask", "cluster/main/control", "engage") == "ok\n"
     before = state.until(lambda m: m["phase"] == "engaged").message
-    target = {"values": {"z_c": 2.5}, "over_s": 6}
+    target = {"values": {"z_c": 2.5}, "over_s": 4}
     assert terminal("ask", "cluster/main/control", "target", json.dumps(target)) == "ok\n"
     place = before["names"].index("z_c")
     state.until(lambda m: m["desired"][place] == pytest.approx(2.5))
@@ -152,7 +152,7 @@ def test_validate_prints_what_a_scenario_resolves_to(tmp_path: Path) -> None:
 
 
 def test_report_of_a_run(federation: Federation) -> None:
-    zsim("run", federation.write(PAIR), "--in-process", "--duration", "8", "--no-report", "--out", str(federation.out))
+    zsim("run", federation.write(PAIR), "--in-process", "--duration", "2", "--no-report", "--out", str(federation.out))
     output = zsim("report", str(federation.out)).stdout
     assert f"report: {federation.out / 'report.html'}" in output
     summary = json.loads((federation.out / "summary.json").read_text())

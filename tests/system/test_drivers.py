@@ -34,7 +34,7 @@ def test_two_simulated_drones_and_one_of_hardware_fly_in_formation(hardware: Har
     held = mixed.formation.until(lambda m: m["phase"] != "engaged" or "drone3" in m["reason"]).message
     driver = mixed.drive("drone3", wire, ports)
     again_ns = mixed.engaged_ns(max(held["t_ns"], engaged_ns) + SECOND_NS)
-    until_ns = mixed.engaged_ns(again_ns + 12 * SECOND_NS)
+    until_ns = mixed.engaged_ns(again_ns + 8 * SECOND_NS)
     link = mixed.links.now()[-1].message
     assert (link["state"], link["source"]) == ("armed", "driver.drone3")
     assert link["age_ms"] >= 0

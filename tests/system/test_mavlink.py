@@ -25,7 +25,7 @@ drones:
 {chr(10).join(f"  - {{name: drone{i + 1}, position_m: [{12 * i}, 0, 0], yaw_deg: 90}}" for i in range(DRONES))}
 processes: {{expect: []}}
 """
-PACE = ("--rate", "3")
+PACE = ("--rate", "2")
 ASKED_MAX = 60
 LEAST_READ = 0.95  # of what is sent on UDP to a busy process
 KEY = bytes(range(32))

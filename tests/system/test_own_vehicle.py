@@ -21,7 +21,7 @@ def examples(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("examples")
 def test_a_sweep_compares_vehicles(federation: Federation) -> None:
-    path, out = federation.write(PAIR), federation.folder / "sweep"
+    path, out = federation.write(PAIR.replace("duration_s: 12", "duration_s: 4")), federation.folder / "sweep"
     vary = ("--vary", "drones.drone1.model=ardrone2,crazyflie2,larger_battery", "--workers", "1", "--no-report")
     federation.start("sweep", path, *vary, "--out", str(out)).ends(with_code=0)
     rows = pq.read_table(out / "sweep.parquet").to_pylist()

@@ -13,7 +13,7 @@ from picture_pump import calibration, pumping
 from ros1_graph import RosGraph, numbers
 
 CLIMB = Path(__file__).parent / "ros1_climb.py"
-PACE = ("--rate", "4", "--duration", "3600")
+PACE = ("--rate", "2", "--duration", "3600")
 TRUTH = "/drone1/ground_truth/state/pose/pose/position"
 NAVDATA = """
 Header header

@@ -26,7 +26,7 @@ class Watched:
         self.tokens: list[object] = []  # that live as long as this
         self.incarnation = 0  # of the last join that was made up
         self._incarnations = itertools.count(2**40)
-        self.run = federation.run(PAIR, *(pace or ("--rate", "4")), "--duration", "100000")
+        self.run = federation.run(PAIR, *(pace or ("--rate", "1")), "--duration", "100000")
         self.client: Client = federation.client()
         self.clock: Subscription = self.client.subscribe("clock")
         self.events: Subscription = self.client.subscribe("world/event")

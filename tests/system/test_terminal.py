@@ -36,7 +36,7 @@ def shown(command: list[str], columns: int) -> str:
 
 
 @pytest.mark.usefixtures("compiled")
-@pytest.mark.parametrize("columns", [80, 120])
+@pytest.mark.parametrize("columns", [80, pytest.param(120, marks=pytest.mark.soak)])
 def test_a_run_in_one_process_leaves_its_outcome_and_its_folder(tmp_path: Path, columns: int) -> None:
     scenario, out = tmp_path / "one.yaml", tmp_path / "run"
     scenario.write_text(ONE)
