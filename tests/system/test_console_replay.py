@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from chromium import needs_browser
 from console_browser import SCREENS, BrowserPage
-from page_overflow import overflow
+from page_overflow import FAULTS_JS
 from staged_console import StagedRun, staged_console
 
 pytestmark = needs_browser
@@ -59,17 +59,18 @@ def test_a_replay_looks_like_one_and_shows_the_record_around_its_cursor(
     assert blue > red > green
     assert page.page.evaluate(TINT_JS) not in ("rgba(0, 0, 0, 0)", "transparent")
     assert head.locator(".acknowledge").is_hidden()
-    assert overflow(page.page) == []
+    page.page.wait_for_function(f"() => ({FAULTS_JS})().length === 0")
 
     # curves on both sides, before anything was played
     page.select_tab("Plots")
     page.page.wait_for_function(FILLED_JS)
+    (first, *_) = page.page.evaluate(CURVE_JS)
 
     # the same after going back, and trails in the scene and on the map
     run.t_s = BACK_S
     run.publish_views()
     page.wait_for_text(f"{BACK_S:.1f} of {TIMELINE['to_s']:.1f} s (20 %)")
-    page.page.wait_for_function(FILLED_JS)
+    page.page.wait_for_function(f"line => ({FILLED_JS})() && ({CURVE_JS})()[0][1][0] !== line", arg=first[1][0])
     page.page.locator("#zsim-flight .map").click()
     trails = "() => JSON.parse(document.getElementById('zsim-map').dataset.trails ?? '[]')"
     page.page.wait_for_function(f"() => {{ const found = ({trails})();"
