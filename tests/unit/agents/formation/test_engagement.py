@@ -2,6 +2,7 @@
 
 import copy
 import math
+from functools import cache
 
 import msgspec
 import numpy as np
@@ -118,6 +119,11 @@ def rising_fleet(noise_m=0.0):
 
 
 def engaged_fleet(noise_m=0.0):
+    return copy.deepcopy(engaged(noise_m))
+
+
+@cache
+def engaged(noise_m):
     fleet = rising_fleet(noise_m)
     fleet.fly_until("assembling")
     while fleet.engagement.request(Order.ENGAGE):
