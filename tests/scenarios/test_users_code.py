@@ -15,10 +15,10 @@ from zsim.schema import plugin
 from zsim.sensors.sensor_catalogue import sensor_type
 from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_analysis.in_process import fly
-from zsim_analysis.report import make_report
 from zsim_analysis.reading.formation import formations_of
 from zsim_analysis.reading.recorded_flight import read_flight
 from zsim_analysis.reading.shortfall import verdict
+from zsim_analysis.report import make_report
 from zsim_analysis.rerun import rerun_record
 from zsim_analysis.sweep import sweep_run
 from zsim_analysis.sweep.sweep_run import Task
