@@ -612,7 +612,7 @@ def restarted(fleet, plan):
     fleet.engagement.warm_start(last.phase, last.desired, last.plan_step)
 
 
-def assert_the_same_from_here(fleet, plan, seconds=25.0):
+def assert_the_same_from_here(fleet, plan, seconds=13.0):
     """Fly the fleet, and a copy whose engagement is another one with the snapshot of the former."""
     copied = copy.deepcopy(fleet)
     copied.engagement = Engagement(SPACE, DRONES, plan=plan)
