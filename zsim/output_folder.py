@@ -5,6 +5,7 @@ are kept apart by locks. Some file systems have none (Lustre, some of NFS, FUSE)
 """
 
 from collections.abc import Collection
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO, Any
@@ -33,6 +34,13 @@ def take_lock(file: IO[Any] | int, shared: bool = False) -> bool:
     except OSError:  # ENOLCK, ENOSYS, EOPNOTSUPP: what a file system answers differs
         return True
     return True
+
+
+def wait_for_lock(file: IO[Any]) -> None:
+    """Lock an open file until it is closed, once no other process holds it; not where the file system has no locks."""
+    if fcntl is not None:
+        with suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_EX)
 
 
 def no_locks(folder: Path) -> str | None:

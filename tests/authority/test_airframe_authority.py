@@ -17,17 +17,21 @@ from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.physics.fleet_arrays import STATE, VEHICLE
 
-# drones with other numbers of rotors or with aerodynamics have kernels of their own, each a minute's compilation
-pytestmark = pytest.mark.xdist_group("airframes")
+pytestmark = pytest.mark.xdist_group("airframes")  # so that no worker waits for another that compiles the kernel
 
-ROTORS = slice(STATE.size, STATE.size + 4)  # of drone a: the fleet has a column more, for the Iris
+ROTORS = slice(STATE.size, STATE.size + 4)  # of drone a: with the Iris there is a column more
 
 
 def fleet_of(**drone: Any) -> Fleet:
-    """Return a fleet of one drone; where it has aerodynamics an Iris stands far away, with which one kernel does for all."""
+    """Return a fleet of one drone.
+
+    Rotors that are no cross, and aerodynamics, have kernels of their own, each a minute's compilation. So where there
+    are some, an Iris with aerodynamics stands far away: one kernel does for all.
+    """
     drones = [{"name": "a", "position_m": [0, 0, 0], **drone}]
-    if any(drone.get("aerodynamics", {}).values()):
-        drones.append({"name": "b", "position_m": [100, 0, 0], "model": "iris"})
+    if "model" in drone or any(drone.get("aerodynamics", {}).values()):
+        far = {"name": "b", "position_m": [100, 0, 0], "model": "iris"}
+        drones.append({**far, "aerodynamics": {"rotor_drag_n_s2_m": 1e-4}})
     return Fleet(resolve({"name": "t", "duration_s": 1, "sensors": {"preset": "paper"}, "drones": drones}))
 
 

@@ -14,7 +14,8 @@ from synthetic_flight import Circle, Flight, estimator, fly, readings, scenario
 
 from zsim.math.frames import wrap_angle
 
-SEEDS = range(8)
+SEEDS = range(4)  # a fault of these leaves the band threefold to a thousandfold
+HEADED = range(6)
 FLYING_S, STANDING_S = 10.0, 1000.0  # instant of the start: within the flight, or after it
 PRECISE = {"position_m": {"noise": 0.02}, "velocity_m_s": {"noise": 0.43}}
 LATE = {
@@ -70,7 +71,7 @@ def test_late_readings_are_worth_what_they_are(case: str):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", cases(CORRELATED, "position, quickly", "accelerometer"))
+@pytest.mark.parametrize("case", cases(CORRELATED, "position, quickly", "velocity", "gyroscope", "accelerometer"))
 def test_correlated_errors_are_not_averaged_away(case: str):
     low, high = band(6, len(SEEDS))
     assert low < mean_nees(CORRELATED[case], 40.0, 10.0) < high
@@ -96,13 +97,13 @@ def test_correlated_errors_are_not_averaged_away(case: str):
 def test_where_the_field_tells_no_heading_it_is_that_of_the_set_down(field: tuple[float, ...], start_s: float):
     end_s, errors, sigmas = 30.0, [], []
     of = scenario(environment={"magnetic_field_ut": list(field)}, yaw_deg=30.0)
-    for seed in range(12):
+    for seed in HEADED:
         flight = Flight(seed, start_s=start_s)
         flight.yaw_start = math.radians(30.0) + 0.05 * np.random.default_rng(seed).standard_normal()
         estimates = fly(estimator(of), readings(flight, of, seed, end_s), end_s)
         errors.append(wrap_angle(estimates[-1][1].yaw_rad - flight.heading(np.array([end_s]))[0]))
         sigmas.append(estimates[-1][1].yaw_sigma_rad)
-    low, high = band(1, 12)
+    low, high = band(1, len(HEADED))
     assert low < np.mean(np.square(errors) / np.square(sigmas)) < high
     assert max(sigmas) < 0.06
 

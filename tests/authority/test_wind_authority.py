@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 import pytest
-from numba import njit
 from scipy import signal
 
+from zsim.math.compiled import kernel
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.physics import air
@@ -24,7 +24,7 @@ def windy(count, seed=1, **parameters):
     return resolve({"name": "t", "duration_s": 1, "seed": seed, "environment": environment, "drones": drones})
 
 
-@njit
+@kernel()
 def blown(row, common, own, start):
     """Return gusts at standing drones, one per row of noise; common (T, 3), own (T, N, 3)."""
     out, gust = np.empty_like(own), start.copy()

@@ -24,7 +24,8 @@ from zsim_analysis.in_process import agents
 from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
-AT_S, FOR_S, DURATION_S = 6.0, 2.0, 9.0  # the formation of PAIR is engaged from 5 s on
+AT_S, FOR_S, DURATION_S = 6.0, 2.0, 9.0
+ENGAGED_S, BRIEF_S = 5.0, 6.5  # from when on the formation of PAIR is engaged
 Document = dict[str, Any]
 LINK = "estimator.drone1/controller.main"
 KILL = "process_kill"
@@ -133,25 +134,35 @@ def undisturbed() -> Flight:
     return fly([])
 
 
+@pytest.fixture(scope="module")
+def briefly_undisturbed() -> Flight:
+    return fly([], duration_s=BRIEF_S)
+
+
 def test_every_kind_is_in_the_matrix() -> None:
     assert {*MATRIX, KILL} == {*KINDS}
 
 
 @pytest.mark.parametrize("kind", MATRIX)
-def test_the_same_bits_twice_and_others_than_without(kind: str, undisturbed: Flight) -> None:
-    """The fault from 6 s on for 2 s, unless it says otherwise.
+def test_other_bits_than_without(kind: str, briefly_undisturbed: Flight) -> None:
+    """The fault from 5 s on for a second, unless it says otherwise.
 
-    Expected: another hash than without it, and the same twice where chance has a part in it; an event at its start and
-    at its end; the flight goes on to the end.
+    Expected: another hash than without it; an event at its start and at its end; the flight goes on to the end.
     """
-    fault = {"kind": kind, "at_s": AT_S, "for_s": FOR_S, **MATRIX[kind]}
-    first = fly([fault])
-    assert first.sha256 != undisturbed.sha256
-    if CHANCE & set(kind.split("_")) or "probability" in fault:
-        assert first.sha256 == fly([fault]).sha256
-    times = [(event.kind, event.t_ns / 1e9) for event in first.events_of("fault", "fault_end")]
-    assert times == [("fault", AT_S), ("fault_end", AT_S + fault["for_s"])]
-    assert first.events_of("end")[0].data["last_ns"] == 9_000_000_000
+    fault = {"kind": kind, "at_s": ENGAGED_S, "for_s": 1.0, **MATRIX[kind]}
+    flight = fly([fault], duration_s=BRIEF_S)
+    assert flight.sha256 != briefly_undisturbed.sha256
+    times = [(event.kind, event.t_ns / 1e9) for event in flight.events_of("fault", "fault_end")]
+    assert times == [("fault", ENGAGED_S), ("fault_end", ENGAGED_S + fault["for_s"])]
+    assert flight.events_of("end")[0].data["last_ns"] == BRIEF_S * 1e9
+
+
+def test_the_same_bits_twice() -> None:
+    """All faults in which chance has a part at once, each with numbers of its own to draw, from 4 s on, twice."""
+    chance = [kind for kind in MATRIX if CHANCE & set(kind.split("_")) or "probability" in MATRIX[kind]]
+    faults = [{"kind": kind, "at_s": 4.0, **MATRIX[kind]} for kind in chance]
+    assert len(faults) == 11
+    assert fly(faults, duration_s=BRIEF_S).sha256 == fly(faults, duration_s=BRIEF_S).sha256
 
 
 def test_a_fault_that_comes_after_the_end_changes_nothing(undisturbed: Flight) -> None:

@@ -18,6 +18,7 @@ from zsim_analysis.in_process import fly
 from zsim_analysis.reading.formation import formations_of
 from zsim_analysis.reading.recorded_flight import read_flight
 from zsim_analysis.reading.shortfall import verdict
+from zsim_analysis.report import make_report
 from zsim_analysis.rerun import rerun_record
 from zsim_analysis.sweep import sweep_run
 from zsim_analysis.sweep.sweep_run import Task
@@ -371,7 +372,10 @@ def test_kinds_of_faults_neither(marked: Path) -> None:
     assert "beam" in zsim(marked, "fault", "kinds", str(path), "--trust", runs=True)
 
 
-def test_nor_does_what_reads_a_record_and_a_rerun_only_if_told_to(marked: Path) -> None:
+def test_nor_does_what_reads_a_record_and_a_rerun_only_if_told_to(
+    marked: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(make_report, "figures", lambda *_: [])  # whose drawing takes longer than all the rest
     run = marked.parent / "run"
     run.mkdir()
     scenario = scenario_file.load(marked.parent / "pair.yaml", NAMED.values(), duration_s=1.0)

@@ -1,8 +1,10 @@
 """Writes records of flights that never were, with errors known in closed form."""
 
 import math
+import pickle
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.record import RecordWriter
 from zsim.scenario import scenario_file
 from zsim.schema.message import Message
+from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_analysis.reading.recorded_flight import FlightReader, RecordedFlight
 
@@ -69,16 +72,8 @@ def flight(entries: Entries, answers: bool = False) -> RecordedFlight:
 
 def traffic(flown: Flown) -> Iterator[tuple[str, Message, int]]:
     """Yield key, message and wall time of everything that a run puts on the wire."""
-    scenario = scenario_file.load(SCENARIOS / f"{flown.scenario}.yaml", flown.overrides)
-    yield keys.INFO, info(scenario), 0
-    for seq, name in enumerate(["estimator.drone1", "controller.main"]):
-        join = run_messages.Join(0, seq, "run", 7, name.split(".")[0], "host-a", 100 + seq, GATE_NS, "0.1.0", "f" * 16)
-        yield keys.process(name, "join"), join, 0
-    rng = np.random.default_rng(1)
+    yield from _flight(pickle.dumps(replace(flown, end=None, events=())))
     last = round(flown.duration_s * 1e9) // GATE_NS
-    for k in range(last + 1):
-        for key, message in _gate(flown, scenario, k, rng):
-            yield key, message, 1_000_000 * k
     for event in flown.events:
         yield keys.EVENT, event, 1_000_000 * last
     if flown.end is not None:
@@ -86,7 +81,23 @@ def traffic(flown: Flown) -> Iterator[tuple[str, Message, int]]:
         yield keys.EVENT, event, 1_000_000 * last
 
 
+@lru_cache(maxsize=4)
+def _flight(pickled: bytes) -> list[tuple[str, Message, int]]:
+    """Return what is on the wire without events; many tests fly alike."""
+    flown = pickle.loads(pickled)
+    scenario = scenario_file.load(SCENARIOS / f"{flown.scenario}.yaml", flown.overrides)
+    entries: list[tuple[str, Message, int]] = [(keys.INFO, info(scenario), 0)]
+    for seq, name in enumerate(["estimator.drone1", "controller.main"]):
+        join = run_messages.Join(0, seq, "run", 7, name.split(".")[0], "host-a", 100 + seq, GATE_NS, "0.1.0", "f" * 16)
+        entries.append((keys.process(name, "join"), join, 0))
+    rng, space = np.random.default_rng(1), cluster_space(3)
+    for k in range(round(flown.duration_s * 1e9) // GATE_NS + 1):
+        entries += [(*each, 1_000_000 * k) for each in _gate(flown, scenario, space, k, rng)]
+    return entries
+
+
 def info(scenario) -> messages.Info:
+    text = scenario_file.to_text(scenario)
     return messages.Info(
         t_ns=0,
         seq=0,
@@ -105,8 +116,8 @@ def info(scenario) -> messages.Info:
             for drone in scenario.drones
         ),
         clusters=tuple(messages.ClusterInfo(c.name, tuple(c.drones)) for c in scenario.clusters),
-        scenario=scenario_file.to_text(scenario),
-        scenario_sha256=scenario_file.sha256(scenario_file.to_text(scenario)),
+        scenario=text,
+        scenario_sha256=scenario_file.sha256(text),
         version="0.1.0",
         fingerprint="f" * 16,
     )
@@ -128,9 +139,10 @@ def true_at(flown: Flown, t_s: float) -> np.ndarray:
     return desired_at(flown, t_s) + flown.offset + flown.amplitude * wave
 
 
-def _gate(flown: Flown, scenario, k: int, rng: np.random.Generator) -> Iterator[tuple[str, Message]]:
+def _gate(
+    flown: Flown, scenario, space: ClusterSpace, k: int, rng: np.random.Generator
+) -> Iterator[tuple[str, Message]]:
     t_ns, t_s = k * GATE_NS, k * GATE_NS / 1e9
-    space = cluster_space(3)
     desired = desired_at(flown, t_s)
     wave = math.sin(2 * math.pi * t_s / flown.period_s)
     p_W, yaw = space.inverse(true_at(flown, t_s) + flown.noise * rng.standard_normal(12))

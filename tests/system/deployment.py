@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from federation import Record, Role
-from forked_commands import ROOT
+from forked_commands import ROOT, run_here
 from lab import LAUNCHER, Lab
 
 from zsim.record import RecordReader, repair
@@ -42,13 +42,22 @@ class Deployment:
         self._roles: list[Role] = []
         self._stack = ExitStack()
         if secure:
-            self.zsim("certs", "init", self.hosts, "--scenario", str(STEP)).ends(with_code=0)
+            self.here("certs", "init", self.hosts, "--scenario", str(STEP))
 
     def zsim(self, *arguments: str, prefix: tuple[str, ...] = ()) -> Role:
         """Start a command where the launcher is."""
         role = Role(list(arguments), (*self.lab.prefix(LAUNCHER), *prefix), self._env)
         self._roles.append(role)
         return role
+
+    def here(self, *arguments: str) -> str:
+        """Run to its end, in this process, a command that asks the launcher alone; return what it prints."""
+        with pytest.MonkeyPatch.context() as patch:
+            for name, value in self._env.items():
+                patch.setenv(name, value)
+            done = run_here(*arguments)
+        assert done.code == 0, done
+        return done.stdout
 
     def up(self, *options: str, prefix: tuple[str, ...] = ()) -> Role:
         """Start a run."""
@@ -67,9 +76,14 @@ class Deployment:
 
     def ps(self) -> dict[str, dict[str, Any]]:
         """Return the rows of `zsim ps` by role."""
-        role = self.zsim("ps", "--json")
-        role.ends(with_code=0)
-        return {row["role"]: row for row in json.loads(role.text().splitlines()[-1])["rows"]}
+        return {row["role"]: row for row in json.loads(self.here("ps", "--json"))["rows"]}
+
+    def until_states(self, wanted: Callable[[dict[str, str]], bool]) -> None:
+        """Ask for the roles' states until they are as wanted."""
+        until_s = time.monotonic() + START_S
+        while not wanted(states := {role: row["state"] for role, row in self.ps().items()}):
+            assert time.monotonic() < until_s, states
+            threading.Event().wait(0.05)  # the launcher tells who asks, and nobody else
 
     def kill(self, role: str, number: int = signal.SIGKILL) -> None:
         """Send a role a signal, once it runs: the newest of its processes where it is being moved."""

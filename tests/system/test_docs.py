@@ -26,7 +26,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import chdir, suppress
+from functools import cache
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.request import urlopen
@@ -36,6 +38,7 @@ import pytest
 import typer
 import yaml
 from federation import free_port
+from forked_commands import run_here
 from msgspec import inspect as types
 
 from zsim.contract import messages
@@ -169,8 +172,21 @@ class Checkout:
         return shutil.which(program, path=self._environment["PATH"]) is not None
 
     def run(self, block: Block, page: Path) -> None:
-        """Run a block as one script."""
-        text = "\n".join(adapted(line, self._ports, RUN_S) for line in lines(block))
+        """Run a block as one script; a plain command that needs no process of its own, in this one."""
+        where, whole = f"{page.name}:{block.line}", "$" in block.text
+        all_lines = [adapted(line, self._ports, RUN_S) for line in lines(block)]
+        for is_plain, some in groupby(all_lines, lambda line: not whole and PLAIN.fullmatch(line) is not None):
+            if not is_plain:
+                self._run_script("\n".join(some), where)
+                continue
+            for line in some:
+                if steered := STEERED.search(line):
+                    self._wait_for_flight(steered[1])
+                with chdir(self._folder):
+                    done = run_here(*shlex.split(line)[1:])
+                assert done.code == 0, f"{where}: {line}\n{done}\n{self._logs()}"
+
+    def _run_script(self, text: str, where: str) -> None:
         script = subprocess.Popen(
             ["bash", "-euo", "pipefail", "-c", text],
             cwd=self._folder,
@@ -186,7 +202,6 @@ class Checkout:
         except subprocess.TimeoutExpired:
             os.killpg(script.pid, signal.SIGKILL)
             output = f"{script.communicate()[0]}\nnot done after {PATIENCE_S} s"
-        where = f"{page.name}:{block.line}"
         assert script.returncode == 0, f"{where}: {text}\n{output}\n{self._logs()}"
 
     def open_terminals(self, block: Block, page: Path) -> None:
@@ -218,6 +233,15 @@ class Checkout:
                 return
             time.sleep(0.1)
         raise AssertionError(f"the gateway tells of no estimate\n{self._logs()}")
+
+    def _wait_for_flight(self, drone: str) -> None:
+        """Wait until a drone takes setpoints: whoever types the commands is slower than these."""
+        until_s, where = time.monotonic() + PATIENCE_S, f"tcp/127.0.0.1:{self._ports[0]}"
+        while time.monotonic() < until_s:
+            said = run_here("echo", f"drone/{drone}/sensor/status", "-n", "1", "--connect", where).stdout
+            if re.search("hovering|flying", said):
+                return
+        raise AssertionError(f"{drone} does not fly\n{self._logs()}")
 
     def _wait_for_port(self, port: int) -> None:
         until_s = time.monotonic() + PATIENCE_S
@@ -262,6 +286,8 @@ FOREIGN = (
     "external_drone.py",
 )  # take the endpoint as an argument
 OURS = ("fly_square.py",)
+STEERED = re.compile(r"zsim pub .*\bdrone/(\w+)/cmd/velocity")
+PLAIN = re.compile(r"zsim (validate|keys|echo|hz|ask|pub|fault|report|export|rerun) [^|<>;&]*")
 
 
 def adapted(line: str, ports: tuple[int, ...], longest_s: float | None) -> str:
@@ -275,6 +301,7 @@ def adapted(line: str, ports: tuple[int, ...], longest_s: float | None) -> str:
     if longest_s is not None and re.search(r"\bzsim run\b", line):
         line = re.sub(r"--duration \S+", "", line).replace("zsim run", f"zsim run --duration {longest_s:g}")
     line = re.sub(r"(\bzsim sweep\b.* --duration) \S+", rf"\1 {RUN_S:g}", line)
+    line = re.sub(r"\bzsim sweep\b(?=.* --out )", "zsim sweep --no-report", line)
     line = re.sub(r"(examples/.* --duration) (\S+)", lambda m: f"{m[1]} {min(float(m[2]), EXAMPLE_S):g}", line)
     if " --out " not in line:
         line = re.sub(r"\bzsim run\b", "zsim run --no-report", line)
@@ -318,6 +345,7 @@ def parses(arguments: list[str]) -> bool:
         return True
 
 
+@cache
 def commands() -> dict[str, Any]:
     """Return the commands of `zsim` by name."""
     return typer.main.get_command(app).commands  # type: ignore[attr-defined]

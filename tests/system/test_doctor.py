@@ -1,30 +1,29 @@
 """`zsim doctor` on a lab: what it measures, through what greetings and how slow a link, and what it calls a fault."""
 
 import socket
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from forked_commands import ZSIM
+from forked_commands import Completed, run_here
 from lab import LAUNCHER, Lab
 from refused import has_terms
 
 ROOT = Path(__file__).parents[2]
 STEP = ROOT / "scenarios/step.yaml"
-DOCTOR_S = 180.0  # wall time on a loaded machine
 ROLES: dict[str, str | list[str]] = {"world": "h1", "controller.*": "h1", "estimator.*": "h2"}
 
 pytestmark = pytest.mark.slow
 
 
-def doctor(lab: Lab, hosts: Path, *options: str) -> subprocess.CompletedProcess[str]:
+def doctor(lab: Lab, hosts: Path, *options: str) -> Completed:
     """Run `zsim doctor` for the step scenario at the launcher."""
-    return lab.run(LAUNCHER, *ZSIM, "doctor", str(STEP), "--hosts", str(hosts), *options, timeout=DOCTOR_S)
+    with lab.inside(LAUNCHER):
+        return run_here("doctor", str(STEP), "--hosts", str(hosts), *options)
 
 
-def faults(done: subprocess.CompletedProcess[str]) -> list[str]:
+def faults(done: Completed) -> list[str]:
     """Return what keeps the hosts from flying."""
     return [line for line in done.stderr.splitlines() if not line.startswith("warning: ")]
 
@@ -42,7 +41,7 @@ def test_a_host_with_a_router_only_is_measured_and_a_greeting_is_passed_over(lab
         (lab.folder / name / ".bashrc").write_text("echo 'Welcome to lab'\necho '17'\n")
     routers: dict[str, dict[str, Any]] = {"field": {"host": "h3"}}
     done = doctor(lab, lab.inventory(ROLES, routers=routers, through={"h2": "field"}, insecure=True))
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.stderr
     assert "ready" in done.stdout.splitlines()[-1]
     assert set(rows(done.stdout)) == {("h2", "h3", "7448"), ("h3", "h1", "7447")}
 
@@ -51,7 +50,7 @@ def test_a_host_with_a_router_only_is_measured_and_a_greeting_is_passed_over(lab
 def test_a_slow_link_is_measured(lab: Lab) -> None:
     lab.slow("h2", 150)
     done = doctor(lab, lab.inventory(ROLES, insecure=True))
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.stderr
     ((path, found),) = rows(done.stdout).items()
     assert path == ("h2", "h1", "7447")
     assert 300.0 <= float(found[0]) < 1000.0
@@ -61,7 +60,7 @@ def test_a_slow_link_is_measured(lab: Lab) -> None:
 def test_a_port_that_is_taken_is_a_line(lab: Lab) -> None:
     with lab.inside("h1"), socket.create_server((lab.address("h1"), 7447)):
         done = doctor(lab, lab.inventory(ROLES, insecure=True))
-    assert done.returncode == 2
+    assert done.code == 2
     (line,) = faults(done)
     assert has_terms(line, "h1: ", "7447")
 
@@ -74,7 +73,7 @@ def test_what_a_host_lacks_is_a_line_with_what_to_do(lab: Lab) -> None:
     document["hosts"]["h2"]["python"] = "/tmp"
     hosts.write_text(yaml.safe_dump(document))
     done = doctor(lab, hosts)
-    assert done.returncode == 2
+    assert done.code == 2
     h1, h2, h3 = faults(done)
     assert has_terms(h1, "h1: ", str(lab.host_folder("h1")), f"`zsim push --hosts {hosts}`")
     assert has_terms(h2, "h2: ", "/tmp", "hosts.h2.python", f"`zsim push --hosts {hosts}`")
@@ -84,10 +83,10 @@ def test_what_a_host_lacks_is_a_line_with_what_to_do(lab: Lab) -> None:
 def test_hosts_without_certificates_are_not_ready(lab: Lab) -> None:
     hosts = lab.inventory(ROLES)
     done = doctor(lab, hosts)
-    assert done.returncode == 2
+    assert done.code == 2
     (line,) = faults(done)
     assert has_terms(line, f"{lab.folder}/certs: ", f"`zsim certs init {hosts} --scenario FILE`", "security.insecure")
     assert "ready" not in done.stdout
-    assert lab.run(LAUNCHER, *ZSIM, "certs", "init", str(hosts), "--scenario", str(STEP)).returncode == 0
+    assert run_here("certs", "init", str(hosts), "--scenario", str(STEP)).code == 0
     done = doctor(lab, hosts)
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.stderr

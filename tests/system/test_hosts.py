@@ -16,13 +16,14 @@ from lab import Lab
 DRONES = ("drone1", "drone2", "drone3")
 FLIGHT_S = 15.0  # simulated, of Test 1
 GATES_PER_S = 50  # of Test 1
+TAKEOFF = "clusters.main.plan.takeoff_s=1"  # a second into the run, so that it flies
 CUT_S = 1.0  # shorter than what a host is named for
 CUT_IN_REALTIME_S = 5.0  # longer than the firmware's patience (0.5 s until it hovers, 2 s more until it lands)
 
 
 def test_ps_logs_restart_move_and_down(deployment: Deployment, tmp_path: Path) -> None:
     """Who is restarted, moved or cut off goes on from where it was: the bits are those of a quiet run."""
-    run = deployment.up("--rate", "1", "--duration", "3600")
+    run = deployment.up("--rate", "0.5", "--duration", "3600", "--set", TAKEOFF)
     in_flight(run)
     rows = deployment.ps()
     assert {role: row["host"] for role, row in rows.items()} == {
@@ -34,21 +35,24 @@ def test_ps_logs_restart_move_and_down(deployment: Deployment, tmp_path: Path) -
         "controller.main": "h2",
     }
     assert all(row["pid"] for row in rows.values())
-    deployment.zsim("logs", "estimator.drone3").line("estimator.drone3: in run")
+    assert "estimator.drone3: in run" in deployment.here("logs", "estimator.drone3")
     for role, named in (("estimator.drone3", "silent: estimator.drone3 on h3"), ("world", "world .* no sign of life")):
         deployment.kill(role, signal.SIGSTOP)
         run.line(named, START_S)
-        states = {each: row["state"] for each, row in deployment.ps().items()}
-        assert [each for each, state in states.items() if "no sign of life" in state] == [role]
-        assert role == "world" or states["controller.main"] == f"waits for {role}"
+        deployment.until_states(
+            lambda states, role=role: (
+                [each for each, state in states.items() if "no sign of life" in state] == [role]
+                and (role == "world" or states["controller.main"] == f"waits for {role}")
+            )
+        )
         deployment.kill(role, signal.SIGCONT)
         run.line(f"{role} .*is back", START_S)
-    deployment.zsim("restart", "estimator.drone3").ends(with_code=0)
+    deployment.here("restart", "estimator.drone3")
     run.line("restart: estimator.drone3 on h3|superseded: estimator.drone3 on h3", START_S)
     cut_at_s = deployment.cut("h3")
     threading.Event().wait(cut_at_s + CUT_S - time.monotonic())
     deployment.heal("h3")
-    deployment.zsim("move", "estimator.drone3", "h2").ends(with_code=0)
+    deployment.here("move", "estimator.drone3", "h2")
     run.line("superseded: estimator.drone3 on h2", START_S)
     assert deployment.ps()["estimator.drone3"]["host"] == "h2"
     refused = deployment.zsim("move", "world", "h2")
@@ -60,7 +64,7 @@ def test_ps_logs_restart_move_and_down(deployment: Deployment, tmp_path: Path) -
     reason = record.end()["reason"]
     assert "zsim down" in reason
     assert reason in run.text()
-    assert record.sha256() == in_process(tmp_path, record.end()["last_ns"] / 1e9)
+    assert record.sha256() == in_process(tmp_path, record.end()["last_ns"] / 1e9, [TAKEOFF])
 
 
 @pytest.mark.soak

@@ -409,7 +409,9 @@ def test_a_terminal_that_is_closed(federation: Federation, options: tuple[str, .
     assert re.search("ended: .*closed", (federation.out / "run.log").read_text())
 
 
-@pytest.mark.parametrize("options", [("--in-process",), ()], ids=["one process", "processes"])
+@pytest.mark.parametrize(
+    "options", [pytest.param(("--in-process",), marks=pytest.mark.soak), ()], ids=["one process", "processes"]
+)
 def test_a_pipe_that_nobody_reads_any_more(federation: Federation, tmp_path: Path, options: tuple[str, ...]) -> None:
     """As in `zsim run … 2>&1 | head`: whoever reads leaves in flight."""
     where = options or ("--listen", federation.endpoint)
@@ -445,7 +447,7 @@ def test_two_interrupts(federation: Federation) -> None:
     check_end(federation, whole=False)
 
 
-@pytest.mark.parametrize("number", REASONS)
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.soak)])
 def test_a_run_that_is_told_to_end_before_it_has_loaded(
     federation: Federation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:

@@ -1,13 +1,11 @@
 """What a person types who has installed zsim without extras: each command says which one it needs, in a line."""
 
-import os
+import json
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 
-import pytest
 from refused import has_terms
 from synthetic_record import SCENARIOS, Flown, write
 
@@ -15,18 +13,29 @@ from zsim.errors import EXTRA_OF, install_command
 
 ROOT = Path(__file__).parents[2]
 STEP = str(SCENARIOS / "step.yaml")
-HIDES = """
-import os, sys
+BARE = """
+import json, os, sys
 from importlib.machinery import PathFinder
 
-HIDDEN = set(os.environ["HIDDEN"].split())
+hidden, folder, commands = json.loads(sys.argv[1])
 
 class Finder(PathFinder):
     @classmethod
     def find_spec(cls, name, path=None, target=None):
-        return None if path is None and name in HIDDEN else super().find_spec(name, path, target)
+        return None if path is None and name in hidden else super().find_spec(name, path, target)
 
 sys.meta_path[sys.meta_path.index(PathFinder)] = Finder
+import zsim.scenario.scenario_file
+from zsim_deploy.cli.cli import main
+
+for number, words in enumerate(commands):
+    if not (pid := os.fork()):
+        for stream in (1, 2):
+            os.dup2(os.open(f"{folder}/{number}.{stream}", os.O_WRONLY | os.O_CREAT), stream)
+        sys.argv = ["zsim", *words]
+        main()
+        os._exit(0)
+    print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
 """
 INVENTORY = "hosts: {a: {address: 127.0.0.1}}\nroles: {world: a, recorder: a, 'estimator.*': a, 'controller.*': a}\n"
 # command, and extras that it names; {run} is the folder of a run, {hosts} an inventory, {new} a folder that is not there
@@ -57,33 +66,23 @@ COMMANDS = [
 ]
 
 
-@pytest.fixture
-def bare(tmp_path: Path) -> Callable[[list[str]], subprocess.CompletedProcess[str]]:
-    """Return how a command is run without any package that an extra brings."""
-    (tmp_path / "hidden").mkdir()
-    (tmp_path / "hidden" / "sitecustomize.py").write_text(HIDES)
+def test_a_command_without_its_extra_says_what_to_type(tmp_path: Path) -> None:
+    """Each command is forked from one Python in which there is no package that an extra brings."""
     (tmp_path / "hosts.yaml").write_text(INVENTORY)
     (tmp_path / "run").mkdir()
     write(tmp_path / "run" / "run.mcap", Flown())
-    places = {"{run}": str(tmp_path / "run"), "{hosts}": str(tmp_path / "hosts.yaml"), "{new}": str(tmp_path / "new")}
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "hidden"), "HIDDEN": " ".join(EXTRA_OF)}
-
-    def run(words: list[str]) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "zsim_deploy.cli", *(places.get(word, word) for word in words)]
-        return subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=False)
-
-    return run
-
-
-@pytest.mark.parametrize(("words", "extra"), COMMANDS, ids=[" ".join(words[:1] + words[-1:]) for words, _ in COMMANDS])
-def test_a_command_without_its_extra_says_what_to_type(
-    bare: Callable[[list[str]], subprocess.CompletedProcess[str]], tmp_path: Path, words: list[str], extra: str
-) -> None:
-    done = bare(words)
-    lines = done.stderr.splitlines()
-    assert (done.returncode, len(lines)) == (2, 1), done.stderr
-    assert has_terms(lines[0], install_command(extra.split(",")))
-    assert not (tmp_path / "new").exists()
+    new = tmp_path / "new"
+    places = {"{run}": str(tmp_path / "run"), "{hosts}": str(tmp_path / "hosts.yaml"), "{new}": str(new)}
+    commands = [[places.get(word, word) for word in words] for words, _ in COMMANDS]
+    given = json.dumps([[*EXTRA_OF], str(tmp_path), commands])
+    done = subprocess.run([sys.executable, "-c", BARE, given], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    codes = list(map(int, done.stdout.split()))
+    for number, ((words, extra), code) in enumerate(zip(COMMANDS, codes, strict=True)):
+        printed = (tmp_path / f"{number}.2").read_text()
+        assert (code, len(printed.splitlines())) == (2, 1), (words, printed)
+        assert has_terms(printed, install_command(extra.split(","))), words
+    assert not new.exists()
 
 
 def test_each_module_is_of_an_extra() -> None:

@@ -90,41 +90,30 @@ ODD = os.fsdecode(b"lab:3 'a' \"b\" $HOME `x` [red]%s;&| \xc3\xbc\xe9\xa3\x9b \x
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Glyph")  # of the font
-def test_any_path_will_do(tmp_path: Path, flown: Path) -> None:
+@pytest.mark.parametrize("several", [False, pytest.param(True, marks=pytest.mark.soak)], ids=["a run", "several"])
+def test_any_path_will_do(tmp_path: Path, flown: Path, several: bool) -> None:
     folder = tmp_path / (ODD + "n" * 150)
     folder.mkdir()
     scenario, run = folder / f"{ODD}.yaml", folder / "run"
     shutil.copy(flown.parent / "pair.yaml", scenario)
-    outside = (
-        ("run", scenario, *SHORT, "--out", run),
-        (
-            "sweep",
-            scenario,
-            *SHORT,
-            "--vary",
-            "seed=1,2",
-            "--workers",
-            "1",
-            "--keep-records",
-            "--out",
-            folder / "sweep",
-        ),
-    )
-    for arguments in outside:  # with processes that are given these paths
-        done = zsim(*map(str, arguments))
-        assert done.returncode == 0, (arguments, done.stderr)
-        assert "Traceback" not in done.stderr
-    for arguments in (
-        *(("export", run, "--format", form) for form in ("csv", "parquet", "mat", "foxglove")),
-        ("report", run, "--format", "svg"),
-        ("report", run, flown, "--out", folder / f"{ODD}.html"),
-        ("rerun", run),
-        ("report", folder / "sweep"),
-    ):
-        here = run_here(*map(str, arguments))
-        assert here.code == 0, (arguments, here)
-    for name in ("csv/truth.csv", "parquet/truth.parquet", "run.mat", "foxglove.mcap", "foxglove.rbl", "report.html"):
-        assert (run / name).stat().st_size > 1000, name
+    varied = ("--vary", "seed=1,2", "--workers", "1", "--keep-records")
+    outside = ("sweep", scenario, *SHORT, *varied, "--out", folder / "sweep")
+    here = [("report", run, flown, "--out", folder / f"{ODD}.html"), ("report", folder / "sweep")]
+    if not several:
+        outside = ("run", scenario, *SHORT, "--out", run)
+        here = [("export", run, "--format", form) for form in ("csv", "parquet", "mat", "foxglove")]
+        here += [("report", run, "--format", "svg"), ("rerun", run)]
+    done = zsim(*map(str, outside))  # with processes that are given these paths
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    if several:
+        shutil.copytree(flown, run)
+    for arguments in here:
+        ended = run_here(*map(str, arguments))
+        assert ended.code == 0, (arguments, ended)
+    files = ("csv/truth.csv", "parquet/truth.parquet", "run.mat", "foxglove.mcap", "foxglove.rbl", "report.html")
+    for path in [folder / f"{ODD}.html", folder / "sweep/report.html"] if several else [run / name for name in files]:
+        assert path.stat().st_size > 1000, path
 
 
 @pytest.mark.parametrize("path", ["n" * 300, "/tmp/" + "nnnnnnnnn/" * 450])
@@ -243,7 +232,8 @@ def test_a_run_and_a_sweep_go_on_without_locks(tmp_path: Path, lockless: dict[st
     scenario = tmp_path / "pair.yaml"
     scenario.write_text(PAIR)
     reason = os.strerror(errno.EOPNOTSUPP)
-    for command, *options in (("run", *SHORT), ("run", *SHORT, "--force"), ("sweep", "--runs", "1", *SHORT)):
+    run = ("run", "--in-process", *SHORT)
+    for command, *options in (run, (*run, "--force"), ("sweep", "--runs", "1", *SHORT)):
         out = tmp_path / f"{command}s"
         done = zsim(command, str(scenario), *options, "--out", str(out), **lockless)
         assert done.returncode == 0, done.stderr

@@ -25,7 +25,7 @@ import sys
 import tempfile
 from collections import namedtuple
 from collections.abc import Callable, Iterable
-from functools import cache
+from functools import cache, partial
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
@@ -106,9 +106,32 @@ def _kept(function: Function, options: dict[str, Any]) -> Function:
     version = _digest_of_module(function.__module__)
     function.__qualname__ = f"{function.__qualname__}_{version}"
     try:
-        return _compile(function, {**options, "cache": True})
+        dispatcher: Any = _compile(function, {**options, "cache": True})
     except RuntimeError:  # neither beside its file nor in the user's cache may anything be written
         return _compile(function, options)
+    dispatcher.compile = partial(_compile_once, dispatcher, dispatcher.compile)
+    return dispatcher
+
+
+def _compile_once(dispatcher: Any, compile_for: Callable[[Any], Any], signature: Any) -> Any:
+    """Compile a kernel in one process of a machine, while others that need it wait and then load the result.
+
+    Processes of a run start together, and each would compile the same for half a minute.
+    """
+    if is_kept(dispatcher):
+        return compile_for(signature)
+    from numba.core.compiler_lock import global_compiler_lock
+
+    from zsim.output_folder import wait_for_lock  # here: what is imported above counts as a kernel's source
+
+    lock = Path(dispatcher.stats.cache_path, f"{dispatcher.__qualname__}.lock")
+    # numba's lock first: a thread that holds it may come to a kernel that another thread is about to compile
+    with global_compiler_lock, open(lock, "w") as file:
+        wait_for_lock(file)
+        try:
+            return compile_for(signature)
+        finally:
+            lock.unlink(missing_ok=True)  # it is kept by now
 
 
 def kernel(makes_arrays: bool = True) -> Callable[[Function], Function]:

@@ -11,7 +11,7 @@ import threading
 import zlib
 from collections import defaultdict
 from collections.abc import Iterator
-from io import BytesIO
+from io import BytesIO, FileIO
 from mmap import mmap
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -230,6 +230,13 @@ def content_of(source: Source, place: RecordSpan) -> bytes | None:
             return None
     unchecked = head.crc == 0 and not is_ours(source)  # MCAP has 0 where a tool computes none
     return content if unchecked or head.crc == zlib.crc32(content) else None
+
+
+def write_all(file: FileIO, data: bytes) -> None:
+    """Write all of it; an unbuffered file may take it in parts when the disk is nearly full."""
+    view = memoryview(data)
+    while view:
+        view = view[file.write(view) or 0 :]
 
 
 def crc_until(source: Source, end: int) -> int:

@@ -37,7 +37,7 @@ def finish(file: FileIO) -> None:
     body = b"".join(summary.values()) + offsets
     covered = _FOOTER_CRC.pack(Opcode.FOOTER, _FOOTER_LENGTH, start, at)
     footer = layout.packed(Footer(start, at, zlib.crc32(covered, zlib.crc32(body))))
-    write_all(file, data_end + body + footer + layout.MAGIC)
+    layout.write_all(file, data_end + body + footer + layout.MAGIC)
 
 
 def _summary(source: layout.Source) -> dict[Opcode, bytes]:
@@ -93,14 +93,7 @@ def _summary(source: layout.Source) -> dict[Opcode, bytes]:
 def finish_bare(file: FileIO) -> None:
     """Write the shortest end that MCAP allows, 50 bytes without a summary; OSError if there is no room."""
     file.seek(0, 2)
-    write_all(file, layout.packed(DataEnd(0)) + layout.packed(Footer(0, 0, 0)) + layout.MAGIC)
-
-
-def write_all(file: FileIO, data: bytes) -> None:
-    """Write all of it; an unbuffered file may take it in parts when the disk is nearly full."""
-    view = memoryview(data)
-    while view:
-        view = view[file.write(view) or 0 :]
+    layout.write_all(file, layout.packed(DataEnd(0)) + layout.packed(Footer(0, 0, 0)) + layout.MAGIC)
 
 
 def repair(path: str | Path) -> bool:
@@ -148,4 +141,4 @@ def cut_off(file: FileIO, path: Path) -> None:
                 tail = b"".join(layout.index_record(channel, np.array(own, "<u8").tobytes()) for channel, own in found)
     file.truncate(end)
     file.seek(end)
-    write_all(file, tail)
+    layout.write_all(file, tail)

@@ -29,8 +29,9 @@ from zsim.record.mcap_layout import (
     opening,
     packed,
     unpacked,
+    write_all,
 )
-from zsim.record.record_end import cut_off, finish, finish_bare, write_all
+from zsim.record.record_end import cut_off, finish, finish_bare
 from zsim.record.record_reader import RecordReader
 
 CHUNK_BYTES = 1024 * 1024  # not yet on disk at most, besides the last message

@@ -2,7 +2,7 @@
 
 import pytest
 
-from zsim_analysis.report.figure_style import ReportFigure
+from zsim_analysis.report.figure_style import COLUMN_IN, ReportFigure, new_figure
 
 PNG = b"\x89PNG"
 
@@ -13,6 +13,14 @@ def axes_png(figure: ReportFigure) -> bytes:
     assert visible
     assert any(axes.has_data() or axes.texts for axes in visible)
     return PNG
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make reports, comparisons and those of sweeps with one figure, which is empty."""
+    figure = ReportFigure("one.png", "", "", new_figure(COLUMN_IN, 1.0))
+    for module in ("report.make_report.", "sweep.sweep_report.", "report.comparison.comparison_"):
+        monkeypatch.setattr(f"zsim_analysis.{module}figures", lambda *_: iter([figure]))
 
 
 @pytest.fixture

@@ -136,7 +136,7 @@ def test_drones_stand_apart_in_clusters_of_three(count: int, clusters: int) -> N
 
 @pytest.mark.parametrize("name", ["zsim", "zsim_lookahead", "zenoh_queue", "raw_tcp"])
 def test_a_world_and_one_agent_exchange_steps(name: str) -> None:
-    found = result(lockstep.command(lockstep.CONTENDERS[name], 1, 0.5), 60.0)
+    found = result(lockstep.command(lockstep.CONTENDERS[name], 1, 0.1), 60.0)
     assert found["steps"] > 3
 
 

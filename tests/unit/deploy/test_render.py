@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from zsim.errors import InventoryError, RunError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
-from zsim_deploy import inventory
+from zsim_deploy import inventory, render
 from zsim_deploy.cli import hosts_commands
 from zsim_deploy.cli.cli import app
 from zsim_deploy.inventory import InventoryFile
@@ -439,11 +439,13 @@ def test_names_that_kubernetes_does_not_take_are_told_at_once(tmp_path: Path) ->
     assert has_terms(clash, "hosts.yaml", "estimator.drone.2", "estimator.drone_2", "same name")
 
 
-def test_a_scenario_beyond_a_config_map_is_refused(tmp_path: Path) -> None:
-    drones = ", ".join(f"{{name: d{i}, position_m: [{2 * i}, 0, 0]}}" for i in range(600))
+def test_a_scenario_beyond_a_config_map_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert render.CONFIG_BYTES_MAX == 1 << 20  # of Kubernetes; 600 drones have more
+    monkeypatch.setattr(render, "CONFIG_BYTES_MAX", 100_000)
+    drones = ", ".join(f"{{name: d{i}, position_m: [{2 * i}, 0, 0]}}" for i in range(60))
     large = scenario_file.load(STEP, [f"drones=[{drones}]", "clusters=[]"])
     text = HOSTS.replace('"controller.*": two, ', "")
-    with refused(InventoryError, "scenario", "bytes", "ConfigMap", "1048576"):
+    with refused(InventoryError, "scenario", "bytes", "ConfigMap", "100000"):
         kubernetes(placed(tmp_path, text), large)
 
 

@@ -18,14 +18,21 @@ def formation(count: int, radius_m: float, height_m: float, turn_rad: float = 0.
     return DroneStates(p_WB, none, quaternion_from_heading(angles), none, [[300.0] * 4] * count)
 
 
+@pytest.fixture(scope="module")
+def view() -> View:
+    return View(lens_of(CAMERA))
+
+
 @pytest.mark.parametrize("turn_rad", [0.0, 0.7, 1.4])
 @pytest.mark.parametrize(("count", "radius_m", "height_m"), [(2, 1.0, 3.0), (3, 2.3, 15.0), (30, 40.0, 60.0)])
-def test_the_camera_follows_the_formation(count: int, radius_m: float, height_m: float, turn_rad: float) -> None:
+def test_the_camera_follows_the_formation(
+    view: View, count: int, radius_m: float, height_m: float, turn_rad: float
+) -> None:
     bodies = follower(formation(count, radius_m, height_m, turn_rad))
     motion = camera_motion(camera_pose(CAMERA), bodies, rotation_matrix(bodies.q_WB[count]), count)
     points_K = motion.points_K(bodies.p_WB[:count])
     assert (points_K[:, 2] > 0).all()
-    pixels = View(lens_of(CAMERA)).pixels(points_K)
+    pixels = view.pixels(points_K)
     assert (pixels > 0).all()
     assert (pixels < (CAMERA.width_px, CAMERA.height_px)).all()
 

@@ -142,8 +142,8 @@ class Bodies(NamedTuple):
 
 
 class Boards(NamedTuple):
-    setting: NDArray  # (N, firmware_settings.SETTING.size)
-    gain: NDArray  # (N, observer_gains.GAIN.size)
+    setting: NDArray  # (N, firmware.SETTING.size)
+    gain: NDArray  # (N, observer.GAIN.size)
     calibration: NDArray  # (N, observer.CALIBRATION.size)
     setpoint: NDArray  # (N, firmware.SETPOINT.size)
     set_tick: NDArray  # int64 (N,), when the setpoint was sent

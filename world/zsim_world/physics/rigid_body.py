@@ -84,7 +84,7 @@ def accelerations(
         grounded: a constant where it is called. False leaves the ground out, and then the result holds only where
             the ground is out of reach; so there is no branch in it, and several drones go at once (simd.py).
         row, rotors: parameters; anchor: of its contact points (surfaces.py).
-        p_WB, v_WB, q_WB, w_WB_B: state; speeds, commands, decay: of the rotors, as for `rotors.wrench`.
+        p_WB, v_WB, q_WB, w_WB_B: state; speeds, commands, decay: of the rotors, as for `wrench`.
         air_W: velocity of the air at the drone [m/s]; push_W: force of other drones [N].
         touch: what it touches besides, None: nothing; aero: its aerodynamics, None: none but `drag`.
     """

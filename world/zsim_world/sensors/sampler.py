@@ -47,7 +47,7 @@ class SampledLog(NamedTuple):
     whose: NDArray[np.int64]  # (M, 3): sensor, drone, tick
     value: NDArray[np.float64]  # (M, CHANNELS_MAX)
     latency_ns: NDArray[np.int64]  # (N, sensors)
-    rows: NDArray[np.float64]  # these two of geodetic.anchor
+    rows: NDArray[np.float64]  # these two of frames.anchor
     place: NDArray[np.float64]
 
 

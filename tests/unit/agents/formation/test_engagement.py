@@ -2,6 +2,7 @@
 
 import copy
 import math
+from functools import cache
 
 import msgspec
 import numpy as np
@@ -118,6 +119,11 @@ def rising_fleet(noise_m=0.0):
 
 
 def engaged_fleet(noise_m=0.0):
+    return copy.deepcopy(engaged(noise_m))
+
+
+@cache
+def engaged(noise_m):
     fleet = rising_fleet(noise_m)
     fleet.fly_until("assembling")
     while fleet.engagement.request(Order.ENGAGE):
@@ -606,7 +612,7 @@ def restarted(fleet, plan):
     fleet.engagement.warm_start(last.phase, last.desired, last.plan_step)
 
 
-def assert_the_same_from_here(fleet, plan, seconds=25.0):
+def assert_the_same_from_here(fleet, plan, seconds=13.0):
     """Fly the fleet, and a copy whose engagement is another one with the snapshot of the former."""
     copied = copy.deepcopy(fleet)
     copied.engagement = Engagement(SPACE, DRONES, plan=plan)

@@ -128,8 +128,9 @@ def along(from_s: float, to_s: float = 30.0) -> State:
     return state
 
 
-def interrupted(t_s: float) -> dict[str, Any]:
-    return {**along(10.0)(t_s), **({"phase": "held"} if 13 < t_s < 16 else {})}
+def interrupted() -> State:
+    led = along(10.0)
+    return lambda t_s: {**led(t_s), **({"phase": "held"} if 13 < t_s < 16 else {})}
 
 
 FALL = numbered(
@@ -208,7 +209,7 @@ CASES = {
     "trajectory joined at once": case(along(10.5), **LED),
     "only the end of a trajectory": case(along(19.5), "plan main 10 !", *REFUSED_FIRST, **LED),
     "trajectory left": case(along(10.0, 14.0), "plan main !", "from 0 to 4.1 of 10 s", **LED),
-    "trajectory interrupted": case(interrupted, "held main !; plan main !; window main", **LED),
+    "trajectory interrupted": case(interrupted(), "held main !; plan main !; window main", **LED),
     "ended within the trajectory": case(along(10.0), "early main", "4 of 10 s", duration_s=14.0, **LED),
     "collisions": case(engaged, PAIRS, "at 7 s", "2 contacts", events=CONTACTS),
     "fall": case(engaged, "emergency drone1 10.3 !", *FELL, events=FALL),
@@ -250,7 +251,7 @@ def test_shortfalls_of_a_flight(name: str) -> None:
 def test_what_is_not_said_or_said_of_other_lines() -> None:
     _, outside = found(by_phases)
     assert has_terms(outside.text, "engaged in 30 %", "held 50 %", "taking_off 10.1 %", "assembling 9.99 %")
-    _, parted, _ = found(interrupted, overrides=TRAJECTORY)
+    _, parted, _ = found(interrupted(), overrides=TRAJECTORY)
     assert has_terms(parted.text, "for 7.1 s in all", "from 6 to 10 of 10 s")
     (hit,) = found(engaged, events=(TOUCHDOWN, IMPACT))
     assert "in flight" not in hit.text  # the touchdown is part of the impact
@@ -398,7 +399,6 @@ def test_errors_are_those_of_the_engaged_part_of_the_window() -> None:
     assert {value for errors in none.errors(WINDOW_S).values() for value in msgspec.structs.astuple(errors)} == {None}
 
 
-@pytest.mark.usefixtures("unrendered")
 @pytest.mark.parametrize(
     ("state", "part"), [(engaged_between(17.0, 30.0), "50"), (engaged_between(2.0, 3.0), "no errors")]
 )
@@ -411,7 +411,8 @@ def test_table_figures_and_page_say_of_which_part_the_errors_are(state: State, p
     console.print(table(summary, "main"))
     assert summary.clusters["main"].part in console.file.getvalue()  # type: ignore[attr-defined]
     assert part in page(summary, [])
-    assert all("window" in figure.drawing.get_suptitle() for figure in figures(flight, formations, summary))
+    if part == "50":  # marks are the same ones whatever a note says
+        assert all("window" in figure.drawing.get_suptitle() for figure in figures(flight, formations, summary))
 
 
 @pytest.mark.parametrize(
@@ -455,7 +456,7 @@ def test_the_mark_of_a_figure_is_whole_and_covers_nothing(reason: str, width_in:
     assert middle.y0 >= below.y1
 
 
-@pytest.mark.usefixtures("unrendered")
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     "name",
     ["step refused to the end", "never engaged", "collisions", "fall", "engaged in half of the window", "as planned"],

@@ -153,7 +153,7 @@ def test_truth_that_is_not_on_record_is_told(tmp_path):
     assert summary.errors["p"].true_std == pytest.approx(AMPLITUDE[9] / math.sqrt(2), rel=0.05)
 
 
-@pytest.mark.usefixtures("unrendered")
+@pytest.mark.usefixtures("undrawn")
 def test_a_replay_is_told_and_judged_from_where_it_begins(tmp_path):
     synthetic_record.record(tmp_path / "run.mcap", late(replay_of="20261122-run"))
     summary = make_report(tmp_path)
@@ -332,7 +332,7 @@ def test_times_of_a_window_have_two_decimals_at_most(tmp_path):
     assert [percent_text(share) for share in (0.0, 1e-4, 0.3014, 0.9999, 1.0)] == ["0", "0.1", "30.1", "99.9", "100"]
 
 
-@pytest.mark.usefixtures("unrendered")
+@pytest.mark.usefixtures("undrawn")
 def test_nothing_to_report_on_is_one_line(tmp_path):
     with refused(RecordError, "run.mcap", os.strerror(errno.ENOENT)):
         make_report(tmp_path)

@@ -24,6 +24,7 @@ from zsim_analysis.sweep.sweep_run import Row
 from zsim_analysis.sweep.sweep_summary import SweepResults, field_name
 
 unrendered = pytest.mark.usefixtures("unrendered")
+undrawn = pytest.mark.usefixtures("undrawn")
 X_RMS = "errors.x_c.true_rms"
 
 
@@ -93,7 +94,7 @@ def test_the_report_of_a_sweep(tmp_path: Path, vary: tuple[str, ...], more: set[
     assert (first["ended_well"]["value"], summary["failed"]) == (1.0, {})
 
 
-@unrendered
+@undrawn
 def test_the_user_s_own_figures_come_first_and_pairs_have_their_differences(tmp_path: Path) -> None:
     of = plan("seed=paired", "duration_s=1,2", "wind.gust_m_s=uniform(0,1)", runs=10, report={"metrics": "mine:own_m"})
     of = msgspec.structs.replace(of, changed=("duration_s=9",))
@@ -128,7 +129,7 @@ def test_figures_in_other_formats_stand_beside_the_pictures_until_a_report_witho
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {f"{stem}.png" for stem in stems} | {own.name}
 
 
-@unrendered
+@undrawn
 def test_a_report_of_failures_and_of_what_is_not_finished(tmp_path: Path) -> None:
     of = plan("seed", "duration_s=1,2", runs=40)
     rows = [well(of, run) if run % 4 == 1 else made(of, run, failure="the <world> waits") for run in range(20)]
@@ -155,7 +156,7 @@ def engaged(of: SweepPlan, run: int, **since_s: float | None) -> Row:
     return {**row, **own, **begun, **errors}
 
 
-@unrendered
+@undrawn
 def test_the_report_says_which_cluster_and_how_many_were_engaged(tmp_path: Path) -> None:
     of = plan("seed", "duration_s=1,2", runs=8)
     rows = [
@@ -176,7 +177,7 @@ def test_the_report_says_which_cluster_and_how_many_were_engaged(tmp_path: Path)
     assert read.summary().json() == (tmp_path / "summary.json").read_bytes()
 
 
-@unrendered
+@undrawn
 def test_a_sweep_marks_runs_that_left_their_plan_and_shows_window_and_errors(tmp_path: Path) -> None:
     of = plan("seed", "duration_s=1,2", runs=8)
     known = {"window_from_s": 40 / 3, "window_to_s": 1234567.0, "engaged": True, "collisions": 0, "as_planned": True}
@@ -196,7 +197,7 @@ def test_a_sweep_marks_runs_that_left_their_plan_and_shows_window_and_errors(tmp
     assert next(line for line in text.splitlines() if "x_c" in line).split()[1:] == ["x_c", "y_c", "beta"]
 
 
-@unrendered
+@undrawn
 def test_a_mean_does_not_profit_from_runs_that_fell_or_were_not_flown(tmp_path: Path) -> None:
     """Four of ten runs fall in the same way, at other times: they err by less and keep farther apart."""
     of = plan("seed", runs=10)
@@ -377,7 +378,7 @@ def test_quantities_without_data_have_no_panel() -> None:
 # Tables
 
 
-@unrendered
+@undrawn
 def test_values_that_begin_alike_have_rows_and_labels_that_differ(tmp_path: Path) -> None:
     dropouts = [f"[{{kind: gps_dropout, target: {drone}, at_s: 20}}]" for drone in ("drone1", "drone2")]
     of = plan("seed", f"faults={','.join(dropouts)}", "wind.gust_m_s=0,1", runs=4)
@@ -413,7 +414,7 @@ def test_the_columns_of_a_terminal_are_shared_out_so_that_no_table_has_one(width
     assert all(len(head[1:]) >= 2 for head in heads)
 
 
-@unrendered
+@undrawn
 def test_no_table_of_the_page_has_more_columns_than_fit_it_or_only_one(tmp_path: Path) -> None:
     of = plan("seed", "wind.gust_m_s=0,1", "sensors.gps.position_m.noise=1,4", runs=8)
     more = {f"errors.phi_{i}.true_rms": 0.1 for i in range(1, 13)} | {"metrics.overshoot_m": 0.5}
@@ -429,7 +430,7 @@ def test_no_table_of_the_page_has_more_columns_than_fit_it_or_only_one(tmp_path:
     assert [row.count("<th>") - 1 for row in part.split("<tr>") if "<th>" in row] == [4, 4, 3]
 
 
-@unrendered
+@undrawn
 @pytest.mark.parametrize("vary", [(), ("duration_s=1,2",)])
 def test_a_mean_of_fewer_runs_than_the_legend_says_has_its_number(vary: tuple[str, ...], tmp_path: Path) -> None:
     def counts(axes: Axes) -> list[str]:

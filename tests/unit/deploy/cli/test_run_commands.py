@@ -22,6 +22,11 @@ DIED = Outcome("the world died", failed=True)
 NO_MESSAGE = RecordError("run.mcap: holds no message")
 
 
+@pytest.fixture(autouse=True)
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("zsim_analysis.report.make_report.figures", lambda *_: ())
+
+
 @pytest.fixture
 def recorded(tmp_path: Path) -> Path:
     (tmp_path / "run.mcap").touch()

@@ -3,10 +3,7 @@
 import asyncio
 import errno
 import os
-import platform
 import socket
-import sys
-import sysconfig
 import tarfile
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +15,6 @@ from refused import has_terms, refused
 from zsim.errors import HostsError
 from zsim_deploy.hosts import wheelhouse
 from zsim_deploy.hosts.wheelhouse import (
-    PipError,
     Wheelhouse,
     WheelSet,
     WheelTarget,
@@ -50,17 +46,6 @@ packages = ["source"]
 """
 NEEDS = "Requires-Dist: gadget; extra == 'agents'\\nProvides-Extra: agents\\n"
 ELSEWHERE = WheelTarget((3, 12), "cp312", ("manylinux_2_31_aarch64", "linux_aarch64"))
-
-
-def here() -> WheelTarget:
-    facts = {
-        "version": list(sys.version_info[:2]),
-        "implementation": "cpython",
-        "free_threaded": False,
-        "platform": sysconfig.get_platform(),
-        "libc": list(platform.libc_ver()),
-    }
-    return wheel_target("here", facts)
 
 
 def write_project(folder: Path, name: str, needs: str = "") -> Path:
@@ -105,20 +90,16 @@ def checkout(index: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 
 def test_versions_are_those_of_here_and_others_only_where_there_are_none(index: Path, tmp_path: Path) -> None:
-    def download(wanted: str, held: str) -> bool:
-        return asyncio.run(download_wheels([wanted], ELSEWHERE, tmp_path / held, [held], tmp_path, print))
+    """A project without wheels is built here, for others, too."""
 
-    assert not download("gadget", "gadget==1.0")
-    assert download("gadget", "gadget==0.9")
-    with refused(PipError, "requirement numpy"):
-        download("numpy", "gadget==1.0")
+    def download(held: str) -> bool:
+        into = tmp_path / held
+        others = asyncio.run(download_wheels(["gadget"], ELSEWHERE, into, [held], tmp_path / "kept", print))
+        assert [path.name for path in into.glob("*.whl")] == ["gadget-1.0-py3-none-any.whl"]
+        return others
 
-
-@pytest.mark.parametrize("aim", [here(), ELSEWHERE], ids=["here", "elsewhere"])
-def test_a_project_without_wheels_is_built_here_also_for_others(index: Path, tmp_path: Path, aim: WheelTarget) -> None:
-    into = tmp_path / "into"
-    assert not asyncio.run(download_wheels(["gadget"], aim, into, [], tmp_path, print))
-    assert [path.name for path in into.iterdir()] == ["gadget-1.0-py3-none-any.whl"]
+    assert not download("gadget==1.0")
+    assert download("gadget==0.9")
 
 
 def house(folder: Path, extras: list[str], host: str = "h") -> tuple[WheelSet, list[str]]:
@@ -127,8 +108,14 @@ def house(folder: Path, extras: list[str], host: str = "h") -> tuple[WheelSet, l
     return asyncio.run(Wheelhouse(folder, lines.append).wheel_set(host, ELSEWHERE, extras)), lines
 
 
-def test_a_house_holds_what_a_host_needs_and_is_gathered_once(checkout: Path, tmp_path: Path) -> None:
-    """Unless a wheel of it was lost."""
+def test_a_house_holds_what_a_host_needs_and_is_gathered_once(
+    checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unless a wheel of it was lost. A changed file builds the project and nothing else.
+
+    Wheels that are kept need no index, also where something else has been installed here since, by which the house
+    would be another.
+    """
     first, lines = house(tmp_path / "cache", ["agents"])
     wheels = (first.project, first.pip, *first.others)
     assert [wheel.path.name.partition("-")[0] for wheel in wheels] == ["zsim", "pip", "gadget"]
@@ -142,16 +129,15 @@ def test_a_house_holds_what_a_host_needs_and_is_gathered_once(checkout: Path, tm
     second, lines = house(tmp_path / "cache", ["agents"])
     assert lines == [gathering]
     assert second.others[0].path.exists()
-
-
-def test_a_changed_file_builds_the_project_and_nothing_else(checkout: Path, tmp_path: Path) -> None:
-    first, _ = house(tmp_path / "cache", [])
     (checkout / "source/flight.py").write_text("height_m = 5\n")
-    second, lines = house(tmp_path / "cache", [])
-    (line,) = lines
-    assert has_terms(line, "building", "zsim")
-    assert second.project.path != first.project.path
-    assert second.pip == first.pip
+    third, lines = house(tmp_path / "cache", ["agents"])
+    assert lines == [building]
+    assert third.project.path != second.project.path
+    assert third.pip == second.pip
+    nowhere(monkeypatch)
+    monkeypatch.setattr(wheelhouse, "constraints", lambda: ["gadget==1.0", "widget==2.0"])
+    again, lines = house(tmp_path / "cache", ["agents"])
+    assert (again, lines) == (third, [gathering])
 
 
 def test_a_missing_wheel_is_a_line_with_host_package_and_system(no_gadget: None, tmp_path: Path) -> None:
@@ -207,16 +193,6 @@ def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("PIP_NO_INDEX", raising=False)
     monkeypatch.delenv("PIP_FIND_LINKS")
     monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:1/simple")  # tcpmux; nobody has it
-
-
-def test_wheels_that_are_kept_need_no_index(checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where something else has been installed here since, by which the house would be another."""
-    first, _ = house(tmp_path / "cache", ["agents"])
-    nowhere(monkeypatch)
-    monkeypatch.setattr(wheelhouse, "constraints", lambda: ["gadget==1.0", "widget==2.0"])
-    again, lines = house(tmp_path / "cache", ["agents"])
-    assert again == first
-    assert not [line for line in lines if has_terms(line, "index")]
 
 
 @pytest.mark.soak

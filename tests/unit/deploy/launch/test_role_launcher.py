@@ -22,6 +22,10 @@ from zsim_deploy.launch.role_launcher import ForkedProcess, RoleLauncher, RolePr
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="roles are forked on Linux alone")
 WAITING = ["record", "--connect", "tcp/127.0.0.1:1", "--launched", "0", "--wait", "100"]  # for a world that never comes
 VERSION = f"zsim {__version__}\n"
+LIGHT = (
+    *(sys.executable, "-P", "-c"),
+    "from zsim_deploy.cli import forkserver as it; it._prepare = lambda: None; it.main()",
+)  # a fork server that imports nothing beforehand: each role does
 END_S = 30.0
 LOOK_S = 0.02
 
@@ -34,6 +38,11 @@ def quiet(_: str) -> None:
 def role_launcher() -> Iterator[RoleLauncher]:
     with RoleLauncher(quiet, "a run") as made:
         yield made
+
+
+@pytest.fixture
+def light(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "FORKSERVER", LIGHT)
 
 
 @pytest.fixture
@@ -132,6 +141,7 @@ def test_where_the_fork_server_fails_a_role_is_started_as_a_program(log: Path, m
 
 
 @LINUX
+@pytest.mark.usefixtures("light")
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_fork_server_that_dies_or_stands_is_done_without(
     number: int, log: Path, monkeypatch: pytest.MonkeyPatch
@@ -148,6 +158,7 @@ def test_a_fork_server_that_dies_or_stands_is_done_without(
 
 
 @LINUX
+@pytest.mark.usefixtures("light")
 def test_a_role_of_which_the_launcher_does_not_know_never_begins(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One launcher within another leaves it its children."""
     with RoleLauncher(quiet) as outer:
@@ -166,6 +177,7 @@ def test_a_role_of_which_the_launcher_does_not_know_never_begins(log: Path, monk
 
 
 @LINUX
+@pytest.mark.usefixtures("light")
 def test_a_command_that_is_too_long_for_a_packet_is_no_matter(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with RoleLauncher(quiet) as role_launcher:
         monkeypatch.setattr(module, "PACKET_MAX", 5)
@@ -179,8 +191,8 @@ def test_a_command_that_is_too_long_for_a_packet_is_no_matter(log: Path, monkeyp
 
 @LINUX
 def test_the_fork_server_ends_with_its_launcher() -> None:
-    code = "import time\nfrom zsim_deploy.launch.role_launcher import RoleLauncher\n"
-    code += "with RoleLauncher(lambda _: None) as roles: print(roles._forkserver.pid, flush=True); time.sleep(100)"
+    code = f"import time\nfrom zsim_deploy.launch import role_launcher as it\nit.FORKSERVER = {LIGHT!r}\n"
+    code += "with it.RoleLauncher(lambda _: None) as roles: print(roles._forkserver.pid, flush=True); time.sleep(100)"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as launcher:
         assert launcher.stdout is not None
         forkserver = psutil.Process(int(launcher.stdout.readline()))

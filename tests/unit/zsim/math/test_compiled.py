@@ -5,7 +5,9 @@ import os
 import shutil
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -80,6 +82,52 @@ def test_a_kernel_is_known_to_be_kept_once_it_was_compiled(monkeypatch: pytest.M
     assert not is_kept(made)
     assert made(2.0) == 4.0
     assert is_kept(made)
+
+
+DOUBLED = """
+import os, sys, time
+from pathlib import Path
+from numba.core import event
+from zsim.math.compiled import kernel
+
+class Compilations(event.Listener):
+    def on_start(self, event):
+        print("compiles", flush=True)
+        while len(list(Path().glob("calls-*"))) < 3:
+            time.sleep(0.01)
+
+    def on_end(self, event): pass
+
+@kernel()
+def doubled(x):
+    return 2.0 * x
+
+event.register("numba:compile", Compilations())
+print("ready", flush=True)
+sys.stdin.read()
+Path(f"calls-{os.getpid()}").touch()
+print(doubled(2.0))
+"""
+
+
+def test_processes_that_start_together_compile_a_kernel_once(tmp_path: Path):
+    pytest.importorskip("numba")
+    (tmp_path / "doubling.py").write_text(DOUBLED)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
+    with ExitStack() as stack:
+        command, pipe = [sys.executable, "-c", "import doubling"], subprocess.PIPE
+        more: Any = {"env": environment, "cwd": tmp_path, "stdin": pipe, "stdout": pipe, "text": True}
+        started = [subprocess.Popen(command, **more) for _ in range(3)]
+        processes = [stack.enter_context(each) for each in started]
+        for each in processes:
+            assert each.stdout is not None
+            assert each.stdout.readline() == "ready\n"
+        for each in processes:
+            assert each.stdin is not None
+            each.stdin.close()
+        said = [each.stdout.read().split() for each in processes if each.stdout is not None]
+    assert sorted(said) == [["4.0"], ["4.0"], ["compiles", "4.0"]]
+    assert not list((tmp_path / "cache").rglob("*.lock"))
 
 
 HELD = """

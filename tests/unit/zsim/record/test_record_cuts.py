@@ -35,7 +35,7 @@ from zsim_analysis.export.columns import MessageSelection
 from zsim_analysis.export.make_export import export
 from zsim_analysis.report.make_report import judge
 
-CUTS = 50
+CUTS = 25
 FLIPS = 30
 
 Content = tuple[bytes, int, int]  # payload, simulated and wall time [ns] of a message
@@ -132,7 +132,7 @@ def test_whatever_is_cut_off_a_writer_goes_on_behind_the_rest(
     data, cut = run.read_bytes(), tmp_path / "cut.mcap"
     added = [each._replace(wall_ns=7) for key in whole for each in whole[key][:2]]
     added += [each._replace(key=f"{each.key}/again") for each in added]
-    for at in [*nasty(data), len(data)]:
+    for number, at in enumerate([len(data), *nasty(data)]):
         cut.write_bytes(data[:at])
         before = by_key(cut) if at else {}
         with RecordWriter(cut, goes_on=True) as writer:
@@ -144,6 +144,8 @@ def test_whatever_is_cut_off_a_writer_goes_on_behind_the_rest(
             assert after[key] == [*before.get(key, []), *(each for each in added if each.key == key)], f"cut at {at}"
         with RecordReader(cut) as reader:
             assert reader.complete
+        if number % 3:  # the other reader is slow
+            continue
         with open(cut, "rb") as file:
             numbers = by_channel(file)
         assert all(seen == list(range(len(seen))) for seen in numbers.values()), f"cut at {at}"
