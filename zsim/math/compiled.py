@@ -109,7 +109,8 @@ def _kept(function: Function, options: dict[str, Any]) -> Function:
         dispatcher: Any = _compile(function, {**options, "cache": True})
     except RuntimeError:  # neither beside its file nor in the user's cache may anything be written
         return _compile(function, options)
-    dispatcher.compile = partial(_compile_once, dispatcher, dispatcher.compile)
+    if dispatcher is not function:  # as it is where NUMBA_DISABLE_JIT is set
+        dispatcher.compile = partial(_compile_once, dispatcher, dispatcher.compile)
     return dispatcher
 
 
