@@ -2,6 +2,7 @@
 
 import io
 import math
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -40,6 +41,7 @@ UNDRAWN_JS = f"""(() => {{
 """Draws no scene, and slows down what asks for frame after frame: all that costs most without a graphics card."""
 POLL_MS = 100  # between two looks at what a page shows
 PATIENCE_MS = 1000 * PATIENCE_S
+PICTURES = os.environ.get("ZSIM_TEST_PICTURES")  # a folder for pictures of pages, for people to look at
 HOLD_MS = 600  # of orders.html: as long a button of an emergency or a take-over is held down
 
 
@@ -145,7 +147,7 @@ def opening(browser: Any) -> Iterator[Callable[..., BrowserPage]]:
         def open_it(address: str, viewport: dict[str, int] = VIEWPORT, drawn: bool = False) -> BrowserPage:
             context = browser.new_context(viewport=viewport)
             stack.callback(context.close)
-            if not drawn:
+            if not drawn and not PICTURES:
                 context.add_init_script(UNDRAWN_JS)
             return BrowserPage(context.new_page(), address)
 

@@ -1,14 +1,13 @@
 """Orders that must not get lost, confirmations, ages and limits: in a real browser, with page, console or world stopped."""
 
 import json
-import os
 import signal
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 from chromium import needs_browser
-from console_browser import IN_SIGHT, PATIENCE_MS, BrowserPage, console, opening
+from console_browser import IN_SIGHT, PATIENCE_MS, PICTURES, BrowserPage, console, opening
 from federation import Federation
 from page_overflow import overflow
 from staged_console import StagedRun, staged_console
@@ -26,7 +25,6 @@ STALL_JS = "ms => { const until = performance.now() + ms; while (performance.now
 ROW = "#zsim-orders [data-state={}]"
 BAR = "document.querySelector('#zsim-flight .bar').dataset.state"
 MARKER_JS = "() => JSON.parse(document.getElementById('zsim-map').dataset.marker || 'null')"
-PICTURES = os.environ.get("ZSIM_TEST_PICTURES")
 
 
 def picture(page: BrowserPage, name: str) -> None:

@@ -74,6 +74,22 @@ def test_who_does_the_work_of_the_dead_takes_their_place_and_goes_on_where_they_
     assert (joined.from_ns, joined.done_ns) == (0, 5 * GATE_NS)
 
 
+def test_a_join_again_changes_nothing_and_a_newcomer_of_a_known_name_replaces():
+    made = barrier("estimator.d1")
+    first = made.participants["estimator.d1"]
+    first.away = True
+    assert not made.takes_place("estimator.d1", join())
+    assert made.join("estimator.d1", join(), 10 * GATE_NS, WALL_NS) is None
+    assert made.participants["estimator.d1"] is first
+    assert (first.away, first.rejoined) == (False, False)
+
+    assert made.takes_place("estimator.d1", join(2, pid=43))
+    assert not made.takes_place("estimator.d1", join(2, pid=43, run_id="run2"))
+    assert not made.takes_place("estimator.d2", join(2, pid=43))
+    assert made.join("estimator.d1", join(2), 10 * GATE_NS, WALL_NS) is None
+    assert made.participants["estimator.d1"].rejoined
+
+
 def test_nobody_takes_the_place_of_one_that_lives_or_does_more():
     made = barrier("estimator.d1")
     made.join("estimator.d3", join(serves=("estimator.d2",)), 0, 0)

@@ -12,7 +12,7 @@ from zsim.contract import keys
 from zsim.contract.flight_messages import Mode, Velocity
 from zsim.contract.run_messages import ControlRequest, Event
 from zsim.scenario import scenario_file
-from zsim_world.run.commands import PROGRAM, RECENT_PER_DRONE, CommandQueue, QueuedCommand
+from zsim_world.run.commands import PRIORITY_MAX, PROGRAM, RECENT_PER_DRONE, CommandQueue, QueuedCommand
 from zsim_world.run.outbox import Refusal
 from zsim_world.run.world import World
 
@@ -252,6 +252,13 @@ def test_an_old_command_is_refused_in_realtime_alone(kind: str):
     (refusal,) = refusals("realtime", AGE_MAX_MS + 20, kind)
     assert has_terms(refusal["reason"], "age", "420 ms", "400 ms")
     assert refusals("realtime", AGE_MAX_MS, kind) == refusals("lockstep", 10 * AGE_MAX_MS, kind) == []
+
+
+@pytest.mark.parametrize(("priority", "ok"), [(0, True), (PRIORITY_MAX, True), (-1, False), (PRIORITY_MAX + 1, False)])
+def test_a_drone_is_acquired_with_any_priority_of_the_protocol(priority: int, ok: bool):
+    world = World(scenario_file.from_text(SCENARIO), "realtime", run_id="run1")
+    answer = world.control(ControlRequest("acquire", {"drone": "d1", "priority": priority}, "me.x"))
+    assert answer.ok == ok
 
 
 MISSION = {"drone": "d1", "state": "aborted", "items": 5, "done": 3, "reason": "it left its geofence", "failsafe": True}

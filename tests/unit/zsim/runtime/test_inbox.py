@@ -186,6 +186,23 @@ def test_a_gap_that_no_replay_can_fill_is_a_jump():
     assert [t_ns for t_ns, _ in feed(inbox, gate_of("d1", far)[-1:])] == [far * GATE_NS]
 
 
+def test_the_longest_gap_that_a_replay_can_fill_is_known() -> None:
+    inbox = Inbox([STATUS])
+    feed(inbox, gate_of("d1", 0)[-1:])
+    assert feed(inbox, gate_of("d1", GAP_MAX + 1)[-1:]) == []
+    assert inbox.next_gate_ns() == GATE_NS
+
+
+def test_a_gap_is_known_by_the_numbers_of_gates_that_come_whole() -> None:
+    inbox = Inbox([STATUS])
+    for gate in (0, 2):
+        t_ns = gate * GATE_NS
+        pair = (STATUS, encode(status(t_ns, gate, 1)))
+        inbox.put(keys.GATE, GateMessages.of(t_ns, gate, key_table(["d1"]), [pair]))
+    assert [t_ns for t_ns, _ in ready(inbox)] == [0]
+    assert inbox.next_gate_ns() == GATE_NS
+
+
 def test_lost_names_only_what_will_not_come():
     estimates = keys.estimate("d1")
     inbox = Inbox([STATUS, estimates])
