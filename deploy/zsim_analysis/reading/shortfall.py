@@ -147,13 +147,17 @@ def _processes(flight: RecordedFlight) -> Iterator[Shortfall]:
             return  # deaths after it do not matter
         if event.subject not in expected:
             continue
-        is_death = event.kind == "death" and (event.data.get("on_death") == "end" or event.subject in dropped)
-        allowed = actions.on_overdue or {} if event.kind == "overdue" else actions.on_death
+        on_death = event.data.get("on_death")
+        is_death = event.kind == "death" and (on_death == "end" or event.subject in dropped)
+        # a process that was to come back is dropped once it is overdue
+        is_overdue = event.kind == "overdue" or (event.kind == "death" and on_death in ("wait", "restart"))
+        allowed = event.kind != "overdue" and lets_drop(actions.on_death, event.subject)
+        allowed = allowed or (is_overdue and lets_drop(actions.on_overdue or {}, event.subject))
         t_s = event.t_ns / 1e9
         text = event.text if event.kind == "failure" else f"{event.text}, at {t_s:.2f} s"
         if event.kind == "leave":
             yield Shortfall("process", event.subject, t_s, text, bool(event.data.get("fails")))
-        elif (is_death or event.kind in ("failure", "overdue")) and not lets_drop(allowed, event.subject):
+        elif (is_death or event.kind in ("failure", "overdue")) and not allowed:
             yield Shortfall("process", event.subject, t_s, text, True)
 
 

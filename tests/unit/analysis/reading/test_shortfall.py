@@ -333,7 +333,8 @@ def test_a_record_without_events_of_falls_shows_that_a_drone_ended_in_an_emergen
 
 
 EXPECTS_FENCE = 'processes.expect=["estimator.drone1", "fence.main"]'
-DEATH, DROP, DROPS_FENCE = {"on_death": "drop"}, {}, "processes.on_death={fence: drop}"
+DEATH, AWAITED, DROP = {"on_death": "drop"}, {"on_death": "wait"}, {}
+DROPS_FENCE, LOSES_FENCE = "processes.on_death={fence: drop}", "processes.on_overdue={fence.main: drop}"
 
 
 @pytest.mark.parametrize(
@@ -342,11 +343,14 @@ DEATH, DROP, DROPS_FENCE = {"on_death": "drop"}, {}, "processes.on_death={fence:
         ([("failure", "controller.main", {})], (), [True]),
         ([("failure", "controller.main", {})], ("processes.on_death={controller: drop}",), []),
         ([("overdue", "fence.main", {})], (EXPECTS_FENCE,), [True]),
-        ([("overdue", "fence.main", {})], (EXPECTS_FENCE, "processes.on_overdue={fence.main: drop}"), []),
+        ([("overdue", "fence.main", {})], (EXPECTS_FENCE, LOSES_FENCE), []),
         ([("death", "fence.main", DEATH), ("drop", "fence.main", DROP)], (EXPECTS_FENCE,), [True]),
         ([("death", "fence.main", DEATH), ("drop", "fence.main", DROP)], (), []),
         ([("death", "fence.main", DEATH)], (EXPECTS_FENCE,), []),  # another does its work
         ([("death", "fence.main", DEATH), ("drop", "fence.main", DROP)], (EXPECTS_FENCE, DROPS_FENCE), []),
+        ([("death", "fence.main", AWAITED), ("drop", "fence.main", DROP)], (EXPECTS_FENCE,), [True]),
+        ([("death", "fence.main", AWAITED), ("drop", "fence.main", DROP)], (EXPECTS_FENCE, LOSES_FENCE), []),
+        ([("death", "fence.main", DEATH), ("drop", "fence.main", DROP)], (EXPECTS_FENCE, LOSES_FENCE), [True]),
         ([("death", "estimator.drone1", {"on_death": "restart"})], (), []),
         ([("death", "estimator.drone1", {"on_death": "end"})], (), [True]),
         ([("leave", "fence.main", {})], (EXPECTS_FENCE,), [False]),
