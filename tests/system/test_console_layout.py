@@ -201,8 +201,8 @@ def test_plots_of_a_run_that_is_over_have_curves_of_any_variable(opened: Callabl
 
 @pytest.mark.slow
 @pytest.mark.soak
-def test_the_dark_theme_is_one_pages_and_all_of_it_is_dark(replay: str, opened: Callable[..., BrowserPage]) -> None:
-    page, other = opened(replay, SCREENS[1], drawn=True), opened(replay, SCREENS[1], drawn=True)
+def test_the_dark_theme_is_one_pages_and_all_of_it_is_dark(flight: str, opened: Callable[..., BrowserPage]) -> None:
+    page, other = opened(flight, SCREENS[1], drawn=True), opened(flight, SCREENS[1], drawn=True)
     for each in (page, other):
         each.wait_for_text("running")
         each.select_tab("Run")
