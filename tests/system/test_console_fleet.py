@@ -46,7 +46,8 @@ BARS_JS = """() => {
 }"""
 """Pairs of bars of which one lies over the other."""
 DRONES_JS = """() => {
-  const view = JSON.parse(document.getElementById("zsim-map").dataset.view);
+  const view = JSON.parse(document.getElementById("zsim-map").dataset.view ?? "null");
+  if (!view) return ["not drawn yet"];
   const canvas = document.querySelector("#zsim-map canvas").getBoundingClientRect();
   return [[-8.75, 7], [8.75, 7], [-8.75, -7], [8.75, -7]].filter(([x, y]) => {
     const px = canvas.x + canvas.width / 2 + (x + 5 - view.x) * view.scale, py = canvas.y + canvas.height / 2 - (y - view.y) * view.scale;
