@@ -2,11 +2,16 @@
 
 Rooms from the ground up: errors; math and schema; sensors; contract; vehicles; record, scenario and transport, which do
 not import each other; runtime; presentation. A room imports those below it. Nothing here imports another package of the
-product.
+product: what users call as `zsim.run` and so on is `zsim_api`'s, imported when it is first asked for.
 """
 
+import importlib
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # what `__getattr__` passes on
+    from zsim_api import *  # noqa: F403
 
 RELEASE = "0.1.0"  # as in pyproject.toml
 CONTRACT = 1
@@ -48,3 +53,17 @@ def _checked_out(git: Path) -> str:
 
 
 __version__ = f"{RELEASE}+g{found[:DIGITS]}" if (found := commit()) else RELEASE
+
+_LIBRARY = "zsim_api"  # imported when one of its names is first asked for
+
+
+def __getattr__(name: str) -> Any:
+    """Return a name of the library for Python."""
+    if not name.startswith("_") and name in (library := importlib.import_module(_LIBRARY)).__all__:
+        globals()[name] = found = getattr(library, name)
+        return found
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *importlib.import_module(_LIBRARY).__all__})

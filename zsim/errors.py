@@ -3,7 +3,8 @@
 import os
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -94,6 +95,18 @@ class RecordError(ZsimError):
 
 class ReportError(ZsimError):
     """A report that cannot be made or written."""
+
+
+OTHER_OUT = "give --out another folder"  # remedy
+
+
+@contextmanager
+def file_fault(path: Path, fault: str, remedy: str, kind: type[ZsimError] = RunError) -> Iterator[None]:
+    """Turn an OSError on a file into an error of one line: `PATH: FAULT (REASON); REMEDY`."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{path}: {fault} ({error.strerror}); {remedy}") from error
 
 
 # C0, C1, bidirectional

@@ -1,8 +1,9 @@
 """Makes the agents of a process from names and patterns, and checks the classes and plans of a scenario."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
+from inspect import signature
 from typing import Any
 
 from zsim.contract.messages import Info
@@ -116,6 +117,41 @@ def make_agents(role: str, info: Info, scenario: Scenario, names: Sequence[str])
         if failure is None:
             raise
         raise failure from error
+
+
+def own_agent(
+    made: Agent | Callable[..., Agent], info: Info, scenario: Scenario, settings: Mapping[str, Any] = {}
+) -> Agent:
+    """Return an agent of a user's that is ready to join.
+
+    Args:
+        made: the agent; or a class or function that makes it of `settings`, and of `info` and `scenario` where it has
+            parameters of these names.
+
+    Raises:
+        UserCodeError: the class raised.
+        RunError: the settings are not those that it takes, or what it returns is no agent.
+    """
+    if not isinstance(made, Agent):
+        name = f"{made.__module__}:{made.__qualname__}"
+        taken = signature(made)
+        given = {"info": info, "scenario": scenario}
+        given = {key: value for key, value in given.items() if key in taken.parameters} | dict(settings)
+        try:
+            taken.bind(**given)
+        except TypeError as error:
+            raise RunError(f"{name} takes {taken}, and cannot be made: {error}") from None
+        try:
+            made = made(**given)
+        except plugin.RAISED as error:
+            failure = plugin.user_code_error(error, "before the start")
+            if failure is None:
+                raise
+            raise failure from error
+        if not isinstance(made, Agent):
+            raise RunError(f"{name} makes a {type(made).__name__}; must make a zsim.Agent")
+    made.bind(info)
+    return made
 
 
 def agent_class(role: str) -> Callable[..., Agent]:

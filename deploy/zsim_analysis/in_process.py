@@ -5,19 +5,28 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from msgspec.structs import replace
+
 from zsim.contract import flight_messages, keys, run_messages
 from zsim.contract.framing import GateMessages
+from zsim.contract.messages import Info
+from zsim.contract.run_messages import ControlAnswer, ControlRequest
+from zsim.contract.snapshot import State, pack, unpack
 from zsim.errors import RunError, UserCodeError
 from zsim.record import RecordWriter
-from zsim.runtime.agent import Agent
+from zsim.runtime.agent import Agent, Output
 from zsim.runtime.bus import Bus
 from zsim.runtime.health import rare_collections
 from zsim.runtime.progress import PERIOD_S, HoldReasons, Screen, SlowStart
 from zsim.runtime.rate_limit import RateLimit
 from zsim.scenario.roles import agent_names, expected_processes, lets_drop
 from zsim.scenario.scenario import Scenario
-from zsim_agents.hosting import hosted
+from zsim_agents.hosting import hosted, own_agent
+from zsim_world import run_state
 from zsim_world.run.world import World
+
+CALLER = "python.main"  # process name of whoever steps a flight
+OwnAgent = Agent | Callable[..., Agent]
 
 
 def fly(
@@ -27,6 +36,7 @@ def fly(
     screen: Screen | None = None,
     run_id: str | None = None,
     changed: Sequence[str] | None = None,
+    own: Sequence[OwnAgent] = (),
 ) -> str:
     """Fly a resolved scenario and record it; return why it ended.
 
@@ -36,6 +46,7 @@ def fly(
         screen: shows progress.
         run_id: set only by tests that compare records.
         changed: as of `World`.
+        own: as of `InProcessFlight`.
 
     Raises:
         RunError: a failure has ended the run, of a user's class, or because the state of a drone was no longer finite;
@@ -44,7 +55,7 @@ def fly(
     progress = _Progress(scenario, screen) if screen else None
     writer = None
     try:
-        flight = InProcessFlight(scenario, run_id, changed)
+        flight = InProcessFlight(scenario, run_id, changed, own)
         writer = RecordWriter(record) if record else None  # after it: a refused scenario leaves no record in the way
         flight.run([each for each in (writer, progress) if each], stop_reason)
     finally:
@@ -65,26 +76,67 @@ class FlightObserver(Protocol):
 
 
 class InProcessFlight:
-    """A world with its agents, ready to be flown once; arguments as of `fly`.
+    """A world with its agents on a bus, to be flown to its end (`run`) or in turns (`start`, `turn`, `end`).
+
+    Args:
+        scenario: resolved.
+        run_id, changed: as of `fly`.
+        own: agents of a user's, beside those of the scenario: objects, or what `own_agent` makes them of.
+        stock: whether the estimators and controllers of the scenario fly.
+        steered: whether `send` is used: the caller takes part as `python.main`.
 
     Raises:
         ScenarioError, RunError: the scenario cannot be flown.
+        UserCodeError: the class of an agent raised.
     """
 
-    def __init__(self, scenario: Scenario, run_id: str | None = None, changed: Sequence[str] | None = None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        run_id: str | None = None,
+        changed: Sequence[str] | None = None,
+        own: Sequence[OwnAgent] = (),
+        stock: bool = True,
+        steered: bool = False,
+    ) -> None:
         if scenario.gates("camera"):
             raise RunError(
                 "processes.gating is [camera]; must be left out in one process, which has no cameras: "
                 "fly it as processes, or with --set processes.gating=[]"
             )
+        if not stock:
+            scenario = replace(scenario, processes=replace(scenario.processes, expect=[]))
         self.world = World(scenario, "lockstep", 0.0, time.monotonic_ns, run_id, changed)
-        for name in set(expected_processes(scenario)) - set(agent_names(scenario)):
+        self.info = self.world.info()
+        others = [own_agent(each, self.info, scenario) for each in own]
+        taken = {name for agent in others for name in (agent.name, *agent.serves)}
+        known, wanted = agent_names(scenario), expected_processes(scenario)
+        for name in set(wanted) - set(known) - taken:
             if lets_drop(scenario.processes.on_overdue or {}, name):
                 self.world.expired(name)  # no other process can join
-        self._agents = agents(self.world)
+        names = [name for name in wanted if name in known and name not in taken]
+        self.agents = [*others]
+        if names:
+            self.agents.insert(0, hosted(self.info, scenario, names))
+        self._caller = Caller(self.info) if steered else None
+        if self._caller:
+            self.agents.append(self._caller)
 
     def run(self, observers: Sequence[FlightObserver], stop_reason: Callable[[], str | None] = lambda: None) -> None:
         """Fly to the end; observers receive every message; `world.ended` and `world.failure` then have the reason."""
+        self.start(observers)
+        try:
+            with rare_collections():
+                while self.turn():
+                    if reason := stop_reason():
+                        self.world.clock.stop(reason)
+                self.end()
+        except UserCodeError:
+            if self.world.failure:  # otherwise the run goes on without the failed agent, as the scenario says
+                raise
+
+    def start(self, observers: Sequence[FlightObserver]) -> None:
+        """Let the agents join."""
         takes_message = [observer.add_message for observer in observers]
         takes_gate = [observer.add_gate for observer in observers]
 
@@ -98,25 +150,72 @@ class InProcessFlight:
             for take in takes_gate:
                 take(gate, wall_ns)
 
-        bus = Bus(self.world, self._agents, time.monotonic_ns, add_message, add_gate)
-        add_message(keys.INFO, self.world.info())
-        bus.join()
-        try:
-            with rare_collections():
-                while bus.turn():
-                    if reason := stop_reason():
-                        self.world.clock.stop(reason)
-                bus.end()
-        except UserCodeError:
-            if self.world.failure:  # otherwise the run goes on without the failed agent, as the scenario says
-                raise
+        self.bus = Bus(self.world, self.agents, time.monotonic_ns, add_message, add_gate)
+        self.turn, self.end = self.bus.turn, self.bus.end
+        add_message(keys.INFO, self.info)
+        self.bus.join()
+
+    def send(self, commands: Sequence[Output]) -> None:
+        """Publish the caller's commands of the newest gate; without it the world does not go beyond that gate."""
+        caller, t_ns = self._caller, self.world.now_ns
+        assert caller is not None
+        stamped = [
+            Output(key, replace(message, t_ns=t_ns, seq=caller.next_seq(key), source=CALLER))
+            for key, message in commands
+        ]
+        self.bus.publish(caller, t_ns, stamped)
+
+    def control(self, key: str, request: ControlRequest) -> ControlAnswer:
+        """Answer a request to the world, or to the controller of a cluster, between two gates."""
+        if key == keys.CONTROL:
+            return self.world.control(request)
+        for agent in self.agents:
+            if key in agent.control_keys():
+                return agent.control(key, request)
+        known = [keys.CONTROL, *(each for agent in self.agents for each in agent.control_keys())]
+        return ControlAnswer(False, f"{key}: nobody answers there; must be one of {', '.join(known)}")
+
+    def snapshot(self) -> tuple[Any, ...]:
+        """Return all from which `restore` continues to the same bits.
+
+        Raises:
+            RunError: an agent of a user's has no `snapshot`.
+        """
+        states = [agent.checkpoint() for agent in self.agents]
+        for agent, state in zip(self.agents, states, strict=True):
+            if state is None:
+                raise RunError(f"{agent.name} has no snapshot(); must return its state there, {{}} if it has none")
+        world, agents = pack(self.world.checkpoint()), [pack(state) for state in states if state is not None]
+        return world, agents, self.bus.snapshot(), self.world.truth_hash.snapshot()
+
+    def restore(self, snapshot: tuple[Any, ...]) -> None:
+        """Continue from a snapshot of this flight, or of another one of the same scenario."""
+        world, agents, inboxes, truth_hash = snapshot
+        run_state.restore(self.world, unpack(world))
+        self.world.failure = None
+        self.world.truth_hash.restore(truth_hash)
+        for agent, state in zip(self.agents, agents, strict=True):
+            agent.resume(self.info, unpack(state))
+        self.bus.restore(inboxes)
 
 
-def agents(world: World) -> list[Agent]:
-    """Return the agents expected by a scenario as one, built from `world/info` as by any process."""
-    known = agent_names(world.scenario)
-    names = [name for name in expected_processes(world.scenario) if name in known]
-    return [hosted(world.info(), world.scenario, names)] if names else []
+class Caller(Agent):
+    """Takes part for whoever steps a flight: its commands are published by `InProcessFlight.send`."""
+
+    name, reads, gate_keys = CALLER, (), ()
+
+    def __init__(self, info: Info) -> None:
+        super().__init__()
+        self.period_ns = info.gate_ns
+
+    def receive(self, key: str, message: Any) -> None:
+        """Take nothing."""
+
+    def step(self, t_ns: int) -> list[Output]:
+        return []
+
+    def snapshot(self) -> State:
+        return {}
 
 
 class _Progress:

@@ -3,8 +3,7 @@
 import inspect
 import math
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import StrEnum
 from functools import wraps
 from importlib.util import find_spec
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 from typer import Argument, BadParameter, Exit, Option
 
 from zsim.contract.run_messages import RATE_MAX
-from zsim.errors import RunError, ZsimError, install_command, printable
+from zsim.errors import RunError, install_command, printable
 
 if TYPE_CHECKING:
     from zsim.transport.tls import Identity
@@ -26,7 +25,6 @@ CONSOLE_PORT = 8080  # of its page
 PORT_MAX = 65535
 REALTIME = "--realtime"  # of the world and the routers, whose lease it shortens
 CHANGED = "--changed"  # of the world: what a launcher, whose scenario is resolved, has changed of its file
-OTHER_OUT = "give --out another folder"  # remedy
 LOOK_S = 5.0  # wall; for which a command that a person types waits for a world
 
 # Panels of the help
@@ -53,15 +51,6 @@ def failed(cause: str) -> Exit:
     """Print why a command ends with exit code 1, as its last line; return the exception to raise."""
     note(cause)
     return Exit(1)
-
-
-@contextmanager
-def file_fault(path: Path, fault: str, remedy: str, kind: type[ZsimError] = RunError) -> Iterator[None]:
-    """Turn an OSError on a file into an error of one line: `PATH: FAULT (REASON); REMEDY`."""
-    try:
-        yield
-    except OSError as error:
-        raise kind(f"{path}: {fault} ({error.strerror}); {remedy}") from error
 
 
 def require(command: str, needs: Mapping[str, Sequence[str]]) -> None:

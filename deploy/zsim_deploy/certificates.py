@@ -26,13 +26,12 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from zsim.contract import keys
-from zsim.errors import InventoryError, RunError
+from zsim.errors import InventoryError, RunError, file_fault
 from zsim.scenario import roles as rights
 from zsim.scenario.roles import OPERATOR, ROUTER, WORLD, Rights, drivers_of
 from zsim.scenario.scenario import Scenario
 from zsim.transport.tls import AUTHORITY, CERTIFICATE, CERTIFICATES, DAYS, KEY
 from zsim_deploy import inventory as inv
-from zsim_deploy.arguments import file_fault
 from zsim_deploy.inventory import InventoryFile
 
 AUTHORITY_DAYS = 1825  # 5 years; its key never leaves the machine that made it

@@ -18,14 +18,14 @@ from typing import Any
 import yaml
 
 from zsim import RELEASE
-from zsim.errors import InventoryError, RunError
+from zsim.errors import OTHER_OUT, InventoryError, RunError, file_fault
 from zsim.scenario import scenario_file
 from zsim.scenario.roles import RECORDER, ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim.schema.checker import show
 from zsim_deploy import USER_FAULT
 from zsim_deploy import inventory as inv
-from zsim_deploy.arguments import OTHER_OUT, RUN_ID, file_fault
+from zsim_deploy.arguments import RUN_ID
 from zsim_deploy.inventory import Host, InventoryFile, PlannedProcess, ProcessFiles
 from zsim_deploy.launch.role_launcher import SINGLE_THREADED
 from zsim_deploy.launch.supervisor import RESTART_WINDOW_S, RESTARTS_MAX, SUPERSEDED

@@ -10,6 +10,7 @@ import platform
 from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import threadpoolctl
@@ -102,6 +103,14 @@ class TruthHash:
         for data in hashed:
             self._hash.update(data)
         self._copy = copy
+
+    def snapshot(self) -> Any:
+        """Return what `restore` takes to go on from here."""
+        self.flush()
+        return self._hash.copy()
+
+    def restore(self, snapshot: Any) -> None:
+        self._hash, self._held = snapshot.copy(), 0
 
     def add(self, t_ns: ArrayLike, state: NDArray[np.float64]) -> None:
         """Add rows.

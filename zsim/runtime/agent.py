@@ -27,6 +27,8 @@ from zsim.runtime.inbox import GateRouter, Input, RoutingTable, canonical, is_he
 from zsim.runtime.link_faults import LinkFaults
 from zsim.schema import plugin
 
+_FILLED = ("name", "period_ns", "reads", "gate_keys")  # by `Agent.bind`, where a class leaves them out
+
 
 class Output(NamedTuple):
     """A message on its way out; the key is without the federation's prefix."""
@@ -56,6 +58,32 @@ class Agent(ABC):
     def __init__(self) -> None:
         self._seq: defaultdict[str, int] = defaultdict(int)
         self._process = ""  # of the group that it is a member of, under whose name it publishes
+
+    def bind(self, info: Info) -> None:
+        """Fill in what a class of a user's leaves out, before its agent joins the run of `world/info`.
+
+        The name: `agent.` and the class's name; `period_ns`: every gate; `gate_keys`: the status of every drone, and
+        what `reads` has of the estimates and cluster states, which are published at every gate.
+        """
+        if not hasattr(self, "_process"):  # a class whose constructor does not call this one's
+            Agent.__init__(self)
+        own = vars(self)
+        if "_declared" in own:  # bound for an earlier run
+            for name in _FILLED:
+                own.pop(name, None)
+            own |= self._declared
+        self._declared = {name: own[name] for name in _FILLED if name in own}
+        self._seq.clear()
+        statuses = [keys.status(drone.name) for drone in info.drones]
+        at_gates = [keys.estimate(drone.name) for drone in info.drones]
+        at_gates += [keys.cluster_state(cluster.name) for cluster in info.clusters]
+        self.name = getattr(self, "name", f"agent.{type(self).__name__.lower()}"[:32])
+        self.period_ns = getattr(self, "period_ns", info.gate_ns)
+        self.reads = getattr(self, "reads", ())
+        if not hasattr(self, "gate_keys"):
+            read = [key for key in at_gates if any(keys.matches(each, key) for each in self.reads)]
+            self.gate_keys = (*statuses, *read)
+            self.reads = tuple(dict.fromkeys((*self.reads, *statuses)))
 
     @property
     def role(self) -> str:

@@ -3,6 +3,7 @@
 The agents get the same inputs in the same order as on Zenoh, and so give the same bits.
 """
 
+import copy
 import socket
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
@@ -81,7 +82,7 @@ class Bus:
             for _, inbox in self._agents:
                 inbox.hold_ns = hold_ns
 
-    def turn(self) -> bool:
+    def turn(self, gates_max: int = GATES_MAX) -> bool:
         """Let the world go as far as it may, and every agent answer; return whether the run goes on.
 
         Several gates in a row of the world, of each agent, and of their outputs, keep the code of each in the
@@ -96,7 +97,7 @@ class Bus:
                 raise RunError(f"the world waits for {names}, not run in-process; see `processes.expect`")
             return False
         gates = 0
-        while gates < GATES_MAX and self._coordinator.may_advance():
+        while gates < gates_max and self._coordinator.may_advance():
             self._coordinator.advance(self._wall_ns())
             gates += 1
         self._spread()
@@ -121,7 +122,7 @@ class Bus:
                     steps.append((t_ns, outputs))
                 t_ns = inbox.next_gate_ns()
             for t_ns, outputs in steps:
-                self._publish(agent, t_ns, outputs)
+                self.publish(agent, t_ns, outputs)
             stepped = stepped or bool(steps)
             if agent.name in self._failures and inbox.taken_ns != NEVER_NS:
                 inbox.start_after(NEVER_NS)  # it is handed nothing any more
@@ -131,6 +132,15 @@ class Bus:
     def _leave(self, agent: Agent, reason: str, failed: bool = False) -> None:
         bye = self._memberships[agent.name].bye(self._t_ns, reason, failed)
         self._to_world(keys.process(agent.name, "bye"), bye)
+
+    def snapshot(self) -> list[Inbox]:
+        """Return copies of what the agents have not taken yet, for `restore`; to be called between turns."""
+        return [copy.deepcopy(inbox) for _, inbox in self._agents]
+
+    def restore(self, inboxes: Sequence[Inbox]) -> None:
+        pairs = zip(self._agents, inboxes, strict=True)
+        self._agents = [(agent, copy.deepcopy(inbox)) for (agent, _), inbox in pairs]
+        self._routes, self._gate_route, self._failures = {}, ((), ()), {}
 
     def end(self) -> None:
         """Let every agent leave, and publish the world's last messages.
@@ -179,7 +189,8 @@ class Bus:
         for agent, _ in self._agents:
             agent.update_faults(info, faults)
 
-    def _publish(self, agent: Agent, t_ns: int, outputs: Sequence[Output]) -> None:
+    def publish(self, agent: Agent, t_ns: int, outputs: Sequence[Output]) -> None:
+        """Publish an agent's outputs of a gate, and that it is done with it."""
         sent, world, routes = 0, self._coordinator, self._routes
         for key, message in outputs:
             inboxes, is_counted, is_relayed = routes.get(key) or self._route(key)

@@ -35,7 +35,7 @@ FOLDERS = "ZSIM_PLUGIN_PATH"  # environment variable, so that processes started 
 IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # environment variable, for the same reason, and what it then holds
 WHERE = "install it, or put it on PYTHONPATH or beside the scenario"
 
-PACKAGES = frozenset({"zsim", "zsim_world", "zsim_agents", "zsim_bridges", "zsim_analysis", "zsim_deploy"})
+PACKAGES = frozenset({"zsim", "zsim_world", "zsim_agents", "zsim_bridges", "zsim_analysis", "zsim_api", "zsim_deploy"})
 """Of zsim: none of these is a user's."""
 LIBRARIES = tuple(f"{sysconfig.get_path(part)}{os.sep}" for part in ("stdlib", "purelib", "platlib"))
 

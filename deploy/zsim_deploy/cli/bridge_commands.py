@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from typer import Argument, BadParameter, Option
 
-from zsim.errors import RunError, SessionError
+from zsim.errors import RunError, SessionError, file_fault
 from zsim_bridges.ros1.master_api import DEFAULT_MASTER, own_address
 from zsim_deploy import arguments as opt
-from zsim_deploy.arguments import file_fault, require, say
+from zsim_deploy.arguments import require, say
 from zsim_deploy.cli.role_commands import serve_as
 
 if TYPE_CHECKING:

@@ -109,11 +109,11 @@ def up(
     """
     require("up", UP_NEEDS | (opt.REPORT_NEEDS if report else {}))
     from zsim.transport.zenoh_settings import host_launcher_files, require_files
+    from zsim_api.run_folder import make_directory, new_launch
     from zsim_deploy import inventory
     from zsim_deploy.cli.run_commands import conclude
     from zsim_deploy.hosts.host_run import HostRun
     from zsim_deploy.hosts.status_table import RowChoice, StatusTable
-    from zsim_deploy.launch.run_folder import make_directory, new_launch
 
     loaded = flight.scenario(elsewhere=True)
     placed = inventory.load(hosts)

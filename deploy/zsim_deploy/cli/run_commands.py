@@ -68,10 +68,10 @@ def run(
     """Fly a scenario: start every process, show progress, record, report."""
     require("run", opt.FLIGHT_NEEDS | (opt.REPORT_NEEDS if report else {}))
     from zsim_agents.hosting import check_plans
+    from zsim_api.run_folder import make_directory, new_launch
     from zsim_deploy.hosts.control_socket import seen_by_ps
     from zsim_deploy.launch.console_process import RunConsole
     from zsim_deploy.launch.run import RunOptions, check_endpoint, check_open_files, fly, options_of, with_cameras
-    from zsim_deploy.launch.run_folder import make_directory, new_launch
 
     if in_process and (useless := _given(context, OF_PROCESSES)):
         raise BadParameter(f"--in-process is lockstep, unpaced, without Zenoh; leave out {useless}, or it")

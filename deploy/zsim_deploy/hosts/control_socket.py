@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from zsim import __version__
-from zsim.errors import RunError, ZsimError
+from zsim.errors import RunError, ZsimError, file_fault
 from zsim.output_folder import no_locks, take_lock
-from zsim_deploy.arguments import file_fault, note
+from zsim_deploy.arguments import note
 
 REQUEST_S = 5.0  # from the same machine
 ANSWER_S = 150.0  # a move connects to a host, asks it about itself, and brings a certificate: 135 s at most

@@ -7,17 +7,16 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from zsim.errors import HostsError
+from zsim.errors import HostsError, file_fault
 from zsim.scenario import scenario_file
 from zsim.scenario.roles import RECORDER, ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim.transport.tls import CERTIFICATES, KEY
+from zsim_api.run_folder import JOURNAL
 from zsim_deploy import certificates
 from zsim_deploy import inventory as inv
-from zsim_deploy.arguments import file_fault
 from zsim_deploy.hosts.host_link import HostLink, json_answer, shell_line, shell_word
 from zsim_deploy.inventory import MODULE, SSH_PORT, Host, InventoryFile, ProcessFiles
-from zsim_deploy.launch.run_folder import JOURNAL
 from zsim_deploy.roles.stop_channel import FOLDER
 
 ACCESS = "access.json"

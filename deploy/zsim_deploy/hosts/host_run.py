@@ -14,12 +14,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from zsim.errors import HostsError, RunError, ZsimError
+from zsim.errors import OTHER_OUT, HostsError, RunError, ZsimError, file_fault
 from zsim.record import repair
 from zsim.scenario import scenario_file
 from zsim.scenario.roles import RECORDER, ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
-from zsim_deploy.arguments import OTHER_OUT, changed_options, file_fault, pace_options
+from zsim_api.run_folder import Launch
+from zsim_deploy.arguments import changed_options, pace_options
 from zsim_deploy.certificates import exposed_keys
 from zsim_deploy.hosts.control_socket import ControlSocket
 from zsim_deploy.hosts.doctor import HostReport, compare_reports, host_report
@@ -28,7 +29,6 @@ from zsim_deploy.hosts.host_plan import RECORD, HostPlan, leftovers, port_faults
 from zsim_deploy.hosts.remote_process import ProcessLog, RemoteProcess
 from zsim_deploy.hosts.status_table import StatusTable
 from zsim_deploy.inventory import MODULE, MODULES, InventoryFile, extras
-from zsim_deploy.launch.run_folder import Launch
 from zsim_deploy.launch.supervisor import EndSignals, Outcome, Supervisor
 
 CONNECT_S = 30.0  # how long all hosts together may take to let us in, …

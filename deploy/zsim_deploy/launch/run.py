@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 from msgspec.structs import replace
 
-from zsim.errors import RecordError, RunFailedError, SessionError
+from zsim.errors import OTHER_OUT, RecordError, RunFailedError, SessionError, file_fault
 from zsim.output_folder import RECORD, no_locks
 from zsim.record import repair
 from zsim.runtime.progress import Screen
@@ -26,12 +26,12 @@ from zsim.sensors.camera import BottomCamera, FrontCamera
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import launcher_files, require_files
 from zsim_agents.hosting import agents_of
-from zsim_deploy.arguments import OTHER_OUT, changed_options, file_fault, load_scenario, pace_options
+from zsim_api import run_folder
+from zsim_api.run_folder import JOURNAL, Launch
+from zsim_deploy.arguments import changed_options, load_scenario, pace_options
 from zsim_deploy.inventory import COMMANDS
-from zsim_deploy.launch import run_folder
 from zsim_deploy.launch.console_process import RunConsole
 from zsim_deploy.launch.role_launcher import ChildProcess, RoleLauncher
-from zsim_deploy.launch.run_folder import JOURNAL, Launch
 from zsim_deploy.launch.supervisor import EndSignals, Outcome, Supervisor, status_row
 from zsim_deploy.roles.stop_channel import REASONS, StopChannel, handled_by
 

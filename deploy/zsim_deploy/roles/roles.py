@@ -20,6 +20,7 @@ from zsim.contract import keys, messages
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Join
 from zsim.errors import (
+    OTHER_OUT,
     DecodeError,
     NoWorldError,
     RecordError,
@@ -28,6 +29,7 @@ from zsim.errors import (
     SupersededError,
     UserCodeError,
     ZsimError,
+    file_fault,
     printable,
 )
 from zsim.output_folder import no_locks
@@ -47,7 +49,7 @@ from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
 from zsim_agents.hosting import agent_class, chosen, hosted, make_agents
 from zsim_deploy import USER_FAULT
-from zsim_deploy.arguments import OTHER_OUT, RUN_ID, WorldAccess, file_fault
+from zsim_deploy.arguments import RUN_ID, WorldAccess
 from zsim_deploy.roles.stop_channel import StopChannel, lower_priority
 
 RUN_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # an id of a run that is part of a folder's name

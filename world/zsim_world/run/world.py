@@ -47,6 +47,7 @@ class World(Coordinator):
         drivers: what is published of the external drones.
         queue: of the commands, with the commander of each drone.
         faults: that are injected.
+        truth_hash: of the instants so far.
     """
 
     SAVED: ClassVar[Saved] = {
@@ -86,7 +87,7 @@ class World(Coordinator):
         self.queue = self._intake.queue
         self._operations |= {**self._intake.operations(), **self.faults.operations()}
         self._publication = GatePublication(self.fleet)
-        self._hash = TruthHash(len(self._simulated))
+        self.truth_hash = TruthHash(len(self._simulated))
         self._last_ns = round(scenario.duration_s * 1e9) // self.clock.gate_ns * self.clock.gate_ns
         self.statistics.closest_m = self.fleet.closest_m
 
@@ -130,12 +131,12 @@ class World(Coordinator):
 
         Nothing may be pending in the outbox.
         """
-        self._hash.flush()
+        self.truth_hash.flush()
         return saved_state(self)
 
     def keep_truth(self, copy: Callable[[memoryview], object], hashed: Iterable[bytes] = ()) -> None:
         """Copy the bytes of the truth hash to `copy` from now on; those before were `hashed`."""
-        self._hash.resume(hashed, copy)
+        self.truth_hash.resume(hashed, copy)
 
     # What arrives
 
@@ -189,7 +190,7 @@ class World(Coordinator):
             statistics.closest_m = min(statistics.closest_m, fleet.closest_m)
             self._publish_incidents()
         state = fleet.bodies.state
-        self._hash.add(clock.now_ns, state[self._simulated] if self.external else state)
+        self.truth_hash.add(clock.now_ns, state[self._simulated] if self.external else state)
         if gate is not None:
             self.outbox.put(keys.GATE, gate)
         statistics.gate(clock.now_ns, wall_ns)
@@ -218,7 +219,7 @@ class World(Coordinator):
             "requests": self.requests,
             "requests_refused": self.outbox.refused_requests.count,
             "events_left_out": self.outbox.left_out,
-            "truth_sha256": self._hash.hexdigest(),
+            "truth_sha256": self.truth_hash.hexdigest(),
         }
 
     def views(self, seq: int) -> list[Output]:

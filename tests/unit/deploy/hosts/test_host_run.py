@@ -12,11 +12,11 @@ from rich.console import Console
 
 from zsim.errors import HostsError
 from zsim.scenario import scenario_file
+from zsim_api.run_folder import Launch
 from zsim_deploy import inventory
 from zsim_deploy.hosts import host_run as module
 from zsim_deploy.hosts.host_run import HostRun
 from zsim_deploy.hosts.status_table import StatusTable
-from zsim_deploy.launch.run_folder import Launch
 from zsim_deploy.launch.supervisor import UNREAD, Outcome
 from zsim_deploy.roles.closed_output import CLOSED
 

@@ -16,11 +16,11 @@ from zsim.errors import RunError, SessionError
 from zsim.record import RecordReader
 from zsim.runtime.progress import Screen
 from zsim.scenario import scenario_file
+from zsim_api.run_folder import new_launch
 from zsim_deploy.arguments import changed_fields
 from zsim_deploy.launch import run
 from zsim_deploy.launch.role_launcher import RoleLauncher
 from zsim_deploy.launch.run import RunOptions
-from zsim_deploy.launch.run_folder import new_launch
 from zsim_deploy.launch.supervisor import Outcome
 
 TAKEN = "the world died: exit code 2: cannot listen on tcp/127.0.0.1:{port} (Address already in use)"

@@ -14,13 +14,12 @@ from typing import Any
 import msgspec
 
 from zsim.contract import keys, messages
-from zsim.errors import DecodeError, RunError
+from zsim.errors import OTHER_OUT, DecodeError, RunError, file_fault
 from zsim.output_folder import RECORD, refuse_others
 from zsim.record.mcap_layout import LIBRARY, OURS, is_ours
 from zsim.record.record_writer import cut_at_last, is_being_written
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
-from zsim_deploy.arguments import OTHER_OUT, file_fault
 
 LOGS, SCENARIO, FIGURES = "logs", "scenario.yaml", "figures"
 JOURNAL = "journal"  # what the world hands itself is there

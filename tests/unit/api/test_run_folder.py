@@ -11,7 +11,7 @@ from synthetic_record import SCENARIOS
 from zsim.errors import RunError
 from zsim.record import RecordWriter
 from zsim.scenario import scenario_file
-from zsim_deploy.launch.run_folder import make_directory
+from zsim_api.run_folder import make_directory
 
 STEP = scenario_file.load(SCENARIOS / "step.yaml")
 

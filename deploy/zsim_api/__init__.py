@@ -1,0 +1,36 @@
+"""zsim from Python: what users call as `zsim.run`, `zsim.Simulation` and so on; see docs/python.md.
+
+Each name is imported from its module when it is first asked for, so an onboard computer needs only what it uses.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # for editors, which do not read _WHERE
+    from zsim.errors import ZsimError as ZsimError
+    from zsim.runtime.agent import Agent as Agent
+    from zsim.runtime.agent import Output as Output
+    from zsim_api.commands import Command as Command
+    from zsim_api.commands import ardrone as ardrone
+    from zsim_api.commands import attitude as attitude
+    from zsim_api.commands import emergency as emergency
+    from zsim_api.commands import land as land
+    from zsim_api.commands import rotors as rotors
+    from zsim_api.commands import takeoff as takeoff
+    from zsim_api.commands import velocity as velocity
+    from zsim_api.simulation import Simulation as Simulation
+
+_WHERE = {
+    "zsim.errors": ("ZsimError",),
+    "zsim.runtime.agent": ("Agent", "Output"),
+    "zsim_api.commands": ("Command", "ardrone", "attitude", "emergency", "land", "rotors", "takeoff", "velocity"),
+    "zsim_api.simulation": ("Simulation",),
+}
+_MODULES = {name: module for module, names in _WHERE.items() for name in names}
+__all__ = [*_MODULES]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_MODULES[name]), name)

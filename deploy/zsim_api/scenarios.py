@@ -1,0 +1,164 @@
+"""A scenario in Python: the same document as in YAML, changed by paths and by classes, checked by the same rules."""
+
+import copy
+import json
+import shutil
+import tempfile
+from collections.abc import Mapping
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from zsim.errors import ScenarioError
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario as Resolved
+from zsim.schema import plugin, yaml_file
+from zsim_agents.hosting import check_classes, check_plans
+
+
+class Scenario:
+    """A scenario that is not changed in place.
+
+        zsim.Scenario.load("step.yaml").with_({"environment.wind.gust_m_s": 1.0}, seed=3)
+        zsim.Scenario(name="pair", duration_s=20, drones=[{"name": "drone1", "position_m": [0, 0, 0]}, …])
+
+    It is checked as a whole when it is flown, or by `resolved`.
+
+    Args:
+        fields: top-level fields, in maps and lists as in YAML; docs/scenario.md has them all.
+    """
+
+    def __init__(self, **fields: Any) -> None:
+        self._document: dict[str, Any] = copy.deepcopy(fields)
+        self.source = "scenario"  # named in faults
+        self.folders: tuple[Path, ...] = (Path.cwd(),)  # where modules that it names are searched
+        self.changes: tuple[str, ...] | None = None  # texts `a.b.c=value` against its file
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Return the scenario of a YAML file; ScenarioError if it cannot be read."""
+        path = Path(path)
+        made = cls(**yaml_file.read(path, scenario_file.EXAMPLE, ScenarioError))
+        made.source, made.folders, made.changes = path.name, (path.parent,), ()
+        return made
+
+    def with_(self, set: Mapping[str, Any] = {}, /, **fields: Any) -> Self:
+        """Return the scenario with other values.
+
+        Args:
+            set: values by path, `{"drones.drone2.mass_kg": 0.5}`; a value may be a class, where one is named.
+            fields: top-level fields.
+
+        Raises:
+            ScenarioError: a path leads nowhere; a line for each.
+        """
+        made = copy.copy(self)
+        made.__dict__.pop("resolved", None)
+        made._document = document = copy.deepcopy(self._document)
+        faults: list[str] = []
+        for path, given in {**fields, **set}.items():
+            value = made._named(given)
+            if fault := scenario_file.apply_override(document, f"{path}=", lambda _, value=value: copy.deepcopy(value)):
+                faults.append(fault.replace("--set ", "", 1))
+            elif made.changes is not None:
+                made.changes = (*made.changes, f"{path}={value if isinstance(value, str) else json.dumps(value)}")
+        if faults:
+            raise ScenarioError([f"{self.source}: {line}" for line in faults])
+        return made
+
+    def changed(
+        self,
+        seed: int | None = None,
+        duration_s: float | None = None,
+        set: Mapping[str, Any] | None = None,
+        law: type | None = None,
+        estimator: type | None = None,
+    ) -> Self:
+        """Return it as the arguments of `zsim.run` say."""
+        values = dict(set or {})
+        values |= {k: v for k, v in (("seed", seed), ("duration_s", duration_s)) if v is not None}
+        if estimator is not None:
+            values["estimation.algorithm"] = estimator
+        if law is not None:
+            values |= {f"clusters[{i}].law": law for i in range(len(self._document.get("clusters") or ()))}
+        return self.with_(values) if values else self
+
+    @cached_property
+    def resolved(self) -> Resolved:
+        """The scenario with all defaults, as it is flown; ScenarioError with every fault, a line each."""
+        self.search()
+        scenario = scenario_file.resolve(self._document, self.source)
+        check_classes(scenario, self.source)
+        check_plans(scenario, self.source)
+        return scenario
+
+    def search(self) -> None:
+        """Let modules that it names be found, in this process and in those started from here."""
+        plugin.search(*self.folders)
+
+    def keep_modules(self, folder: Path) -> None:
+        """Copy the modules of notebook classes that it names into a run's folder, where `zsim rerun` finds them."""
+        for name in self.resolved.own_code():
+            file = scratch_folder() / f"{name.partition(':')[0]}.py"
+            if file.exists():
+                shutil.copy(file, folder)
+
+    def document(self) -> dict[str, Any]:
+        """Return a copy of the document, as in YAML."""
+        return copy.deepcopy(self._document)
+
+    def to_yaml(self) -> str:
+        return yaml_file.dump(self._document)
+
+    def save(self, path: str | Path) -> None:
+        Path(path).write_text(self.to_yaml(), encoding="utf-8")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Scenario) and (self._document, self.folders) == (other._document, other.folders)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        drones = self._document.get("drones")
+        count = len(drones) if isinstance(drones, list) else 0
+        return f"<Scenario {self._document.get('name')!r} of {self.source}, {count} drones>"
+
+    def _named(self, value: Any) -> Any:
+        """Return a value with the names of classes and functions in place of them, and search where these are."""
+        if isinstance(value, type) or (callable(value) and hasattr(value, "__qualname__")):
+            from zsim_api.own_code import module_folders, name_of
+
+            name = name_of(value, scratch_folder())
+            self.folders = tuple(dict.fromkeys((*self.folders, *module_folders([name]))))
+            return name
+        if isinstance(value, Mapping):
+            return {key: self._named(each) for key, each in value.items()}
+        if isinstance(value, list | tuple):
+            return [self._named(each) for each in value]
+        return value.item() if isinstance(value, np.generic) else value
+
+
+AnyScenario = str | Path | Mapping[str, Any] | Scenario | Resolved
+
+
+def scenario_of(given: AnyScenario) -> Scenario:
+    """Return a scenario as it may be given: a path, a mapping as in YAML, a Scenario, or a resolved one."""
+    if isinstance(given, Scenario):
+        return given
+    if isinstance(given, Resolved):
+        return Scenario(**yaml_file.value(scenario_file.to_text(given)))
+    if isinstance(given, Mapping):
+        return Scenario(**given)
+    return Scenario.load(given)
+
+
+@cache
+def scratch_folder() -> Path:
+    """Return the folder, until this process ends, of the modules of notebook classes that no run's folder has yet."""
+    _SCRATCH.append(tempfile.TemporaryDirectory(prefix="zsim-", ignore_cleanup_errors=True))
+    return Path(_SCRATCH[0].name)
+
+
+_SCRATCH: list[tempfile.TemporaryDirectory[str]] = []

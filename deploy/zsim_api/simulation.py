@@ -1,0 +1,411 @@
+"""A flight in this process that is stepped from Python, one gate at a time.
+
+    sim = zsim.Simulation("step.yaml", agents=None)
+    sim.step({"drone1": zsim.takeoff()})
+    while sim.t_s < 10:
+        sim.step({"drone1": zsim.velocity(0.5, 0, 0)})
+    print(sim.truth.position_m[0])
+
+It is the flight of `zsim run --in-process`, to the same bits, with one participant more: the caller.
+"""
+
+import copy
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, NamedTuple, Self
+
+import numpy as np
+from msgspec import Struct, structs
+from numpy.typing import NDArray
+
+from zsim.contract import keys, messages
+from zsim.contract.flight_messages import ClusterState, Estimate
+from zsim.contract.framing import GateMessages
+from zsim.contract.messages import TOPICS, Info
+from zsim.contract.run_messages import ControlRequest, Event
+from zsim.errors import RequestRefusedError, RunError
+from zsim.output_folder import RECORD
+from zsim.record import RecordWriter
+from zsim.runtime.agent import Agent, Output
+from zsim.schema.checker import suggestion
+from zsim.sensors.sensor import Sample
+from zsim_analysis.in_process import CALLER, FlightObserver, InProcessFlight, OwnAgent
+from zsim_api.commands import Command
+from zsim_api.scenarios import AnyScenario, scenario_of
+from zsim_world.physics.fleet_arrays import STATE
+
+Array = NDArray[np.float64]
+GATES_HELD = 64  # of sensor messages that are not looked at; chosen: 0.3 MB of three drones
+_KINDS = {topic.message: key.rpartition("/")[2] for key, topic in TOPICS.items() if key.startswith("drone/*/cmd/")}
+
+
+class Truth(NamedTuple):
+    """The true state of N drones, in the order of `Simulation.names`: views, read-only, that change with every step."""
+
+    position_m: Array  # (N, 3), W
+    velocity_m_s: Array  # (N, 3), W
+    orientation_wxyz: Array  # (N, 4), B to W
+    angular_velocity_rad_s: Array  # (N, 3), B
+    accel_m_s2: Array  # (N, 3), W
+    rotor_rad_s: Array  # (N, R), 0 where a drone has fewer
+
+
+class Estimates(NamedTuple):
+    """The newest estimates of N drones; NaN before the first one, or where nobody estimates a drone."""
+
+    position_m: Array  # (N, 3), W
+    velocity_m_s: Array  # (N, 3), W
+    orientation_wxyz: Array  # (N, 4), B to W
+    yaw_rad: Array  # (N,)
+    covariance: Array  # (N, 6, 6) of position and velocity, SI units
+    yaw_sigma_rad: Array  # (N,)
+
+
+class Simulation:
+    """World and agents of a scenario, stepped gate by gate.
+
+    What acts when: the commands of a `step` carry the stamp of the gate that the caller has just seen, at `t_s`, as
+    those of an agent do. They act from `t_s + command_delay_s` on, so with the scenario's usual delay of one gate the
+    state after this step does not show them yet, and the state after the next one does.
+
+    Args:
+        scenario: path of a YAML file, `zsim.Scenario`, or a mapping as in YAML.
+        seed, duration_s, set: replace those of the scenario; `set` by paths, `{"environment.wind.gust_m_s": 1.0}`.
+        agents: "stock" flies the scenario's estimators and controllers, None nobody; a sequence of agents of your own,
+            classes or objects, flies them beside the stock ones; `stock=False` without these.
+        law, estimator: classes that replace those of all clusters and drones.
+        record: folder for the record, which `zsim.load` reads; None for none.
+
+    Raises:
+        ScenarioError: with every fault of the scenario, a line each.
+        RunError: it cannot be flown in one process, or the folder of the record is not empty.
+
+    Attributes:
+        names: of the drones; all arrays have them in this order.
+        truth, sensors, estimates: see `Truth`, `Sensors`, `Estimates`.
+        clusters: newest state of each cluster's controller, by cluster.
+        events: of the last step.
+    """
+
+    def __init__(
+        self,
+        scenario: AnyScenario,
+        *,
+        seed: int | None = None,
+        duration_s: float | None = None,
+        set: Mapping[str, Any] | None = None,
+        agents: Literal["stock"] | Sequence[OwnAgent] | None = "stock",
+        stock: bool = True,
+        law: type | None = None,
+        estimator: type | None = None,
+        record: str | Path | None = None,
+    ) -> None:
+        folder = Path(record) if record is not None else None
+        self.source = scenario_of(scenario).changed(
+            seed=seed, duration_s=duration_s, set=set, law=law, estimator=estimator
+        )
+        if isinstance(agents, str) and agents != "stock":
+            raise RunError(f"agents is {agents!r}; must be 'stock', None, or a sequence of agents")
+        self._own: Sequence[OwnAgent] = () if agents is None or isinstance(agents, str) else tuple(agents)
+        self._stock = stock and agents is not None
+        self._pristine = {i: _copied(each) for i, each in enumerate(self._own) if isinstance(each, Agent)}
+        self._folder, self._writer = folder, None
+        self._is_closed = False
+        self.reset()
+
+    def reset(self, seed: int | None = None, set: Mapping[str, Any] | None = None) -> Truth:
+        """Begin a flight from the start.
+
+        Agents that were given as objects begin with the attributes that they had then.
+
+        Args:
+            seed: of this flight and those after it; None: as before.
+            set: fields of the scenario that change for this flight and those after it.
+        """
+        if seed is not None or set:
+            self.source = self.source.changed(seed=seed, set=set)
+        if self._writer is not None:
+            raise RunError("reset: this simulation is recorded, and a record holds one flight; make another Simulation")
+        for i, attributes in self._pristine.items():
+            own = vars(self._own[i])
+            own.clear()
+            own |= copy.deepcopy(attributes)
+        self.scenario = self.source.resolved
+        self._flight = flight = InProcessFlight(self.scenario, None, None, self._own, stock=self._stock, steered=True)
+        self.info: Info = flight.info
+        self.names = [drone.name for drone in self.scenario.drones]
+        self.gate_s = self.info.gate_ns / 1e9
+        self.command_delay_s = self.info.command_delay_ns / 1e9
+        self.clusters: dict[str, ClusterState] = {}
+        self.events: list[Event] = []
+        self.sensors = Sensors(self.names)
+        self._index = {name: i for i, name in enumerate(self.names)}
+        self._last_estimates: dict[str, Estimate] = {}
+        self._estimates: Estimates | None = None
+        bodies = flight.world.fleet.bodies
+        state, accel = bodies.state[:], bodies.accel[:, 0:3]
+        state.setflags(write=False)
+        accel.setflags(write=False)
+        parts = (state[:, 0:3], state[:, 3:6], state[:, 6:10], state[:, 10:13], accel, state[:, STATE.size :])
+        self.truth = Truth(*parts)
+        observers: list[FlightObserver] = [self]
+        if self._folder is not None:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self.source.keep_modules(self._folder)
+            self._writer = RecordWriter(self._folder / RECORD)
+            observers.append(self._writer)
+        flight.start(observers)
+        self._turn()
+        return self.truth
+
+    @property
+    def t_s(self) -> float:
+        """The simulated time of the newest gate [s]."""
+        return self._flight.world.now_ns / 1e9
+
+    @property
+    def ended(self) -> str | None:
+        """Why the flight is over, None while it goes on."""
+        return self._flight.world.ended
+
+    @property
+    def estimates(self) -> Estimates:
+        if self._estimates is None:
+            count = len(self.names)
+            shapes = {"position_m": (3,), "velocity_m_s": (3,), "orientation_wxyz": (4,), "covariance": (6, 6)}
+            columns = [np.full((count, *shapes.get(name, ())), np.nan) for name in Estimates._fields]
+            for drone, estimate in self._last_estimates.items():
+                for name, column in zip(Estimates._fields, columns, strict=True):
+                    column[self._index[drone]] = np.reshape(getattr(estimate, name), shapes.get(name, ()))
+            self._estimates = Estimates(*columns)
+        return self._estimates
+
+    def state(self, drone: str) -> str:
+        """Return the state of a drone's firmware: "landed", "hovering", "flying" and so on."""
+        return self._flight.world.fleet.status(self._place(drone))[0]
+
+    def step(self, commands: Mapping[str, Command | Sequence[Command]] = {}) -> Truth:
+        """Fly one gate.
+
+        Args:
+            commands: by drone, one or several, by `zsim.velocity` and so on; see above what acts when. A drone without
+                one keeps the last one for `silence.hover_s`, then it hovers.
+
+        Raises:
+            RunError: the flight is over, or no drone has that name; before anything is sent.
+            UserCodeError: a user's class failed, and the flight has ended for it.
+        """
+        world = self._flight.world
+        if world.ended is not None:
+            raise RunError(f"step: the flight is over ({world.ended}); reset() begins another one")
+        outputs: list[Output] = []
+        for drone, given in commands.items():
+            self._place(drone)
+            for command in (given,) if isinstance(given, Struct) else given:
+                kind = _KINDS.get(type(command))
+                if kind is None:
+                    found = type(command).__name__
+                    raise RunError(
+                        f"step: the command to {drone} is a {found}; must be made by zsim.velocity and so on"
+                    )
+                outputs.append(Output(keys.command(drone, kind), command))
+        self.events = []
+        self._flight.send(outputs)
+        self._turn()
+        return self.truth
+
+    def run(self, until_s: float | None = None) -> str | None:
+        """Fly on without commands until a simulated time [s], or to the end; return `ended`."""
+        until_ns = np.inf if until_s is None else round(until_s * 1e9)
+        while self.ended is None and self._flight.world.now_ns < until_ns:
+            self.step()
+        return self.ended
+
+    def ask(self, key: str, op: str, **args: Any) -> dict[str, Any]:
+        """Ask the world or a controller, as `zsim ask` does: `sim.ask("cluster/main/control", "target", values={…})`.
+
+        It is done between this gate and the next.
+
+        Raises:
+            RequestRefusedError: with the reason.
+        """
+        answer = self._flight.control(key, ControlRequest(op, args, CALLER))
+        if not answer.ok:
+            raise RequestRefusedError(answer.error)
+        return answer.result or {}
+
+    def inject(self, fault: Mapping[str, Any]) -> dict[str, Any]:
+        """Inject a fault, as in a scenario's `faults`, from the next gate on; see docs/faults.md."""
+        return self.ask(keys.CONTROL, "fault_add", **fault)
+
+    def snapshot(self) -> Any:
+        """Return the whole state of the flight, for `restore`.
+
+        Raises:
+            RunError: an agent of yours has no `snapshot`.
+        """
+        return (self.source, self._flight.snapshot(), dict(self._last_estimates), dict(self.clusters))
+
+    def restore(self, snapshot: Any) -> Truth:
+        """Go on from a snapshot, to the same bits. A flight that is recorded cannot go back."""
+        source, flight, estimates, clusters = snapshot
+        if self._writer is not None:
+            raise RunError(
+                "restore: this simulation is recorded, and a record does not go back; make another Simulation"
+            )
+        if source != self.source:
+            self.source = source
+            self.reset()
+        self._flight.restore(flight)
+        self._last_estimates, self.clusters, self._estimates = dict(estimates), dict(clusters), None
+        self.events = []
+        self.sensors.forget()
+        return self.truth
+
+    def close(self) -> None:
+        """End the flight, and finish its record."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        self._flight.world.clock.stop("closed")
+        try:
+            self._flight.end()
+        finally:
+            if self._writer is not None:
+                self._writer.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, _: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        state = f"ended: {self.ended}" if self.ended else f"at {self.t_s:g} of {self.scenario.duration_s:g} s"
+        return f"<Simulation {self.scenario.name}, {len(self.names)} drones, seed {self.scenario.seed}, {state}>"
+
+    def _turn(self) -> None:
+        self._estimates = None
+        self._flight.turn(1)
+        if self._flight.world.failure is not None:
+            raise self._flight.world.failure
+
+    def _place(self, drone: str) -> int:
+        place = self._index.get(drone)
+        if place is None:
+            hint = suggestion(drone, self.names)
+            raise RunError(f"no drone is named {drone!r}; {hint}must be one of {', '.join(self.names)}")
+        return place
+
+    # As an observer of the flight
+
+    def add_message(self, key: str, message: Any, wall_ns: int) -> None:
+        kind = type(message)
+        if kind is Estimate:
+            self._last_estimates[keys.thing(key)] = message
+        elif kind is ClusterState:
+            self.clusters[keys.thing(key)] = message
+        elif kind is Event:
+            self.events.append(message)
+
+    def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
+        self.sensors.add(gate)
+
+
+class Sensors(Mapping[str, "Samples"]):
+    """The newest samples of all drones by sensor: "imu", "gps", "mag", "baro", "sonar", "flow", or of your own."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = names
+        self._gates: list[GateMessages] = []
+        self._newest: dict[str, tuple[GateMessages, int]] = {}  # by key, not decoded yet
+        self._samples: dict[str, Samples] = {}
+
+    def add(self, gate: GateMessages) -> None:
+        self._gates.append(gate)
+        if len(self._gates) > GATES_HELD:
+            self._fold()
+
+    def forget(self) -> None:
+        self._gates, self._newest = [], {}
+        self._samples.clear()
+
+    def _fold(self) -> None:
+        for gate in self._gates:
+            for place, which in enumerate(gate.which.tolist()):
+                self._newest[gate.table[which]] = (gate, place)
+        self._gates.clear()
+
+    def _update(self) -> None:
+        self._fold()
+        newest, self._newest = self._newest, {}
+        for key, (gate, place) in newest.items():
+            if not keys.is_sensor(key) or keys.is_status(key):
+                continue
+            message = messages.decode(key, gate.payload(place))
+            if isinstance(message, Sample):
+                _, drone, what = keys.parts(key)
+                sensor = what.removeprefix("sensor/")
+                if sensor not in self._samples:
+                    self._samples[sensor] = Samples(type(message), len(self._names))
+                self._samples[sensor].put(self._names.index(drone), message)
+
+    def __getitem__(self, sensor: str) -> "Samples":
+        self._update()
+        if sensor not in self._samples:
+            hint = suggestion(sensor, [*self._samples])
+            known = ", ".join(self._samples) or "none has come yet"
+            raise RunError(f"no sample of {sensor!r} has come; {hint}there are {known}")
+        return self._samples[sensor]
+
+    def __iter__(self) -> Iterator[str]:
+        self._update()
+        return iter(self._samples)
+
+    def __len__(self) -> int:
+        self._update()
+        return len(self._samples)
+
+
+class Samples:
+    """The newest sample of one sensor of N drones: an attribute (N, …) for each field of its message, in its units.
+
+    `t_sample_ns`, `t_ns` and `seq` are -1, all else is NaN, where a drone has had no sample.
+    """
+
+    def __init__(self, kind: type[Struct], drones: int) -> None:
+        self._fields = structs.fields(kind)
+        self._count = drones
+        self._columns: dict[str, NDArray[Any]] = {}
+
+    def put(self, place: int, message: Struct) -> None:
+        for name, value in structs.asdict(message).items():
+            if name not in self._columns:
+                whole = isinstance(value, int) and not isinstance(value, bool)
+                shape = np.shape(value) if not isinstance(value, str) else ()
+                kind = np.int64 if whole else object if isinstance(value, str) else np.float64
+                self._columns[name] = np.full((self._count, *shape), -1 if whole else np.nan, dtype=kind)
+            self._columns[name][place] = value
+
+    def __getattr__(self, name: str) -> NDArray[Any]:
+        columns = self.__dict__.get("_columns", {})
+        if name not in columns:
+            raise AttributeError(f"no field {name!r}; {suggestion(name, [*columns])}there are {', '.join(columns)}")
+        return columns[name]
+
+    def __dir__(self) -> list[str]:
+        return [*self._columns]
+
+    def __repr__(self) -> str:
+        return f"<Samples of {self._count} drones: {', '.join(self._columns)}>"
+
+
+def _copied(agent: Agent) -> dict[str, Any]:
+    """Return a copy of the attributes of an agent; RunError if they cannot be copied."""
+    try:
+        return copy.deepcopy(vars(agent))
+    except Exception as error:
+        raise RunError(
+            f"{type(agent).__qualname__} cannot be copied ({error}), as reset() needs; give the class"
+        ) from error
