@@ -138,6 +138,7 @@ EXTRA_OF = {
     "aiohttp": "gateway",
     "asyncssh": "hosts",
     "av": "video",
+    "cloudpickle": "agents",
     "cryptography": "hosts",
     "cv2": "cameras",
     "distributed": "dask",

@@ -11,6 +11,7 @@ others have written look names up without importing anything (`names_only`).
 import ast
 import importlib
 import os
+import re
 import sys
 import sysconfig
 from collections.abc import Callable, Iterator
@@ -37,6 +38,7 @@ WHERE = "install it, or put it on PYTHONPATH or beside the scenario"
 
 PACKAGES = frozenset({"zsim", "zsim_world", "zsim_agents", "zsim_bridges", "zsim_analysis", "zsim_api", "zsim_deploy"})
 """Of zsim: none of these is a user's."""
+MADE = "zsim_own_"  # begins the names of modules made for what notebooks and scripts define: zsim_api.own_code
 LIBRARIES = tuple(f"{sysconfig.get_path(part)}{os.sep}" for part in ("stdlib", "purelib", "platlib"))
 
 MODULE_NAME = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*\Z"
@@ -131,6 +133,11 @@ def is_own(kind: type) -> bool:
     return kind.__module__.partition(".")[0] not in PACKAGES
 
 
+def is_library(path: str) -> bool:
+    """Tell whether a file is of Python or of an installed package."""
+    return path.startswith(LIBRARIES) or "site-packages" in path or "dist-packages" in path
+
+
 def full_name(kind: type) -> str:
     return f"{kind.__module__}:{kind.__qualname__}"
 
@@ -157,8 +164,7 @@ def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
     (called, _), (deepest, line) = frames[0], frames[-1]
     method = f"{called.f_globals.get('__name__', '')}:{called.f_code.co_qualname}"
     raised = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
-    path = deepest.f_code.co_filename.removeprefix(f"{os.getcwd()}{os.sep}")
-    return UserCodeError(f"{method} raised {raised} ({path}:{line})", where)
+    return UserCodeError(f"{method} raised {raised} ({_place(deepest.f_code.co_filename, line)})", where)
 
 
 def numbers(returned: Any) -> NDArray[np.float64]:
@@ -170,12 +176,26 @@ def numbers(returned: Any) -> NDArray[np.float64]:
 
 
 def _is_user_frame(frame: FrameType) -> bool:
-    """Tell whether a frame is of a user's file, or of an installed package that a document names."""
+    """Tell whether a frame is of a user's file or notebook, or of an installed package that a document names."""
     package, path = frame.f_globals.get("__name__", "").partition(".")[0], frame.f_code.co_filename
-    if package in PACKAGES or path.startswith("<"):
+    if package in PACKAGES or (path.startswith("<") and package != "__main__"):
         return False
-    is_library = path.startswith(LIBRARIES) or "site-packages" in path or "dist-packages" in path
-    return not is_library or package in _LOADED
+    return not is_library(path) or package in _LOADED
+
+
+_CELL = re.compile(r".*ipykernel_\d+[/\\]\d+\.py|<ipython-input-(\d+)-.*>")
+
+
+def _place(path: str, line: int) -> str:
+    """Return file and line, or cell and line of a notebook, as the notebook names it."""
+    cell = _CELL.fullmatch(path)
+    if cell is None:
+        return f"{path.removeprefix(f'{os.getcwd()}{os.sep}')}:{line}"
+    notebook = sys.modules.get("IPython")  # none in another process
+    shell = notebook.get_ipython() if notebook else None
+    named = shell.compile.format_code_name(path) if shell else None
+    number = f"In[{cell[1]}]" if cell[1] else named[1] if named else "of the notebook"
+    return f"cell {number}, line {line}"
 
 
 _LOADED: set[str] = set()  # packages that documents have named
