@@ -90,12 +90,20 @@ class Launch(msgspec.Struct, frozen=True):
     insecure: bool = False
     listen: str | None = None
     modules: tuple[str, ...] = ()  # folders in which those that its scenario names were looked for
+    agents: tuple[tuple[str, ...], ...] = ()  # of the user's own, as words of `AgentSpec`
     changed: tuple[str, ...] = ()  # texts `a.b.c=value` by which the scenario was changed against its file
 
 
 def new_launch(**how: Any) -> Launch:
     """Return a launch of a new run, with the modules that its scenario has been loaded with."""
     return Launch(uuid.uuid4().hex[:12], modules=tuple(map(str, plugin.folders())), **how)
+
+
+def keep_launch(folder: Path, launch: Launch) -> None:
+    """Note how a run was launched, until `forget_launch`."""
+    (folder / JOURNAL).mkdir(exist_ok=True)
+    content = json.dumps(msgspec.to_builtins(launch))  # not msgspec's: a path may hold no UTF-8
+    (folder / JOURNAL / LAUNCH).write_text(content, "utf-8")
 
 
 def forget_launch(folder: Path) -> None:

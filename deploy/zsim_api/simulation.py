@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import ClusterState, Estimate
 from zsim.contract.framing import GateMessages
-from zsim.contract.messages import TOPICS, Info
+from zsim.contract.messages import Info
 from zsim.contract.run_messages import ControlRequest, Event
 from zsim.errors import RequestRefusedError, RunError
 from zsim.output_folder import RECORD
 from zsim.record import RecordWriter
-from zsim.runtime.agent import Agent, Output
+from zsim.runtime.agent import Agent
 from zsim.schema.checker import suggestion
 from zsim.sensors.sensor import Sample
 from zsim_analysis.in_process import CALLER, FlightObserver, InProcessFlight, OwnAgent
@@ -37,7 +37,6 @@ from zsim_world.physics.fleet_arrays import STATE
 
 Array = NDArray[np.float64]
 GATES_HELD = 64  # of sensor messages that are not looked at; chosen: 0.3 MB of three drones
-_KINDS = {topic.message: key.rpartition("/")[2] for key, topic in TOPICS.items() if key.startswith("drone/*/cmd/")}
 
 
 class Truth(NamedTuple):
@@ -199,19 +198,12 @@ class Simulation:
         world = self._flight.world
         if world.ended is not None:
             raise RunError(f"step: the flight is over ({world.ended}); reset() begins another one")
-        outputs: list[Output] = []
+        sent: list[tuple[str, Command]] = []
         for drone, given in commands.items():
             self._place(drone)
-            for command in (given,) if isinstance(given, Struct) else given:
-                kind = _KINDS.get(type(command))
-                if kind is None:
-                    found = type(command).__name__
-                    raise RunError(
-                        f"step: the command to {drone} is a {found}; must be made by zsim.velocity and so on"
-                    )
-                outputs.append(Output(keys.command(drone, kind), command))
+            sent += [(drone, command) for command in (given if isinstance(given, list | tuple) else (given,))]
         self.events = []
-        self._flight.send(outputs)
+        self._flight.send(sent)
         self._turn()
         return self.truth
 
