@@ -73,15 +73,17 @@ class Agent(ABC):
             Agent.__init__(self)
         own = vars(self)
         if "_declared" in own:  # bound for an earlier run
-            for name in _FILLED:
-                own.pop(name, None)
+            for each in _FILLED:
+                own.pop(each, None)
             own |= self._declared
-        self._declared = {name: own[name] for name in _FILLED if name in own}
+        if name:
+            own["name"] = name
+        self._declared = {each: own[each] for each in _FILLED if each in own}
         self._seq.clear()
         statuses = [keys.status(drone.name) for drone in info.drones]
         at_gates = [keys.estimate(drone.name) for drone in info.drones]
         at_gates += [keys.cluster_state(cluster.name) for cluster in info.clusters]
-        self.name = name or getattr(self, "name", default_name(type(self)))
+        self.name = getattr(self, "name", default_name(type(self)))
         self.period_ns = getattr(self, "period_ns", info.gate_ns)
         self.reads = getattr(self, "reads", ())
         if not hasattr(self, "gate_keys"):
