@@ -18,6 +18,7 @@ from zsim.errors import OTHER_OUT, DecodeError, RunError, file_fault
 from zsim.output_folder import RECORD, refuse_others
 from zsim.record.mcap_layout import LIBRARY, OURS, is_ours
 from zsim.record.record_writer import cut_at_last, is_being_written
+from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 
@@ -99,11 +100,15 @@ def new_launch(**how: Any) -> Launch:
     return Launch(uuid.uuid4().hex[:12], modules=tuple(map(str, plugin.folders())), **how)
 
 
-def keep_launch(folder: Path, launch: Launch) -> None:
-    """Note how a run was launched, until `forget_launch`."""
-    (folder / JOURNAL).mkdir(exist_ok=True)
-    content = json.dumps(msgspec.to_builtins(launch))  # not msgspec's: a path may hold no UTF-8
-    (folder / JOURNAL / LAUNCH).write_text(content, "utf-8")
+def prepare(folder: Path, scenario: Scenario, launch: Launch) -> None:
+    """Put what is to be flown, and how, into the run's folder; RunError if it cannot be written."""
+    with file_fault(folder, "cannot be written", OTHER_OUT):
+        if not launch.in_process:
+            (folder / LOGS).mkdir(exist_ok=True)
+        (folder / SCENARIO).write_text(scenario_file.to_text(scenario))
+        (folder / JOURNAL).mkdir(exist_ok=True)
+        content = json.dumps(msgspec.to_builtins(launch))  # not msgspec's: a path may hold no UTF-8
+        (folder / JOURNAL / LAUNCH).write_text(content, "utf-8")
 
 
 def forget_launch(folder: Path) -> None:

@@ -159,7 +159,7 @@ def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
         where: which process, at which simulated time.
     """
     if isinstance(error, UserCodeError):
-        return error if error.where else UserCodeError(error.text, where)
+        return UserCodeError(error.text, error.where or where)  # another one, to be raised from it
     walked = list(walk_tb(error.__traceback__))
     frames = [(frame, line) for frame, line in walked if is_user_frame(frame)]
     if not frames:
@@ -186,6 +186,22 @@ def numbers(returned: Any) -> NDArray[np.float64]:
     if array.dtype.kind not in "biuf":
         raise ValueError(f"no real numbers: {array.dtype}")
     return array.astype(float, copy=False)
+
+
+def raised_by_user(failure: UserCodeError) -> BaseException | None:
+    """Return what a user's code has raised, its traceback beginning with its own first line; None if it only returned.
+
+    Only for a failure that is caught: the traceback of what is returned is changed.
+    """
+    raised: BaseException | None = failure
+    while raised is not None:
+        traceback = raised.__traceback__
+        while traceback and not is_user_frame(traceback.tb_frame):
+            traceback = traceback.tb_next
+        if traceback and not isinstance(raised, UserCodeError):
+            return raised.with_traceback(traceback)
+        raised = raised.__cause__
+    return None
 
 
 _CELL = re.compile(r".*ipykernel_\d+[/\\]\d+\.py|<ipython-input-(\d+)-.*>")

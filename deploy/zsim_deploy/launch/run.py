@@ -12,11 +12,10 @@ from typing import Any, NamedTuple
 
 from msgspec.structs import replace
 
-from zsim.errors import OTHER_OUT, RecordError, RunFailedError, SessionError, file_fault
+from zsim.errors import RecordError, RunFailedError, SessionError
 from zsim.output_folder import RECORD, no_locks
 from zsim.record import repair
 from zsim.runtime.progress import Screen
-from zsim.scenario import scenario_file
 from zsim.scenario.consistency import unflown_plans
 from zsim.scenario.roles import driver_lines, expected_processes, watched_drones
 from zsim.scenario.scenario import Scenario
@@ -191,14 +190,10 @@ def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
 
 
 def _prepare(options: RunOptions, screen: Screen) -> None:
-    """Put what is to be flown, and how, into the run's folder, and show it; RunError if it cannot be written."""
+    """Put what is to be flown, and how, into the run's folder, and show it; errors as of `prepare`."""
     scenario = options.scenario
     if not options.continued:
-        with file_fault(options.out, "cannot be written", OTHER_OUT):
-            if not options.launch.in_process:
-                (options.out / "logs").mkdir(exist_ok=True)
-            (options.out / "scenario.yaml").write_text(scenario_file.to_text(scenario))
-            run_folder.keep_launch(options.out, options.launch)
+        run_folder.prepare(options.out, scenario, options.launch)
     screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
     for line in (*unflown_plans(scenario), no_locks(options.out)):
         if line:
