@@ -22,7 +22,7 @@ from zsim.runtime.progress import PERIOD_S, HoldReasons, Screen, SlowStart
 from zsim.runtime.rate_limit import RateLimit
 from zsim.scenario.roles import agent_names, expected_processes, lets_drop
 from zsim.scenario.scenario import Scenario
-from zsim_agents.hosting import hosted, own_agent
+from zsim_agents.hosting import hosted, own_agent, with_own_agents
 from zsim_world import run_state
 from zsim_world.run.world import World
 
@@ -66,6 +66,15 @@ def fly(
     if flight.world.failure:
         raise flight.world.failure
     return flight.world.ended or "ended"
+
+
+def with_agents(scenario: Scenario, own: Sequence[OwnAgent]) -> tuple[Scenario, list[Agent]]:
+    """Return a resolved scenario that waits for agents of a user's, and ends where one fails; and the agents."""
+    if not own:
+        return scenario, []
+    info = World(scenario).info()
+    made = [own_agent(each, info, scenario) for each in own]
+    return with_own_agents(scenario, [agent.name for agent in made]), made
 
 
 class FlightObserver(Protocol):

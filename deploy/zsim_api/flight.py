@@ -14,15 +14,12 @@ from rich.console import Console
 
 from zsim.errors import RunError, RunFailedError, UserCodeError
 from zsim.output_folder import RECORD
-from zsim.runtime.agent import Agent
 from zsim.runtime.progress import Screen, describe
 from zsim.schema import plugin
-from zsim_agents.hosting import own_agent, with_own_agents
-from zsim_analysis.in_process import OwnAgent, fly
+from zsim_analysis.in_process import OwnAgent, fly, with_agents
 from zsim_analysis.reading.shortfall import verdict
 from zsim_api import run_folder
 from zsim_api.scenarios import AnyScenario, Scenario, scenario_of
-from zsim_world.run.world import World
 
 if TYPE_CHECKING:
     from zsim_api.recorded import Run
@@ -73,12 +70,7 @@ def run(
     source = scenario_of(scenario).changed(seed=seed, duration_s=duration_s, set=set, law=law, estimator=estimator)
     if options and not processes:
         raise RunError(f"options is {list(options)}; must be empty without processes=True, which they are for")
-    flown = source.resolved
-    made: list[Agent] = []
-    if agents:
-        info = World(flown).info()
-        made = _calling(lambda: [own_agent(each, info, flown) for each in agents])
-        flown = with_own_agents(flown, [agent.name for agent in made])
+    flown, made = calling(lambda: with_agents(source.resolved, agents))
     folder = run_folder.make_directory(Path(out) if out is not None else None, flown, force)
     source.keep_modules(folder)
     if processes:
@@ -89,7 +81,7 @@ def run(
         with screen_for(flown.duration_s) if progress else nullcontext() as screen, _ctrl_c() as stop_reason:
             if screen:
                 screen.say(f"{flown.name}: {len(flown.drones)} drones, {flown.duration_s:g} s, into {folder}")
-            _calling(lambda: fly(flown, folder / RECORD, stop_reason, screen, None, source.changes, made), folder)
+            calling(lambda: fly(flown, folder / RECORD, stop_reason, screen, None, source.changes, made), folder)
         if reason := stop_reason():
             raise KeyboardInterrupt(f"{reason}; zsim.load({str(folder)!r}) reads the record so far")
         run_folder.forget_launch(folder)
@@ -163,7 +155,7 @@ def _raise_failure(folder: Path, code: int) -> None:
 # In this process
 
 
-def _calling(call: Callable[[], Result], folder: Path | None = None) -> Result:
+def calling(call: Callable[[], Result], folder: Path | None = None) -> Result:
     """Call what calls classes of a user's; what one raises is raised as it is, after a line with where that was."""
     try:
         return call()

@@ -30,8 +30,9 @@ from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent
 from zsim.schema.checker import suggestion
 from zsim.sensors.sensor import Sample
-from zsim_analysis.in_process import CALLER, FlightObserver, InProcessFlight, OwnAgent
+from zsim_analysis.in_process import CALLER, FlightObserver, InProcessFlight, OwnAgent, with_agents
 from zsim_api.commands import Command
+from zsim_api.flight import calling
 from zsim_api.scenarios import AnyScenario, scenario_of
 from zsim_world.physics.fleet_arrays import STATE
 
@@ -110,7 +111,6 @@ class Simulation:
         self._stock = stock and agents is not None
         self._pristine = {i: _copied(each) for i, each in enumerate(self._own) if isinstance(each, Agent)}
         self._folder, self._writer = folder, None
-        self._is_closed = False
         self.reset()
 
     def reset(self, seed: int | None = None, set: Mapping[str, Any] | None = None) -> Truth:
@@ -130,8 +130,9 @@ class Simulation:
             own = vars(self._own[i])
             own.clear()
             own |= copy.deepcopy(attributes)
-        self.scenario = self.source.resolved
-        self._flight = flight = InProcessFlight(self.scenario, None, None, self._own, stock=self._stock, steered=True)
+        self._is_closed = False
+        self.scenario, own = with_agents(self.source.resolved, self._own)
+        self._flight = flight = InProcessFlight(self.scenario, None, None, own, stock=self._stock, steered=True)
         self.info: Info = flight.info
         self.names = [drone.name for drone in self.scenario.drones]
         self.gate_s = self.info.gate_ns / 1e9
@@ -169,6 +170,11 @@ class Simulation:
         return self._flight.world.ended
 
     @property
+    def truth_sha256(self) -> str:
+        """The hash of the truth of all gates so far, as of `zsim report`."""
+        return self._flight.world.truth_hash.hexdigest()
+
+    @property
     def estimates(self) -> Estimates:
         if self._estimates is None:
             count = len(self.names)
@@ -193,7 +199,7 @@ class Simulation:
 
         Raises:
             RunError: the flight is over, or no drone has that name; before anything is sent.
-            UserCodeError: a user's class failed, and the flight has ended for it.
+            Exception: what a class of yours raised, after a line on stderr that says where; the flight is over.
         """
         world = self._flight.world
         if world.ended is not None:
@@ -259,10 +265,13 @@ class Simulation:
         """End the flight, and finish its record."""
         if self._is_closed:
             return
-        self._is_closed = True
         self._flight.world.clock.stop("closed")
+        self._end()
+
+    def _end(self) -> None:
+        self._is_closed = True
         try:
-            self._flight.end()
+            calling(self._flight.end, self._folder)
         finally:
             if self._writer is not None:
                 self._writer.close()
@@ -281,6 +290,7 @@ class Simulation:
         self._estimates = None
         self._flight.turn(1)
         if self._flight.world.failure is not None:
+            self._end()
             raise self._flight.world.failure
 
     def _place(self, drone: str) -> int:
