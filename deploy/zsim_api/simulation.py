@@ -207,7 +207,8 @@ class Simulation:
         sent: list[tuple[str, Command]] = []
         for drone, given in commands.items():
             self._place(drone)
-            sent += [(drone, command) for command in (given if isinstance(given, list | tuple) else (given,))]
+            several: Sequence[Any] = given if isinstance(given, list | tuple) else (given,)
+            sent += [(drone, command) for command in several]
         self.events = []
         self._flight.send(sent)
         self._turn()
