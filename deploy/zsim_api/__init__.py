@@ -19,12 +19,14 @@ if TYPE_CHECKING:  # for editors, which do not read _WHERE
     from zsim_api.commands import takeoff as takeoff
     from zsim_api.commands import velocity as velocity
     from zsim_api.simulation import Simulation as Simulation
+    from zsim_api.sweeping import sweep as sweep
 
 _WHERE = {
     "zsim.errors": ("ZsimError",),
     "zsim.runtime.agent": ("Agent", "Output"),
     "zsim_api.commands": ("Command", "ardrone", "attitude", "emergency", "land", "rotors", "takeoff", "velocity"),
     "zsim_api.simulation": ("Simulation",),
+    "zsim_api.sweeping": ("sweep",),
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
 __all__ = [*_MODULES]
