@@ -291,18 +291,15 @@ def sweep(
     require("sweep", SWEEP_NEEDS if dask is None else DASK_NEEDS)
     from rich.console import Console
 
-    from zsim_analysis.sweep.design import make_plan, read_document
+    from zsim_analysis.sweep.design import read_document
     from zsim_analysis.sweep.sweep import SweepRequest
     from zsim_analysis.sweep.sweep import sweep as fly
+    from zsim_api.sweeping import planned
 
     document, faults = read_document(scenario, set_ or [], seed=seed, duration_s=duration)
     changed = opt.changed_fields(set_, seed, duration)
-    with Console(stderr=True).status("checking every combination …") as status:
-
-        def look(run: int, of: int) -> None:
-            status.update(f"checking combination {run + 1} of {of}")
-
-        plan = make_plan(scenario.name, document, vary or [], runs, keep_records, look, faults, changed)
+    shown = Console(stderr=True)
+    plan = planned(scenario.name, document, vary or [], runs, keep_records, changed, shown, faults)
     folder = out or Path("runs") / f"{plan.document['name']}-sweep-{time.strftime('%Y%m%d-%H%M%S')}"
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
@@ -316,9 +313,7 @@ def sweep(
 
 
 def _conclude(folder: Path, failures: list[str], runs: int, report: bool, short: Sequence[str] = ()) -> None:
-    """Print what did not end well, make the report, and fail if a run did not end well, or none flew its plan."""
-    for failure in sorted(set(failures), key=failures.count, reverse=True)[:5]:
-        note(f"{failures.count(failure)} of {runs} runs failed: {failure}")
+    """Make the report, and fail if a run did not end well, or none flew its plan."""
     if report:
         _report(folder)
     say(f"table: {folder / 'sweep.parquet'}")
