@@ -56,7 +56,7 @@ def sweep(
 
         frame = zsim.sweep(
             "step.yaml",
-            vary={"seed": range(50), "estimation.algorithm": ["error_state", MyEstimator]},
+            vary={"seed": range(50), "estimation.algorithm": ["ekf", MyEstimator]},
             metrics=[settling_time],
         )
         frame.groupby("estimation.algorithm")["metrics.settling_time"].mean()
@@ -101,7 +101,7 @@ def sweep(
     try:
         plan = planned(varied.source, varied.document(), texts, runs, keep_records, varied.changes, console)
     except ScenarioError as error:
-        raise ScenarioError([_in_python(fault) for fault in error.faults]) from error
+        raise ScenarioError([_in_python(fault) for fault in error.faults]) from None
     folder = Path(out) if out is not None else Path(tempfile.mkdtemp(prefix="zsim-sweep-"))
     modules = made_modules(_names(plan), [scratch_folder()])
     try:
@@ -113,7 +113,7 @@ def sweep(
         )
         raise
     except RunError as error:
-        raise RunError(_in_python(str(error))) from error
+        raise RunError(_in_python(str(error))) from None
     if out is None:
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
     design = SweepDesign(plan)
