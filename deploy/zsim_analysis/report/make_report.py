@@ -13,19 +13,19 @@ from tempfile import TemporaryDirectory
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
 
-from zsim.errors import RecordError, ReportError
+from zsim.errors import ReportError
 from zsim.output_folder import RECORD
 from zsim.presentation import colours_of
 from zsim_analysis.reading.drone_errors import distances, estimate_errors, separations, velocity_responses
-from zsim_analysis.reading.formation import Formation, formations_of, goal_errors
-from zsim_analysis.reading.recorded_flight import RecordedFlight, read_flight
+from zsim_analysis.reading.formation import Formation, goal_errors
+from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.reading.shortfall import seconds_text, span_text
 from zsim_analysis.report import FORMATS
 from zsim_analysis.report import drone_figures as drones
 from zsim_analysis.report.figure_style import DARK, TAKE_OVER, VERMILION, ReportFigure, mark_figure, time_marks
 from zsim_analysis.report.formation_figures import ROWS_MAX, draw_errors, draw_parameters, numbered, parameter_groups
 from zsim_analysis.report.paper import PAPER_NOTE, flies_paper_test
-from zsim_analysis.report.summary import PAPER_COLUMN, RunSummary, error_table, summarise
+from zsim_analysis.report.summary import PAPER_COLUMN, RunSummary, error_table, judge
 
 FAULTS_MAX = 6  # at the head of a page
 REFERENCE = (
@@ -51,26 +51,6 @@ def make_report(
     drawings = figures(flight, formations, summary)
     write_report(directory, summary.json(), drawings, partial(page, summary), progress, formats)
     return summary
-
-
-def judge(
-    record: Path, progress: Callable[[str], None] = lambda _: None, answers: bool = False
-) -> tuple[RecordedFlight, list[Formation], RunSummary]:
-    """Return the flight of a record, its formations and its summary.
-
-    With `answers` it includes the drones' estimates and velocity commands. `progress` receives a text at each step.
-
-    Raises:
-        RecordError: there is no record, or it holds no truth of any drone.
-    """
-    progress("reading the record")
-    flight = read_flight(record, answers)
-    if all(len(track.t_ns) == 0 for track in flight.tracks):
-        content = f"holds {flight.messages} messages and no truth" if flight.messages else "holds no message"
-        raise RecordError(f"{record}: {content} ({flight.completeness}); there is nothing to report")
-    progress("computing the formation's errors")
-    formations = formations_of(flight)
-    return flight, formations, summarise(flight, formations, record)
 
 
 # Figures, in the order of the page

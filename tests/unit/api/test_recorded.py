@@ -1,0 +1,237 @@
+"""A run on record, read from Python: against the messages that were written, the export and the report."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import recorded_run
+import synthetic_record
+from refused import refused
+from synthetic_record import Flown
+
+import zsim
+from zsim.contract import keys
+from zsim.contract.messages import decode
+from zsim.errors import RecordError, RunError
+from zsim.record import RecordReader
+from zsim_agents.formation.spaces.scenario_space import cluster_space
+from zsim_analysis.export import Format
+from zsim_analysis.export.columns import MessageSelection
+from zsim_analysis.export.make_export import export
+from zsim_analysis.report.summary import judge
+from zsim_api import recorded, tables
+
+DRONE = "a-b.c"
+NAMES = [*cluster_space(3).names]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flight of six seconds, engaged from about the fourth on, with a message of every kind."""
+    made = tmp_path_factory.mktemp("run")
+    recorded_run.write(made / "run.mcap")
+    return made
+
+
+@pytest.fixture(scope="module")
+def run(folder: Path) -> zsim.Run:
+    return zsim.load(folder)
+
+
+@pytest.fixture
+def without_pandas(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+
+
+# Tables
+
+
+def test_truth_is_what_was_recorded(folder: Path, run: zsim.Run) -> None:
+    truth, written = run.truth(DRONE), recorded_run.messages_on(folder, keys.truth(DRONE))
+    assert len(truth) == len(written) > 290
+    assert [*truth.index] == [message.t_ns / 1e9 for message in written]
+    for i, axis in enumerate("xyz"):
+        assert [*truth[f"position_m_{axis}"]] == [message.position_m[i] for message in written]
+    assert truth.index.name == "t_s"
+    assert not {"name", "t_ns", "seq", "wall_ns"} & {*truth}
+
+
+EXPORTED = {
+    "truth": lambda run: run.truth("drone1"),
+    "estimate": lambda run: run.estimate("drone1"),
+    "gps": lambda run: run.sensor("drone1", "gps"),
+    "status": lambda run: run.sensor("drone1", "status"),
+    "velocity": lambda run: run.commands("drone1"),
+    "mode": lambda run: run.commands("drone1", "mode"),
+    "cluster_state": lambda run: run.cluster("main"),
+    "event": lambda run: run.events,
+}
+
+
+@pytest.mark.parametrize("name", EXPORTED)
+def test_a_frame_has_the_columns_and_rows_of_the_export(folder: Path, run: zsim.Run, name: str, tmp_path: Path) -> None:
+    selection = MessageSelection(
+        ("drone/drone1/*", "drone/drone1/sensor/*", "drone/drone1/cmd/*", "cluster/*/state", "world/event")
+    )
+    export(folder, Format.PARQUET, tmp_path / "tables", selection)
+    table = pd.read_parquet(tmp_path / "tables" / f"{name}.parquet").set_index("t_s")
+    expected = table.drop(columns=["name", "t_ns", "seq", "wall_ns"])
+    pd.testing.assert_frame_equal(plain(EXPORTED[name](run)), plain(expected))
+
+
+def plain(table: pd.DataFrame) -> pd.DataFrame:
+    return table.astype(object).where(table.notna(), None)
+
+
+def test_a_hat_that_was_seen_is_a_row(run: zsim.Run) -> None:
+    seen = run.messages("drone/drone1/sensor/sightings")
+    assert {"camera", "hat", "direction_B_x", "range_m"} <= {*seen}
+
+
+def test_own_messages_have_a_column_for_each_field(run: zsim.Run) -> None:
+    thing = run.messages("own/thing")
+    assert thing[["x_0", "x_1"]].to_numpy().tolist() == [[1.0, 2.0]]
+    assert run.messages("own/noise")["hexadecimal"].tolist() == ["c100"]
+
+
+@pytest.mark.parametrize(
+    ("values", "columns"),
+    [
+        ([[1.5, 2, 3], None], {"f_x": [1.5, np.nan], "f_y": [2.0, np.nan], "f_z": [3.0, np.nan]}),
+        ([1, 2], {"f": [1, 2]}),
+        ([1, None, 0.5], {"f": [1.0, np.nan, 0.5]}),
+        ([True, False], {"f": [True, False]}),
+        ([True, None], {"f": [True, None]}),
+        ([2**63, 1], {"f": [2.0**63, 1.0]}),
+        (["a", None], {"f": ["a", None]}),
+        ([[1, 2], [1]], {"f": ["[1,2]", "[1]"]}),
+        ([{"a": 1}, 3], {"f": ['{"a":1}', "3"]}),
+        ([[True, False]], {"f": ["[true,false]"]}),
+        ([[]], {"f": ["[]"]}),
+    ],
+)
+def test_own_fields_become_numbers_where_all_are(values: list[Any], columns: dict[str, list[Any]]) -> None:
+    made = tables._own_columns("f", values)
+    assert {*made} == {*columns}
+    for name, expected in columns.items():
+        np.testing.assert_array_equal(made[name], np.array(expected, made[name].dtype))
+
+
+def test_messages_have_their_stamps_too(folder: Path, run: zsim.Run) -> None:
+    with RecordReader(folder / "run.mcap") as reader:
+        written = [*reader.messages({"clock"})]
+    clock = run.messages("clock")
+    assert clock["t_ns"].tolist() == [each.t_ns for each in written]
+    assert clock["wall_ns"].tolist() == [each.wall_ns for each in written]
+    assert clock["seq"].tolist() == [decode("clock", each.payload).seq for each in written]
+
+
+def test_without_pandas_a_frame_is_a_dict_of_arrays(folder: Path, without_pandas: None) -> None:
+    run = zsim.load(folder)
+    truth: Any = run.truth("drone1")
+    assert isinstance(truth, dict)
+    assert next(iter(truth)) == "t_s"
+    assert truth["position_m_z"].shape == truth["t_s"].shape
+    with pytest.raises(ValueError, match="read-only"):
+        truth["position_m_z"][0] = 1.0
+    assert "unit" in run.error_summary("main")
+
+
+def test_a_key_is_read_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = []
+    monkeypatch.setattr(recorded, "read_table", lambda *of: read.append(of[1]) or tables.read_table(*of))
+    run = zsim.load(folder)
+    first = run.truth("drone1")
+    first.loc[:, "position_m_x"] = 7.0  # the user's own from here on
+    assert run.truth("drone1")["position_m_x"].iloc[0] == pytest.approx(2.0)
+    run.messages("drone/drone1/truth")
+    assert read == ["drone/drone1/truth"]
+
+
+# Errors and summary
+
+
+@pytest.fixture(scope="module")
+def step(tmp_path_factory: pytest.TempPathFactory) -> zsim.Run:
+    """A synthetic flight whose true errors are sines of 1 mm to 12 mm about 1 cm, and half of that as estimated."""
+    made = tmp_path_factory.mktemp("step")
+    true = np.arange(1, 13) * 1e-3
+    synthetic_record.write(
+        made / "run.mcap", Flown(duration_s=12.0, amplitude=true, est_amplitude=true / 2, offset=np.full(12, 0.01))
+    )
+    return zsim.load(made)
+
+
+def test_errors_of_a_formation_are_those_of_the_closed_form(step: zsim.Run) -> None:
+    table = step.error_summary("main", window=(2.0, 9.98))
+    assert [*table.index] == [*step.summary.errors] == NAMES
+    sine = np.arange(1, 13) * 1e-3 / np.sqrt(2)
+    assert table["true_std"].to_numpy() == pytest.approx(sine)
+    assert table["true_rms"].to_numpy() == pytest.approx(np.hypot(sine, 0.01))
+    assert table["est_rms"].to_numpy() == pytest.approx(sine / 2)
+    assert table["unit"][["p", "beta"]].tolist() == ["m", "rad"]
+    errors = step.errors("main", window=(2.0, 9.98))
+    assert errors["true_p_m"].to_numpy().std() == pytest.approx(table.loc["p", "true_std"])
+    assert errors["est_beta_rad"].to_numpy().std() == pytest.approx(table.loc["beta", "est_std"])
+    assert errors["engaged"].all()
+
+
+def test_without_a_window_statistics_are_those_of_the_report(step: zsim.Run) -> None:
+    expected = [errors.true_rms for errors in step.summary.errors.values()]
+    assert step.error_summary()["true_rms"].tolist() == expected
+    assert step.summary.json() == judge(step.record)[2].json()
+
+
+def test_errors_of_a_drone_are_estimate_less_truth(run: zsim.Run) -> None:
+    errors, truth, estimate = run.errors("drone1"), run.truth("drone1"), run.estimate("drone1")
+    own = (estimate["position_m_x"] - truth["position_m_x"]).dropna()
+    assert errors["position_m_x"].to_numpy() == pytest.approx(own.to_numpy(), abs=1e-5)  # estimates are read as float32
+    table = run.error_summary("drone1", window=(2.0, 4.0))
+    part = errors.loc[2.0:4.0, "position_m_x"]
+    assert table.loc["position_m_x", "rms"] == pytest.approx(np.sqrt(np.mean(part**2)))
+    assert table.loc["position_m_x", "mean"] == pytest.approx(part.mean())
+    assert table.loc["nees", "mean"] == pytest.approx(errors.loc[2.0:4.0, "nees"].mean())
+
+
+def test_a_window_selects_instants(run: zsim.Run) -> None:
+    part = run.errors("drone1", window=(2.0, 3.0))
+    assert (part.index.min(), part.index.max()) == (2.0, 3.0)
+    assert np.isnan(run.error_summary("drone1", window=(100.0, 200.0))["rms"]).all()
+
+
+def test_how_it_was_flown_is_known(run: zsim.Run) -> None:
+    assert run.drones == ("drone1", "a-b.c", "end")
+    assert run.clusters == ("main",)
+    assert run.duration_s == 6.0
+    assert run.truth_sha256 == run.summary.truth_sha256
+    assert run.scenario.resolved.seed == 3
+    assert run.scenario.document()["drones"][1]["name"] == DRONE
+
+
+# What is not there
+
+
+@pytest.mark.parametrize(
+    ("ask", "words"),
+    [
+        (lambda run: run.truth("drone4"), ("no drone 'drone4'", "did you mean drone1?", "drone1, a-b.c, end")),
+        (lambda run: run.sensor("drone1", "gsp"), ("no sensor gsp of drone1", "did you mean gps?", "imu")),
+        (lambda run: run.commands("end", "rotors"), ("no cmd rotors of end", "none")),
+        (lambda run: run.commands("drone1", "rotor"), ("no cmd rotor of drone1", "did you mean rotors?", "velocity")),
+        (lambda run: run.cluster("mian"), ("no cluster 'mian'", "did you mean main?")),
+        (lambda run: run.errors("drome1"), ("no cluster or drone 'drome1'", "did you mean drone1?")),
+        (lambda run: run.messages("drone/*/truth"), ("no messages of 'drone/*/truth'", "drone/drone1/truth")),
+        (lambda run: run.messages("own/thin"), ("'own/thin'", "did you mean own/thing?")),
+    ],
+)
+def test_what_is_not_on_record_is_refused_with_what_is(run: zsim.Run, ask: Any, words: tuple[str, ...]) -> None:
+    with refused(RecordError, *words):
+        ask(run)
+
+
+def test_a_folder_without_a_record_is_refused(tmp_path: Path) -> None:
+    with refused(RunError, str(tmp_path), "run.mcap"):
+        zsim.load(tmp_path)
