@@ -1,18 +1,22 @@
 """Makes the agents of a process from names and patterns, and checks the classes and plans of a scenario."""
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
 from inspect import signature
-from typing import Any
+from typing import Any, NamedTuple
 
+from msgspec.structs import replace
+
+from zsim.contract import keys
 from zsim.contract.messages import Info
 from zsim.errors import DocumentError, NotTrustedError, RunError, ScenarioError
-from zsim.runtime.agent import Agent, AgentGroup
+from zsim.runtime.agent import Agent, AgentGroup, default_name
 from zsim.runtime.inbox import output_hold_ns
-from zsim.scenario.roles import AGENTS, agent_names
+from zsim.scenario.roles import AGENTS, agent_names, expected_processes
 from zsim.scenario.scenario import Scenario
-from zsim.schema import plugin
+from zsim.schema import plugin, yaml_file
 
 NAMED_MAX = 10  # of the known names in a refusal
 
@@ -119,28 +123,88 @@ def make_agents(role: str, info: Info, scenario: Scenario, names: Sequence[str])
         raise failure from error
 
 
+class AgentSpec(NamedTuple):
+    """An agent of a user's, as a command line names it: `[NAME=]MODULE:CLASS [SETTING=VALUE]...`."""
+
+    named: str  # the class, a function that makes the agent, or the agent
+    settings: dict[str, Any]  # arguments of the class
+    name: str  # of its process
+
+    @classmethod
+    def parse(cls, words: Sequence[str], name: str = "") -> "AgentSpec":
+        """Return the agent of some words, the class loaded here.
+
+        Raises:
+            RunError: a setting is malformed, or a name.
+            DocumentError: there is no such class.
+        """
+        given, _, named = words[0].rpartition("=")
+        settings: dict[str, Any] = {}
+        for word in words[1:]:
+            setting, equals, value = word.partition("=")
+            if not (equals and setting.isidentifier()):
+                raise RunError(f"setting of {named} is {word!r}; must be NAME=VALUE")
+            try:
+                settings[setting] = yaml_file.value(value)
+            except ValueError as error:
+                raise RunError(f"setting {setting} of {named} {error}; must be a value in YAML") from error
+        made = plugin.load_any(named, "agent", Agent)
+        return cls(named, settings, keys.name(name or given or process_name(made)))
+
+    def words(self) -> list[str]:
+        """Return the words of which `parse` makes it."""
+        named = f"{self.name}={self.named}"
+        return [named, *(f"{setting}={json.dumps(value)}" for setting, value in self.settings.items())]
+
+    def make(self, info: Info, scenario: Scenario) -> Agent:
+        """Return the agent, ready to join; errors as of `own_agent`."""
+        return own_agent(plugin.load_any(self.named, "agent", Agent), info, scenario, self.settings, self.name)
+
+
+def process_name(made: Agent | Callable[..., Agent]) -> str:
+    """Return the name under which an agent of a user's takes part that has not been made yet."""
+    name = getattr(made, "name", None)
+    return name if isinstance(name, str) else default_name(type(made) if isinstance(made, Agent) else made)
+
+
+def with_own_agents(scenario: Scenario, names: Sequence[str]) -> Scenario:
+    """Return a resolved scenario that waits for agents of a user's, and ends where one of them fails.
+
+    What it says of them itself in `processes.on_death` holds.
+    """
+    processes = scenario.processes
+    expect = [*dict.fromkeys((*expected_processes(scenario), *names))]
+    ends = {name: "end" for name in names if name.partition(".")[0] not in processes.on_death}
+    return replace(scenario, processes=replace(processes, expect=expect, on_death={**ends, **processes.on_death}))
+
+
 def own_agent(
-    made: Agent | Callable[..., Agent], info: Info, scenario: Scenario, settings: Mapping[str, Any] = {}
+    made: Agent | Callable[..., Agent],
+    info: Info,
+    scenario: Scenario,
+    settings: Mapping[str, Any] = {},
+    name: str = "",
 ) -> Agent:
     """Return an agent of a user's that is ready to join.
 
     Args:
         made: the agent; or a class or function that makes it of `settings`, and of `info` and `scenario` where it has
             parameters of these names.
+        name: of its process; empty for its own.
 
     Raises:
         UserCodeError: the class raised.
         RunError: the settings are not those that it takes, or what it returns is no agent.
     """
     if not isinstance(made, Agent):
-        name = f"{made.__module__}:{made.__qualname__}"
+        kind = f"{getattr(made, '__module__', '')}:{getattr(made, '__qualname__', type(made).__name__)}"
         taken = signature(made)
         given = {"info": info, "scenario": scenario}
         given = {key: value for key, value in given.items() if key in taken.parameters} | dict(settings)
         try:
             taken.bind(**given)
         except TypeError as error:
-            raise RunError(f"{name} takes {taken}, and cannot be made: {error}") from None
+            raise RunError(f"{kind} takes {taken}, and cannot be made: {error}") from None
         try:
             made = made(**given)
         except plugin.RAISED as error:
@@ -149,8 +213,8 @@ def own_agent(
                 raise
             raise failure from error
         if not isinstance(made, Agent):
-            raise RunError(f"{name} makes a {type(made).__name__}; must make a zsim.Agent")
-    made.bind(info)
+            raise RunError(f"{kind} makes a {type(made).__name__}; must make a zsim.Agent")
+    made.bind(info, name)
     return made
 
 

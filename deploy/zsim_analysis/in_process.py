@@ -5,9 +5,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from msgspec import Struct
 from msgspec.structs import replace
 
-from zsim.contract import flight_messages, keys, run_messages
+from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.framing import GateMessages
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
@@ -21,7 +22,7 @@ from zsim.runtime.progress import PERIOD_S, HoldReasons, Screen, SlowStart
 from zsim.runtime.rate_limit import RateLimit
 from zsim.scenario.roles import agent_names, expected_processes, lets_drop
 from zsim.scenario.scenario import Scenario
-from zsim_agents.hosting import hosted, own_agent
+from zsim_agents.hosting import hosted, own_agent, with_own_agents
 from zsim_world import run_state
 from zsim_world.run.world import World
 
@@ -65,6 +66,15 @@ def fly(
     if flight.world.failure:
         raise flight.world.failure
     return flight.world.ended or "ended"
+
+
+def with_agents(scenario: Scenario, own: Sequence[OwnAgent]) -> tuple[Scenario, list[Agent]]:
+    """Return a resolved scenario that waits for agents of a user's, and ends where one fails; and the agents."""
+    if not own:
+        return scenario, []
+    info = World(scenario).info()
+    made = [own_agent(each, info, scenario) for each in own]
+    return with_own_agents(scenario, [agent.name for agent in made]), made
 
 
 class FlightObserver(Protocol):
@@ -155,15 +165,16 @@ class InProcessFlight:
         add_message(keys.INFO, self.info)
         self.bus.join()
 
-    def send(self, commands: Sequence[Output]) -> None:
-        """Publish the caller's commands of the newest gate; without it the world does not go beyond that gate."""
+    def send(self, commands: Sequence[tuple[str, Struct]]) -> None:
+        """Publish the caller's commands of the newest gate by drone; without it the world does not go beyond that gate.
+
+        RunError, before anything is sent, if one is no command.
+        """
         caller, t_ns = self._caller, self.world.now_ns
         assert caller is not None
-        stamped = [
-            Output(key, replace(message, t_ns=t_ns, seq=caller.next_seq(key), source=CALLER))
-            for key, message in commands
-        ]
-        self.bus.publish(caller, t_ns, stamped)
+        for command in commands:
+            messages.command_key(*command)
+        self.bus.publish(caller, t_ns, [caller.command(t_ns, *command) for command in commands])
 
     def control(self, key: str, request: ControlRequest) -> ControlAnswer:
         """Answer a request to the world, or to the controller of a cluster, between two gates."""

@@ -18,16 +18,22 @@ if TYPE_CHECKING:  # for editors, which do not read _WHERE
     from zsim_api.commands import rotors as rotors
     from zsim_api.commands import takeoff as takeoff
     from zsim_api.commands import velocity as velocity
+    from zsim_api.flight import run as run
     from zsim_api.recorded import Run as Run
     from zsim_api.recorded import load as load
+    from zsim_api.scenarios import Scenario as Scenario
     from zsim_api.simulation import Simulation as Simulation
+    from zsim_api.sweeping import sweep as sweep
 
 _WHERE = {
     "zsim.errors": ("ZsimError",),
     "zsim.runtime.agent": ("Agent", "Output"),
     "zsim_api.commands": ("Command", "ardrone", "attitude", "emergency", "land", "rotors", "takeoff", "velocity"),
+    "zsim_api.flight": ("run",),
     "zsim_api.recorded": ("Run", "load"),
+    "zsim_api.scenarios": ("Scenario",),
     "zsim_api.simulation": ("Simulation",),
+    "zsim_api.sweeping": ("sweep",),
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
 __all__ = [*_MODULES]

@@ -1,18 +1,20 @@
 """A run on record, read from Python.
 
     run = zsim.load("runs/step")
-    run.truth("drone1")["position_m_z"].plot()
-    run.error_summary("main", window=(20, 40))
+    run.truth("drone1").position_m_z.plot()
+    run.errors(window=(20, 40))
     run.figure("shape")
 
 It reads what it is asked for when it is asked for it, each key once, and keeps that. Records of runs in one process, of
 processes on any hosts, of runs that were cut, and of replays are the same to it.
 """
 
-from collections.abc import Iterable, Mapping
+import html
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from msgspec import UNSET
@@ -20,8 +22,8 @@ from msgspec import UNSET
 from zsim.contract import keys
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
-from zsim.errors import RecordError
-from zsim.output_folder import record_at
+from zsim.errors import RecordError, RunError
+from zsim.output_folder import RECORD, record_at
 from zsim.record import RecordReader
 from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import suggestion
@@ -30,135 +32,232 @@ from zsim_analysis.reading.drone_errors import EstimateErrors, estimate_errors
 from zsim_analysis.reading.formation import Formation, ParameterErrors
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.reading.recorded_run import decode_or_none
-from zsim_analysis.report.summary import RunSummary, judge
+from zsim_analysis.reading.shortfall import Shortfall
+from zsim_analysis.report.summary import RunSummary, error_table, judge
 from zsim_api.scenarios import Scenario
 from zsim_api.tables import INDEX, STAMPS, Table, frame, read_table
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from pandas import DataFrame
+    from xarray import Dataset
 
 SHOWN = 12  # names in an error
+NOTES = 3  # shortfalls where a notebook shows a run
 ERROR_COLUMNS = ("position_m_x", "position_m_y", "position_m_z", "yaw_rad")  # as those of estimates
 Window = tuple[float, float]
 
 
 def load(place: str | Path, trust: bool = False) -> "Run":
-    """Return the run of a folder, or of a record in a file; see `Run`.
+    """Return a run on record, of any kind: in one process, as processes, on several hosts, or interrupted.
 
     Args:
-        place: folder of a run, or its `run.mcap`.
-        trust: whether classes of the scenario's own may be imported where they are needed, which runs code that came
-            with the record. Only clusters with a space of their own need it; everything else is read without.
+        place: the folder of a run, or its `run.mcap`.
+        trust: whether a cluster space of the scenario's own may be imported, which runs code that came with the record.
+            Without, clusters with such a space have no errors; everything else is read in any case.
 
     Raises:
         RunError: there is no record.
-        RecordError: it is none of zsim's, or cannot be read.
+        RecordError: the file is no record of zsim's.
     """
     return Run(place, trust)
 
 
 class Run:
-    """A run on record. Frames have simulated time `t_s` [s] as index and units in the names of their columns.
+    """A run on record.
 
-    The columns are those of `zsim export`; docs/records.md lists them. Without pandas a frame is a dict of numpy arrays
-    by column, `t_s` first. Arguments as of `load`.
+    Tables are pandas frames with simulated time in seconds as index, `t_s`, and units in the names of their columns,
+    which are those of `zsim export`; docs/records.md lists them. Without pandas they are dicts of numpy arrays by
+    column. Runs of the same bits have equal tables.
 
     Attributes:
-        record: its file, `folder` that in which it is.
+        record: the file.
         keys: number of messages on record by key.
         drones, clusters: names, in the order of the scenario.
     """
 
     def __init__(self, place: str | Path, trust: bool = False) -> None:
         self.record = record_at(Path(place))
-        self.trust = trust
+        self._trust = trust
+        self._tables: dict[str, Table] = {}
         with RecordReader(self.record) as reader:
             self.keys = reader.topics()
             recorded = reader.last(keys.INFO)
-            self.info: Info | None = decode_or_none(recorded) if recorded else None
-        drones = self.info.drones if self.info else ()
-        clusters = self.info.clusters if self.info else ()
-        self.drones = tuple(drone.name for drone in drones) or self._things("drone")
-        self.clusters = tuple(cluster.name for cluster in clusters) or self._things("cluster")
-        self._tables: dict[str, Table] = {}
+        self._info: Info | None = decode_or_none(recorded) if recorded else None
+        drones = [drone.name for drone in self._info.drones] if self._info else self._named("drone")
+        clusters = [cluster.name for cluster in self._info.clusters] if self._info else self._named("cluster")
+        self.drones, self.clusters = tuple(drones), tuple(clusters)
 
     @property
     def folder(self) -> Path:
         return self.record.parent
 
-    # What was recorded
+    # Tables
 
     def truth(self, drone: str) -> "DataFrame":
-        """Return the true motion of a drone, W and B as in docs/conventions.md; RecordError if it is not on record."""
-        return self._said_by("drone", drone, "truth")
+        """Return the true motion of a drone at every gate, W and B as in docs/conventions.md; RunError if unknown."""
+        return self._of("drone", drone, "truth")
 
     def estimate(self, drone: str) -> "DataFrame":
-        """Return the estimates of a drone, with their covariance; RecordError if there are none."""
-        return self._said_by("drone", drone, "estimate")
+        """Return the estimates of a drone's motion, with their covariance; RunError without any."""
+        return self._of("drone", drone, "estimate")
+
+    def sensor(self, drone: str, sensor: str) -> "DataFrame":
+        """Return the samples of a sensor: imu, gps, mag, baro, sonar, flow, or one of your own; RunError without any.
+
+        `t_sample_ns` is when a sample was taken, the index when it was delivered.
+        """
+        return self._of("drone", drone, f"sensor/{sensor}")
+
+    def status(self, drone: str) -> "DataFrame":
+        """Return the state of a drone's firmware and battery, at every gate; RunError if unknown."""
+        return self._of("drone", drone, "sensor/status")
 
     def commands(self, drone: str, kind: str = "velocity") -> "DataFrame":
-        """Return the commands that were sent to a drone, by anybody; `source` says by whom.
+        """Return the commands that anybody has sent to a drone; `source` says who; RunError without any.
 
         Args:
             drone: name.
             kind: velocity, attitude, rotors, ardrone or mode.
-
-        Raises:
-            RecordError: no such drone, or no such commands.
         """
-        return self._said_by("drone", drone, f"cmd/{kind}")
+        return self._of("drone", drone, f"cmd/{kind}")
 
-    def sensor(self, drone: str, name: str) -> "DataFrame":
-        """Return the samples of a drone's sensor: `gps`, `status`, or one of your own; RecordError if there are none.
-
-        `t_sample_ns` is when a sample was taken, the index when it was delivered.
-        """
-        return self._said_by("drone", drone, f"sensor/{name}")
-
-    def cluster(self, name: str | None = None) -> "DataFrame":
-        """Return the states of a cluster's controller: `phase`, `value_p`, `desired_p` and so on [m or rad].
+    def cluster(self, cluster: str | None = None) -> "DataFrame":
+        """Return the states of a cluster as its controller saw it: `phase`, `value_p`, `desired_p` and so on [m, rad].
 
         Args:
-            name: None for the first cluster.
+            cluster: name; None: the first.
 
         Raises:
-            RecordError: no such cluster, or it published nothing.
+            RunError: no such cluster, or its controller published nothing.
         """
-        return self._said_by("cluster", self._first_cluster() if name is None else name, "state")
+        return self._of("cluster", self._cluster(cluster), "state")
 
     def messages(self, key: str) -> "DataFrame":
-        """Return all messages of a key, also one of your own; RecordError if there are none.
+        """Return all messages of a key, with `t_ns`, `seq`, and `wall_ns`, when each was recorded [ns since 1970].
 
-        With the columns `t_ns`, `seq` and `wall_ns`, when the recorder received a message [ns since 1970].
-        Messages of your own have a column for each field.
+        Messages of a program of your own have a column for each field.
 
         Args:
-            key: without the federation's name and without wildcards: `drone/drone1/link`.
+            key: without the federation's name, and without wildcards; `run.keys` has those on record.
+
+        Raises:
+            RunError: there are none.
         """
         return frame(self._table(key))
 
     @property
     def events(self) -> "DataFrame":
-        """What happened: kind, source, subject, text, and `data` as JSON text."""
-        table = self._table(keys.EVENT)
-        return frame({name: values for name, values in table.items() if name not in STAMPS})
+        """What happened: kind, source, subject, text, and data as JSON text."""
+        return self._plain(keys.EVENT)
+
+    # Errors
+
+    def formation(self, cluster: str | None = None) -> "DataFrame":
+        """Return the variables of a formation over time, its `phase`, and errors, angles within ±π.
+
+        For a variable p: `desired_p_m`, `estimate_p_m`, `truth_p_m`; `estimate_error_p_m`, which is estimate − desired,
+        what the controller saw; and `truth_error_p_m`, truth − desired, what the drones did. NaN where unknown. Until
+        the phase is engaged, the desired value is the estimate.
+
+        Args:
+            cluster: name; None: the first.
+
+        Raises:
+            RunError: no such cluster, or its states cannot be judged.
+        """
+        found = self._formation(cluster)
+        parts = {
+            "desired": found.desired,
+            "estimate": found.value,
+            "truth": found.true,
+            "estimate_error": found.est_error,
+            "truth_error": found.true_error,
+        }
+        table: Table = {INDEX: found.t_s, "phase": np.array(found.phases, object)}
+        for i, name in enumerate(found.names):
+            table |= {f"{what}_{name}_{unit(name)}": values[:, i] for what, values in parts.items()}
+        return frame(table)
+
+    def estimate_errors(self, drone: str) -> "DataFrame":
+        """Return estimate − truth of a drone over time: position in W and heading, σ of each as the estimator states
+        it (`sigma_position_m_x`), and `nees`, 6 on average where it states the truth.
+
+        Of more than 200 000 estimates of all drones, every n-th is compared.
+
+        Raises:
+            RunError: no such drone, or truth and estimate are not both on record.
+        """
+        own = self._drone_errors.get(self._known("drone", drone, self.drones))
+        if own is None:
+            raise RunError(f"{self.record}: truth and estimates of {drone} are not both on record")
+        errors = dict(zip(ERROR_COLUMNS, own.error.T, strict=True))
+        sigmas = {f"sigma_{name}": values for name, values in zip(ERROR_COLUMNS, own.sigma.T, strict=True)}
+        return frame({INDEX: own.t_s, **errors, **sigmas, "nees": own.nees})
+
+    def errors(
+        self, window: Window | None = None, of: Literal["formations", "estimates"] = "formations"
+    ) -> "DataFrame":
+        """Return statistics of errors, a row for each variable with its unit; the report's table.
+
+        Of formations, by cluster and variable, over the instants of the window at which it was engaged: `est_…` is
+        estimate − desired, what the controller saw, `true_…` truth − desired, what the drones did. Of estimates, by
+        drone and variable: `std`, `rms` and `mean` of estimate − truth, and `inside`, the share of errors within two
+        stated standard deviations. NaN where there is no such instant.
+
+        Args:
+            window: from and to [s]; None: the report's, `run.summary.window_s`.
+            of: formations, or estimates.
+
+        Raises:
+            RecordError: there is no truth on record.
+        """
+        window = window or self.summary.window_s
+        if of == "estimates":
+            return _statistics("drone", {name: _moments(each, window) for name, each in self._drone_errors.items()})
+        if of != "formations":
+            raise RunError(f"of is {of!r}; must be 'formations' or 'estimates'")
+        rows = {
+            each.name: {
+                name: (unit(name), *(getattr(moments, field) for field in ParameterErrors.__struct_fields__))
+                for name, moments in each.errors(window).items()
+            }
+            for each in self._judged[1]
+        }
+        return _statistics("cluster", rows, ParameterErrors.__struct_fields__)
+
+    def xarray(self) -> "Dataset":
+        """Return truth and estimates of all drones, with the dimensions drone and t_s; needs xarray and pandas."""
+        import pandas
+        import xarray
+
+        parts: list[Dataset] = []
+        for what, read in (("truth", self.truth), ("estimate", self.estimate)):
+            tables = {drone: read(drone) for drone in self.drones if f"drone/{drone}/{what}" in self.keys}
+            if tables:  # a world that was restarted may have published a gate again
+                once = {drone: table[~table.index.duplicated()] for drone, table in tables.items()}
+                joined: Any = pandas.concat(once, names=["drone"]).select_dtypes("number").add_prefix(f"{what}_")
+                parts.append(joined.to_xarray().reindex(drone=list(tables)))
+        return xarray.merge(parts, join="outer", compat="no_conflicts")
 
     # How it was flown
 
     @cached_property
     def scenario(self) -> Scenario:
-        """The scenario with which it was flown, with all defaults; RecordError without `world/info` on record."""
-        if self.info is None:
-            raise RecordError(f"{self.record}: has no world/info, so that its scenario is unknown")
-        made = Scenario(**yaml_file.value(self.info.scenario))
-        modules = () if self.info.module_folders is UNSET else self.info.module_folders
+        """The scenario, with all defaults and changes, to be looked at or flown again.
+
+        RunError without `world/info` on record.
+        """
+        if self._info is None:
+            raise RunError(f"{self.record}: has no world/info, so that its scenario is unknown")
+        made = Scenario(**yaml_file.value(self._info.scenario))
+        modules = () if self._info.module_folders is UNSET else self._info.module_folders
         made.source, made.folders = str(self.record), (*map(Path, modules), self.folder, Path.cwd())
-        made.changes = None if self.info.changed is UNSET else self.info.changed
         return made
 
-    @cached_property
+    @property
     def summary(self) -> RunSummary:
-        """What `zsim report` writes into summary.json; RecordError if there is no truth on record."""
+        """The content of summary.json; RecordError if there is no truth on record."""
         return self._judged[2]
 
     @property
@@ -173,81 +272,101 @@ class Run:
         return str(self._end["reason"]) if "reason" in self._end else self.summary.ended
 
     @property
+    def truth_sha256(self) -> str:
+        """The hash of all truth: equal for flights that are equal to the bit."""
+        return str(self._end.get("truth_sha256") or self.summary.truth_sha256)
+
+    @property
     def complete(self) -> bool:
-        """Whether every message of the world is on record, and the end; `summary.record.state` says what is missing."""
+        """Whether every message of the world and the end are on record; `summary.record.state` says what is missing."""
         return self.summary.record.complete
 
     @property
     def as_planned(self) -> bool:
-        """Whether it followed its plan, as far as it went; `summary.shortfalls` has what differed."""
+        """Whether the flight followed its plan; `shortfalls` has the deviations."""
         return self.summary.as_planned
 
     @property
-    def truth_sha256(self) -> str:
-        """Hash of the true motion of all drones; runs with the same bits have the same one."""
-        return str(self._end.get("truth_sha256") or self.summary.truth_sha256)
+    def shortfalls(self) -> list[Shortfall]:
+        return self.summary.shortfalls
 
-    def formation(self, name: str | None = None) -> Formation:
-        """Return the flight of a cluster as arrays: desired, estimated and true variables, errors, phases.
+    # Shown
 
-        Raises:
-            RecordError: no such cluster, or its states cannot be judged.
-        """
-        chosen = self._known("cluster", self._first_cluster() if name is None else name)
-        found = next((each for each in self._judged[1] if each.name == chosen), None)
-        if found is None:
-            why = "; it may have a space of its own: load it with trust=True" if not self.trust else ""
-            raise RecordError(f"{self.record}: has no states of {chosen} that can be judged{why}")
-        return found
-
-    def errors(self, of: str | None = None, window: Window | None = None) -> "DataFrame":
-        """Return errors over time.
-
-        Of a cluster, for each variable: `est_p_m`, what its controller saw (estimate − desired), and `true_p_m`, what
-        the drones did (truth − desired), and whether it was `engaged`; until then, desired is the estimate. Of a drone,
-        estimate − truth: `position_m_x`, …, `yaw_rad`, the standard deviations that the estimator states,
-        `sigma_position_m_x`, …, and `nees`, 6 on average where these are true.
+    def figure(self, name: str) -> "Figure":
+        """Return a figure of the report, drawn anew.
 
         Args:
-            of: cluster or drone; None for the first cluster.
-            window: first and last instant [s]; None for the whole run.
+            name: errors, position, orientation, shape, plan_view, distances, drones, estimates or velocities; of
+                further clusters with the cluster's name, `shape_side`.
 
         Raises:
-            RecordError: no such cluster or drone, or its errors are not known.
+            RunError: the record has no such figure; with those that it has.
         """
-        table = self._drone_table(of) if of in self.drones else self._cluster_table(self._judged_cluster(of))
-        low, high = window or (-np.inf, np.inf)
-        rows = (table[INDEX] >= low) & (table[INDEX] <= high)
-        return frame({name: values[rows] for name, values in table.items()})
+        from zsim_analysis.report.make_report import marked, planned_figures
 
-    def error_summary(self, of: str | None = None, window: Window | None = None) -> "DataFrame":
-        """Return statistics of errors, a row for each variable, with its `unit`.
+        flight, formations, summary = self._judged
+        known = []
+        with plugin.names_only(not self._trust):
+            for each in planned_figures(flight, formations, summary.window_s):
+                stem = Path(each.name).stem
+                known.append(stem.split("_", 2)[2] if stem.startswith("figure_") else stem)  # figure_8_shape
+                if name in (known[-1], stem):
+                    drawing = marked(each, summary).drawing
+                    # a figure without pyplot is shown by a notebook only if it has this
+                    setattr(drawing, "_repr_png_", _png_of(drawing))  # noqa: B010
+                    return drawing
+        raise RunError(f"{self.record}: has no figure {name!r}; {_there(name, known)}")
 
-        Of a cluster as in the report, over the instants of the window at which it was engaged: `est_std`, `est_rms`,
-        `est_mean`, `true_std`, `true_rms`, `true_mean`. Of a drone `std`, `rms`, `mean` of estimate − truth, and
-        `inside`, the share of errors within two stated standard deviations.
+    def report(self, formats: Sequence[str] = ()) -> Path:
+        """Write the report into the run's folder, as `zsim report` does; return its page.
 
         Args:
-            of: cluster or drone; None for the first cluster.
-            window: first and last instant [s]; None for that of the report.
+            formats: of figures beside PNG: "pdf", "svg".
 
         Raises:
-            RecordError: as of `errors`.
+            RunError: the record is not in the folder of a run.
+            ReportError: the folder cannot be written.
         """
-        window = window or self.summary.window_s
-        if of not in self.drones:
-            return _formation_statistics(self._judged_cluster(of), window)
-        return _estimate_statistics(self._estimate_errors(of), window)
+        from zsim_analysis.report.make_report import make_report
+
+        if self.record.name != RECORD:
+            raise RunError(f"{self.record}: has no folder for its report; must be {RECORD} in the folder of a run")
+        with plugin.names_only(not self._trust):
+            make_report(self.folder, formats=formats)
+        return self.folder / "report.html"
 
     def __repr__(self) -> str:
-        return f"<Run of {self.record}, {len(self.drones)} drones, {sum(self.keys.values())} messages>"
+        return f"<Run {self.record}, {len(self.drones)} drones>"
+
+    def _repr_html_(self) -> str:
+        try:
+            summary = self.summary
+        except RecordError as error:  # nothing was flown
+            return f"<p>{html.escape(str(error))}</p>"
+        facts = {
+            "Scenario": f"{summary.scenario}, seed {summary.seed}, {len(self.drones)} drones",
+            "Flown": f"{summary.sim_s:g} s, {'as planned' if summary.as_planned else 'not as planned'}",
+            "Ended": summary.ended,
+            **{f"Note {i}": each.text for i, each in enumerate(summary.shortfalls[:NOTES], start=1)},
+            "Record": f"{self.record}: {summary.record.state}",
+        }
+        parts = [_html_table([], [[f"<b>{label}</b>", html.escape(text)] for label, text in facts.items()])]
+        for name, cluster in summary.clusters.items():
+            table = error_table(cluster)
+            cells = [[html.escape(cell) for cell in row] for row in table.rows]
+            parts += [f"<p>Errors of {html.escape(name)}</p>", _html_table(table.columns, cells)]
+        return "".join(parts)
 
     # Reading
 
     @cached_property
     def _judged(self) -> tuple[RecordedFlight, list[Formation], RunSummary]:
-        with plugin.names_only(not self.trust):
+        with plugin.names_only(not self._trust):
             return judge(self.record, answers=True)
+
+    @cached_property
+    def _drone_errors(self) -> dict[str, EstimateErrors]:
+        return estimate_errors(self._judged[0])
 
     @cached_property
     def _end(self) -> Mapping[str, Any]:
@@ -258,96 +377,95 @@ class Run:
 
     def _table(self, key: str) -> Table:
         if key not in self.keys:
-            raise RecordError(f"{self.record}: has no messages of {key!r}; {_there(key, self.keys)}")
+            raise RunError(f"{self.record}: has no messages of {key!r}; {_there(key, self.keys)}")
         if key not in self._tables:
-            with plugin.names_only(not self.trust):
+            with plugin.names_only(not self._trust):
                 table = read_table(self.record, key)
             for values in table.values():
-                values.setflags(write=False)  # frames copy, and dicts share them
+                values.setflags(write=False)  # frames copy them, dicts share them
             self._tables[key] = table
         return self._tables[key]
 
-    def _said_by(self, kind: str, name: str, what: str) -> "DataFrame":
-        """Return the messages of a drone or cluster on one of its keys, without their stamps."""
-        key = f"{kind}/{self._known(kind, name)}/{what}"
+    def _plain(self, key: str) -> "DataFrame":
+        """Return the messages of a key without their stamps."""
+        return frame({column: values for column, values in self._table(key).items() if column not in STAMPS})
+
+    def _of(self, kind: str, name: str, what: str) -> "DataFrame":
+        key = f"{kind}/{self._known(kind, name, self.drones if kind == 'drone' else self.clusters)}/{what}"
         if key not in self.keys:
             group, _, last = what.rpartition("/")  # "sensor", "gps"
             head = f"{kind}/{name}/{group}/" if group else f"{kind}/{name}/"
             there = [each.removeprefix(head) for each in self.keys if each.startswith(head)]
-            raise RecordError(f"{self.record}: has no {what.replace('/', ' ')} of {name}; {_there(last, there)}")
-        return frame({column: values for column, values in self._table(key).items() if column not in STAMPS})
+            raise RunError(f"{self.record}: has no {group} {last!r} of {name}; {_there(last, there)}")
+        return self._plain(key)
 
-    def _known(self, kind: str, name: str) -> str:
-        names = self.drones if kind == "drone" else self.clusters
+    def _known(self, kind: str, name: str, names: Sequence[str]) -> str:
         if name not in names:
-            raise RecordError(f"{self.record}: has no {kind} {name!r}; {_there(name, names)}")
+            raise RunError(f"{self.record}: has no {kind} {name!r}; {_there(name, names)}")
         return name
 
-    def _things(self, kind: str) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(keys.thing(key) for key in self.keys if key.startswith(f"{kind}/")))
+    def _named(self, kind: str) -> list[str]:
+        """Return the drones, or clusters, of which there are messages."""
+        return list(dict.fromkeys(keys.thing(key) for key in self.keys if key.startswith(f"{kind}/")))
 
-    def _first_cluster(self) -> str:
-        if not self.clusters:
-            raise RecordError(f"{self.record}: has no cluster; name a drone: {', '.join(self.drones[:SHOWN])}")
-        return self.clusters[0]
+    def _cluster(self, name: str | None) -> str:
+        if name is None and not self.clusters:
+            raise RunError(f"{self.record}: has no cluster")
+        return self._known("cluster", self.clusters[0] if name is None else name, self.clusters)
 
-    def _judged_cluster(self, of: str | None) -> Formation:
-        if of is not None and of not in self.clusters:
-            names = (*self.clusters, *self.drones)
-            raise RecordError(f"{self.record}: has no cluster or drone {of!r}; {_there(of, names)}")
-        return self.formation(of)
-
-    def _cluster_table(self, formation: Formation) -> Table:
-        table: Table = {INDEX: formation.t_s}
-        for i, name in enumerate(formation.names):
-            table[f"est_{name}_{unit(name)}"] = formation.est_error[:, i]
-            table[f"true_{name}_{unit(name)}"] = formation.true_error[:, i]
-        return {**table, "engaged": formation.engaged}
-
-    def _drone_table(self, drone: str) -> Table:
-        own = self._estimate_errors(drone)
-        errors = dict(zip(ERROR_COLUMNS, own.error.T, strict=True))
-        sigmas = {f"sigma_{name}": values for name, values in zip(ERROR_COLUMNS, own.sigma.T, strict=True)}
-        return {INDEX: own.t_s, **errors, **sigmas, "nees": own.nees}
-
-    @cached_property
-    def _drone_errors(self) -> dict[str, EstimateErrors]:
-        return estimate_errors(self._judged[0])
-
-    def _estimate_errors(self, drone: str) -> EstimateErrors:
-        if drone not in self._drone_errors:
-            known = ", ".join(self._drone_errors) or "of none"
-            raise RecordError(f"{self.record}: truth and estimates of {drone} are not both on record; {known} are")
-        return self._drone_errors[drone]
+    def _formation(self, cluster: str | None) -> Formation:
+        name = self._cluster(cluster)
+        found = next((each for each in self._judged[1] if each.name == name), None)
+        if found is None:
+            why = "" if self._trust else "; if its space is of the scenario's own, zsim.load(…, trust=True) imports it"
+            raise RunError(f"{self.record}: has no states of cluster {name} that can be judged{why}")
+        return found
 
 
-def _formation_statistics(formation: Formation, window: Window) -> "DataFrame":
-    errors = formation.errors(window)
-    columns = {
-        name: np.array([getattr(each, name) for each in errors.values()], np.float64)
-        for name in ParameterErrors.__struct_fields__
-    }
-    names, units = (np.array(each, object) for each in ([*errors], [*map(unit, errors)]))
-    return frame({"variable": names, "unit": units, **columns}, "variable")
-
-
-def _estimate_statistics(errors: EstimateErrors, window: Window) -> "DataFrame":
+def _moments(errors: EstimateErrors, window: Window) -> dict[str, tuple[Any, ...]]:
+    """Return unit, standard deviation, root mean square, mean and share inside of each error within a window."""
     rows = (errors.t_s >= window[0]) & (errors.t_s <= window[1])
-    each = [values[np.isfinite(values)] for values in np.column_stack([errors.error, errors.nees])[rows].T]
-    inside = [*(errors.share_inside(rows) if rows.any() else [np.nan] * len(ERROR_COLUMNS)), np.nan]
-    columns: dict[str, list[Any]] = {
-        "std": [values.std() if len(values) else np.nan for values in each],
-        "rms": [np.sqrt(np.mean(values**2)) if len(values) else np.nan for values in each],
-        "mean": [values.mean() if len(values) else np.nan for values in each],
-        "inside": inside,
-    }
-    names = np.array([*ERROR_COLUMNS, "nees"], object)
-    units = np.array(["rad" if "rad" in name else "m" if "_m_" in name else "" for name in names], object)
-    return frame({"variable": names, "unit": units, **{k: np.array(v) for k, v in columns.items()}}, "variable")
+    inside = errors.share_inside(rows) if rows.any() else [None] * len(ERROR_COLUMNS)
+    moments = {}
+    units = ("m", "m", "m", "rad", "")
+    columns = np.column_stack([errors.error, errors.nees])[rows].T
+    for name, measure, values, share in zip((*ERROR_COLUMNS, "nees"), units, columns, (*inside, None), strict=True):
+        known = values[np.isfinite(values)]
+        found = (known.std(), np.sqrt(np.mean(known**2)), known.mean()) if len(known) else (None,) * 3
+        moments[name] = (measure, *found, share)
+    return moments
+
+
+def _statistics(
+    of: str, rows: Mapping[str, Mapping[str, tuple[Any, ...]]], fields: Sequence[str] = ("std", "rms", "mean", "inside")
+) -> "DataFrame":
+    """Return a frame of a row for each variable of each cluster or drone: its unit, and numbers, None for unknown."""
+    flat = [(name, variable, *values) for name, variables in rows.items() for variable, values in variables.items()]
+    names = (of, "variable", "unit", *fields)
+    texts = 3
+    return frame(
+        {name: np.array([row[i] for row in flat], object if i < texts else np.float64) for i, name in enumerate(names)},
+        (of, "variable"),
+    )
 
 
 def _there(given: str, names: Iterable[str]) -> str:
-    """Return what there is in place of what was asked for, the most alike first."""
+    """Return what there is in place of what was asked for, after the most alike."""
     names = list(names)
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     return f"{suggestion(given, names)}there are {', '.join(names[:SHOWN])}{more}" if names else "there are none"
+
+
+def _png_of(drawing: "Figure") -> Callable[[], bytes]:
+    def png() -> bytes:
+        file = BytesIO()
+        drawing.savefig(file, format="png")
+        return file.getvalue()
+
+    return png
+
+
+def _html_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    head = "".join(f"<th>{html.escape(each)}</th>" for each in heads)
+    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
+    return f"<table>{f'<tr>{head}</tr>' if head else ''}{body}</table>"

@@ -18,6 +18,7 @@ from zsim.errors import OTHER_OUT, DecodeError, RunError, file_fault
 from zsim.output_folder import RECORD, refuse_others
 from zsim.record.mcap_layout import LIBRARY, OURS, is_ours
 from zsim.record.record_writer import cut_at_last, is_being_written
+from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 
@@ -90,12 +91,24 @@ class Launch(msgspec.Struct, frozen=True):
     insecure: bool = False
     listen: str | None = None
     modules: tuple[str, ...] = ()  # folders in which those that its scenario names were looked for
+    agents: tuple[tuple[str, ...], ...] = ()  # of the user's own, as words of `AgentSpec`
     changed: tuple[str, ...] = ()  # texts `a.b.c=value` by which the scenario was changed against its file
 
 
 def new_launch(**how: Any) -> Launch:
     """Return a launch of a new run, with the modules that its scenario has been loaded with."""
     return Launch(uuid.uuid4().hex[:12], modules=tuple(map(str, plugin.folders())), **how)
+
+
+def prepare(folder: Path, scenario: Scenario, launch: Launch) -> None:
+    """Put what is to be flown, and how, into the run's folder; RunError if it cannot be written."""
+    with file_fault(folder, "cannot be written", OTHER_OUT):
+        if not launch.in_process:
+            (folder / LOGS).mkdir(exist_ok=True)
+        (folder / SCENARIO).write_text(scenario_file.to_text(scenario))
+        (folder / JOURNAL).mkdir(exist_ok=True)
+        content = json.dumps(msgspec.to_builtins(launch))  # not msgspec's: a path may hold no UTF-8
+        (folder / JOURNAL / LAUNCH).write_text(content, "utf-8")
 
 
 def forget_launch(folder: Path) -> None:

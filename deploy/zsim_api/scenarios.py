@@ -59,7 +59,7 @@ class Scenario:
         made._document = document = copy.deepcopy(self._document)
         faults: list[str] = []
         for path, given in {**fields, **set}.items():
-            value = made._named(given)
+            value = made.named(given)
             if fault := scenario_file.apply_override(document, f"{path}=", lambda _, value=value: copy.deepcopy(value)):
                 faults.append(fault.replace("--set ", "", 1))
             elif made.changes is not None:
@@ -125,18 +125,18 @@ class Scenario:
         count = len(drones) if isinstance(drones, list) else 0
         return f"<Scenario {self._document.get('name')!r} of {self.source}, {count} drones>"
 
-    def _named(self, value: Any) -> Any:
+    def named(self, value: Any) -> Any:
         """Return a value with the names of classes and functions in place of them, and search where these are."""
-        if isinstance(value, type) or (callable(value) and hasattr(value, "__qualname__")):
+        if callable(value):
             from zsim_api.own_code import module_folders, name_of
 
             name = name_of(value, scratch_folder())
             self.folders = tuple(dict.fromkeys((*self.folders, *module_folders([name]))))
             return name
         if isinstance(value, Mapping):
-            return {key: self._named(each) for key, each in value.items()}
+            return {key: self.named(each) for key, each in value.items()}
         if isinstance(value, list | tuple):
-            return [self._named(each) for each in value]
+            return [self.named(each) for each in value]
         return value.item() if isinstance(value, np.generic) else value
 
 

@@ -22,22 +22,22 @@ from numpy.typing import NDArray
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import ClusterState, Estimate
 from zsim.contract.framing import GateMessages
-from zsim.contract.messages import TOPICS, Info
+from zsim.contract.messages import Info
 from zsim.contract.run_messages import ControlRequest, Event
 from zsim.errors import RequestRefusedError, RunError
 from zsim.output_folder import RECORD
 from zsim.record import RecordWriter
-from zsim.runtime.agent import Agent, Output
+from zsim.runtime.agent import Agent
 from zsim.schema.checker import suggestion
 from zsim.sensors.sensor import Sample
-from zsim_analysis.in_process import CALLER, FlightObserver, InProcessFlight, OwnAgent
+from zsim_analysis.in_process import CALLER, FlightObserver, InProcessFlight, OwnAgent, with_agents
 from zsim_api.commands import Command
+from zsim_api.flight import calling
 from zsim_api.scenarios import AnyScenario, scenario_of
 from zsim_world.physics.fleet_arrays import STATE
 
 Array = NDArray[np.float64]
 GATES_HELD = 64  # of sensor messages that are not looked at; chosen: 0.3 MB of three drones
-_KINDS = {topic.message: key.rpartition("/")[2] for key, topic in TOPICS.items() if key.startswith("drone/*/cmd/")}
 
 
 class Truth(NamedTuple):
@@ -111,7 +111,6 @@ class Simulation:
         self._stock = stock and agents is not None
         self._pristine = {i: _copied(each) for i, each in enumerate(self._own) if isinstance(each, Agent)}
         self._folder, self._writer = folder, None
-        self._is_closed = False
         self.reset()
 
     def reset(self, seed: int | None = None, set: Mapping[str, Any] | None = None) -> Truth:
@@ -131,8 +130,9 @@ class Simulation:
             own = vars(self._own[i])
             own.clear()
             own |= copy.deepcopy(attributes)
-        self.scenario = self.source.resolved
-        self._flight = flight = InProcessFlight(self.scenario, None, None, self._own, stock=self._stock, steered=True)
+        self._is_closed = False
+        self.scenario, own = with_agents(self.source.resolved, self._own)
+        self._flight = flight = InProcessFlight(self.scenario, None, None, own, stock=self._stock, steered=True)
         self.info: Info = flight.info
         self.names = [drone.name for drone in self.scenario.drones]
         self.gate_s = self.info.gate_ns / 1e9
@@ -170,6 +170,11 @@ class Simulation:
         return self._flight.world.ended
 
     @property
+    def truth_sha256(self) -> str:
+        """The hash of the truth of all gates so far, as of `zsim report`."""
+        return self._flight.world.truth_hash.hexdigest()
+
+    @property
     def estimates(self) -> Estimates:
         if self._estimates is None:
             count = len(self.names)
@@ -194,24 +199,18 @@ class Simulation:
 
         Raises:
             RunError: the flight is over, or no drone has that name; before anything is sent.
-            UserCodeError: a user's class failed, and the flight has ended for it.
+            Exception: what a class of yours raised, after a line on stderr that says where; the flight is over.
         """
         world = self._flight.world
         if world.ended is not None:
             raise RunError(f"step: the flight is over ({world.ended}); reset() begins another one")
-        outputs: list[Output] = []
+        sent: list[tuple[str, Command]] = []
         for drone, given in commands.items():
             self._place(drone)
-            for command in (given,) if isinstance(given, Struct) else given:
-                kind = _KINDS.get(type(command))
-                if kind is None:
-                    found = type(command).__name__
-                    raise RunError(
-                        f"step: the command to {drone} is a {found}; must be made by zsim.velocity and so on"
-                    )
-                outputs.append(Output(keys.command(drone, kind), command))
+            several: Sequence[Any] = given if isinstance(given, list | tuple) else (given,)
+            sent += [(drone, command) for command in several]
         self.events = []
-        self._flight.send(outputs)
+        self._flight.send(sent)
         self._turn()
         return self.truth
 
@@ -267,10 +266,13 @@ class Simulation:
         """End the flight, and finish its record."""
         if self._is_closed:
             return
-        self._is_closed = True
         self._flight.world.clock.stop("closed")
+        self._end()
+
+    def _end(self) -> None:
+        self._is_closed = True
         try:
-            self._flight.end()
+            calling(self._flight.end, self._folder)
         finally:
             if self._writer is not None:
                 self._writer.close()
@@ -289,6 +291,7 @@ class Simulation:
         self._estimates = None
         self._flight.turn(1)
         if self._flight.world.failure is not None:
+            self._end()
             raise self._flight.world.failure
 
     def _place(self, drone: str) -> int:

@@ -52,14 +52,13 @@ def read_table(record: Path, key: str) -> Table:
     return {name: np.concatenate(arrays) for name, arrays in parts.items()}
 
 
-def frame(table: Mapping[str, NDArray[Any]], index: str = INDEX) -> "DataFrame":
-    """Return a table as a pandas DataFrame with one column as its index; without pandas a dict of arrays."""
+def frame(table: Mapping[str, NDArray[Any]], index: Sequence[str] = (INDEX,)) -> "DataFrame":
+    """Return a table as a pandas DataFrame with one or more columns as its index; without pandas a dict of arrays."""
     try:
-        from pandas import DataFrame, Index
+        from pandas import DataFrame
     except ModuleNotFoundError:
-        return {index: table[index], **table}  # type: ignore[return-value]
-    columns = {name: values for name, values in table.items() if name != index}
-    return DataFrame(columns, index=Index(table[index], name=index))
+        return {**{name: table[name] for name in index}, **table}  # type: ignore[return-value]
+    return DataFrame(dict(table)).set_index(list(index) if len(index) > 1 else index[0])
 
 
 def _own_table(reader: RecordReader, key: str) -> Table:

@@ -13,7 +13,7 @@ import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
 from zsim.contract import flight_messages, keys, run_messages
-from zsim.errors import DecodeError
+from zsim.errors import DecodeError, RunError
 from zsim.schema.checker import first_fault
 from zsim.schema.message import Count, Message, Number, Whole
 from zsim.sensors.sensor import FieldType, Sample, message_type
@@ -178,6 +178,18 @@ def register_sensors(sensors: Iterable[SensorInfo]) -> None:
 
 def types_by_shape() -> dict[str, type[Struct]]:
     return {shape: topic.message for shape, topic in TOPICS.items() if topic.message}
+
+
+_COMMANDS = {topic.message: shape for shape, topic in TOPICS.items() if topic.message and keys.is_command(shape)}
+
+
+def command_key(drone: str, command: Struct) -> str:
+    """Return the key of a command to a drone, by the command's type; RunError if it is none."""
+    shape = _COMMANDS.get(type(command))
+    if shape is None:
+        kinds = ", ".join(each.__name__ for each in _COMMANDS)
+        raise RunError(f"the command to {drone} is a {type(command).__name__}; must be one of {kinds}")
+    return keys.command(drone, shape.rpartition("/")[2])
 
 
 @lru_cache(maxsize=KEYS_KEPT)

@@ -7,6 +7,7 @@
 inputs in the same order, so that the outputs are the same to the bit.
 """
 
+import re
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Sequence
@@ -59,25 +60,30 @@ class Agent(ABC):
         self._seq: defaultdict[str, int] = defaultdict(int)
         self._process = ""  # of the group that it is a member of, under whose name it publishes
 
-    def bind(self, info: Info) -> None:
+    def bind(self, info: Info, name: str = "") -> None:
         """Fill in what a class of a user's leaves out, before its agent joins the run of `world/info`.
 
         The name: `agent.` and the class's name; `period_ns`: every gate; `gate_keys`: the status of every drone, and
         what `reads` has of the estimates and cluster states, which are published at every gate.
+
+        Args:
+            name: of the process, in place of the agent's own.
         """
         if not hasattr(self, "_process"):  # a class whose constructor does not call this one's
             Agent.__init__(self)
         own = vars(self)
         if "_declared" in own:  # bound for an earlier run
-            for name in _FILLED:
-                own.pop(name, None)
+            for each in _FILLED:
+                own.pop(each, None)
             own |= self._declared
-        self._declared = {name: own[name] for name in _FILLED if name in own}
+        if name:
+            own["name"] = name
+        self._declared = {each: own[each] for each in _FILLED if each in own}
         self._seq.clear()
         statuses = [keys.status(drone.name) for drone in info.drones]
         at_gates = [keys.estimate(drone.name) for drone in info.drones]
         at_gates += [keys.cluster_state(cluster.name) for cluster in info.clusters]
-        self.name = getattr(self, "name", f"agent.{type(self).__name__.lower()}"[:32])
+        self.name = getattr(self, "name", default_name(type(self)))
         self.period_ns = getattr(self, "period_ns", info.gate_ns)
         self.reads = getattr(self, "reads", ())
         if not hasattr(self, "gate_keys"):
@@ -233,6 +239,16 @@ class Agent(ABC):
             self._links = self._links or LinkFaults(info, (self.name, *self.serves))
             self._links.restore(checkpoint["links"])
 
+    def command(self, t_ns: int, drone: str, command: Struct) -> Output:
+        """Return an output of the gate t_ns that commands a drone; stamp, number and source are filled in.
+
+        Args:
+            command: by `zsim.velocity` and so on.
+        """
+        key = messages.command_key(drone, command)
+        stamp = {"t_ns": t_ns, "seq": self.next_seq(key), "source": self.source}
+        return Output(key, replace(command, **stamp))
+
     def next_seq(self, key: str) -> int:
         """Return the next sequence number of one of its keys, from 0."""
         count = self._seq[key]
@@ -242,6 +258,12 @@ class Agent(ABC):
     def resume_seq(self, key: str, last: int) -> None:
         """Go on counting after `last`, so that after a restart it is clear what is new."""
         self._seq[key] = last + 1
+
+
+def default_name(made: Any) -> str:
+    """Return the process name of an agent without one, by its class, or by the function that makes it."""
+    letters = re.sub(r"[^a-z0-9_.-]", "", getattr(made, "__name__", type(made).__name__).lower())
+    return f"agent.{letters or 'main'}"[:32]
 
 
 class AgentGroup(Agent):

@@ -24,6 +24,7 @@ PROCESSES_MAX = 4 * DRONES_MAX  # an estimator a drone, a controller a cluster, 
 WAYPOINTS_MAX = 10_000  # an hour of them at 3 a second
 CONSTANTS_MAX = 100  # of a user, for the expressions of a trajectory
 ROBOTS_MAX = 64  # drones of a cluster; beyond it a dense Jacobian of 4n x 4n no longer fits a control gate of 20 ms
+METRICS_MAX = 20  # functions
 VARIABLES_MAX = 4 * ROBOTS_MAX  # of a formation: four a robot
 SEA_HEIGHT_MAX_M = 11_000  # m above the sea: end of the layer whose pressure the barometer follows (ISO 2533)
 
@@ -254,12 +255,24 @@ class TimeSteps(Spec, frozen=True, kw_only=True):
     max_command_age_ms: Positive = 500.0  # as silence.hover_s: an older command counts as silence
 
 
+Function = Annotated[str, Meta(pattern=CLASS_NAME)]
+Functions = Annotated[
+    Function | Annotated[list[Function], Meta(min_length=1, max_length=METRICS_MAX)],
+    Meta(description=f"package.module:function, or a list of at most {METRICS_MAX} of these"),
+]
+
+
 class Figures(Spec, frozen=True, kw_only=True):
     """What is reported of a run; window of the statistics in simulated seconds, None: the last two thirds."""
 
     window_s: tuple[Real, Real] | None = None
-    metrics: Annotated[str, Meta(pattern=CLASS_NAME, description="package.module:function")] | UnsetType = UNSET
-    """A user's function, for further figures of each run of a sweep; unset: left out of the resolved text."""
+    metrics: Functions | UnsetType = UNSET
+    """A user's functions, for further figures of each run of a sweep; unset: left out of the resolved text."""
+
+    @property
+    def metric_names(self) -> list[str]:
+        metrics = [] if self.metrics is UNSET else self.metrics
+        return [metrics] if isinstance(metrics, str) else metrics
 
 
 class Scenario(Spec, frozen=True, kw_only=True):
@@ -289,7 +302,8 @@ class Scenario(Spec, frozen=True, kw_only=True):
     def own_code(self) -> list[str]:
         """Return the classes, functions, sensors and vehicles of users that it names, whose modules a rerun needs."""
         spaces = [part.space for cluster in self.clusters for part in (cluster, *cluster.groups)]
-        names = [*spaces, *(cluster.law for cluster in self.clusters), self.estimation.chosen(), self.report.metrics]
+        names = [*spaces, *(cluster.law for cluster in self.clusters), self.estimation.chosen()]
+        names += self.report.metric_names
         classes = [name for name in names if isinstance(name, str) and ":" in name]
         sensors = [each["module"] for drone in self.drones for each in (drone.sensors.own or {}).values()]
         models = [drone.model for drone in self.drones if drone.model not in STOCK]

@@ -114,6 +114,11 @@ def load_function(name: str, where: str) -> Callable[..., Any]:
     return _attribute(name, where, "function", callable)
 
 
+def load_any(name: str, where: str, kind: type) -> Any:
+    """Return the class, the function, or the object of a kind, of a name `package.module:Name`; errors as of `load`."""
+    return _attribute(name, where, "class", lambda found: callable(found) or isinstance(found, kind))
+
+
 def load_module(name: str, where: str) -> ModuleType:
     """Return the module of a name `package.module`; errors as of `load`."""
     return _imported(name, f"{where} is {show(name)}")
@@ -154,9 +159,9 @@ def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
         where: which process, at which simulated time.
     """
     if isinstance(error, UserCodeError):
-        return error if error.where else UserCodeError(error.text, where)
+        return UserCodeError(error.text, error.where or where)  # another one, to be raised from it
     walked = list(walk_tb(error.__traceback__))
-    frames = [(frame, line) for frame, line in walked if _is_user_frame(frame)]
+    frames = [(frame, line) for frame, line in walked if is_user_frame(frame)]
     if not frames:
         return None
     if isinstance(error, SystemExit) and walked[-1][0].f_globals.get("__name__", "").partition(".")[0] in PACKAGES:
@@ -167,6 +172,14 @@ def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
     return UserCodeError(f"{method} raised {raised} ({_place(deepest.f_code.co_filename, line)})", where)
 
 
+def is_user_frame(frame: FrameType) -> bool:
+    """Tell whether a frame is of a user's file or notebook, or of an installed package that a document names."""
+    package, path = frame.f_globals.get("__name__", "").partition(".")[0], frame.f_code.co_filename
+    if package in PACKAGES or (path.startswith("<") and package != "__main__"):
+        return False
+    return not is_library(path) or package in _LOADED
+
+
 def numbers(returned: Any) -> NDArray[np.float64]:
     """Return what a user's code returned as an array; ValueError if these are not real numbers of a regular shape."""
     array = np.asarray(returned)
@@ -175,12 +188,20 @@ def numbers(returned: Any) -> NDArray[np.float64]:
     return array.astype(float, copy=False)
 
 
-def _is_user_frame(frame: FrameType) -> bool:
-    """Tell whether a frame is of a user's file or notebook, or of an installed package that a document names."""
-    package, path = frame.f_globals.get("__name__", "").partition(".")[0], frame.f_code.co_filename
-    if package in PACKAGES or (path.startswith("<") and package != "__main__"):
-        return False
-    return not is_library(path) or package in _LOADED
+def raised_by_user(failure: UserCodeError) -> BaseException | None:
+    """Return what a user's code has raised, its traceback beginning with its own first line; None if it only returned.
+
+    Only for a failure that is caught: the traceback of what is returned is changed.
+    """
+    raised: BaseException | None = failure
+    while raised is not None:
+        traceback = raised.__traceback__
+        while traceback and not is_user_frame(traceback.tb_frame):
+            traceback = traceback.tb_next
+        if traceback and not isinstance(raised, UserCodeError):
+            return raised.with_traceback(traceback)
+        raised = raised.__cause__
+    return None
 
 
 _CELL = re.compile(r".*ipykernel_\d+[/\\]\d+\.py|<ipython-input-(\d+)-.*>")

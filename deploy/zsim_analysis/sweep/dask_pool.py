@@ -6,15 +6,19 @@ Dask repeats a run whose worker died, and gives up a run in which several worker
 import asyncio
 import logging
 import threading
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from pathlib import Path
 from typing import Any
 
-from distributed import CancelledError, Client, KilledWorker
+from distributed import CancelledError, Client, KilledWorker, WorkerPlugin
 from distributed import as_completed as _as_completed
 from distributed.comm.core import connect
 
 from zsim import __version__
 from zsim.errors import RunError, reason_of
+from zsim.schema import plugin
+from zsim.schema.checker import show
 from zsim_analysis.sweep.sweep_run import Row, Task, failed_row, fly
 
 AHEAD = 2  # tasks per thread of the cluster, so that none of them idles
@@ -29,27 +33,58 @@ def fly_alone(task: Task) -> Row:
         return fly(task)
 
 
+class UserCode(WorkerPlugin):
+    """Lets the workers of a cluster, and those that join later, find what a notebook or a script defines.
+
+    Args:
+        modules: texts of modules by the names of their files.
+        folders: searched for other modules, too, where a worker's host has them.
+    """
+
+    name = "zsim-user-code"
+
+    def __init__(self, modules: Mapping[str, str], folders: Sequence[Path]) -> None:
+        self._modules, self._folders = dict(modules), tuple(folders)
+
+    def setup(self, worker: Any) -> None:
+        folder = Path(worker.local_directory) / self.name
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in self._modules.items():
+            (folder / name).write_text(text, encoding="utf-8")
+        plugin.search(folder, *self._folders, *plugin.folders())
+
+
 class DaskPool:
     """Flies tasks on a Dask cluster.
+
+    Args:
+        cluster: a client, which stays open, or the address of a scheduler.
+        modules: of `UserCode`.
 
     Raises:
         RunError: no scheduler answers there, or a worker has another zsim than this host.
     """
 
-    def __init__(self, address: str, say: Callable[[str], None]) -> None:
-        self._address = address
+    def __init__(self, cluster: Any, say: Callable[[str], None], modules: Mapping[str, str] = {}) -> None:
         self._say = say
+        self._modules = modules
+        self._is_lent = not isinstance(cluster, str)
+        if self._is_lent:
+            self._client = _checked(cluster)
+            self._at, self._where = self._client.scheduler.address, "client"
+            return
+        self._at, self._where = cluster, f"--dask {cluster}"
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # errors that end the sweep are raised
 
         async def connect_once() -> None:
-            await (await connect(address, timeout=CONNECT_S)).close()
+            await (await connect(cluster, timeout=CONNECT_S)).close()
 
         try:
             asyncio.run(connect_once())  # first, since a client takes long to give up
-            self._client: Any = Client(address, timeout=CONNECT_S, set_as_default=False)
+            self._client: Any = Client(cluster, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
             reason = " ".join(str(error).split()) or type(error).__name__
-            raise RunError(f"--dask {address}: no scheduler ({reason}); start `dask scheduler` there") from error
+            raise RunError(f"{self._where}: no scheduler ({reason}); start `dask scheduler` there") from error
 
     def rows(self, tasks: Iterator[Task]) -> Generator[Row]:
         """Yield the rows of tasks as they are finished; when closed, the cluster drops the rest.
@@ -57,46 +92,62 @@ class DaskPool:
         Raises:
             RunError: the cluster is gone, or rows cannot be recorded.
         """
-        pending: dict[str, Task] = {}
+        pending: dict[Any, Task] = {}  # by future
         try:
-            with self._client:
-                if not self._client.nthreads():
-                    at = self._address
-                    self._say(f"waiting for workers at {at}; start `dask worker {at}` on every host")
-                    self._client.wait_for_workers(1)
-                versions = self._client.run(_version, on_error="return")
-                for worker, version in versions.items():
-                    if version != __version__:
-                        present = f"zsim {version}" if isinstance(version, str) else reason_of(version)
-                        must = f"must have zsim {__version__}"
-                        raise RunError(f"--dask {self._address}: worker {worker} has {present}; {must}")
-                self._say(f"{len(versions)} Dask worker{'s'[: len(versions) != 1]} at {self._address}")
-                flying: Any = _as_completed(loop=self._client.loop)
-                self._fill(flying, pending, tasks)
-                for future in flying:
-                    task = pending.pop(future.key)
-                    try:
-                        row = future.result()
-                    except KilledWorker:
-                        row = failed_row(task, "several workers died of it, see Dask's allowed-failures")
-                    except CancelledError:
-                        raise
-                    except Exception as error:  # raised by `fly`: every further run would fail as well
-                        raise RunError(f"--dask {self._address}: {reason_of(error)}") from error
-                    yield row
+            with nullcontext() if self._is_lent else self._client:
+                try:
+                    self._prepare()
+                    flying: Any = _as_completed(loop=self._client.loop)
                     self._fill(flying, pending, tasks)
+                    for future in flying:
+                        task = pending.pop(future)
+                        try:
+                            row = future.result()
+                        except KilledWorker:
+                            row = failed_row(task, "several workers died of it, see Dask's allowed-failures")
+                        except CancelledError:
+                            raise
+                        except Exception as error:  # raised by `fly`: every further run would fail as well
+                            raise RunError(f"{self._where}: {reason_of(error)}") from error
+                        yield row
+                        self._fill(flying, pending, tasks)
+                finally:
+                    if self._is_lent and pending:
+                        self._client.cancel(list(pending))
         except (OSError, CancelledError) as error:  # broken links are OSErrors too
-            raise RunError(f"--dask {self._address}: the cluster is gone; the same command goes on") from error
+            raise RunError(f"{self._where}: the cluster is gone; the same command goes on") from error
 
-    def _fill(self, flying: Any, pending: dict[str, Task], tasks: Iterator[Task]) -> None:
+    def _prepare(self) -> None:
+        """Wait for workers, which have this zsim, and let them find the user's modules."""
+        if not self._client.nthreads():
+            self._say(f"waiting for workers at {self._at}; start `dask worker {self._at}` on every host")
+            self._client.wait_for_workers(1)
+        versions = self._client.run(_version, on_error="return")
+        for worker, version in versions.items():
+            if version != __version__:
+                present = f"zsim {version}" if isinstance(version, str) else reason_of(version)
+                raise RunError(f"{self._where}: worker {worker} has {present}; must have zsim {__version__}")
+        self._client.register_plugin(UserCode(self._modules, plugin.folders()))
+        self._say(f"{len(versions)} Dask worker{'s'[: len(versions) != 1]} at {self._at}")
+
+    def _fill(self, flying: Any, pending: dict[Any, Task], tasks: Iterator[Task]) -> None:
         """Submit tasks up to AHEAD per thread of the cluster; new workers may join at any time."""
         while len(pending) < AHEAD * sum(self._client.nthreads().values()):
             task = next(tasks, None)
             if task is None:
                 return
             future = self._client.submit(fly_alone, task, key=f"zsim-{id(self)}-{task.run}", pure=False)
-            pending[future.key] = task
+            pending[future] = task
             flying.add(future)
+
+
+def _checked(client: Any) -> Any:
+    """Return a client that can be used here; RunError for another one, or for something else."""
+    if not isinstance(client, Client) or client.asynchronous or client.status != "running":
+        found = "that is closed" if isinstance(client, Client) and client.status != "running" else "asynchronous"
+        shown = f"a Client {found}" if isinstance(client, Client) else show(str(type(client).__name__))
+        raise RunError(f"client is {shown}; must be a distributed.Client that is connected and not asynchronous")
+    return client
 
 
 def _version() -> str:

@@ -5,7 +5,6 @@ turn are the points of the grid.
 """
 
 import copy
-import itertools
 import json
 import math
 import re
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 import msgspec
-from msgspec import UNSET, Struct
+from msgspec import Struct
 
 from zsim import __version__
 from zsim.errors import DocumentError, ScenarioError
@@ -30,7 +29,7 @@ from zsim.schema.checker import first_fault, first_lines, show
 from zsim_agents.hosting import check_classes
 
 PLAN = "plan.json"
-METRICS = "report.metrics"  # names the user's function that computes metrics of a run
+METRICS = "report.metrics"  # names the user's functions that compute metrics of a run
 RUNS_MAX = 1_000_000
 SEED = "seed"
 SHOWN_MAX = 24  # characters of a value in a table or figure
@@ -65,11 +64,13 @@ def difference(old: SweepPlan, new: SweepPlan) -> str | None:
         keys = sorted(old.document.keys() | new.document.keys())
         other = next(key for key in keys if old.document.get(key) != new.document.get(key))
         return f"{other} of its scenario is another one"
-    fields = []  # of each plan: paths from the top of the scenario, and values
+    fields = []  # of each plan: values by paths from the top of the scenario
     for plan in (old, new):
         parts = [text.partition("=") for text in plan.vary]
-        fields.append([(whole_path(path.strip(), plan.document), values) for path, _, values in parts])
-    if fields[0] != fields[1]:
+        fields.append({whole_path(path.strip(), plan.document): values for path, _, values in parts})
+    if SEED in fields[0] and fields[1].get(SEED, "").startswith(f"{fields[0][SEED]},"):
+        fields[1][SEED] = fields[0][SEED]  # further seeds behind the same ones
+    if list(fields[0].items()) != list(fields[1].items()):
         return f"it varies {' '.join(old.vary) or 'nothing'}, not {' '.join(new.vary) or 'nothing'}"
     if old.records != new.records:
         return f"it {'keeps' if old.records else 'does not keep'} records"
@@ -112,7 +113,7 @@ class Grid(Struct, frozen=True):
     @property
     def names(self) -> list[str]:
         """Abbreviated values; those cut to the same text as their differing part, or with their number."""
-        names = [_cut(f"{value:g}" if isinstance(value, float) else text_of(value)) for value in self.values]
+        names = [_cut(f"{value:g}" if isinstance(value, float) else _without_made(value)) for value in self.values]
         for short in [name for name, count in Counter(names).items() if count > 1]:
             alike = [place for place, name in enumerate(names) if name == short]
             texts = parts = [text_of(self.values[place]) for place in alike]
@@ -189,15 +190,24 @@ def _grid_values(text: str) -> tuple[Any, ...]:
         raise ValueError(f"{error}; must be {SYNTAX}") from error
     if not values:
         raise ValueError(f"gives no value; must be {SYNTAX}")
-    for a, b in itertools.combinations(values, 2):
-        if a == b and isinstance(a, bool) == isinstance(b, bool):
-            raise ValueError(f"gives {show(a)} twice; every value once")
+    known: dict[tuple[bool, Any], Any] = {}
+    for value in values:
+        each = isinstance(value, bool), json.dumps(value) if isinstance(value, list | dict) else value
+        if each in known:
+            raise ValueError(f"gives {show(known[each])} twice; every value once")
+        known[each] = value
     return tuple(values)
 
 
 def text_of(value: Any) -> str:
     """Return a value as `--set` takes it, in one line."""
     return value if isinstance(value, str) else json.dumps(value, default=str)
+
+
+def _without_made(value: Any) -> str:
+    """Return a value as text; a class of a notebook or a script without the module that was made for it."""
+    text = text_of(value)
+    return text.partition(":")[2] if text.startswith(plugin.MADE) else text
 
 
 def _cut(text: str) -> str:
@@ -307,9 +317,9 @@ class SweepDesign:
         if faults:
             raise ScenarioError(faults)
         check_classes(scenario, self.plan.source)
-        if scenario.report.metrics is not UNSET:
+        for name in scenario.report.metric_names:
             try:
-                plugin.load_function(scenario.report.metrics, f"{self.plan.source}: {METRICS}")
+                plugin.load_function(name, f"{self.plan.source}: {METRICS}")
             except DocumentError as error:
                 raise ScenarioError(error.faults) from error
         check_pace(scenario, "lockstep")

@@ -10,12 +10,14 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection, wait
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from zsim.errors import RunError
@@ -64,19 +66,32 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+@contextlib.contextmanager
+def _bare_start() -> Iterator[None]:
+    """Start processes that neither import from the working folder first, nor the program that starts them.
+
+    `spawn` imports the main module again, which a script without `if __name__ == "__main__"` does not stand. A worker
+    needs nothing of it: what a script defines has a module of its own.
+    """
+    main, former = sys.modules["__main__"], os.environ.get(SAFE_PATH)
+    sys.modules["__main__"] = ModuleType("__main__")
+    os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+        del os.environ[SAFE_PATH]
+        if former is not None:
+            os.environ[SAFE_PATH] = former
+
+
 class WorkerProcess:
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.link, far = context.Pipe()
         self.process = context.Process(target=work, args=(far,), name="zsim-sweep", daemon=True)
-        former = os.environ.get(SAFE_PATH)
-        os.environ[SAFE_PATH] = "1"  # its interpreter is not to import from the working folder first
-        try:
+        with _bare_start():
             self.process.start()
-        finally:
-            del os.environ[SAFE_PATH]
-            if former is not None:
-                os.environ[SAFE_PATH] = former
         far.close()  # so that the link ends when the process dies
         self.ready = False
         self.task: Task | None = None

@@ -8,9 +8,12 @@ The folder of a sweep:
     runs/000012/     record of run 12, if records are kept
 """
 
+import html
 import os
+import shutil
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -27,6 +30,7 @@ from zsim.errors import ReportError, RunError, printable
 from zsim.output_folder import no_locks, refuse_others, take_lock
 from zsim.runtime.progress import cell
 from zsim.runtime.rate_limit import RateLimit
+from zsim.schema import plugin
 from zsim_analysis.sweep.design import PLAN, SEED, Axis, Grid, SweepDesign, SweepPlan, difference, is_sweep
 from zsim_analysis.sweep.process_pool import ProcessPool, cores
 from zsim_analysis.sweep.sweep_run import FIXED, Row, Task
@@ -36,6 +40,7 @@ NEW_PLAN = f".{PLAN}.new"
 PLAN_METADATA = b"zsim_sweep"  # key of the plan in the table's metadata
 PLAIN_S = 10.0  # wall time between two lines without a terminal
 BAR = 20  # characters
+FAILURES_MAX = 5  # lines about why runs failed
 UNMEASURED_MAX = 5  # lines about runs without metrics of the user
 _TYPES: dict[Any, pa.DataType] = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
 
@@ -46,8 +51,10 @@ class SweepRequest(Struct, frozen=True):
     plan: SweepPlan  # what is flown
     out: Path  # folder of the sweep
     workers: int | None = None  # processes on this host, None: one per core
-    dask: str | None = None  # address of a Dask scheduler whose workers are used instead
+    dask: Any = None  # a Dask client, or the address of a scheduler, whose workers are used instead
     force: bool = False  # whether the folder may hold other files
+    console: Console | None = None  # where progress is shown, None: stderr
+    modules: tuple[Path, ...] = ()  # made for what a notebook or a script defines; copied into the folder
 
 
 def sweep(request: SweepRequest) -> list[Row]:
@@ -59,9 +66,12 @@ def sweep(request: SweepRequest) -> list[Row]:
     """
     plan = request.plan
     with locked(request.out, plan, request.force) as folder:
+        for module in request.modules:
+            shutil.copy(module, folder.path)
+        plugin.search(*plugin.folders(), folder.path)
         done = {row["run"] for row in folder.compact()}
         missing = [run for run in range(plan.runs) if run not in done]
-        with SweepScreen(plan.runs, len(done)) as screen:
+        with SweepScreen(plan.runs, len(done), request.console) as screen:
             points = folder.design.points
             over = f" over {points} combinations" if points > 1 else ""
             screen.say(f"{plan.source}: {plan.runs} runs{over}, into {folder.path}")
@@ -72,7 +82,15 @@ def sweep(request: SweepRequest) -> list[Row]:
                     _fly(folder, request, missing, screen)
             finally:
                 rows = folder.compact()
+        for line in failures(rows):
+            screen.say(line)
     return rows
+
+
+def failures(rows: Sequence[Row]) -> list[str]:
+    """Return a line for each of the most frequent failures."""
+    counted = Counter(row["failure"] for row in rows if row["failure"])
+    return [f"{count} of {len(rows)} runs failed: {text}" for text, count in counted.most_common(FAILURES_MAX)]
 
 
 def _fly(folder: "SweepFolder", request: SweepRequest, missing: list[int], screen: "SweepScreen") -> None:
@@ -81,7 +99,8 @@ def _fly(folder: "SweepFolder", request: SweepRequest, missing: list[int], scree
     else:
         from zsim_analysis.sweep.dask_pool import DaskPool
 
-        pool = DaskPool(request.dask, screen.say)
+        modules = {file.name: file.read_text(encoding="utf-8") for file in folder.path.glob(f"{plugin.MADE}*.py")}
+        pool = DaskPool(request.dask, screen.say, modules)
     with folder.journal() as journal, closing(pool.rows(_tasks(folder, missing))) as rows:
         for row in rows:
             journal.append(row)
@@ -105,7 +124,7 @@ def _tasks(folder: "SweepFolder", runs: list[int]) -> Iterator[Task]:
 
 
 class SweepScreen:
-    """Shows the progress of a sweep while it is entered."""
+    """Shows the progress of a sweep while it is entered: a live line on a terminal and in a notebook, else lines."""
 
     def __init__(
         self, total: int, done: int, console: Console | None = None, now_s: Callable[[], float] = time.monotonic
@@ -118,6 +137,7 @@ class SweepScreen:
         self._now_s = now_s
         self._start_s = now_s()
         self._throttle = RateLimit(PLAIN_S)
+        self._cell: NotebookLine | None = None
         self._live = Live(
             console=self.console, get_renderable=lambda: cell(self.line()), refresh_per_second=5, transient=True
         )
@@ -126,11 +146,15 @@ class SweepScreen:
         self._start_s = self._now_s()
         if self.console.is_terminal:
             self._live.start()
+        elif self.console.is_jupyter and not self.console.quiet:
+            self._cell = NotebookLine(self.line())
         return self
 
     def __exit__(self, *_: object) -> None:
         if self.console.is_terminal:
             self._live.stop()
+        elif self._cell:
+            self._cell.update(self.line())
         elif self._done > self._before:
             self.say(self.line())
 
@@ -140,7 +164,9 @@ class SweepScreen:
     def finished(self, failed: bool) -> None:
         self._done += 1
         self._failed += failed
-        if not self.console.is_terminal and self._done < self._total and self._throttle.spend():
+        if self._cell:
+            self._cell.update(self.line())
+        elif not self.console.is_terminal and self._done < self._total and self._throttle.spend():
             self.say(self.line())
 
     def unmeasured(self, run: int, reason: str) -> None:
@@ -162,6 +188,22 @@ class SweepScreen:
         elif self._done < self._total:
             text += f"  the first ones are flying, {span(elapsed_s)}"
         return text + (f"  {self._failed} failed" if self._failed else "")
+
+
+class NotebookLine:
+    """A line below a notebook's cell that changes; rich needs ipywidgets for that."""
+
+    def __init__(self, text: str) -> None:
+        from IPython.display import display  # there in a notebook
+
+        self._handle: Any = display(self._shown(text), raw=True, display_id=True)
+
+    def update(self, text: str) -> None:
+        self._handle.update(self._shown(text), raw=True)
+
+    def _shown(self, text: str) -> dict[str, str]:
+        text = printable(text)
+        return {"text/plain": text, "text/html": f"<pre>{html.escape(text)}</pre>"}
 
 
 def span(seconds: float) -> str:

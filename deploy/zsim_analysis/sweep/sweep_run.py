@@ -1,28 +1,28 @@
 """One run of a sweep: its task, how it is flown in this process, and its row of the table.
 
-It is judged as by `zsim report`, without a record on disk. `report.metrics` names a function of the user that computes
+It is judged as by `zsim report`, without a record on disk. `report.metrics` names functions of the user that compute
 further figures from the flight:
 
     def metrics(flight: RecordedFlight) -> float | Mapping[str, float]
 
 A number becomes the column `metrics.` and the function's name, a mapping a column `metrics.NAME` for each of its names.
 The unit at the end of a name, as in scenarios (`overshoot_m`), is shown in tables and figures. NaN, infinity and None
-are empty. An exception of the function becomes the run's `metrics_failure`, and nothing else is lost.
+are empty. An exception of a function becomes the run's `metrics_failure`, and nothing else is lost.
 """
 
 import math
 import re
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from numbers import Real
 from pathlib import Path
-from shutil import rmtree
+from shutil import copy, rmtree
 from typing import Any
 
 import msgspec
 import numpy as np
-from msgspec import UNSET, Struct
+from msgspec import Struct
 
 from zsim.contract.fingerprint import fingerprint
 from zsim.errors import DocumentError, RecordError, ReportError, reason_of
@@ -166,7 +166,7 @@ def fly_scenario(scenario: Scenario, writer: RecordWriter | None = None) -> tupl
 
     A flight for metrics of the user has the drones' estimates and commands, too.
     """
-    flight, reader = InProcessFlight(scenario), FlightReader(answers=scenario.report.metrics is not UNSET)
+    flight, reader = InProcessFlight(scenario), FlightReader(answers=bool(scenario.report.metric_names))
     flight.run([reader, writer] if writer else [reader])
     return reader.flight(), flight.world.failure
 
@@ -184,6 +184,8 @@ def _record(task: Task) -> Iterator[RecordWriter | None]:
     try:
         part.mkdir(parents=True)
         (part / "scenario.yaml").write_text(scenario_file.to_text(task.scenario), encoding="utf-8")
+        for module in made_modules(task.scenario.own_code(), plugin.folders()):
+            copy(module, part)
     except OSError as error:
         reason = f"cannot be written ({error.strerror}); free some space; the same command then continues"
         raise RecordError(f"{part}: {reason}") from error
@@ -202,6 +204,13 @@ def _record(task: Task) -> Iterator[RecordWriter | None]:
     part.rename(folder)
 
 
+def made_modules(names: Iterable[str], folders: Iterable[Path]) -> list[Path]:
+    """Return the files of the modules that were made for what a notebook or a script defines, among some names."""
+    made = dict.fromkeys(name.partition(":")[0] for name in names if name.startswith(plugin.MADE))
+    files = [folder / f"{module}.py" for module in made for folder in folders]
+    return [file for file in files if file.is_file()]
+
+
 def engaged_s(formations: list[Formation], window_s: tuple[float, float]) -> dict[str, float | None]:
     """Return the first instant [s] of a window at which each cluster was engaged, None if it never was."""
     rows = {each.name: np.flatnonzero(each.judged(window_s)) for each in formations}
@@ -209,10 +218,22 @@ def engaged_s(formations: list[Formation], window_s: tuple[float, float]) -> dic
 
 
 def metrics_of(scenario: Scenario, flight: RecordedFlight) -> tuple[dict[str, float | None], str | None]:
-    """Return the metrics of a flight by the user's function, by column, or in one line why there are none."""
-    name = scenario.report.metrics
-    if name is UNSET:
-        return {}, None
+    """Return the metrics of a flight by the user's functions, by column, and in one line why some have none."""
+    metrics: dict[str, float | None] = {}
+    failures: list[str] = []
+    for name in scenario.report.metric_names:
+        found, failure = _metrics_of(name, flight)
+        if twice := found.keys() & metrics.keys():
+            returned = min(twice).removeprefix(METRIC)
+            failures.append(f"{METRICS} {name}: returned {returned}, which another function returns, too")
+        elif failure:
+            failures.append(failure)
+        else:
+            metrics.update(found)
+    return metrics, "; ".join(failures) or None
+
+
+def _metrics_of(name: str, flight: RecordedFlight) -> tuple[dict[str, float | None], str | None]:
     try:
         returned = plugin.load_function(name, METRICS)(flight)
         named = returned if isinstance(returned, Mapping) else {name.partition(":")[2]: returned}

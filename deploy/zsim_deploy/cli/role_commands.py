@@ -95,6 +95,27 @@ def host_agents(
     roles.agent(roles.host(names), reach)
 
 
+@app.command("agent", rich_help_panel=opt.ROLES)
+@opt.participant_options
+def own_agent(
+    reach: opt.WorldAccess,
+    named: Annotated[str, Argument(metavar="MODULE:CLASS", help="A subclass of zsim.Agent.", show_default=False)],
+    settings: Annotated[
+        list[str] | None, Argument(metavar="[NAME=VALUE]...", help="Arguments of the class.", show_default=False)
+    ] = None,
+    name: Annotated[str, Option(help="Process name (default: the class's own).", show_default=False)] = "",
+) -> None:
+    """Run an agent of your own, a class of a module on PYTHONPATH or in this folder."""
+    from zsim.schema import plugin
+    from zsim_agents.hosting import AgentSpec
+    from zsim_deploy.roles import roles
+
+    if not reach.launched:
+        plugin.search(Path.cwd())
+    spec = AgentSpec.parse([named, *(settings or ())], name)
+    roles.agent(spec.make, reach, spec.name)
+
+
 @app.command(rich_help_panel=opt.ROLES)
 @opt.participant_options
 def record(

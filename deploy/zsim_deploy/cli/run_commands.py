@@ -1,5 +1,6 @@
 """`zsim run` and `validate`, and what is done with records: `report`, `sweep`, `export`, `rerun` and `replay`."""
 
+import shlex
 import signal
 import sys
 import time
@@ -33,7 +34,7 @@ GATE = "a gate: an instant at which the processes meet"
 OF_PROCESSES = ("--realtime", "--rate", "--listen", "--hosted", "--console", "--cameras", "--detect")
 OF_A_NEW_RUN = (
     *("--seed", "--duration", "--realtime", "--rate", "--set", "--out"),
-    *("--in-process", "--listen", "--insecure", "--hosted"),
+    *("--in-process", "--listen", "--insecure", "--hosted", "--agent"),
 )
 
 app = typer.Typer()
@@ -58,6 +59,10 @@ def run(
         bool, Option("--cameras", help="Draw what cameras see; front and bottom where no drone has any.")
     ] = False,
     detect: Annotated[bool, Option("--detect", help="Find hats in the cameras' pictures.")] = False,
+    agent: Annotated[
+        list[str] | None,
+        Option(help="An agent of your own, 'MODULE:CLASS [NAME=VALUE]...', or 'PROCESS=MODULE:CLASS …'. Repeatable."),
+    ] = None,
     report: opt.Report = True,
     continue_: Annotated[
         bool, Option("--continue", help="SCENARIO is the folder of an interrupted run, which is continued.")
@@ -67,7 +72,8 @@ def run(
 ) -> None:
     """Fly a scenario: start every process, show progress, record, report."""
     require("run", opt.FLIGHT_NEEDS | (opt.REPORT_NEEDS if report else {}))
-    from zsim_agents.hosting import check_plans
+    from zsim.schema import plugin
+    from zsim_agents.hosting import AgentSpec, check_plans, with_own_agents
     from zsim_api.run_folder import make_directory, new_launch
     from zsim_deploy.hosts.control_socket import seen_by_ps
     from zsim_deploy.launch.console_process import RunConsole
@@ -88,7 +94,13 @@ def run(
         scenario = with_cameras(flight.scenario()) if cameras else flight.scenario()
         if in_process:
             check_plans(scenario, flight.path.name)  # as processes, controllers refuse them
-        how = {"in_process": in_process, "hosted": hosted, "insecure": insecure, "listen": listen}
+        if agent:
+            plugin.search(*plugin.folders(), Path.cwd())
+        agents = [AgentSpec.parse(shlex.split(each) or [""]) for each in agent or ()]
+        if agents:
+            scenario = with_own_agents(scenario, [each.name for each in agents])
+        own = tuple(tuple(each.words()) for each in agents)
+        how = {"in_process": in_process, "agents": own, "hosted": hosted, "insecure": insecure, "listen": listen}
         launch = new_launch(mode=mode, rate=pace, changed=tuple(flight.changed()), **how)
         options = RunOptions(scenario, Path(), launch, [name for name in order.split(",") if name])
     options.console, options.cameras, options.detect = shown, cameras, detect
@@ -279,18 +291,15 @@ def sweep(
     require("sweep", SWEEP_NEEDS if dask is None else DASK_NEEDS)
     from rich.console import Console
 
-    from zsim_analysis.sweep.design import make_plan, read_document
+    from zsim_analysis.sweep.design import read_document
     from zsim_analysis.sweep.sweep import SweepRequest
     from zsim_analysis.sweep.sweep import sweep as fly
+    from zsim_api.sweeping import planned
 
     document, faults = read_document(scenario, set_ or [], seed=seed, duration_s=duration)
     changed = opt.changed_fields(set_, seed, duration)
-    with Console(stderr=True).status("checking every combination …") as status:
-
-        def look(run: int, of: int) -> None:
-            status.update(f"checking combination {run + 1} of {of}")
-
-        plan = make_plan(scenario.name, document, vary or [], runs, keep_records, look, faults, changed)
+    shown = Console(stderr=True)
+    plan = planned(scenario.name, document, vary or [], runs, keep_records, changed, shown, faults)
     folder = out or Path("runs") / f"{plan.document['name']}-sweep-{time.strftime('%Y%m%d-%H%M%S')}"
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
@@ -304,9 +313,7 @@ def sweep(
 
 
 def _conclude(folder: Path, failures: list[str], runs: int, report: bool, short: Sequence[str] = ()) -> None:
-    """Print what did not end well, make the report, and fail if a run did not end well, or none flew its plan."""
-    for failure in sorted(set(failures), key=failures.count, reverse=True)[:5]:
-        note(f"{failures.count(failure)} of {runs} runs failed: {failure}")
+    """Make the report, and fail if a run did not end well, or none flew its plan."""
     if report:
         _report(folder)
     say(f"table: {folder / 'sweep.parquet'}")

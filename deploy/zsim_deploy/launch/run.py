@@ -1,7 +1,6 @@
 """A whole run on this host: every process of a scenario started, watched, recorded, and ended."""
 
 import contextlib
-import json
 import os
 import re
 import signal
@@ -11,21 +10,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
 from msgspec.structs import replace
 
-from zsim.errors import OTHER_OUT, RecordError, RunFailedError, SessionError, file_fault
+from zsim.errors import RecordError, RunFailedError, SessionError
 from zsim.output_folder import RECORD, no_locks
 from zsim.record import repair
 from zsim.runtime.progress import Screen
-from zsim.scenario import scenario_file
 from zsim.scenario.consistency import unflown_plans
 from zsim.scenario.roles import driver_lines, expected_processes, watched_drones
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import BottomCamera, FrontCamera
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import launcher_files, require_files
-from zsim_agents.hosting import agents_of
+from zsim_agents.hosting import AgentSpec, agents_of
 from zsim_api import run_folder
 from zsim_api.run_folder import JOURNAL, Launch
 from zsim_deploy.arguments import changed_options, load_scenario, pace_options
@@ -62,6 +59,9 @@ class RunOptions:
         else:
             rows, clock = [status_row("in-process", socket.gethostname(), os.getpid(), "running")], None
         return {"rows": rows, "clock": clock, "out": str(self.out.absolute()), "roles": [row["role"] for row in rows]}
+
+    def agents(self) -> list[AgentSpec]:
+        return [AgentSpec.parse(words) for words in self.launch.agents]
 
     def camera_children(self) -> "list[CameraChild]":
         return camera_children(self.scenario, self.cameras or self.scenario.gates("camera"), self.detect)
@@ -149,6 +149,8 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
     else:
         for role, _, thing in (name.partition(".") for name in names):
             commands[f"{role}.{thing}"] = [role, *reach, "--", thing]  # a name of the contract may begin with -
+    for agent in options.agents():
+        commands[agent.name] = ["agent", "--name", agent.name, *reach, "--", *agent.words()]
     if options.console:
         commands[CONSOLE] = ["console", "--name", CONSOLE, "--folder", str(options.out), *reach]
     for role, name, drones in options.camera_children():
@@ -175,7 +177,8 @@ def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
             return signals.look() or stop.reason()
 
         try:
-            ended = fly(options.scenario, options.out / RECORD, reason, screen, changed=options.launch.changed)
+            own, changed = [each.make for each in options.agents()], options.launch.changed
+            ended = fly(options.scenario, options.out / RECORD, reason, screen, changed=changed, own=own)
         except (DivergedError, RunFailedError) as error:
             return Outcome(str(error), failed=True)
         finally:
@@ -187,16 +190,10 @@ def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
 
 
 def _prepare(options: RunOptions, screen: Screen) -> None:
-    """Put what is to be flown, and how, into the run's folder, and show it; RunError if it cannot be written."""
+    """Put what is to be flown, and how, into the run's folder, and show it; errors as of `prepare`."""
     scenario = options.scenario
     if not options.continued:
-        with file_fault(options.out, "cannot be written", OTHER_OUT):
-            if not options.launch.in_process:
-                (options.out / "logs").mkdir(exist_ok=True)
-            (options.out / "scenario.yaml").write_text(scenario_file.to_text(scenario))
-            (options.out / JOURNAL).mkdir(exist_ok=True)
-            content = json.dumps(msgspec.to_builtins(options.launch))  # not msgspec's: a path may hold no UTF-8
-            (options.out / JOURNAL / run_folder.LAUNCH).write_text(content, "utf-8")
+        run_folder.prepare(options.out, scenario, options.launch)
     screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
     for line in (*unflown_plans(scenario), no_locks(options.out)):
         if line:
@@ -229,7 +226,7 @@ def check_open_files(options: RunOptions) -> None:
     """Refuse a run of more processes than this machine allows files for."""
     cameras = {child.name for child in options.camera_children()}
     expected = {*expected_processes(options.scenario), RECORDER}
-    agents = 1 if options.launch.hosted else len(expected - cameras) - 1
+    agents = 1 + len(options.launch.agents) if options.launch.hosted else len(expected - cameras) - 1
     count = 2 + agents + (options.console is not None) + len(cameras)
     require_files(launcher_files(count, len(expected)), f"{count} processes")
 

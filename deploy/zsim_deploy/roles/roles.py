@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
+from traceback import format_exception
 
 from msgspec import UNSET
 
@@ -40,6 +41,7 @@ from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file
 from zsim.scenario.roles import AGENTS, RECORDER, ROUTER, things, watched_drones
 from zsim.scenario.scenario import Scenario
+from zsim.schema import plugin
 from zsim.sensors.camera import Hats
 from zsim.transport import tls
 from zsim.transport.connection import find_world, route
@@ -109,6 +111,8 @@ def agent(build: Build, reach: WorldAccess, name: str = "") -> None:
         if not launched:
             raise
         print(printable(str(error)), file=sys.stderr)
+        if (raised := plugin.raised_by_user(error)) is not None:
+            print(printable("".join(format_exception(raised, chain=False))), end="", file=sys.stderr)
         sys.exit(USER_FAULT)  # its launcher is not to start it again
     say(f"{member.name}: left, {reason}")
     if runner.killed:  # end as by kill -9, so that the launcher sees it die; Windows has no SIGKILL

@@ -1,5 +1,7 @@
 """A run on record, read from Python: against the messages that were written, the export and the report."""
 
+import html
+import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,13 +17,13 @@ from synthetic_record import Flown
 import zsim
 from zsim.contract import keys
 from zsim.contract.messages import decode
-from zsim.errors import RecordError, RunError
+from zsim.errors import RunError
 from zsim.record import RecordReader
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_analysis.export import Format
 from zsim_analysis.export.columns import MessageSelection
 from zsim_analysis.export.make_export import export
-from zsim_analysis.report.summary import judge
+from zsim_analysis.report import drone_figures, make_report
 from zsim_api import recorded, tables
 
 DRONE = "a-b.c"
@@ -137,7 +139,7 @@ def test_without_pandas_a_frame_is_a_dict_of_arrays(folder: Path, without_pandas
     assert truth["position_m_z"].shape == truth["t_s"].shape
     with pytest.raises(ValueError, match="read-only"):
         truth["position_m_z"][0] = 1.0
-    assert "unit" in run.error_summary("main")
+    assert "variable" in run.errors()
 
 
 def test_a_key_is_read_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -166,49 +168,108 @@ def step(tmp_path_factory: pytest.TempPathFactory) -> zsim.Run:
 
 
 def test_errors_of_a_formation_are_those_of_the_closed_form(step: zsim.Run) -> None:
-    table = step.error_summary("main", window=(2.0, 9.98))
-    assert [*table.index] == [*step.summary.errors] == NAMES
+    table = step.errors(window=(2.0, 9.98))
+    assert [*table.index] == [("main", name) for name in NAMES]
     sine = np.arange(1, 13) * 1e-3 / np.sqrt(2)
     assert table["true_std"].to_numpy() == pytest.approx(sine)
     assert table["true_rms"].to_numpy() == pytest.approx(np.hypot(sine, 0.01))
     assert table["est_rms"].to_numpy() == pytest.approx(sine / 2)
-    assert table["unit"][["p", "beta"]].tolist() == ["m", "rad"]
-    errors = step.errors("main", window=(2.0, 9.98))
-    assert errors["true_p_m"].to_numpy().std() == pytest.approx(table.loc["p", "true_std"])
-    assert errors["est_beta_rad"].to_numpy().std() == pytest.approx(table.loc["beta", "est_std"])
-    assert errors["engaged"].all()
+    assert [table["unit"]["main", name] for name in ("p", "beta")] == ["m", "rad"]
+    formation = step.formation("main").loc[2.0:9.98]
+    p = NAMES.index("p")
+    assert formation["truth_error_p_m"].to_numpy().std() == pytest.approx(sine[p])
+    assert (formation["truth_p_m"] - formation["desired_p_m"]).mean() == pytest.approx(0.01)
+    assert (formation["estimate_p_m"] - formation["desired_p_m"]).std(ddof=0) == pytest.approx(sine[p] / 2)
+    assert formation["estimate_error_beta_rad"].to_numpy().std() == pytest.approx(sine[-1] / 2)
+    assert set(formation["phase"]) == {"engaged"}
 
 
-def test_without_a_window_statistics_are_those_of_the_report(step: zsim.Run) -> None:
-    expected = [errors.true_rms for errors in step.summary.errors.values()]
-    assert step.error_summary()["true_rms"].tolist() == expected
-    assert step.summary.json() == judge(step.record)[2].json()
+def test_without_a_window_errors_are_those_of_the_report(step: zsim.Run) -> None:
+    page = step.report()
+    reported = json.loads((page.parent / "summary.json").read_text())
+    for name, errors in reported["clusters"]["main"]["errors"].items():
+        row = step.errors().loc[("main", name)]
+        assert [row[field] for field in errors] == [*errors.values()]
+    assert "<html" in page.read_text()
+    assert step.summary.json() == (page.parent / "summary.json").read_bytes()
 
 
-def test_errors_of_a_drone_are_estimate_less_truth(run: zsim.Run) -> None:
-    errors, truth, estimate = run.errors("drone1"), run.truth("drone1"), run.estimate("drone1")
+def test_errors_of_an_estimate_are_against_the_truth(run: zsim.Run) -> None:
+    errors, truth, estimate = run.estimate_errors("drone1"), run.truth("drone1"), run.estimate("drone1")
     own = (estimate["position_m_x"] - truth["position_m_x"]).dropna()
-    assert errors["position_m_x"].to_numpy() == pytest.approx(own.to_numpy(), abs=1e-5)  # estimates are read as float32
-    table = run.error_summary("drone1", window=(2.0, 4.0))
-    part = errors.loc[2.0:4.0, "position_m_x"]
-    assert table.loc["position_m_x", "rms"] == pytest.approx(np.sqrt(np.mean(part**2)))
-    assert table.loc["position_m_x", "mean"] == pytest.approx(part.mean())
-    assert table.loc["nees", "mean"] == pytest.approx(errors.loc[2.0:4.0, "nees"].mean())
+    assert errors["position_m_x"].to_numpy() == pytest.approx(own.to_numpy(), abs=1e-6)  # estimates are held as float32
+    stated = np.sqrt(estimate["covariance_11"].loc[errors.index])
+    assert errors["sigma_position_m_y"].to_numpy() == pytest.approx(stated.to_numpy(), rel=1e-6)
+    part = errors.loc[2.0:4.0]
+    table = run.errors(window=(2.0, 4.0), of="estimates").loc["drone1"]
+    assert table.loc["position_m_x", "rms"] == pytest.approx(np.sqrt(np.mean(part["position_m_x"] ** 2)))
+    assert table.loc["yaw_rad", "mean"] == pytest.approx(part["yaw_rad"].mean())
+    assert table.loc["nees", "mean"] == pytest.approx(part["nees"].mean())
+    inside = (part["position_m_z"].abs() <= 2 * part["sigma_position_m_z"]).mean()
+    assert table.loc["position_m_z", "inside"] == pytest.approx(inside)
 
 
-def test_a_window_selects_instants(run: zsim.Run) -> None:
-    part = run.errors("drone1", window=(2.0, 3.0))
-    assert (part.index.min(), part.index.max()) == (2.0, 3.0)
-    assert np.isnan(run.error_summary("drone1", window=(100.0, 200.0))["rms"]).all()
+def test_where_a_window_has_nothing_statistics_are_unknown(run: zsim.Run) -> None:
+    for of in ("formations", "estimates"):
+        assert run.errors((100.0, 200.0), of).drop(columns="unit").isna().all(axis=None)
 
 
 def test_how_it_was_flown_is_known(run: zsim.Run) -> None:
     assert run.drones == ("drone1", "a-b.c", "end")
     assert run.clusters == ("main",)
     assert run.duration_s == 6.0
+    assert run.ended == "the scenario's duration is over"
     assert run.truth_sha256 == run.summary.truth_sha256
     assert run.scenario.resolved.seed == 3
     assert run.scenario.document()["drones"][1]["name"] == DRONE
+    assert run.keys["drone/end/truth"] == len(run.truth("end"))
+
+
+def test_its_scenario_flies_again_to_the_same_bits(run: zsim.Run, tmp_path: Path) -> None:
+    again = zsim.run(run.scenario, out=tmp_path / "again", progress=False)
+    assert again.truth_sha256 == run.truth_sha256
+    pd.testing.assert_frame_equal(again.truth(DRONE), run.truth(DRONE))
+
+
+def test_all_drones_are_one_dataset(run: zsim.Run) -> None:
+    data = run.xarray()
+    assert dict(data.sizes) == {"drone": 3, "t_s": 301}
+    assert [*data.drone.values] == [*run.drones]
+    assert data.truth_position_m_y.sel(drone="end", t_s=0.0) == 3.0
+    last = run.estimate(DRONE)["position_m_x"].iloc[-1]
+    assert data.estimate_position_m_x.sel(drone=DRONE).dropna("t_s")[-1] == last
+
+
+# Shown
+
+
+def test_a_figure_is_that_of_the_report(step: zsim.Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = []
+    monkeypatch.setattr(drone_figures, "draw_plan", lambda *_: drawn.append("plan"))
+    monkeypatch.setattr(make_report, "draw_errors", lambda *_: drawn.append("errors"))
+    shape: Any = step.figure("shape")
+    assert "$p$" in shape.axes[0].get_ylabel()
+    assert step.figure("figure_8_shape").axes[0].get_ylabel() == shape.axes[0].get_ylabel()
+    assert drawn == []  # no other one
+    assert shape._repr_png_().startswith(b"\x89PNG")
+
+
+def test_a_figure_that_there_is_not_is_refused_with_those_that_there_are(run: zsim.Run) -> None:
+    with refused(
+        RunError,
+        "'shap'",
+        "did you mean shape?",
+        "errors, position, orientation, shape, plan_view, distances, drones, estimates, …",
+    ):
+        run.figure("shap")
+
+
+def test_a_notebook_shows_its_errors_and_how_it_fell_short(step: zsim.Run) -> None:
+    shown = step._repr_html_()
+    assert "step, seed 1, 3 drones" in shown
+    assert "12 s, " in shown
+    assert "<td>beta (rad)</td>" in shown
+    assert html.escape(step.shortfalls[0].text) in shown
 
 
 # What is not there
@@ -218,17 +279,18 @@ def test_how_it_was_flown_is_known(run: zsim.Run) -> None:
     ("ask", "words"),
     [
         (lambda run: run.truth("drone4"), ("no drone 'drone4'", "did you mean drone1?", "drone1, a-b.c, end")),
-        (lambda run: run.sensor("drone1", "gsp"), ("no sensor gsp of drone1", "did you mean gps?", "imu")),
-        (lambda run: run.commands("end", "rotors"), ("no cmd rotors of end", "none")),
-        (lambda run: run.commands("drone1", "rotor"), ("no cmd rotor of drone1", "did you mean rotors?", "velocity")),
+        (lambda run: run.sensor("drone1", "gsp"), ("no sensor 'gsp' of drone1", "did you mean gps?", "imu")),
+        (lambda run: run.commands("end", "rotors"), ("no cmd 'rotors' of end", "none")),
+        (lambda run: run.commands("drone1", "rotor"), ("no cmd 'rotor' of drone1", "did you mean rotors?", "velocity")),
         (lambda run: run.cluster("mian"), ("no cluster 'mian'", "did you mean main?")),
-        (lambda run: run.errors("drome1"), ("no cluster or drone 'drome1'", "did you mean drone1?")),
+        (lambda run: run.formation("drone1"), ("no cluster 'drone1'", "main")),
+        (lambda run: run.errors(of="estimate"), ("of is 'estimate'", "'formations'", "'estimates'")),
         (lambda run: run.messages("drone/*/truth"), ("no messages of 'drone/*/truth'", "drone/drone1/truth")),
         (lambda run: run.messages("own/thin"), ("'own/thin'", "did you mean own/thing?")),
     ],
 )
 def test_what_is_not_on_record_is_refused_with_what_is(run: zsim.Run, ask: Any, words: tuple[str, ...]) -> None:
-    with refused(RecordError, *words):
+    with refused(RunError, *words):
         ask(run)
 
 

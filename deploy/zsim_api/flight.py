@@ -1,0 +1,220 @@
+"""`zsim.run`: a whole flight, in this process or as processes of its own, recorded and given back as a `Run`."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from rich.console import Console
+
+from zsim.errors import RunError, RunFailedError, UserCodeError
+from zsim.output_folder import RECORD
+from zsim.runtime.progress import Screen, describe
+from zsim.schema import plugin
+from zsim_analysis.in_process import OwnAgent, fly, with_agents
+from zsim_analysis.reading.shortfall import verdict
+from zsim_api import run_folder
+from zsim_api.scenarios import AnyScenario, Scenario, scenario_of
+
+if TYPE_CHECKING:
+    from zsim_api.recorded import Run
+
+Result = TypeVar("Result")
+COMMAND = (sys.executable, "-P", "-m", "zsim_deploy")
+INTERRUPTED = 130  # exit code of `zsim run` after Ctrl-C
+
+
+def run(
+    scenario: AnyScenario,
+    *,
+    seed: int | None = None,
+    duration_s: float | None = None,
+    set: Mapping[str, Any] | None = None,
+    agents: Sequence[OwnAgent] = (),
+    law: type | None = None,
+    estimator: type | None = None,
+    processes: bool = False,
+    options: Sequence[str] = (),
+    out: str | Path | None = None,
+    force: bool = False,
+    progress: bool = True,
+) -> "Run":
+    """Fly a scenario to its end, record it, and return the run, as `zsim.load` does.
+
+    Classes and functions may be defined anywhere, also in a notebook's cell or in a script.
+
+    Args:
+        scenario: path of a YAML file, `zsim.Scenario`, or a mapping as in YAML.
+        seed, duration_s, set: replace those of the scenario; `set` by paths, `{"environment.wind.gust_m_s": 1.0}`.
+        agents: of your own, beside the estimators and controllers of the scenario: subclasses of `zsim.Agent`, or
+            objects of them, which keep their state after the run, except as processes. The run waits for them, and
+            ends where one fails.
+        law, estimator: classes that replace those of all clusters and drones; see docs/extending.md.
+        processes: fly it as real processes on this machine, as `zsim run` does, to the same bits. It takes longer.
+        options: of `zsim run`, for processes: `["--hosted"]`, `["--realtime", "--console"]`.
+        out: folder of the run; None: `runs/NAME-TIME`.
+        force: replace an earlier run in that folder.
+        progress: show a bar and the events.
+
+    Raises:
+        ScenarioError: with every fault of the scenario, a line each; nothing has been flown.
+        RunFailedError: a failure ended the run; its record holds all until then.
+        KeyboardInterrupt: it was interrupted; its record holds all until then. A second Ctrl-C ends it at once.
+        Exception: what a class of yours raised, after a line on stderr that says where, with its own traceback.
+    """
+    source = scenario_of(scenario).changed(seed=seed, duration_s=duration_s, set=set, law=law, estimator=estimator)
+    if options and not processes:
+        raise RunError(f"options is {list(options)}; must be empty without processes=True, which they are for")
+    flown, made = calling(lambda: with_agents(source.resolved, agents))
+    folder = run_folder.make_directory(Path(out) if out is not None else None, flown, force)
+    source.keep_modules(folder)
+    if processes:
+        _fly_as_processes(source, agents, [agent.name for agent in made], options, folder, progress)
+    else:
+        launch = run_folder.new_launch(in_process=True, changed=source.changes or ())
+        run_folder.prepare(folder, flown, launch)
+        with screen_for(flown.duration_s) if progress else nullcontext() as screen, _ctrl_c() as stop_reason:
+            if screen:
+                screen.say(f"{flown.name}: {len(flown.drones)} drones, {flown.duration_s:g} s, into {folder}")
+            calling(lambda: fly(flown, folder / RECORD, stop_reason, screen, None, source.changes, made), folder)
+        if reason := stop_reason():
+            raise KeyboardInterrupt(f"{reason}; zsim.load({str(folder)!r}) reads the record so far")
+        run_folder.forget_launch(folder)
+    from zsim_api.recorded import load
+
+    return load(folder, trust=True)
+
+
+# Of processes
+
+
+def _fly_as_processes(
+    source: Scenario,
+    agents: Sequence[OwnAgent],
+    names: Sequence[str],
+    options: Sequence[str],
+    folder: Path,
+    progress: bool,
+) -> None:
+    """Fly by `zsim run`: a launcher of its own has its signals and its children for itself."""
+    command = [*COMMAND, "run", str(_file_of(source, folder)), "--out", str(folder), "--force", "--no-report"]
+    command += [word for change in source.changes or () for word in ("--set", change)]
+    folders = [folder, *source.folders]
+    if agents:
+        from zsim_api.own_code import module_folders, name_of
+
+        named = [name_of(each, folder) for each in agents]
+        folders += module_folders(named)
+        command += [w for name, each in zip(names, named, strict=True) for w in ("--agent", f"{name}={each}")]
+    searched = [*map(str, folders), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(dict.fromkeys(searched))}
+    quiet = None if progress else subprocess.DEVNULL
+    # in a session of its own, so that Ctrl-C reaches it from here alone, once
+    with subprocess.Popen(
+        [*command, *options], env=environment, stdout=quiet, stderr=quiet, start_new_session=True
+    ) as program:
+        while True:
+            try:
+                code = program.wait()
+                break
+            except KeyboardInterrupt:
+                program.send_signal(signal.SIGINT)
+            except BaseException:
+                program.terminate()
+                raise
+    if code in (INTERRUPTED, -signal.SIGINT):
+        raise KeyboardInterrupt(f"interrupted; zsim.load({str(folder)!r}) reads the record so far")
+    if code:
+        _raise_failure(folder, code)
+
+
+def _file_of(source: Scenario, folder: Path) -> Path:
+    """Return a scenario's file; one that was made in Python is written into the run's folder."""
+    if source.changes is not None:
+        return source.folders[0] / source.source
+    file = folder / run_folder.SCENARIO
+    source.save(file)
+    return file
+
+
+def _raise_failure(folder: Path, code: int) -> None:
+    """Raise what ended the processes of a run; nothing where all of it was flown, though not as planned."""
+    record = folder / RECORD
+    if not record.exists():
+        raise RunFailedError(f"{folder}: `zsim run` ended with code {code}, and nothing was recorded")
+    judged = verdict(record)
+    if failures := [each.text for each in judged.shortfalls if each.kind == "process" and each.fails]:
+        raise RunFailedError(f"{failures[0]}; the record is {record}, the logs are in {folder / run_folder.LOGS}")
+
+
+# In this process
+
+
+def calling(call: Callable[[], Result], folder: Path | None = None) -> Result:
+    """Call what calls classes of a user's; what one raises is raised as it is, after a line with where that was."""
+    try:
+        return call()
+    except UserCodeError as error:
+        failure, raised = error, plugin.raised_by_user(error)
+    if raised is None:  # it returned what cannot be used
+        raise failure.with_traceback(None) from None
+    kept = f"; zsim.load({str(folder)!r}) reads the record so far" if folder and (folder / RECORD).exists() else ""
+    print(f"{failure}{kept}", file=sys.stderr, flush=True)
+    raise raised
+
+
+class _StopRequest:
+    """Whether Ctrl-C was pressed."""
+
+    reason: str | None = None
+
+    def __call__(self) -> str | None:
+        return self.reason
+
+
+@contextmanager
+def _ctrl_c() -> Iterator[_StopRequest]:
+    """Let Ctrl-C end a flight at its next gate, with its record complete; the second one interrupts at once."""
+    request = _StopRequest()
+    former = signal.getsignal(signal.SIGINT)
+    if former is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
+        yield request
+        return
+
+    def on_interrupt(*_: object) -> None:
+        request.reason = "interrupted"
+        signal.signal(signal.SIGINT, former)
+
+    signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield request
+    finally:
+        signal.signal(signal.SIGINT, former)
+
+
+def screen_for(duration_s: float) -> Screen:
+    """Return what shows the progress of a run: on a terminal, or below a notebook's cell."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return NotebookScreen(duration_s) if type(shell).__name__ == "ZMQInteractiveShell" else Screen(duration_s)
+
+
+class NotebookScreen(Screen):
+    """Shows the live line below a notebook's cell; events on its standard output."""
+
+    def __init__(self, duration_s: float) -> None:
+        super().__init__(duration_s, Console(file=sys.stdout, force_jupyter=False))
+        self._handle: Any = None
+
+    def clock(self, line: dict[str, Any]) -> None:
+        from IPython.display import Pretty, display
+
+        text = Pretty(describe(line, self._duration_s))
+        if self._handle is None:
+            self._handle = display(text, display_id=True)
+        else:
+            self._handle.update(text)

@@ -1,0 +1,183 @@
+"""Flies a scenario many times, with other seeds and other values of its fields: `zsim.sweep` and `zsim sweep`."""
+
+import atexit
+import json
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+from rich.console import Console
+
+from zsim.errors import RunError, ScenarioError, missing
+from zsim.scenario.scenario_file import whole_path
+from zsim.schema import plugin
+from zsim.schema.checker import show
+from zsim_analysis.sweep.design import METRICS, SweepDesign, SweepPlan, make_plan
+from zsim_analysis.sweep.sweep import TABLE, SweepFolder, SweepRequest, read_table
+from zsim_analysis.sweep.sweep import sweep as fly
+from zsim_analysis.sweep.sweep_run import FIXED, made_modules
+from zsim_analysis.sweep.sweep_summary import SweepResults
+from zsim_api.scenarios import AnyScenario, Scenario, scenario_of, scratch_folder
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    Metric = Callable[[Any], Any]
+
+
+def sweep(
+    scenario: AnyScenario,
+    vary: Mapping[str, Any] = {},
+    *,
+    metrics: "Metric | Sequence[Metric | str]" = (),
+    runs: int | None = None,
+    seed: int | None = None,
+    duration_s: float | None = None,
+    set: Mapping[str, Any] | None = None,
+    law: type | None = None,
+    estimator: type | None = None,
+    workers: int | None = None,
+    client: Any = None,
+    out: str | Path | None = None,
+    keep_records: bool = False,
+    progress: bool = True,
+) -> "pd.DataFrame":
+    """Fly every combination of some values, on all cores; return a frame with a row for each run.
+
+        frame = zsim.sweep(
+            "step.yaml",
+            vary={"seed": range(50), "estimation.algorithm": ["error_state", MyEstimator]},
+            metrics=[settling_time],
+        )
+        frame.groupby("estimation.algorithm")["metrics.settling_time"].mean()
+
+    Each run has the bits of `zsim.run` with the same values, wherever it is flown. Ctrl-C ends the workers and raises
+    KeyboardInterrupt; what is finished is in the folder, where the same call with `out` goes on.
+
+    Args:
+        scenario: path of a YAML file, `zsim.Scenario`, or a mapping as in YAML.
+        vary: values by path, in a sequence, of which every combination is flown; classes where one is named; or a text
+            as `--vary` takes it: `{"seed": "paired", "wind.gust_m_s": "uniform(0, 2)"}`, with `runs`.
+        metrics: functions of the flight, or their names `module:function`, that return a number or a mapping of numbers
+            by name: columns `metrics.NAME`.
+        runs: their number; None: one for each combination.
+        seed, duration_s, set, law, estimator: for all runs, as of `zsim.run`.
+        workers: processes; None: one per core.
+        client: a `distributed.Client`, whose workers are used instead.
+        out: folder of the sweep, which `zsim report` reads; one that is not finished is gone on with. None: a folder
+            that is removed when this process ends.
+        keep_records: whether the record of every run is kept, in `runs/` of the folder.
+        progress: whether progress is shown.
+
+    Returns:
+        frame by number of the run: `seed`, the values by path, `failure` (why the run did not end well, else None),
+        `metrics.NAME`, errors, and the other columns of docs/sweep.md. `attrs["folder"]` is the folder of the sweep,
+        `attrs["summary"]` what `zsim report` writes as summary.json: means and intervals of each combination.
+
+    Raises:
+        ScenarioError: with every fault of the values and of the scenarios, a line each.
+        RunError: the folder holds something else; workers cannot start; pandas is not installed.
+    """
+    with _pandas_needed():
+        import pandas as pd
+    console = Console(stderr=True, quiet=not progress)
+    varied = scenario_of(scenario).changed(seed, duration_s, set, law, estimator)
+    functions = [metrics] if callable(metrics) or isinstance(metrics, str) else list(metrics)
+    if functions:
+        varied = varied.with_({METRICS: functions})
+    texts = [_text(path, values, varied) for path, values in vary.items()]
+    varied.search()
+    try:
+        plan = planned(varied.source, varied.document(), texts, runs, keep_records, varied.changes, console)
+    except ScenarioError as error:
+        raise ScenarioError([_in_python(fault) for fault in error.faults]) from error
+    folder = Path(out) if out is not None else Path(tempfile.mkdtemp(prefix="zsim-sweep-"))
+    modules = made_modules(_names(plan), [scratch_folder()])
+    try:
+        rows = fly(SweepRequest(plan, folder, workers, client, console=console, modules=tuple(modules)))
+    except KeyboardInterrupt:
+        finished = len(SweepFolder(folder, plan).rows())
+        console.print(
+            f"interrupted: {finished} of {plan.runs} runs are finished; out={str(folder)!r} goes on", markup=False
+        )
+        raise
+    except RunError as error:
+        raise RunError(_in_python(str(error))) from error
+    if out is None:
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    design = SweepDesign(plan)
+    frame = pd.DataFrame(read_table(folder / TABLE)).set_index("run")
+    figures = [column for column in frame if column not in (*FIXED, *design.varied)]
+    frame = frame.astype(dict.fromkeys(figures, float))
+    for path, values in vary.items():
+        if labels := _labels(values, varied):
+            column = whole_path(path, plan.document)
+            frame[column] = frame[column].replace(labels)
+    frame.attrs = {"folder": str(folder), "summary": json.loads(SweepResults(design, rows).summary().json())}
+    return frame
+
+
+def planned(
+    source: str,
+    document: dict[str, Any],
+    vary: list[str],
+    runs: int | None,
+    records: bool,
+    changed: Sequence[str] | None,
+    console: Console,
+    faults: Sequence[str] = (),
+) -> SweepPlan:
+    """Return the plan of a sweep, as `make_plan`, showing which combination is checked."""
+    status = console.status("checking every combination …") if console.is_terminal else None
+    with status or nullcontext():
+
+        def look(run: int, of: int) -> None:
+            if status:
+                status.update(f"checking combination {run + 1} of {of}")
+
+        return make_plan(source, document, vary, runs, records, look, faults, changed)
+
+
+def _text(path: str, values: Any, scenario: Scenario) -> str:
+    """Return what varies as a text of `--vary`."""
+    if isinstance(values, str):
+        return f"{path}={values}"
+    values = values.tolist() if isinstance(values, np.ndarray) else values
+    if isinstance(values, Mapping) or not isinstance(values, Iterable):
+        must = "must be a sequence of values, or a text such as 'uniform(0, 2)'"
+        raise ScenarioError([f"vary {path} is {show(values)}; {must}"])
+    try:
+        return f"{path}={','.join(json.dumps(scenario.named(value)) for value in values)}"
+    except TypeError as error:
+        raise ScenarioError([f"vary {path}: {error}; must be values as in YAML, or classes"]) from error
+
+
+def _labels(values: Any, scenario: Scenario) -> dict[str, str]:
+    """Return the names of classes and functions among values, by those that the scenario has for them."""
+    given = [] if isinstance(values, str) else [value for value in values if callable(value)]
+    labels = {scenario.named(value): value.__name__ for value in given if hasattr(value, "__name__")}
+    return labels if len({*labels.values()}) == len(given) else {}
+
+
+def _names(plan: SweepPlan) -> list[str]:
+    """Return the names of modules, made for what a notebook or a script defines, anywhere in a plan."""
+    return re.findall(rf"{plugin.MADE}\w+", msgspec.json.encode(plan).decode())
+
+
+def _in_python(line: str) -> str:
+    """Return a line about a sweep with its arguments as Python has them."""
+    return re.sub(r"--(?=(vary|runs|out|set)\b)", "", line)
+
+
+@contextmanager
+def _pandas_needed() -> Iterator[None]:
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise RunError(missing(error) or str(error)) from error

@@ -1,0 +1,135 @@
+"""`zsim.run`: classes from anywhere, the bits of the command, and how what goes wrong is told."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from refused import refused
+
+import zsim
+from zsim.errors import RunError, ScenarioError, UserCodeError
+from zsim_agents.formation.control_law import ControlLaw
+
+PAIR: dict[str, Any] = {
+    "name": "pair",
+    "seed": 3,
+    "duration_s": 6,
+    "sensors": {"preset": "paper"},
+    "drones": [{"name": "d1", "position_m": [0, 3, 0]}, {"name": "d2", "position_m": [0, -3, 0]}],
+    "clusters": [{"name": "main", "drones": ["d1", "d2"], "plan": {"takeoff_s": 0.1}}],
+}
+STATUS = "drone/*/sensor/status"
+
+
+class Lander(zsim.Agent):
+    """Lands d2 at 5 s, and counts its gates."""
+
+    name = "lander.main"
+    reads = (STATUS,)
+
+    def __init__(self, at_s: float = 5.0) -> None:
+        self.at_s = at_s
+        self.gates = 0
+
+    def receive(self, key: str, message: Any) -> None:
+        """Take nothing."""
+
+    def step(self, t_ns: int) -> list[zsim.Output]:
+        self.gates += 1
+        return [self.command(t_ns, "d2", zsim.land())] if t_ns == self.at_s * 1e9 else []
+
+
+class Failing(Lander):
+    def step(self, t_ns: int) -> list[zsim.Output]:
+        return [] if t_ns < 1e9 else {}["key"]
+
+
+class Nan(ControlLaw):
+    def rates(self, c: Any, p_W: Any, v_W: Any, c_des: Any, c_dot_des: Any) -> Any:
+        return c * float("nan")
+
+
+class TwoRates(ControlLaw):
+    def rates(self, c: Any, p_W: Any, v_W: Any, c_des: Any, c_dot_des: Any) -> Any:
+        return c[:2]
+
+
+def test_an_agent_flies_beside_the_stock_ones(tmp_path: Path) -> None:
+    lander = Lander()
+    run = zsim.run(PAIR, agents=[lander], out=tmp_path / "run", progress=False)
+    assert lander.gates == 301
+    assert run.commands("d2", "mode").source.tolist()[-1] == "lander.main"
+    assert run.status("d2").state.iloc[-1] in ("landing", "landed")
+    other = zsim.run(PAIR, agents=[Lander], out=tmp_path / "other", progress=False)
+    assert other.truth_sha256 == run.truth_sha256
+    assert zsim.run(PAIR, out=tmp_path / "none", progress=False).truth_sha256 != run.truth_sha256
+
+
+def test_fields_are_replaced_by_path_by_name_and_by_class(tmp_path: Path) -> None:
+    scenario = zsim.Scenario(**PAIR).with_({"environment.wind.gust_m_s": 1.0}, duration_s=1)
+    run = zsim.run(scenario, seed=9, out=tmp_path / "run", progress=False, set={"drones.d1.mass_kg": 0.5})
+    flown = run.scenario
+    assert (flown.seed, flown.duration_s, flown.environment.wind.gust_m_s) == (9, 1, 1.0)
+    assert flown.drones[0].mass_kg == 0.5
+    with refused(ScenarioError, "drones.d3.mass_kg=:", "d2"):
+        zsim.run(scenario, set={"drones.d3.mass_kg": 1})
+    with refused(RunError, "options", "processes=True"):
+        zsim.run(scenario, options=["--hosted"])
+
+
+def test_what_a_class_raises_is_raised_after_a_line_that_says_where(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(KeyError) as caught:
+        zsim.run(PAIR, agents=[Failing], out=tmp_path / "run", progress=False)
+    own = [frame.name for frame in caught.traceback if frame.path == Path(__file__)]
+    assert own == [*own[:1], "step"]
+    assert caught.traceback[-1].name == "step"
+    assert not any("zsim/runtime" in str(frame.path) for frame in caught.traceback)
+    assert "lander.main at 1.00 s" in capsys.readouterr().err
+    assert zsim.load(tmp_path / "run").duration_s >= 1.0
+
+
+@pytest.mark.parametrize(("law", "terms"), [(Nan, ("nan", "robot")), (TwoRates, ("(2,);", "(8,),"))])
+def test_what_a_law_returns_amiss_names_class_field_and_shapes(
+    law: type, terms: tuple[str, ...], tmp_path: Path
+) -> None:
+    with refused(UserCodeError, f"{law.__module__}:{law.__qualname__}.rates", *terms):
+        zsim.run(PAIR, law=law, out=tmp_path / "run", progress=False)
+
+
+SCRIPT = """
+import zsim
+
+class Lander(zsim.Agent):
+    reads = ("drone/*/sensor/status",)
+    def receive(self, key, message): ...
+    def step(self, t_ns):
+        if t_ns == 1_000_000_000:
+            print("flying", flush=True)
+        return []
+
+run = zsim.run({scenario!r}, duration_s=1e5, agents=[Lander], out={out!r}, progress=False)
+"""
+
+
+def test_ctrl_c_ends_a_flight_with_its_record_whole(tmp_path: Path) -> None:
+    script = SCRIPT.format(scenario=PAIR, out=str(tmp_path / "run"))
+    with subprocess.Popen(
+        [sys.executable, "-c", script],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler) and None,
+    ) as program:
+        assert program.stdout is not None
+        assert program.stdout.readline() == "flying\n"
+        program.send_signal(signal.SIGINT)
+        _, said = program.communicate()
+    assert said.rstrip().splitlines()[-1].startswith("KeyboardInterrupt: interrupted; zsim.load(")
+    run = zsim.load(tmp_path / "run")
+    assert run.duration_s > 1.0
+    assert run.summary.record.complete

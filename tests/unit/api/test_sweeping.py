@@ -1,0 +1,265 @@
+"""`zsim.sweep`: a frame of the runs, with classes and functions of scripts, in workers that know nothing of the script."""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import psutil
+import pytest
+from refused import refused
+from short_flight import ONE, diverge
+
+import zsim
+from zsim.errors import RunError, ScenarioError
+from zsim.scenario import scenario_file
+from zsim.schema import plugin, yaml_file
+from zsim_analysis.reading.recorded_flight import RecordedFlight
+from zsim_analysis.sweep import process_pool
+from zsim_analysis.sweep.process_pool import READY
+from zsim_analysis.sweep.sweep import load, read_table
+from zsim_analysis.sweep.sweep_run import Row, Task, fly, fly_scenario
+
+PATIENCE_S = 30.0  # wall time within which processes end
+DOCUMENT = yaml_file.value(ONE)
+
+
+class NearWorker:
+    """A worker without a process of its own."""
+
+    def __init__(self) -> None:
+        self.link, self._far = process_pool.multiprocessing.Pipe()
+        self.ready, self.task = False, None
+        self._far.send(READY)
+
+    def send(self, task: Task) -> None:
+        self._far.send(fly(task))
+
+    def receive(self) -> Row:
+        return self.link.recv()
+
+    def stop(self) -> None:
+        self._far.close()
+        self.link.close()
+
+
+@pytest.fixture
+def near(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fly the runs in this process."""
+    monkeypatch.setattr(process_pool, "WorkerProcess", NearWorker)
+    monkeypatch.setenv(plugin.FOLDERS, "")
+    monkeypatch.setattr(sys, "path", [*sys.path])
+
+
+def highest_m(flight: RecordedFlight) -> float:
+    return max(float(track.p_W[:, 2].max()) for track in flight.tracks)
+
+
+def counts(flight: RecordedFlight) -> dict[str, float | None]:
+    return {"drones": len(flight.tracks), "nothing_m": None}
+
+
+def fails(flight: RecordedFlight) -> float:
+    raise ValueError(f"no {len(flight.tracks)}")
+
+
+def test_a_frame_has_a_row_for_each_run_with_its_values_and_figures(near: None, tmp_path: Path) -> None:
+    gusts = np.array([0.0, 0.5])
+    frame: Any = zsim.sweep(
+        DOCUMENT,
+        {"seed": range(2, 4), "wind.gust_m_s": gusts},
+        metrics=[highest_m, counts, fails],
+        out=tmp_path / "swept",
+        progress=False,
+    )
+    assert frame.index.tolist() == [0, 1, 2, 3]
+    assert frame.index.name == "run"
+    gust = "environment.wind.gust_m_s"
+    assert frame[["seed", gust]].to_numpy().tolist() == [[2, 0.0], [2, 0.5], [3, 0.0], [3, 0.5]]
+    assert frame["failure"].isna().all()
+    assert frame["metrics.nothing_m"].isna().all()
+    assert {str(frame[f"metrics.{name}"].dtype) for name in ("nothing_m", "highest_m")} == {"float64"}
+    assert (frame["metrics.drones"] == 1).all()
+    assert frame["metrics_failure"].str.contains("fails: ValueError: no 1").all()
+    single, _ = fly_scenario(scenario_file.from_text(f"{ONE}environment: {{wind: {{gust_m_s: 0.5}}}}\n"))
+    assert single.end is not None
+    assert frame["truth_sha256"][3] == single.end["truth_sha256"]
+    assert frame.attrs["folder"] == str(tmp_path / "swept")
+    points = frame.attrs["summary"]["points"]
+    assert [each["spreads"]["metrics.highest_m"]["mean"]["value"] for each in points] == pytest.approx(
+        [frame.loc[frame[gust] == value, "metrics.highest_m"].mean() for value in gusts]
+    )
+
+
+SCRIPT = """
+import zsim
+from beside import FACTOR, Slow
+
+print("the script runs")
+
+class Law(Slow):
+    def rates(self, c, p_W, v_W, c_des, c_dot_des):
+        return GAIN * FACTOR * self.towards(c, c_des)
+
+GAIN = 0.2
+
+def highest_m(flight):
+    return GAIN * float(max(track.p_W[:, 2].max() for track in flight.tracks))
+
+frame = zsim.sweep(
+    "pair.yaml",
+    vary={"seed": [1, 2], "clusters.main.law": [Law, "proportional"]},
+    metrics=[highest_m],
+    workers=2,
+    out="swept",
+    keep_records=True,
+)
+print(frame["clusters.main.law"].tolist(), frame["failure"].isna().all(), frame["metrics.highest_m"].gt(0.01).all())
+"""
+BESIDE = """
+from zsim_agents.formation.control_law import ControlLaw
+
+FACTOR = 2.0
+
+class Slow(ControlLaw):
+    def towards(self, c, c_des):
+        return self.space.inverse_jacobian(c) @ (c_des - c)
+"""
+PAIR = """
+name: pair
+duration_s: 2
+drones:
+  - {name: drone1, position_m: [2, 0, 0]}
+  - {name: drone2, position_m: [-2, 0, 0]}
+clusters: [{name: main, drones: [drone1, drone2], plan: {takeoff_s: 0.2}}]
+"""
+
+
+def write(folder: Path, **files: str) -> None:
+    for name, text in files.items():
+        (folder / name.replace("_", ".")).write_text(text)
+
+
+def test_workers_know_a_script_s_classes_and_do_not_run_it_again(tmp_path: Path) -> None:
+    """The script has no `if __name__ == "__main__"`, and its law is one of a module beside it."""
+    write(tmp_path, script_py=SCRIPT, beside_py=BESIDE, pair_yaml=PAIR)
+    done = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.stdout.splitlines() == [
+        "the script runs",
+        "['Law', 'proportional', 'Law', 'proportional'] True True",
+    ], done.stderr
+    assert " 4 / 4 runs" in done.stderr
+    law = read_table(tmp_path / "swept/sweep.parquet")[0]["clusters.main.law"].partition(":")[0]
+    assert law.startswith(plugin.MADE)
+    assert (tmp_path / f"swept/runs/000000/{law}.py").exists()
+    assert not (tmp_path / f"swept/runs/000001/{law}.py").exists()  # flies the stock law
+    command = [sys.executable, "-P", "-m", "zsim_deploy", "rerun", "--trust", "swept/runs/000000"]
+    again = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert again.returncode == 0, again.stderr
+
+
+WAITING = """
+import pathlib
+import time
+import zsim
+
+def waits(flight):
+    if flight.scenario.seed > 1:
+        pathlib.Path("flying").touch()
+        time.sleep(600)
+    return 1.0
+
+zsim.sweep("one.yaml", {"seed": range(1, 4)}, metrics=[waits], workers=1, out=OUT)
+print("not reached")
+"""
+
+
+def interrupted(folder: Path, out: str | None) -> subprocess.CompletedProcess[str]:
+    """Run a sweep of three runs that is interrupted when the first one is finished."""
+    write(folder, script_py=f"OUT = {out!r}\n{WAITING}", one_yaml=ONE)
+    with subprocess.Popen(
+        [sys.executable, "script.py"],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        while not (folder / "flying").exists() and process.poll() is None:
+            time.sleep(0.05)
+        workers = psutil.Process(process.pid).children(recursive=True)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        output, errors = process.communicate()
+    assert workers
+    assert psutil.wait_procs(workers, PATIENCE_S)[1] == []
+    return subprocess.CompletedProcess([], process.returncode, output, errors)
+
+
+def test_ctrl_c_ends_the_workers_and_the_same_call_goes_on(near: None, tmp_path: Path) -> None:
+    done = interrupted(tmp_path, "swept")
+    assert done.stdout == ""
+    assert done.returncode == -signal.SIGINT
+    assert "interrupted: 1 of 3 runs are finished; out='swept' goes on" in done.stderr.splitlines()
+    (kept,) = read_table(tmp_path / "swept/sweep.parquet")
+    assert (kept["seed"], kept["metrics.waits"]) == (1, 1.0)
+    plan = load(tmp_path / "swept").plan
+    assert (plan.runs, plan.vary) == (3, ("seed=1,2,3",))
+
+
+def test_a_folder_of_its_own_is_kept_when_interrupted(tmp_path: Path) -> None:
+    done = interrupted(tmp_path, None)
+    (folder,) = re.findall(r"out='(.*?)' goes on", done.stderr)
+    assert len(read_table(Path(folder) / "sweep.parquet")) == 1
+    shutil.rmtree(folder)
+
+
+def test_the_same_call_flies_what_is_missing(
+    near: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def call(count: int) -> pd.DataFrame:
+        return zsim.sweep(DOCUMENT, {"seed": range(count)}, metrics=[highest_m], out=tmp_path / "swept")
+
+    first, whole = call(2), call(3)
+    assert "2 of them are done already" in capsys.readouterr().err
+    pd.testing.assert_frame_equal(whole.iloc[:2], first)
+    with refused(RunError, "it varies seed=0,1,2", "give out another folder"):
+        call(1)
+    with refused(RunError, "it has 3 runs"):
+        zsim.sweep(DOCUMENT, {"seed": range(3)}, runs=2, metrics=[highest_m], out=tmp_path / "swept")
+
+
+def test_a_run_that_fails_is_a_row_with_its_reason(
+    near: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    diverge(monkeypatch)
+    frame: Any = zsim.sweep(DOCUMENT, {"seed": [1, 2]})
+    assert frame["failure"].str.contains("d1").all()
+    assert frame["seed"].tolist() == [1, 2]
+    shown = capsys.readouterr().err.splitlines()
+    assert shown[-1] == f"2 of 2 runs failed: {frame['failure'][0]}"
+
+
+BAD: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
+    "no sequence": ({"seed": 5}, ("vary", "seed", "5", "sequence", "values")),
+    "twice": ({"seed": [1, 1]}, ("vary", "seed=1,1", "1", "once")),
+    "nothing": ({"seed": []}, ("vary", "seed=", "no value")),
+    "no field": ({"no.such": [1]}, ("no", "not known")),
+    "no value of YAML": ({"seed": [object()]}, ("vary", "seed", "object", "YAML")),
+    "out of range": ({"duration_s": [1, -1]}, ("duration_s", "-1", "0")),
+    "no words": ({"duration_s": "uniform(2, 1)"}, ("vary", "duration_s=uniform(2,", "low", "high")),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_cannot_vary_is_refused_before_anything_flies(case: str) -> None:
+    vary, terms = BAD[case]
+    with refused(ScenarioError, *terms) as raised:
+        zsim.sweep(DOCUMENT, vary)
+    assert "--" not in str(raised.value)
