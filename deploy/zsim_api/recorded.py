@@ -164,7 +164,8 @@ class Run:
             tables = [read(drone).select_dtypes("number").add_prefix(f"{what}_").to_xarray() for drone in drones]
             if tables:
                 parts.append(xarray.concat(tables, xarray.DataArray(drones, dims="drone", name="drone"), join="outer"))
-        return xarray.merge(parts, join="outer", compat="no_conflicts")
+        merged: Any = xarray.merge(parts, join="outer", compat="no_conflicts")
+        return merged
 
     # What the report says
 
