@@ -6,7 +6,7 @@ SCENARIO ?= scenarios/step.yaml
 PARTS ?=
 AGAINST ?=
 WORKERS ?= 4
-FLIGHT := agents,world,record,report
+FLIGHT := python
 PIP := $(BIN)/pip install --disable-pip-version-check --no-compile
 COMPILED = @$(MAKE) --silent --no-print-directory $(VENV)/.compiled
 export PYTHONDONTWRITEBYTECODE = # many processes import the same files, and pip has not compiled them
@@ -54,7 +54,7 @@ $(VENV)/bin/python:
 
 # pip's own output is shown: on a slow line or disk this takes minutes
 $(VENV)/.run: pyproject.toml | $(VENV)/bin/python
-	@echo "installing what a flight needs (extras $(FLIGHT); about 550 MB; \`make setup\` installs all extras)"
+	@echo "installing what a flight needs (extras $(FLIGHT); about 600 MB; \`make setup\` installs all extras)"
 	@$(PIP) -e '.[$(FLIGHT)]'
 	@touch $@
 

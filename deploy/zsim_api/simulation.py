@@ -207,7 +207,7 @@ class Simulation:
         sent: list[tuple[str, Command]] = []
         for drone, given in commands.items():
             self._place(drone)
-            several: Sequence[Any] = given if isinstance(given, list | tuple) else (given,)
+            several: Any = given if isinstance(given, list | tuple) else (given,)
             sent += [(drone, command) for command in several]
         self.events = []
         self._flight.send(sent)

@@ -18,17 +18,21 @@ from zsim.errors import RunError, ScenarioError, missing
 from zsim.scenario.scenario_file import whole_path
 from zsim.schema import plugin
 from zsim.schema.checker import show
+from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.sweep.design import METRICS, SweepDesign, SweepPlan, make_plan
 from zsim_analysis.sweep.sweep import TABLE, SweepFolder, SweepRequest, read_table
-from zsim_analysis.sweep.sweep import sweep as fly
-from zsim_analysis.sweep.sweep_run import FIXED, made_modules
+from zsim_analysis.sweep.sweep import sweep as swept
+from zsim_analysis.sweep.sweep_run import FIXED, Row, made_modules
 from zsim_analysis.sweep.sweep_summary import SweepResults
+from zsim_api.recorded import load
 from zsim_api.scenarios import AnyScenario, Scenario, scenario_of, scratch_folder
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    Metric = Callable[[Any], Any]
+    from zsim_api.recorded import Run
+
+    Metric = Callable[[Run], Any] | Callable[[RecordedFlight], Any]
 
 
 def sweep(
@@ -52,7 +56,7 @@ def sweep(
 
         frame = zsim.sweep(
             "step.yaml",
-            vary={"seed": range(50), "estimation.algorithm": ["error_state", MyEstimator]},
+            vary={"seed": range(50), "estimation.algorithm": ["ekf", MyEstimator]},
             metrics=[settling_time],
         )
         frame.groupby("estimation.algorithm")["metrics.settling_time"].mean()
@@ -64,8 +68,9 @@ def sweep(
         scenario: path of a YAML file, `zsim.Scenario`, or a mapping as in YAML.
         vary: values by path, in a sequence, of which every combination is flown; classes where one is named; or a text
             as `--vary` takes it: `{"seed": "paired", "wind.gust_m_s": "uniform(0, 2)"}`, with `runs`.
-        metrics: functions of the flight, or their names `module:function`, that return a number or a mapping of numbers
-            by name: columns `metrics.NAME`.
+        metrics: functions of the run (`zsim.Run`), or their names `module:function`, that return a number or a mapping
+            of numbers by name: columns `metrics.NAME`. One whose argument is named `flight` is given the arrays of a
+            `RecordedFlight` instead, for which nothing is recorded: that is faster.
         runs: their number; None: one for each combination.
         seed, duration_s, set, law, estimator: for all runs, as of `zsim.run`.
         workers: processes; None: one per core.
@@ -96,11 +101,11 @@ def sweep(
     try:
         plan = planned(varied.source, varied.document(), texts, runs, keep_records, varied.changes, console)
     except ScenarioError as error:
-        raise ScenarioError([_in_python(fault) for fault in error.faults]) from error
+        raise ScenarioError([_in_python(fault) for fault in error.faults]) from None
     folder = Path(out) if out is not None else Path(tempfile.mkdtemp(prefix="zsim-sweep-"))
     modules = made_modules(_names(plan), [scratch_folder()])
     try:
-        rows = fly(SweepRequest(plan, folder, workers, client, console=console, modules=tuple(modules)))
+        rows = flown(plan, folder, workers, client, console=console, modules=tuple(modules))
     except KeyboardInterrupt:
         finished = len(SweepFolder(folder, plan).rows())
         console.print(
@@ -108,7 +113,7 @@ def sweep(
         )
         raise
     except RunError as error:
-        raise RunError(_in_python(str(error))) from error
+        raise RunError(_in_python(str(error))) from None
     if out is None:
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
     design = SweepDesign(plan)
@@ -142,6 +147,13 @@ def planned(
                 status.update(f"checking combination {run + 1} of {of}")
 
         return make_plan(source, document, vary, runs, records, look, faults, changed)
+
+
+def flown(
+    plan: SweepPlan, folder: Path, workers: int | None = None, dask: Any = None, force: bool = False, **more: Any
+) -> list[Row]:
+    """Fly a plan into a folder; return its rows. Arguments and errors as of `SweepRequest`, and of its `sweep`."""
+    return swept(SweepRequest(plan, folder, workers, dask, force, open_run=load, **more))
 
 
 def _text(path: str, values: Any, scenario: Scenario) -> str:

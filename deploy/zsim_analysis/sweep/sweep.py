@@ -54,6 +54,7 @@ class SweepRequest(Struct, frozen=True):
     dask: Any = None  # a Dask client, or the address of a scheduler, whose workers are used instead
     force: bool = False  # whether the folder may hold other files
     console: Console | None = None  # where progress is shown, None: stderr
+    open_run: Callable[[Path], Any] | None = None  # as of a task
     modules: tuple[Path, ...] = ()  # made for what a notebook or a script defines; copied into the folder
 
 
@@ -101,7 +102,7 @@ def _fly(folder: "SweepFolder", request: SweepRequest, missing: list[int], scree
 
         modules = {file.name: file.read_text(encoding="utf-8") for file in folder.path.glob(f"{plugin.MADE}*.py")}
         pool = DaskPool(request.dask, screen.say, modules)
-    with folder.journal() as journal, closing(pool.rows(_tasks(folder, missing))) as rows:
+    with folder.journal() as journal, closing(pool.rows(_tasks(folder, missing, request.open_run))) as rows:
         for row in rows:
             journal.append(row)
             screen.finished(row["failure"] is not None)
@@ -109,7 +110,7 @@ def _fly(folder: "SweepFolder", request: SweepRequest, missing: list[int], scree
                 screen.unmeasured(row["run"], row["metrics_failure"])
 
 
-def _tasks(folder: "SweepFolder", runs: list[int]) -> Iterator[Task]:
+def _tasks(folder: "SweepFolder", runs: list[int], open_run: Callable[[Path], Any] | None) -> Iterator[Task]:
     """Yield the tasks of some runs, each made on demand."""
     design = folder.design
     for run in runs:
@@ -120,6 +121,7 @@ def _tasks(folder: "SweepFolder", runs: list[int]) -> Iterator[Task]:
             varied={path: values[path] for path in design.varied},
             scenario=design.scenario(run),
             record=str(folder.record(run).absolute()) if folder.plan.records else None,
+            open_run=open_run,
         )
 
 

@@ -4,6 +4,9 @@ It is judged as by `zsim report`, without a record on disk. `report.metrics` nam
 further figures from the flight:
 
     def metrics(flight: RecordedFlight) -> float | Mapping[str, float]
+    def metrics(run: zsim.Run) -> float | Mapping[str, float]
+
+The name of its argument says what it is given: `flight` the arrays of a RecordedFlight, any other the run on record.
 
 A number becomes the column `metrics.` and the function's name, a mapping a column `metrics.NAME` for each of its names.
 The unit at the end of a name, as in scenarios (`overshoot_m`), is shown in tables and figures. NaN, infinity and None
@@ -13,16 +16,20 @@ are empty. An exception of a function becomes the run's `metrics_failure`, and n
 import math
 import re
 import socket
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import cache
+from inspect import signature
 from numbers import Real
 from pathlib import Path
 from shutil import copy, rmtree
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 
 from zsim.contract.fingerprint import fingerprint
 from zsim.errors import DocumentError, RecordError, ReportError, reason_of
@@ -39,6 +46,7 @@ from zsim_analysis.report.summary import summarise
 from zsim_analysis.sweep.design import METRICS
 
 METRIC = "metrics."  # prefix of the columns of the user's metrics
+FLIGHT = "flight"  # argument of a function that is given a RecordedFlight
 METRICS_MAX = 100  # of one function
 _NAME = re.compile(r"[A-Za-z]\w{0,63}", re.ASCII)
 
@@ -55,6 +63,7 @@ class Task(Struct, frozen=True):
     varied: dict[str, Any]  # values by path, without the seed
     scenario: Scenario  # resolved, with the run's seed
     record: str | None = None  # folder for the record, None to keep none
+    open_run: Callable[[Path], Any] | None = None  # makes a `zsim.Run` of a record, for metrics
 
 
 class RunResult(Struct, frozen=True, kw_only=True):
@@ -118,6 +127,9 @@ def fly(task: Task) -> Row:
     Raises:
         RecordError, OSError: its record cannot be written, nor could that of any other run.
     """
+    if task.record is None and task.open_run and any(map(_takes_run, task.scenario.report.metric_names)):
+        with TemporaryDirectory(prefix="zsim-run-") as folder:
+            return fly(replace(task, record=str(Path(folder) / "run")))
     where: Row = {"host": socket.gethostname(), "fingerprint": fingerprint()}
     try:
         with _record(task) as writer:
@@ -131,7 +143,7 @@ def fly(task: Task) -> Row:
     engaged = engaged_s(formations, summary.window_s)
     clusters = [cluster.name for cluster in task.scenario.clusters]
     shares = {name: each.engaged_share for name, each in summary.clusters.items()}
-    metrics, metrics_failure = ({}, None) if diverged else metrics_of(task.scenario, flight)
+    metrics, metrics_failure = ({}, None) if diverged else metrics_of(task, flight)
     result = RunResult(
         run=task.run,
         point=task.point,
@@ -217,12 +229,18 @@ def engaged_s(formations: list[Formation], window_s: tuple[float, float]) -> dic
     return {each.name: float(each.t_s[rows[each.name][0]]) if len(rows[each.name]) else None for each in formations}
 
 
-def metrics_of(scenario: Scenario, flight: RecordedFlight) -> tuple[dict[str, float | None], str | None]:
+def metrics_of(task: Task, flight: RecordedFlight) -> tuple[dict[str, float | None], str | None]:
     """Return the metrics of a flight by the user's functions, by column, and in one line why some have none."""
     metrics: dict[str, float | None] = {}
     failures: list[str] = []
-    for name in scenario.report.metric_names:
-        found, failure = _metrics_of(name, flight)
+
+    @cache
+    def run() -> Any:
+        assert task.open_run is not None
+        return task.open_run(Path(task.record or ""))
+
+    for name in task.scenario.report.metric_names:
+        found, failure = _metrics_of(name, run if task.open_run and _takes_run(name) else lambda: flight)
         if twice := found.keys() & metrics.keys():
             returned = min(twice).removeprefix(METRIC)
             failures.append(f"{METRICS} {name}: returned {returned}, which another function returns, too")
@@ -233,9 +251,18 @@ def metrics_of(scenario: Scenario, flight: RecordedFlight) -> tuple[dict[str, fl
     return metrics, "; ".join(failures) or None
 
 
-def _metrics_of(name: str, flight: RecordedFlight) -> tuple[dict[str, float | None], str | None]:
+def _takes_run(name: str) -> bool:
+    """Tell whether a function of the user is given the run on record; not one whose argument is `flight`."""
     try:
-        returned = plugin.load_function(name, METRICS)(flight)
+        arguments = signature(plugin.load_function(name, METRICS)).parameters
+    except (DocumentError, TypeError, ValueError):  # which is reported when it is called
+        return False
+    return next(iter(arguments), FLIGHT) != FLIGHT
+
+
+def _metrics_of(name: str, given: Callable[[], Any]) -> tuple[dict[str, float | None], str | None]:
+    try:
+        returned = plugin.load_function(name, METRICS)(given())
         named = returned if isinstance(returned, Mapping) else {name.partition(":")[2]: returned}
         if len(named) > METRICS_MAX:
             raise ReportError(f"returned {len(named)} numbers; must be at most {METRICS_MAX}")

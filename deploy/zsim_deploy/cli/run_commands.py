@@ -292,9 +292,7 @@ def sweep(
     from rich.console import Console
 
     from zsim_analysis.sweep.design import read_document
-    from zsim_analysis.sweep.sweep import SweepRequest
-    from zsim_analysis.sweep.sweep import sweep as fly
-    from zsim_api.sweeping import planned
+    from zsim_api.sweeping import flown, planned
 
     document, faults = read_document(scenario, set_ or [], seed=seed, duration_s=duration)
     changed = opt.changed_fields(set_, seed, duration)
@@ -303,7 +301,7 @@ def sweep(
     folder = out or Path("runs") / f"{plan.document['name']}-sweep-{time.strftime('%Y%m%d-%H%M%S')}"
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        rows = fly(SweepRequest(plan, folder, workers, dask, force))
+        rows = flown(plan, folder, workers, dask, force)
     except KeyboardInterrupt:
         note(f"interrupted; the same command with --out {folder} goes on, the table so far is in it")
         sys.exit(INTERRUPTED)

@@ -70,6 +70,23 @@ def fails(flight: RecordedFlight) -> float:
     raise ValueError(f"no {len(flight.tracks)}")
 
 
+def climb_m(run: "zsim.Run") -> dict[str, float]:
+    height_m = run.truth("d1")["position_m_z"].to_numpy()
+    return {"climb_m": float(np.ptp(height_m)), "gates": len(height_m)}
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_a_metric_is_given_the_run_or_where_it_says_flight_the_arrays(near: None, tmp_path: Path, keep: bool) -> None:
+    frame = zsim.sweep(
+        DOCUMENT, {"seed": [4, 6]}, metrics=[climb_m, counts], out=tmp_path, keep_records=keep, progress=False
+    )
+    assert frame["metrics_failure"].tolist() == [None, None]
+    assert frame["metrics.gates"].tolist() == [26, 26]  # 0.5 s, with the first instant
+    assert frame["metrics.drones"].tolist() == [1, 1]
+    records = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("run.mcap"))
+    assert records == ([f"runs/00000{run}/run.mcap" for run in range(2)] if keep else [])
+
+
 def test_a_frame_has_a_row_for_each_run_with_its_values_and_figures(near: None, tmp_path: Path) -> None:
     gusts = np.array([0.0, 0.5])
     frame: Any = zsim.sweep(
@@ -263,3 +280,67 @@ def test_what_cannot_vary_is_refused_before_anything_flies(case: str) -> None:
     with refused(ScenarioError, *terms) as raised:
         zsim.sweep(DOCUMENT, vary)
     assert "--" not in str(raised.value)
+
+
+CELL = """
+import zsim
+from zsim_agents.formation.control_law import ControlLaw
+
+class Law(ControlLaw):
+    def rates(self, c, p_W, v_W, c_des, c_dot_des):
+        return self.space.inverse_jacobian(c) @ (0.3 * (c_des - c))
+
+def drones(flight):
+    return len(flight.tracks)
+
+frame = zsim.sweep("pair.yaml", {"clusters.main.law": [Law, "proportional"]}, metrics=[drones], workers=1)
+print(frame["clusters.main.law"].tolist(), frame["failure"].isna().all(), frame["metrics.drones"].tolist())
+"""
+
+
+@pytest.mark.slow
+def test_a_cell_of_a_notebook_shows_one_line_that_changes(tmp_path: Path) -> None:
+    nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
+    pytest.importorskip("ipykernel")
+    write(tmp_path, pair_yaml=PAIR)
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(CELL)])
+    options = {"resources": {"metadata": {"path": str(tmp_path)}}, "kernel_name": "python3"}
+    nbclient.NotebookClient(notebook, timeout=300, **options).execute()
+    outputs = notebook.cells[0].outputs
+    printed = "".join(each.text for each in outputs if each.get("name") == "stdout")
+    assert printed == "['Law', 'proportional'] True [2.0, 2.0]\n"
+    lines = [each.data["text/plain"] for each in outputs if "█" in each.get("data", {}).get("text/plain", "")]
+    assert len(lines) == 1  # it has changed in its place
+    assert " 2 / 2 runs" in lines[0]
+    assert not [each for each in outputs if each.get("name") == "stderr"]  # no warning about a missing widget
+
+
+@pytest.mark.slow
+def test_a_client_s_workers_are_given_a_script_s_modules(tmp_path: Path) -> None:
+    """They run in a folder from which they would not find them."""
+    pytest.importorskip("distributed")
+    script = f"""
+import logging
+import distributed
+
+if __name__ == "__main__":  # for the cluster, whose workers Dask starts
+    options = {{"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}}
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, **options) as cluster:
+        with distributed.Client(cluster) as client:
+            {
+        SCRIPT.strip()
+        .replace(chr(10), chr(10) + " " * 12)
+        .replace("workers=2", "client=client")
+        .replace("keep_records=True,", "")
+    }
+            print(client.status)
+"""
+    write(tmp_path, script_py=script, beside_py=BESIDE, pair_yaml=PAIR)
+    done = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.stdout.splitlines() == [
+        "the script runs",
+        "['Law', 'proportional', 'Law', 'proportional'] True True",
+        "running",  # the client stays open
+    ], done.stderr
+    with refused(RunError, "client", "'object'", "distributed.Client"):
+        zsim.sweep(DOCUMENT, {"seed": [1]}, client=object(), out=tmp_path / "other")
