@@ -11,7 +11,7 @@ PIP := $(BIN)/pip install --disable-pip-version-check --no-compile
 COMPILED = @$(MAKE) --silent --no-print-directory $(VENV)/.compiled
 export PYTHONDONTWRITEBYTECODE = # many processes import the same files, and pip has not compiled them
 
-.PHONY: run test setup lint soak bench clean help
+.PHONY: run test setup lint soak bench docs clean help
 
 help:            ## list the commands
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -40,6 +40,10 @@ soak: $(VENV)/.dev ## repetitions and long runs
 bench: $(VENV)/.dev ## measure, all or PARTS='a b'; PARTS=c AGAINST=REV: beside a commit; see docs/performance.md
 	$(COMPILED)
 	$(BIN)/python -m benchmarks $(PARTS) $(if $(AGAINST),--against $(AGAINST))
+
+docs: $(VENV)/.dev ## the reference of zsim in Python, from its docstrings, into build/api
+	$(BIN)/sphinx-build -W --keep-going -q docs/api build/api
+	@echo "build/api/index.html"
 
 clean:           ## remove the environment and what tools leave behind
 	rm -rf $(VENV) .venv-bench .pytest_cache .ruff_cache .hypothesis .import_linter_cache

@@ -90,6 +90,7 @@ class Run:
 
     @property
     def folder(self) -> Path:
+        """Where the record is."""
         return self.record.parent
 
     # Tables
@@ -148,7 +149,7 @@ class Run:
 
     @property
     def events(self) -> "DataFrame":
-        """What happened: kind, source, subject, text, and data as JSON text."""
+        """Events, with kind, source, subject, text, and data as JSON text."""
         return self._plain(keys.EVENT)
 
     # Errors
@@ -288,6 +289,7 @@ class Run:
 
     @property
     def shortfalls(self) -> list[Shortfall]:
+        """The deviations from its plan, as the report has them."""
         return self.summary.shortfalls
 
     # Shown

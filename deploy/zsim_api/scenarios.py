@@ -22,7 +22,7 @@ class Scenario:
     """A scenario that is not changed in place.
 
         zsim.Scenario.load("step.yaml").with_({"environment.wind.gust_m_s": 1.0}, seed=3)
-        zsim.Scenario(name="pair", duration_s=20, drones=[{"name": "drone1", "position_m": [0, 0, 0]}, …])
+        zsim.Scenario(name="pair", duration_s=20, drones=[{"name": "drone1", "position_m": [0, 0, 0]}])
 
     It is checked as a whole when it is flown, or by `resolved`.
 
@@ -110,9 +110,11 @@ class Scenario:
         return copy.deepcopy(self._document)
 
     def to_yaml(self) -> str:
+        """Return the document as YAML text."""
         return yaml_file.dump(self._document)
 
     def save(self, path: str | Path) -> None:
+        """Write the document as a YAML file."""
         Path(path).write_text(self.to_yaml(), encoding="utf-8")
 
     def __eq__(self, other: object) -> bool:
