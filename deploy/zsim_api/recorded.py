@@ -29,7 +29,7 @@ from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import suggestion
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.drone_errors import EstimateErrors, estimate_errors
-from zsim_analysis.reading.formation import Formation, ParameterErrors
+from zsim_analysis.reading.formation import Formation, ParameterErrors, cluster_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.reading.recorded_run import decode_or_none
 from zsim_analysis.reading.shortfall import Shortfall
@@ -314,7 +314,7 @@ class Run:
 
         flight, formations, summary = self._judged
         known = []
-        with plugin.names_only(not self._trust):
+        with plugin.names_only(not self._trust, looked_up=False):
             for each in planned_figures(flight, formations, summary.window_s):
                 stem = Path(each.name).stem
                 known.append(stem.split("_", 2)[2] if stem.startswith("figure_") else stem)  # figure_8_shape
@@ -339,7 +339,7 @@ class Run:
 
         if self.record.name != RECORD:
             raise RunError(f"{self.record}: has no folder for its report; must be {RECORD} in the folder of a run")
-        with plugin.names_only(not self._trust):
+        with plugin.names_only(not self._trust, looked_up=False):
             make_report(self.folder, formats=formats)
         return self.folder / "report.html"
 
@@ -369,7 +369,7 @@ class Run:
 
     @cached_property
     def _judged(self) -> tuple[RecordedFlight, list[Formation], RunSummary]:
-        with plugin.names_only(not self._trust):
+        with plugin.names_only(not self._trust, looked_up=False):
             return judge(self.record, answers=True)
 
     @cached_property
@@ -387,10 +387,12 @@ class Run:
         if key not in self.keys:
             raise RunError(f"{self.record}: has no messages of {key!r}; {_there(key, self.keys)}")
         if key not in self._tables:
-            alike = [each for each in self._of_all_drones(key) if each not in self._tables]
-            rows = sum(self.keys[each] for each in alike)
-            is_next = len(alike) < len(self._of_all_drones(key))  # after that of another drone, it is to be all of them
-            self._read(alike if is_next and rows <= ROWS_MAX else [key])
+            fleet = self._of_all_drones(key)
+            missing = [each for each in fleet if each not in self._tables]
+            # who asks for a second drone will ask for all, and a pass over the record takes longer than one's messages
+            is_second = len(fleet) - len(missing) > 0
+            at_once = is_second and sum(self.keys[each] for each in missing) <= ROWS_MAX
+            self._read(missing if at_once else [key])
         return self._tables[key]
 
     def _of_all_drones(self, key: str) -> list[str]:
@@ -401,7 +403,9 @@ class Run:
 
     def _read(self, wanted: Sequence[str]) -> None:
         """Read keys that are not known yet, in one pass."""
-        with plugin.names_only(not self._trust):
+        if not wanted:
+            return
+        with plugin.names_only(not self._trust, looked_up=False):
             tables = read_tables(self.record, wanted)
         for table in tables.values():
             for values in table.values():
@@ -436,12 +440,18 @@ class Run:
             raise RunError(f"{self.record}: has no cluster")
         return self._known("cluster", self.clusters[0] if name is None else name, self.clusters)
 
+    def _untrusted(self, cluster: str) -> str:
+        """Name the space of a cluster if it was not imported."""
+        scenario = None if self._trust else self._judged[0].scenario
+        own = cluster_of(scenario, cluster)
+        names = [each.space for each in (own, *own.groups) if each.space and ":" in each.space] if own else []
+        return f"; its space {names[0]} is imported by zsim.load(…, trust=True) only" if names else ""
+
     def _formation(self, cluster: str | None) -> Formation:
         name = self._cluster(cluster)
         found = next((each for each in self._judged[1] if each.name == name), None)
         if found is None:
-            why = "" if self._trust else "; if its space is of the scenario's own, zsim.load(…, trust=True) imports it"
-            raise RunError(f"{self.record}: has no states of cluster {name} that can be judged{why}")
+            raise RunError(f"{self.record}: has no states of cluster {name} that can be judged{self._untrusted(name)}")
         return found
 
 
