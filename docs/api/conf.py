@@ -24,7 +24,7 @@ import zsim_api
 PAGES = {  # last parts of modules by page
     "flights": ("flight", "simulation", "recorded", "sweeping", "scenarios", "errors"),
     "commands": ("commands",),
-    "agents": ("agent", "fmu_agent"),
+    "agents": ("agent", "control_law", "cluster_space", "drone_estimator", "fmu_agent"),
     "testing": ("federation", "programs", "pytest_plugin"),
     "environments": ("environments",),
 }
@@ -40,7 +40,6 @@ extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True, "undoc-members": True}
 autodoc_typehints_format = "short"
-autodoc_preserve_defaults = True
 python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 100
 napoleon_numpy_docstring = False
