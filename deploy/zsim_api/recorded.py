@@ -69,7 +69,7 @@ class Run:
 
     Tables are pandas frames with simulated time in seconds as index, `t_s`, and units in the names of their columns,
     which are those of `zsim export`; docs/records.md lists them. Without pandas they are dicts of numpy arrays by
-    column. Runs of the same bits have equal tables.
+    column. Runs of the same bits have equal tables, but for `source`, which names processes.
 
     Attributes:
         record: the file.
