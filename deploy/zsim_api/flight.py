@@ -14,7 +14,7 @@ from rich.console import Console
 
 from zsim.errors import RunError, RunFailedError, UserCodeError
 from zsim.output_folder import RECORD
-from zsim.runtime.progress import Screen, describe
+from zsim.runtime.progress import NotebookLine, Screen, describe
 from zsim.scenario.scenario import Scenario as Resolved
 from zsim.schema import plugin
 from zsim_analysis.in_process import OwnAgent, fly, with_agents
@@ -221,14 +221,9 @@ class NotebookScreen(Screen):
     """Shows the live line below a notebook's cell; events on its standard output."""
 
     def __init__(self, duration_s: float) -> None:
-        super().__init__(duration_s, Console(file=sys.stdout, force_jupyter=False))
-        self._handle: Any = None
+        # a kernel sets FORCE_COLOR, which rich takes for a terminal
+        super().__init__(duration_s, Console(file=sys.stdout, force_jupyter=False, force_terminal=False))
+        self._line = NotebookLine()
 
     def clock(self, line: dict[str, Any]) -> None:
-        from IPython.display import Pretty, display
-
-        text = Pretty(describe(line, self._duration_s))
-        if self._handle is None:
-            self._handle = display(text, display_id=True)
-        else:
-            self._handle.update(text)
+        self._line.update(describe(line, self._duration_s))

@@ -29,13 +29,13 @@ from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import suggestion
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.drone_errors import EstimateErrors, estimate_errors
-from zsim_analysis.reading.formation import Formation, ParameterErrors
+from zsim_analysis.reading.formation import Formation, ParameterErrors, cluster_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.reading.recorded_run import decode_or_none
 from zsim_analysis.reading.shortfall import Shortfall
 from zsim_analysis.report.summary import RunSummary, error_table, judge
 from zsim_api.scenarios import Scenario
-from zsim_api.tables import INDEX, STAMPS, Table, frame, read_table
+from zsim_api.tables import INDEX, STAMPS, Table, frame, read_tables
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 SHOWN = 12  # names in an error
+ROWS_MAX = 200_000  # of several drones, read at once; of estimates 100 MB
 NOTES = 3  # shortfalls where a notebook shows a run
 ERROR_COLUMNS = ("position_m_x", "position_m_y", "position_m_z", "yaw_rad")  # as those of estimates
 Window = tuple[float, float]
@@ -234,11 +235,13 @@ class Run:
 
         parts: list[Dataset] = []
         for what, read in (("truth", self.truth), ("estimate", self.estimate)):
-            tables = {drone: read(drone) for drone in self.drones if f"drone/{drone}/{what}" in self.keys}
-            if tables:  # a world that was restarted may have published a gate again
+            known = [drone for drone in self.drones if f"drone/{drone}/{what}" in self.keys]
+            if known:
+                self._read([key for drone in known if (key := f"drone/{drone}/{what}") not in self._tables])
+                tables = {drone: read(drone).select_dtypes("number").add_prefix(f"{what}_") for drone in known}
+                # a world that was restarted may have published a gate again
                 once = {drone: table[~table.index.duplicated()] for drone, table in tables.items()}
-                joined: Any = pandas.concat(once, names=["drone"]).select_dtypes("number").add_prefix(f"{what}_")
-                parts.append(joined.to_xarray().reindex(drone=list(tables)))
+                parts.append(pandas.concat(once, names=["drone"]).to_xarray().reindex(drone=known))
         return xarray.merge(parts, join="outer", compat="no_conflicts")
 
     # How it was flown
@@ -280,7 +283,10 @@ class Run:
     @property
     def complete(self) -> bool:
         """Whether every message of the world and the end are on record; `summary.record.state` says what is missing."""
-        return self.summary.record.complete
+        try:
+            return self.summary.record.complete
+        except RecordError:  # it holds no truth
+            return False
 
     @property
     def as_planned(self) -> bool:
@@ -308,7 +314,7 @@ class Run:
 
         flight, formations, summary = self._judged
         known = []
-        with plugin.names_only(not self._trust):
+        with plugin.names_only(not self._trust, looked_up=False):
             for each in planned_figures(flight, formations, summary.window_s):
                 stem = Path(each.name).stem
                 known.append(stem.split("_", 2)[2] if stem.startswith("figure_") else stem)  # figure_8_shape
@@ -333,7 +339,7 @@ class Run:
 
         if self.record.name != RECORD:
             raise RunError(f"{self.record}: has no folder for its report; must be {RECORD} in the folder of a run")
-        with plugin.names_only(not self._trust):
+        with plugin.names_only(not self._trust, looked_up=False):
             make_report(self.folder, formats=formats)
         return self.folder / "report.html"
 
@@ -363,7 +369,7 @@ class Run:
 
     @cached_property
     def _judged(self) -> tuple[RecordedFlight, list[Formation], RunSummary]:
-        with plugin.names_only(not self._trust):
+        with plugin.names_only(not self._trust, looked_up=False):
             return judge(self.record, answers=True)
 
     @cached_property
@@ -381,12 +387,30 @@ class Run:
         if key not in self.keys:
             raise RunError(f"{self.record}: has no messages of {key!r}; {_there(key, self.keys)}")
         if key not in self._tables:
-            with plugin.names_only(not self._trust):
-                table = read_table(self.record, key)
+            fleet = self._of_all_drones(key)
+            missing = [each for each in fleet if each not in self._tables]
+            # who asks for a second drone will ask for all, and a pass over the record takes longer than one's messages
+            is_second = len(fleet) - len(missing) > 0
+            at_once = is_second and sum(self.keys[each] for each in missing) <= ROWS_MAX
+            self._read(missing if at_once else [key])
+        return self._tables[key]
+
+    def _of_all_drones(self, key: str) -> list[str]:
+        """Return the keys of all drones that carry the same as one drone's; any other key alone."""
+        kind, _, what = keys.parts(key)
+        alike = [f"drone/{drone}/{what}" for drone in self.drones] if kind == "drone" else [key]
+        return [each for each in alike if each in self.keys]
+
+    def _read(self, wanted: Sequence[str]) -> None:
+        """Read keys that are not known yet, in one pass."""
+        if not wanted:
+            return
+        with plugin.names_only(not self._trust, looked_up=False):
+            tables = read_tables(self.record, wanted)
+        for table in tables.values():
             for values in table.values():
                 values.setflags(write=False)  # frames copy them, dicts share them
-            self._tables[key] = table
-        return self._tables[key]
+        self._tables |= tables
 
     def _plain(self, key: str) -> "DataFrame":
         """Return the messages of a key without their stamps."""
@@ -398,7 +422,8 @@ class Run:
             group, _, last = what.rpartition("/")  # "sensor", "gps"
             head = f"{kind}/{name}/{group}/" if group else f"{kind}/{name}/"
             there = [each.removeprefix(head) for each in self.keys if each.startswith(head)]
-            raise RunError(f"{self.record}: has no {group} {last!r} of {name}; {_there(last, there)}")
+            said = f"{group} {last!r}" if group else what
+            raise RunError(f"{self.record}: has no {said} of {name}; {_there(last, there)}")
         return self._plain(key)
 
     def _known(self, kind: str, name: str, names: Sequence[str]) -> str:
@@ -415,12 +440,18 @@ class Run:
             raise RunError(f"{self.record}: has no cluster")
         return self._known("cluster", self.clusters[0] if name is None else name, self.clusters)
 
+    def _untrusted(self, cluster: str) -> str:
+        """Name the space of a cluster if it was not imported."""
+        scenario = None if self._trust else self._judged[0].scenario
+        own = cluster_of(scenario, cluster)
+        names = [each.space for each in (own, *own.groups) if each.space and ":" in each.space] if own else []
+        return f"; its space {names[0]} is imported by zsim.load(…, trust=True) only" if names else ""
+
     def _formation(self, cluster: str | None) -> Formation:
         name = self._cluster(cluster)
         found = next((each for each in self._judged[1] if each.name == name), None)
         if found is None:
-            why = "" if self._trust else "; if its space is of the scenario's own, zsim.load(…, trust=True) imports it"
-            raise RunError(f"{self.record}: has no states of cluster {name} that can be judged{why}")
+            raise RunError(f"{self.record}: has no states of cluster {name} that can be judged{self._untrusted(name)}")
         return found
 
 

@@ -3,7 +3,7 @@
 Columns have the names that `zsim export` gives them: `position_m_x`, `value_p`. The index is simulated time, `t_s`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,7 @@ from zsim_analysis.export.columns import (
     column_values,
     component_names,
     json_text,
+    subject,
 )
 
 if TYPE_CHECKING:
@@ -33,23 +34,28 @@ INDEX = "t_s"
 STAMPS = ("t_ns", "seq", "wall_ns")  # columns about a message, not about what it says
 
 
-def read_table(record: Path, key: str) -> Table:
-    """Return all messages of one key.
+def read_tables(record: Path, wanted: Collection[str]) -> dict[str, Table]:
+    """Return all messages of some keys, by key, in one pass over the record.
 
     A column of the export each, without `name`, which is the same in all rows. Messages of a key that is not of the
     contract have a column for each field, and those of a list of numbers one for each of these.
+
+    Args:
+        record: file.
+        wanted: one key, or the same one of several drones.
     """
     with RecordReader(record) as reader:
-        selection = MessageSelection((key,))
+        selection = MessageSelection(tuple(wanted))
         survey = TableSurvey(reader, selection)
-        if key not in survey.kinds:
-            return _own_table(reader, key)
-        parts: dict[str, list[NDArray[Any]]] = {}
-        messages = DecodedMessages(selection.messages(reader, [key]), survey.decode, lambda _: None)
-        for batch in batches(messages, survey.width):
+        by_subject = {subject(key): key for key in wanted}
+        parts: dict[str, dict[str, list[NDArray[Any]]]] = {key: {} for key in wanted if key in survey.kinds}
+        decoded = DecodedMessages(selection.messages(reader, [*parts]), survey.decode, lambda _: None)
+        for batch in batches(decoded, survey.width, by_name=True):
             for name, kind, values in column_values(survey.table(batch.kind)[1:], batch):
-                parts.setdefault(name, []).append(as_array(kind, values))
-    return {name: np.concatenate(arrays) for name, arrays in parts.items()}
+                parts[by_subject[batch.only]].setdefault(name, []).append(as_array(kind, values))
+        own = {key: _own_table(reader, key) for key in wanted if key not in parts}
+    joined = {key: {name: np.concatenate(each) for name, each in columns.items()} for key, columns in parts.items()}
+    return {**joined, **own}
 
 
 def frame(table: Mapping[str, NDArray[Any]], index: Sequence[str] = (INDEX,)) -> "DataFrame":

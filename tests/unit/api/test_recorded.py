@@ -3,6 +3,7 @@
 import html
 import json
 import sys
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,8 @@ from synthetic_record import Flown
 import zsim
 from zsim.contract import keys
 from zsim.contract.messages import decode
-from zsim.errors import RunError
-from zsim.record import RecordReader
+from zsim.errors import DocumentError, RecordError, RunError
+from zsim.record import RecordReader, RecordWriter
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_analysis.export import Format
 from zsim_analysis.export.columns import MessageSelection
@@ -142,15 +143,46 @@ def test_without_pandas_a_frame_is_a_dict_of_arrays(folder: Path, without_pandas
     assert "variable" in run.errors()
 
 
-def test_a_key_is_read_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    read = []
-    monkeypatch.setattr(recorded, "read_table", lambda *of: read.append(of[1]) or tables.read_table(*of))
+@pytest.fixture
+def passes(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """The keys of each pass over a record."""
+    made: list[list[str]] = []
+
+    def read_tables(record: Path, wanted: Collection[str]) -> dict[str, tables.Table]:
+        made.append([*wanted])
+        return tables.read_tables(record, wanted)
+
+    monkeypatch.setattr(recorded, "read_tables", read_tables)
+    return made
+
+
+def test_a_key_is_read_once(folder: Path, passes: list[list[str]]) -> None:
     run = zsim.load(folder)
     first = run.truth("drone1")
     first.loc[:, "position_m_x"] = 7.0  # the user's own from here on
     assert run.truth("drone1")["position_m_x"].iloc[0] == pytest.approx(2.0)
     run.messages("drone/drone1/truth")
-    assert read == ["drone/drone1/truth"]
+    assert passes == [["drone/drone1/truth"]]
+
+
+def test_all_drones_are_read_at_once_from_the_second_on(folder: Path, passes: list[list[str]]) -> None:
+    run = zsim.load(folder)
+    heights = {drone: run.truth(drone)["position_m_y"].iloc[0] for drone in run.drones}
+    assert heights == {"drone1": 0.0, DRONE: 0.0, "end": 3.0}
+    assert passes == [["drone/drone1/truth"], [f"drone/{DRONE}/truth", "drone/end/truth"]]
+    run.sensor("end", "gps")
+    run.xarray()
+    assert passes[2:] == [["drone/end/sensor/gps"], [f"drone/{drone}/estimate" for drone in run.drones]]
+
+
+def test_a_fleet_too_large_for_memory_is_read_drone_by_drone(
+    folder: Path, passes: list[list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorded, "ROWS_MAX", 500)
+    run = zsim.load(folder)
+    for drone in run.drones:
+        run.truth(drone)
+    assert [*map(len, passes)] == [1, 1, 1]
 
 
 # Errors and summary
@@ -297,3 +329,83 @@ def test_what_is_not_on_record_is_refused_with_what_is(run: zsim.Run, ask: Any, 
 def test_a_folder_without_a_record_is_refused(tmp_path: Path) -> None:
     with refused(RunError, str(tmp_path), "run.mcap"):
         zsim.load(tmp_path)
+
+
+# Records of every kind
+
+
+def test_a_record_that_was_cut_is_read_to_its_last_chunk(folder: Path, tmp_path: Path) -> None:
+    content = (folder / "run.mcap").read_bytes()
+    (tmp_path / "run.mcap").write_bytes(content[: len(content) // 2])
+    run = zsim.load(tmp_path)
+    assert not run.complete
+    assert "was cut" in run.ended
+    truth = run.truth("drone1")
+    assert 50 < len(truth) < 290
+    assert run.duration_s == truth.index[-1]
+    pd.testing.assert_frame_equal(truth, zsim.load(folder).truth("drone1").iloc[: len(truth)])
+    assert "was cut" in run._repr_html_()
+
+
+def written_of(folder: Path, out: Path, is_kept: Callable[[str], bool]) -> zsim.Run:
+    with RecordReader(folder / "run.mcap") as reader, RecordWriter(out / "run.mcap") as writer:
+        for each in reader.messages([key for key in reader.topics() if is_kept(key)], by_time=False):
+            writer.add(each.key, each.payload, "", each.t_ns, each.wall_ns)
+    return zsim.load(out / "run.mcap")
+
+
+def test_a_record_without_world_info_has_the_drones_that_are_on_it(folder: Path, tmp_path: Path) -> None:
+    run = written_of(folder, tmp_path, lambda key: key != keys.INFO)
+    assert {*run.drones} == {"drone1", DRONE, "end"}
+    assert run.clusters == ("main",)
+    assert len(run.truth("end")) > 290
+    with refused(RunError, "run.mcap", "no world/info"):
+        _ = run.scenario
+
+
+def test_a_record_without_truth_says_so_where_truth_is_needed(folder: Path, tmp_path: Path) -> None:
+    run = written_of(folder, tmp_path, lambda key: key in (keys.INFO, keys.EVENT))
+    assert (run.duration_s, run.ended) == (6.0, "the scenario's duration is over")
+    assert "end" in [*run.events["kind"]]
+    assert not run.complete
+    with refused(RecordError, "no truth"):
+        run.errors()
+    with refused(RunError, "no truth of drone1"):
+        run.truth("drone1")
+    assert "no truth" in run._repr_html_()
+
+
+OWN_SPACE = """
+from zsim_agents.formation.spaces.triad_cluster import TriadCluster
+
+class Space(TriadCluster):
+    pass
+"""
+
+
+def test_a_space_of_the_scenario_s_own_is_imported_for_who_trusts_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "space_of_a_stranger", None)  # put back what was there, which is nothing
+    del sys.modules["space_of_a_stranger"]
+    module = tmp_path / "space_of_a_stranger.py"
+    module.write_text(OWN_SPACE)
+    own = {"clusters[0].space": "space_of_a_stranger:Space", "duration_s": 1}
+    monkeypatch.chdir(tmp_path)
+    flown = zsim.run(recorded_run.SCENARIO, set=own, out=tmp_path / "run", progress=False)
+    assert len(flown.formation()) > 40
+    del sys.modules["space_of_a_stranger"]
+    run = zsim.load(tmp_path / "run")
+    assert "x_c" not in run.errors().index.get_level_values("variable")
+    with refused(RunError, "space_of_a_stranger:Space", "trust=True"):
+        run.formation("main")
+    assert "space_of_a_stranger" not in sys.modules
+    assert len(zsim.load(tmp_path / "run", trust=True).formation()) == len(flown.formation())
+
+    module.unlink()  # as on another machine
+    del sys.modules["space_of_a_stranger"]
+    elsewhere = zsim.load(tmp_path / "run")
+    assert elsewhere.summary.truth_sha256 == flown.truth_sha256
+    assert elsewhere.figure("plan_view").axes
+    with refused(DocumentError, "'space_of_a_stranger:Space'", "ModuleNotFoundError"):
+        _ = zsim.load(tmp_path / "run", trust=True).summary
