@@ -43,7 +43,7 @@ _WHERE = {
     "zsim_api.sweeping": ("sweep",),
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
-__all__ = [*_MODULES]
+__all__ = [*_MODULES]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
