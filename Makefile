@@ -6,12 +6,12 @@ SCENARIO ?= scenarios/step.yaml
 PARTS ?=
 AGAINST ?=
 WORKERS ?= 4
-FLIGHT := agents,world,record,report
+FLIGHT := python
 PIP := $(BIN)/pip install --disable-pip-version-check --no-compile
 COMPILED = @$(MAKE) --silent --no-print-directory $(VENV)/.compiled
 export PYTHONDONTWRITEBYTECODE = # many processes import the same files, and pip has not compiled them
 
-.PHONY: run test setup lint soak bench clean help
+.PHONY: run test setup lint soak bench docs clean help
 
 help:            ## list the commands
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -41,6 +41,10 @@ bench: $(VENV)/.dev ## measure, all or PARTS='a b'; PARTS=c AGAINST=REV: beside 
 	$(COMPILED)
 	$(BIN)/python -m benchmarks $(PARTS) $(if $(AGAINST),--against $(AGAINST))
 
+docs: $(VENV)/.dev ## the reference of zsim in Python, from its docstrings, into build/api
+	$(BIN)/sphinx-build -W --keep-going -q docs/api build/api
+	@echo "build/api/index.html"
+
 clean:           ## remove the environment and what tools leave behind
 	rm -rf $(VENV) .venv-bench .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 
@@ -54,7 +58,7 @@ $(VENV)/bin/python:
 
 # pip's own output is shown: on a slow line or disk this takes minutes
 $(VENV)/.run: pyproject.toml | $(VENV)/bin/python
-	@echo "installing what a flight needs (extras $(FLIGHT); about 550 MB; \`make setup\` installs all extras)"
+	@echo "installing what a flight needs (extras $(FLIGHT); about 600 MB; \`make setup\` installs all extras)"
 	@$(PIP) -e '.[$(FLIGHT)]'
 	@touch $@
 

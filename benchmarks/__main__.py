@@ -24,6 +24,7 @@ from benchmarks import (
     against,
     command_age,
     console,
+    from_python,
     gateway,
     growth,
     kernels,
@@ -58,6 +59,7 @@ PARTS = {
     "g": Part(gateway.measure, gateway.page),
     "h": Part(console.measure, console.page),
     "i": Part(recorder.measure, recorder.page),
+    "j": Part(from_python.measure, from_python.page),
 }
 
 

@@ -14,9 +14,7 @@ import psutil
 
 from benchmarks import grid
 from zsim.record import RecordWriter
-from zsim.runtime.bus import Bus
-from zsim_analysis.in_process import agents
-from zsim_world.run.world import World
+from zsim_analysis.in_process import InProcessFlight
 
 WARM_NS = 1_000_000_000  # simulated, not counted
 
@@ -31,28 +29,22 @@ def main() -> None:
 
 def fly(drones: int, seconds: float) -> dict[str, float]:
     """Return CPU seconds per simulated second, and resident memory at the end [MB]."""
-    world = World(grid.scenario(drones, duration_s=WARM_NS / 1e9 + seconds), "lockstep", 0.0, time.monotonic_ns)
+    flight = InProcessFlight(grid.scenario(drones, duration_s=WARM_NS / 1e9 + seconds))
+    world = flight.world
     with tempfile.TemporaryDirectory() as folder:
         writer = RecordWriter(Path(folder) / "run.mcap")
-        bus = Bus(
-            world,
-            agents(world),
-            time.monotonic_ns,
-            lambda key, message: writer.add_message(key, message, time.time_ns()),
-            lambda gate: writer.add_gate(gate, time.time_ns()),
-        )
-        bus.join()
+        flight.start([writer])
         gc.collect()
         gc.freeze()  # as `zsim run --in-process` does
         while world.now_ns < WARM_NS:
-            bus.turn()
+            flight.turn()
         start_s, start_ns = time.process_time(), world.now_ns
-        while bus.turn():
+        while flight.turn():
             pass
         cpu_s = time.process_time() - start_s
         simulated_s = (world.now_ns - start_ns) / 1e9
         resident = psutil.Process().memory_info().rss / 1e6
-        bus.end()
+        flight.end()
         writer.close()
     return {"cpu_s_per_simulated_s": cpu_s / simulated_s, "resident_mb": resident}
 

@@ -149,7 +149,7 @@ EXTRA_OF = {
     "matplotlib": "report",
     "mcap": "record",
     "numba": "agents",
-    "pandas": "notebook",
+    "pandas": "python",
     "pyarrow": "export",
     "rosbags": "ros2",
     "scipy": "agents",

@@ -10,6 +10,10 @@ if TYPE_CHECKING:  # for editors, which do not read _WHERE
     from zsim.errors import ZsimError as ZsimError
     from zsim.runtime.agent import Agent as Agent
     from zsim.runtime.agent import Output as Output
+    from zsim_agents.estimation.drone_estimator import DroneEstimator as DroneEstimator
+    from zsim_agents.estimation.drone_estimator import StateEstimate as StateEstimate
+    from zsim_agents.formation.control_law import ControlLaw as ControlLaw
+    from zsim_agents.formation.spaces.cluster_space import ClusterSpace as ClusterSpace
     from zsim_api.commands import Command as Command
     from zsim_api.commands import ardrone as ardrone
     from zsim_api.commands import attitude as attitude
@@ -29,6 +33,9 @@ if TYPE_CHECKING:  # for editors, which do not read _WHERE
 _WHERE = {
     "zsim.errors": ("ZsimError",),
     "zsim.runtime.agent": ("Agent", "Output"),
+    "zsim_agents.estimation.drone_estimator": ("DroneEstimator", "StateEstimate"),
+    "zsim_agents.formation.control_law": ("ControlLaw",),
+    "zsim_agents.formation.spaces.cluster_space": ("ClusterSpace",),
     "zsim_api.commands": ("Command", "ardrone", "attitude", "emergency", "land", "rotors", "takeoff", "velocity"),
     "zsim_api.flight": ("run",),
     "zsim_api.recorded": ("Run", "load"),
@@ -38,7 +45,7 @@ _WHERE = {
     "zsim_api.sweeping": ("sweep",),
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
-__all__ = [*_MODULES]
+__all__ = [*_MODULES]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

@@ -13,6 +13,7 @@ from zsim.contract.flight_messages import Ardrone, Attitude, Mode, RotorSpeeds, 
 from zsim.errors import RunError
 
 Command = Velocity | Attitude | RotorSpeeds | Ardrone | Mode
+"""What a drone can be told: what the functions of this module return."""
 _UNSTAMPED = (0, 0, "")  # t_ns, seq, source
 
 
@@ -57,10 +58,12 @@ def ardrone(forward: float, left: float, up: float, yaw_left: float, hover: bool
 
 
 def takeoff() -> Mode:
+    """Return a command to take off, and to hover then."""
     return Mode(*_UNSTAMPED, "takeoff")
 
 
 def land() -> Mode:
+    """Return a command to land."""
     return Mode(*_UNSTAMPED, "land")
 
 

@@ -14,7 +14,8 @@ from rich.console import Console
 
 from zsim.errors import RunError, RunFailedError, UserCodeError
 from zsim.output_folder import RECORD
-from zsim.runtime.progress import Screen, describe
+from zsim.runtime.progress import NotebookLine, Screen, describe
+from zsim.scenario.scenario import Scenario as Resolved
 from zsim.schema import plugin
 from zsim_analysis.in_process import OwnAgent, fly, with_agents
 from zsim_analysis.reading.shortfall import verdict
@@ -77,17 +78,30 @@ def run(
         _fly_as_processes(source, agents, [agent.name for agent in made], options, folder, progress)
     else:
         launch = run_folder.new_launch(in_process=True, changed=source.changes or ())
-        run_folder.prepare(folder, flown, launch)
         with screen_for(flown.duration_s) if progress else nullcontext() as screen, _ctrl_c() as stop_reason:
-            if screen:
-                screen.say(f"{flown.name}: {len(flown.drones)} drones, {flown.duration_s:g} s, into {folder}")
-            calling(lambda: fly(flown, folder / RECORD, stop_reason, screen, None, source.changes, made), folder)
+            calling(lambda: fly_here(flown, folder, launch, made, screen, stop_reason), folder)
         if reason := stop_reason():
             raise KeyboardInterrupt(f"{reason}; zsim.load({str(folder)!r}) reads the record so far")
-        run_folder.forget_launch(folder)
     from zsim_api.recorded import load
 
-    return load(folder)
+    return load(folder, trust=True)
+
+
+def fly_here(
+    scenario: Resolved,
+    folder: Path,
+    launch: run_folder.Launch,
+    own: Sequence[OwnAgent],
+    screen: Screen | None,
+    stop_reason: Callable[[], str | None],
+    continued: bool = False,
+) -> str:
+    """Fly a resolved scenario in this process into a run's folder; return why it ended; errors as of `fly`."""
+    run_folder.prepare(folder, scenario, launch, screen.say if screen else lambda _: None, continued)
+    ended = fly(scenario, folder / RECORD, stop_reason, screen, None, launch.changed, own)
+    if not stop_reason():
+        run_folder.forget_launch(folder)
+    return ended
 
 
 # Of processes
@@ -207,14 +221,9 @@ class NotebookScreen(Screen):
     """Shows the live line below a notebook's cell; events on its standard output."""
 
     def __init__(self, duration_s: float) -> None:
-        super().__init__(duration_s, Console(file=sys.stdout, force_jupyter=False))
-        self._handle: Any = None
+        # a kernel sets FORCE_COLOR, which rich takes for a terminal
+        super().__init__(duration_s, Console(file=sys.stdout, force_jupyter=False, force_terminal=False))
+        self._line = NotebookLine()
 
     def clock(self, line: dict[str, Any]) -> None:
-        from IPython.display import Pretty, display
-
-        text = Pretty(describe(line, self._duration_s))
-        if self._handle is None:
-            self._handle = display(text, display_id=True)
-        else:
-            self._handle.update(text)
+        self._line.update(describe(line, self._duration_s))

@@ -1,188 +1,292 @@
-"""A run on record, as tables, errors and figures: `zsim.load`.
+"""A run on record, read from Python.
 
-    run = zsim.load("runs/step-20260101-120000")
+    run = zsim.load("runs/step")
     run.truth("drone1").position_m_z.plot()
-    run.errors()
+    run.errors(window=(20, 40))
+    run.figure("shape")
 
-A table has the columns that `zsim export` writes; its index is simulated time. Nothing is read before it is asked for.
+It reads what it is asked for when it is asked for it, each key once, and keeps that. Records of runs in one process, of
+processes on any hosts, of runs that were cut, and of replays are the same to it.
 """
 
 import html
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from msgspec import UNSET
 
 from zsim.contract import keys
-from zsim.errors import RunError
-from zsim.output_folder import record_at
+from zsim.contract.messages import Info
+from zsim.contract.run_messages import Event
+from zsim.errors import RecordError, RunError
+from zsim.output_folder import RECORD, record_at
 from zsim.record import RecordReader
+from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import suggestion
 from zsim_agents.formation.spaces.cluster_space import unit
-from zsim_analysis.export.columns import DecodedMessages, MessageSelection, TableSurvey, batches
 from zsim_analysis.reading.drone_errors import EstimateErrors, estimate_errors
-from zsim_analysis.reading.formation import Formation, ParameterErrors
+from zsim_analysis.reading.formation import Formation, ParameterErrors, cluster_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
+from zsim_analysis.reading.recorded_run import decode_or_none
 from zsim_analysis.reading.shortfall import Shortfall
+from zsim_analysis.report.summary import RunSummary, error_table, judge
+from zsim_api.scenarios import Scenario
+from zsim_api.tables import INDEX, STAMPS, Table, frame, read_tables
 
 if TYPE_CHECKING:
-    import pandas
-    import xarray
     from matplotlib.figure import Figure
+    from pandas import DataFrame
+    from xarray import Dataset
 
-    from zsim_analysis.report.summary import RunSummary
+SHOWN = 12  # names in an error
+ROWS_MAX = 200_000  # of several drones, read at once; of estimates 100 MB
+NOTES = 3  # shortfalls where a notebook shows a run
+ERROR_COLUMNS = ("position_m_x", "position_m_y", "position_m_z", "yaw_rad")  # as those of estimates
+Window = tuple[float, float]
 
-COMMANDS = ("velocity", "ardrone", "attitude", "rotors", "mode")  # drone/{d}/cmd/...
-DROPPED = ("name", "t_ns")  # the first is in the question, the second in the index
 
-
-def load(place: str | Path) -> "Run":
+def load(place: str | Path, trust: bool = False) -> "Run":
     """Return a run on record, of any kind: in one process, as processes, on several hosts, or interrupted.
 
     Args:
-        place: the folder of a run, or its run.mcap.
+        place: the folder of a run, or its `run.mcap`.
+        trust: whether a cluster space of the scenario's own may be imported, which runs code that came with the record.
+            Without, clusters with such a space have no errors; everything else is read in any case.
 
     Raises:
         RunError: there is no record.
         RecordError: the file is no record of zsim's.
     """
-    return Run(Path(place))
+    return Run(place, trust)
 
 
 class Run:
     """A run on record.
 
-    Tables are pandas frames with simulated time in seconds as index, `t_s`; units are in the names of the columns.
-    Without pandas they are maps of numpy arrays by column.
+    Tables are pandas frames with simulated time in seconds as index, `t_s`, and units in the names of their columns,
+    which are those of `zsim export`; docs/records.md lists them. Without pandas they are dicts of numpy arrays by
+    column. Runs of the same bits have equal tables, but for `source`, which names processes.
 
     Attributes:
-        folder: of the run.
         record: the file.
+        keys: number of messages on record by key.
+        drones, clusters: names, in the order of the scenario.
     """
 
-    def __init__(self, place: Path) -> None:
-        self.record = record_at(place)
-        self.folder = self.record.parent
-        self._tables: dict[str, Any] = {}
+    def __init__(self, place: str | Path, trust: bool = False) -> None:
+        self.record = record_at(Path(place))
+        self._trust = trust
+        self._tables: dict[str, Table] = {}
         with RecordReader(self.record) as reader:
-            self.keys = sorted(reader.topics())
+            self.keys = reader.topics()
+            recorded = reader.last(keys.INFO)
+        self._info: Info | None = decode_or_none(recorded) if recorded else None
+        drones = [drone.name for drone in self._info.drones] if self._info else self._named("drone")
+        clusters = [cluster.name for cluster in self._info.clusters] if self._info else self._named("cluster")
+        self.drones, self.clusters = tuple(drones), tuple(clusters)
+
+    @property
+    def folder(self) -> Path:
+        """Where the record is."""
+        return self.record.parent
 
     # Tables
 
-    def truth(self, drone: str) -> "pandas.DataFrame":
-        """Return the true motion of a drone, at every gate; W, B and rotors in the order of `world/info`."""
-        return self._of_drone(drone, "truth")
+    def truth(self, drone: str) -> "DataFrame":
+        """Return the true motion of a drone at every gate, W and B as in docs/conventions.md; RunError if unknown."""
+        return self._of("drone", drone, "truth")
 
-    def estimate(self, drone: str) -> "pandas.DataFrame":
-        """Return the estimates of a drone's motion, with their covariance."""
-        return self._of_drone(drone, "estimate")
+    def estimate(self, drone: str) -> "DataFrame":
+        """Return the estimates of a drone's motion, with their covariance; RunError without any."""
+        return self._of("drone", drone, "estimate")
 
-    def sensor(self, drone: str, sensor: str) -> "pandas.DataFrame":
-        """Return the samples of a sensor: "imu", "gps", "mag", "baro", "sonar", "flow", or one of your own."""
-        return self._of_drone(drone, f"sensor/{sensor}", "sensor")
+    def sensor(self, drone: str, sensor: str) -> "DataFrame":
+        """Return the samples of a sensor: imu, gps, mag, baro, sonar, flow, or one of your own; RunError without any.
 
-    def status(self, drone: str) -> "pandas.DataFrame":
-        """Return the state of a drone's firmware and battery, at every gate."""
-        return self._of_drone(drone, "sensor/status")
+        `t_sample_ns` is when a sample was taken, the index when it was delivered.
+        """
+        return self._of("drone", drone, f"sensor/{sensor}")
 
-    def commands(self, drone: str, kind: str = "velocity") -> "pandas.DataFrame":
-        """Return the commands to a drone of a kind: "velocity", "ardrone", "attitude", "rotors" or "mode"."""
-        if kind not in COMMANDS:
-            raise RunError(f"kind of commands is {kind!r}; {suggestion(kind, COMMANDS)}must be one of {COMMANDS}")
-        return self._of_drone(drone, f"cmd/{kind}", "cmd")
+    def status(self, drone: str) -> "DataFrame":
+        """Return the state of a drone's firmware and battery, at every gate; RunError if unknown."""
+        return self._of("drone", drone, "sensor/status")
 
-    def cluster(self, cluster: str = "main") -> "pandas.DataFrame":
-        """Return the states of a formation as its controller saw it: phase, measured and desired variables."""
-        return self._table(keys.cluster_state(cluster))
+    def commands(self, drone: str, kind: str = "velocity") -> "DataFrame":
+        """Return the commands that anybody has sent to a drone; `source` says who; RunError without any.
 
-    def formation(self, cluster: str = "main") -> "pandas.DataFrame":
-        """Return the variables of a formation, `desired_x_c_m`, `estimate_x_c_m`, `truth_x_c_m`; NaN where unknown.
+        Args:
+            drone: name.
+            kind: velocity, attitude, rotors, ardrone or mode.
+        """
+        return self._of("drone", drone, f"cmd/{kind}")
+
+    def cluster(self, cluster: str | None = None) -> "DataFrame":
+        """Return the states of a cluster as its controller saw it: `phase`, `value_p`, `desired_p` and so on [m, rad].
+
+        Args:
+            cluster: name; None: the first.
 
         Raises:
-            RunError: no formation of that name can be judged.
+            RunError: no such cluster, or its controller published nothing.
         """
-        found = next((each for each in self._formations if each.name == cluster), None)
-        if found is None:
-            raise RunError(_unknown("formation", cluster, [each.name for each in self._formations], self.record))
-        parts = {"desired": found.desired, "estimate": found.value, "truth": found.true}
-        columns: dict[str, Any] = {
-            f"{what}_{name}_{unit(name)}": values[:, i]
-            for i, name in enumerate(found.names)
-            for what, values in parts.items()
-        }
-        return _frame({"t_s": found.t_s, "phase": np.array(found.phases, object), **columns})
+        return self._of("cluster", self._cluster(cluster), "state")
 
-    def messages(self, key: str) -> "pandas.DataFrame":
-        """Return all messages of a key, without the federation; `run.keys` has those on record."""
-        return self._table(key)
+    def messages(self, key: str) -> "DataFrame":
+        """Return all messages of a key, with `t_ns`, `seq`, and `wall_ns`, when each was recorded [ns since 1970].
+
+        Messages of a program of your own have a column for each field.
+
+        Args:
+            key: without the federation's name, and without wildcards; `run.keys` has those on record.
+
+        Raises:
+            RunError: there are none.
+        """
+        return frame(self._table(key))
 
     @property
-    def events(self) -> "pandas.DataFrame":
-        """What happened, by kind, source, subject and text."""
-        return self._table(keys.EVENT)
+    def events(self) -> "DataFrame":
+        """Events, with kind, source, subject, text, and data as JSON text."""
+        return self._plain(keys.EVENT)
 
-    def estimate_errors(self, drone: str) -> "pandas.DataFrame":
-        """Return estimate − truth of a drone: x_m, y_m, z_m in W, yaw_rad, the stated σ of each, and NEES."""
-        errors = self._estimate_errors
-        if drone not in errors:
-            raise RunError(_unknown("drone with truth and estimates", drone, list(errors), self.record))
-        of = errors[drone]
-        names = ("x_m", "y_m", "z_m", "yaw_rad")
-        columns = {name: of.error[:, i] for i, name in enumerate(names)}
-        columns |= {f"{name}_sigma": of.sigma[:, i] for i, name in enumerate(names)}
-        return _frame({"t_s": of.t_s, **columns, "nees": of.nees})
+    # Errors
 
-    def errors(self, window: tuple[float, float] | None = None) -> "pandas.DataFrame":
-        """Return the errors of every variable of every formation, with its unit; the report's table.
+    def formation(self, cluster: str | None = None) -> "DataFrame":
+        """Return the variables of a formation over time, its `phase`, and errors, angles within ±π.
 
-        `est_…` is estimate − desired, what the controller saw; `true_…` truth − desired, what the drones did; over
-        the instants of the window at which the formation was engaged, NaN without any.
+        For a variable p: `desired_p_m`, `estimate_p_m`, `truth_p_m`; `estimate_error_p_m`, which is estimate − desired,
+        what the controller saw; and `truth_error_p_m`, truth − desired, what the drones did. NaN where unknown. Until
+        the phase is engaged, the desired value is the estimate.
+
+        Args:
+            cluster: name; None: the first.
+
+        Raises:
+            RunError: no such cluster, or its states cannot be judged.
+        """
+        found = self._formation(cluster)
+        parts = {
+            "desired": found.desired,
+            "estimate": found.value,
+            "truth": found.true,
+            "estimate_error": found.est_error,
+            "truth_error": found.true_error,
+        }
+        table: Table = {INDEX: found.t_s, "phase": np.array(found.phases, object)}
+        for i, name in enumerate(found.names):
+            table |= {f"{what}_{name}_{unit(name)}": values[:, i] for what, values in parts.items()}
+        return frame(table)
+
+    def estimate_errors(self, drone: str) -> "DataFrame":
+        """Return estimate − truth of a drone over time: position in W and heading, σ of each as the estimator states
+        it (`sigma_position_m_x`), and `nees`, 6 on average where it states the truth.
+
+        Of more than 200 000 estimates of all drones, every n-th is compared.
+
+        Raises:
+            RunError: no such drone, or truth and estimate are not both on record.
+        """
+        own = self._drone_errors.get(self._known("drone", drone, self.drones))
+        if own is None:
+            raise RunError(f"{self.record}: truth and estimates of {drone} are not both on record")
+        errors = dict(zip(ERROR_COLUMNS, own.error.T, strict=True))
+        sigmas = {f"sigma_{name}": values for name, values in zip(ERROR_COLUMNS, own.sigma.T, strict=True)}
+        return frame({INDEX: own.t_s, **errors, **sigmas, "nees": own.nees})
+
+    def errors(
+        self, window: Window | None = None, of: Literal["formations", "estimates"] = "formations"
+    ) -> "DataFrame":
+        """Return statistics of errors, a row for each variable with its unit; the report's table.
+
+        Of formations, by cluster and variable, over the instants of the window at which it was engaged: `est_…` is
+        estimate − desired, what the controller saw, `true_…` truth − desired, what the drones did. Of estimates, by
+        drone and variable: `std`, `rms` and `mean` of estimate − truth, and `inside`, the share of errors within two
+        stated standard deviations. NaN where there is no such instant.
 
         Args:
             window: from and to [s]; None: the report's, `run.summary.window_s`.
-        """
-        window_s = window or self.summary.window_s
-        rows: list[dict[str, Any]] = []
-        for formation in self._formations:
-            for variable, of in formation.errors(window_s).items():
-                moments = {name: getattr(of, name) for name in ParameterErrors.__struct_fields__}
-                numbers = {name: np.nan if value is None else value for name, value in moments.items()}
-                rows.append({"cluster": formation.name, "variable": variable, "unit": unit(variable), **numbers})
-        columns = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
-        return _frame(columns, ["cluster", "variable"])
+            of: formations, or estimates.
 
-    def xarray(self) -> "xarray.Dataset":
-        """Return truth and estimates of all drones, with the dimensions t_s and drone; needs xarray and pandas."""
+        Raises:
+            RecordError: there is no truth on record.
+        """
+        window = window or self.summary.window_s
+        if of == "estimates":
+            return _statistics("drone", {name: _moments(each, window) for name, each in self._drone_errors.items()})
+        if of != "formations":
+            raise RunError(f"of is {of!r}; must be 'formations' or 'estimates'")
+        rows = {
+            each.name: {
+                name: (unit(name), *(getattr(moments, field) for field in ParameterErrors.__struct_fields__))
+                for name, moments in each.errors(window).items()
+            }
+            for each in self._judged[1]
+        }
+        return _statistics("cluster", rows, ParameterErrors.__struct_fields__)
+
+    def xarray(self) -> "Dataset":
+        """Return truth and estimates of all drones, with the dimensions drone and t_s; needs xarray and pandas."""
+        import pandas
         import xarray
 
-        parts: list[Any] = []
+        parts: list[Dataset] = []
         for what, read in (("truth", self.truth), ("estimate", self.estimate)):
-            drones = [d for d in self.drones if f"drone/{d}/{what}" in self.keys]
-            tables = [read(drone).select_dtypes("number").add_prefix(f"{what}_").to_xarray() for drone in drones]
-            if tables:
-                parts.append(xarray.concat(tables, xarray.DataArray(drones, dims="drone", name="drone"), join="outer"))
+            known = [drone for drone in self.drones if f"drone/{drone}/{what}" in self.keys]
+            if known:
+                self._read([key for drone in known if (key := f"drone/{drone}/{what}") not in self._tables])
+                tables = {drone: read(drone).select_dtypes("number").add_prefix(f"{what}_") for drone in known}
+                # a world that was restarted may have published a gate again
+                once = {drone: table[~table.index.duplicated()] for drone, table in tables.items()}
+                parts.append(pandas.concat(once, names=["drone"]).to_xarray().reindex(drone=known))
         return xarray.merge(parts, join="outer", compat="no_conflicts")
 
-    # What the report says
+    # How it was flown
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """The scenario, with all defaults and changes, to be looked at or flown again.
+
+        RunError without `world/info` on record.
+        """
+        if self._info is None:
+            raise RunError(f"{self.record}: has no world/info, so that its scenario is unknown")
+        made = Scenario(**yaml_file.value(self._info.scenario))
+        modules = () if self._info.module_folders is UNSET else self._info.module_folders
+        made.source, made.folders = str(self.record), (*map(Path, modules), self.folder, Path.cwd())
+        return made
 
     @property
-    def summary(self) -> "RunSummary":
-        """The content of summary.json."""
+    def summary(self) -> RunSummary:
+        """The content of summary.json; RecordError if there is no truth on record."""
         return self._judged[2]
 
     @property
-    def drones(self) -> list[str]:
-        """Names of the drones on record."""
-        info = self._flight.info
-        return [drone.name for drone in info.drones] if info else [track.name for track in self._flight.tracks]
+    def duration_s(self) -> float:
+        """Simulated time that was flown [s]."""
+        sim_s = self._end.get("sim_s")
+        return self.summary.sim_s if sim_s is None else float(sim_s)
 
     @property
-    def scenario(self) -> Any:
-        """The resolved scenario; None if this version cannot read it."""
-        return self._flight.scenario
+    def ended(self) -> str:
+        """Why it ended."""
+        return str(self._end["reason"]) if "reason" in self._end else self.summary.ended
+
+    @property
+    def truth_sha256(self) -> str:
+        """The hash of all truth: equal for flights that are equal to the bit."""
+        return str(self._end.get("truth_sha256") or self.summary.truth_sha256)
+
+    @property
+    def complete(self) -> bool:
+        """Whether every message of the world and the end are on record; `summary.record.state` says what is missing."""
+        try:
+            return self.summary.record.complete
+        except RecordError:  # it holds no truth
+            return False
 
     @property
     def as_planned(self) -> bool:
@@ -191,148 +295,202 @@ class Run:
 
     @property
     def shortfalls(self) -> list[Shortfall]:
+        """The deviations from its plan, as the report has them."""
         return self.summary.shortfalls
 
-    @property
-    def truth_sha256(self) -> str:
-        """The hash of all truth: equal for flights that are equal to the bit."""
-        return self.summary.truth_sha256
-
-    @property
-    def duration_s(self) -> float:
-        """Simulated time that was flown [s]."""
-        return self.summary.sim_s
+    # Shown
 
     def figure(self, name: str) -> "Figure":
-        """Return a figure of the report: "errors", "position", "orientation", "shape", "plan_view", "distances",
-        "drones", "estimates", "velocities"; of further clusters with the cluster's name, "shape_CLUSTER".
+        """Return a figure of the report, drawn anew.
+
+        Args:
+            name: errors, position, orientation, shape, plan_view, distances, drones, estimates or velocities; of
+                further clusters with the cluster's name, `shape_side`.
 
         Raises:
-            RunError: the record has no such figure.
+            RunError: the record has no such figure; with those that it has.
         """
-        from zsim_analysis.report.make_report import figures
+        from zsim_analysis.report.make_report import marked, planned_figures
 
+        flight, formations, summary = self._judged
         known = []
-        for each in figures(*self._judged):
-            known.append(_plain_name(each.name))
-            if name in (known[-1], Path(each.name).stem):
-                # a figure without pyplot is shown by a notebook only if it has this
-                setattr(each.drawing, "_repr_png_", _png_of(each.drawing))  # noqa: B010
-                return each.drawing
-        raise RunError(_unknown("figure", name, known, self.record))
+        with plugin.names_only(not self._trust, looked_up=False):
+            for each in planned_figures(flight, formations, summary.window_s):
+                stem = Path(each.name).stem
+                known.append(stem.split("_", 2)[2] if stem.startswith("figure_") else stem)  # figure_8_shape
+                if name in (known[-1], stem):
+                    drawing = marked(each, summary).drawing
+                    # a figure without pyplot is shown by a notebook only if it has this
+                    setattr(drawing, "_repr_png_", _png_of(drawing))  # noqa: B010
+                    return drawing
+        raise RunError(f"{self.record}: has no figure {name!r}; {_there(name, known)}")
 
     def report(self, formats: Sequence[str] = ()) -> Path:
         """Write the report into the run's folder, as `zsim report` does; return its page.
 
         Args:
             formats: of figures beside PNG: "pdf", "svg".
+
+        Raises:
+            RunError: the record is not in the folder of a run.
+            ReportError: the folder cannot be written.
         """
         from zsim_analysis.report.make_report import make_report
 
-        make_report(self.folder, formats=formats)
+        if self.record.name != RECORD:
+            raise RunError(f"{self.record}: has no folder for its report; must be {RECORD} in the folder of a run")
+        with plugin.names_only(not self._trust, looked_up=False):
+            make_report(self.folder, formats=formats)
         return self.folder / "report.html"
 
     def __repr__(self) -> str:
-        return f"<Run {self.folder}>"
+        return f"<Run {self.record}, {len(self.drones)} drones>"
 
     def _repr_html_(self) -> str:
-        summary = self.summary
-        verdict = "as planned" if summary.as_planned else "NOT AS PLANNED"
+        try:
+            summary = self.summary
+        except RecordError as error:  # nothing was flown
+            return f"<p>{html.escape(str(error))}</p>"
         facts = {
             "Scenario": f"{summary.scenario}, seed {summary.seed}, {len(self.drones)} drones",
-            "Flown": f"{summary.sim_s:g} s ({summary.ended}), {verdict}",
-            **{f"Note {i}" if i else "Note": each.text for i, each in enumerate(summary.shortfalls[:3])},
-            "Record": f"{self.folder} ({summary.record.state})",
+            "Flown": f"{summary.sim_s:g} s, {'as planned' if summary.as_planned else 'not as planned'}",
+            "Ended": summary.ended,
+            **{f"Note {i}": each.text for i, each in enumerate(summary.shortfalls[:NOTES], start=1)},
+            "Record": f"{self.record}: {summary.record.state}",
         }
-        rows = "".join(f"<tr><th>{html.escape(k)}</th><td>{html.escape(str(v))}</td></tr>" for k, v in facts.items())
-        errors = self.errors()
-        return f"<table>{rows}</table>" + (errors._repr_html_() if hasattr(errors, "_repr_html_") else "")  # type: ignore[operator]
+        parts = [_html_table([], [[f"<b>{label}</b>", html.escape(text)] for label, text in facts.items()])]
+        for name, cluster in summary.clusters.items():
+            table = error_table(cluster)
+            cells = [[html.escape(cell) for cell in row] for row in table.rows]
+            parts += [f"<p>Errors of {html.escape(name)}</p>", _html_table(table.columns, cells)]
+        return "".join(parts)
 
     # Reading
 
     @cached_property
-    def _judged(self) -> tuple[RecordedFlight, list[Formation], "RunSummary"]:
-        from zsim_analysis.report.make_report import judge
-
-        return judge(self.record, answers=True)
-
-    @property
-    def _flight(self) -> RecordedFlight:
-        return self._judged[0]
-
-    @property
-    def _formations(self) -> list[Formation]:
-        return self._judged[1]
+    def _judged(self) -> tuple[RecordedFlight, list[Formation], RunSummary]:
+        with plugin.names_only(not self._trust, looked_up=False):
+            return judge(self.record, answers=True)
 
     @cached_property
-    def _estimate_errors(self) -> dict[str, EstimateErrors]:
-        return estimate_errors(self._flight)
+    def _drone_errors(self) -> dict[str, EstimateErrors]:
+        return estimate_errors(self._judged[0])
 
-    def _of_drone(self, drone: str, what: str, group: str = "") -> "pandas.DataFrame":
-        key = f"drone/{drone}/{what}"
-        if key not in self.keys:
-            drones = list(dict.fromkeys(keys.thing(each) for each in self.keys if each.startswith("drone/")))
-            if drone not in drones:
-                raise RunError(_unknown("drone", drone, drones, self.record))
-            parts = [keys.parts(each)[2] for each in self.keys if each.startswith(f"drone/{drone}/")]
-            own = [each.removeprefix(f"{group}/") for each in parts if each.startswith(f"{group}/") or not group]
-            raise RunError(
-                _unknown(f"{group or 'message'} of {drone}", what.removeprefix(f"{group}/"), own, self.record)
-            )
-        return self._table(key)
+    @cached_property
+    def _end(self) -> Mapping[str, Any]:
+        """Data of the world's last `end` event; empty without one."""
+        with RecordReader(self.record) as reader:
+            events = [decode_or_none(recorded) for recorded in reader.messages({keys.EVENT}, by_time=False)]
+        return next((e.data for e in reversed(events) if isinstance(e, Event) and e.kind == "end"), {})
 
-    def _table(self, key: str) -> Any:
+    def _table(self, key: str) -> Table:
         if key not in self.keys:
-            raise RunError(_unknown("key", key, self.keys, self.record))
+            raise RunError(f"{self.record}: has no messages of {key!r}; {_there(key, self.keys)}")
         if key not in self._tables:
-            self._tables[key] = read_table(self.record, key)
-        table = self._tables[key]
-        return table.copy() if hasattr(table, "copy") else dict(table)
+            fleet = self._of_all_drones(key)
+            missing = [each for each in fleet if each not in self._tables]
+            # who asks for a second drone will ask for all, and a pass over the record takes longer than one's messages
+            is_second = len(fleet) - len(missing) > 0
+            at_once = is_second and sum(self.keys[each] for each in missing) <= ROWS_MAX
+            self._read(missing if at_once else [key])
+        return self._tables[key]
+
+    def _of_all_drones(self, key: str) -> list[str]:
+        """Return the keys of all drones that carry the same as one drone's; any other key alone."""
+        kind, _, what = keys.parts(key)
+        alike = [f"drone/{drone}/{what}" for drone in self.drones] if kind == "drone" else [key]
+        return [each for each in alike if each in self.keys]
+
+    def _read(self, wanted: Sequence[str]) -> None:
+        """Read keys that are not known yet, in one pass."""
+        if not wanted:
+            return
+        with plugin.names_only(not self._trust, looked_up=False):
+            tables = read_tables(self.record, wanted)
+        for table in tables.values():
+            for values in table.values():
+                values.setflags(write=False)  # frames copy them, dicts share them
+        self._tables |= tables
+
+    def _plain(self, key: str) -> "DataFrame":
+        """Return the messages of a key without their stamps."""
+        return frame({column: values for column, values in self._table(key).items() if column not in STAMPS})
+
+    def _of(self, kind: str, name: str, what: str) -> "DataFrame":
+        key = f"{kind}/{self._known(kind, name, self.drones if kind == 'drone' else self.clusters)}/{what}"
+        if key not in self.keys:
+            group, _, last = what.rpartition("/")  # "sensor", "gps"
+            head = f"{kind}/{name}/{group}/" if group else f"{kind}/{name}/"
+            there = [each.removeprefix(head) for each in self.keys if each.startswith(head)]
+            said = f"{group} {last!r}" if group else what
+            raise RunError(f"{self.record}: has no {said} of {name}; {_there(last, there)}")
+        return self._plain(key)
+
+    def _known(self, kind: str, name: str, names: Sequence[str]) -> str:
+        if name not in names:
+            raise RunError(f"{self.record}: has no {kind} {name!r}; {_there(name, names)}")
+        return name
+
+    def _named(self, kind: str) -> list[str]:
+        """Return the drones, or clusters, of which there are messages."""
+        return list(dict.fromkeys(keys.thing(key) for key in self.keys if key.startswith(f"{kind}/")))
+
+    def _cluster(self, name: str | None) -> str:
+        if name is None and not self.clusters:
+            raise RunError(f"{self.record}: has no cluster")
+        return self._known("cluster", self.clusters[0] if name is None else name, self.clusters)
+
+    def _untrusted(self, cluster: str) -> str:
+        """Name the space of a cluster if it was not imported."""
+        scenario = None if self._trust else self._judged[0].scenario
+        own = cluster_of(scenario, cluster)
+        names = [each.space for each in (own, *own.groups) if each.space and ":" in each.space] if own else []
+        return f"; its space {names[0]} is imported by zsim.load(…, trust=True) only" if names else ""
+
+    def _formation(self, cluster: str | None) -> Formation:
+        name = self._cluster(cluster)
+        found = next((each for each in self._judged[1] if each.name == name), None)
+        if found is None:
+            raise RunError(f"{self.record}: has no states of cluster {name} that can be judged{self._untrusted(name)}")
+        return found
 
 
-def read_table(record: Path, key: str) -> Any:
-    """Return the messages of one key of a record as a table."""
-    parts: dict[str, list[Any]] = {}
-    with RecordReader(record) as reader:
-        selection = MessageSelection((key,))
-        survey = TableSurvey(reader, selection)
-        decoded = DecodedMessages(selection.messages(reader, survey.wanted), survey.decode, lambda _: None)
-        for batch in batches(decoded, survey.width):
-            for each in survey.table(batch.kind):
-                values = each.values(batch)
-                split = values.T if isinstance(values, np.ndarray) and values.ndim == 2 else [values]
-                for column, of_column in zip(each.columns, split, strict=True):
-                    parts.setdefault(column, []).append(_array(of_column, each.kind))
-    columns = {name: np.concatenate(arrays) for name, arrays in parts.items() if name not in DROPPED}
-    return _frame(columns)
+def _moments(errors: EstimateErrors, window: Window) -> dict[str, tuple[Any, ...]]:
+    """Return unit, standard deviation, root mean square, mean and share inside of each error within a window."""
+    rows = (errors.t_s >= window[0]) & (errors.t_s <= window[1])
+    inside = errors.share_inside(rows) if rows.any() else [None] * len(ERROR_COLUMNS)
+    moments = {}
+    units = ("m", "m", "m", "rad", "")
+    columns = np.column_stack([errors.error, errors.nees])[rows].T
+    for name, measure, values, share in zip((*ERROR_COLUMNS, "nees"), units, columns, (*inside, None), strict=True):
+        known = values[np.isfinite(values)]
+        found = (known.std(), np.sqrt(np.mean(known**2)), known.mean()) if len(known) else (None,) * 3
+        moments[name] = (measure, *found, share)
+    return moments
 
 
-def _array(values: Sequence[Any] | NDArray[Any], kind: str) -> NDArray[Any]:
-    if kind == "text" or any(value is None for value in values):
-        return np.array(values, object) if kind in ("text", "flag") else np.array(values, np.float64)
-    return np.asarray(values, {"whole": np.int64, "number": np.float64, "flag": bool}[kind])
+def _statistics(
+    of: str, rows: Mapping[str, Mapping[str, tuple[Any, ...]]], fields: Sequence[str] = ("std", "rms", "mean", "inside")
+) -> "DataFrame":
+    """Return a frame of a row for each variable of each cluster or drone: its unit, and numbers, None for unknown."""
+    flat = [(name, variable, *values) for name, variables in rows.items() for variable, values in variables.items()]
+    names = (of, "variable", "unit", *fields)
+    texts = 3
+    return frame(
+        {name: np.array([row[i] for row in flat], object if i < texts else np.float64) for i, name in enumerate(names)},
+        (of, "variable"),
+    )
 
 
-def _frame(columns: Mapping[str, NDArray[Any]], index: Sequence[str] = ("t_s",)) -> Any:
-    """Return columns as a pandas frame; as they are without pandas."""
-    try:
-        import pandas
-    except ModuleNotFoundError:
-        return dict(columns)
-    table = pandas.DataFrame(dict(columns))
-    return table.set_index(list(index) if len(index) > 1 else index[0]) if set(index) <= set(columns) else table
-
-
-def _plain_name(file: str) -> str:
-    """Return the name of a figure without the paper's number and the suffix: shape for figure_8_shape.png."""
-    stem = Path(file).stem
-    return stem.split("_", 2)[2] if stem.startswith("figure_") else stem
+def _there(given: str, names: Iterable[str]) -> str:
+    """Return what there is in place of what was asked for, after the most alike."""
+    names = list(names)
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return f"{suggestion(given, names)}there are {', '.join(names[:SHOWN])}{more}" if names else "there are none"
 
 
 def _png_of(drawing: "Figure") -> Callable[[], bytes]:
     def png() -> bytes:
-        from io import BytesIO
-
         file = BytesIO()
         drawing.savefig(file, format="png")
         return file.getvalue()
@@ -340,6 +498,7 @@ def _png_of(drawing: "Figure") -> Callable[[], bytes]:
     return png
 
 
-def _unknown(what: str, found: str, known: Sequence[str], record: Path) -> str:
-    listed = ", ".join(known) or "it has none"
-    return f"{record}: no {what} is {found!r}; {suggestion(found, known)}there are {listed}"
+def _html_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    head = "".join(f"<th>{html.escape(each)}</th>" for each in heads)
+    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
+    return f"<table>{f'<tr>{head}</tr>' if head else ''}{body}</table>"

@@ -7,6 +7,7 @@ import json
 import shutil
 import time
 import uuid
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,11 @@ import msgspec
 
 from zsim.contract import keys, messages
 from zsim.errors import OTHER_OUT, DecodeError, RunError, file_fault
-from zsim.output_folder import RECORD, refuse_others
+from zsim.output_folder import RECORD, no_locks, refuse_others
 from zsim.record.mcap_layout import LIBRARY, OURS, is_ours
 from zsim.record.record_writer import cut_at_last, is_being_written
 from zsim.scenario import scenario_file
+from zsim.scenario.consistency import unflown_plans
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 
@@ -100,15 +102,25 @@ def new_launch(**how: Any) -> Launch:
     return Launch(uuid.uuid4().hex[:12], modules=tuple(map(str, plugin.folders())), **how)
 
 
-def prepare(folder: Path, scenario: Scenario, launch: Launch) -> None:
-    """Put what is to be flown, and how, into the run's folder; RunError if it cannot be written."""
-    with file_fault(folder, "cannot be written", OTHER_OUT):
-        if not launch.in_process:
-            (folder / LOGS).mkdir(exist_ok=True)
-        (folder / SCENARIO).write_text(scenario_file.to_text(scenario))
-        (folder / JOURNAL).mkdir(exist_ok=True)
-        content = json.dumps(msgspec.to_builtins(launch))  # not msgspec's: a path may hold no UTF-8
-        (folder / JOURNAL / LAUNCH).write_text(content, "utf-8")
+def prepare(
+    folder: Path, scenario: Scenario, launch: Launch, say: Callable[[str], None], continued: bool = False
+) -> None:
+    """Put what is to be flown, and how, into the run's folder, if that is not `continued`; and say it.
+
+    RunError if it cannot be written.
+    """
+    if not continued:
+        with file_fault(folder, "cannot be written", OTHER_OUT):
+            if not launch.in_process:
+                (folder / LOGS).mkdir(exist_ok=True)
+            (folder / SCENARIO).write_text(scenario_file.to_text(scenario))
+            (folder / JOURNAL).mkdir(exist_ok=True)
+            content = json.dumps(msgspec.to_builtins(launch))  # not msgspec's: a path may hold no UTF-8
+            (folder / JOURNAL / LAUNCH).write_text(content, "utf-8")
+    say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {folder}")
+    for line in (*unflown_plans(scenario), no_locks(folder)):
+        if line:
+            say(line)
 
 
 def forget_launch(folder: Path) -> None:

@@ -6,8 +6,9 @@ import shutil
 import tempfile
 from collections.abc import Mapping
 from functools import cache, cached_property
+from inspect import Parameter, Signature
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, get_type_hints
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario as Resolved
 from zsim.schema import plugin, yaml_file
+from zsim.schema.checker import suggestion
 from zsim_agents.hosting import check_classes, check_plans
 
 
@@ -22,7 +24,7 @@ class Scenario:
     """A scenario that is not changed in place.
 
         zsim.Scenario.load("step.yaml").with_({"environment.wind.gust_m_s": 1.0}, seed=3)
-        zsim.Scenario(name="pair", duration_s=20, drones=[{"name": "drone1", "position_m": [0, 0, 0]}, …])
+        zsim.Scenario(name="pair", duration_s=20, drones=[{"name": "drone1", "position_m": [0, 0, 0]}])
 
     It is checked as a whole when it is flown, or by `resolved`.
 
@@ -105,14 +107,37 @@ class Scenario:
             if file.exists():
                 shutil.copy(file, folder)
 
+    def __getitem__(self, path: str) -> Any:
+        """Return the value at a path as it is flown, in maps and lists as in YAML: `s["environment.wind.gust_m_s"]`.
+
+        Raises:
+            ScenarioError: a path leads nowhere, or the scenario has faults.
+        """
+        values = _by_path(self._whole)
+        if path not in values:
+            raise ScenarioError(
+                [f"{self.source}: {path} is not known; {suggestion(path, [*values])}see docs/scenario.md"]
+            )
+        return copy.deepcopy(values[path])
+
+    def _ipython_key_completions_(self) -> list[str]:
+        """Return all paths, with which notebooks complete `scenario["…`."""
+        return [*_by_path(self._whole)]
+
+    @property
+    def _whole(self) -> dict[str, Any]:
+        return yaml_file.value(scenario_file.to_text(self.resolved))
+
     def document(self) -> dict[str, Any]:
         """Return a copy of the document, as in YAML."""
         return copy.deepcopy(self._document)
 
     def to_yaml(self) -> str:
+        """Return the document as YAML text."""
         return yaml_file.dump(self._document)
 
     def save(self, path: str | Path) -> None:
+        """Write the document as a YAML file."""
         Path(path).write_text(self.to_yaml(), encoding="utf-8")
 
     def __eq__(self, other: object) -> bool:
@@ -139,6 +164,23 @@ class Scenario:
             return [self.named(each) for each in value]
         return value.item() if isinstance(value, np.generic) else value
 
+
+def _by_path(values: Any, path: str = "") -> dict[str, Any]:
+    """Return values by path, those of named entries of a list by their name."""
+    found = {path: values} if path else {}
+    parts: dict[str, Any] = values if isinstance(values, dict) else {}
+    if isinstance(values, list):
+        parts = {each["name"]: each for each in values if isinstance(each, dict) and "name" in each}
+    for name, each in parts.items():
+        found |= _by_path(each, f"{path}.{name}" if path else name)
+    return found
+
+
+# Editors complete the fields; the types are those of the declaration, as far as Python has them.
+_OWN = [Parameter(name, Parameter.KEYWORD_ONLY, annotation=kind) for name, kind in get_type_hints(Resolved).items()]
+setattr(Scenario, "__signature__", Signature(_OWN))  # noqa: B010
+_SELF = [Parameter("self", Parameter.POSITIONAL_ONLY), Parameter("set", Parameter.POSITIONAL_ONLY, default={})]
+setattr(Scenario.with_, "__signature__", Signature([*_SELF, *_OWN]))  # noqa: B010
 
 AnyScenario = str | Path | Mapping[str, Any] | Scenario | Resolved
 

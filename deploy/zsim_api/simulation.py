@@ -176,6 +176,7 @@ class Simulation:
 
     @property
     def estimates(self) -> Estimates:
+        """The newest estimates of all drones."""
         if self._estimates is None:
             count = len(self.names)
             shapes = {"position_m": (3,), "velocity_m_s": (3,), "orientation_wxyz": (4,), "covariance": (6, 6)}
@@ -207,7 +208,7 @@ class Simulation:
         sent: list[tuple[str, Command]] = []
         for drone, given in commands.items():
             self._place(drone)
-            several: Sequence[Any] = given if isinstance(given, list | tuple) else (given,)
+            several: Any = given if isinstance(given, list | tuple) else (given,)
             sent += [(drone, command) for command in several]
         self.events = []
         self._flight.send(sent)
@@ -304,6 +305,7 @@ class Simulation:
     # As an observer of the flight
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
+        """Take a message of the flight, which calls this."""
         kind = type(message)
         if kind is Estimate:
             self._last_estimates[keys.thing(key)] = message
@@ -313,6 +315,7 @@ class Simulation:
             self.events.append(message)
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
+        """Take the world's messages of a gate of the flight, which calls this."""
         self.sensors.add(gate)
 
 

@@ -7,6 +7,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ import numpy as np
 from rich.console import Console
 
 from zsim.errors import RunError, ScenarioError, missing
+from zsim.runtime.progress import cell
 from zsim.scenario.scenario_file import whole_path
 from zsim.schema import plugin
 from zsim.schema.checker import show
@@ -108,9 +110,8 @@ def sweep(
         rows = flown(plan, folder, workers, client, console=console, modules=tuple(modules))
     except KeyboardInterrupt:
         finished = len(SweepFolder(folder, plan).rows())
-        console.print(
-            f"interrupted: {finished} of {plan.runs} runs are finished; out={str(folder)!r} goes on", markup=False
-        )
+        text = f"interrupted: {finished} of {plan.runs} runs are finished; out={str(folder)!r} goes on"
+        console.print(cell(text), soft_wrap=True)
         raise
     except RunError as error:
         raise RunError(_in_python(str(error))) from None
@@ -153,7 +154,7 @@ def flown(
     plan: SweepPlan, folder: Path, workers: int | None = None, dask: Any = None, force: bool = False, **more: Any
 ) -> list[Row]:
     """Fly a plan into a folder; return its rows. Arguments and errors as of `SweepRequest`, and of its `sweep`."""
-    return swept(SweepRequest(plan, folder, workers, dask, force, open_run=load, **more))
+    return swept(SweepRequest(plan, folder, workers, dask, force, open_run=partial(load, trust=True), **more))
 
 
 def _text(path: str, values: Any, scenario: Scenario) -> str:

@@ -14,7 +14,7 @@ from zsim.contract import messages
 from zsim.record import RecordReader
 from zsim.scenario import scenario_file
 from zsim_analysis.in_process import fly
-from zsim_analysis.report.make_report import judge
+from zsim_analysis.report.summary import judge
 
 Array = NDArray[np.float64]
 SCENARIOS = Path(__file__).parents[2] / "scenarios"

@@ -20,7 +20,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.faults import KINDS
 from zsim_agents.estimation.estimator import Estimator
 from zsim_agents.formation.controller import Controller
-from zsim_analysis.in_process import agents
+from zsim_agents.hosting import hosted
 from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
@@ -103,7 +103,7 @@ def apart(world: World) -> list[Agent]:
 
 def fly(
     faults: Sequence[Document],
-    team: Callable[[World], list[Agent]] = agents,
+    team: Callable[[World], list[Agent]] = lambda world: [hosted(world.info(), world.scenario, ["*"])],
     between: Callable[[World], None] = lambda world: None,
     **values: Any,
 ) -> Flight:

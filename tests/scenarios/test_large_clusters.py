@@ -15,7 +15,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import Array, closest_pair
 from zsim_agents.formation.spaces.scenario_space import scenario_space
-from zsim_analysis.in_process import agents
+from zsim_agents.hosting import hosted
 from zsim_world.run.world import World
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
@@ -75,7 +75,7 @@ class Flight:
 def fly(name: str, *overrides: str, **values: Any) -> Flight:
     scenario = scenario_file.load(SCENARIOS / f"{name}.yaml", overrides, **values)
     world, flight = World(scenario), Flight(scenario)
-    bus = Bus(world, agents(world), time.monotonic_ns, flight.sink)
+    bus = Bus(world, [hosted(world.info(), scenario, ["*"])], time.monotonic_ns, flight.sink)
     bus.join()
     while bus.turn():
         pass

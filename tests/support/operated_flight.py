@@ -11,7 +11,7 @@ from zsim.contract.run_messages import ControlAnswer, ControlRequest, Event
 from zsim.runtime.bus import Bus
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import closest_pair
-from zsim_analysis.in_process import agents
+from zsim_agents.hosting import hosted
 from zsim_world.run.world import World
 
 OPERATOR, PRIORITY = "tester.one", 10
@@ -28,7 +28,7 @@ class OperatedFlight:
         self.collisions: list[Event] = []
         self.closest_m: list[float] = []
         self.formation: Any = None
-        (self._agents,) = agents(self.world)
+        self._agents = hosted(self.world.info(), scenario, ["*"])
         self._bus = Bus(self.world, [self._agents], time.monotonic_ns, self._sink)
         self._bus.join()
 

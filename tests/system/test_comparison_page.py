@@ -10,7 +10,7 @@ from synthetic_record import Flown
 
 from zsim_analysis.report.comparison import comparison_page
 from zsim_analysis.report.comparison_figures import ComparedRun
-from zsim_analysis.report.make_report import judge
+from zsim_analysis.report.summary import judge
 
 WIDTH_PX = 1280
 HIDDEN_PX = "[...document.querySelectorAll('.wide')].map(each => each.scrollWidth - each.clientWidth)"

@@ -10,6 +10,7 @@ How a fenced block is marked, in the line that opens it:
     yaml, yaml part     a whole scenario; top-level sections to be put into scenarios/step.yaml
     yaml inventory      a whole inventory, into which scenarios/step.yaml must fit
     python              must compile
+    python run          executed, all those of a page as one script
     text, json          output and drawings, not checked
 
 A block of any other kind is a fault, so nothing is left out without a word. What `adapted` changes is all that
@@ -75,6 +76,7 @@ KINDS = (
     "yaml part",
     "yaml inventory",
     "python",
+    "python run",
     "text",
     "json",
 )
@@ -140,6 +142,14 @@ def test_commands_run(page: Path, tmp_path: Path) -> None:
                 checkout.open_terminals(block, page)
     if missing:
         pytest.skip(f"{page.name}: all but the blocks with {', '.join(missing)}, which this machine does not have")
+
+
+@pytest.mark.parametrize("page", pages_with("python run"))
+def test_python_runs(page: Path, tmp_path: Path) -> None:
+    with Checkout(tmp_path) as checkout:
+        script = tmp_path / f"{page.stem}_page.py"
+        script.write_text("\n\n".join(block.text for block in blocks(page) if block.kind == "python run"))
+        checkout.run(Block("bash run", f"python {script.name}", 1, 0), page)
 
 
 class Checkout:
@@ -277,7 +287,7 @@ def lines(block: Block) -> list[str]:
 EXAMPLE_S = 25.0  # simulated seconds of an example: past the take-off at 20 s
 PORTS = ("7447", "7448", "8000", "7470", "11311")  # as printed: world, router, HTTP, lines, ROS master
 LEADERS = r"zsim (run|world|replay|router|gateway|ros1|ros2|camera|detect)\b"
-ANSWERED = ("estimator", "controller", "host", "record", "keys", "echo", "hz", "pub", "ask", "gateway", "ros1", "ros2", "camera", "detect",
+ANSWERED = ("agent", "estimator", "controller", "host", "record", "keys", "echo", "hz", "pub", "ask", "gateway", "ros1", "ros2", "camera", "detect",
             "fault (?:add|clear|list)")  # fmt: skip
 FOREIGN = (
     "plain_client.py",

@@ -20,7 +20,7 @@ from forked_commands import USER_FAULT
 from refused import has_terms
 from wire import PATIENCE_S
 
-from zsim_analysis.report.make_report import judge
+from zsim_analysis.report.summary import judge
 from zsim_analysis.sweep.sweep import load, locked
 
 GUST = "environment.wind.gust_m_s"

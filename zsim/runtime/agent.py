@@ -93,6 +93,7 @@ class Agent(ABC):
 
     @property
     def role(self) -> str:
+        """The first part of the name, `estimator` of `estimator.drone1`."""
         return self.name.split(".", 1)[0]
 
     @property
@@ -199,6 +200,7 @@ class Agent(ABC):
         return
 
     def control_keys(self) -> tuple[str, ...]:
+        """Return the keys at which it answers requests, by `control`."""
         return ()
 
     def control(self, key: str, request: ControlRequest) -> ControlAnswer:
@@ -206,6 +208,7 @@ class Agent(ABC):
         return ControlAnswer(ok=False, error=f"{key}: {self.name} answers no requests")
 
     def warm_start_keys(self) -> tuple[str, ...]:
+        """Return the keys whose last value a new incarnation takes over, by `warm_start`."""
         return ()
 
     def warm_start(self, key: str, message: Any) -> None:  # noqa: B027 - taking over nothing is a choice

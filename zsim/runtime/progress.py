@@ -33,6 +33,22 @@ def cell(text: str) -> Text:
     return Text(printable(text))
 
 
+class NotebookLine:
+    """A line below a notebook's cell that changes in its place; rich needs ipywidgets for that."""
+
+    def __init__(self) -> None:
+        self._handle: Any = None
+
+    def update(self, text: str) -> None:
+        from IPython.display import Pretty, display  # there in a notebook
+
+        shown = Pretty(printable(text))
+        if self._handle is None:
+            self._handle = display(shown, display_id=True)
+        else:
+            self._handle.update(shown)
+
+
 class ProgressSink(Protocol):
     """Shows progress: a `Screen` or `JsonProgress`."""
 

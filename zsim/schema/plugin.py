@@ -34,6 +34,7 @@ from zsim.schema.checker import show
 Object = TypeVar("Object")
 FOLDERS = "ZSIM_PLUGIN_PATH"  # environment variable, so that processes started from here search there too
 IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # environment variable, for the same reason, and what it then holds
+NO_LOOKUP = "unseen"  # or this
 WHERE = "install it, or put it on PYTHONPATH or beside the scenario"
 
 PACKAGES = frozenset({"zsim", "zsim_world", "zsim_agents", "zsim_bridges", "zsim_analysis", "zsim_api", "zsim_deploy"})
@@ -61,15 +62,19 @@ def folders() -> tuple[Path, ...]:
 
 
 @contextmanager
-def names_only(wanted: bool = True) -> Iterator[list[str]]:
+def names_only(wanted: bool = True, looked_up: bool = True) -> Iterator[list[str]]:
     """Import nothing that documents name, here and in processes started from here, unless `wanted` is False.
+
+    Args:
+        wanted: whether to do so at all.
+        looked_up: whether a name that is nowhere is a fault, as where it is imported.
 
     Yields:
         the names of what was found and not imported, as documents have them; empty where all may be imported.
     """
     former, _SKIPPED[:] = os.environ.get(IMPORTS), []
     if wanted:
-        os.environ[IMPORTS] = NO_IMPORTS
+        os.environ[IMPORTS] = NO_IMPORTS if looked_up else NO_LOOKUP
     try:
         yield _SKIPPED
     finally:
@@ -79,7 +84,7 @@ def names_only(wanted: bool = True) -> Iterator[list[str]]:
 
 
 def may_import() -> bool:
-    return os.environ.get(IMPORTS) != NO_IMPORTS
+    return os.environ.get(IMPORTS) not in (NO_IMPORTS, NO_LOOKUP)
 
 
 def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Callable[..., Any]:
@@ -243,7 +248,8 @@ def _imported(name: str, what: str, attribute: str = "") -> ModuleType:
     """Import a module, if that is allowed; else check that it exists and that its text defines the attribute."""
     package = name.partition(".")[0]
     if not may_import() and package not in PACKAGES:
-        _find(name, what, attribute)
+        if os.environ[IMPORTS] != NO_LOOKUP:
+            _find(name, what, attribute)
         full = f"{name}:{attribute}" if attribute else name
         if full not in _SKIPPED:
             _SKIPPED.append(full)

@@ -94,6 +94,24 @@ def table_columns(kind: type[Struct], names: Mapping[str, Sequence[str]]) -> tup
     )
 
 
+def column_values(table: Iterable[Columns], batch: RowBatch) -> Iterator[tuple[str, Kind, Values]]:
+    """Yield name, kind and values of every column of a batch, in the order of the table."""
+    for each in table:
+        values = each.values(batch)
+        apart = values.T if isinstance(values, np.ndarray) and values.ndim == 2 else [values]
+        for name, column in zip(each.columns, apart, strict=True):
+            yield name, each.kind, column
+
+
+def as_array(kind: Kind, values: Values) -> NDArray[Any]:
+    """Return values as int64, float64, bool or objects; whole numbers of which some are missing as float64 with NaN."""
+    if kind == "text":
+        return np.array(values, object)
+    if kind == "whole" and not any(value is None for value in values):
+        return np.array(values, np.int64)
+    return np.array(values, bool if kind == "flag" else np.float64)
+
+
 def open_fields(kind: type[Struct]) -> dict[str, Literal["named", "numbers", "pairs"]]:
     """Return the fields of a message whose columns depend on its content: named variables, maps of numbers or pairs."""
     opens: dict[str, Literal["named", "numbers", "pairs"]] = {}
@@ -195,12 +213,16 @@ def _components(name: str, info: inspect.Type) -> list[str]:
         parts = list(ROTORS)
     elif not isinstance(info, inspect.TupleType) or not all(isinstance(each, _NUMERIC) for each in info.item_types):
         parts = []
-    elif name.endswith(QUATERNION):
-        name, parts = name.removesuffix(QUATERNION), list("wxyz")
     else:
-        count = len(info.item_types)
-        parts = list("xyz") if count == 3 else [str(i) for i in range(count)]
+        return component_names(name, len(info.item_types))
     return [f"{name}_{part}" for part in parts]
+
+
+def component_names(name: str, count: int) -> list[str]:
+    """Return the columns of a vector of so many numbers: `_x`, `_y` and `_z` of three, `_w` to `_z` of a quaternion."""
+    if name.endswith(QUATERNION) and count == len("wxyz"):
+        return [f"{name.removesuffix(QUATERNION)}_{part}" for part in "wxyz"]
+    return [f"{name}_{part}" for part in ("xyz" if count == 3 else range(count))]
 
 
 def json_text(value: Any) -> str:

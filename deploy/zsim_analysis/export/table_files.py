@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from msgspec import Struct
 
 from zsim.errors import ReportError
-from zsim_analysis.export.columns import RowBatch, TableSurvey, table_name
+from zsim_analysis.export.columns import RowBatch, TableSurvey, as_array, column_values, table_name
 
 ROW_GROUP = 65_536  # rows of a Parquet row group, of which one per table is held in memory
 _TYPES = {"whole": pa.int64(), "number": pa.float64(), "flag": pa.bool_(), "text": pa.string()}
@@ -47,12 +47,8 @@ class TableFolder:
             opened = self._stack.enter_context((self._folder / file).open("wb"))
             self._sinks[file] = _Csv(opened, schema) if self._suffix == "csv" else _Parquet(opened, schema)
             self._stack.callback(self._sinks[file].close)
-        arrays: list[Any] = []
-        for each in table:
-            values = each.values(batch)
-            arrays += list(values.T) if isinstance(values, np.ndarray) and values.ndim == 2 else [values]
         # no message holds NaN: it marks a missing value
-        rows = [pa.array(values, each.type, from_pandas=True) for values, each in zip(arrays, schema, strict=True)]
+        rows = [pa.array(values, _TYPES[kind], from_pandas=True) for _, kind, values in column_values(table, batch)]
         self._sinks[file].write(pa.RecordBatch.from_arrays(rows, schema=schema))
         before = self._written[file].rows if file in self._written else 0
         self._written[file] = WrittenTable(file, before + len(batch.names), schema.names)
@@ -146,10 +142,8 @@ class MatFile:
                 values = each.values(own)
                 if each.kind == "text":  # a list until all of it is known
                     block[each.name] = ["" if value is None else value for value in values]
-                elif each.kind == "whole" and not any(value is None for value in values):
-                    block[each.name] = np.array(values, np.int64)
                 else:
-                    block[each.name] = np.array(values, bool if each.kind == "flag" else np.float64)
+                    block[each.name] = as_array(each.kind, values)
             subjects.setdefault(name, []).append(block)
 
     def finish(self) -> list[WrittenTable]:

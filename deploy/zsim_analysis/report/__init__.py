@@ -1,7 +1,7 @@
 """The report of a run, made from its record alone, and the comparison of several runs.
 
     make_report(DIR)     reads DIR/run.mcap and writes DIR/summary.json, DIR/figures/*.png, DIR/report.html
-    judge(PATH)          the same without writing anything: flight, formations, summary
+    judge(PATH)          the same without writing anything: flight, formations, summary; needs no matplotlib
     compare(DIRS, OUT)   one page of several runs, side by side
     terminal_text(summary)   shortfalls and errors of the formations, for the terminal
 

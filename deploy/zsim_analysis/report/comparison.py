@@ -14,8 +14,8 @@ from zsim.output_folder import RECORD
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.shortfall import span_text
 from zsim_analysis.report.comparison_figures import UNPLANNED, ComparedRun, clusters, comparison_figures, parameters
-from zsim_analysis.report.make_report import Picture, facts, judge, sources, template, write_page
-from zsim_analysis.report.summary import STATISTICS
+from zsim_analysis.report.make_report import Picture, facts, sources, template, write_page
+from zsim_analysis.report.summary import STATISTICS, judge
 
 ABSENT = "–"
 RUNS_PER_TABLE = 2  # beside each other with all their statistics: as many as fit the page

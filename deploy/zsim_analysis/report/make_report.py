@@ -10,22 +10,24 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
+from matplotlib.figure import Figure
 
-from zsim.errors import RecordError, ReportError
+from zsim.errors import ReportError
 from zsim.output_folder import RECORD
 from zsim.presentation import colours_of
 from zsim_analysis.reading.drone_errors import distances, estimate_errors, separations, velocity_responses
-from zsim_analysis.reading.formation import Formation, formations_of, goal_errors
-from zsim_analysis.reading.recorded_flight import RecordedFlight, read_flight
+from zsim_analysis.reading.formation import Formation, goal_errors
+from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.reading.shortfall import seconds_text, span_text
 from zsim_analysis.report import FORMATS
 from zsim_analysis.report import drone_figures as drones
 from zsim_analysis.report.figure_style import DARK, TAKE_OVER, VERMILION, ReportFigure, mark_figure, time_marks
 from zsim_analysis.report.formation_figures import ROWS_MAX, draw_errors, draw_parameters, numbered, parameter_groups
 from zsim_analysis.report.paper import PAPER_NOTE, flies_paper_test
-from zsim_analysis.report.summary import PAPER_COLUMN, RunSummary, error_table, summarise
+from zsim_analysis.report.summary import PAPER_COLUMN, RunSummary, error_table, judge
 
 FAULTS_MAX = 6  # at the head of a page
 REFERENCE = (
@@ -53,112 +55,107 @@ def make_report(
     return summary
 
 
-def judge(
-    record: Path, progress: Callable[[str], None] = lambda _: None, answers: bool = False
-) -> tuple[RecordedFlight, list[Formation], RunSummary]:
-    """Return the flight of a record, its formations and its summary.
-
-    With `answers` it includes the drones' estimates and velocity commands. `progress` receives a text at each step.
-
-    Raises:
-        RecordError: there is no record, or it holds no truth of any drone.
-    """
-    progress("reading the record")
-    flight = read_flight(record, answers)
-    if all(len(track.t_ns) == 0 for track in flight.tracks):
-        content = f"holds {flight.messages} messages and no truth" if flight.messages else "holds no message"
-        raise RecordError(f"{record}: {content} ({flight.completeness}); there is nothing to report")
-    progress("computing the formation's errors")
-    formations = formations_of(flight)
-    return flight, formations, summarise(flight, formations, record)
-
-
 # Figures, in the order of the page
 
 
 def figures(flight: RecordedFlight, formations: Sequence[Formation], summary: RunSummary) -> Iterator[ReportFigure]:
     """Yield the figures for which the record has data, with a mark if the flight has shortfalls."""
-    for figure in _unmarked(flight, formations, summary.window_s):
-        if summary.shortfalls:
-            found = [each.text for each in summary.shortfalls if each.fails or summary.as_planned]
-            more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-            head, colour = ("Note", DARK) if summary.as_planned else ("Not as planned", VERMILION)
-            mark_figure(figure.drawing, f"{head}{more}", found[0], colour)
-        yield figure
+    return (marked(each, summary) for each in planned_figures(flight, formations, summary.window_s))
 
 
-def _unmarked(
+class PlannedFigure(NamedTuple):
+    """A figure that has not been drawn yet; see `ReportFigure`."""
+
+    name: str
+    title: str
+    caption: str
+    draw: Callable[[], Figure]
+
+
+def marked(planned: PlannedFigure, summary: RunSummary) -> ReportFigure:
+    """Draw a figure, with a mark if the flight has shortfalls."""
+    drawing = planned.draw()
+    if summary.shortfalls:
+        found = [each.text for each in summary.shortfalls if each.fails or summary.as_planned]
+        more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+        head, colour = ("Note", DARK) if summary.as_planned else ("Not as planned", VERMILION)
+        mark_figure(drawing, f"{head}{more}", found[0], colour)
+    return ReportFigure(planned.name, planned.title, planned.caption, drawing)
+
+
+def planned_figures(
     flight: RecordedFlight, formations: Sequence[Formation], window_s: tuple[float, float]
-) -> Iterator[ReportFigure]:
+) -> Iterator[PlannedFigure]:
+    """Yield the figures for which the record has data."""
     for i, formation in enumerate(formations):  # the first cluster's have names without the cluster's
         yield from _of_cluster(flight, formation, window_s, f"_{formation.name}" if i else "")
     marks = time_marks(flight, formations[0] if formations else None)
     colours = colours_of([track.name for track in flight.tracks])
     has_truth = any(len(track.t_ns) for track in flight.tracks)
     if has_truth:
-        yield ReportFigure(
+        yield PlannedFigure(
             "plan_view.png",
             "Plan view",
             "True paths from above, squares where they begin and dots where they end; black: desired centroid; grey: "
             "the formation at some instants of simulated time.",
-            drones.draw_plan(flight, formations),
+            partial(drones.draw_plan, flight, formations),
         )
     if apart := distances(flight, drones.PAIRS_MAX):
         what = "every two drones" if apart.pairs else "each drone to the nearest other one: median, 5 to 95 %, extremes"
-        yield ReportFigure(
+        yield PlannedFigure(
             "distances.png",
             "Distances between drones",
             f"True distance of {what}; below the first line the controller's guard parts them.",
-            drones.draw_distances(apart, separations(flight), colours, marks),
+            partial(drones.draw_distances, apart, separations(flight), colours, marks),
         )
     if has_truth:
-        yield ReportFigure(
+        yield PlannedFigure(
             "drones.png",
             "Drones",
             "True altitude, state of the firmware and battery of every drone.",
-            drones.draw_drones(flight, marks),
+            partial(drones.draw_drones, flight, marks),
         )
     if errors := estimate_errors(flight):
-        yield ReportFigure(
+        yield PlannedFigure(
             "estimates.png",
             "Estimates",
             "Estimate − truth with the band of two standard deviations that the estimator states, and NEES, the error "
             "of position and velocity squared and divided by its covariance: 6 on average where that is true. Shares "
             "and means, above the panels, are those of the window; the axes hold all since the engagement, and what is "
             "larger before it leaves them.",
-            drones.draw_estimates(errors, colours, window_s, marks),
+            partial(drones.draw_estimates, errors, colours, window_s, marks),
         )
     if responses := velocity_responses(flight):
-        yield ReportFigure(
+        yield PlannedFigure(
             "velocities.png",
             "Commanded and flown velocity",
             "By the drone's heading. Flown: in truth; commanded: as sent by whoever flew the drone, without the delay "
             "of the link. Of many drones: median, 5 to 95 % and extremes of the difference.",
-            drones.draw_velocities(responses, colours, marks),
+            partial(drones.draw_velocities, responses, colours, marks),
         )
 
 
 def _of_cluster(
     flight: RecordedFlight, formation: Formation, window_s: tuple[float, float], suffix: str
-) -> Iterator[ReportFigure]:
+) -> Iterator[PlannedFigure]:
     marks, goal = time_marks(flight, formation), goal_errors(formation, flight.scenario)
     paper = flies_paper_test(flight, formation.name) and not marks.has(TAKE_OVER)
     reference, window = ("(b)", "(c)") if goal else ("(a)", "(b)")
     large = SPREAD if len(formation.names) > ROWS_MAX else ""
-    yield ReportFigure(
+    yield PlannedFigure(
         f"figure_5_errors{suffix}.png",
         f"Formation parameters' errors{numbered(5, paper)}",
         f"{GOAL if goal else ''}{reference} Against the reference, the whole run. {window} The window of the "
         f"statistics, on an axis of its own. {large}{REFERENCE}",
-        draw_errors(formation, window_s, marks, goal),
+        partial(draw_errors, formation, window_s, marks, goal),
     )
     for file, number, what, names in parameter_groups(formation.names):
         shown = ", ".join(names) if len(names) <= ROWS_MAX else f"of the {len(names)} variables those that move most"
-        yield ReportFigure(
+        yield PlannedFigure(
             f"{file}{suffix}.png",
             f"{what}{numbered(number, paper)}",
             f"Desired, measured (from the estimates) and true {shown}.",
-            draw_parameters(formation, names, marks),
+            partial(draw_parameters, formation, names, marks),
         )
 
 

@@ -1,7 +1,7 @@
 """summary.json: what was flown, and how well; and its tables of errors, for the page and the terminal."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,11 @@ from rich.text import Text
 
 from zsim import __version__
 from zsim.contract.fingerprint import TruthHash
-from zsim.errors import printable
+from zsim.errors import RecordError, printable
 from zsim.presentation import Column, FittedTable
 from zsim_agents.formation.spaces.cluster_space import unit
-from zsim_analysis.reading.formation import Formation, ParameterErrors, min_separation_m
-from zsim_analysis.reading.recorded_flight import TRUTH_WIDTH, RecordedFlight
+from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of, min_separation_m
+from zsim_analysis.reading.recorded_flight import TRUTH_WIDTH, RecordedFlight, read_flight
 from zsim_analysis.reading.recorded_run import DriverLink, command_age_ms, driver_links
 from zsim_analysis.reading.shortfall import (
     NOT_AS_PLANNED,
@@ -121,6 +121,26 @@ class RunSummary(Struct, frozen=True):
 
     def json(self) -> bytes:
         return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
+
+
+def judge(
+    record: Path, progress: Callable[[str], None] = lambda _: None, answers: bool = False
+) -> tuple[RecordedFlight, list[Formation], RunSummary]:
+    """Return the flight of a record, its formations and its summary.
+
+    With `answers` it includes the drones' estimates and velocity commands. `progress` receives a text at each step.
+
+    Raises:
+        RecordError: there is no record, or it holds no truth of any drone.
+    """
+    progress("reading the record")
+    flight = read_flight(record, answers)
+    if all(len(track.t_ns) == 0 for track in flight.tracks):
+        content = f"holds {flight.messages} messages and no truth" if flight.messages else "holds no message"
+        raise RecordError(f"{record}: {content} ({flight.completeness}); there is nothing to report")
+    progress("computing the formation's errors")
+    formations = formations_of(flight)
+    return flight, formations, summarise(flight, formations, record)
 
 
 def summarise(flight: RecordedFlight, formations: list[Formation], record: Path) -> RunSummary:

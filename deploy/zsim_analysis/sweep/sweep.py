@@ -8,7 +8,6 @@ The folder of a sweep:
     runs/000012/     record of run 12, if records are kept
 """
 
-import html
 import os
 import shutil
 import sys
@@ -28,7 +27,7 @@ from rich.live import Live
 
 from zsim.errors import ReportError, RunError, printable
 from zsim.output_folder import no_locks, refuse_others, take_lock
-from zsim.runtime.progress import cell
+from zsim.runtime.progress import NotebookLine, cell
 from zsim.runtime.rate_limit import RateLimit
 from zsim.schema import plugin
 from zsim_analysis.sweep.design import PLAN, SEED, Axis, Grid, SweepDesign, SweepPlan, difference, is_sweep
@@ -149,7 +148,8 @@ class SweepScreen:
         if self.console.is_terminal:
             self._live.start()
         elif self.console.is_jupyter and not self.console.quiet:
-            self._cell = NotebookLine(self.line())
+            self._cell = NotebookLine()
+            self._cell.update(self.line())
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -190,22 +190,6 @@ class SweepScreen:
         elif self._done < self._total:
             text += f"  the first ones are flying, {span(elapsed_s)}"
         return text + (f"  {self._failed} failed" if self._failed else "")
-
-
-class NotebookLine:
-    """A line below a notebook's cell that changes; rich needs ipywidgets for that."""
-
-    def __init__(self, text: str) -> None:
-        from IPython.display import display  # there in a notebook
-
-        self._handle: Any = display(self._shown(text), raw=True, display_id=True)
-
-    def update(self, text: str) -> None:
-        self._handle.update(self._shown(text), raw=True)
-
-    def _shown(self, text: str) -> dict[str, str]:
-        text = printable(text)
-        return {"text/plain": text, "text/html": f"<pre>{html.escape(text)}</pre>"}
 
 
 def span(seconds: float) -> str:

@@ -13,10 +13,9 @@ from typing import Any, NamedTuple
 from msgspec.structs import replace
 
 from zsim.errors import RecordError, RunFailedError, SessionError
-from zsim.output_folder import RECORD, no_locks
+from zsim.output_folder import RECORD
 from zsim.record import repair
 from zsim.runtime.progress import Screen
-from zsim.scenario.consistency import unflown_plans
 from zsim.scenario.roles import driver_lines, expected_processes, watched_drones
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import BottomCamera, FrontCamera
@@ -101,7 +100,7 @@ def run_processes(options: RunOptions, screen: Screen) -> Outcome:
 
 def _run(options: RunOptions, screen: Screen, signals: EndSignals) -> Outcome:
     """Prepare the folder and the fork server, and run on an endpoint; on another one where its port was lost."""
-    _prepare(options, screen)
+    run_folder.prepare(options.out, options.scenario, options.launch, screen.say, options.continued)
     if options.camera_children() and not options.launch.rate and not options.scenario.gates("camera"):
         screen.say("as fast as it goes, a lockstep run is faster than its cameras; --rate 1 leaves them time")
     with RoleLauncher(screen.say, str(options.out)) as launcher:
@@ -166,10 +165,9 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
 
 
 def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
-    from zsim_analysis.in_process import fly
+    from zsim_api.flight import fly_here
     from zsim_world.fleet.fleet import DivergedError
 
-    _prepare(options, screen)
     with EndSignals(options.out / "run.log", screen.hang_up) as signals:
         stop = StopChannel()
 
@@ -177,27 +175,13 @@ def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
             return signals.look() or stop.reason()
 
         try:
-            own, changed = [each.make for each in options.agents()], options.launch.changed
-            ended = fly(options.scenario, options.out / RECORD, reason, screen, changed=changed, own=own)
+            own, here = [each.make for each in options.agents()], (options.scenario, options.out, options.launch)
+            ended = fly_here(*here, own, screen, reason, options.continued)
         except (DivergedError, RunFailedError) as error:
             return Outcome(str(error), failed=True)
         finally:
             stop.restore_signals()
-        interrupted = reason() is not None
-        if not interrupted:
-            run_folder.forget_launch(options.out)
-        return Outcome(ended, interrupted=interrupted)
-
-
-def _prepare(options: RunOptions, screen: Screen) -> None:
-    """Put what is to be flown, and how, into the run's folder, and show it; errors as of `prepare`."""
-    scenario = options.scenario
-    if not options.continued:
-        run_folder.prepare(options.out, scenario, options.launch)
-    screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
-    for line in (*unflown_plans(scenario), no_locks(options.out)):
-        if line:
-            screen.say(line)
+        return Outcome(ended, interrupted=reason() is not None)
 
 
 def options_of(folder: Path) -> RunOptions:

@@ -71,7 +71,7 @@ def test_an_agent_flies_beside_the_stock_ones(tmp_path: Path) -> None:
 def test_fields_are_replaced_by_path_by_name_and_by_class(tmp_path: Path) -> None:
     scenario = zsim.Scenario(**PAIR).with_({"environment.wind.gust_m_s": 1.0}, duration_s=1)
     run = zsim.run(scenario, seed=9, out=tmp_path / "run", progress=False, set={"drones.d1.mass_kg": 0.5})
-    flown = run.scenario
+    flown = run.scenario.resolved
     assert (flown.seed, flown.duration_s, flown.environment.wind.gust_m_s) == (9, 1, 1.0)
     assert flown.drones[0].mass_kg == 0.5
     with refused(ScenarioError, "drones.d3.mass_kg=:", "d2"):

@@ -1,126 +1,411 @@
-"""A run on record as tables, errors and figures: the numbers of the record, the report and the export."""
+"""A run on record, read from Python: against the messages that were written, the export and the report."""
 
-import builtins
+import html
 import json
+import sys
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
+import recorded_run
+import synthetic_record
 from refused import refused
+from synthetic_record import Flown
 
 import zsim
-from zsim.errors import RunError
+from zsim.contract import keys
+from zsim.contract.messages import decode
+from zsim.errors import DocumentError, RecordError, RunError
+from zsim.record import RecordReader, RecordWriter
+from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_analysis.export import Format
+from zsim_analysis.export.columns import MessageSelection
 from zsim_analysis.export.make_export import export
-from zsim_analysis.reading.recorded_flight import read_flight
+from zsim_analysis.report import drone_figures, make_report
+from zsim_api import recorded, tables
 
-PAIR: dict[str, Any] = {
-    "name": "pair",
-    "seed": 3,
-    "duration_s": 12,
-    "sensors": {"preset": "paper"},
-    "drones": [{"name": "d1", "position_m": [0, 3, 0]}, {"name": "d2", "position_m": [0, -3, 0]}],
-    "clusters": [{"name": "main", "drones": ["d1", "d2"], "plan": {"takeoff_s": 0.1}}],
-}
+DRONE = "a-b.c"
+NAMES = [*cluster_space(3).names]
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> zsim.Run:
-    return zsim.run(PAIR, out=tmp_path_factory.mktemp("runs") / "pair", progress=False)
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flight of six seconds, engaged from about the fourth on, with a message of every kind."""
+    made = tmp_path_factory.mktemp("run")
+    recorded_run.write(made / "run.mcap")
+    return made
 
 
-def test_a_table_has_simulated_time_as_index_and_units_in_its_columns(run: zsim.Run) -> None:
-    truth = run.truth("d1")
+@pytest.fixture(scope="module")
+def run(folder: Path) -> zsim.Run:
+    return zsim.load(folder)
+
+
+@pytest.fixture
+def without_pandas(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+
+
+# Tables
+
+
+def test_truth_is_what_was_recorded(folder: Path, run: zsim.Run) -> None:
+    truth, written = run.truth(DRONE), recorded_run.messages_on(folder, keys.truth(DRONE))
+    assert len(truth) == len(written) > 290
+    assert [*truth.index] == [message.t_ns / 1e9 for message in written]
+    for i, axis in enumerate("xyz"):
+        assert [*truth[f"position_m_{axis}"]] == [message.position_m[i] for message in written]
     assert truth.index.name == "t_s"
-    assert truth.index[[0, 1, -1]].tolist() == [0.0, 0.02, 12.0]
-    track = read_flight(run.record).tracks[0]
-    np.testing.assert_array_equal(truth[["position_m_x", "position_m_y", "position_m_z"]].to_numpy(), track.p_W)
-    gps = run.sensor("d2", "gps")
-    assert gps.index[1] - gps.index[0] == pytest.approx(0.2)
-    assert gps["sigma_m"].iloc[0] == 2.0
-    assert set(run.commands("d1").columns) >= {"velocity_m_s_x", "yaw_rate_rad_s", "source"}
-    assert "takeoff" in run.commands("d1", "mode")["mode"].tolist()
-    assert run.status("d1").state.iloc[0] == "landed"
+    assert not {"name", "t_ns", "seq", "wall_ns"} & {*truth}
 
 
-def test_its_columns_are_those_of_an_export(run: zsim.Run, tmp_path: Path) -> None:
-    export(run.folder, Format.CSV, tmp_path / "csv")
-    for file, table in (("truth", run.truth("d1")), ("estimate", run.estimate("d1")), ("event", run.events)):
-        header = (tmp_path / "csv" / f"{file}.csv").read_text().partition("\n")[0].replace('"', "").split(",")
-        assert [*table.columns] == [name for name in header if name not in ("name", "t_s", "t_ns")]
+EXPORTED = {
+    "truth": lambda run: run.truth("drone1"),
+    "estimate": lambda run: run.estimate("drone1"),
+    "gps": lambda run: run.sensor("drone1", "gps"),
+    "status": lambda run: run.sensor("drone1", "status"),
+    "velocity": lambda run: run.commands("drone1"),
+    "mode": lambda run: run.commands("drone1", "mode"),
+    "cluster_state": lambda run: run.cluster("main"),
+    "event": lambda run: run.events,
+}
 
 
-def test_errors_are_those_of_the_report(run: zsim.Run) -> None:
-    page = run.report()
+@pytest.mark.parametrize("name", EXPORTED)
+def test_a_frame_has_the_columns_and_rows_of_the_export(folder: Path, run: zsim.Run, name: str, tmp_path: Path) -> None:
+    selection = MessageSelection(
+        ("drone/drone1/*", "drone/drone1/sensor/*", "drone/drone1/cmd/*", "cluster/*/state", "world/event")
+    )
+    export(folder, Format.PARQUET, tmp_path / "tables", selection)
+    table = pd.read_parquet(tmp_path / "tables" / f"{name}.parquet").set_index("t_s")
+    expected = table.drop(columns=["name", "t_ns", "seq", "wall_ns"])
+    pd.testing.assert_frame_equal(plain(EXPORTED[name](run)), plain(expected))
+
+
+def plain(table: pd.DataFrame) -> pd.DataFrame:
+    return table.astype(object).where(table.notna(), None)
+
+
+def test_a_hat_that_was_seen_is_a_row(run: zsim.Run) -> None:
+    seen = run.messages("drone/drone1/sensor/sightings")
+    assert {"camera", "hat", "direction_B_x", "range_m"} <= {*seen}
+
+
+def test_own_messages_have_a_column_for_each_field(run: zsim.Run) -> None:
+    thing = run.messages("own/thing")
+    assert thing[["x_0", "x_1"]].to_numpy().tolist() == [[1.0, 2.0]]
+    assert run.messages("own/noise")["hexadecimal"].tolist() == ["c100"]
+
+
+@pytest.mark.parametrize(
+    ("values", "columns"),
+    [
+        ([[1.5, 2, 3], None], {"f_x": [1.5, np.nan], "f_y": [2.0, np.nan], "f_z": [3.0, np.nan]}),
+        ([1, 2], {"f": [1, 2]}),
+        ([1, None, 0.5], {"f": [1.0, np.nan, 0.5]}),
+        ([True, False], {"f": [True, False]}),
+        ([True, None], {"f": [True, None]}),
+        ([2**63, 1], {"f": [2.0**63, 1.0]}),
+        (["a", None], {"f": ["a", None]}),
+        ([[1, 2], [1]], {"f": ["[1,2]", "[1]"]}),
+        ([{"a": 1}, 3], {"f": ['{"a":1}', "3"]}),
+        ([[True, False]], {"f": ["[true,false]"]}),
+        ([[]], {"f": ["[]"]}),
+    ],
+)
+def test_own_fields_become_numbers_where_all_are(values: list[Any], columns: dict[str, list[Any]]) -> None:
+    made = tables._own_columns("f", values)
+    assert {*made} == {*columns}
+    for name, expected in columns.items():
+        np.testing.assert_array_equal(made[name], np.array(expected, made[name].dtype))
+
+
+def test_messages_have_their_stamps_too(folder: Path, run: zsim.Run) -> None:
+    with RecordReader(folder / "run.mcap") as reader:
+        written = [*reader.messages({"clock"})]
+    clock = run.messages("clock")
+    assert clock["t_ns"].tolist() == [each.t_ns for each in written]
+    assert clock["wall_ns"].tolist() == [each.wall_ns for each in written]
+    assert clock["seq"].tolist() == [decode("clock", each.payload).seq for each in written]
+
+
+def test_without_pandas_a_frame_is_a_dict_of_arrays(folder: Path, without_pandas: None) -> None:
+    run = zsim.load(folder)
+    truth: Any = run.truth("drone1")
+    assert isinstance(truth, dict)
+    assert next(iter(truth)) == "t_s"
+    assert truth["position_m_z"].shape == truth["t_s"].shape
+    with pytest.raises(ValueError, match="read-only"):
+        truth["position_m_z"][0] = 1.0
+    assert "variable" in run.errors()
+
+
+@pytest.fixture
+def passes(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """The keys of each pass over a record."""
+    made: list[list[str]] = []
+
+    def read_tables(record: Path, wanted: Collection[str]) -> dict[str, tables.Table]:
+        made.append([*wanted])
+        return tables.read_tables(record, wanted)
+
+    monkeypatch.setattr(recorded, "read_tables", read_tables)
+    return made
+
+
+def test_a_key_is_read_once(folder: Path, passes: list[list[str]]) -> None:
+    run = zsim.load(folder)
+    first = run.truth("drone1")
+    first.loc[:, "position_m_x"] = 7.0  # the user's own from here on
+    assert run.truth("drone1")["position_m_x"].iloc[0] == pytest.approx(2.0)
+    run.messages("drone/drone1/truth")
+    assert passes == [["drone/drone1/truth"]]
+
+
+def test_all_drones_are_read_at_once_from_the_second_on(folder: Path, passes: list[list[str]]) -> None:
+    run = zsim.load(folder)
+    heights = {drone: run.truth(drone)["position_m_y"].iloc[0] for drone in run.drones}
+    assert heights == {"drone1": 0.0, DRONE: 0.0, "end": 3.0}
+    assert passes == [["drone/drone1/truth"], [f"drone/{DRONE}/truth", "drone/end/truth"]]
+    run.sensor("end", "gps")
+    run.xarray()
+    assert passes[2:] == [["drone/end/sensor/gps"], [f"drone/{drone}/estimate" for drone in run.drones]]
+
+
+def test_a_fleet_too_large_for_memory_is_read_drone_by_drone(
+    folder: Path, passes: list[list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorded, "ROWS_MAX", 500)
+    run = zsim.load(folder)
+    for drone in run.drones:
+        run.truth(drone)
+    assert [*map(len, passes)] == [1, 1, 1]
+
+
+# Errors and summary
+
+
+@pytest.fixture(scope="module")
+def step(tmp_path_factory: pytest.TempPathFactory) -> zsim.Run:
+    """A synthetic flight whose true errors are sines of 1 mm to 12 mm about 1 cm, and half of that as estimated."""
+    made = tmp_path_factory.mktemp("step")
+    true = np.arange(1, 13) * 1e-3
+    synthetic_record.write(
+        made / "run.mcap", Flown(duration_s=12.0, amplitude=true, est_amplitude=true / 2, offset=np.full(12, 0.01))
+    )
+    return zsim.load(made)
+
+
+def test_errors_of_a_formation_are_those_of_the_closed_form(step: zsim.Run) -> None:
+    table = step.errors(window=(2.0, 9.98))
+    assert [*table.index] == [("main", name) for name in NAMES]
+    sine = np.arange(1, 13) * 1e-3 / np.sqrt(2)
+    assert table["true_std"].to_numpy() == pytest.approx(sine)
+    assert table["true_rms"].to_numpy() == pytest.approx(np.hypot(sine, 0.01))
+    assert table["est_rms"].to_numpy() == pytest.approx(sine / 2)
+    assert [table["unit"]["main", name] for name in ("p", "beta")] == ["m", "rad"]
+    formation = step.formation("main").loc[2.0:9.98]
+    p = NAMES.index("p")
+    assert formation["truth_error_p_m"].to_numpy().std() == pytest.approx(sine[p])
+    assert (formation["truth_p_m"] - formation["desired_p_m"]).mean() == pytest.approx(0.01)
+    assert (formation["estimate_p_m"] - formation["desired_p_m"]).std(ddof=0) == pytest.approx(sine[p] / 2)
+    assert formation["estimate_error_beta_rad"].to_numpy().std() == pytest.approx(sine[-1] / 2)
+    assert set(formation["phase"]) == {"engaged"}
+
+
+def test_without_a_window_errors_are_those_of_the_report(step: zsim.Run) -> None:
+    page = step.report()
     reported = json.loads((page.parent / "summary.json").read_text())
-    errors = run.errors()
-    for variable, of in reported["clusters"]["main"]["errors"].items():
-        row = errors.loc["main", variable]
-        assert [row[name] for name in of] == pytest.approx([*of.values()])
-    assert errors.loc["main", "x_c"].unit == "m"
-    assert run.truth_sha256 == reported["truth_sha256"]
-    late = run.errors(window=(11, 12)).loc["main", "x_c"].true_rms
-    formation = run.formation().loc[11:12]
-    off = formation.truth_x_c_m - formation.desired_x_c_m
-    assert late == pytest.approx(float(np.sqrt((off**2).mean())))
-    assert np.isnan(run.errors(window=(0, 0.1)).true_rms).all()
+    for name, errors in reported["clusters"]["main"]["errors"].items():
+        row = step.errors().loc[("main", name)]
+        assert [row[field] for field in errors] == [*errors.values()]
+    assert "<html" in page.read_text()
+    assert step.summary.json() == (page.parent / "summary.json").read_bytes()
 
 
-def test_errors_of_estimates_are_against_the_truth(run: zsim.Run) -> None:
-    errors = run.estimate_errors("d2")
-    off = (run.estimate("d2").position_m_x - run.truth("d2").position_m_x).loc[errors.index]
-    assert errors.x_m.to_numpy() == pytest.approx(off.to_numpy(), abs=1e-7)  # estimates are held as float32
-    assert 0 < errors.nees.loc[8:].mean() < 20
+def test_errors_of_an_estimate_are_against_the_truth(run: zsim.Run) -> None:
+    errors, truth, estimate = run.estimate_errors("drone1"), run.truth("drone1"), run.estimate("drone1")
+    own = (estimate["position_m_x"] - truth["position_m_x"]).dropna()
+    assert errors["position_m_x"].to_numpy() == pytest.approx(own.to_numpy(), abs=1e-6)  # estimates are held as float32
+    stated = np.sqrt(estimate["covariance_11"].loc[errors.index])
+    assert errors["sigma_position_m_y"].to_numpy() == pytest.approx(stated.to_numpy(), rel=1e-6)
+    part = errors.loc[2.0:4.0]
+    table = run.errors(window=(2.0, 4.0), of="estimates").loc["drone1"]
+    assert table.loc["position_m_x", "rms"] == pytest.approx(np.sqrt(np.mean(part["position_m_x"] ** 2)))
+    assert table.loc["yaw_rad", "mean"] == pytest.approx(part["yaw_rad"].mean())
+    assert table.loc["nees", "mean"] == pytest.approx(part["nees"].mean())
+    inside = (part["position_m_z"].abs() <= 2 * part["sigma_position_m_z"]).mean()
+    assert table.loc["position_m_z", "inside"] == pytest.approx(inside)
+
+
+def test_where_a_window_has_nothing_statistics_are_unknown(run: zsim.Run) -> None:
+    for of in ("formations", "estimates"):
+        assert run.errors((100.0, 200.0), of).drop(columns="unit").isna().all(axis=None)
+
+
+def test_how_it_was_flown_is_known(run: zsim.Run) -> None:
+    assert run.drones == ("drone1", "a-b.c", "end")
+    assert run.clusters == ("main",)
+    assert run.duration_s == 6.0
+    assert run.ended == "the scenario's duration is over"
+    assert run.truth_sha256 == run.summary.truth_sha256
+    assert run.scenario.resolved.seed == 3
+    assert run.scenario.document()["drones"][1]["name"] == DRONE
+    assert run.keys["drone/end/truth"] == len(run.truth("end"))
+
+
+def test_its_scenario_flies_again_to_the_same_bits(run: zsim.Run, tmp_path: Path) -> None:
+    again = zsim.run(run.scenario, out=tmp_path / "again", progress=False)
+    assert again.truth_sha256 == run.truth_sha256
+    pd.testing.assert_frame_equal(again.truth(DRONE), run.truth(DRONE))
 
 
 def test_all_drones_are_one_dataset(run: zsim.Run) -> None:
-    pytest.importorskip("xarray")
     data = run.xarray()
-    assert dict(data.sizes) == {"t_s": 601, "drone": 2}
-    assert data.truth_position_m_y.sel(drone="d2", t_s=0.0) == -3.0
+    assert dict(data.sizes) == {"drone": 3, "t_s": 301}
+    assert [*data.drone.values] == [*run.drones]
+    assert data.truth_position_m_y.sel(drone="end", t_s=0.0) == 3.0
+    last = run.estimate(DRONE)["position_m_x"].iloc[-1]
+    assert data.estimate_position_m_x.sel(drone=DRONE).dropna("t_s")[-1] == last
 
 
-def test_a_figure_is_that_of_the_report(run: zsim.Run) -> None:
-    shape: Any = run.figure("shape")
-    assert shape._repr_png_().startswith(b"\x89PNG")
+# Shown
+
+
+def test_a_figure_is_that_of_the_report(step: zsim.Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = []
+    monkeypatch.setattr(drone_figures, "draw_plan", lambda *_: drawn.append("plan"))
+    monkeypatch.setattr(make_report, "draw_errors", lambda *_: drawn.append("errors"))
+    shape: Any = step.figure("shape")
     assert "$p$" in shape.axes[0].get_ylabel()
+    assert step.figure("figure_8_shape").axes[0].get_ylabel() == shape.axes[0].get_ylabel()
+    assert drawn == []  # no other one
+    assert shape._repr_png_().startswith(b"\x89PNG")
 
 
-def test_a_run_shows_itself_in_a_notebook(run: zsim.Run) -> None:
-    shown = run._repr_html_()
-    assert "pair, seed 3, 2 drones" in shown
-    assert "x_c" in shown
-
-
-def test_without_pandas_tables_are_maps_of_arrays(run: zsim.Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    frame = run.truth("d1")
-    kept = builtins.__import__
-
-    def no_pandas(name: str, *more: Any) -> Any:
-        if name == "pandas":
-            raise ModuleNotFoundError(name=name)
-        return kept(name, *more)
-
-    monkeypatch.setattr(builtins, "__import__", no_pandas)
-    table: Any = zsim.load(run.record).truth("d1")
-    assert type(table) is dict
-    assert table["t_s"].tolist() == frame.index.tolist()
-    assert table["position_m_z"].tolist() == frame.position_m_z.tolist()
-
-
-def test_what_is_not_on_record_is_named_with_what_is(run: zsim.Run, tmp_path: Path) -> None:
-    with refused(RunError, "'d9';", "d1,"):
-        run.truth("d9")
-    with refused(RunError, "'gpss';", "gps?"):
-        run.sensor("d1", "gpss")
-    with refused(RunError, "'rotors';", "velocity"):
-        run.commands("d1", "rotors")
-    with refused(RunError, "'shap';", "shape?"):
+def test_a_figure_that_there_is_not_is_refused_with_those_that_there_are(run: zsim.Run) -> None:
+    with refused(
+        RunError,
+        "'shap'",
+        "did you mean shape?",
+        "errors, position, orientation, shape, plan_view, distances, drones, estimates, …",
+    ):
         run.figure("shap")
-    with refused(RunError, "'my/key';", "event,"):
-        run.messages("my/key")
-    with refused(RunError, "'side';", "main"):
-        run.formation("side")
-    with refused(RunError, "run.mcap"):
+
+
+def test_a_notebook_shows_its_errors_and_how_it_fell_short(step: zsim.Run) -> None:
+    shown = step._repr_html_()
+    assert "step, seed 1, 3 drones" in shown
+    assert "12 s, " in shown
+    assert "<td>beta (rad)</td>" in shown
+    assert html.escape(step.shortfalls[0].text) in shown
+
+
+# What is not there
+
+
+@pytest.mark.parametrize(
+    ("ask", "words"),
+    [
+        (lambda run: run.truth("drone4"), ("no drone 'drone4'", "did you mean drone1?", "drone1, a-b.c, end")),
+        (lambda run: run.sensor("drone1", "gsp"), ("no sensor 'gsp' of drone1", "did you mean gps?", "imu")),
+        (lambda run: run.commands("end", "rotors"), ("no cmd 'rotors' of end", "none")),
+        (lambda run: run.commands("drone1", "rotor"), ("no cmd 'rotor' of drone1", "did you mean rotors?", "velocity")),
+        (lambda run: run.cluster("mian"), ("no cluster 'mian'", "did you mean main?")),
+        (lambda run: run.formation("drone1"), ("no cluster 'drone1'", "main")),
+        (lambda run: run.errors(of="estimate"), ("of is 'estimate'", "'formations'", "'estimates'")),
+        (lambda run: run.messages("drone/*/truth"), ("no messages of 'drone/*/truth'", "drone/drone1/truth")),
+        (lambda run: run.messages("own/thin"), ("'own/thin'", "did you mean own/thing?")),
+    ],
+)
+def test_what_is_not_on_record_is_refused_with_what_is(run: zsim.Run, ask: Any, words: tuple[str, ...]) -> None:
+    with refused(RunError, *words):
+        ask(run)
+
+
+def test_a_folder_without_a_record_is_refused(tmp_path: Path) -> None:
+    with refused(RunError, str(tmp_path), "run.mcap"):
         zsim.load(tmp_path)
+
+
+# Records of every kind
+
+
+def test_a_record_that_was_cut_is_read_to_its_last_chunk(folder: Path, tmp_path: Path) -> None:
+    content = (folder / "run.mcap").read_bytes()
+    (tmp_path / "run.mcap").write_bytes(content[: len(content) // 2])
+    run = zsim.load(tmp_path)
+    assert not run.complete
+    assert "was cut" in run.ended
+    truth = run.truth("drone1")
+    assert 50 < len(truth) < 290
+    assert run.duration_s == truth.index[-1]
+    pd.testing.assert_frame_equal(truth, zsim.load(folder).truth("drone1").iloc[: len(truth)])
+    assert "was cut" in run._repr_html_()
+
+
+def written_of(folder: Path, out: Path, is_kept: Callable[[str], bool]) -> zsim.Run:
+    with RecordReader(folder / "run.mcap") as reader, RecordWriter(out / "run.mcap") as writer:
+        for each in reader.messages([key for key in reader.topics() if is_kept(key)], by_time=False):
+            writer.add(each.key, each.payload, "", each.t_ns, each.wall_ns)
+    return zsim.load(out / "run.mcap")
+
+
+def test_a_record_without_world_info_has_the_drones_that_are_on_it(folder: Path, tmp_path: Path) -> None:
+    run = written_of(folder, tmp_path, lambda key: key != keys.INFO)
+    assert {*run.drones} == {"drone1", DRONE, "end"}
+    assert run.clusters == ("main",)
+    assert len(run.truth("end")) > 290
+    with refused(RunError, "run.mcap", "no world/info"):
+        _ = run.scenario
+
+
+def test_a_record_without_truth_says_so_where_truth_is_needed(folder: Path, tmp_path: Path) -> None:
+    run = written_of(folder, tmp_path, lambda key: key in (keys.INFO, keys.EVENT))
+    assert (run.duration_s, run.ended) == (6.0, "the scenario's duration is over")
+    assert "end" in [*run.events["kind"]]
+    assert not run.complete
+    with refused(RecordError, "no truth"):
+        run.errors()
+    with refused(RunError, "no truth of drone1"):
+        run.truth("drone1")
+    assert "no truth" in run._repr_html_()
+
+
+OWN_SPACE = """
+from zsim_agents.formation.spaces.triad_cluster import TriadCluster
+
+class Space(TriadCluster):
+    pass
+"""
+
+
+def test_a_space_of_the_scenario_s_own_is_imported_for_who_trusts_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "space_of_a_stranger", None)  # put back what was there, which is nothing
+    del sys.modules["space_of_a_stranger"]
+    module = tmp_path / "space_of_a_stranger.py"
+    module.write_text(OWN_SPACE)
+    own = {"clusters[0].space": "space_of_a_stranger:Space", "duration_s": 1}
+    monkeypatch.chdir(tmp_path)
+    flown = zsim.run(recorded_run.SCENARIO, set=own, out=tmp_path / "run", progress=False)
+    assert len(flown.formation()) > 40
+    del sys.modules["space_of_a_stranger"]
+    run = zsim.load(tmp_path / "run")
+    assert "x_c" not in run.errors().index.get_level_values("variable")
+    with refused(RunError, "space_of_a_stranger:Space", "trust=True"):
+        run.formation("main")
+    assert "space_of_a_stranger" not in sys.modules
+    assert len(zsim.load(tmp_path / "run", trust=True).formation()) == len(flown.formation())
+
+    module.unlink()  # as on another machine
+    del sys.modules["space_of_a_stranger"]
+    elsewhere = zsim.load(tmp_path / "run")
+    assert elsewhere.summary.truth_sha256 == flown.truth_sha256
+    assert elsewhere.figure("plan_view").axes
+    with refused(DocumentError, "'space_of_a_stranger:Space'", "ModuleNotFoundError"):
+        _ = zsim.load(tmp_path / "run", trust=True).summary

@@ -140,6 +140,7 @@ class ClusterSpace(ABC):
         return self.measures(c)[1]
 
     def measures(self, c: Array) -> tuple[float, float]:
+        """Return spread(c) and margin(c) [m], with one computation of the spread."""
         spread = self.spread(c)
         return spread, spread * math.cos(c[self._pitch])
 

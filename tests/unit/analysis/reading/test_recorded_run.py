@@ -28,7 +28,8 @@ from zsim_analysis.reading.recorded_run import (
 )
 from zsim_analysis.report.comparison import ABSENT, fact_rows
 from zsim_analysis.report.comparison_figures import ComparedRun
-from zsim_analysis.report.make_report import facts, judge
+from zsim_analysis.report.make_report import facts
+from zsim_analysis.report.summary import judge
 from zsim_world.run.world import World
 
 GATE_NS = 20_000_000

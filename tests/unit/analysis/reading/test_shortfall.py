@@ -25,8 +25,8 @@ from zsim_analysis.reading.formation import formations_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight, read_flight
 from zsim_analysis.reading.shortfall import CRASHES, NOT_AS_PLANNED, Shortfall, marks_of, shortfalls, verdict, window
 from zsim_analysis.report.figure_style import COLUMN_IN, PAGE_IN, VERMILION, legend_above, mark_figure, new_figure
-from zsim_analysis.report.make_report import facts, figures, judge, page
-from zsim_analysis.report.summary import table
+from zsim_analysis.report.make_report import facts, figures, page
+from zsim_analysis.report.summary import judge, table
 from zsim_deploy.cli import run_commands
 
 State = Callable[[float], dict[str, Any]]

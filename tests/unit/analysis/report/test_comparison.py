@@ -46,8 +46,7 @@ from zsim_analysis.report.comparison_figures import (
     run_style,
 )
 from zsim_analysis.report.figure_style import ReportFigure
-from zsim_analysis.report.make_report import judge
-from zsim_analysis.report.summary import STATISTICS
+from zsim_analysis.report.summary import STATISTICS, judge
 from zsim_deploy.cli.cli import app
 
 WINDOW = "report.window_s=[2, 9.98]"

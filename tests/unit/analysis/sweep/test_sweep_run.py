@@ -29,7 +29,7 @@ from zsim_analysis.in_process import InProcessFlight
 from zsim_analysis.reading.drone_errors import estimate_errors
 from zsim_analysis.reading.formation import Formation, formations_of
 from zsim_analysis.reading.recorded_flight import FlightReader
-from zsim_analysis.report.make_report import judge
+from zsim_analysis.report.summary import judge
 from zsim_analysis.sweep.design import SweepDesign, make_plan, read_document
 from zsim_analysis.sweep.sweep_run import Task, engaged_s, fly
 from zsim_world.fleet.fleet import Fleet

@@ -33,7 +33,7 @@ from zsim.record.mcap_layout import (
 from zsim_analysis.export import Format
 from zsim_analysis.export.columns import MessageSelection
 from zsim_analysis.export.make_export import export
-from zsim_analysis.report.make_report import judge
+from zsim_analysis.report.summary import judge
 
 CUTS = 25
 FLIPS = 30

@@ -169,6 +169,10 @@ def test_and_refused_where_it_is_not_there(beside: Path, name: str, terms: tuple
         assert skipped == []
     assert not isinstance(raised.value, NotTrustedError)
     assert has_terms(raised.value.faults[0], "a.yaml: meter", *terms)
+    with plugin.names_only(looked_up=False) as skipped:
+        with pytest.raises(NotTrustedError):
+            plugin.load(name, "a.yaml: meter", Meter)
+        assert skipped == [name]
 
 
 def test_code_of_zsim_is_imported_whoever_names_it() -> None:

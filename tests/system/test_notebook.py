@@ -1,0 +1,107 @@
+"""In a notebook: classes of a cell fly, progress is one line below the cell, and an interrupt keeps the record."""
+
+import queue
+from collections.abc import Iterator
+from pathlib import Path
+from textwrap import dedent
+from typing import Any
+
+import pytest
+from federation import PAIR
+from wire import PATIENCE_S
+
+jupyter_client = pytest.importorskip("jupyter_client", reason="jupyter_client is not installed")
+pytest.importorskip("ipykernel", reason="ipykernel is not installed")
+
+
+class Notebook:
+    """A kernel whose cells are run one after the other."""
+
+    def __init__(self, folder: Path) -> None:
+        self.manager = jupyter_client.KernelManager(kernel_name="python3")
+        self.manager.start_kernel(cwd=str(folder))
+        self.client = self.manager.blocking_client()
+        self.client.start_channels()
+        self.client.wait_for_ready(timeout=PATIENCE_S)
+
+    def messages(self, code: str) -> Iterator[dict[str, Any]]:
+        """Run a cell; yield what the kernel says until it is through."""
+        asked = self.client.execute(dedent(code))
+        while True:
+            try:
+                said = self.client.get_iopub_msg(timeout=PATIENCE_S)
+            except queue.Empty:
+                pytest.fail(f"the kernel says nothing: {code}")
+            if said["parent_header"].get("msg_id") != asked:
+                continue
+            if said["msg_type"] == "status" and said["content"]["execution_state"] == "idle":
+                return
+            yield said
+
+    def run(self, code: str) -> str:
+        """Run a cell; return what it prints; fails where it raises."""
+        text = ""
+        for said in self.messages(code):
+            if said["msg_type"] == "error":
+                pytest.fail("\n".join(said["content"]["traceback"]))
+            if said["msg_type"] == "stream":
+                text += said["content"]["text"]
+        return text
+
+    def close(self) -> None:
+        self.client.stop_channels()
+        self.manager.shutdown_kernel(now=True)
+
+
+@pytest.fixture
+def notebook(tmp_path: Path, compiled: None) -> Iterator[Notebook]:
+    (tmp_path / "pair.yaml").write_text(PAIR)
+    made = Notebook(tmp_path)
+    made.run("import warnings; warnings.simplefilter('ignore')\nimport zsim")
+    yield made
+    made.close()
+
+
+CELL = """
+class Lander(zsim.Agent):
+    reads = ("drone/*/sensor/status",)
+    def receive(self, key, message):
+        pass
+    def step(self, t_ns):
+        if t_ns == 6_000_000_000 and FAILS:
+            undefined_name
+        return []
+FAILS = False
+"""
+
+
+def test_a_class_of_a_cell_flies_here_and_as_processes(notebook: Notebook) -> None:
+    notebook.run(CELL)
+    said = [*notebook.messages("run = zsim.run('pair.yaml', agents=[Lander], out='here')\nrun")]
+    shown = [each["content"]["data"] for each in said if "data" in each["content"]]
+    assert "<table>" in shown[-1]["text/html"]
+    assert sum(each["msg_type"] == "display_data" for each in said) == 1
+    assert not [each for each in said if each["msg_type"] == "error"]
+    notebook.run("many = zsim.run('pair.yaml', agents=[Lander], out='many', processes=True, progress=False)")
+    assert notebook.run("print(many.truth_sha256 == run.truth_sha256)") == "True\n"
+
+
+def test_what_a_cell_does_wrong_is_shown_with_its_line(notebook: Notebook) -> None:
+    notebook.run(CELL.replace("FAILS = False", "FAILS = True"))
+    said = [*notebook.messages("zsim.run('pair.yaml', agents=[Lander], out='here', progress=False)")]
+    before, error = said[-2:]
+    assert "agent.lander at 6.00 s" in before["content"]["text"]
+    assert error["content"]["ename"] == "NameError"
+    assert "undefined_name" in "".join(error["content"]["traceback"])
+    assert notebook.run("print(zsim.load('here').duration_s >= 6)") == "True\n"
+
+
+def test_an_interrupt_ends_a_flight_with_its_record_whole(notebook: Notebook) -> None:
+    names = []
+    for said in notebook.messages("zsim.run('pair.yaml', duration_s=1e5, out='here')"):
+        if said["msg_type"] == "update_display_data":
+            notebook.manager.interrupt_kernel()
+        if said["msg_type"] == "error":
+            names.append(said["content"]["ename"])
+    assert names == ["KeyboardInterrupt"]
+    assert notebook.run("print(zsim.load('here').summary.record.complete)") == "True\n"

@@ -1,0 +1,74 @@
+"""The notebooks of docs/ run, and hold what a whole run of them shows.
+
+A cell of parameters has others in its metadata, `short`, with which the notebook takes seconds.
+"""
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
+PATIENCE_S = 1800  # wall seconds for a cell on a machine that does other work as well
+SIZE_MAX = 1_000_000  # bytes of a notebook, with its pictures
+
+nbformat = pytest.importorskip("nbformat", reason="nbclient is not installed")
+nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed")
+pytest.importorskip("ipykernel", reason="ipykernel is not installed")
+each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+
+
+def code_cells(notebook: Any) -> list[Any]:
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def pictures(notebook: Any) -> list[int]:
+    """Return the number of pictures below each cell."""
+    return [sum("image/png" in each.get("data", {}) for each in cell.outputs) for cell in code_cells(notebook)]
+
+
+def executed(path: Path, folder: Path, short: bool) -> Any:
+    """Run a copy of a notebook in a folder as in this repository; CellExecutionError if a cell raises."""
+    notebook = copy.deepcopy(nbformat.read(path, as_version=4))
+    for cell in notebook.cells:
+        if short and "short" in cell.metadata:
+            cell.source = cell.metadata["short"]
+    for name in ("scenarios", "examples"):
+        (folder / name).symlink_to(ROOT / name)
+    where = folder / "docs/notebooks"
+    where.mkdir(parents=True)
+    options = {"resources": {"metadata": {"path": str(where)}}, "kernel_name": "python3"}
+    nbclient.NotebookClient(notebook, timeout=PATIENCE_S, **options).execute()
+    return notebook
+
+
+@each_notebook
+def test_it_holds_what_a_whole_run_shows(path: Path) -> None:
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    assert path.stat().st_size < SIZE_MAX
+    cells = code_cells(notebook)
+    assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
+    assert sum(pictures(notebook)) >= 1
+    assert [cell.source for cell in cells if cell.source == cell.metadata.get("short")] == []
+    assert any("short" in cell.metadata for cell in cells)
+    for output in (output for cell in cells for output in cell.outputs):
+        assert output.output_type != "error"
+        assert output.get("name") != "stderr", output.text
+        shown = str(output.get("text", output.get("data", {}).get("text/plain", "")))
+        assert str(Path.home()) not in shown
+        assert str(ROOT.parent) not in shown
+
+
+@pytest.mark.slow
+@each_notebook
+def test_it_runs(path: Path, tmp_path: Path) -> None:
+    assert pictures(executed(path, tmp_path, short=True)) == pictures(nbformat.read(path, as_version=4))
+
+
+@pytest.mark.soak
+@each_notebook
+def test_the_whole_of_it_runs(path: Path, tmp_path: Path) -> None:
+    assert pictures(executed(path, tmp_path, short=False)) == pictures(nbformat.read(path, as_version=4))

@@ -1,0 +1,84 @@
+"""Classes of a script fly as processes: the bits of one process, their errors, and nothing left running after Ctrl-C."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from textwrap import dedent
+
+from federation import PAIR, Federation
+
+import zsim
+
+SCRIPT = dedent(
+    """
+    import sys
+    import zsim
+    from zsim_agents.formation.control_law import ControlLaw
+
+    class Slow(ControlLaw):
+        def rates(self, c, p_W, v_W, c_des, c_dot_des):
+            return 0.5 * self.space.difference(c_des, c) + c_dot_des
+
+    class Lander(zsim.Agent):
+        reads = ("drone/*/sensor/status",)
+        def __init__(self, at_s):
+            self.at_s = at_s
+        def receive(self, key, message):
+            pass
+        def step(self, t_ns):
+            if self.at_s < 0 and t_ns >= 2_000_000_000:
+                raise LookupError("of the script")
+            return [self.command(t_ns, "drone2", zsim.land())] if t_ns == self.at_s * 1e9 else []
+
+    def fly(name, at_s, **how):
+        return zsim.run("pair.yaml", law=Slow, agents=[Lander(at_s)], out=name, **{'progress': False, **how})
+    """
+)
+
+
+def script(folder: Path, text: str) -> subprocess.Popen[str]:
+    (folder / "pair.yaml").write_text(PAIR)
+    (folder / "flown.py").write_text(SCRIPT + text)
+    command = [sys.executable, "flown.py"]
+    return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_a_script_flies_as_processes_to_the_bits_of_one(tmp_path: Path) -> None:
+    text = "for name, how in (('one', {}), ('many', {'processes': True})):\n    print(fly(name, 9.0, **how).truth_sha256)\n"
+    said, errors = script(tmp_path, text).communicate()
+    one, many = said.split()
+    assert one == many, errors
+    run = zsim.load(tmp_path / "many")
+    assert run.commands("drone2", "mode")["source"].iloc[-1] == "agent.lander"
+    assert {process["name"] for process in run.summary.participants} >= {"agent.lander", "controller.main"}
+    again = subprocess.run(
+        [sys.executable, "-m", "zsim_deploy", "rerun", "many", "--trust"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert again.returncode == 0, again.stderr
+    assert one in again.stdout
+
+
+def test_what_a_process_raises_is_in_its_log_and_in_the_error(tmp_path: Path) -> None:
+    program = script(tmp_path, "fly('many', -1.0, processes=True)\n")
+    _, errors = program.communicate()
+    assert program.returncode == 1
+    last = errors.rstrip().splitlines()[-1]
+    assert last.startswith("zsim.errors.RunFailedError: agent.lander at 2.00 s: ")
+    assert "LookupError: of the script" in last
+    log = (tmp_path / "many" / "logs" / "agent.lander.log").read_text()
+    assert 'LookupError("of the script")' in log
+    assert "Traceback (most recent call last):" in log
+    assert zsim.load(tmp_path / "many").duration_s >= 2.0
+
+
+def test_ctrl_c_ends_the_processes_of_a_script(tmp_path: Path, federation: Federation) -> None:
+    program = script(tmp_path, "fly('many', 1e6, processes=True, duration_s=1e5, progress=True)\n")
+    assert program.stderr is not None
+    assert any("engaged" in line for line in program.stderr)
+    os.kill(program.pid, signal.SIGINT)
+    _, errors = program.communicate()
+    assert "KeyboardInterrupt: interrupted; zsim.load('many')" in errors
+    assert zsim.load(tmp_path / "many").summary.record.complete
+    federation.nobody_left()
