@@ -27,8 +27,8 @@ if TYPE_CHECKING:  # for editors, which do not read _WHERE
     from zsim_api.recorded import load as load
     from zsim_api.scenarios import Scenario as Scenario
     from zsim_api.simulation import Simulation as Simulation
-    from zsim_bridges.fmu.agent import Fmu as Fmu
     from zsim_api.sweeping import sweep as sweep
+    from zsim_bridges.fmu.agent import Fmu as Fmu
 
 _WHERE = {
     "zsim.errors": ("ZsimError",),
