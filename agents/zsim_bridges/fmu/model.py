@@ -113,7 +113,8 @@ class FmuModel:
         about = self.description.coSimulation
         folder = fmpy.platform if self.version == 2 else fmpy.platform_tuple
         self.library = f"binaries/{folder}/{about.modelIdentifier}{fmpy.sharedLibraryExtension}"
-        names = zipfile.ZipFile(path).namelist()
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
         if self.library not in names:
             has = {name.split("/")[1] for name in names if name.startswith("binaries/") and name.count("/") == 2}
             listed = ", ".join(sorted(has)) or "none"
