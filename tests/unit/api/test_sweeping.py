@@ -299,10 +299,11 @@ print(frame["clusters.main.law"].tolist(), frame["failure"].isna().all(), frame[
 
 
 @pytest.mark.slow
-def test_a_cell_of_a_notebook_shows_one_line_that_changes(tmp_path: Path) -> None:
+def test_a_cell_of_a_notebook_shows_one_line_that_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
     pytest.importorskip("ipykernel")
     write(tmp_path, pair_yaml=PAIR)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # a kernel is killed in the end, and leaves what is temporary
     notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(CELL)])
     options = {"resources": {"metadata": {"path": str(tmp_path)}}, "kernel_name": "python3"}
     nbclient.NotebookClient(notebook, timeout=300, **options).execute()
