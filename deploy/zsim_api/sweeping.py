@@ -16,6 +16,7 @@ import numpy as np
 from rich.console import Console
 
 from zsim.errors import RunError, ScenarioError, what_is_missing
+from zsim.runtime.progress import cell
 from zsim.scenario.scenario_file import whole_path
 from zsim.schema import plugin
 from zsim.schema.checker import show
@@ -109,9 +110,8 @@ def sweep(
         rows = flown(plan, folder, workers, client, console=console, modules=tuple(modules))
     except KeyboardInterrupt:
         finished = len(SweepFolder(folder, plan).rows())
-        console.print(
-            f"interrupted: {finished} of {plan.runs} runs are finished; out={str(folder)!r} goes on", markup=False
-        )
+        text = f"interrupted: {finished} of {plan.runs} runs are finished; out={str(folder)!r} goes on"
+        console.print(cell(text), soft_wrap=True)
         raise
     except RunError as error:
         raise RunError(_in_python(str(error))) from None
