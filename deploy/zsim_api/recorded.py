@@ -22,7 +22,7 @@ from msgspec import UNSET
 from zsim.contract import keys
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
-from zsim.errors import RecordError, RunError
+from zsim.errors import RecordError, RunError, what_is_missing
 from zsim.output_folder import RECORD, record_at
 from zsim.record import RecordReader
 from zsim.schema import plugin, yaml_file
@@ -230,8 +230,9 @@ class Run:
 
     def xarray(self) -> "Dataset":
         """Return truth and estimates of all drones, with the dimensions drone and t_s; needs xarray and pandas."""
-        import pandas
-        import xarray
+        with what_is_missing():
+            import pandas
+            import xarray
 
         parts: list[Dataset] = []
         for what, read in (("truth", self.truth), ("estimate", self.estimate)):
@@ -310,7 +311,8 @@ class Run:
         Raises:
             RunError: the record has no such figure; with those that it has.
         """
-        from zsim_analysis.report.make_report import marked, planned_figures
+        with what_is_missing():
+            from zsim_analysis.report.make_report import marked, planned_figures
 
         flight, formations, summary = self._judged
         known = []
@@ -335,7 +337,8 @@ class Run:
             RunError: the record is not in the folder of a run.
             ReportError: the folder cannot be written.
         """
-        from zsim_analysis.report.make_report import make_report
+        with what_is_missing():
+            from zsim_analysis.report.make_report import make_report
 
         if self.record.name != RECORD:
             raise RunError(f"{self.record}: has no folder for its report; must be {RECORD} in the folder of a run")

@@ -2,6 +2,7 @@
 
 import html
 import json
+import subprocess
 import sys
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -12,13 +13,13 @@ import pandas as pd
 import pytest
 import recorded_run
 import synthetic_record
-from refused import refused
+from refused import has_terms, refused
 from synthetic_record import Flown
 
 import zsim
 from zsim.contract import keys
 from zsim.contract.messages import decode
-from zsim.errors import DocumentError, RecordError, RunError
+from zsim.errors import DocumentError, RecordError, RunError, install_command
 from zsim.record import RecordReader, RecordWriter
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_analysis.export import Format
@@ -330,6 +331,22 @@ def test_what_is_not_on_record_is_refused_with_what_is(run: zsim.Run, ask: Any, 
 def test_a_folder_without_a_record_is_refused(tmp_path: Path) -> None:
     with refused(RunError, str(tmp_path), "run.mcap"):
         zsim.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("module", "code", "extra"),
+    [
+        ("mcap", "zsim.load", "record"),
+        ("matplotlib", "zsim.load(sys.argv[1]).figure('shape')", "report"),
+        ("xarray", "zsim.load(sys.argv[1]).xarray()", "notebook"),
+    ],
+)
+def test_a_missing_extra_is_named_with_its_command(folder: Path, module: str, code: str, extra: str) -> None:
+    script = f"import sys, zsim; sys.modules[{module!r}] = None; {code}"
+    done = subprocess.run([sys.executable, "-c", script, str(folder)], capture_output=True, text=True, check=False)
+    assert has_terms(
+        done.stderr.splitlines()[-1], "zsim.errors.RunError", module, "not installed", install_command([extra])
+    )
 
 
 # Records of every kind
