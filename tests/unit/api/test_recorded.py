@@ -27,6 +27,7 @@ from zsim_analysis.export.columns import MessageSelection
 from zsim_analysis.export.make_export import export
 from zsim_analysis.report import drone_figures, make_report
 from zsim_api import recorded, tables
+from zsim_world.run.world import DURATION_OVER
 
 DRONE = "a-b.c"
 NAMES = [*cluster_space(3).names]
