@@ -212,9 +212,10 @@ class Run:
             of: formations, or estimates.
 
         Raises:
+            RunError: the window has no end after its start.
             RecordError: there is no truth on record.
         """
-        window = window or self.summary.window_s
+        window = self.summary.window_s if window is None else _checked(window)
         if of == "estimates":
             return _statistics("drone", {name: _moments(each, window) for name, each in self._drone_errors.items()})
         if of != "formations":
@@ -456,6 +457,16 @@ class Run:
         if found is None:
             raise RunError(f"{self.record}: has no states of cluster {name} that can be judged{self._untrusted(name)}")
         return found
+
+
+def _checked(window: Window) -> Window:
+    try:
+        start_s, end_s = map(float, window)
+        if start_s < end_s:
+            return start_s, end_s
+    except (TypeError, ValueError):
+        pass
+    raise RunError(f"window is {window!r}; must be from and to [s], as (20, 40)")
 
 
 def _moments(errors: EstimateErrors, window: Window) -> dict[str, tuple[Any, ...]]:

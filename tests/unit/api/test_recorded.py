@@ -116,6 +116,7 @@ def test_own_messages_have_a_column_for_each_field(run: zsim.Run) -> None:
         ([{"a": 1}, 3], {"f": ['{"a":1}', "3"]}),
         ([[True, False]], {"f": ["[true,false]"]}),
         ([[]], {"f": ["[]"]}),
+        ([b"\xff\xd8", None], {"f": [b"\xff\xd8", None]}),
     ],
 )
 def test_own_fields_become_numbers_where_all_are(values: list[Any], columns: dict[str, list[Any]]) -> None:
@@ -123,6 +124,11 @@ def test_own_fields_become_numbers_where_all_are(values: list[Any], columns: dic
     assert {*made} == {*columns}
     for name, expected in columns.items():
         np.testing.assert_array_equal(made[name], np.array(expected, made[name].dtype))
+
+
+def test_a_picture_is_bytes(folder: Path, run: zsim.Run) -> None:
+    (picture,) = recorded_run.messages_on(folder, "drone/drone1/camera/front")
+    assert run.messages("drone/drone1/camera/front")["data"].tolist() == [picture.data]
 
 
 def test_messages_have_their_stamps_too(folder: Path, run: zsim.Run) -> None:
@@ -319,6 +325,8 @@ def test_a_notebook_shows_its_errors_and_how_it_fell_short(step: zsim.Run) -> No
         (lambda run: run.commands("drone1", "rotor"), ("no cmd 'rotor' of drone1", "did you mean rotors?", "velocity")),
         (lambda run: run.cluster("mian"), ("no cluster 'mian'", "did you mean main?")),
         (lambda run: run.formation("drone1"), ("no cluster 'drone1'", "main")),
+        (lambda run: run.errors(window=(40, 20)), ("window is (40, 20)", "(20, 40)")),
+        (lambda run: run.errors(window=(20,)), ("window is (20,)", "(20, 40)")),
         (lambda run: run.errors(of="estimate"), ("of is 'estimate'", "'formations'", "'estimates'")),
         (lambda run: run.messages("drone/*/truth"), ("no messages of 'drone/*/truth'", "drone/drone1/truth")),
         (lambda run: run.messages("own/thin"), ("'own/thin'", "did you mean own/thing?")),
