@@ -8,10 +8,7 @@ product: what users call as `zsim.run` and so on is `zsim_api`'s, imported when 
 import importlib
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:  # what `__getattr__` passes on
-    from zsim_api import *  # noqa: F403
+from typing import Any
 
 RELEASE = "0.1.0"  # as in pyproject.toml
 CONTRACT = 1
@@ -54,7 +51,7 @@ def _checked_out(git: Path) -> str:
 
 __version__ = f"{RELEASE}+g{found[:DIGITS]}" if (found := commit()) else RELEASE
 
-_LIBRARY = "zsim_api"  # imported when one of its names is first asked for
+_LIBRARY = "zsim_api"  # imported when one of its names is first asked for; type checkers read __init__.pyi
 
 
 def __getattr__(name: str) -> Any:

@@ -45,10 +45,13 @@ _WHERE = {
     "zsim_api.sweeping": ("sweep",),
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
-__all__ = [*_MODULES]
+__all__ = [*_MODULES]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_MODULES[name]), name)
+    from zsim.errors import what_is_missing
+
+    with what_is_missing():
+        return getattr(importlib.import_module(_MODULES[name]), name)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.console import Console
 
-from zsim.errors import RunError, RunFailedError, UserCodeError
+from zsim.errors import RunError, RunFailedError, UserCodeError, printable
 from zsim.output_folder import RECORD
 from zsim.runtime.progress import NotebookLine, Screen, describe
 from zsim.scenario.scenario import Scenario as Resolved
@@ -180,7 +180,7 @@ def calling(call: Callable[[], Result], folder: Path | None = None) -> Result:
     if raised is None:  # it returned what cannot be used
         raise failure.with_traceback(None) from None
     kept = f"; zsim.load({str(folder)!r}) reads the record so far" if folder and (folder / RECORD).exists() else ""
-    print(f"{failure}{kept}", file=sys.stderr, flush=True)
+    print(printable(f"{failure}{kept}"), file=sys.stderr, flush=True)
     raise raised
 
 

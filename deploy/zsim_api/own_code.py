@@ -190,9 +190,11 @@ def _tokens(pickled: bytes, files: set[str]) -> Iterator[str]:
     """Yield what a pickle says, equal for equal objects: without files, and the numbers that are drawn in a process."""
     drawn: dict[str, str] = {}
     for opcode, arg, _ in pickletools.genops(pickled):
-        if isinstance(arg, str) and arg in cloudpickle_parts._DYNAMIC_CLASS_TRACKER_BY_ID:
+        if not isinstance(arg, str):  # a frame's is a number of bytes; that of an array's content a bytearray
+            yield "" if opcode.name == "FRAME" else f"{arg!r}\n"
+        elif arg in cloudpickle_parts._DYNAMIC_CLASS_TRACKER_BY_ID:
             yield drawn.setdefault(arg, f"class {len(drawn)}\n")
-        elif opcode.name != "FRAME" and arg not in files:  # a frame's is a number of bytes
+        elif arg not in files:
             yield f"{arg!r}\n"
 
 

@@ -187,3 +187,11 @@ def test_a_record_of_others_is_looked_at_without_importing(searched: Path) -> No
             plugin.load(name, "law", object)
         assert skipped == [name]
     assert plugin.load(name, "law", object).__doc__ == "Of a cell."
+
+
+def test_a_function_may_use_an_array(searched: Path) -> None:
+    text = "import numpy as np\nTIMES = np.arange({})\ndef last(flight):\n    return int(TIMES[-1])\n"
+    one, same, other = (name_of(cell(text.format(count))["last"], searched) for count in (4, 4, 5))
+    assert one == same != other
+    sys.modules.pop(other.partition(":")[0])
+    assert plugin.load_function(other, "metrics")(None) == 4
