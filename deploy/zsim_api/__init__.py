@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # for editors, which do not read _WHERE
     from zsim_api.commands import rotors as rotors
     from zsim_api.commands import takeoff as takeoff
     from zsim_api.commands import velocity as velocity
+    from zsim_api.federation import Federation as Federation
     from zsim_api.flight import run as run
     from zsim_api.recorded import Run as Run
     from zsim_api.recorded import load as load
@@ -36,6 +37,7 @@ _WHERE = {
     "zsim_agents.formation.control_law": ("ControlLaw",),
     "zsim_agents.formation.spaces.cluster_space": ("ClusterSpace",),
     "zsim_api.commands": ("Command", "ardrone", "attitude", "emergency", "land", "rotors", "takeoff", "velocity"),
+    "zsim_api.federation": ("Federation",),
     "zsim_api.flight": ("run",),
     "zsim_api.recorded": ("Run", "load"),
     "zsim_api.scenarios": ("Scenario",),

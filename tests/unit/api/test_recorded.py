@@ -404,7 +404,6 @@ def test_a_record_without_truth_says_so_where_truth_is_needed(folder: Path, tmp_
 
 OWN_SPACE = """
 from zsim_agents.formation.spaces.triad_cluster import TriadCluster
-from zsim_world.run.world import DURATION_OVER
 
 class Space(TriadCluster):
     pass
