@@ -154,6 +154,7 @@ EXTRA_OF = {
     "rosbags": "ros2",
     "scipy": "agents",
     "viser": "console",
+    "xarray": "notebook",
     "xxhash": "ros2",
     "zstandard": "record",
 }
@@ -175,3 +176,14 @@ def missing(error: ModuleNotFoundError) -> str | None:
     module = (error.name or "").partition(".")[0]
     extra = EXTRA_OF.get(module)
     return f"{module} is not installed; {install_command([extra])}" if extra else None
+
+
+@contextmanager
+def what_is_missing() -> Iterator[None]:
+    """Turn a missing module that an extra brings into a RunError with the command that installs it."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (lacking := missing(error)) is None:
+            raise
+        raise RunError(lacking) from error

@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # for editors, which do not read _WHERE
     from zsim_api.commands import rotors as rotors
     from zsim_api.commands import takeoff as takeoff
     from zsim_api.commands import velocity as velocity
+    from zsim_api.federation import Federation as Federation
     from zsim_api.flight import run as run
     from zsim_api.recorded import Run as Run
     from zsim_api.recorded import load as load
@@ -37,6 +38,7 @@ _WHERE = {
     "zsim_agents.formation.control_law": ("ControlLaw",),
     "zsim_agents.formation.spaces.cluster_space": ("ClusterSpace",),
     "zsim_api.commands": ("Command", "ardrone", "attitude", "emergency", "land", "rotors", "takeoff", "velocity"),
+    "zsim_api.federation": ("Federation",),
     "zsim_api.flight": ("run",),
     "zsim_api.recorded": ("Run", "load"),
     "zsim_api.scenarios": ("Scenario",),
@@ -51,4 +53,7 @@ __all__ = [*_MODULES]  # pyright: ignore[reportUnsupportedDunderAll]
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_MODULES[name]), name)
+    from zsim.errors import what_is_missing
+
+    with what_is_missing():
+        return getattr(importlib.import_module(_MODULES[name]), name)

@@ -22,7 +22,7 @@ from msgspec import UNSET
 from zsim.contract import keys
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
-from zsim.errors import RecordError, RunError
+from zsim.errors import RecordError, RunError, what_is_missing
 from zsim.output_folder import RECORD, record_at
 from zsim.record import RecordReader
 from zsim.schema import plugin, yaml_file
@@ -168,7 +168,7 @@ class Run:
         Raises:
             RunError: no such cluster, or its states cannot be judged.
         """
-        found = self._formation(cluster)
+        found = self.judged_formation(cluster)
         parts = {
             "desired": found.desired,
             "estimate": found.value,
@@ -212,9 +212,10 @@ class Run:
             of: formations, or estimates.
 
         Raises:
+            RunError: the window has no end after its start.
             RecordError: there is no truth on record.
         """
-        window = window or self.summary.window_s
+        window = self.summary.window_s if window is None else _checked(window)
         if of == "estimates":
             return _statistics("drone", {name: _moments(each, window) for name, each in self._drone_errors.items()})
         if of != "formations":
@@ -230,8 +231,9 @@ class Run:
 
     def xarray(self) -> "Dataset":
         """Return truth and estimates of all drones, with the dimensions drone and t_s; needs xarray and pandas."""
-        import pandas
-        import xarray
+        with what_is_missing():
+            import pandas
+            import xarray
 
         parts: list[Dataset] = []
         for what, read in (("truth", self.truth), ("estimate", self.estimate)):
@@ -310,7 +312,8 @@ class Run:
         Raises:
             RunError: the record has no such figure; with those that it has.
         """
-        from zsim_analysis.report.make_report import marked, planned_figures
+        with what_is_missing():
+            from zsim_analysis.report.make_report import marked, planned_figures
 
         flight, formations, summary = self._judged
         known = []
@@ -335,7 +338,8 @@ class Run:
             RunError: the record is not in the folder of a run.
             ReportError: the folder cannot be written.
         """
-        from zsim_analysis.report.make_report import make_report
+        with what_is_missing():
+            from zsim_analysis.report.make_report import make_report
 
         if self.record.name != RECORD:
             raise RunError(f"{self.record}: has no folder for its report; must be {RECORD} in the folder of a run")
@@ -447,12 +451,23 @@ class Run:
         names = [each.space for each in (own, *own.groups) if each.space and ":" in each.space] if own else []
         return f"; its space {names[0]} is imported by zsim.load(…, trust=True) only" if names else ""
 
-    def _formation(self, cluster: str | None) -> Formation:
+    def judged_formation(self, cluster: str | None = None) -> Formation:
+        """Return what `formation` shows of a cluster, as arrays; errors as there."""
         name = self._cluster(cluster)
         found = next((each for each in self._judged[1] if each.name == name), None)
         if found is None:
             raise RunError(f"{self.record}: has no states of cluster {name} that can be judged{self._untrusted(name)}")
         return found
+
+
+def _checked(window: Window) -> Window:
+    try:
+        start_s, end_s = map(float, window)
+        if start_s < end_s:
+            return start_s, end_s
+    except (TypeError, ValueError):
+        pass
+    raise RunError(f"window is {window!r}; must be from and to [s], as (20, 40)")
 
 
 def _moments(errors: EstimateErrors, window: Window) -> dict[str, tuple[Any, ...]]:

@@ -5,8 +5,8 @@ import json
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from rich.console import Console
 
-from zsim.errors import RunError, ScenarioError, missing
+from zsim.errors import RunError, ScenarioError, what_is_missing
 from zsim.runtime.progress import cell
 from zsim.scenario.scenario_file import whole_path
 from zsim.schema import plugin
@@ -91,7 +91,7 @@ def sweep(
         ScenarioError: with every fault of the values and of the scenarios, a line each.
         RunError: the folder holds something else; workers cannot start; pandas is not installed.
     """
-    with _pandas_needed():
+    with what_is_missing():
         import pandas as pd
     console = Console(stderr=True, quiet=not progress)
     varied = scenario_of(scenario).changed(seed, duration_s, set, law, estimator)
@@ -186,11 +186,3 @@ def _names(plan: SweepPlan) -> list[str]:
 def _in_python(line: str) -> str:
     """Return a line about a sweep with its arguments as Python has them."""
     return re.sub(r"--(?=(vary|runs|out|set)\b)", "", line)
-
-
-@contextmanager
-def _pandas_needed() -> Iterator[None]:
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        raise RunError(missing(error) or str(error)) from error

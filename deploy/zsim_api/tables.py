@@ -38,7 +38,7 @@ def read_tables(record: Path, wanted: Collection[str]) -> dict[str, Table]:
     """Return all messages of some keys, by key, in one pass over the record.
 
     A column of the export each, without `name`, which is the same in all rows. Messages of a key that is not of the
-    contract have a column for each field, and those of a list of numbers one for each of these.
+    contract, and pictures, have a column for each field, and those of a list of numbers one for each of these.
 
     Args:
         record: file.
@@ -95,7 +95,7 @@ def _own_columns(name: str, values: Sequence[Any]) -> Table:
         return dict(zip(component_names(name, width), rows.T, strict=True))
     kind = _kind(known)
     if kind == "text":
-        values = [value if value is None or isinstance(value, str) else json_text(value) for value in values]
+        values = [value if isinstance(value, str | bytes | None) else json_text(value) for value in values]
     elif kind == "flag" and len(known) < len(values):
         return {name: np.array(values, object)}
     return {name: as_array(kind, list(values))}

@@ -29,12 +29,13 @@ def pictures(notebook: Any) -> list[int]:
     return [sum("image/png" in each.get("data", {}) for each in cell.outputs) for cell in code_cells(notebook)]
 
 
-def executed(path: Path, folder: Path, short: bool) -> Any:
+def executed(path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, short: bool) -> Any:
     """Run a copy of a notebook in a folder as in this repository; CellExecutionError if a cell raises."""
     notebook = copy.deepcopy(nbformat.read(path, as_version=4))
     for cell in notebook.cells:
         if short and "short" in cell.metadata:
             cell.source = cell.metadata["short"]
+    monkeypatch.setenv("TMPDIR", str(folder))  # a kernel is killed in the end, and leaves what is temporary
     for name in ("scenarios", "examples"):
         (folder / name).symlink_to(ROOT / name)
     where = folder / "docs/notebooks"
@@ -64,11 +65,11 @@ def test_it_holds_what_a_whole_run_shows(path: Path) -> None:
 
 @pytest.mark.slow
 @each_notebook
-def test_it_runs(path: Path, tmp_path: Path) -> None:
-    assert pictures(executed(path, tmp_path, short=True)) == pictures(nbformat.read(path, as_version=4))
+def test_it_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert pictures(executed(path, tmp_path, monkeypatch, short=True)) == pictures(nbformat.read(path, as_version=4))
 
 
 @pytest.mark.soak
 @each_notebook
-def test_the_whole_of_it_runs(path: Path, tmp_path: Path) -> None:
-    assert pictures(executed(path, tmp_path, short=False)) == pictures(nbformat.read(path, as_version=4))
+def test_the_whole_of_it_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert pictures(executed(path, tmp_path, monkeypatch, short=False)) == pictures(nbformat.read(path, as_version=4))

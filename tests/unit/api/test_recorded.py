@@ -2,6 +2,7 @@
 
 import html
 import json
+import subprocess
 import sys
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -12,13 +13,13 @@ import pandas as pd
 import pytest
 import recorded_run
 import synthetic_record
-from refused import refused
+from refused import has_terms, refused
 from synthetic_record import Flown
 
 import zsim
 from zsim.contract import keys
 from zsim.contract.messages import decode
-from zsim.errors import DocumentError, RecordError, RunError
+from zsim.errors import DocumentError, RecordError, RunError, install_command
 from zsim.record import RecordReader, RecordWriter
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_analysis.export import Format
@@ -26,6 +27,7 @@ from zsim_analysis.export.columns import MessageSelection
 from zsim_analysis.export.make_export import export
 from zsim_analysis.report import drone_figures, make_report
 from zsim_api import recorded, tables
+from zsim_world.run.world import DURATION_OVER
 
 DRONE = "a-b.c"
 NAMES = [*cluster_space(3).names]
@@ -114,6 +116,7 @@ def test_own_messages_have_a_column_for_each_field(run: zsim.Run) -> None:
         ([{"a": 1}, 3], {"f": ['{"a":1}', "3"]}),
         ([[True, False]], {"f": ["[true,false]"]}),
         ([[]], {"f": ["[]"]}),
+        ([b"\xff\xd8", None], {"f": [b"\xff\xd8", None]}),
     ],
 )
 def test_own_fields_become_numbers_where_all_are(values: list[Any], columns: dict[str, list[Any]]) -> None:
@@ -121,6 +124,11 @@ def test_own_fields_become_numbers_where_all_are(values: list[Any], columns: dic
     assert {*made} == {*columns}
     for name, expected in columns.items():
         np.testing.assert_array_equal(made[name], np.array(expected, made[name].dtype))
+
+
+def test_a_picture_is_bytes(folder: Path, run: zsim.Run) -> None:
+    (picture,) = recorded_run.messages_on(folder, "drone/drone1/camera/front")
+    assert run.messages("drone/drone1/camera/front")["data"].tolist() == [picture.data]
 
 
 def test_messages_have_their_stamps_too(folder: Path, run: zsim.Run) -> None:
@@ -250,7 +258,7 @@ def test_how_it_was_flown_is_known(run: zsim.Run) -> None:
     assert run.drones == ("drone1", "a-b.c", "end")
     assert run.clusters == ("main",)
     assert run.duration_s == 6.0
-    assert run.ended == "the scenario's duration is over"
+    assert run.ended == DURATION_OVER
     assert run.truth_sha256 == run.summary.truth_sha256
     assert run.scenario.resolved.seed == 3
     assert run.scenario.document()["drones"][1]["name"] == DRONE
@@ -290,8 +298,9 @@ def test_a_figure_that_there_is_not_is_refused_with_those_that_there_are(run: zs
     with refused(
         RunError,
         "'shap'",
-        "did you mean shape?",
-        "errors, position, orientation, shape, plan_view, distances, drones, estimates, …",
+        "mean shape?",
+        "errors,",
+        "plan_view,",
     ):
         run.figure("shap")
 
@@ -316,6 +325,8 @@ def test_a_notebook_shows_its_errors_and_how_it_fell_short(step: zsim.Run) -> No
         (lambda run: run.commands("drone1", "rotor"), ("no cmd 'rotor' of drone1", "did you mean rotors?", "velocity")),
         (lambda run: run.cluster("mian"), ("no cluster 'mian'", "did you mean main?")),
         (lambda run: run.formation("drone1"), ("no cluster 'drone1'", "main")),
+        (lambda run: run.errors(window=(40, 20)), ("window is (40, 20)", "(20, 40)")),
+        (lambda run: run.errors(window=(20,)), ("window is (20,)", "(20, 40)")),
         (lambda run: run.errors(of="estimate"), ("of is 'estimate'", "'formations'", "'estimates'")),
         (lambda run: run.messages("drone/*/truth"), ("no messages of 'drone/*/truth'", "drone/drone1/truth")),
         (lambda run: run.messages("own/thin"), ("'own/thin'", "did you mean own/thing?")),
@@ -329,6 +340,22 @@ def test_what_is_not_on_record_is_refused_with_what_is(run: zsim.Run, ask: Any, 
 def test_a_folder_without_a_record_is_refused(tmp_path: Path) -> None:
     with refused(RunError, str(tmp_path), "run.mcap"):
         zsim.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("module", "code", "extra"),
+    [
+        ("mcap", "zsim.load", "record"),
+        ("matplotlib", "zsim.load(sys.argv[1]).figure('shape')", "report"),
+        ("xarray", "zsim.load(sys.argv[1]).xarray()", "notebook"),
+    ],
+)
+def test_a_missing_extra_is_named_with_its_command(folder: Path, module: str, code: str, extra: str) -> None:
+    script = f"import sys, zsim; sys.modules[{module!r}] = None; {code}"
+    done = subprocess.run([sys.executable, "-c", script, str(folder)], capture_output=True, text=True, check=False)
+    assert has_terms(
+        done.stderr.splitlines()[-1], "zsim.errors.RunError", module, "not installed", install_command([extra])
+    )
 
 
 # Records of every kind
@@ -365,7 +392,7 @@ def test_a_record_without_world_info_has_the_drones_that_are_on_it(folder: Path,
 
 def test_a_record_without_truth_says_so_where_truth_is_needed(folder: Path, tmp_path: Path) -> None:
     run = written_of(folder, tmp_path, lambda key: key in (keys.INFO, keys.EVENT))
-    assert (run.duration_s, run.ended) == (6.0, "the scenario's duration is over")
+    assert (run.duration_s, run.ended) == (6.0, DURATION_OVER)
     assert "end" in [*run.events["kind"]]
     assert not run.complete
     with refused(RecordError, "no truth"):

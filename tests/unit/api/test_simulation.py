@@ -15,6 +15,7 @@ from zsim.runtime.agent import Agent, Output
 from zsim_analysis.in_process import InProcessFlight
 from zsim_analysis.reading.recorded_flight import read_flight
 from zsim_api.scenarios import Scenario
+from zsim_world.run.world import DURATION_OVER
 
 ONE: dict[str, Any] = {
     "name": "one",
@@ -46,7 +47,7 @@ def gates(sim: zsim.Simulation, number: int) -> list[bytes]:
 
 def test_a_stepped_flight_has_the_bits_of_a_whole_one() -> None:
     sim = zsim.Simulation(PAIR)
-    assert sim.run() == "the scenario's duration is over"
+    assert sim.run() == DURATION_OVER
     flight = InProcessFlight(Scenario(**PAIR).resolved)
     flight.run([])
     assert sim.t_s == 6.0

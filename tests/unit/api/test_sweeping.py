@@ -193,7 +193,7 @@ def waits(flight):
         time.sleep(600)
     return 1.0
 
-zsim.sweep("one.yaml", {"seed": range(1, 4)}, metrics=[waits], workers=1, out=OUT)
+frame = zsim.sweep("one.yaml", {"seed": range(1, 4)}, metrics=[waits], workers=1, out=OUT)
 print("not reached")
 """
 
@@ -299,10 +299,11 @@ print(frame["clusters.main.law"].tolist(), frame["failure"].isna().all(), frame[
 
 
 @pytest.mark.slow
-def test_a_cell_of_a_notebook_shows_one_line_that_changes(tmp_path: Path) -> None:
+def test_a_cell_of_a_notebook_shows_one_line_that_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
     pytest.importorskip("ipykernel")
     write(tmp_path, pair_yaml=PAIR)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # a kernel is killed in the end, and leaves what is temporary
     notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(CELL)])
     options = {"resources": {"metadata": {"path": str(tmp_path)}}, "kernel_name": "python3"}
     nbclient.NotebookClient(notebook, timeout=300, **options).execute()
@@ -313,6 +314,32 @@ def test_a_cell_of_a_notebook_shows_one_line_that_changes(tmp_path: Path) -> Non
     assert len(lines) == 1  # it has changed in its place
     assert " 2 / 2 runs" in lines[0]
     assert not [each for each in outputs if each.get("name") == "stderr"]  # no warning about a missing widget
+
+
+@pytest.mark.slow
+def test_an_interrupted_cell_ends_its_workers_and_the_kernel_goes_on(tmp_path: Path) -> None:
+    jupyter = pytest.importorskip("jupyter_client")
+    pytest.importorskip("ipykernel")
+    write(tmp_path, one_yaml=ONE)
+    manager, client = jupyter.manager.start_new_kernel(kernel_name="python3", cwd=str(tmp_path))
+    try:
+        sent = client.execute(f"OUT = 'swept'\n{WAITING}")
+        while not (tmp_path / "flying").exists():
+            time.sleep(0.05)
+        kernel = psutil.Process(manager.provisioner.process.pid)
+        workers = [each for each in kernel.children(recursive=True) if "spawn_main" in " ".join(each.cmdline())]
+        assert len(workers) == 1
+        manager.interrupt_kernel()
+        replies = iter(lambda: client.get_shell_msg(timeout=PATIENCE_S), None)  # those of its start come first
+        reply = next(each for each in replies if each["parent_header"]["msg_id"] == sent)
+        assert reply["content"]["ename"] == "KeyboardInterrupt"
+        assert psutil.wait_procs(workers, PATIENCE_S)[1] == []
+        again = client.execute("assert 'frame' not in globals()", reply=True, timeout=PATIENCE_S)
+        assert again["content"]["status"] == "ok"
+    finally:
+        client.stop_channels()
+        manager.shutdown_kernel(now=True)
+    assert [row["seed"] for row in read_table(tmp_path / "swept/sweep.parquet")] == [1]
 
 
 @pytest.mark.slow

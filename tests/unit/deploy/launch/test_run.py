@@ -165,7 +165,7 @@ def test_an_endpoint_is_checked_before_anything_starts(endpoint: str):
 
 
 def test_a_run_in_one_process_says_where_it_is_recorded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    monkeypatch.setattr("zsim_analysis.in_process.fly", lambda *_, changed: "over")
+    monkeypatch.setattr("zsim_api.flight.fly", lambda *_: "over")
     screen, made = Say(), options(tmp_path, in_process=True)
     run.run_in_process(made, screen)  # type: ignore[arg-type]
     assert any(has_terms(line, "into", str(tmp_path)) for line in screen.lines)
