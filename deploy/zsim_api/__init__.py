@@ -29,6 +29,7 @@ if TYPE_CHECKING:  # for editors, which do not read _WHERE
     from zsim_api.environments import gym_env as gym_env
     from zsim_api.environments import parallel_env as parallel_env
     from zsim_api.environments import vector_env as vector_env
+    from zsim_api.federation import Federation as Federation
     from zsim_api.flight import run as run
     from zsim_api.policy import Interface as Interface
     from zsim_api.policy import PolicyAgent as PolicyAgent
@@ -49,6 +50,7 @@ _WHERE = {
         *("any_of", "collided", "far_away", "flipped"),
         *("gym_env", "parallel_env", "vector_env"),
     ),
+    "zsim_api.federation": ("Federation",),
     "zsim_api.flight": ("run",),
     "zsim_api.policy": ("Interface", "PolicyAgent"),
     "zsim_api.recorded": ("Run", "load"),

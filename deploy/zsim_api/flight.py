@@ -1,8 +1,6 @@
 """`zsim.run`: a whole flight, in this process or as processes of its own, recorded and given back as a `Run`."""
 
-import os
 import signal
-import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,6 +18,7 @@ from zsim.schema import plugin
 from zsim_analysis.in_process import OwnAgent, fly, with_agents
 from zsim_analysis.reading.shortfall import verdict
 from zsim_api import run_folder
+from zsim_api.programs import Program, search_path
 from zsim_api.scenarios import AnyScenario, Scenario, scenario_of
 
 if TYPE_CHECKING:
@@ -115,7 +114,29 @@ def _fly_as_processes(
     folder: Path,
     progress: bool,
 ) -> None:
-    """Fly by `zsim run`: a launcher of its own has its signals and its children for itself."""
+    program = Program(*command_of(source, agents, names, options, folder), quiet=not progress)
+    try:
+        while True:
+            try:
+                code = program.wait()
+                break
+            except KeyboardInterrupt:
+                program.interrupt()
+    finally:
+        program.close()
+    if code == INTERRUPTED:
+        raise KeyboardInterrupt(f"interrupted; zsim.load({str(folder)!r}) reads the record so far")
+    if code:
+        raise_failure(folder, code)
+
+
+def command_of(
+    source: Scenario, agents: Sequence[OwnAgent], names: Sequence[str], options: Sequence[str], folder: Path
+) -> tuple[list[str], dict[str, str]]:
+    """Return the `zsim run` that flies a scenario as processes, and its environment.
+
+    A launcher of its own has its signals and its children for itself.
+    """
     command = [*COMMAND, "run", str(_file_of(source, folder)), "--out", str(folder), "--force", "--no-report"]
     command += [word for change in source.changes or () for word in ("--set", change)]
     folders = [folder, *source.folders]
@@ -125,26 +146,7 @@ def _fly_as_processes(
         named = [name_of(each, folder) for each in agents]
         folders += module_folders(named)
         command += [w for name, each in zip(names, named, strict=True) for w in ("--agent", f"{name}={each}")]
-    searched = [*map(str, folders), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(dict.fromkeys(searched))}
-    quiet = None if progress else subprocess.DEVNULL
-    # in a session of its own, so that Ctrl-C reaches it from here alone, once
-    with subprocess.Popen(
-        [*command, *options], env=environment, stdout=quiet, stderr=quiet, start_new_session=True
-    ) as program:
-        while True:
-            try:
-                code = program.wait()
-                break
-            except KeyboardInterrupt:
-                program.send_signal(signal.SIGINT)
-            except BaseException:
-                program.terminate()
-                raise
-    if code in (INTERRUPTED, -signal.SIGINT):
-        raise KeyboardInterrupt(f"interrupted; zsim.load({str(folder)!r}) reads the record so far")
-    if code:
-        _raise_failure(folder, code)
+    return [*command, *options], {"PYTHONPATH": search_path(folders)}
 
 
 def _file_of(source: Scenario, folder: Path) -> Path:
@@ -156,7 +158,7 @@ def _file_of(source: Scenario, folder: Path) -> Path:
     return file
 
 
-def _raise_failure(folder: Path, code: int) -> None:
+def raise_failure(folder: Path, code: int) -> None:
     """Raise what ended the processes of a run; nothing where all of it was flown, though not as planned."""
     record = folder / RECORD
     if not record.exists():

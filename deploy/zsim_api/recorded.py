@@ -168,7 +168,7 @@ class Run:
         Raises:
             RunError: no such cluster, or its states cannot be judged.
         """
-        found = self._formation(cluster)
+        found = self.judged_formation(cluster)
         parts = {
             "desired": found.desired,
             "estimate": found.value,
@@ -451,7 +451,8 @@ class Run:
         names = [each.space for each in (own, *own.groups) if each.space and ":" in each.space] if own else []
         return f"; its space {names[0]} is imported by zsim.load(…, trust=True) only" if names else ""
 
-    def _formation(self, cluster: str | None) -> Formation:
+    def judged_formation(self, cluster: str | None = None) -> Formation:
+        """Return what `formation` shows of a cluster, as arrays; errors as there."""
         name = self._cluster(cluster)
         found = next((each for each in self._judged[1] if each.name == name), None)
         if found is None:

@@ -16,7 +16,7 @@ from msgspec import Struct
 
 from zsim.contract import keys, messages
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
-from zsim.errors import SessionError
+from zsim.errors import RequestRefusedError, RunError, SessionError
 from zsim.transport import tls, zenoh_settings
 from zsim.transport.tls import Act, Identity, Permissions
 from zsim.transport.zenoh_settings import SESSION_FILES, Mode, Settings, require_files
@@ -186,6 +186,13 @@ class Query:
 
 class Unanswered(ControlAnswer, frozen=True):
     """Takes the place of an answer that did not come, and says why."""
+
+
+def result_of(answer: ControlAnswer) -> Any:
+    """Return the result of a request; RequestRefusedError if it is refused, RunError if no answer came."""
+    if answer.ok:
+        return answer.result
+    raise (RunError if isinstance(answer, Unanswered) else RequestRefusedError)(answer.error)
 
 
 class Session:

@@ -271,7 +271,7 @@ def row(fault: "Fault", now_ns: int) -> tuple[str, ...]:
 
 def _ask(link: "Session", op: str, args: dict[str, Any]) -> dict[str, Any]:
     from zsim.contract import keys
-    from zsim_deploy.cli import inspection
+    from zsim.transport.session import result_of
 
     given = {name: value for name, value in args.items() if value is not None}
-    return inspection.result_of(link.request(keys.CONTROL, op, SOURCE, given))
+    return result_of(link.request(keys.CONTROL, op, SOURCE, given))

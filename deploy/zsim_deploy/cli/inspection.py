@@ -13,8 +13,8 @@ import msgspec
 
 from zsim.contract import keys, messages, run_messages
 from zsim.contract.framing import pairs_of
-from zsim.errors import DecodeError, RequestRefusedError, RunError
-from zsim.transport.session import RawSample, ReceivedSample, Session, Subscription, Unanswered, check_expression
+from zsim.errors import DecodeError, RunError
+from zsim.transport.session import RawSample, ReceivedSample, Session, Subscription, check_expression, result_of
 
 LISTEN_S = 1.0  # wall time that `keys` listens: every live key of the contract has a message at least once a second
 PACKET_S = 0.05  # wait between two looks into an empty subscription
@@ -280,10 +280,3 @@ def ask(link: Session, key: str, op: str, text: str) -> Any:
     with suppress(DecodeError):  # a replay is the only result that holds messages
         return [{"key": key, "message": readable(ReceivedSample(key, payload))} for key, payload in pairs_of(result)]
     return msgspec.to_builtins(result, str_keys=True)
-
-
-def result_of(answer: run_messages.ControlAnswer) -> Any:
-    """Return the result of a request; RequestRefusedError if it is refused, RunError if no answer came."""
-    if answer.ok:
-        return answer.result
-    raise (RunError if isinstance(answer, Unanswered) else RequestRefusedError)(answer.error)

@@ -1,0 +1,116 @@
+"""What tests assert of a run: its errors, that nothing collided, that it is the same to the bit as another."""
+
+from abc import ABC, abstractmethod
+from itertools import zip_longest
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from zsim.contract import keys
+from zsim.contract.run_messages import Event
+from zsim.errors import RunError
+from zsim.record import RecordReader
+from zsim_agents.formation.spaces.cluster_space import unit
+from zsim_analysis.reading.recorded_run import decode_or_none, gates
+from zsim_analysis.rerun import TruthComparison
+
+if TYPE_CHECKING:
+    from zsim_api.recorded import Run
+
+NAMED_MAX = 3  # collisions
+
+
+class Assertions(ABC):
+    """What a test asserts of a run; each lets it fly to its end first."""
+
+    @abstractmethod
+    def run(self) -> "Run":
+        """Return the run on record."""
+
+    def assert_errors(
+        self, window: tuple[float, float] | None = None, cluster: str | None = None, **rms: float
+    ) -> None:
+        """Assert the true errors of a formation: the RMS of truth − desired while it is engaged.
+
+        Args:
+            window: from and to [s]; None: that of the report.
+            cluster: name; None: the first.
+            rms: the largest RMS allowed by cluster variable [m, rad], such as p=0.3.
+
+        Raises:
+            AssertionError: an RMS is larger or not known, a line each, with the largest error and when it was; or the
+                formation was not engaged all the time.
+        """
+        __tracebackhide__ = True  # pytest shows the test's line, not these
+        run = self.run()
+        formation = run.judged_formation(cluster)
+        window = window or run.summary.window_s
+        where = f"{formation.name} from {window[0]:g} to {window[1]:g} s"
+        if unknown := [name for name in rms if name not in formation.names]:
+            raise RunError(f"{where}: has no variable {unknown[0]!r}; must be one of {', '.join(formation.names)}")
+        share, found, faults = formation.engaged_share(window), formation.errors(window), []
+        if share != 1.0:
+            faults.append(f"{where}: was engaged {share or 0:.0%} of the time; must be all of it")
+        for name, allowed in rms.items():
+            error = found[name].true_rms
+            if error is None:
+                faults.append(f"{where}: true RMS of {name} is unknown")
+            elif not error <= allowed:
+                errors = np.where(
+                    formation.judged(window), np.abs(formation.true_error[:, formation.column(name)]), 0.0
+                )
+                row = int(np.nanargmax(errors))
+                most = f"the largest error is {errors[row]:.3g}, at {formation.t_s[row]:.2f} s"
+                faults.append(
+                    f"{where}: true RMS of {name} is {error:.3g} {unit(name)}; allowed are {allowed:g}; {most}"
+                )
+        if faults:
+            raise AssertionError("\n".join([*faults, f"the record is {run.record}"]))
+
+    def assert_no_collision(self) -> None:
+        """Assert that no drone collided with another, or ran into an obstacle; AssertionError says which, and when."""
+        __tracebackhide__ = True
+        run = self.run()
+        with RecordReader(run.record) as reader:
+            events = [decode_or_none(recorded) for recorded in reader.messages([keys.EVENT])]
+        found = [event for event in events if isinstance(event, Event) and event.kind == "collision"]
+        if found:
+            lines = [f"{event.text}, at {event.t_ns / 1e9:.2f} s" for event in found[:NAMED_MAX]]
+            more = [f"and {len(found) - NAMED_MAX} more"] if len(found) > NAMED_MAX else []
+            raise AssertionError("\n".join([*lines, *more, f"the record is {run.record}"]))
+
+    def assert_same_bits(self, other: "Assertions | Run | str | Path") -> None:
+        """Assert that the truth of another run is the same to the bit.
+
+        Args:
+            other: another federation, a run, or where one is.
+
+        Raises:
+            AssertionError: with the first difference: drone, time, and how large.
+        """
+        __tracebackhide__ = True
+        from zsim_api.recorded import Run
+
+        ours = self.run()
+        theirs = other.run() if isinstance(other, Assertions) else other if isinstance(other, Run) else Run(other)
+        if ours.truth_sha256 != theirs.truth_sha256:
+            raise AssertionError(f"{_difference(ours, theirs)}\nthe records are {ours.record} and {theirs.record}")
+
+
+def _difference(ours: "Run", theirs: "Run") -> str:
+    if ours.drones != theirs.drones:
+        return f"the drones are {', '.join(ours.drones)}; those of the other run are {', '.join(theirs.drones)}"
+    comparison = TruthComparison(ours.drones)
+    with RecordReader(ours.record) as one, RecordReader(theirs.record) as two:
+        for a, b in zip_longest(*(gates(reader, list(ours.drones)) for reader in (one, two))):
+            if a is None:
+                return f"truth is the same until this run ends, before t = {b.t_ns / 1e9:.2f} s"
+            if b is None:
+                return f"truth is the same until the other run ends, before t = {a.t_ns / 1e9:.2f} s"
+            if a.t_ns != b.t_ns:
+                return f"gates differ: t = {a.t_ns / 1e9:.3f} s, and {b.t_ns / 1e9:.3f} s in the other run"
+            comparison.add(a.t_ns, b.truth, a.truth)
+            if comparison.first:
+                return f"truth is not the same: it first differs from the other run's for {comparison.first}"
+    return "truth on record is the same, but its hash is not: one of the records is not complete"

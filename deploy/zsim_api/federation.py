@@ -1,0 +1,512 @@
+"""A flight under test: real processes, and a user's own programs beside them, while a test looks on and intervenes.
+
+    with zsim.Federation("step.yaml", duration=40, programs=["python my_controller.py --connect {endpoint}"]) as flight:
+        flight.wait_until("engaged")
+        flight.inject({"kind": "gps_dropout", "target": "drone2", "for_s": 10})
+        flight.kill("estimator.drone2")
+        flight.assert_errors(p=0.3, window=(20, 40))
+
+The test takes part in the lockstep as `test.federation`: simulated time stands still unless it waits for something, so
+what it does acts at the same gate each time. The fixture `federation` of the pytest plugin gives these.
+"""
+
+import os
+import shlex
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, get_args
+
+from msgspec import UNSET
+
+from zsim.contract import keys
+from zsim.contract.flight_messages import ClusterState, Phase, Truth
+from zsim.contract.messages import Info, decode
+from zsim.contract.run_messages import Clock, Event, holding_up
+from zsim.errors import DecodeError, RunError, RunFailedError, ZsimError
+from zsim.runtime.agent import Agent, Output
+from zsim.runtime.runner import Runner
+from zsim.scenario.roles import expected_processes
+from zsim.schema.checker import suggestion
+from zsim.transport.connection import find_world
+from zsim.transport.session import RawSample, Session, result_of
+from zsim_analysis.in_process import OwnAgent, with_agents
+from zsim_api import run_folder
+from zsim_api.assertions import Assertions
+from zsim_api.flight import calling, command_of, raise_failure
+from zsim_api.programs import Program, search_path
+from zsim_api.scenarios import AnyScenario, scenario_of
+
+if TYPE_CHECKING:
+    from zsim_api.recorded import Run
+
+PROCESS = "test.federation"
+PATIENCE_S = 180.0  # wall time; the first run on a machine compiles for one to three minutes
+PROGRAM_END_S = 5.0  # wall time that programs have to see that the run is over
+LAST_LINES = 10  # of each log
+LAUNCHER = "zsim-run"  # its output, beside the logs of the processes
+
+
+class Moment(NamedTuple):
+    """What a condition of `wait_until` is told of a gate.
+
+    Attributes:
+        t_s: simulated time.
+        states: the states of the clusters by name, as far as they have come: two gates old.
+        truth: the true motion of the drones by name; without external ones.
+        events: those since the last `wait_until`.
+    """
+
+    t_s: float
+    states: Mapping[str, ClusterState]
+    truth: Mapping[str, Truth]
+    events: Sequence[Event]
+
+
+Condition = Callable[[Moment], Any]
+
+
+class Federation(Assertions):
+    """A flight as processes: `zsim run`, on a free port and under a federation's name of its own, and programs.
+
+    Args:
+        scenario: path, `zsim.Scenario`, or a mapping as in YAML.
+        duration: simulated time of the flight [s]; None: that of the scenario.
+        seed, set, law, estimator, out: as of `zsim.run`; `out` may be replaced.
+        agents: of your own, as of `zsim.run`, or as words of `zsim run --agent`, "MODULE:CLASS NAME=VALUE".
+        programs: command lines of your own programs, in any language, as text or as words. `{endpoint}`,
+            `{federation}` and `{folder}` are replaced, and the environment has ZSIM_CONNECT and ZSIM_FEDERATION. Time
+            does not begin before a program has joined that is named, as in "ground.main=python ground.py".
+        options: of `zsim run`, such as "--hosted", or "--rate" and "1".
+        modules: folders in which classes that are named are looked for, beside those of the scenario.
+
+    Attributes:
+        endpoint, name: where its world listens; the federation's name.
+        folder: of the run, with the record and the logs.
+
+    Raises:
+        ScenarioError, RunError: it cannot be flown; nothing was started.
+    """
+
+    def __init__(
+        self,
+        scenario: AnyScenario,
+        duration: float | None = None,
+        *,
+        seed: int | None = None,
+        set: Mapping[str, Any] | None = None,
+        agents: Sequence[OwnAgent | str] = (),
+        programs: Sequence[str | Sequence[str]] = (),
+        law: type | None = None,
+        estimator: type | None = None,
+        options: Sequence[str] = (),
+        out: str | Path | None = None,
+        modules: Sequence[str | Path] = (),
+    ) -> None:
+        self._port = _reserved_port()
+        self.endpoint = f"tcp/127.0.0.1:{self._port.getsockname()[1]}"
+        self.name = f"test-{os.getpid()}-{self._port.getsockname()[1]}"
+        started: list[tuple[str, list[str]]] = [_named(each) for each in programs]
+        try:
+            source = scenario_of(scenario).changed(
+                seed=seed, duration_s=duration, set=set, law=law, estimator=estimator
+            )
+            own = [each for each in agents if not isinstance(each, str)]
+            named = [each for each in agents if isinstance(each, str)]
+            flown, made = calling(lambda: with_agents(source.resolved, own))
+            expected = [*expected_processes(flown), *(name for name, _ in started if name), PROCESS]
+            changed: dict[str, Any] = {"federation": self.name, "processes.expect": expected}
+            changed["processes.on_death"] = {**flown.processes.on_death, PROCESS: "drop"}
+            source = source.with_(changed)
+            self.folder = run_folder.make_directory(Path(out) if out is not None else None, flown, force=True)
+            source.keep_modules(self.folder)
+            logs = self.folder / run_folder.LOGS
+            logs.mkdir(exist_ok=True)
+        except BaseException:
+            self._port.close()
+            raise
+        self._watch = _Watch()
+        self._clock: Clock | None = None
+        self._pids: dict[str, int] = {}
+        self._killed: dict[int, str] = {}
+        self._link: Session | None = None
+        self._over = False
+        self._run: Run | None = None
+        words = [word for each in named for word in ("--agent", each)]
+        launched = ["--listen", self.endpoint, *words, *options]
+        command, environment = command_of(source, own, [agent.name for agent in made], launched, self.folder)
+        environment["PYTHONPATH"] = search_path([*modules, environment["PYTHONPATH"]])
+        self._launcher = Program(command, environment, logs / f"{LAUNCHER}.log")
+        environment |= {"ZSIM_CONNECT": self.endpoint, "ZSIM_FEDERATION": self.name}
+        # `python` and `zsim` are those that run the test
+        environment["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
+        self._programs: dict[str, Program] = {}
+        for i, (name, words) in enumerate(started):
+            label = name or f"program-{i + 1}"
+            self._programs[label] = Program(self._filled(words), environment, logs / f"{label}.log")
+        self._threads = [threading.Thread(target=self._take_part, name=PROCESS, daemon=True)]
+        for program in (self._launcher, *self._programs.values()):
+            self._threads.append(threading.Thread(target=self._await_end, args=(program,), daemon=True))
+        for thread in self._threads:
+            thread.start()
+
+    def _filled(self, words: Sequence[str]) -> list[str]:
+        values = {"{endpoint}": self.endpoint, "{federation}": self.name, "{folder}": str(self.folder)}
+        filled = list(words)
+        for mark, value in values.items():
+            filled = [word.replace(mark, value) for word in filled]
+        return filled
+
+    # Time
+
+    @property
+    def t_s(self) -> float:
+        """Simulated time at which it stands, or which it has come to [s]; 0 before it begins."""
+        moment = self._watch.moment
+        return moment.t_s if moment else 0.0
+
+    def wait_until(self, what: str | float | Condition, within_s: float = PATIENCE_S) -> Moment:
+        """Let time pass until something is the case, and stand there. In realtime it goes on.
+
+        Args:
+            what: a phase in which every cluster is, such as "engaged"; the kind of an event, such as "collision",
+                that has happened since the last call; a simulated time [s]; or a function of a `Moment`.
+            within_s: wall time.
+
+        Returns:
+            The moment.
+
+        Raises:
+            RunFailedError: the run has ended before, or a program has failed, or it takes longer.
+            Exception: what the function has raised.
+        """
+        __tracebackhide__ = True
+        condition, text = _condition(what)
+        watch, until_s = self._watch, time.monotonic() + within_s
+        with watch.news:
+            watch.begin(condition)
+            while watch.wanted is condition and self._fault is None:
+                if not watch.news.wait(max(0.0, until_s - time.monotonic())):
+                    break
+            waited, watch.wanted = watch.wanted is condition, None
+            if watch.raised is not None:
+                raise watch.raised
+            if not waited and watch.moment is not None:
+                return watch.moment
+        fault = self._fault or f"it has not come within {within_s:g} s of wall time"
+        raise RunFailedError(f"{self.folder.name}: waiting for {text} from {self.t_s:.2f} s on: {fault}")
+
+    def run(self, within_s: float = PATIENCE_S) -> "Run":
+        """Let time pass until the end of the run; return the run on record, `zsim.load` of its folder.
+
+        Args:
+            within_s: wall time.
+
+        Raises:
+            RunFailedError: a failure ended the run, or a program ended with another code than 0, or it takes longer.
+        """
+        if self._run is None:
+            self._watch.finish()
+            code = self._launcher.wait(within_s)
+            if code is None:
+                raise RunFailedError(f"{self.folder.name}: the run has not ended within {within_s:g} s of wall time")
+            until_s = time.monotonic() + PROGRAM_END_S
+            for program in self._programs.values():
+                program.wait(max(0.0, until_s - time.monotonic()))
+                program.close()
+            if fault := self._program_fault():
+                raise RunFailedError(f"{self.folder.name}: {fault}")
+            if code:
+                raise_failure(self.folder, code)
+            from zsim_api.recorded import load
+
+            self._run = load(self.folder, trust=True)
+        return self._run
+
+    # Interventions
+
+    def ask(self, key: str, op: str, within_s: float = PATIENCE_S, **args: Any) -> Any:
+        """Ask the world or a controller, as `zsim ask` does: `ask("cluster/main/control", "target", values={…})`.
+
+        Args:
+            key: `world/control` or `cluster/NAME/control`.
+            op, args: docs/protocol.md has them.
+            within_s: wall time to wait for the world.
+
+        Raises:
+            RequestRefusedError: with the reason.
+            RunError: no answer came.
+        """
+        return result_of(self._session(within_s).request(key, op, PROCESS, args))
+
+    def inject(self, fault: Mapping[str, Any]) -> Any:
+        """Inject a fault, as in a scenario's `faults`, from the next gate on; see docs/faults.md.
+
+        Returns:
+            `id`, `from_ns` and `until_ns`.
+
+        Raises:
+            RequestRefusedError: with the reason.
+        """
+        return self.ask(keys.CONTROL, "fault_add", **fault)
+
+    def kill(self, process: str, within_s: float = PATIENCE_S) -> int:
+        """Kill a process of the run, as by kill -9; return its process id.
+
+        Args:
+            process: name, such as "estimator.drone2", "world", or that of a program of yours that has joined.
+            within_s: wall time to wait for its joining.
+
+        Raises:
+            RunFailedError: it has not joined.
+        """
+        until_s = time.monotonic() + within_s
+        with self._watch.news:
+            while (pid := self._pids.get(process)) is None or pid in self._killed:
+                if self._fault is not None or not self._watch.news.wait(max(0.0, until_s - time.monotonic())):
+                    known = ", ".join(sorted(self._pids)) or "none"
+                    raise RunFailedError(
+                        f"kill: process is {process!r}; {suggestion(process, list(self._pids))}joined are {known}"
+                    )
+            self._killed[pid] = process
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+        return pid
+
+    def _session(self, within_s: float) -> Session:
+        until_s = time.monotonic() + within_s
+        with self._watch.news:
+            while self._link is None:
+                if self._fault is not None or not self._watch.news.wait(max(0.0, until_s - time.monotonic())):
+                    raise RunFailedError(f"{self.folder.name}: {self._fault or f'no world within {within_s:g} s'}")
+            return self._link
+
+    # Its end
+
+    def close(self) -> None:
+        """End whatever of it runs; its record holds all until then."""
+        self._over = True
+        self._watch.finish()
+        self._launcher.close()
+        for program in self._programs.values():
+            program.close()
+        for thread in self._threads:
+            thread.join()
+        self._port.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def diagnosis(self) -> str:
+        """Return how far it has come, who waits for whom, and the last lines of every log, for people."""
+        parts = [self._standing()]
+        if fault := self._program_fault():
+            parts.append(fault)
+        for log in sorted((self.folder / run_folder.LOGS).glob("*.log"), key=lambda each: each.stem != LAUNCHER):
+            lines = log.read_text(errors="replace").splitlines()
+            shown = lines[-(4 * LAST_LINES if log.stem == LAUNCHER else LAST_LINES) :]
+            if shown:
+                before = f" (last {len(shown)} of {len(lines)} lines)" if len(shown) < len(lines) else ""
+                parts.append("\n".join([f"--- {log.name}{before}", *shown]))
+        return "\n".join(parts)
+
+    def _standing(self) -> str:
+        clock = self._newest_clock()
+        if clock is None:
+            return "no clock of a world has come"
+        waiting = [each for each in clock.waiting_for if each.name != PROCESS]
+        lines = []
+        for each in holding_up(clock.state, waiting) or waiting:
+            held = f", held by {', '.join(each.held_by)}" if each.held_by else ""
+            lines.append(f"  {each.name} on {each.host} since {each.since_wall_s:.1f} s{held}")
+        if not self._watch.left and self._watch.wanted is None:
+            lines.append(f"  {PROCESS}, this test, which waits for nothing at the moment")
+        lines.insert(0, f"t = {clock.t_ns / 1e9:.2f} s, {clock.state}; waiting_for:{'' if lines else ' nobody'}")
+        return "\n".join(lines)
+
+    def _newest_clock(self) -> Clock | None:
+        link = self._link
+        with suppress(ZsimError):
+            for sample in link.get(keys.CLOCK) if link and self._launcher.code is None else ():
+                self._take_clock(sample.payload)
+        return self._clock
+
+    # In threads of its own
+
+    @property
+    def _fault(self) -> str | None:
+        """Why nothing more comes of it, None while it goes on."""
+        if fault := self._program_fault():
+            return fault
+        if (code := self._launcher.code) is not None:
+            log = self.folder / run_folder.LOGS / f"{LAUNCHER}.log"
+            lines = log.read_text(errors="replace").splitlines()
+            return f"the run has ended with code {code}: {lines[-1] if lines else 'it has said nothing'}"
+        return "the run has ended" if self._watch.left else None
+
+    def _program_fault(self) -> str:
+        for name, program in self._programs.items():
+            if program.code and not program.asked:
+                lines = (self.folder / run_folder.LOGS / f"{name}.log").read_text(errors="replace").splitlines()
+                said = lines[-1] if lines else "it has said nothing"
+                return f"{name} ({shlex.join(program.words)}) ended with code {program.code}: {said}"
+        return ""
+
+    def _await_end(self, program: Program) -> None:
+        program.wait()
+        with self._watch.news:
+            self._watch.news.notify_all()
+
+    def _take_part(self) -> None:
+        """Look on from before the run begins to its end; the world waits for this."""
+
+        def is_over() -> bool:
+            return self._over or self._launcher.code is not None
+
+        try:
+            with find_world(self.endpoint, self.name, None, stopped=is_over) as (link, info):
+                link.declare_subscriber(keys.CLOCK, lambda sample: self._take_clock(sample.payload))
+                for kind in ("join", "health"):
+                    link.declare_subscriber(keys.process("*", kind), self._take_process)
+                with self._watch.news:
+                    self._link = link
+                    self._watch.news.notify_all()
+                self._watch.watch(info)
+                Runner(link, info, self._watch, stopped=lambda: self._launcher.code is not None).run()
+        except ZsimError as error:
+            if not is_over():
+                print(f"{PROCESS}: {error}", file=sys.stderr)
+        finally:
+            with self._watch.news:
+                self._link, self._watch.left = None, True
+                self._watch.news.notify_all()
+
+    def _take_clock(self, payload: bytes) -> None:
+        with suppress(DecodeError):
+            self._clock = decode(keys.CLOCK, payload)
+
+    def _take_process(self, sample: RawSample) -> None:
+        with suppress(DecodeError):
+            message = decode(sample.key, sample.payload)
+            with self._watch.news:
+                name = keys.thing(sample.key)
+                if self._pids.get(name) != message.pid and message.pid not in self._killed and name != PROCESS:
+                    self._pids[name] = message.pid
+                    self._watch.news.notify_all()
+
+
+class _Watch(Agent):
+    """The test's part in the lockstep: it is done with a gate once the test has let time pass.
+
+    Attributes:
+        news: guards all of this, and tells of changes.
+        wanted: what the test waits for; None while time is to stand.
+        moment: the newest gate; None before the first.
+        raised: by the condition.
+        left: whether it takes part no longer.
+    """
+
+    name = PROCESS
+    uncounted = (keys.EVENT,)  # the end of a process is stamped with a gate that has been taken
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.news = threading.Condition()
+        self.wanted: Condition | None = None
+        self.moment: Moment | None = None
+        self.raised: BaseException | None = None
+        self.left = False
+        self._holds = True
+        self._now_ns = 0
+        self._states: dict[str, ClusterState] = {}
+        self._truth: dict[str, Truth] = {}
+        self._events: list[Event] = []
+
+    def watch(self, info: Info) -> None:
+        """Prepare for the run of `world/info`; in realtime, time goes on by itself."""
+        simulated = [drone.name for drone in info.drones if drone.body is UNSET]
+        truth = [keys.truth(drone) for drone in simulated]
+        self.gate_keys = (*(keys.status(drone.name) for drone in info.drones), *truth)
+        self.reads = (*self.gate_keys, keys.cluster_state("*"), keys.EVENT)
+        self.bind(info)
+        self._holds = info.mode == "lockstep"
+
+    def begin(self, condition: Condition) -> None:
+        """Let time pass until a condition; to be called with `news` held."""
+        self._events = [event for event in self._events if event.t_ns >= self._now_ns]
+        self.raised, self.wanted = None, condition
+        self.news.notify_all()
+
+    def finish(self) -> None:
+        """Let time pass to the end."""
+        with self.news:
+            self.begin(lambda _: False)
+
+    def receive(self, key: str, message: Any) -> None:
+        if key == keys.EVENT:
+            self._events.append(message)
+        elif isinstance(message, ClusterState):
+            self._states[keys.thing(key)] = message
+        elif isinstance(message, Truth):
+            self._truth[keys.thing(key)] = message
+
+    def step(self, t_ns: int) -> Sequence[Output]:
+        with self.news:
+            self._now_ns = t_ns
+            events = tuple(event for event in self._events if event.t_ns < t_ns)  # of this gate, some are on their way
+            self.moment = Moment(t_ns / 1e9, dict(self._states), dict(self._truth), events)
+            while True:
+                wanted = self.wanted
+                if wanted is not None:
+                    try:
+                        if not wanted(self.moment):
+                            return []
+                    except BaseException as error:  # the test's: it is raised there
+                        self.raised = error
+                    self.wanted = None
+                self.news.notify_all()
+                if not self._holds:
+                    return []
+                self.news.wait()
+
+
+def _condition(what: str | float | Condition) -> tuple[Condition, str]:
+    """Return what a test waits for as a function of a moment, and as a text."""
+    if callable(what):
+        return what, getattr(what, "__name__", repr(what))
+    if isinstance(what, str):
+        if what in get_args(Phase):
+
+            def in_phase(moment: Moment) -> bool:
+                return bool(moment.states) and all(state.phase == what for state in moment.states.values())
+
+            return in_phase, f"the phase {what!r}"
+        return lambda moment: any(event.kind == what for event in moment.events), f"an event of kind {what!r}"
+    return lambda moment: moment.t_s >= what, f"t = {what:g} s"
+
+
+def _named(program: str | Sequence[str]) -> tuple[str, list[str]]:
+    """Return the process name of a program, empty if it has none, and its words."""
+    words = shlex.split(program) if isinstance(program, str) else list(program)
+    if not words:
+        raise RunError("programs: a command line is empty; must be words such as 'python my_controller.py'")
+    name, equals, first = words[0].partition("=")
+    if equals and "." in name and keys.PROCESS_NAME.fullmatch(name):
+        return name, [first, *words[1:]]
+    return "", words
+
+
+def _reserved_port() -> socket.socket:
+    """Return a socket that keeps a free port of this machine from others, and on which a world can listen."""
+    kept = socket.socket()
+    kept.bind(("127.0.0.1", 0))
+    kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # after: another that asks for any port gets another
+    return kept

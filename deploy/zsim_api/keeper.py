@@ -1,0 +1,83 @@
+"""Runs a program, and ends it and all that it has started when whoever asked for it is gone, also by kill -9.
+
+    python -I -S keeper.py GRACE_S WORD...
+
+Standard input is a pipe from the caller, which ends with it: then the program is asked to end (SIGTERM), and killed if
+it has not within the grace. Signals are passed on to its process group. What a program leaves behind it has the same
+grace, and is killed. The exit code is the program's; 128 + N for a signal, as in shells, and 127 where it cannot start.
+
+This file is run by its path and imports the standard library alone, so that it costs some milliseconds.
+"""
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+
+PR_SET_CHILD_SUBREAPER = 36  # linux/prctl.h
+NOT_STARTED = 127
+AGAIN_S = 0.02  # between two looks for what the killed have left
+
+
+def main(grace_s: float, words: list[str]) -> int:
+    early: list[int] = []
+    program: subprocess.Popen[bytes] | None = None
+
+    def forward(number: int, _: object = None) -> None:
+        if program is None:
+            early.append(number)
+        else:
+            with suppress(ProcessLookupError):
+                os.killpg(program.pid, number)
+
+    def await_caller() -> None:
+        while os.read(sys.stdin.fileno(), 1):
+            continue
+        forward(signal.SIGTERM)
+        time.sleep(grace_s)
+        _kill_children()
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, forward)
+    if sys.platform == "linux":  # whatever a program detaches becomes a child of this process
+        ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    try:
+        program = subprocess.Popen(words, stdin=subprocess.DEVNULL, process_group=0)
+    except OSError as error:
+        print(f"{words[0]}: cannot be started ({error.strerror})", file=sys.stderr)
+        return NOT_STARTED
+    for number in early:
+        forward(number)
+    threading.Thread(target=await_caller, daemon=True).start()
+    code = program.wait()
+    forward(signal.SIGTERM)
+    killer = threading.Timer(grace_s, _kill_children)
+    killer.daemon = True
+    killer.start()
+    with suppress(ChildProcessError):  # none is left
+        while True:
+            os.waitpid(-1, 0)
+    return code if code >= 0 else 128 - code
+
+
+def _kill_children() -> None:
+    """Kill the children, and theirs, which become children of this process in turn, until none is left."""
+    while children := _children():
+        for pid in children:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        time.sleep(AGAIN_S)
+
+
+def _children() -> list[int]:
+    """Return the children of all threads; only Linux tells."""
+    return [int(pid) for path in Path("/proc/self/task").glob("*/children") for pid in path.read_text().split()]
+
+
+if __name__ == "__main__":
+    sys.exit(main(float(sys.argv[1]), sys.argv[2:]))

@@ -1,0 +1,81 @@
+"""Programs that this process starts beside itself, and that never outlive it: `zsim run`, and a user's own.
+
+Each has a keeper (keeper.py) in a session of its own between it and this process. So Ctrl-C in a terminal reaches a
+program from here alone, and nothing is left running when this process is killed.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from zsim_api import keeper
+
+GRACE_S = 10.0  # wall time that a program has to end, once it is asked to; `zsim run` ends within 3 s
+KEEPER = (sys.executable, "-I", "-S", keeper.__file__)
+
+
+class Program:
+    """A program that has been started.
+
+    Args:
+        words: its command line.
+        environment: variables that differ from those of this process.
+        output: file that takes its output; None for this process's own.
+        quiet: show no output, without a file.
+    """
+
+    def __init__(
+        self,
+        words: Sequence[str],
+        environment: Mapping[str, str] | None = None,
+        output: Path | None = None,
+        quiet: bool = False,
+    ) -> None:
+        self.words = tuple(words)
+        self.asked = False  # whether it has been asked to end from here
+        self._lock = threading.Lock()
+        with open(output or os.devnull, "ab") as log:
+            goes_to = log if output or quiet else None
+            self._keeper = subprocess.Popen(
+                [*KEEPER, str(GRACE_S), *words],
+                stdin=subprocess.PIPE,
+                stdout=goes_to,
+                stderr=goes_to,
+                env={**os.environ, **(environment or {})},
+                start_new_session=True,
+            )
+
+    @property
+    def code(self) -> int | None:
+        """Its exit code, None while it runs; 128 + N for a signal, 127 where it could not be started."""
+        return self._keeper.poll()
+
+    def wait(self, timeout_s: float | None = None) -> int | None:
+        """Wait for its end, and that of all that it has started; return its exit code, None if it runs still."""
+        with suppress(subprocess.TimeoutExpired):
+            return self._keeper.wait(timeout_s)
+        return None
+
+    def interrupt(self) -> None:
+        """Send it what Ctrl-C sends."""
+        self._keeper.send_signal(signal.SIGINT)
+
+    def close(self) -> int:
+        """Ask it to end if it runs, kill what has not ended within GRACE_S, and return its exit code."""
+        with self._lock:
+            self.asked = self.asked or self.code is None
+            assert self._keeper.stdin is not None
+            with suppress(OSError):
+                self._keeper.stdin.close()
+            return self._keeper.wait()
+
+
+def search_path(folders: Sequence[str | Path]) -> str:
+    """Return a PYTHONPATH of folders, before those that it has."""
+    former = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    return os.pathsep.join(dict.fromkeys([*map(str, folders), *filter(None, former)]))

@@ -1,0 +1,106 @@
+"""Tests of a user's, by the fixture `federation` of the pytest plugin: each is run by a pytest of its own."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from wire import PATIENCE_S
+
+from zsim.record import RecordReader
+
+HEAD = """
+PAIR = {
+    "name": "pair",
+    "seed": 3,
+    "duration_s": 12,
+    "sensors": {"preset": "paper"},
+    "drones": [
+        {"name": "drone1", "position_m": [2, 0, 0], "yaw_deg": 90},
+        {"name": "drone2", "position_m": [-2, 0, 0], "yaw_deg": 90},
+    ],
+    "clusters": [{"name": "main", "drones": ["drone1", "drone2"], "plan": {"takeoff_s": 0.5}}],
+}
+"""
+PASSING = """
+def test_gps_dropout_and_a_kill(federation):
+    def flown():
+        flight = federation(PAIR)
+        flight.wait_until("engaged")
+        at_s = flight.t_s
+        flight.inject({"kind": "gps_dropout", "target": "drone2", "for_s": 1})
+        flight.kill("estimator.drone2")
+        kinds = [event.kind for event in flight.wait_until("restart").events]
+        assert {"fault", "death", "restart"} <= {*kinds}
+        flight.assert_no_collision()
+        flight.assert_errors(z_c=0.1, window=(8, 12))
+        return flight, at_s
+
+    (one, one_s), (other, other_s) = flown(), flown()
+    assert one_s == other_s  # time stands still between what a test does
+    one.assert_same_bits(other)
+"""
+FAILING = """
+def test_of_a_program_that_hangs(federation):
+    flight = federation(PAIR, programs=["ground.main=sh -c 'echo here on $ZSIM_CONNECT; sleep 600 & wait'"])
+    flight.kill("estimator.drone2")
+    flight.wait_until("engaged", within_s=1)
+"""
+
+
+def pytest_run(folder: Path, test: str, *options: str) -> subprocess.Popen[str]:
+    """Start pytest on a test, as a user does."""
+    (folder / "test_mine.py").write_text(HEAD + test)
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--basetemp", str(folder / "tmp"), *options]
+    return subprocess.Popen(
+        command,
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "COLUMNS": "200"},
+    )
+
+
+def output_of(process: subprocess.Popen[str]) -> str:
+    output, _ = process.communicate(timeout=4 * PATIENCE_S)
+    return output
+
+
+def left_in(folder: Path) -> list[int]:
+    """Return the processes that have something of a folder in their command line."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and int(entry.name) != os.getpid():
+            try:
+                line = (entry / "cmdline").read_bytes()
+            except OSError:
+                continue
+            if str(folder).encode() in line:
+                found.append(int(entry.name))
+    return found
+
+
+def test_a_passing_test(compiled: None, tmp_path: Path) -> None:
+    process = pytest_run(tmp_path, PASSING)
+    output = output_of(process)
+    assert process.returncode == 0, output
+    assert left_in(tmp_path) == []
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_failing_test_says_who_waits_and_keeps_the_record(compiled: None, tmp_path: Path) -> None:
+    process = pytest_run(tmp_path, FAILING)
+    output = output_of(process)
+    assert process.returncode == 1, output
+    assert re.search(r"t = 0.00 s, waiting; waiting_for:\n +ground.main on ", output), output
+    for log in ("zsim-run.log", "estimator.drone1.log", "controller.main.log", "ground.main.log"):
+        assert f"--- {log}" in output
+    assert re.search("here on tcp/127.0.0.1:[0-9]+\n", output)
+    kept = tmp_path / "runs/failed/test_mine.py-test_of_a_program_that_hangs/run1"
+    assert f"kept in {kept}" in output
+    assert (kept / "logs/ground.main.log").exists()
+    with RecordReader(kept / "run.mcap") as reader:
+        assert reader.complete
+    assert left_in(tmp_path) == []
