@@ -143,6 +143,7 @@ EXTRA_OF = {
     "cv2": "cameras",
     "distributed": "dask",
     "filterpy": "agents",
+    "fmpy": "fmu",
     "foxglove": "export",
     "jinja2": "report",
     "matplotlib": "report",

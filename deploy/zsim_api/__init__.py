@@ -29,6 +29,7 @@ if TYPE_CHECKING:  # for editors, which do not read _WHERE
     from zsim_api.scenarios import Scenario as Scenario
     from zsim_api.simulation import Simulation as Simulation
     from zsim_api.sweeping import sweep as sweep
+    from zsim_bridges.fmu.agent import Fmu as Fmu
 
 _WHERE = {
     "zsim.errors": ("ZsimError",),
@@ -42,6 +43,7 @@ _WHERE = {
     "zsim_api.recorded": ("Run", "load"),
     "zsim_api.scenarios": ("Scenario",),
     "zsim_api.simulation": ("Simulation",),
+    "zsim_bridges.fmu.agent": ("Fmu",),
     "zsim_api.sweeping": ("sweep",),
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}

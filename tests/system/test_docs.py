@@ -315,7 +315,7 @@ def lines(block: Block) -> list[str]:
 EXAMPLE_S = 25.0  # simulated seconds of an example: past the take-off at 20 s
 PORTS = ("7447", "7448", "8000", "7470", "11311")  # as printed: world, router, HTTP, lines, ROS master
 LEADERS = r"zsim (run|world|replay|router|gateway|ros1|ros2|camera|detect)\b"
-ANSWERED = ("agent", "estimator", "controller", "host", "record", "keys", "echo", "hz", "pub", "ask", "gateway", "ros1", "ros2", "camera", "detect",
+ANSWERED = ("agent", "estimator", "fmu", "controller", "host", "record", "keys", "echo", "hz", "pub", "ask", "gateway", "ros1", "ros2", "camera", "detect",
             "fault (?:add|clear|list)")  # fmt: skip
 FOREIGN = (
     "plain_client.py",

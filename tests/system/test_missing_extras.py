@@ -58,6 +58,7 @@ COMMANDS = [
     (["gateway"], "gateway"),
     (["ros1"], "ros1"),
     (["ros2"], "ros2"),
+    (["fmu", "controller.fmu"], "fmu"),
     (["camera", "drone1"], "cameras"),
     (["detect", "drone1"], "cameras"),
     (["push", "--hosts", "{hosts}"], "hosts"),

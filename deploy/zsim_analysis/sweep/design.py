@@ -113,7 +113,7 @@ class Grid(Struct, frozen=True):
     @property
     def names(self) -> list[str]:
         """Abbreviated values; those cut to the same text as their differing part, or with their number."""
-        names = [_cut(f"{value:g}" if isinstance(value, float) else _without_made(value)) for value in self.values]
+        names = [_cut(f"{value:g}" if isinstance(value, float) else without_made(value)) for value in self.values]
         for short in [name for name, count in Counter(names).items() if count > 1]:
             alike = [place for place, name in enumerate(names) if name == short]
             texts = parts = [text_of(self.values[place]) for place in alike]
@@ -204,7 +204,7 @@ def text_of(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value, default=str)
 
 
-def _without_made(value: Any) -> str:
+def without_made(value: Any) -> str:
     """Return a value as text; a class of a notebook or a script without the module that was made for it."""
     text = text_of(value)
     return text.partition(":")[2] if text.startswith(plugin.MADE) else text

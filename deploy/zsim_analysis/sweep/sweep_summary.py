@@ -20,7 +20,7 @@ from zsim.errors import ScenarioError
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.report.paper import PAPER_TABLE_1, paper_table
 from zsim_analysis.report.summary import STATISTICS
-from zsim_analysis.sweep.design import Draw, SweepDesign
+from zsim_analysis.sweep.design import Draw, SweepDesign, without_made
 from zsim_analysis.sweep.sweep_run import FIXED, METRIC, Row, engaged_column
 
 Samples = NDArray[np.float64]
@@ -214,7 +214,9 @@ class SweepResults:
         self.parameters = parameters(self.errors, [name[len(prefix) : -len(suffix)] for name in engaged])
         self.metrics = [name for name in columns if name.startswith(METRIC)]
         report = design.plan.document.get("report")
-        self.metrics_function = str(report.get("metrics") or "") if isinstance(report, Mapping) else ""
+        named = (report.get("metrics") or ()) if isinstance(report, Mapping) else ()
+        names = [named] if isinstance(named, str) else named
+        self.metrics_function = " and ".join(map(without_made, names))  # of the user, with a module unless made for it
         self.has_seeds = design.seeds is not None
         self.drawn = [axis.path for axis in design.axes if isinstance(axis, Draw)]
         self.paper_std: Mapping[str, float] = {}

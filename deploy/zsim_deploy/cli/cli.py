@@ -22,7 +22,14 @@ from zsim.errors import (
 )
 from zsim_deploy import INTERRUPTED, USER_FAULT
 from zsim_deploy.arguments import HOSTS, POKE, TRANSLATE, endpoint_origin, note, say
-from zsim_deploy.cli import bridge_commands, federation_commands, hosts_commands, role_commands, run_commands
+from zsim_deploy.cli import (
+    bridge_commands,
+    federation_commands,
+    fmu_command,
+    hosts_commands,
+    role_commands,
+    run_commands,
+)
 from zsim_deploy.roles.closed_output import STREAMS, is_unread
 
 UsageError: Any = importlib.import_module(typer.BadParameter.__module__).UsageError  # of the click that typer uses
@@ -44,7 +51,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-for _family in (run_commands, role_commands, hosts_commands, federation_commands, bridge_commands):
+for _family in (run_commands, role_commands, hosts_commands, federation_commands, bridge_commands, fmu_command):
     app.add_typer(_family.app)
 for _panel, _group in (
     (POKE, federation_commands.faults),

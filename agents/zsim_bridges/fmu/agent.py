@@ -1,0 +1,336 @@
+"""An FMU as an agent: inputs from the messages of a gate, one communication step, outputs as commands or an estimate.
+
+At a gate t the FMU is given what its inputs' messages said last, steps from t to t + period, and what it then gives is
+published with the stamp t, as the answer of any agent to that gate.
+"""
+
+import math
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from zsim.contract import flight_messages, keys, messages
+from zsim.contract.flight_messages import Estimate, Mode, Status, state_refusal
+from zsim.contract.messages import Info
+from zsim.contract.snapshot import State
+from zsim.errors import RunError, UserCodeError
+from zsim.runtime.agent import Agent, Output
+from zsim.scenario.scenario import Scenario
+from zsim_bridges.fmu.mapping import Link, mapping_of
+from zsim_bridges.fmu.model import FmuInstance, FmuModel, Inputs, Variable
+
+Frame = Literal["heading", "world"]
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+COVARIANCE = tuple(float(i == j) for i in range(6) for j in range(6))
+# Fields that an FMU need not give, by message. What it gives of a vector may be some of its numbers: the others are 0.
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "velocity": {"velocity_m_s": (0.0, 0.0, 0.0), "yaw_rate_rad_s": 0.0},
+    "attitude": {"orientation_wxyz": LEVEL, "yaw_rate_rad_s": 0.0},
+    "ardrone": {"forward": 0.0, "left": 0.0, "up": 0.0, "yaw_left": 0.0, "hover": False},
+    "rotors": {},
+    "estimate": {
+        "orientation_wxyz": LEVEL,
+        "yaw_rad": 0.0,
+        "covariance": COVARIANCE,
+        "yaw_sigma_rad": 0.1,
+        "gyro_bias_rad_s": (0.0, 0.0, 0.0),
+        "sensors": {},
+    },
+}
+
+
+class Fmu:
+    """An FMU for a flight: `zsim.run("step.yaml", agents=[zsim.Fmu("controller.fmu", "drone1", {...})])`.
+
+    Args:
+        path: of the file, FMI 2 or 3 for co-simulation.
+        drone: whose places need no name before them; None where all name theirs.
+        map: places by variable, `{"vx": "velocity_m_s.0"}`, or texts `vx=velocity_m_s.0`; see docs/fmu.md.
+        name: of the process (default `fmu.` and the drone, or `fmu.main`); that of a stock agent takes its place.
+        period_s: communication step [s], a multiple of the gate; default what the FMU suggests, or the gate.
+        param: start values of parameters and inputs, by variable.
+        takeoff_s: when the drones that it commands take off [s]; None where others see to that.
+        frame: of velocity commands.
+        log: whether all that the FMU logs is printed, and not only warnings and errors.
+        say: takes lines on the FMU; by default they go to standard error.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        drone: str | None = None,
+        map: Mapping[str, str] | Sequence[str] = (),
+        *,
+        name: str = "",
+        period_s: float | None = None,
+        param: Mapping[str, Any] = {},
+        takeoff_s: float | None = None,
+        frame: Frame = "heading",
+        log: bool = False,
+        say: Callable[[str], None] | None = None,
+    ) -> None:
+        self.path = Path(path)
+        self.drone = drone
+        self.map = [f"{name}={place}" for name, place in map.items()] if isinstance(map, Mapping) else list(map)
+        self.name, self.period_s, self.param = name, period_s, dict(param)
+        self.frame: Frame = frame
+        self.takeoff_s, self.log, self.say = takeoff_s, log, say
+        self.__qualname__ = type(self).__name__  # as a function that makes an agent has
+
+    def __call__(self, info: Info, scenario: Scenario) -> "FmuAgent":
+        """Return the agent for a run.
+
+        Raises:
+            RunError: the file, its variables or the mapping cannot be used.
+        """
+        return FmuAgent(self, info, scenario)
+
+
+class FmuAgent(Agent):
+    """An FMU in a run."""
+
+    def __init__(self, of: Fmu, info: Info, scenario: Scenario) -> None:
+        super().__init__()
+        drones = [drone.name for drone in info.drones]
+        if of.drone is not None and of.drone not in drones:
+            raise RunError(f"--drone is {of.drone!r}; must be one of {', '.join(drones)}")
+        self._model = model = FmuModel(of.path)
+        self.name = of.name or f"fmu.{of.drone or 'main'}"
+        self._say = of.say or _print
+        self.period_ns = _period_ns(model, of.period_s, info)
+        mapping = mapping_of(model, of.map, info, of.drone, lambda cluster: _cluster_names(scenario, cluster))
+        if not mapping.outputs:
+            known = ", ".join(each.name for each in model.variables.values() if each.causality == "output") or "none"
+            raise RunError(f"{of.path}: none of its outputs is mapped; must map one of {known}")
+        self._inputs = mapping.inputs
+        self._writers = _writers(mapping.outputs, of.frame)
+        self._given = [link.variable for writer in self._writers for link in writer.links]
+        self._commanded = sorted({keys.thing(writer.key) for writer in self._writers if keys.is_command(writer.key)})
+        self._takeoff_ns = None if of.takeoff_s is None else round(of.takeoff_s * 1e9)
+        self._latest: dict[str, Any] = {}
+        self._states: dict[str, Any] = {}  # of the drones that it commands
+        self._raised: set[str] = set()  # flags of modes that were up at the last step
+        self._has_started = False
+        self._declare_keys(info)
+        for line in mapping.notes:
+            self._say(f"{self.name}: {of.path.name}: {line}")
+        if not model.restores:
+            self._say(f"{self.name}: {of.path.name} cannot give its state: started again, it begins afresh")
+        self._unit = FmuInstance(model, self.name, lambda line: self._say(f"{self.name}: {line}"), of.log)
+        self._unit.set_parameters([_parameter(model, name, value) for name, value in of.param.items()])
+
+    def _declare_keys(self, info: Info) -> None:
+        reads = {link.place.key for link in self._inputs}
+        about = [*(key for key in reads if key.startswith("drone/")), *(writer.key for writer in self._writers)]
+        drones = list(dict.fromkeys(map(keys.thing, about))) or [drone.name for drone in info.drones]
+        statuses = [keys.status(drone) for drone in drones]
+        self.counted = tuple(
+            drone for drone in drones if any(keys.is_sensor(key) and keys.thing(key) == drone for key in reads)
+        )
+        every_gate = [key for key in reads if messages.type_of(key) in messages.RELAYED]
+        plain = [key for key in (*reads, *statuses) if not (keys.is_sensor(key) and keys.thing(key) in self.counted)]
+        self.reads = tuple(sorted({*plain, *map(keys.sensors, self.counted)}))
+        self.gate_keys = (*statuses, *sorted(every_gate))
+        self.writes = tuple(writer.key for writer in self._writers if not keys.is_command(writer.key))
+        self._wanted = reads
+
+    def receive(self, key: str, message: Any) -> None:
+        if key in self._wanted:
+            self._latest[key] = message
+        if type(message) is Status:
+            self._states[keys.thing(key)] = message.state
+
+    def step(self, t_ns: int) -> list[Output]:
+        t_s = t_ns / 1e9
+        inputs = self._values()
+        if not self._has_started:
+            self._unit.start(t_s, inputs)
+            self._has_started = True
+        else:
+            self._unit.write(inputs)
+        self._unit.step(t_s, self.period_ns / 1e9)
+        given = self._unit.read(self._given)
+        for variable, values in zip(self._given, given, strict=True):
+            self._check_finite(variable, values)
+        outputs = self._takeoffs(t_ns)
+        begin = 0
+        for writer in self._writers:
+            values = given[begin : begin + len(writer.links)]
+            begin += len(writer.links)
+            outputs += writer.outputs(self, t_ns, values)
+        return outputs
+
+    def _values(self) -> Inputs:
+        """Return the inputs of which there has been a message; the others keep their start values."""
+        values = []
+        for link in self._inputs:
+            message = self._latest.get(link.place.key)
+            read = link.place.read(message) if message is not None else None
+            if read is not None:
+                values.append((link.variable, link.converted(read)))
+        return values
+
+    def _check_finite(self, variable: Variable, values: Sequence[Any]) -> None:
+        for value in values:
+            if isinstance(value, float) and not math.isfinite(value):
+                raise UserCodeError(f"{self._model.path}: output {variable.name} is {value}; must be finite")
+
+    def _takeoffs(self, t_ns: int) -> list[Output]:
+        if self._takeoff_ns is None or t_ns < self._takeoff_ns:
+            return []
+        self._takeoff_ns = None
+        grounded = [drone for drone in self._commanded if self._states.get(drone) == "landed"]
+        return [self.mode(t_ns, keys.command(drone, "mode"), "takeoff") for drone in grounded]
+
+    def mode(self, t_ns: int, key: str, mode: Any) -> Output:
+        return Output(key, Mode(t_ns, self.next_seq(key), self.source, mode))
+
+    def takes_setpoints(self, drone: str) -> bool:
+        return state_refusal(drone, self._states.get(drone, "landed"), "setpoint") is None
+
+    def rises(self, flag: str, is_up: bool) -> bool:
+        """Tell whether a flag has gone up since the last step."""
+        was_up = flag in self._raised
+        (self._raised.add if is_up else self._raised.discard)(flag)
+        return is_up and not was_up
+
+    def snapshot(self) -> State | None:
+        if not self._model.restores or not self._has_started:
+            return None
+        return {
+            "fmu": self._unit.state(),
+            "latest": [[key, messages.encode(message)] for key, message in sorted(self._latest.items())],
+            "states": dict(self._states),
+            "raised": sorted(self._raised),
+            "takeoff_ns": self._takeoff_ns,
+        }
+
+    def restore(self, state: State) -> None:
+        self._unit.restore(state["fmu"])
+        self._has_started = True
+        self._latest = {key: messages.decode(key, payload) for key, payload in state["latest"]}
+        self._states, self._raised = dict(state["states"]), set(state["raised"])
+        self._takeoff_ns = state["takeoff_ns"]
+
+
+class _Writer:
+    """Makes the messages of one key of what the FMU gives."""
+
+    def __init__(self, key: str, links: Sequence[Link], frame: Frame) -> None:
+        self.key, self.links = key, links
+        self._kind = messages.output_type(key)
+        self._drone = keys.thing(key)
+        leaf = keys.leaf(key)
+        fields = {"frame": frame} if self._kind is flight_messages.Velocity else {}
+        self._fields = {**DEFAULTS.get(leaf, {}), **fields}
+        self._is_mode = self._kind is Mode
+        mapped = {link.place.field for link in links}
+        self._yaw_from, self._level_from = "orientation_wxyz" in mapped, "yaw_rad" in mapped
+        if not self._is_mode:
+            self._check_complete(leaf)
+
+    def _check_complete(self, leaf: str) -> None:
+        sizes = {"velocity_m_s": 3, "position_m": 3, "thrust_n": 1}
+        needed = {"attitude": ("thrust_n",), "estimate": ("position_m", "velocity_m_s")}.get(leaf, ())
+        for field in needed:
+            given = sum(link.place.size for link in self.links if link.place.field == field)
+            if given < sizes[field]:
+                raise RunError(f"{self.key}: {given} of {sizes[field]} values of {field} are mapped; must be all")
+
+    def outputs(self, agent: FmuAgent, t_ns: int, values: Sequence[Sequence[Any]]) -> list[Output]:
+        if self._is_mode:
+            return [
+                agent.mode(t_ns, self.key, link.place.field)
+                for link, (value,) in zip(self.links, values, strict=True)
+                if agent.rises(f"{self._drone}.{link.place.field}", value > 0)
+            ]
+        if keys.is_command(self.key) and not agent.takes_setpoints(self._drone):
+            return []
+        fields: dict[str, Any] = dict(self._fields)
+        for link, own in zip(self.links, values, strict=True):
+            place, given = link.place, link.converted(list(own))
+            if place.kind == "flag":
+                given = [value > 0 for value in given]
+            elif place.kind == "number":
+                given = [float(value) for value in given]
+            if place.indices is None:
+                fields[place.field] = given[0]
+                continue
+            held = list(fields.get(place.field, ()))
+            held += [0.0] * (max(place.indices) + 1 - len(held))
+            for index, value in zip(place.indices, given, strict=True):
+                held[index] = value
+            fields[place.field] = tuple(held)
+        if self._kind is Estimate:
+            self._complete_attitude(fields)
+        return [Output(self.key, self._kind(t_ns=t_ns, seq=agent.next_seq(self.key), source=agent.source, **fields))]
+
+    def _complete_attitude(self, fields: dict[str, Any]) -> None:
+        """Set the heading of an estimate where the FMU gives the attitude only, or the attitude by the heading."""
+        if self._level_from and not self._yaw_from:
+            half = fields["yaw_rad"] / 2
+            fields["orientation_wxyz"] = (math.cos(half), 0.0, 0.0, math.sin(half))
+        elif self._yaw_from and not self._level_from:
+            w, x, y, z = fields["orientation_wxyz"]
+            fields["yaw_rad"] = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def _writers(outputs: Sequence[Link], frame: Frame) -> list[_Writer]:
+    by_key: dict[str, list[Link]] = {}
+    for link in outputs:
+        by_key.setdefault(link.place.key, []).append(link)
+    return [_Writer(key, links, frame) for key, links in by_key.items()]
+
+
+def _period_ns(model: FmuModel, period_s: float | None, info: Info) -> int:
+    """Return the communication step [ns]; RunError if it is no multiple of the gate, or not what the FMU takes."""
+    gate_s = info.gate_ns / 1e9
+    wanted_s = period_s if period_s is not None else model.step_s
+    if model.is_step_fixed and period_s is not None and not math.isclose(period_s, model.step_s or 0.0):
+        raise RunError(f"--period is {period_s:g} s; {model.path} takes {model.step_s:g} s only, by its description")
+    if wanted_s is None:
+        return info.gate_ns
+    gates = round(wanted_s / gate_s)
+    if gates >= 1 and math.isclose(gates * gate_s, wanted_s, rel_tol=1e-9):
+        return gates * info.gate_ns
+    if period_s is not None or model.is_step_fixed:
+        what = (
+            f"--period is {wanted_s:g} s" if period_s is not None else f"{model.path}: its fixed step is {wanted_s:g} s"
+        )
+        raise RunError(f"{what}; must be a multiple of the gate, {gate_s:g} s (time.gate_ms of the scenario)")
+    return info.gate_ns
+
+
+def _parameter(model: FmuModel, name: str, value: Any) -> tuple[Variable, list[Any]]:
+    variable = model.variable(name)
+    if variable.causality not in ("parameter", "input", "structuralParameter"):
+        raise RunError(f"--param {name}: is a {variable.causality}; must be a parameter or an input")
+    texts = value.split(",") if isinstance(value, str) and variable.kind != "text" else [value]
+    values = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else texts
+    if len(values) != variable.size:
+        raise RunError(f"--param {name}: has {len(values)} values; must have {variable.size}")
+    try:
+        return variable, [_typed(each, variable) for each in values]
+    except ValueError:
+        raise RunError(f"--param {name} is {value!r}; must be a {variable.kind}, as {variable.type} is") from None
+
+
+def _typed(value: Any, variable: Variable) -> Any:
+    if variable.kind == "text":
+        return str(value)
+    if variable.kind == "flag":
+        if str(value).lower() not in ("true", "false", "1", "0"):
+            raise ValueError
+        return str(value).lower() in ("true", "1")
+    return int(value) if variable.kind == "whole" else float(value)
+
+
+def _cluster_names(scenario: Scenario, cluster: str) -> Sequence[str]:
+    from zsim_agents.formation.spaces.scenario_space import scenario_space
+
+    return scenario_space(scenario, scenario.cluster(cluster)).names
+
+
+def _print(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

@@ -1,0 +1,298 @@
+"""Which variable of an FMU stands for which field of a message: `vx=velocity_m_s.0`, read and checked.
+
+    NAME = [WHOSE/] [MESSAGE.] FIELD [.INDEX]
+
+WHOSE is a drone or a cluster (by default the drone that the FMU is for), or a key up to its last `/`. MESSAGE is the
+last part of a key: `estimate`, `truth`, a sensor, `state` of a cluster; for what the FMU gives `velocity`, `attitude`,
+`rotors`, `ardrone`, `mode`, `estimate`. Without it, an input is of the drone's estimate, and an output of its velocity
+command.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import msgspec
+from msgspec import Struct
+
+from zsim.contract import flight_messages, keys, messages
+from zsim.contract.messages import Info
+from zsim.errors import DecodeError, RunError
+from zsim.schema.checker import suggestion
+from zsim_bridges.fmu.model import FmuModel, Kind, Unit, Variable
+
+COMMANDS: dict[str, type[Struct]] = {
+    key.rpartition("/")[2]: topic.message
+    for key, topic in messages.TOPICS.items()
+    if key.startswith("drone/*/cmd/") and topic.message
+}
+MODES = ("takeoff", "land", "emergency", "reset")
+NUMBERED = ("value", "desired", "desired_rate")  # fields of a cluster's state, one number for each of its variables
+OWN_FIELDS = ("t_ns", "seq", "source", "frame")  # that no FMU gives: the process does
+# What a field is in, by the end of its name: unit, exponents as BASE_UNITS, and what one is in SI units
+RAD, PER_S = (0, 0, 0, 0, 0, 0, 0, 1), (0, 0, -1, 0, 0, 0, 0, 1)
+UNITS = {
+    "_rad_s": Unit("rad/s", PER_S),
+    "_m_s2": Unit("m/s2", (0, 1, -2, 0, 0, 0, 0, 0)),
+    "_m_s": Unit("m/s", (0, 1, -1, 0, 0, 0, 0, 0)),
+    "_m": Unit("m", (0, 1, 0, 0, 0, 0, 0, 0)),
+    "_rad": Unit("rad", RAD),
+    "_deg": Unit("deg", RAD, math.pi / 180.0),
+    "_n": Unit("N", (1, 1, -2, 0, 0, 0, 0, 0)),
+    "_pa": Unit("Pa", (1, -1, -2, 0, 0, 0, 0, 0)),
+    "_ut": Unit("uT", (1, 0, -2, -1, 0, 0, 0, 0), 1e-6),
+    "_ns": Unit("ns", (0, 0, 1, 0, 0, 0, 0, 0), 1e-9),
+}
+# What an FMU's variables of a kind may stand for
+TAKES: dict[Kind, tuple[Kind, ...]] = {
+    "number": ("number", "whole", "flag"),
+    "whole": ("whole", "flag"),
+    "flag": ("flag",),
+    "text": ("text",),
+}
+
+
+class Place(NamedTuple):
+    """A field of the messages on a key, or some of its numbers."""
+
+    text: str  # as the user wrote it
+    key: str
+    field: str
+    indices: tuple[int, ...] | None  # None for a field that is one value
+    kind: Kind
+
+    @property
+    def size(self) -> int:
+        return 1 if self.indices is None else len(self.indices)
+
+    @property
+    def unit(self) -> Unit | None:
+        return next((unit for end, unit in UNITS.items() if self.field.endswith(end)), None)
+
+    def read(self, message: Any) -> list[Any] | None:
+        """Return its values in a message, None where the message leaves them out."""
+        value = getattr(message, self.field)
+        if value is None:
+            return None
+        return [value] if self.indices is None else [value[i] for i in self.indices]
+
+
+class Link(NamedTuple):
+    """A variable and its place; `to_unit` converts what the sender gives to the receiver's unit, None for no change."""
+
+    variable: Variable
+    place: Place
+    to_unit: Callable[[float], float] | None
+
+    def converted(self, values: list[Any]) -> list[Any]:
+        """Return values in the receiver's unit and type: numbers for a number."""
+        if self.to_unit is not None:
+            return [self.to_unit(value) for value in values]
+        return values
+
+
+class Mapping(NamedTuple):
+    """What an FMU takes and gives, and lines on units that differ."""
+
+    inputs: list[Link]
+    outputs: list[Link]
+    notes: list[str]
+
+
+def mapping_of(
+    model: FmuModel, texts: Sequence[str], info: Info, drone: str | None, cluster_names: Callable[[str], Sequence[str]]
+) -> Mapping:
+    """Return what texts `NAME=PLACE` mean.
+
+    Args:
+        drone: whose places need no WHOSE; None for none.
+        cluster_names: returns the variables of a cluster.
+
+    Raises:
+        RunError: with the text that cannot be used, what was found, and what is allowed.
+    """
+    found = Mapping([], [], [])
+    places = _Places(info, drone, cluster_names)
+    for text in texts:
+        name, equals, where = (part.strip() for part in text.partition("="))
+        if not equals or not name or not where:
+            raise RunError(f"--map is {text!r}; must be NAME=PLACE, such as vx=velocity_m_s.0")
+        variable = model.variable(name)
+        if variable.causality not in ("input", "output"):
+            hint = "; give a value of its own with --param" if variable.causality == "parameter" else ""
+            raise RunError(f"--map {text}: {name} is a {variable.causality}; must be an input or an output{hint}")
+        is_output = variable.causality == "output"
+        place = places.parse(where, is_output, f"--map {text}")
+        if place.size != variable.size:
+            raise RunError(f"--map {text}: {name} has {variable.size} values and {where} {place.size}; must be as many")
+        gives, takes = (variable.kind, place.kind) if is_output else (place.kind, variable.kind)
+        if gives not in TAKES[takes] and not (is_output and takes == "flag" and gives != "text"):
+            raise RunError(
+                f"--map {text}: {name} is {variable.type} and {where} a {place.kind}; a {gives} is no {takes}"
+            )
+        convert, note = _conversion(variable, place, is_output)
+        if note:
+            found.notes.append(f"{name}={where}: {note}")
+        (found.outputs if is_output else found.inputs).append(Link(variable, place, convert))
+    _check_once(found)
+    return found
+
+
+def _check_once(found: Mapping) -> None:
+    taken: dict[tuple[str, str, int | None], str] = {}
+    for variable, place, _ in found.outputs:
+        for index in place.indices or (None,):
+            spot = (place.key, place.field, index)
+            if spot in taken:
+                raise RunError(f"--map {variable.name}={place.text}: {taken[spot]} gives that already; one only may")
+            taken[spot] = variable.name
+    fed: set[str] = set()
+    for variable, place, _ in found.inputs:
+        if variable.name in fed:
+            raise RunError(f"--map {variable.name}={place.text}: {variable.name} is fed twice; once only may it be")
+        fed.add(variable.name)
+
+
+class _Places:
+    def __init__(self, info: Info, drone: str | None, cluster_names: Callable[[str], Sequence[str]]) -> None:
+        self._drones = {each.name: each for each in info.drones}
+        self._clusters = {each.name: each for each in info.clusters}
+        self._drone = drone
+        self._cluster_names = cluster_names
+
+    def parse(self, text: str, is_output: bool, where: str) -> Place:
+        whose, _, rest = text.rpartition("/")
+        first, *path = rest.split(".")
+        if whose in self._clusters:
+            key = f"cluster/{whose}/{first}"
+        elif whose in self._drones or not whose:
+            drone = whose or self._drone
+            if drone is None:
+                known = ", ".join([*self._drones, *self._clusters])
+                raise RunError(f"{where}: names no drone, and there is no --drone; must begin with one of {known}")
+            found = self._drone_key(drone, first, is_output)
+            if found is None:
+                path.insert(0, first)
+            key = found or (keys.command(drone, "velocity") if is_output else keys.estimate(drone))
+        else:
+            key = f"{whose}/{first}"
+        kind, thing, _ = keys.parts(key)
+        known = {"drone": self._drones, "cluster": self._clusters}.get(kind)
+        if known is not None and thing not in known:
+            hint = suggestion(thing, known)
+            raise RunError(f"{where}: there is no {kind} {thing!r}; {hint}must be one of {', '.join(known) or 'none'}")
+        return self._field(text, key, path, is_output, where)
+
+    def _drone_key(self, drone: str, leaf: str, is_output: bool) -> str | None:
+        if is_output:
+            candidates = [keys.command(drone, leaf), f"drone/{drone}/{leaf}"]
+        else:
+            candidates = [f"drone/{drone}/{leaf}", keys.sensor(drone, leaf)]
+        return next((key for key in candidates if messages.type_of(key) is not None), None)
+
+    def _field(self, text: str, key: str, path: list[str], is_output: bool, where: str) -> Place:
+        kind = self._message(key, is_output, where)
+        name, *rest = path or [""]
+        if kind is flight_messages.Mode and is_output:
+            if name not in MODES or rest:
+                raise RunError(f"{where}: mode is {name!r}; must be one of {', '.join(MODES)}, which a flag asks for")
+            return Place(text, key, name, None, "flag")
+        kinds = {each.name: each.type for each in _fields(kind) if not is_output or each.name not in OWN_FIELDS}
+        if name not in kinds:
+            hint = suggestion(name, kinds)
+            raise RunError(f"{where}: {key} has no field {name!r}; {hint}must be one of {', '.join(kinds)}")
+        described = kinds[name]
+        if isinstance(described, msgspec.inspect.UnionType):
+            some = [each for each in described.types if not isinstance(each, msgspec.inspect.NoneType)]
+            described = some[0] if len(some) == 1 else described
+        value = _kind(described)
+        if value is not None:
+            if rest:
+                raise RunError(f"{where}: {name} is one value; has no {'.'.join(rest)}")
+            return Place(text, key, name, None, value)
+        element, names = self._elements(key, name, described)
+        if element is None:
+            raise RunError(f"{where}: {name} of {key} holds neither numbers nor flags nor texts; map another field")
+        if not rest:
+            return Place(text, key, name, tuple(range(len(names))), element)
+        if len(rest) > 1 and ".".join(rest) in names:  # variables of a group have a dot in their names
+            rest = [".".join(rest)]
+        index = next((i for i, each in enumerate(names) if rest in ([each], [str(i)])), None)
+        if index is None:
+            hint = suggestion(rest[0], names) if names[0] != "0" else ""
+            allowed = f"0 to {len(names) - 1}" if names[0] == "0" else f"one of {', '.join(names)}"
+            raise RunError(f"{where}: {'.'.join(rest)!r} is no part of {name}; {hint}must be {allowed}")
+        return Place(text, key, name, (index,), element)
+
+    def _message(self, key: str, is_output: bool, where: str) -> type[Struct]:
+        kind = messages.type_of(key)
+        if is_output:
+            try:
+                kind = messages.output_type(key)
+            except DecodeError as error:
+                raise RunError(f"{where}: {error}") from error
+            if kind not in (*COMMANDS.values(), flight_messages.Estimate):
+                allowed = ", ".join([*COMMANDS, "estimate"])
+                raise RunError(f"{where}: an FMU gives no {kind.__name__}; must be one of {allowed}")
+        if kind is None:
+            hint = "an input is of an estimate, truth, a sensor, or the state of a cluster"
+            raise RunError(f"{where}: {key} is no key of the contract; {hint}; see docs/protocol.md")
+        return kind
+
+    def _elements(self, key: str, field: str, described: Any) -> tuple[Kind | None, Sequence[str]]:
+        """Return the kind of the elements of a field, and by which names they are known."""
+        _, thing, _ = keys.parts(key)
+        if isinstance(described, msgspec.inspect.TupleType):
+            kinds: set[Kind | None] = {_kind(each) for each in described.item_types}
+            return (kinds.pop() if len(kinds) == 1 else None), _numbered(len(described.item_types))
+        if not isinstance(described, msgspec.inspect.VarTupleType):
+            return None, ()
+        element = _kind(described.item_type)
+        if messages.type_of(key) is flight_messages.ClusterState and field in NUMBERED:
+            return element, self._cluster_names(thing)
+        if field in ("speed_rad_s", "rotor_rad_s"):
+            return element, _numbered(len(self._drones[thing].rotors))
+        if described.min_length is not None and described.min_length == described.max_length:
+            return element, _numbered(described.min_length)
+        return None, ()
+
+
+def _numbered(count: int) -> Sequence[str]:
+    return [str(i) for i in range(count)]
+
+
+def _fields(kind: type[Struct]) -> Sequence[msgspec.inspect.Field]:
+    described = msgspec.inspect.type_info(kind)
+    assert isinstance(described, msgspec.inspect.StructType)
+    return described.fields
+
+
+def _kind(described: Any) -> Kind | None:
+    if isinstance(described, msgspec.inspect.FloatType):
+        return "number"
+    if isinstance(described, msgspec.inspect.IntType):
+        return "whole"
+    if isinstance(described, msgspec.inspect.BoolType):
+        return "flag"
+    if isinstance(described, msgspec.inspect.StrType | msgspec.inspect.LiteralType):
+        return "text"
+    return None
+
+
+def _conversion(variable: Variable, place: Place, is_output: bool) -> tuple[Callable[[float], float] | None, str]:
+    """Return what converts values on their way, None for none; and a line where units differ or cannot be compared."""
+    theirs, ours = variable.unit, place.unit
+    if theirs is None or ours is None or theirs.name == ours.name or place.kind != "number":
+        return None, ""
+    found = f"{variable.name} is in {theirs.name}, {place.field} in {ours.name}"
+    if theirs.exponents is None:
+        return None, f"{found}, which is not compared: the FMU does not say what its unit is; values are as they are"
+    assert ours.exponents is not None
+    if theirs.exponents[:-1] != ours.exponents[:-1]:  # many tools leave out rad
+        return None, f"{found}, which is another quantity; values are as they are"
+    if (theirs.factor, theirs.offset) == (ours.factor, ours.offset):
+        return None, ""
+    own, factor, offset = ours.factor, theirs.factor, theirs.offset
+    if is_output:
+        return lambda value: (value * factor + offset) / own, f"{found}; converted"
+    return lambda value: (value * own - offset) / factor, f"{found}; converted"

@@ -1,0 +1,83 @@
+"""FMUs for tests: the example's, and others from a few lines of Python, built by pythonfmu3 (FMI 3) or pythonfmu (FMI 2)."""
+
+from pathlib import Path
+from textwrap import indent
+
+from pythonfmu import FmuBuilder as Builder2
+from pythonfmu3 import FmuBuilder as Builder3
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "waypoint_fmu.py"
+HEAD_3 = """
+from pythonfmu3 import *
+
+class {name}(Fmi3Slave):
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.time = 0.0
+        self.register_variable(Float64("time", causality=Fmi3Causality.independent))
+        I, O, P = Fmi3Causality.input, Fmi3Causality.output, Fmi3Causality.parameter
+        Real, Whole = Float64, Int32
+
+        def variable(name, start, causality, Type=Float64, **more):
+            setattr(self, name.replace("[", "_").replace("]", ""), start)
+            place = name.replace("[", "_").replace("]", "")
+            tunable = dict(variability=Fmi3Variability.tunable) if causality is P else dict(
+                variability=Fmi3Variability.continuous if Type is Float64 else Fmi3Variability.discrete)
+            self.register_variable(Type(name, causality=causality, **tunable, **more,
+                getter=lambda: getattr(self, place), setter=lambda v: setattr(self, place, v)))
+
+{variables}
+
+    def do_step(self, time, step):
+        self.time = time + step
+{law}
+        return Fmi3StepResult(status=Fmi3Status.ok)
+"""
+HEAD_2 = """
+from pythonfmu import *
+from pythonfmu.enums import *
+
+class {name}(Fmi2Slave):
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        I, O, P = Fmi2Causality.input, Fmi2Causality.output, Fmi2Causality.parameter
+        Whole = Integer
+
+        def variable(name, start, causality, Type=Real):
+            setattr(self, name.replace("[", "_").replace("]", ""), start)
+            place = name.replace("[", "_").replace("]", "")
+            tunable = dict(variability=Fmi2Variability.tunable) if causality is P else dict(
+                variability=Fmi2Variability.continuous if Type is Real else Fmi2Variability.discrete)
+            exact = dict(initial=Fmi2Initial.exact if causality is O else None)
+            self.register_variable(Type(name, causality=causality, **tunable, **exact,
+                getter=lambda: getattr(self, place), setter=lambda v: setattr(self, place, v)))
+
+{variables}
+
+    def do_step(self, time, step):
+{law}
+        return True
+"""
+
+
+def example(folder: Path) -> Path:
+    """Build the FMU of examples/waypoint_fmu.py; return its path."""
+    return Builder3.build_FMU(EXAMPLE, folder, canGetAndSetFMUState=True, canSerializeFMUState=True)
+
+
+def build(folder: Path, name: str, version: int, variables: str, law: str, restores: bool = True) -> Path:
+    """Build an FMU of an FMI version; return its path.
+
+    Args:
+        name: of its class; two of one name cannot be in one process.
+        variables: calls `variable(name, start, causality)` with I, O, P, and a type Real, Whole, Boolean, String.
+        law: statements of a step, on `self.NAME` of each variable; the elements of an array `v[0]` are `self.v_0`.
+        restores: whether it gives and takes its state.
+    """
+    head = {2: HEAD_2, 3: HEAD_3}[version]
+    parts = {"variables": indent(variables.strip("\n"), " " * 8), "law": indent(law.strip("\n"), " " * 8)}
+    script = folder / f"{name.lower()}_{version}.py"
+    script.write_text(head.format(name=name, **parts))
+    if version == 2:
+        return Builder2.build_FMU(script, folder, canGetAndSetFMUstate=restores, canSerializeFMUstate=restores)
+    return Builder3.build_FMU(script, folder, canGetAndSetFMUState=restores, canSerializeFMUState=restores)
