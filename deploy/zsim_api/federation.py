@@ -81,7 +81,8 @@ class Federation(Assertions):
         agents: of your own, as of `zsim.run`, or as words of `zsim run --agent`, "MODULE:CLASS NAME=VALUE".
         programs: command lines of your own programs, in any language, as text or as words. `{endpoint}`,
             `{federation}` and `{folder}` are replaced, and the environment has ZSIM_CONNECT and ZSIM_FEDERATION. Time
-            does not begin before a program has joined that is named, as in "ground.main=python ground.py".
+            does not begin before a program has joined that is named, as in "ground.main=python ground.py". One that
+            ends with another code than 0 fails the flight.
         options: of `zsim run`, such as "--hosted", or "--rate" and "1".
         modules: folders in which classes that are named are looked for, beside those of the scenario.
 
@@ -110,7 +111,7 @@ class Federation(Assertions):
     ) -> None:
         self._port = _reserved_port()
         self.endpoint = f"tcp/127.0.0.1:{self._port.getsockname()[1]}"
-        self.name = f"test-{os.getpid()}-{self._port.getsockname()[1]}"
+        self.name = str((set or {}).get("federation", f"test-{os.getpid()}-{self._port.getsockname()[1]}"))
         started: list[tuple[str, list[str]]] = [_named(each) for each in programs]
         try:
             source = scenario_of(scenario).changed(
