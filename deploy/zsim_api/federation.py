@@ -28,7 +28,7 @@ from zsim.contract import keys
 from zsim.contract.flight_messages import ClusterState, Phase, Truth
 from zsim.contract.messages import Info, decode
 from zsim.contract.run_messages import Clock, Event, holding_up
-from zsim.errors import DecodeError, RunError, RunFailedError, ZsimError
+from zsim.errors import DecodeError, RunError, RunFailedError, ZsimError, printable
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.runner import Runner
 from zsim.scenario.roles import expected_processes
@@ -384,7 +384,7 @@ class Federation(Assertions):
                 Runner(link, info, self._watch, stopped=lambda: self._launcher.code is not None).run()
         except ZsimError as error:
             if not is_over():
-                print(f"{PROCESS}: {error}", file=sys.stderr)
+                print(printable(f"{PROCESS}: {error}"), file=sys.stderr)
         finally:
             with self._watch.news:
                 self._link, self._watch.left = None, True
