@@ -19,8 +19,6 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from zsim.errors import printable
-
 PR_SET_CHILD_SUBREAPER = 36  # linux/prctl.h
 NOT_STARTED = 127
 AGAIN_S = 0.02  # between two looks for what the killed have left
@@ -51,7 +49,7 @@ def main(grace_s: float, words: list[str]) -> int:
     try:
         program = subprocess.Popen(words, stdin=subprocess.DEVNULL, process_group=0)
     except OSError as error:
-        print(printable(f"{words[0]}: cannot be started ({error.strerror})"), file=sys.stderr)
+        sys.stderr.write(f"{words[0]!a}: cannot be started ({error.strerror})\n")
         return NOT_STARTED
     for number in early:
         forward(number)
