@@ -88,7 +88,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--connect", default=os.environ.get("ZSIM_CONNECT", "tcp/127.0.0.1:7447"))
     args = parser.parse_args()
-    with find_world(args.connect, "zsim", wait_s=60.0, say=print) as (link, _):
+    federation = os.environ.get("ZSIM_FEDERATION", "zsim")
+    with find_world(args.connect, federation, wait_s=60.0, say=print) as (link, _):
         fly(link)
 
 

@@ -22,8 +22,17 @@ if TYPE_CHECKING:  # for editors, which do not read _WHERE
     from zsim_api.commands import rotors as rotors
     from zsim_api.commands import takeoff as takeoff
     from zsim_api.commands import velocity as velocity
+    from zsim_api.environments import any_of as any_of
+    from zsim_api.environments import collided as collided
+    from zsim_api.environments import far_away as far_away
+    from zsim_api.environments import flipped as flipped
+    from zsim_api.environments import gym_env as gym_env
+    from zsim_api.environments import parallel_env as parallel_env
+    from zsim_api.environments import vector_env as vector_env
     from zsim_api.federation import Federation as Federation
     from zsim_api.flight import run as run
+    from zsim_api.policy import Interface as Interface
+    from zsim_api.policy import PolicyAgent as PolicyAgent
     from zsim_api.recorded import Run as Run
     from zsim_api.recorded import load as load
     from zsim_api.scenarios import Scenario as Scenario
@@ -38,8 +47,13 @@ _WHERE = {
     "zsim_agents.formation.control_law": ("ControlLaw",),
     "zsim_agents.formation.spaces.cluster_space": ("ClusterSpace",),
     "zsim_api.commands": ("Command", "ardrone", "attitude", "emergency", "land", "rotors", "takeoff", "velocity"),
+    "zsim_api.environments": (
+        *("any_of", "collided", "far_away", "flipped"),
+        *("gym_env", "parallel_env", "vector_env"),
+    ),
     "zsim_api.federation": ("Federation",),
     "zsim_api.flight": ("run",),
+    "zsim_api.policy": ("Interface", "PolicyAgent"),
     "zsim_api.recorded": ("Run", "load"),
     "zsim_api.scenarios": ("Scenario",),
     "zsim_api.simulation": ("Simulation",),

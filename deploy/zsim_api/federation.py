@@ -28,7 +28,7 @@ from zsim.contract import keys
 from zsim.contract.flight_messages import ClusterState, Phase, Truth
 from zsim.contract.messages import Info, decode
 from zsim.contract.run_messages import Clock, Event, holding_up
-from zsim.errors import DecodeError, RunError, RunFailedError, ZsimError
+from zsim.errors import DecodeError, RunError, RunFailedError, ZsimError, printable
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.runner import Runner
 from zsim.scenario.roles import expected_processes
@@ -81,7 +81,8 @@ class Federation(Assertions):
         agents: of your own, as of `zsim.run`, or as words of `zsim run --agent`, "MODULE:CLASS NAME=VALUE".
         programs: command lines of your own programs, in any language, as text or as words. `{endpoint}`,
             `{federation}` and `{folder}` are replaced, and the environment has ZSIM_CONNECT and ZSIM_FEDERATION. Time
-            does not begin before a program has joined that is named, as in "ground.main=python ground.py".
+            does not begin before a program has joined that is named, as in "ground.main=python ground.py". One that
+            ends with another code than 0 fails the flight.
         options: of `zsim run`, such as "--hosted", or "--rate" and "1".
         modules: folders in which classes that are named are looked for, beside those of the scenario.
 
@@ -110,7 +111,7 @@ class Federation(Assertions):
     ) -> None:
         self._port = _reserved_port()
         self.endpoint = f"tcp/127.0.0.1:{self._port.getsockname()[1]}"
-        self.name = f"test-{os.getpid()}-{self._port.getsockname()[1]}"
+        self.name = str((set or {}).get("federation", f"test-{os.getpid()}-{self._port.getsockname()[1]}"))
         started: list[tuple[str, list[str]]] = [_named(each) for each in programs]
         try:
             source = scenario_of(scenario).changed(
@@ -383,7 +384,7 @@ class Federation(Assertions):
                 Runner(link, info, self._watch, stopped=lambda: self._launcher.code is not None).run()
         except ZsimError as error:
             if not is_over():
-                print(f"{PROCESS}: {error}", file=sys.stderr)
+                print(printable(f"{PROCESS}: {error}"), file=sys.stderr)
         finally:
             with self._watch.news:
                 self._link, self._watch.left = None, True

@@ -49,7 +49,7 @@ def main(grace_s: float, words: list[str]) -> int:
     try:
         program = subprocess.Popen(words, stdin=subprocess.DEVNULL, process_group=0)
     except OSError as error:
-        print(f"{words[0]}: cannot be started ({error.strerror})", file=sys.stderr)
+        sys.stderr.write(f"{words[0]!a}: cannot be started ({error.strerror})\n")
         return NOT_STARTED
     for number in early:
         forward(number)

@@ -62,6 +62,17 @@ class Estimates(NamedTuple):
     yaw_sigma_rad: Array  # (N,)
 
 
+def estimates_of(names: Sequence[str], by_drone: Mapping[str, Estimate]) -> Estimates:
+    """Return the estimates of drones, in the order of their names."""
+    shapes = {"position_m": (3,), "velocity_m_s": (3,), "orientation_wxyz": (4,), "covariance": (6, 6)}
+    columns = [np.full((len(names), *shapes.get(field, ())), np.nan) for field in Estimates._fields]
+    for i, estimate in enumerate(map(by_drone.get, names)):
+        for field, column in zip(Estimates._fields, columns, strict=True):
+            if estimate is not None:
+                column[i] = np.reshape(getattr(estimate, field), shapes.get(field, ()))
+    return Estimates(*columns)
+
+
 class Simulation:
     """World and agents of a scenario, stepped gate by gate.
 
@@ -178,13 +189,7 @@ class Simulation:
     def estimates(self) -> Estimates:
         """The newest estimates of all drones."""
         if self._estimates is None:
-            count = len(self.names)
-            shapes = {"position_m": (3,), "velocity_m_s": (3,), "orientation_wxyz": (4,), "covariance": (6, 6)}
-            columns = [np.full((count, *shapes.get(name, ())), np.nan) for name in Estimates._fields]
-            for drone, estimate in self._last_estimates.items():
-                for name, column in zip(Estimates._fields, columns, strict=True):
-                    column[self._index[drone]] = np.reshape(getattr(estimate, name), shapes.get(name, ()))
-            self._estimates = Estimates(*columns)
+            self._estimates = estimates_of(self.names, self._last_estimates)
         return self._estimates
 
     def state(self, drone: str) -> str:

@@ -111,7 +111,7 @@ Duration = Annotated[float | None, Option(help="Simulated seconds instead of the
 Realtime = Annotated[bool, Option(REALTIME, help="Pace by the wall clock and wait for nobody.")]
 Rate = Annotated[float | None, Option(help="Simulated per wall second (realtime 1, lockstep unpaced).")]
 Connect = Annotated[str, Option("--connect", envvar=CONNECT_VARIABLE, help="Where the world (or a router) listens.")]
-Federation = Annotated[str, Option(help="Name of the federation: the prefix of its keys.")]
+Federation = Annotated[str, Option(envvar="ZSIM_FEDERATION", help="Name of the federation: the prefix of its keys.")]
 Wait = Annotated[
     float | None, Option(callback=not_negative, help="Seconds to wait for a world; for ever if not given.")
 ]

@@ -26,7 +26,7 @@ PAGES = {  # last parts of modules by page
     "commands": ("commands",),
     "agents": ("agent", "control_law", "cluster_space", "drone_estimator", "fmu_agent"),
     "testing": ("federation", "programs", "pytest_plugin"),
-    "environments": ("environments",),
+    "environments": ("environments", "policy"),
 }
 LOGGER = logging.getLogger(__name__)
 FIRST = next(iter(PAGES))

@@ -11,6 +11,8 @@ How a fenced block is marked, in the line that opens it:
     yaml inventory      a whole inventory, into which scenarios/step.yaml must fit
     python              must compile
     python run          executed, all those of a page as one script
+    python test         a file of tests, run by pytest
+    yaml github, yaml gitlab    files of a CI, valid by the schemas of their vendors
     text, json          output and drawings, not checked
 
 A block of any other kind is a fault, so nothing is left out without a word. What `adapted` changes is all that
@@ -77,6 +79,9 @@ KINDS = (
     "yaml inventory",
     "python",
     "python run",
+    "python test",
+    "yaml github",
+    "yaml gitlab",
     "text",
     "json",
 )
@@ -150,6 +155,29 @@ def test_python_runs(page: Path, tmp_path: Path) -> None:
         script = tmp_path / f"{page.stem}_page.py"
         script.write_text("\n\n".join(block.text for block in blocks(page) if block.kind == "python run"))
         checkout.run(Block("bash run", f"python {script.name}", 1, 0), page)
+
+
+@pytest.mark.parametrize("page", pages_with("python test"))
+def test_tests_pass(page: Path, tmp_path: Path, compiled: None) -> None:
+    with Checkout(tmp_path) as checkout:
+        for block in blocks(page):
+            if block.kind == "python test":
+                (tmp_path / "test_page.py").write_text(block.text)
+                checkout.run(Block("bash run", "python -m pytest -p no:cacheprovider test_page.py", 1, 0), page)
+
+
+@pytest.mark.parametrize("schema", ["github-workflows", "gitlab-ci"])
+def test_ci_files_are_valid(schema: str, tmp_path: Path) -> None:
+    kind = f"yaml {schema.partition('-')[0]}"
+    found = [block for page in PAGES for block in blocks(page) if block.kind == kind]
+    for block in found:
+        (tmp_path / "ci.yml").write_text(block.text)
+        command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", f"vendor.{schema}", "ci.yml"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout
+        (tmp_path / "ci.yml").write_text(block.text.replace("script:", "scripts:").replace("runs-on:", "runs:"))
+        assert subprocess.run(command, cwd=tmp_path, capture_output=True, check=False).returncode != 0
+    assert found
 
 
 class Checkout:

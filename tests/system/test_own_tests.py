@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
+import pytest
 from wire import PATIENCE_S
 
 from zsim.record import RecordReader
@@ -52,14 +54,24 @@ def test_of_a_program_that_hangs(federation):
 def pytest_run(folder: Path, test: str, *options: str) -> subprocess.Popen[str]:
     """Start pytest on a test, as a user does."""
     (folder / "test_mine.py").write_text(HEAD + test)
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--basetemp", str(folder / "tmp"), *options]
+    return started(["-m", "pytest", "-p", "no:cacheprovider", "--basetemp", str(folder / "tmp"), *options], folder)
+
+
+def python_run(folder: Path, script: str) -> subprocess.Popen[str]:
+    (folder / "script.py").write_text(HEAD + script)
+    return started(["script.py"], folder)
+
+
+def started(words: list[str], folder: Path) -> subprocess.Popen[str]:
+    """Start Python in a folder; standard error goes with its output."""
+    environment = {**os.environ, "COLUMNS": "200"}
     return subprocess.Popen(
-        command,
+        [sys.executable, *words],
         cwd=folder,
+        env=environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        env={**os.environ, "COLUMNS": "200"},
     )
 
 
@@ -104,3 +116,50 @@ def test_a_failing_test_says_who_waits_and_keeps_the_record(compiled: None, tmp_
     with RecordReader(kept / "run.mcap") as reader:
         assert reader.complete
     assert left_in(tmp_path) == []
+
+
+KILLED_TEST = """
+def test_it_is_killed_in_flight(federation):
+    flight = federation(PAIR, programs=["sh -c 'setsid sleep 601 & sleep 602'"], options=["--rate", "1"], out="run1")
+    flight.wait_until(0.1)
+    print("it flies", flush=True)
+    flight.run()
+"""
+KILLED_SCRIPT = """
+import zsim
+
+gust = {"kind": "gust", "target": "world", "at_s": 0.1, "for_s": 1, "velocity_m_s": [1, 0, 0]}
+zsim.run(PAIR, set={"faults": [gust]}, processes=True, options=["--rate", "1"], out="run1")
+"""
+SIDE_BY_SIDE = """
+import pytest
+
+@pytest.mark.parametrize("number", range(2))
+def test_side_by_side(federation, number):
+    flight = federation(PAIR, duration=2)
+    flight.wait_until(1)
+    assert federation(PAIR, duration=1).run().complete  # and another within the same test
+    assert flight.run().complete
+"""
+
+
+@pytest.mark.parametrize("kind", ["test", "script"])
+def test_kill_9_leaves_nothing_running(compiled: None, tmp_path: Path, kind: str) -> None:
+    process = pytest_run(tmp_path, KILLED_TEST, "-s") if kind == "test" else python_run(tmp_path, KILLED_SCRIPT)
+    assert process.stdout is not None
+    assert any("it flies" in line or "fault: gust" in line for line in process.stdout)
+    started = psutil.Process(process.pid).children(recursive=True)
+    assert len(started) >= (11 if kind == "test" else 7)  # keepers, launcher, fork server, roles, programs
+    process.kill()
+    process.communicate()
+    _, alive = psutil.wait_procs(started, PATIENCE_S)
+    assert alive == []
+    with RecordReader(tmp_path / "run1/run.mcap") as reader:
+        assert reader.complete
+
+
+def test_side_by_side(compiled: None, tmp_path: Path) -> None:
+    process = pytest_run(tmp_path, SIDE_BY_SIDE, "-n", "2")
+    output = output_of(process)
+    assert process.returncode == 0, output
+    assert "2 passed" in output

@@ -16,7 +16,7 @@ from zsim.contract import flight_messages, keys, messages
 from zsim.contract.flight_messages import Estimate, Mode, Status, state_refusal
 from zsim.contract.messages import Info
 from zsim.contract.snapshot import State
-from zsim.errors import RunError, UserCodeError
+from zsim.errors import RunError, UserCodeError, printable
 from zsim.runtime.agent import Agent, Output
 from zsim.scenario.scenario import Scenario
 from zsim_bridges.fmu.formation import Formation
@@ -386,4 +386,4 @@ def _typed(value: Any, variable: Variable) -> Any:
 
 
 def _print(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
+    print(printable(line), file=sys.stderr, flush=True)

@@ -1,0 +1,324 @@
+"""What a policy sees and does: observations and commands, the same in an environment and in a process of its own.
+
+class Trained(zsim.PolicyAgent):
+    observe, action, step_s = "estimate", "velocity", 0.1
+
+    def policy(self, observations):
+        return {drone: model.predict(seen)[0] for drone, seen in observations.items()}
+
+zsim.run(env.scenario, agents=[Trained])    # or: zsim agent MODULE:Trained, on any host
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any, Literal, Protocol, get_args
+
+import numpy as np
+from msgspec import inspect
+from numpy.typing import ArrayLike, NDArray
+
+from zsim.contract import keys
+from zsim.contract.flight_messages import Estimate, Status
+from zsim.contract.flight_messages import Truth as TruthMessage
+from zsim.contract.messages import Info
+from zsim.errors import RunError, UserCodeError
+from zsim.runtime.agent import Agent, Output
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Drone, Scenario
+from zsim.schema import plugin
+from zsim.sensors.sensor import Sample
+from zsim.vehicles.vehicle_catalogue import vehicle_of
+from zsim_agents.formation.spaces.cluster_space import SingularClusterError, unit
+from zsim_agents.formation.spaces.scenario_space import scenario_space
+from zsim_api.commands import Command, attitude, rotors, takeoff, velocity
+from zsim_api.simulation import Estimates, Samples, Truth, estimates_of
+
+Observe = Literal["truth", "estimate", "sensors"]
+Action = Literal["velocity", "attitude", "rotors", "cluster"]
+Floats = NDArray[np.float32]
+FARTHEST = 1e6  # bound of an observation, m and so on: beyond all that flies
+AIRBORNE = ("hovering", "flying")
+STAMPS = ("t_ns", "seq", "t_sample_ns")  # of a sample, no readings
+
+
+class Flown(Protocol):
+    """What is known of a flight at a gate: `zsim.Simulation`, or the messages that an agent has received."""
+
+    @property
+    def names(self) -> Sequence[str]: ...
+    @property
+    def truth(self) -> Truth: ...
+    @property
+    def estimates(self) -> Estimates: ...
+    @property
+    def sensors(self) -> Mapping[str, Samples]: ...
+    def state(self, drone: str) -> str: ...
+
+
+class Interface:
+    """Observations and commands of the agents of an environment: drones, or clusters where these are acted on.
+
+    An observation (K,) of "truth" or "estimate" has for each drone of the agent position [m] and velocity [m/s] in W
+    and orientation (w, x, y, z, B to W), of the truth the angular velocity in B [rad/s] too; then, for each other
+    drone, position and velocity relative to the agent's first drone, in W. Of "sensors" it has the newest sample of
+    every sensor, in the order of the contract; 0 before the first one.
+
+    An action (A,) is of -1 to 1, the limits of the drone's firmware and rotors, see `bounds`. For each drone of the
+    agent it has, "velocity": forward, left, up [m/s], yaw rate [rad/s]; "attitude": roll and pitch [rad], thrust [N],
+    yaw rate [rad/s]; "rotors": their speeds [rad/s]. "cluster": the rates of all variables of the cluster's space
+    [m/s, rad/s].
+
+    Args:
+        scenario: resolved.
+        step_s: time between two actions [s], a whole number of gates.
+
+    Raises:
+        RunError: the arguments do not fit each other or the scenario.
+
+    Attributes:
+        agents: names of the drones, or of the clusters.
+        gates: between two actions.
+    """
+
+    def __init__(self, scenario: Scenario, observe: Observe, action: Action, step_s: float | None = None) -> None:
+        for what, found, allowed in (("observe", observe, get_args(Observe)), ("action", action, get_args(Action))):
+            if found not in allowed:
+                raise RunError(f"{what} is {found!r}; must be one of {', '.join(allowed)}")
+        gate_s = scenario.time.gate_ms / 1e3
+        self.gates = round((step_s or gate_s) / gate_s)
+        if self.gates < 1 or abs(self.gates * gate_s - (step_s or gate_s)) > 1e-9:
+            raise RunError(f"step_s is {step_s:g}; must be a multiple of the scenario's gate, {gate_s:g} s")
+        if action == "cluster" and observe == "sensors":
+            raise RunError("observe is 'sensors' where the action is of a cluster; must be 'truth' or 'estimate'")
+        if action == "cluster" and not scenario.clusters:
+            raise RunError(f"action is 'cluster', and scenario {scenario.name!r} has none")
+        self.observe, self.action = observe, action
+        self._drones = {drone.name: drone for drone in scenario.drones}
+        self.names = list(self._drones)
+        of_clusters = {cluster.name: list(cluster.drones) for cluster in scenario.clusters}
+        self._members = of_clusters if action == "cluster" else {name: [name] for name in self.names}
+        self.agents = list(self._members)
+        self._places = {agent: [self.names.index(drone) for drone in self._members[agent]] for agent in self.agents}
+        self._spaces = {each.name: scenario_space(scenario, each) for each in scenario.clusters}
+        self._sensed = {name: _readings(drone) for name, drone in self._drones.items()}
+
+    def size(self, agent: str) -> int:
+        """Return the length K of an observation."""
+        if self.observe == "sensors":
+            return sum(width for drone in self._members[agent] for _, _, width in self._sensed[drone])
+        own, others = len(self._members[agent]), len(self.names) - len(self._members[agent])
+        return own * (13 if self.observe == "truth" else 10) + 6 * others
+
+    def bounds(self, agent: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return what an action of -1 and of 1 commands (A,), in the units above."""
+        low: list[float] = []
+        high: list[float] = []
+        for drone in (self._drones[name] for name in self._members[agent]):
+            limits = drone.limits
+            speed, climb = limits.horizontal_speed_m_s, limits.vertical_speed_m_s
+            yaw_rate, tilt = np.radians(limits.yaw_rate_deg_s), np.radians(limits.tilt_deg)
+            count = len(vehicle_of(drone.model).rotors)
+            if self.action == "attitude":
+                low += [-tilt, -tilt, 0.0, -yaw_rate]
+                high += [tilt, tilt, count * drone.thrust_n_s2 * drone.rotor_max_rad_s**2, yaw_rate]
+            elif self.action == "rotors":
+                low += [0.0] * count
+                high += [drone.rotor_max_rad_s] * count
+            elif self.action == "velocity":
+                high += [speed, speed, climb, yaw_rate]
+                low += [-speed, -speed, -climb, -yaw_rate]
+        if self.action == "cluster":
+            least = [self._drones[name].limits for name in self._members[agent]]
+            speed = min(each.horizontal_speed_m_s for each in least)
+            turn = min(np.radians(each.yaw_rate_deg_s) for each in least)
+            high = [speed if unit(name) == "m" else turn for name in self._spaces[agent].names]
+            low = [-each for each in high]
+        return np.array(low), np.array(high)
+
+    def observations(self, flown: Flown) -> dict[str, Floats]:
+        """Return what every agent sees."""
+        if self.observe == "sensors":
+            seen = {drone: self._samples(flown, drone) for drone in self.names}
+            return {agent: np.concatenate([seen[name] for name in self._members[agent]]) for agent in self.agents}
+        of = flown.truth if self.observe == "truth" else flown.estimates
+        parts = [of.position_m, of.velocity_m_s, of.orientation_wxyz]
+        parts += [of.angular_velocity_rad_s] if isinstance(of, Truth) else []
+        own = np.column_stack(parts)
+        found = {}
+        for agent, places in self._places.items():
+            others = [i for i in range(len(self.names)) if i not in places]
+            relative = own[others, :6] - own[places[0], :6]
+            found[agent] = _bounded(np.concatenate([own[places].ravel(), relative.ravel()]))
+        return found
+
+    def begin(self, flown: Flown) -> dict[str, Command] | None:
+        """Return the commands that bring the drones into the air; None once all are, and a policy may begin."""
+        states = {name: flown.state(name) for name in self.names}
+        if all(state in AIRBORNE for state in states.values()):
+            return None
+        return {name: takeoff() for name, state in states.items() if state == "landed"}
+
+    def commands(self, flown: Flown, actions: Mapping[str, ArrayLike], by: str = "step") -> dict[str, Command]:
+        """Return the commands to the drones by the actions of agents; those without an action get none.
+
+        Raises:
+            UserCodeError: an action is of another shape, or not finite; `by` says whose it is.
+        """
+        commands: dict[str, Command] = {}
+        for agent, given in actions.items():
+            if agent not in self._bounds:
+                raise UserCodeError(f"{by}: action is of {agent!r}; must be of {', '.join(self.agents)}")
+            low, high = self._bounds[agent]
+            action = np.asarray(given, np.float32)
+            if action.shape != low.shape:
+                raise UserCodeError(f"{by}: action of {agent} has shape {action.shape}; must be {low.shape}")
+            if not np.isfinite(action).all():
+                raise UserCodeError(f"{by}: action of {agent} is {action.tolist()}; must be finite")
+            wanted = low + (np.clip(action, -1.0, 1.0).astype(np.float64) + 1.0) / 2.0 * (high - low)
+            if self.action == "cluster":
+                commands |= self._of_cluster(agent, flown, wanted)
+            else:
+                commands[agent] = self._of_drone(wanted)
+        return commands
+
+    @cached_property
+    def _bounds(self) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+        return {agent: self.bounds(agent) for agent in self.agents}
+
+    def _of_drone(self, action: NDArray[np.float64]) -> Command:
+        if self.action == "rotors":
+            return rotors(action)
+        if self.action == "velocity":
+            return velocity(*action.tolist())
+        roll, pitch, thrust_n, yaw_rate = action.tolist()
+        (sr, sp), (cr, cp) = np.sin([roll / 2, pitch / 2]), np.cos([roll / 2, pitch / 2])
+        return attitude((cr * cp, sr * cp, cr * sp, -sr * sp), thrust_n, yaw_rate)  # first pitch, then roll
+
+    def _of_cluster(self, cluster: str, flown: Flown, c_dot: NDArray[np.float64]) -> dict[str, Command]:
+        """Return velocities of the drones of a cluster; rest where its shape is singular."""
+        of = flown.truth if self.observe == "truth" else flown.estimates
+        places, space = self._places[cluster], self._spaces[cluster]
+        w, x, y, z = of.orientation_wxyz[places].T
+        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        try:
+            r_dot = space.motion(space.forward(of.position_m[places], yaw), c_dot).reshape(-1, 4)
+        except SingularClusterError:
+            r_dot = np.zeros((len(places), 4))
+        moved = zip(self._members[cluster], r_dot.tolist(), strict=True)
+        return {name: velocity(*numbers, frame="world") for name, numbers in moved}
+
+    def _samples(self, flown: Flown, drone: str) -> Floats:
+        place = self.names.index(drone)
+        parts: list[NDArray[Any]] = []
+        came = {*flown.sensors}
+        for sensor, field, width in self._sensed[drone]:
+            column = getattr(flown.sensors[sensor], field)[place] if sensor in came else np.zeros(width)
+            parts.append(np.atleast_1d(np.asarray(column, np.float64)))
+        return _bounded(np.concatenate(parts))
+
+
+def _readings(drone: Drone) -> list[tuple[str, str, int]]:
+    """Return the numbers that a drone's sensors measure: sensor, field, and how many."""
+    found = []
+    for name, kind, settings in drone.sensors.sections():
+        if getattr(settings, "rate_hz", 1.0) == 0:
+            continue
+        info = inspect.type_info(kind.message)
+        assert isinstance(info, inspect.StructType)
+        for field in info.fields:
+            match field.type:
+                case inspect.FloatType():
+                    found.append((name, field.name, 1))
+                case inspect.TupleType(item_types=items) if all(isinstance(each, inspect.FloatType) for each in items):
+                    found.append((name, field.name, len(items)))
+    return found
+
+
+def _bounded(numbers: NDArray[np.float64]) -> Floats:
+    """Return numbers within the bounds of an observation; 0 for what is not known yet."""
+    return np.clip(np.nan_to_num(numbers), -FARTHEST, FARTHEST).astype(np.float32)
+
+
+class PolicyAgent(Agent):
+    """A policy as an agent of a flight; it takes the drones off, and acts once all are in the air.
+
+    Attributes:
+        observe, action, step_s: as of the environment in which it was trained.
+    """
+
+    observe: Observe = "truth"
+    action: Action = "velocity"
+    step_s: float | None = None
+
+    def policy(self, observations: dict[str, Floats]) -> Mapping[str, ArrayLike]:
+        """Return the action of every agent by its observation; see `zsim.Interface` for both."""
+        raise NotImplementedError
+
+    def bind(self, info: Info, name: str = "") -> None:
+        """Get ready for the run of `world/info`."""
+        scenario = scenario_file.from_text(info.scenario)
+        self.interface = Interface(scenario, self.observe, self.action, self.step_s)
+        drones = self.interface.names
+        self.period_ns = self.interface.gates * info.gate_ns
+        self.gate_keys = tuple(map(keys.status, drones))
+        read = {"truth": keys.truth, "estimate": keys.estimate, "sensors": lambda drone: f"drone/{drone}/sensor/*"}
+        own = tuple(map(read[self.observe], drones))
+        self.reads = (*self.gate_keys, *own)
+        if self.observe == "estimate":
+            self.gate_keys = (*self.gate_keys, *own)
+        self.counted = tuple(drones) if self.observe == "sensors" else ()
+        self._flown = _Received(drones, max(len(drone.rotors) for drone in info.drones))
+        self._is_begun = False
+        super().bind(info, name)
+
+    def receive(self, key: str, message: Any) -> None:
+        """Take what the observations are made of."""
+        self._flown.put(key, message)
+
+    def step(self, t_ns: int) -> list[Output]:
+        """Return the commands of a gate."""
+        begin = None if self._is_begun else self.interface.begin(self._flown)
+        if begin is None:
+            self._is_begun = True
+            by = f"{plugin.full_name(type(self))}.policy"
+            actions = self.policy(self.interface.observations(self._flown))
+            if not isinstance(actions, Mapping):
+                raise UserCodeError(f"{by} returns a {type(actions).__name__}; must be a map of actions by agent")
+            begin = self.interface.commands(self._flown, actions, by)
+        return [self.command(t_ns, drone, command) for drone, command in begin.items()]
+
+
+class _Received:
+    """A flight by the messages that an agent has received."""
+
+    def __init__(self, names: Sequence[str], rotors_max: int) -> None:
+        self.names = names
+        self.sensors: dict[str, Samples] = {}
+        self._index = {name: i for i, name in enumerate(names)}
+        self._states: dict[str, str] = dict.fromkeys(names, "")
+        self._estimates: dict[str, Estimate] = {}
+        widths = (3, 3, 4, 3, 3, rotors_max)
+        self.truth = Truth(*(np.zeros((len(names), width)) for width in widths))
+
+    @property
+    def estimates(self) -> Estimates:
+        return estimates_of(self.names, self._estimates)
+
+    def state(self, drone: str) -> str:
+        return self._states[drone]
+
+    def put(self, key: str, message: Any) -> None:
+        drone = keys.thing(key)
+        if isinstance(message, Status):
+            self._states[drone] = message.state
+        elif isinstance(message, Estimate):
+            self._estimates[drone] = message
+        elif isinstance(message, TruthMessage):
+            for name, column in zip(Truth._fields, self.truth, strict=True):
+                numbers = getattr(message, name)
+                column[self._index[drone], : len(numbers)] = numbers
+        elif isinstance(message, Sample):
+            sensor = keys.leaf(key)
+            if sensor not in self.sensors:
+                self.sensors[sensor] = Samples(type(message), len(self.names))
+            self.sensors[sensor].put(self._index[drone], message)
