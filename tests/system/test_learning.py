@@ -29,7 +29,7 @@ def test_a_policy_learns_and_flies_as_an_agent(tmp_path: Path) -> None:
 
     env = train_policy.home_env()
     train_policy.flown(model, env, seed=100)
-    sim = env.unwrapped.sim
+    sim: zsim.Simulation = env.get_wrapper_attr("sim")
     sim.source.save(tmp_path / "home.yaml")
     model.save(tmp_path / "policy.zip")
     flight = ["home.yaml", "--agent", "train_policy:Trained file=policy.zip", "--out", "run"]
