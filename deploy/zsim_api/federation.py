@@ -38,7 +38,7 @@ from zsim.transport.session import RawSample, Session, result_of
 from zsim_analysis.in_process import OwnAgent, with_agents
 from zsim_api import run_folder
 from zsim_api.assertions import Assertions
-from zsim_api.flight import calling, command_of, raise_failure
+from zsim_api.flight import LAUNCHER, calling, command_of, raise_failure
 from zsim_api.programs import Program, search_path
 from zsim_api.scenarios import AnyScenario, scenario_of
 
@@ -49,7 +49,6 @@ PROCESS = "test.federation"
 PATIENCE_S = 180.0  # wall time; the first run on a machine compiles for one to three minutes
 PROGRAM_END_S = 5.0  # wall time that programs have to see that the run is over
 LAST_LINES = 10  # of each log
-LAUNCHER = "zsim-run"  # its output, beside the logs of the processes
 
 
 class Moment(NamedTuple):

@@ -23,6 +23,8 @@ class {name}(Fmi3Slave):
             place = name.replace("[", "_").replace("]", "")
             tunable = dict(variability=Fmi3Variability.tunable) if causality is P else dict(
                 variability=Fmi3Variability.continuous if Type is Float64 else Fmi3Variability.discrete)
+            if isinstance(start, list):
+                more["dimensions"] = [Dimension(start=str(len(start)))]
             self.register_variable(Type(name, causality=causality, **tunable, **more,
                 getter=lambda: getattr(self, place), setter=lambda v: setattr(self, place, v)))
 
@@ -70,7 +72,8 @@ def build(folder: Path, name: str, version: int, variables: str, law: str, resto
 
     Args:
         name: of its class; two of one name cannot be in one process.
-        variables: calls `variable(name, start, causality)` with I, O, P, and a type Real, Whole, Boolean, String.
+        variables: calls `variable(name, start, causality)` with I, O, P, and a type Real, Whole, Boolean, String; a
+            list starts an array, of FMI 3 only.
         law: statements of a step, on `self.NAME` of each variable; the elements of an array `v[0]` are `self.v_0`.
         restores: whether it gives and takes its state.
     """

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import fmus
+import numpy as np
 import pytest
 from federation import ONE, Federation, Record
 from fmpy.validation import validate_fmu
@@ -14,6 +15,10 @@ from zsim.contract import flight_messages, keys
 from zsim.contract.flight_messages import Estimate, Mode, Status, Velocity
 from zsim.record import RecordReader
 from zsim.runtime.agent import Agent, Output
+from zsim.scenario.scenario import Scenario
+from zsim_agents.formation.spaces.cluster_space import robot_rates
+from zsim_agents.formation.spaces.scenario_space import scenario_space
+from zsim_agents.formation.spaces.triad_cluster import TriadCluster
 
 GOAL = (2.0, 1.0, 3.0)
 SCENARIO = ONE.replace("expect: []", "expect: [estimator.drone1, fmu.drone1]")
@@ -48,6 +53,79 @@ class Waypoint(Agent):
 
     def _sent(self, kind: str, message: flight_messages.Command) -> Output:
         return Output(keys.command("drone1", kind), message)
+
+
+# Test 1 of the paper: an FMU as the cluster space controller of three drones
+
+STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
+SHORTER = ("--duration", "45")
+C_DES = (5.0, -5.0, 15.0, 0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.0, 4.0, 4.0, math.pi / 4)  # equation (3)
+CLUSTER_VARIABLES = f"""
+variable("c", [0.0] * 12, I)
+variable("c_des", {list(C_DES)!r}, P)
+variable("c_dot", [0.0] * 12, O)
+"""
+CLUSTER_LAW = """
+import math
+
+error = [wanted - found for wanted, found in zip(self.c_des, self.c, strict=True)]
+error[3:9] = [math.remainder(angle, math.tau) for angle in error[3:9]]
+limits = [0.8] * 3 + [0.1] * 6 + [0.3, 0.3, 0.1]
+self.c_dot = [max(-limit, min(limit, 0.4 * each)) for each, limit in zip(error, limits, strict=True)]
+"""
+
+
+class ClusterController(Agent):
+    """The law of the FMU, as an agent in Python with the kinematics of its own."""
+
+    name = "controller.main"
+
+    def __init__(self, scenario: Scenario) -> None:
+        super().__init__()
+        cluster = scenario.cluster("main")
+        self.drones, self.space = cluster.drones, scenario_space(scenario, cluster)
+        self.reads = tuple(map(keys.estimate, self.drones))
+        self.c_des, self.c, self.c_dot = list(C_DES), [0.0] * 12, [0.0] * 12
+        self.latest: dict[str, Any] = {}
+
+    def receive(self, key: str, message: Any) -> None:
+        self.latest[key] = message
+
+    def step(self, t_ns: int) -> list[Output]:
+        if t_ns == 1_000_000_000:
+            return [Output(keys.command(drone, "mode"), Mode(t_ns, 0, "", "takeoff")) for drone in self.drones]
+        estimates = [self.latest[keys.estimate(drone)] for drone in self.drones]
+        p_W, yaw = np.array([e.position_m for e in estimates]), np.array([e.yaw_rad for e in estimates])
+        self.c = self.space.forward(p_W, yaw).tolist()
+        exec(CLUSTER_LAW, {"self": self})
+        v_W, yaw_rates = robot_rates(self.space, np.array(self.c), np.array(self.c_dot))
+        return [
+            Output(keys.command(drone, "velocity"), Velocity(t_ns, 0, "", tuple(v), float(rate), "world"))
+            for drone, v, rate in zip(self.drones, v_W.tolist(), yaw_rates, strict=True)
+            if self.latest[keys.status(drone)].state in ("hovering", "flying")
+        ]
+
+
+def test_flies_test_1_as_the_cluster_space_controller(federation: Federation, tmp_path: Path) -> None:
+    path = fmus.build(tmp_path, "Cluster", 3, CLUSTER_VARIABLES, CLUSTER_LAW)
+    assert validate_fmu(str(path)) == []
+    world = federation.start("world", str(STEP), *SHORTER, "--listen", federation.endpoint, "--expect", "recorder")
+    federation.role("record", "--out", str(federation.out))
+    federation.role("host", "estimator.*")
+    mapping = ("--map", "c=main/c", "--map", "c_dot=main/c_dot")
+    flown = federation.role("fmu", str(path), "--name", "controller.main", *mapping, "--takeoff", "1")
+    world.ends(with_code=0)
+    flown.ends(with_code=0)
+    record = federation.record()
+    same = zsim.Simulation(STEP, duration_s=45.0, agents=[ClusterController], record=tmp_path / "law")
+    with same:
+        same.run()
+    assert truth_sha256(tmp_path / "law") == record.sha256()
+    p_W = np.array([record.positions(drone)[-1] for drone in ("drone1", "drone2", "drone3")])
+    c = TriadCluster(3).forward(p_W, np.zeros(3))
+    off = c - np.array(C_DES)
+    assert np.abs(off[:3]).max() < 1.0
+    assert np.abs(off[9:11]).max() < 0.5
 
 
 def truth_sha256(folder: Path) -> str:

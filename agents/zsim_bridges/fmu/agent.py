@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+from msgspec.structs import replace
+
 from zsim.contract import flight_messages, keys, messages
 from zsim.contract.flight_messages import Estimate, Mode, Status, state_refusal
 from zsim.contract.messages import Info
@@ -17,7 +19,8 @@ from zsim.contract.snapshot import State
 from zsim.errors import RunError, UserCodeError, printable
 from zsim.runtime.agent import Agent, Output
 from zsim.scenario.scenario import Scenario
-from zsim_bridges.fmu.mapping import Link, mapping_of
+from zsim_bridges.fmu.formation import Formation
+from zsim_bridges.fmu.mapping import FORMATION, MappedVariable, mapping_of
 from zsim_bridges.fmu.model import FmuInstance, FmuModel, Inputs, Variable
 
 Frame = Literal["heading", "world"]
@@ -76,7 +79,10 @@ class Fmu:
         self.name, self.period_s, self.param = name, period_s, dict(param)
         self.frame: Frame = frame
         self.takeoff_s, self.log, self.say = takeoff_s, log, say
-        self.__qualname__ = type(self).__name__  # as a function that makes an agent has
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is pickled: another process finds the file whatever its folder is."""
+        return {**vars(self), "path": self.path.resolve()}
 
     def __call__(self, info: Info, scenario: Scenario) -> "FmuAgent":
         """Return the agent for a run.
@@ -99,14 +105,20 @@ class FmuAgent(Agent):
         self.name = of.name or f"fmu.{of.drone or 'main'}"
         self._say = of.say or _print
         self.period_ns = _period_ns(model, of.period_s, info)
-        mapping = mapping_of(model, of.map, info, of.drone, lambda cluster: _cluster_names(scenario, cluster))
+        formations = _Formations(scenario)
+        mapping = mapping_of(model, of.map, info, of.drone, lambda cluster: formations[cluster].names)
         if not mapping.outputs:
             known = ", ".join(each.name for each in model.variables.values() if each.causality == "output") or "none"
             raise RunError(f"{of.path}: none of its outputs is mapped; must map one of {known}")
         self._inputs = mapping.inputs
-        self._writers = _writers(mapping.outputs, of.frame)
+        self._formations = {
+            key: formations[keys.thing(key)]
+            for key in (link.place.key for link in (*mapping.inputs, *mapping.outputs))
+            if keys.parts(key)[2] in FORMATION
+        }
+        self._writers = _writers(mapping.outputs, of.frame, self._formations)
         self._given = [link.variable for writer in self._writers for link in writer.links]
-        self._commanded = sorted({keys.thing(writer.key) for writer in self._writers if keys.is_command(writer.key)})
+        self._commanded = sorted({drone for writer in self._writers for drone in writer.commanded})
         self._takeoff_ns = None if of.takeoff_s is None else round(of.takeoff_s * 1e9)
         self._latest: dict[str, Any] = {}
         self._states: dict[str, Any] = {}  # of the drones that it commands
@@ -121,9 +133,11 @@ class FmuAgent(Agent):
         self._unit.set_parameters([_parameter(model, name, value) for name, value in of.param.items()])
 
     def _declare_keys(self, info: Info) -> None:
-        reads = {link.place.key for link in self._inputs}
-        about = [*(key for key in reads if key.startswith("drone/")), *(writer.key for writer in self._writers)]
-        drones = list(dict.fromkeys(map(keys.thing, about))) or [drone.name for drone in info.drones]
+        reads = {link.place.key for link in self._inputs} - self._formations.keys()
+        reads |= {keys.estimate(drone) for formation in self._formations.values() for drone in formation.drones}
+        about = [key for key in (*reads, *(writer.key for writer in self._writers)) if key.startswith("drone/")]
+        concerned = {*map(keys.thing, about), *self._commanded}
+        drones = [drone.name for drone in info.drones if drone.name in concerned or not concerned]
         statuses = [keys.status(drone) for drone in drones]
         self.counted = tuple(
             drone for drone in drones if any(keys.is_sensor(key) and keys.thing(key) == drone for key in reads)
@@ -132,7 +146,7 @@ class FmuAgent(Agent):
         plain = [key for key in (*reads, *statuses) if not (keys.is_sensor(key) and keys.thing(key) in self.counted)]
         self.reads = tuple(sorted({*plain, *map(keys.sensors, self.counted)}))
         self.gate_keys = (*statuses, *sorted(every_gate))
-        self.writes = tuple(writer.key for writer in self._writers if not keys.is_command(writer.key))
+        self.writes = tuple(writer.key for writer in self._writers if not writer.commanded)
         self._wanted = reads
 
     def receive(self, key: str, message: Any) -> None:
@@ -165,8 +179,11 @@ class FmuAgent(Agent):
         """Return the inputs of which there has been a message; the others keep their start values."""
         values = []
         for link in self._inputs:
-            message = self._latest.get(link.place.key)
-            read = link.place.read(message) if message is not None else None
+            place = link.place
+            message = self._latest.get(place.key)
+            read = place.read(message) if message is not None else None
+            if place.key in self._formations and (c := self._formations[place.key].c(self._latest)) is not None:
+                read = [c[i] for i in place.indices or ()]
             if read is not None:
                 values.append((link.variable, link.converted(read)))
         return values
@@ -185,6 +202,15 @@ class FmuAgent(Agent):
 
     def mode(self, t_ns: int, key: str, mode: Any) -> Output:
         return Output(key, Mode(t_ns, self.next_seq(key), self.source, mode))
+
+    def motion(self, t_ns: int, formation: Formation, c_dot: Sequence[float]) -> list[Output]:
+        """Return the velocity commands of the drones of a formation that are in the air."""
+        outputs = []
+        for drone, command in zip(formation.drones, formation.velocities(self._latest, c_dot), strict=False):
+            if self.takes_setpoints(drone):
+                key = keys.command(drone, "velocity")
+                outputs.append(Output(key, replace(command, t_ns=t_ns, seq=self.next_seq(key), source=self.source)))
+        return outputs
 
     def takes_setpoints(self, drone: str) -> bool:
         return state_refusal(drone, self._states.get(drone, "landed"), "setpoint") is None
@@ -217,8 +243,9 @@ class FmuAgent(Agent):
 class _Writer:
     """Makes the messages of one key of what the FMU gives."""
 
-    def __init__(self, key: str, links: Sequence[Link], frame: Frame) -> None:
+    def __init__(self, key: str, links: Sequence[MappedVariable], frame: Frame) -> None:
         self.key, self.links = key, links
+        self.commanded = [keys.thing(key)] if keys.is_command(key) else []
         self._kind = messages.output_type(key)
         self._drone = keys.thing(key)
         leaf = keys.leaf(key)
@@ -245,7 +272,7 @@ class _Writer:
                 for link, (value,) in zip(self.links, values, strict=True)
                 if agent.rises(f"{self._drone}.{link.place.field}", value > 0)
             ]
-        if keys.is_command(self.key) and not agent.takes_setpoints(self._drone):
+        if self.commanded and not agent.takes_setpoints(self._drone):
             return []
         fields: dict[str, Any] = dict(self._fields)
         for link, own in zip(self.links, values, strict=True):
@@ -276,11 +303,43 @@ class _Writer:
             fields["yaw_rad"] = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
-def _writers(outputs: Sequence[Link], frame: Frame) -> list[_Writer]:
-    by_key: dict[str, list[Link]] = {}
+class _FormationWriter:
+    """Makes the velocity commands of a formation of what the FMU gives of c_dot; what it does not give is 0."""
+
+    def __init__(self, key: str, links: Sequence[MappedVariable], formation: Formation) -> None:
+        self.key, self.links, self.commanded = key, links, formation.drones
+        self._formation = formation
+
+    def outputs(self, agent: FmuAgent, t_ns: int, values: Sequence[Sequence[Any]]) -> list[Output]:
+        c_dot = [0.0] * len(self._formation.names)
+        for link, own in zip(self.links, values, strict=True):
+            for index, value in zip(link.place.indices or (), own, strict=True):
+                c_dot[index] = float(value)
+        return agent.motion(t_ns, self._formation, c_dot)
+
+
+class _Formations(dict[str, Formation]):
+    """Formations by cluster, made when they are first asked for."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        super().__init__()
+        self._scenario = scenario
+
+    def __missing__(self, cluster: str) -> Formation:
+        self[cluster] = made = Formation(self._scenario, cluster)
+        return made
+
+
+def _writers(
+    outputs: Sequence[MappedVariable], frame: Frame, formations: Mapping[str, Formation]
+) -> "list[_Writer | _FormationWriter]":
+    by_key: dict[str, list[MappedVariable]] = {}
     for link in outputs:
         by_key.setdefault(link.place.key, []).append(link)
-    return [_Writer(key, links, frame) for key, links in by_key.items()]
+    return [
+        _FormationWriter(key, links, formations[key]) if key in formations else _Writer(key, links, frame)
+        for key, links in by_key.items()
+    ]
 
 
 def _period_ns(model: FmuModel, period_s: float | None, info: Info) -> int:
@@ -324,12 +383,6 @@ def _typed(value: Any, variable: Variable) -> Any:
             raise ValueError
         return str(value).lower() in ("true", "1")
     return int(value) if variable.kind == "whole" else float(value)
-
-
-def _cluster_names(scenario: Scenario, cluster: str) -> Sequence[str]:
-    from zsim_agents.formation.spaces.scenario_space import scenario_space
-
-    return scenario_space(scenario, scenario.cluster(cluster)).names
 
 
 def _print(line: str) -> None:

@@ -5,7 +5,7 @@
 WHOSE is a drone or a cluster (by default the drone that the FMU is for), or a key up to its last `/`. MESSAGE is the
 last part of a key: `estimate`, `truth`, a sensor, `state` of a cluster; for what the FMU gives `velocity`, `attitude`,
 `rotors`, `ardrone`, `mode`, `estimate`. Without it, an input is of the drone's estimate, and an output of its velocity
-command.
+command. `main/c` is c of the cluster `main` by the estimates, and `main/c_dot` the rates at which it is to move.
 """
 
 import math
@@ -28,6 +28,7 @@ COMMANDS: dict[str, type[Struct]] = {
 }
 MODES = ("takeoff", "land", "emergency", "reset")
 NUMBERED = ("value", "desired", "desired_rate")  # fields of a cluster's state, one number for each of its variables
+FORMATION = {"c": False, "c_dot": True}  # of a cluster, and no messages; whether an FMU gives them
 OWN_FIELDS = ("t_ns", "seq", "source", "frame")  # that no FMU gives: the process does
 # What a field is in, by the end of its name: unit, exponents as BASE_UNITS, and what one is in SI units
 RAD, PER_S = (0, 0, 0, 0, 0, 0, 0, 1), (0, 0, -1, 0, 0, 0, 0, 1)
@@ -77,7 +78,7 @@ class Place(NamedTuple):
         return [value] if self.indices is None else [value[i] for i in self.indices]
 
 
-class Link(NamedTuple):
+class MappedVariable(NamedTuple):
     """A variable and its place; `to_unit` converts what the sender gives to the receiver's unit, None for no change."""
 
     variable: Variable
@@ -94,8 +95,8 @@ class Link(NamedTuple):
 class Mapping(NamedTuple):
     """What an FMU takes and gives, and lines on units that differ."""
 
-    inputs: list[Link]
-    outputs: list[Link]
+    inputs: list[MappedVariable]
+    outputs: list[MappedVariable]
     notes: list[str]
 
 
@@ -133,7 +134,7 @@ def mapping_of(
         convert, note = _conversion(variable, place, is_output)
         if note:
             found.notes.append(f"{name}={where}: {note}")
-        (found.outputs if is_output else found.inputs).append(Link(variable, place, convert))
+        (found.outputs if is_output else found.inputs).append(MappedVariable(variable, place, convert))
     _check_once(found)
     return found
 
@@ -163,6 +164,9 @@ class _Places:
     def parse(self, text: str, is_output: bool, where: str) -> Place:
         whose, _, rest = text.rpartition("/")
         first, *path = rest.split(".")
+        if whose in self._clusters and FORMATION.get(first) is is_output:
+            names = self._cluster_names(whose)
+            return self._elements_at(text, f"cluster/{whose}/{first}", first, path, "number", names, where)
         if whose in self._clusters:
             key = f"cluster/{whose}/{first}"
         elif whose in self._drones or not whose:
@@ -213,16 +217,21 @@ class _Places:
         element, names = self._elements(key, name, described)
         if element is None:
             raise RunError(f"{where}: {name} of {key} holds neither numbers nor flags nor texts; map another field")
+        return self._elements_at(text, key, name, rest, element, names, where)
+
+    def _elements_at(
+        self, text: str, key: str, field: str, rest: list[str], kind: Kind, names: Sequence[str], where: str
+    ) -> Place:
+        """Return the place of all elements of a field, or of the one that is named or numbered."""
         if not rest:
-            return Place(text, key, name, tuple(range(len(names))), element)
-        if len(rest) > 1 and ".".join(rest) in names:  # variables of a group have a dot in their names
-            rest = [".".join(rest)]
-        index = next((i for i, each in enumerate(names) if rest in ([each], [str(i)])), None)
+            return Place(text, key, field, tuple(range(len(names))), kind)
+        wanted = ".".join(rest)  # variables of a group have a dot in their names
+        index = next((i for i, each in enumerate(names) if wanted in (each, str(i))), None)
         if index is None:
-            hint = suggestion(rest[0], names) if names[0] != "0" else ""
+            hint = suggestion(wanted, names) if names[0] != "0" else ""
             allowed = f"0 to {len(names) - 1}" if names[0] == "0" else f"one of {', '.join(names)}"
-            raise RunError(f"{where}: {'.'.join(rest)!r} is no part of {name}; {hint}must be {allowed}")
-        return Place(text, key, name, (index,), element)
+            raise RunError(f"{where}: {wanted!r} is no part of {field}; {hint}must be {allowed}")
+        return Place(text, key, field, (index,), kind)
 
     def _message(self, key: str, is_output: bool, where: str) -> type[Struct]:
         kind = messages.type_of(key)

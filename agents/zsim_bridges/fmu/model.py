@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from ctypes import byref
 from functools import cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -339,7 +340,7 @@ def _described(path: Path) -> Any:
         with zipfile.ZipFile(path) as archive:
             if "modelDescription.xml" not in archive.namelist():
                 raise RunError(f"{path}: is no FMU (it holds no modelDescription.xml); {ALLOWED}")
-        description = read_model_description(path)
+        description = read_model_description(BytesIO(path.read_bytes()))  # FMPy leaves a refused file open
     except zipfile.BadZipFile as error:
         raise RunError(f"{path}: is no FMU (no zip archive); {ALLOWED}") from error
     except OSError as error:
