@@ -1,5 +1,6 @@
 """`zsim.run`: a whole flight, in this process or as processes of its own, recorded and given back as a `Run`."""
 
+import os
 import signal
 import sys
 import threading
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 COMMAND = (sys.executable, "-P", "-m", "zsim_deploy")
+LAUNCHER = "zsim-run"  # its output, where it is not shown, beside the logs of the processes
 INTERRUPTED = 130  # exit code of `zsim run` after Ctrl-C
 
 
@@ -114,7 +116,9 @@ def _fly_as_processes(
     folder: Path,
     progress: bool,
 ) -> None:
-    program = Program(*command_of(source, agents, names, options, folder), quiet=not progress)
+    log = folder / run_folder.LOGS / f"{LAUNCHER}.log"
+    log.parent.mkdir(exist_ok=True)
+    program = Program(*command_of(source, agents, names, options, folder), None if progress else log)
     try:
         while True:
             try:
@@ -139,7 +143,8 @@ def command_of(
     """
     command = [*COMMAND, "run", str(_file_of(source, folder)), "--out", str(folder), "--force", "--no-report"]
     command += [word for change in source.changes or () for word in ("--set", change)]
-    folders = [folder, *source.folders]
+    mine = [Path(each) for each in sys.path if each and not plugin.is_library(f"{each}{os.sep}")]
+    folders = [folder, *source.folders, *(each for each in mine if each.is_dir())]
     if agents:
         from zsim_api.own_code import module_folders, name_of
 
@@ -162,7 +167,10 @@ def raise_failure(folder: Path, code: int) -> None:
     """Raise what ended the processes of a run; nothing where all of it was flown, though not as planned."""
     record = folder / RECORD
     if not record.exists():
-        raise RunFailedError(f"{folder}: `zsim run` ended with code {code}, and nothing was recorded")
+        log = folder / run_folder.LOGS / f"{LAUNCHER}.log"
+        said = log.read_text(errors="replace").split("\n") if log.exists() else []
+        last = next((line for line in reversed(said) if line.strip()), f"`zsim run` ended with code {code}")
+        raise RunFailedError(f"{folder}: nothing was recorded: {last}")
     judged = verdict(record)
     if failures := [each.text for each in judged.shortfalls if each.kind == "process" and each.fails]:
         raise RunFailedError(f"{failures[0]}; the record is {record}, the logs are in {folder / run_folder.LOGS}")

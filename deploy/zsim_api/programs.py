@@ -26,7 +26,6 @@ class Program:
         words: its command line.
         environment: variables that differ from those of this process.
         output: file that takes its output; None for this process's own.
-        quiet: show no output, without a file.
     """
 
     def __init__(
@@ -34,13 +33,12 @@ class Program:
         words: Sequence[str],
         environment: Mapping[str, str] | None = None,
         output: Path | None = None,
-        quiet: bool = False,
     ) -> None:
         self.words = tuple(words)
         self.asked = False  # whether it has been asked to end from here
         self._lock = threading.Lock()
         with open(output or os.devnull, "ab") as log:
-            goes_to = log if output or quiet else None
+            goes_to = log if output else None
             self._keeper = subprocess.Popen(
                 [*KEEPER, str(GRACE_S), *words],
                 stdin=subprocess.PIPE,

@@ -6,7 +6,9 @@ import subprocess
 import sys
 from pathlib import Path
 from textwrap import dedent
+from typing import Any
 
+import numpy as np
 from federation import PAIR, Federation
 
 import zsim
@@ -82,3 +84,22 @@ def test_ctrl_c_ends_the_processes_of_a_script(tmp_path: Path, federation: Feder
     assert "KeyboardInterrupt: interrupted; zsim.load('many')" in errors
     assert zsim.load(tmp_path / "many").summary.record.complete
     federation.nobody_left()
+
+
+class Pushed(zsim.PolicyAgent):
+    observe, action, step_s = "estimate", "cluster", 0.1
+
+    def policy(self, observations: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {agent: 0.3 * np.tanh(seen[:8]) for agent, seen in observations.items()}
+
+
+def test_a_policy_flies_as_a_process_to_the_bits_of_its_environment(tmp_path: Path, compiled: None) -> None:
+    (tmp_path / "pair.yaml").write_text(PAIR)
+    how: Any = {"observe": Pushed.observe, "action": Pushed.action, "step_s": Pushed.step_s}
+    env = zsim.parallel_env(tmp_path / "pair.yaml", reward=lambda sim, agent: 0.0, duration_s=8, **how)
+    seen, _ = env.reset(seed=5)
+    while env.agents:
+        seen, *_ = env.step(Pushed().policy(seen))
+    run = zsim.run(env.sim.source, agents=[Pushed], processes=True, out=tmp_path / "many", progress=False)
+    assert run.truth_sha256 == env.sim.truth_sha256
+    assert run.commands("drone1")["source"].iloc[-1] == "agent.pushed"

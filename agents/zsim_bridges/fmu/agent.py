@@ -20,7 +20,7 @@ from zsim.errors import RunError, UserCodeError, printable
 from zsim.runtime.agent import Agent, Output
 from zsim.scenario.scenario import Scenario
 from zsim_bridges.fmu.formation import Formation
-from zsim_bridges.fmu.mapping import FORMATION, Link, mapping_of
+from zsim_bridges.fmu.mapping import FORMATION, MappedVariable, mapping_of
 from zsim_bridges.fmu.model import FmuInstance, FmuModel, Inputs, Variable
 
 Frame = Literal["heading", "world"]
@@ -243,7 +243,7 @@ class FmuAgent(Agent):
 class _Writer:
     """Makes the messages of one key of what the FMU gives."""
 
-    def __init__(self, key: str, links: Sequence[Link], frame: Frame) -> None:
+    def __init__(self, key: str, links: Sequence[MappedVariable], frame: Frame) -> None:
         self.key, self.links = key, links
         self.commanded = [keys.thing(key)] if keys.is_command(key) else []
         self._kind = messages.output_type(key)
@@ -306,7 +306,7 @@ class _Writer:
 class _FormationWriter:
     """Makes the velocity commands of a formation of what the FMU gives of c_dot; what it does not give is 0."""
 
-    def __init__(self, key: str, links: Sequence[Link], formation: Formation) -> None:
+    def __init__(self, key: str, links: Sequence[MappedVariable], formation: Formation) -> None:
         self.key, self.links, self.commanded = key, links, formation.drones
         self._formation = formation
 
@@ -331,9 +331,9 @@ class _Formations(dict[str, Formation]):
 
 
 def _writers(
-    outputs: Sequence[Link], frame: Frame, formations: Mapping[str, Formation]
+    outputs: Sequence[MappedVariable], frame: Frame, formations: Mapping[str, Formation]
 ) -> "list[_Writer | _FormationWriter]":
-    by_key: dict[str, list[Link]] = {}
+    by_key: dict[str, list[MappedVariable]] = {}
     for link in outputs:
         by_key.setdefault(link.place.key, []).append(link)
     return [

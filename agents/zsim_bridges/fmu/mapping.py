@@ -78,7 +78,7 @@ class Place(NamedTuple):
         return [value] if self.indices is None else [value[i] for i in self.indices]
 
 
-class Link(NamedTuple):
+class MappedVariable(NamedTuple):
     """A variable and its place; `to_unit` converts what the sender gives to the receiver's unit, None for no change."""
 
     variable: Variable
@@ -95,8 +95,8 @@ class Link(NamedTuple):
 class Mapping(NamedTuple):
     """What an FMU takes and gives, and lines on units that differ."""
 
-    inputs: list[Link]
-    outputs: list[Link]
+    inputs: list[MappedVariable]
+    outputs: list[MappedVariable]
     notes: list[str]
 
 
@@ -134,7 +134,7 @@ def mapping_of(
         convert, note = _conversion(variable, place, is_output)
         if note:
             found.notes.append(f"{name}={where}: {note}")
-        (found.outputs if is_output else found.inputs).append(Link(variable, place, convert))
+        (found.outputs if is_output else found.inputs).append(MappedVariable(variable, place, convert))
     _check_once(found)
     return found
 
