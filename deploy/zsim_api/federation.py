@@ -31,7 +31,7 @@ from zsim.contract.run_messages import Clock, Event, holding_up
 from zsim.errors import DecodeError, RunError, RunFailedError, ZsimError, printable
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.runner import Runner
-from zsim.scenario.roles import expected_processes
+from zsim.scenario.roles import RECORDER, WORLD, expected_processes
 from zsim.schema.checker import suggestion
 from zsim.transport.connection import find_world
 from zsim.transport.session import RawSample, Session, result_of
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from zsim_api.recorded import Run
 
 PROCESS = "test.federation"
-PATIENCE_S = 180.0  # wall time; the first run on a machine compiles for one to three minutes
+PATIENCE_S = 300.0  # wall time; the first run on a machine compiles for one to three minutes, more on a busy one
 PROGRAM_END_S = 5.0  # wall time that programs have to see that the run is over
 LAST_LINES = 10  # of each log
 
@@ -131,6 +131,7 @@ class Federation(Assertions):
             self._port.close()
             raise
         self._watch = _Watch()
+        self._known = {*expected, WORLD, RECORDER}
         self._clock: Clock | None = None
         self._pids: dict[str, int] = {}
         self._killed: dict[int, str] = {}
@@ -268,7 +269,9 @@ class Federation(Assertions):
         until_s = time.monotonic() + within_s
         with self._watch.news:
             while (pid := self._pids.get(process)) is None or pid in self._killed:
-                if self._fault is not None or not self._watch.news.wait(max(0.0, until_s - time.monotonic())):
+                is_unknown = self.t_s > 0 and process not in self._known and process not in self._pids
+                left_s = max(0.0, until_s - time.monotonic())
+                if is_unknown or self._fault is not None or not self._watch.news.wait(left_s):
                     known = ", ".join(sorted(self._pids)) or "none"
                     raise RunFailedError(
                         f"kill: process is {process!r}; {suggestion(process, list(self._pids))}joined are {known}"

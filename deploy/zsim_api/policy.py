@@ -143,13 +143,28 @@ class Interface:
         of = flown.truth if self.observe == "truth" else flown.estimates
         parts = [of.position_m, of.velocity_m_s, of.orientation_wxyz]
         parts += [of.angular_velocity_rad_s] if isinstance(of, Truth) else []
-        own = np.column_stack(parts)
-        found = {}
-        for agent, places in self._places.items():
+        whole = np.concatenate(parts, axis=1).ravel()
+        picked, origins, ends = self._layout
+        seen = whole[picked]
+        seen -= np.append(whole, 0.0)[origins]
+        return dict(zip(self.agents, np.split(_bounded(seen), ends), strict=True))
+
+    @cached_property
+    def _layout(self) -> tuple[NDArray[np.intp], NDArray[np.intp], list[int]]:
+        """Return the layout of all observations in a row: numbers of the drones' rows by place, the places of those
+        from which they are measured (-1 for none), and where one agent's observation ends.
+        """
+        width = 13 if self.observe == "truth" else 10
+        picked: list[int] = []
+        origins: list[int] = []
+        ends: list[int] = []
+        for places in self._places.values():
+            own = [width * i + j for i in places for j in range(width)]
             others = [i for i in range(len(self.names)) if i not in places]
-            relative = own[others, :6] - own[places[0], :6]
-            found[agent] = _bounded(np.concatenate([own[places].ravel(), relative.ravel()]))
-        return found
+            picked += own + [width * i + j for i in others for j in range(6)]
+            origins += [-1] * len(own) + [width * places[0] + j for _ in others for j in range(6)]
+            ends.append(len(picked))
+        return np.array(picked), np.array(origins), ends[:-1]
 
     def begin(self, flown: Flown) -> dict[str, Command] | None:
         """Return the commands that bring the drones into the air; None once all are, and a policy may begin."""
@@ -174,7 +189,7 @@ class Interface:
                 raise UserCodeError(f"{by}: action of {agent} has shape {action.shape}; must be {low.shape}")
             if not np.isfinite(action).all():
                 raise UserCodeError(f"{by}: action of {agent} is {action.tolist()}; must be finite")
-            wanted = low + (np.clip(action, -1.0, 1.0).astype(np.float64) + 1.0) / 2.0 * (high - low)
+            wanted = low + (np.minimum(np.maximum(action, -1.0), 1.0).astype(np.float64) + 1.0) / 2.0 * (high - low)
             if self.action == "cluster":
                 commands |= self._of_cluster(agent, flown, wanted)
             else:
@@ -236,7 +251,9 @@ def _readings(drone: Drone) -> list[tuple[str, str, int]]:
 
 def _bounded(numbers: NDArray[np.float64]) -> Floats:
     """Return numbers within the bounds of an observation; 0 for what is not known yet."""
-    return np.clip(np.nan_to_num(numbers), -FARTHEST, FARTHEST).astype(np.float32)
+    within = np.minimum(np.maximum(numbers, -FARTHEST), FARTHEST)
+    within[np.isnan(within)] = 0.0
+    return within.astype(np.float32)
 
 
 class PolicyAgent(Agent):

@@ -30,7 +30,11 @@ PAGES = {  # last parts of modules by page
 }
 LOGGER = logging.getLogger(__name__)
 FIRST = next(iter(PAGES))
-BESIDE = {"Simulation": ("Truth", "Estimates", "Sensors", "Samples")}  # of its module, where it names them
+BESIDE = {
+    "Federation": ("Moment",),
+    "Simulation": ("Truth", "Estimates", "Sensors", "Samples"),
+}  # of its module, where it names them
+INHERITING = ("Federation",)  # whose methods of their base classes are documented with them
 
 project, author, version = "zsim", "the authors of zsim", zsim.RELEASE
 html_title = f"zsim {zsim.RELEASE} from Python"
@@ -77,7 +81,10 @@ def directive(name: str) -> Iterator[str]:
         for each in undocumented:
             LOGGER.warning(f"zsim.{each}, of {zsim_api._MODULES[name]}, has no docstring")
         kind = "class" if isinstance(found, type) else "module" if isinstance(found, ModuleType) else "function"
-        yield from (f".. auto{kind}:: zsim.{name}", "")
+        yield f".. auto{kind}:: zsim.{name}"
+        if name in INHERITING:
+            yield "   :inherited-members:"
+        yield ""
         for other in BESIDE.get(name, ()):
             yield from (f".. autoclass:: {found.__module__}.{other}", "")
         return

@@ -6,4 +6,6 @@ from deployment import deployment, faketime, small_disk
 from federation import compiled, federation
 from lab import lab
 
-__all__ = ["browser", "compiled", "deployment", "faketime", "federation", "lab", "opened", "small_disk"]
+from zsim_api.pytest_plugin import federation as flights  # as users have it; ours starts single commands, too
+
+__all__ = ["browser", "compiled", "deployment", "faketime", "federation", "flights", "lab", "opened", "small_disk"]

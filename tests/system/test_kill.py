@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+import yaml
 from federation import PAIR, Federation, Record, Role
 from forked_commands import ROOT
 from wire import PATIENCE_S, Client, Received, Subscription
@@ -16,10 +17,11 @@ from zsim.record import RecordReader, repair
 from zsim.record.completeness import record_completeness
 from zsim.scenario import scenario_file
 from zsim_analysis.in_process import fly
+from zsim_api.pytest_plugin import Federations
 from zsim_deploy.launch.supervisor import UNREAD
 
 REASONS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "terminated"}
-SEEN_DEAD = ("death", "superseded")  # the second where it is back before its death is noticed
+SEEN_BACK = ("restart", "superseded")  # the second where it is back before its death is noticed
 GATE_NS = 20_000_000
 ENGAGED_NS, END_NS = 6_000_000_000, 12_000_000_000
 LATE_NS = 7_900_000_000  # of 8 s
@@ -35,12 +37,18 @@ UNWRITTEN_NS = 5_000_000_000  # simulated, at four times real time: what comes w
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> dict[str, np.ndarray]:
-    """True positions of PAIR when nobody is killed."""
+def alone(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Path:
+    """The folder of PAIR flown in one process, where nobody is killed."""
     with Federation(tmp_path_factory.mktemp("undisturbed")) as federation:
         federation.run(PAIR, "--in-process").ends(with_code=0)
-        record = federation.record()
-        return {drone: record.positions(drone) for drone in ("drone1", "drone2")}
+        return federation.out
+
+
+@pytest.fixture(scope="module")
+def undisturbed(alone: Path) -> dict[str, np.ndarray]:
+    """True positions of PAIR when nobody is killed."""
+    with RecordReader(alone / "run.mcap") as reader:
+        return {drone: Record(reader).positions(drone) for drone in ("drone1", "drone2")}
 
 
 class Flight:
@@ -93,22 +101,19 @@ def check_end(federation: Federation, whole: bool) -> Record:
         pytest.param("controller.main", ("--hosted",), marks=pytest.mark.soak),
     ],
 )
-def test_restart(
-    federation: Federation, undisturbed: dict[str, np.ndarray], name: str, options: tuple[str, ...]
-) -> None:
-    flight = Flight(federation, *options)
-    federation.kill(name)
-    flight.events.until(lambda m: m["kind"] in SEEN_DEAD and m["subject"] == name)
-    flight.run.line(f"{name} .*(died|ended: killed by signal 9).*restart")
-    flight.finish()
-    record = check_end(federation, whole=True)
-    assert {event["data"]["on_death"] for event in record.events("death")} <= {"restart"}
-    assert {event["subject"] for event in (*record.events("restart"), *record.events("superseded"))} == {name}
-    for drone, wanted in undisturbed.items():
-        positions = record.positions(drone)[: len(wanted)]
-        assert np.array_equal(positions, wanted)
-    log = (federation.out / "logs" / f"{name}.log").read_text()
-    assert "snapshot" in log
+def test_restart(flights: Federations, alone: Path, name: str, options: tuple[str, ...]) -> None:
+    flight = flights(yaml.safe_load(PAIR), options=options)
+    flight.wait_until("engaged")
+    flight.kill(name)
+    flight.wait_until(lambda moment: any(event.kind in SEEN_BACK for event in moment.events))
+    flight.assert_same_bits(alone)
+    with RecordReader(flight.folder / "run.mcap") as reader:
+        record = Record(reader)
+        assert {event["data"]["on_death"] for event in record.events("death")} <= {"restart"}
+        assert {event["subject"] for event in record.events(*SEEN_BACK)} == {name}
+    logs = flight.folder / "logs"
+    assert "snapshot" in (logs / f"{name}.log").read_text()
+    assert re.search(f"{name} .*(died|ended: killed by signal 9).*restart", (logs / "zsim-run.log").read_text())
 
 
 @pytest.mark.parametrize("name", ["estimator.drone1", pytest.param("controller.main", marks=pytest.mark.soak)])

@@ -1,18 +1,17 @@
 """An estimator of the user's own in the place of the stock one: one line of the scenario, and a file beside it."""
 
-import math
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 from federation import PAIR, Federation, Record
 from forked_commands import ROOT
 
+import zsim
 from zsim.record import RecordReader
+from zsim_api.pytest_plugin import Federations
 
 MINE = "my_estimator:MyEstimator"
-CHOSEN = ("--set", f"estimation.algorithm={MINE}")
 
 
 @pytest.fixture
@@ -21,19 +20,17 @@ def beside(federation: Federation) -> Path:
     return Path(shutil.copy(ROOT / "examples/my_estimator.py", federation.folder))
 
 
-def test_it_flies_in_processes_of_its_own_as_in_one(federation: Federation, beside: Path) -> None:
-    federation.run(PAIR, *CHOSEN).ends(with_code=0)
-    record = federation.record()
-    estimates = record.all("drone/drone1/estimate")
+def test_it_flies_in_processes_of_its_own_as_in_one(flights: Federations, federation: Federation, beside: Path) -> None:
+    flown = {"scenario": federation.write(PAIR), "set": {"estimation.algorithm": MINE}}
+    flight = flights(**flown)
+    run = flight.run()
+    estimates = run.estimate("drone1")
     assert len(estimates) > 500
-    assert all(estimate["source"] == "estimator.drone1" for estimate in estimates)
-    assert estimates[-1]["sensors"]["gps"][0] > 50
-    off = np.subtract(estimates[-1]["position_m"], record.all("drone/drone1/truth")[-1]["position_m"])
-    assert math.hypot(*off) < 3.0
-    options = (*CHOSEN, "--in-process", "--no-report", "--out", str(federation.folder / "one"))
-    federation.start("run", federation.write(PAIR), *options).ends(with_code=0)
-    with RecordReader(federation.folder / "one" / "run.mcap") as reader:
-        assert Record(reader).sha256() == record.sha256()
+    assert set(estimates["source"]) == {"estimator.drone1"}
+    assert run.estimate_errors("drone1").filter(like="position_m").iloc[-1].abs().max() < 3.0
+    with RecordReader(run.record) as reader:
+        assert Record(reader).all("drone/drone1/estimate")[-1]["sensors"]["gps"][0] > 50
+    flight.assert_same_bits(zsim.run(**flown, out=federation.folder / "one", progress=False))
 
 
 @pytest.mark.parametrize(

@@ -163,3 +163,10 @@ def test_side_by_side(compiled: None, tmp_path: Path) -> None:
     output = output_of(process)
     assert process.returncode == 0, output
     assert "2 passed" in output
+
+
+def test_the_plugin_loads_nothing_before_a_test_flies() -> None:
+    loaded = "import pytest, zsim_api.pytest_plugin, sys; print({name.partition('.')[0] for name in sys.modules})"
+    done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, check=True)
+    assert "zsim_api" in done.stdout
+    assert [name for name in ("numpy", "zenoh", "zsim", "zsim_analysis", "msgspec") if f"'{name}'" in done.stdout] == []
