@@ -15,6 +15,8 @@ class {name}(Fmi3Slave):
         super().__init__(**kwargs)
         self.time = 0.0
         self.register_variable(Float64("time", causality=Fmi3Causality.independent))
+        self.register_units([Unit("deg", rad=1, factor=0.017453292519943295), Unit("km/h", m=1, s=-1, factor=1 / 3.6)])
+        self.register_units([Unit("K", K=1)])
         I, O, P = Fmi3Causality.input, Fmi3Causality.output, Fmi3Causality.parameter
         Real, Whole = Float64, Int32
 

@@ -1,5 +1,6 @@
 """An FMU as an agent, in this process: what it takes and gives, and what is refused in one line."""
 
+import math
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -7,6 +8,7 @@ from typing import Any
 
 import fmpy
 import fmus
+import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
 from refused import has_terms, refused
@@ -125,6 +127,50 @@ def test_elements_of_an_array_of_fmi_2_are_mapped_as_one(everything: Path) -> No
     agent = next(agent for agent in sim._flight.agents if agent.name == "fmu.drone1")
     read = agent._unit.read([FmuModel(everything).variable("p")])[0]  # type: ignore[attr-defined]
     assert read == list(agent._latest[keys.truth("drone1")].position_m)  # type: ignore[attr-defined]
+
+
+def test_units_are_converted_where_both_are_of_one_quantity_and_said(tmp_path: Path) -> None:
+    variables = """
+variable("yaw", 0.0, I, unit="deg")
+variable("height", 0.0, I, unit="K")
+variable("vx", 0.0, O, unit="km/h")
+"""
+    said: list[str] = []
+    path = fmus.build(tmp_path, "Units", 3, variables, "self.vx = 3.6")
+    places = {"yaw": "estimate.yaw_rad", "height": "estimate.position_m.2", "vx": "velocity_m_s.0"}
+    sim = flight(Fmu(path, "drone1", places, takeoff_s=0.5, say=said.append))
+    sent = commands_of(sim)
+    assert {round(command.velocity_m_s[0], 12) for command in sent} == {1.0}
+    agent = next(agent for agent in sim._flight.agents if agent.name == "fmu.drone1")
+    variables_of = FmuModel(path).variables
+    unit: Any = agent._unit  # type: ignore[attr-defined]
+    (yaw,), (height,) = unit.read([variables_of["yaw"], variables_of["height"]])
+    estimate: Any = agent._latest[keys.estimate("drone1")]  # type: ignore[attr-defined]
+    assert abs(math.radians(yaw) - estimate.yaw_rad) < 1e-12
+    assert height == estimate.position_m[2]
+    text = "\n".join(said)
+    assert has_terms(text, "yaw=estimate.yaw_rad:", "deg", "rad", "converted")
+    assert has_terms(text, "height=estimate.position_m.2:", "K", "m")
+    assert has_terms(text, "vx=velocity_m_s.0:", "km/h", "m/s", "converted")
+
+
+def test_an_fmu_is_an_estimator_in_the_place_of_the_stock_one(tmp_path: Path) -> None:
+    variables = """
+variable("p", [0.0] * 3, I)
+variable("v", [0.0] * 3, I)
+variable("p_est", [0.0] * 3, O)
+variable("v_est", [0.0] * 3, O)
+variable("yaw", 0.0, O)
+"""
+    law = "self.p_est, self.v_est, self.yaw = [x + 0.25 for x in self.p], self.v, 1.0"
+    path = fmus.build(tmp_path, "Estimator", 3, variables, law)
+    places = {"p": "truth.position_m", "v": "truth.velocity_m_s"}
+    places |= {"p_est": "estimate.position_m", "v_est": "estimate.velocity_m_s", "yaw": "estimate.yaw_rad"}
+    sim = flight(Fmu(path, "drone1", places, name="estimator.drone1"))
+    sim.run(1.0)
+    assert [agent.name for agent in sim._flight.agents] == ["estimator.drone1", "python.main"]
+    assert np.array_equal(sim.estimates.position_m, sim.truth.position_m + 0.25)
+    assert np.allclose(sim.estimates.orientation_wxyz[0], (math.cos(0.5), 0.0, 0.0, math.sin(0.5)), atol=1e-15)
 
 
 def test_its_step_is_a_multiple_of_the_gate(everything: Path) -> None:
