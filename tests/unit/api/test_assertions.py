@@ -54,15 +54,13 @@ def test_errors(flown: Recorded) -> None:
     rms = formation.errors((8, 10))["p"].true_rms
     assert rms is not None
     flown.assert_errors(p=rms, window=(8, 10))
-    with pytest.raises(
-        AssertionError, match=rf"main from 8 to 10 s: true RMS of p is {rms:.3g} m; allowed are 0.001; the"
-    ):
+    with pytest.raises(AssertionError, match=rf"8 to 10 s.* p is {rms:.3g} m; .*0\.001;"):
         flown.assert_errors(p=0.001, window=(8, 10))
-    with pytest.raises(AssertionError, match=r"was engaged [1-9]\d% of the time"):
+    with pytest.raises(AssertionError, match=r"engaged [1-9]\d%"):
         flown.assert_errors(p=100, window=(4, 8))
-    with pytest.raises(AssertionError, match="was engaged 0% of the time"):
+    with pytest.raises(AssertionError, match="engaged 0%"):
         flown.assert_errors(p=100, window=(0, 1))
-    with pytest.raises(RunError, match=r"no variable 'length'; must be one of x_c, y_c, z_c"):
+    with pytest.raises(RunError, match=r"'length'; .*x_c, y_c, z_c"):
         flown.assert_errors(length=1)
 
 
@@ -80,8 +78,8 @@ def test_same_bits(flown: Recorded, tmp_path: Path) -> None:
 
     flown.assert_same_bits(other("same"))
     flown.assert_same_bits(tmp_path / "same")
-    with pytest.raises(AssertionError, match=r"the same until the other run ends, before t = 5\.02 s"):
+    with pytest.raises(AssertionError, match=r"other run ends, .*5\.02 s"):
         flown.assert_same_bits(other("shorter", duration_s=5))
     gust = {"kind": "gust", "target": "world", "at_s": 3, "for_s": 1, "velocity_m_s": [1, 0, 0]}
-    with pytest.raises(AssertionError, match=r"first differs .* for drone1 at 3\.0[24]0 s by .* m, .* m/s"):
+    with pytest.raises(AssertionError, match=r"differs .* drone1 at 3\.0[24]0 s by .* m, .* m/s"):
         flown.assert_same_bits(other("gust", set={"faults": [gust]}))
