@@ -50,7 +50,9 @@ class Assertions(ABC):
         if unknown := [name for name in rms if name not in formation.names]:
             raise RunError(f"{where}: has no variable {unknown[0]!r}; must be one of {', '.join(formation.names)}")
         share, found, faults = formation.engaged_share(window), formation.errors(window), []
-        if share != 1.0:
+        if window[1] > run.duration_s:
+            faults.append(f"{where}: the run ended at {run.duration_s:g} s")
+        elif share != 1.0:
             faults.append(f"{where}: was engaged {share or 0:.0%} of the time; must be all of it")
         for name, allowed in rms.items():
             error = found[name].true_rms

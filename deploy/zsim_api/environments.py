@@ -9,12 +9,12 @@ after the command's delay (`infos[agent]["command_delay_s"]`), as everywhere in 
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, TypedDict
+from inspect import signature
+from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
-from gymnasium.utils import seeding
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
@@ -210,8 +210,6 @@ class FlightEnv(gymnasium.Env[Floats, Floats]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         """Begin an episode; the same seed gives the same bits."""
         super().reset(seed=seed)
-        if self._np_random is None:
-            self._np_random, self._np_random_seed = seeding.np_random()
         return self._whole(self._episodes.begin(self.np_random)), self._episodes.info()
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
@@ -228,19 +226,6 @@ class FlightEnv(gymnasium.Env[Floats, Floats]):
 
     def _whole(self, seen: Mapping[str, NDArray[np.float32]]) -> Floats:
         return np.concatenate([seen[agent] for agent in self._agents])
-
-
-class Settings(TypedDict, total=False):
-    """Settings of an environment, the same for all kinds."""
-
-    reward: Reward
-    terminated: Ended
-    randomise: Randomise
-    observe: Observe
-    action: Action
-    step_s: float
-    duration_s: float
-    set: Mapping[str, Any]
 
 
 def parallel_env(scenario: AnyScenario, **settings: Any) -> FormationEnv:
@@ -284,7 +269,7 @@ def vector_env(
 
 
 def _checked(settings: Mapping[str, Any]) -> dict[str, Any]:
-    known = Settings.__annotations__
+    known = [*signature(_Episodes).parameters][1:]  # after the scenario
     if unknown := [name for name in settings if name not in known]:
         raise RunError(f"settings: {', '.join(unknown)} is not known; must be of {', '.join(known)}")
     if "reward" not in settings:

@@ -199,6 +199,8 @@ class Federation(Assertions):
                 raise watch.raised
             if not waited and watch.moment is not None:
                 return watch.moment
+        if self._watch.left:  # the launcher knows why
+            self._launcher.wait(max(0.0, until_s - time.monotonic()))
         fault = self._fault or f"it has not come within {within_s:g} s of wall time"
         raise RunFailedError(f"{self.folder.name}: waiting for {text} from {self.t_s:.2f} s on: {fault}")
 
@@ -246,7 +248,10 @@ class Federation(Assertions):
         return result_of(self._session(within_s).request(key, op, PROCESS, args))
 
     def inject(self, fault: Mapping[str, Any]) -> Any:
-        """Inject a fault, as in a scenario's `faults`, from the next gate on; see docs/faults.md.
+        """Inject a fault, as in a scenario's `faults`; see docs/faults.md.
+
+        In lockstep, one without `at_s` acts from the first gate to which the world cannot have run ahead, the same in
+        each run: one more than `time.command_delay_gates` after `t_s`.
 
         Returns:
             `id`, `from_ns` and `until_ns`.
@@ -254,7 +259,9 @@ class Federation(Assertions):
         Raises:
             RequestRefusedError: with the reason.
         """
-        return self.ask(keys.CONTROL, "fault_add", **fault)
+        self._session(PATIENCE_S)
+        at = {} if (ahead_s := self._watch.ahead_s) is None else {"at_s": round(self.t_s + ahead_s, 9)}
+        return self.ask(keys.CONTROL, "fault_add", **{**at, **fault})
 
     def kill(self, process: str, within_s: float = PATIENCE_S) -> int:
         """Kill a process of the run, as by kill -9; return its process id.
@@ -379,10 +386,10 @@ class Federation(Assertions):
                 link.declare_subscriber(keys.CLOCK, lambda sample: self._take_clock(sample.payload))
                 for kind in ("join", "health"):
                     link.declare_subscriber(keys.process("*", kind), self._take_process)
+                self._watch.watch(info)
                 with self._watch.news:
                     self._link = link
                     self._watch.news.notify_all()
-                self._watch.watch(info)
                 Runner(link, info, self._watch, stopped=lambda: self._launcher.code is not None).run()
         except ZsimError as error:
             if not is_over():
@@ -415,6 +422,7 @@ class _Watch(Agent):
         moment: the newest gate; None before the first.
         raised: by the condition.
         left: whether it takes part no longer.
+        ahead_s: how far after the newest gate the world cannot be yet [s]; None in realtime.
     """
 
     name = PROCESS
@@ -427,6 +435,7 @@ class _Watch(Agent):
         self.moment: Moment | None = None
         self.raised: BaseException | None = None
         self.left = False
+        self.ahead_s: float | None = None
         self._holds = True
         self._now_ns = 0
         self._states: dict[str, ClusterState] = {}
@@ -441,6 +450,7 @@ class _Watch(Agent):
         self.reads = (*self.gate_keys, keys.cluster_state("*"), keys.EVENT)
         self.bind(info)
         self._holds = info.mode == "lockstep"
+        self.ahead_s = (info.command_delay_ns + info.gate_ns) / 1e9 if self._holds else None
 
     def begin(self, condition: Condition) -> None:
         """Let time pass until a condition; to be called with `news` held."""

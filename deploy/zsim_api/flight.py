@@ -17,6 +17,7 @@ from zsim.runtime.progress import NotebookLine, Screen, describe
 from zsim.scenario.scenario import Scenario as Resolved
 from zsim.schema import plugin
 from zsim_analysis.in_process import OwnAgent, fly, with_agents
+from zsim_analysis.reading.recorded_flight import read_flight
 from zsim_analysis.reading.shortfall import verdict
 from zsim_api import run_folder
 from zsim_api.programs import Program, search_path
@@ -171,8 +172,11 @@ def raise_failure(folder: Path, code: int) -> None:
         said = log.read_text(errors="replace").split("\n") if log.exists() else []
         last = next((line for line in reversed(said) if line.strip()), f"`zsim run` ended with code {code}")
         raise RunFailedError(f"{folder}: nothing was recorded: {last}")
-    judged = verdict(record)
-    if failures := [each.text for each in judged.shortfalls if each.kind == "process" and each.fails]:
+    failures = [each.text for each in verdict(record).shortfalls if each.kind == "process" and each.fails]
+    flight = read_flight(record, motion=False)
+    if not failures and not any(len(track.t_ns) for track in flight.tracks):
+        failures = [str((flight.end or {}).get("reason", "it ended before its first gate"))]
+    if failures:
         raise RunFailedError(f"{failures[0]}; the record is {record}, the logs are in {folder / run_folder.LOGS}")
 
 

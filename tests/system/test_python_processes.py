@@ -9,9 +9,11 @@ from textwrap import dedent
 from typing import Any
 
 import numpy as np
+import pytest
 from federation import PAIR, Federation
 
 import zsim
+from zsim.errors import RunFailedError
 
 SCRIPT = dedent(
     """
@@ -84,6 +86,39 @@ def test_ctrl_c_ends_the_processes_of_a_script(tmp_path: Path, federation: Feder
     assert "KeyboardInterrupt: interrupted; zsim.load('many')" in errors
     assert zsim.load(tmp_path / "many").summary.record.complete
     federation.nobody_left()
+
+
+class TwoRates(zsim.ControlLaw):
+    def rates(self, c: Any, p_W: Any, v_W: Any, c_des: Any, c_dot_des: Any) -> Any:
+        return c[:2]
+
+
+def test_a_law_that_fails_before_the_first_gate_is_an_error(tmp_path: Path, compiled: None) -> None:
+    (tmp_path / "pair.yaml").write_text(PAIR)
+    with pytest.raises(RunFailedError, match=r"TwoRates\.rates .*\(2,\)"):
+        zsim.run(tmp_path / "pair.yaml", law=TwoRates, processes=True, out=tmp_path / "many", progress=False)
+
+
+def test_a_test_that_waits_is_told_why_its_law_failed(tmp_path: Path, compiled: None) -> None:
+    (tmp_path / "pair.yaml").write_text(PAIR)
+    with zsim.Federation(tmp_path / "pair.yaml", law=TwoRates, out=tmp_path / "run") as flight:  # noqa: SIM117
+        with pytest.raises(RunFailedError, match=r"TwoRates\.rates .*\(2,\)"):
+            flight.wait_until("engaged")
+
+
+def test_an_injected_fault_comes_at_the_same_gate_however_far_the_world_may_be(tmp_path: Path, compiled: None) -> None:
+    (tmp_path / "pair.yaml").write_text(PAIR)
+    bias = {"kind": "gyro_bias", "target": "drone2", "for_s": 2, "value_deg_s": [3, 0, 0]}
+    runs = []
+    for name in ("one", "two", "three"):
+        delay = {"time.command_delay_gates": 5}
+        with zsim.Federation(tmp_path / "pair.yaml", 8, set=delay, out=tmp_path / name) as flight:
+            flight.wait_until(5.0)
+            flight.inject(bias)
+            runs.append(flight.run())
+    begun = [run.events.index[run.events.kind == "fault"][0] for run in runs]
+    assert begun == [pytest.approx(5.12)] * 3
+    assert len({run.truth_sha256 for run in runs}) == 1
 
 
 class Pushed(zsim.PolicyAgent):

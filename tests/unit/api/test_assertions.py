@@ -58,6 +58,8 @@ def test_errors(flown: Recorded) -> None:
         flown.assert_errors(p=0.001, window=(8, 10))
     with pytest.raises(AssertionError, match=r"engaged [1-9]\d%"):
         flown.assert_errors(p=100, window=(4, 8))
+    with pytest.raises(AssertionError, match="ended at 10 s"):
+        flown.assert_errors(p=100, window=(8, 99))
     with pytest.raises(AssertionError, match="engaged 0%"):
         flown.assert_errors(p=100, window=(0, 1))
     with pytest.raises(RunError, match=r"'length'; .*x_c, y_c, z_c"):

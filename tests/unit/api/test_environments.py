@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pair_flight
 import pytest
 from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import parallel_api_test, parallel_seed_test
@@ -14,15 +15,7 @@ from refused import refused
 import zsim
 from zsim.errors import RunError, UserCodeError
 
-PAIR: dict[str, Any] = {
-    "name": "pair",
-    "seed": 3,
-    "duration_s": 6.4,
-    "sensors": {"preset": "paper"},
-    "environment": {"wind": {"gust_m_s": 0.5}},
-    "drones": [{"name": "d1", "position_m": [0, 3, 0]}, {"name": "d2", "position_m": [0, -3, 0], "yaw_deg": 90}],
-    "clusters": [{"name": "main", "drones": ["d1", "d2"]}],
-}
+PAIR: dict[str, Any] = {**pair_flight.PAIR, "duration_s": 6.4, "environment": {"wind": {"gust_m_s": 0.5}}}
 FLOWN = [("truth", "velocity"), ("estimate", "attitude"), ("sensors", "rotors"), ("estimate", "cluster")]
 
 

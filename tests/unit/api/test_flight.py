@@ -7,20 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pair_flight import PAIR
 from refused import refused
 
 import zsim
 from zsim.errors import RunError, ScenarioError, UserCodeError
 from zsim_agents.formation.control_law import ControlLaw
 
-PAIR: dict[str, Any] = {
-    "name": "pair",
-    "seed": 3,
-    "duration_s": 6,
-    "sensors": {"preset": "paper"},
-    "drones": [{"name": "d1", "position_m": [0, 3, 0]}, {"name": "d2", "position_m": [0, -3, 0]}],
-    "clusters": [{"name": "main", "drones": ["d1", "d2"], "plan": {"takeoff_s": 0.1}}],
-}
 STATUS = "drone/*/sensor/status"
 
 

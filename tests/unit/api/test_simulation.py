@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pair_flight
 import pytest
 from refused import refused
 
@@ -17,20 +18,9 @@ from zsim_analysis.reading.recorded_flight import read_flight
 from zsim_api.scenarios import Scenario
 from zsim_world.run.world import DURATION_OVER
 
-ONE: dict[str, Any] = {
-    "name": "one",
-    "seed": 3,
-    "duration_s": 6,
-    "sensors": {"preset": "paper"},
-    "environment": {"wind": {"gust_m_s": 0.3}},
-    "drones": [{"name": "d1", "position_m": [1, 2, 0]}],
-}
-PAIR: dict[str, Any] = {
-    **ONE,
-    "name": "pair",
-    "drones": [{"name": "d1", "position_m": [0, 3, 0]}, {"name": "d2", "position_m": [0, -3, 0]}],
-    "clusters": [{"name": "main", "drones": ["d1", "d2"], "plan": {"takeoff_s": 0.1}}],
-}
+GUSTS = {"wind": {"gust_m_s": 0.3}}
+PAIR: dict[str, Any] = {**pair_flight.PAIR, "environment": GUSTS}
+ONE: dict[str, Any] = {**PAIR, "name": "one", "drones": [{"name": "d1", "position_m": [1, 2, 0]}], "clusters": []}
 
 
 def climb(sim: zsim.Simulation) -> Iterator[bytes]:
