@@ -203,7 +203,8 @@ class InProcessFlight:
         """Continue from a snapshot of this flight, or of another one of the same scenario."""
         world, agents, inboxes, truth_hash = snapshot
         run_state.restore(self.world, unpack(world))
-        self.world.failure = None
+        clock = self.world.clock  # the snapshot is of a flight that goes on
+        clock.ended, clock.is_complete, self.world.failure = None, False, None
         self.world.truth_hash.restore(truth_hash)
         for agent, state in zip(self.agents, agents, strict=True):
             agent.resume(self.info, unpack(state))

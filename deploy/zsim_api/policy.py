@@ -28,7 +28,7 @@ from zsim.scenario.scenario import Drone, Scenario
 from zsim.schema import plugin
 from zsim.sensors.sensor import Sample
 from zsim.vehicles.vehicle_catalogue import vehicle_of
-from zsim_agents.formation.spaces.cluster_space import SingularClusterError, unit
+from zsim_agents.formation.spaces.cluster_space import SingularClusterError, robot_rates, unit
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_api.commands import Command, attitude, rotors, takeoff, velocity
 from zsim_api.simulation import Estimates, Samples, Truth, estimates_of
@@ -216,11 +216,11 @@ class Interface:
         w, x, y, z = of.orientation_wxyz[places].T
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         try:
-            r_dot = space.motion(space.forward(of.position_m[places], yaw), c_dot).reshape(-1, 4)
+            v_W, yaw_rates = robot_rates(space, space.forward(of.position_m[places], yaw), c_dot)
         except SingularClusterError:
-            r_dot = np.zeros((len(places), 4))
-        moved = zip(self._members[cluster], r_dot.tolist(), strict=True)
-        return {name: velocity(*numbers, frame="world") for name, numbers in moved}
+            v_W, yaw_rates = np.zeros((len(places), 3)), np.zeros(len(places))
+        moved = zip(self._members[cluster], v_W.tolist(), yaw_rates.tolist(), strict=True)
+        return {name: velocity(*v, yaw_rate, frame="world") for name, v, yaw_rate in moved}
 
     def _samples(self, flown: Flown, drone: str) -> Floats:
         place = self.names.index(drone)

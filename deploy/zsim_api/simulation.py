@@ -248,8 +248,10 @@ class Simulation:
         """Return the whole state of the flight, for `restore`.
 
         Raises:
-            RunError: an agent of yours has no `snapshot`.
+            RunError: an agent of yours has no `snapshot`, or the flight is over.
         """
+        if self.ended is not None:
+            raise RunError(f"snapshot: the flight is over ({self.ended}); must be taken while it goes on")
         return (self.source, self._flight.snapshot(), dict(self._last_estimates), dict(self.clusters))
 
     def restore(self, snapshot: Any) -> Truth:

@@ -180,14 +180,15 @@ def types_by_shape() -> dict[str, type[Struct]]:
     return {shape: topic.message for shape, topic in TOPICS.items() if topic.message}
 
 
-_COMMANDS = {topic.message: shape for shape, topic in TOPICS.items() if topic.message and keys.is_command(shape)}
+COMMANDS = {topic.message: shape for shape, topic in TOPICS.items() if topic.message and keys.is_command(shape)}
+"""Shapes of the keys of commands, by their messages."""
 
 
 def command_key(drone: str, command: Struct) -> str:
     """Return the key of a command to a drone, by the command's type; RunError if it is none."""
-    shape = _COMMANDS.get(type(command))
+    shape = COMMANDS.get(type(command))
     if shape is None:
-        kinds = ", ".join(each.__name__ for each in _COMMANDS)
+        kinds = ", ".join(each.__name__ for each in COMMANDS)
         raise RunError(f"the command to {drone} is a {type(command).__name__}; must be one of {kinds}")
     return keys.command(drone, shape.rpartition("/")[2])
 

@@ -21,11 +21,6 @@ from zsim.errors import DecodeError, RunError
 from zsim.schema.checker import suggestion
 from zsim_bridges.fmu.model import FmuModel, Kind, Unit, Variable
 
-COMMANDS: dict[str, type[Struct]] = {
-    key.rpartition("/")[2]: topic.message
-    for key, topic in messages.TOPICS.items()
-    if key.startswith("drone/*/cmd/") and topic.message
-}
 MODES = ("takeoff", "land", "emergency", "reset")
 NUMBERED = ("value", "desired", "desired_rate")  # fields of a cluster's state, one number for each of its variables
 FORMATION = {"c": False, "c_dot": True}  # of a cluster, and no messages; whether an FMU gives them
@@ -145,12 +140,12 @@ def _check_once(found: Mapping) -> None:
         for index in place.indices or (None,):
             spot = (place.key, place.field, index)
             if spot in taken:
-                raise RunError(f"--map {variable.name}={place.text}: {taken[spot]} gives that already; one only may")
+                raise RunError(f"--map {variable.name}={place.text}: {taken[spot]} gives that already; must be one")
             taken[spot] = variable.name
     fed: set[str] = set()
     for variable, place, _ in found.inputs:
         if variable.name in fed:
-            raise RunError(f"--map {variable.name}={place.text}: {variable.name} is fed twice; once only may it be")
+            raise RunError(f"--map {variable.name}={place.text}: {variable.name} is fed twice; must be fed once")
         fed.add(variable.name)
 
 
@@ -240,8 +235,8 @@ class _Places:
                 kind = messages.output_type(key)
             except DecodeError as error:
                 raise RunError(f"{where}: {error}") from error
-            if kind not in (*COMMANDS.values(), flight_messages.Estimate):
-                allowed = ", ".join([*COMMANDS, "estimate"])
+            if kind not in (*messages.COMMANDS, flight_messages.Estimate):
+                allowed = ", ".join([*map(keys.leaf, messages.COMMANDS.values()), "estimate"])
                 raise RunError(f"{where}: an FMU gives no {kind.__name__}; must be one of {allowed}")
         if kind is None:
             hint = "an input is of an estimate, truth, a sensor, or the state of a cluster"
