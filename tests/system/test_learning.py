@@ -9,15 +9,14 @@ import pytest
 
 import zsim
 
-pytest.importorskip(
-    "stable_baselines3", reason="stable-baselines3 is not installed; `pip install -e .[soak]` brings it"
-)
 pytestmark = pytest.mark.soak
 STEPS = 20_000
 JUDGED = range(20)  # seeds of episodes
 
 
 def test_a_policy_learns_and_flies_as_an_agent(tmp_path: Path) -> None:
+    needed = "stable-baselines3 is not installed; `pip install -e .[soak]` brings it"
+    pytest.importorskip("stable_baselines3", reason=needed)
     import train_policy
 
     model = train_policy.learner(seed=1)
