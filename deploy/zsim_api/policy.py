@@ -220,7 +220,7 @@ class Interface:
         except SingularClusterError:
             v_W, yaw_rates = np.zeros((len(places), 3)), np.zeros(len(places))
         moved = zip(self._members[cluster], v_W.tolist(), yaw_rates.tolist(), strict=True)
-        return {name: velocity(*v, yaw_rate, frame="world") for name, v, yaw_rate in moved}
+        return {name: velocity(vx, vy, vz, yaw_rate, frame="world") for name, (vx, vy, vz), yaw_rate in moved}
 
     def _samples(self, flown: Flown, drone: str) -> Floats:
         place = self.names.index(drone)
