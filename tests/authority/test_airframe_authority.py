@@ -11,28 +11,54 @@ import numpy as np
 import pytest
 
 from zsim.math.frames import quaternion_from_rpy
+from zsim.scenario.scenario import Scenario
 from zsim.scenario.scenario_file import resolve
 from zsim.vehicles.vehicle import allocation, lift_shares
 from zsim.vehicles.vehicle_catalogue import vehicle_of
-from zsim_world.fleet.fleet import Fleet
-from zsim_world.physics.fleet_arrays import STATE, VEHICLE
+from zsim_world.fleet.fleet import Fleet, _initial_arrays
+from zsim_world.physics import simd
+from zsim_world.physics.fleet_arrays import STATE, VEHICLE, Bodies
+from zsim_world.sensors.noise import NoiseTable
+from zsim_world.sensors.sensor_set import fleet_sensors
 
-pytestmark = pytest.mark.xdist_group("airframes")  # so that no worker waits for another that compiles the kernel
+pytestmark = pytest.mark.xdist_group("airframes")  # so that no worker waits for another that compiles the same
 
 ROTORS = slice(STATE.size, STATE.size + 4)  # of drone a: with the Iris there is a column more
+FAR_IRIS = {"name": "b", "position_m": [100, 0, 0], "model": "iris", "aerodynamics": {"rotor_drag_n_s2_m": 1e-4}}
+GRAVITY_M_S2, MASS_KG = 9.80665, 0.429
 
 
-def fleet_of(**drone: Any) -> Fleet:
-    """Return a fleet of one drone.
+def scenario_of(*more: dict[str, Any], **drone: Any) -> Scenario:
+    drones = [{"name": "a", "position_m": [0, 0, 0], **drone}, *more]
+    return resolve({"name": "t", "duration_s": 1, "sensors": {"preset": "paper"}, "drones": drones})
 
-    Rotors that are no cross, and aerodynamics, have kernels of their own, each a minute's compilation. So where there
-    are some, an Iris with aerodynamics stands far away: one kernel does for all.
+
+def bodies_of(**drone: Any) -> Bodies:
+    """Return the bodies of a drone and of an Iris with aerodynamics that stands far away.
+
+    Rotors that are no cross, and aerodynamics, have compiled code of their own: with the Iris, one does for all.
     """
-    drones = [{"name": "a", "position_m": [0, 0, 0], **drone}]
-    if "model" in drone or any(drone.get("aerodynamics", {}).values()):
-        far = {"name": "b", "position_m": [100, 0, 0], "model": "iris"}
-        drones.append({**far, "aerodynamics": {"rotor_drag_n_s2_m": 1e-4}})
-    return Fleet(resolve({"name": "t", "duration_s": 1, "sensors": {"preset": "paper"}, "drones": drones}))
+    scenario = scenario_of(FAR_IRIS, **drone)
+    vehicles = [vehicle_of(each.model) for each in scenario.drones]
+    return _initial_arrays(scenario, vehicles, fleet_sensors(scenario), NoiseTable(scenario, 1)).bodies
+
+
+def thrown(
+    v: Any, q: Any = (1.0, 0.0, 0.0, 0.0), rate: float = 0.0, rotors: Any = 0.0, **drone: Any
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the accelerations of a drone in still air high up [m/s^2], and of its turning [rad/s^2].
+
+    Args:
+        v, q: its velocity [m/s] and attitude; rate: at which it rolls [rad/s]; rotors: steady speeds [rad/s].
+    """
+    bodies = bodies_of(**drone)
+    state = bodies.state[0]
+    state[:] = 0.0
+    state[2], state[3:6], state[6:10], state[10], state[ROTORS] = 1e4, v, q, rate, rotors
+    bodies.command[0, :4] = rotors
+    simd.line_up(bodies)
+    simd.accelerate(bodies)
+    return bodies.accel[0, :3].copy(), bodies.accel[0, 3:].copy()
 
 
 def advance(fleet: Fleet, seconds: float, steer: Any = None) -> None:
@@ -42,17 +68,6 @@ def advance(fleet: Fleet, seconds: float, steer: Any = None) -> None:
         fleet.advance()
 
 
-def thrown(
-    fleet: Fleet, v: Any, q: Any = (1.0, 0.0, 0.0, 0.0), rotor: float = 0.0, seconds: float = 0.02
-) -> np.ndarray:
-    """Let a drone with its rotors at a speed go through still air high up, and return the state after some gates."""
-    state = fleet.bodies.state[0]
-    state[:] = 0.0
-    state[2], state[3:6], state[6:10], state[ROTORS] = 1e4, v, q, rotor
-    advance(fleet, seconds)
-    return fleet.bodies.state[0]
-
-
 def test_the_iris_of_rotors_hovers_level_with_its_rear_rotors_faster() -> None:
     """Moments about the centre: the thrust of each rotor times its arm sums to zero, in closed form x_f / x_r."""
     vehicle = vehicle_of("iris")
@@ -60,7 +75,17 @@ def test_the_iris_of_rotors_hovers_level_with_its_rear_rotors_faster() -> None:
     np.testing.assert_allclose(allocation(vehicle) @ shares, 0.0, atol=1e-9)
     x = np.array([rotor.x_m for rotor in vehicle.rotors])
     np.testing.assert_allclose(shares[0] / shares[2], -x[2] / x[0], rtol=1e-9)
-    fleet = fleet_of(model="iris")
+    squares = vehicle.mass_kg * GRAVITY_M_S2 / vehicle.thrust_n_s2 * shares / shares.sum()
+    accel, turning = thrown((0.0, 0.0, 0.0), rotors=np.sqrt(squares), model="iris")
+    np.testing.assert_allclose(accel, 0.0, atol=1e-6)
+    np.testing.assert_allclose(turning, 0.0, atol=1e-6)
+
+
+@pytest.mark.soak
+def test_the_iris_of_rotors_flies_with_its_rear_rotors_faster() -> None:
+    vehicle = vehicle_of("iris")
+    shares = lift_shares(vehicle)
+    fleet = Fleet(scenario_of(FAR_IRIS, model="iris"))
     assert fleet.takeoff(0) is None
     advance(fleet, 8.0)
     assert fleet.status(0)[0] == "hovering"
@@ -86,21 +111,20 @@ def test_terminal_velocity_with_quadratic_drag() -> None:
     """m g = c v^2: a fall with still rotors, and the same on its side with another coefficient."""
     drag = {"quadratic_drag_n_s2_m2": [0.02, 0.02, 0.08]}
     for rpy, c in (((0.0, 0.0, 0.0), 0.08), ((math.pi / 2, 0.0, 0.0), 0.02)):
-        fleet = fleet_of(drag_n_s_m=0.0, aerodynamics=drag)
-        state = thrown(fleet, (0.0, 0.0, 0.0), quaternion_from_rpy(rpy), seconds=12.0)
-        assert -state[5] == pytest.approx(math.sqrt(0.429 * 9.80665 / c), rel=1e-3)
+        v = (0.0, 0.0, -math.sqrt(MASS_KG * GRAVITY_M_S2 / c))
+        accel, _ = thrown(v, quaternion_from_rpy(rpy), drag_n_s_m=0.0, aerodynamics=drag)
+        np.testing.assert_allclose(accel, 0.0, atol=1e-9)
 
 
 def test_linear_drag_by_axis_turns_with_the_body() -> None:
     """dv/dt = -R D R^T v / m - g (Faessler et al.), for a body yawed by 30 deg in level flight."""
-    fleet = fleet_of(drag_n_s_m=0.0, aerodynamics={"linear_drag_n_s_m": [0.3, 0.6, 0.1]})
+    drag = {"linear_drag_n_s_m": [0.3, 0.6, 0.1]}
     v, yaw = np.array([3.0, 1.0, 0.0]), math.radians(30.0)
-    end = thrown(fleet, v, quaternion_from_rpy((0.0, 0.0, yaw)))[3:6]
+    accel, _ = thrown(v, quaternion_from_rpy((0.0, 0.0, yaw)), drag_n_s_m=0.0, aerodynamics=drag)
     turn = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
-    rate = -turn @ np.diag([0.3, 0.6, 0.1]) @ turn.T / 0.429
-    expected = v + 0.02 * (rate @ v)
-    np.testing.assert_allclose(end[:2], expected[:2], atol=2e-3)  # second order: (0.6 / 0.429 * 0.02)^2 / 2 of 3 m/s
-    assert abs(end[0] - v[0]) > 0.02
+    rate = -turn @ np.diag([0.3, 0.6, 0.1]) @ turn.T / MASS_KG
+    np.testing.assert_allclose(accel, rate @ v - (0.0, 0.0, GRAVITY_M_S2), rtol=1e-9, atol=1e-9)
+    assert abs(accel[0]) > 1.0
 
 
 @pytest.mark.parametrize(
@@ -114,38 +138,27 @@ def test_linear_drag_by_axis_turns_with_the_body() -> None:
     ids=["k_d", "k_z", "k_h"],
 )
 def test_thrust_depends_on_the_flow_past_the_rotors(coefficients: Any, v: Any, force: Any) -> None:
-    rotor = 400.0
-    plain, flown = fleet_of(drag_n_s_m=0.0), fleet_of(drag_n_s_m=0.0, aerodynamics=coefficients)
-    accel = []
-    for fleet in (plain, flown):
-        state = fleet.bodies.state[0]
-        state[:] = 0.0
-        state[2], state[3:6], state[6], state[ROTORS] = 1e4, v, 1.0, rotor
-        fleet._integrate(0)  # the accelerations of the present state
-        accel.append(fleet.bodies.accel[0, :3].copy())
-    np.testing.assert_allclose(0.429 * (accel[1] - accel[0]), force, rtol=1e-9, atol=1e-12)
+    plain, _ = thrown(v, rotors=400.0, drag_n_s_m=0.0)
+    flown, _ = thrown(v, rotors=400.0, drag_n_s_m=0.0, aerodynamics=coefficients)
+    np.testing.assert_allclose(MASS_KG * (flown - plain), force, rtol=1e-9, atol=1e-12)
 
 
 def test_a_rotor_that_stands_still_gives_no_lift_in_a_wind() -> None:
-    fleet = fleet_of(drag_n_s_m=0.0, aerodynamics={"rotor_lift_n_s2_m2": 0.05})
-    assert thrown(fleet, (8.0, 0.0, 0.0), seconds=0.2)[5] == pytest.approx(-9.80665 * 0.2, rel=1e-6)
+    accel, _ = thrown((8.0, 0.0, 0.0), drag_n_s_m=0.0, aerodynamics={"rotor_lift_n_s2_m2": 0.05})
+    np.testing.assert_allclose(accel, (0.0, 0.0, -GRAVITY_M_S2), rtol=1e-9, atol=1e-12)
 
 
 def test_turning_rotors_damp_a_roll_by_their_inflow() -> None:
     """M = -k_z w y^2 p for each rotor at y: a lever arm, not a force at the centre."""
     k_z, rate = 1e-4, 2.0
-    fleet = fleet_of(drag_n_s_m=0.0, aerodynamics={"rotor_inflow_n_s2_m": k_z})
-    state = fleet.bodies.state[0]
-    state[:] = 0.0
-    state[2], state[6], state[10], state[ROTORS] = 1e4, 1.0, rate, 400.0
-    fleet._integrate(0)
-    y = fleet.bodies.vehicle[0, VEHICLE.rotor_unit]
-    expected = -4 * k_z * 400.0 * y * y * rate / fleet.bodies.vehicle[0, VEHICLE.inertia]
-    assert fleet.bodies.accel[0, 3] == pytest.approx(expected, rel=1e-9)
+    _, turning = thrown((0.0, 0.0, 0.0), rate=rate, rotors=400.0, aerodynamics={"rotor_inflow_n_s2_m": k_z})
+    vehicle = bodies_of().vehicle[0]
+    expected = -4 * k_z * 400.0 * vehicle[VEHICLE.rotor_unit] ** 2 * rate / vehicle[VEHICLE.inertia]
+    assert turning[0] == pytest.approx(expected, rel=1e-9)
 
 
 def test_without_aerodynamics_they_are_no_part_of_the_kernel() -> None:
-    plain, none = fleet_of(), fleet_of(aerodynamics={"rotor_drag_n_s2_m": 0.0})
+    plain, none = (Fleet(scenario_of(**drone)) for drone in ({}, {"aerodynamics": {"rotor_drag_n_s2_m": 0.0}}))
     assert plain.bodies.aero_parts == none.bodies.aero_parts == (0,)
     for fleet in (plain, none):
         fleet.takeoff(0)
@@ -154,6 +167,7 @@ def test_without_aerodynamics_they_are_no_part_of_the_kernel() -> None:
     assert STATE.size + 4 == plain.bodies.state.shape[1]
 
 
+@pytest.mark.soak
 def test_it_flies_with_all_of_them() -> None:
     """RotorPy's figures of the Crazyflie and of the Hummingbird's body, on the AR.Drone: it holds its hover and speed."""
     given = {
@@ -162,7 +176,7 @@ def test_it_flies_with_all_of_them() -> None:
         "rotor_inflow_n_s2_m": 2.32e-4,
         "rotor_lift_n_s2_m2": 3.39e-3,
     }
-    fleet = fleet_of(drag_n_s_m=0.0, aerodynamics=given)
+    fleet = Fleet(scenario_of(FAR_IRIS, drag_n_s_m=0.0, aerodynamics=given))
     assert fleet.takeoff(0) is None
     advance(fleet, 8.0)
     assert fleet.status(0)[0] == "hovering"
