@@ -12,6 +12,7 @@ import msgspec
 from msgspec import Struct, structs
 
 from zsim.errors import DocumentError, NotTrustedError, ScenarioError
+from zsim.scenario import own_classes
 from zsim.scenario.consistency import cross_faults
 from zsim.scenario.scenario import DRONES_MAX, VEHICLE_NUMBERS, Document, Scenario, SharedVehicle
 from zsim.schema import plugin, yaml_file
@@ -108,6 +109,9 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
         return {**with_defaults(numbers, drone), "sensors": own}
 
     document = {**document, "sensors": _separated(sensors, "sensors", unsound, unread, imports)}
+    if "agents" in document:
+        document["agents"], wrong = own_classes.with_agents(document["agents"], imports)
+        unsound += wrong
     drones = document.get("drones")
     if isinstance(drones, list) and len(drones) <= DRONES_MAX:
         document["drones"] = [resolved_drone(drone, f"drones[{index}]") for index, drone in enumerate(drones)]
