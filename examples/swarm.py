@@ -1,7 +1,7 @@
 """A decentralised formation: every drone has a pilot that knows its own estimate and what the others tell it.
 
-zsim run scenarios/pentagon.yaml
-zsim run scenarios/pentagon.yaml --set agents.pilot.parameters.gain_1_s=0.6 --set radio.loss=0.3
+zsim run examples/swarm.yaml
+zsim run examples/swarm.yaml --set agents.pilot.parameters.gain_1_s=0.6 --set radio.loss=0.3
 
 Consensus on displacements (Olfati-Saber, Fax and Murray 2007, Proc. IEEE 95(1), section II-D): each pilot flies
 u_i = k sum_j ((p_j - c_j) - (p_i - c_i)) over those that it hears, where c is the place of a drone in the formation.

@@ -64,7 +64,7 @@ def test_drones_that_talk_to_each_other_fly_as_in_one_process(
     monkeypatch.setenv("PYTHONPATH", str(EXAMPLES))
     for host in lab.names:
         lab.environment(host, PYTHONPATH=str(EXAMPLES))
-    pentagon, alone = ROOT / "scenarios" / "pentagon.yaml", tmp_path / "alone.mcap"
+    pentagon, alone = EXAMPLES / "swarm.yaml", tmp_path / "alone.mcap"
     fly(scenario_file.load(pentagon, duration_s=DURATION_S), alone)
     spread = {"world": "h1", "estimator.*": ["h1", "h2", "h3"], "pilot.*": ["h2", "h3", "h1"]}
     with closing(Deployment(lab, spread, scenario=pentagon)) as deployment, RecordReader(alone) as reader:

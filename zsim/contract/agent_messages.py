@@ -8,6 +8,7 @@ class State(zsim.AgentMessage, frozen=True):
 State.of()            "swarm/*/state", to read those of all
 """
 
+import math
 import re
 from typing import ClassVar
 
@@ -43,9 +44,15 @@ class AgentMessage(Struct, frozen=True, kw_only=True, gc=False):
         return f"{head}/{thing}/{leaf}"
 
     def fault(self) -> str | None:
-        """Return what is wrong with a message that has come: zsim fills in both when it is published."""
-        missing = [name for name in ("t_ns", "seq") if getattr(self, name) < 0]
-        return f"{missing[0]} is missing or negative; must be >= 0" if missing else None
+        """Return what is wrong with a message that has come; a class may declare its numbers as plain floats."""
+        for name in self.__struct_fields__:
+            value = getattr(self, name)
+            if name in ("t_ns", "seq") and value < 0:
+                return f"{name} is missing or negative; must be >= 0"
+            for number in value if isinstance(value, tuple | list) else (value,):
+                if isinstance(number, float) and not math.isfinite(number):
+                    return f"{name} is {number}; must be finite"
+        return None
 
 
 class MessageInfo(Struct, frozen=True):

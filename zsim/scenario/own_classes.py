@@ -17,7 +17,7 @@ from zsim.schema.checker import Fault, faults
 OF_THE_RUN = ("info", "scenario", "drone", "cluster")  # arguments of an agent's constructor that are no parameters
 
 
-class AgentMethods:
+class Agent:
     """What the class of an agent must have."""
 
     def receive(self, key: str, message: Any) -> None: ...
@@ -51,7 +51,7 @@ def with_agents(section: Any, imports: bool) -> tuple[Any, list[Fault]]:
 
 
 def _declared(entry: dict[str, Any], where: str) -> dict[str, Any]:
-    kind: Any = plugin.load(entry["class"], f"{where}.class", AgentMethods)
+    kind: Any = plugin.load(entry["class"], f"{where}.class", Agent)
     given = parameters.resolved(kind, entry.get("parameters", {}), f"{where}.parameters", OF_THE_RUN)
     published, per = messages_of(kind, f"{where}.class"), entry.get("per", "drone")
     for each in published:

@@ -112,6 +112,7 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
     if "agents" in document:
         document["agents"], wrong = own_classes.with_agents(document["agents"], imports)
         unsound += wrong
+        document["processes"] = _with_deaths(document.get("processes", {}), document["agents"])
     drones = document.get("drones")
     if isinstance(drones, list) and len(drones) <= DRONES_MAX:
         document["drones"] = [resolved_drone(drone, f"drones[{index}]") for index, drone in enumerate(drones)]
@@ -162,6 +163,14 @@ def _separated(section: Any, where: str, unsound: list[Fault], unread: set[str],
     unsound += [(f"{where}.{path}", text) for path, text in wrong]
     unread |= section.keys() - rest.keys() - own.keys()
     return {**rest, "own": own} if own else rest
+
+
+def _with_deaths(processes: Any, agents: Any) -> Any:
+    """Return a `processes:` section in which users' agents are started again, where it says nothing of their role."""
+    if not (isinstance(processes, dict) and isinstance(agents, dict)):
+        return processes
+    given = processes.get("on_death", {})
+    return {**processes, "on_death": dict.fromkeys(agents, "restart") | given} if isinstance(given, dict) else processes
 
 
 def _vehicle_of(

@@ -196,6 +196,7 @@ def factor(text: str) -> float:
 @pytest.mark.parametrize("path", sorted(SCENARIOS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_the_scenarios_of_this_product_can_be_flown(path: Path) -> None:
     scenario = scenario_file.load(path)
+    assert [refusal(scenario)] * len(scenario.clusters) == [""] * len(scenario.clusters)
     for cluster in scenario.clusters:
         check_plan(scenario, cluster)
 
