@@ -14,7 +14,7 @@ from zsim.contract.messages import Info, register_messages
 from zsim.errors import DocumentError, NotTrustedError, RunError, ScenarioError
 from zsim.runtime.agent import Agent, AgentGroup, default_name
 from zsim.runtime.inbox import output_hold_ns
-from zsim.scenario.own_classes import OF_THE_RUN, messages_of
+from zsim.scenario.own_classes import messages_of
 from zsim.scenario.roles import AGENTS, agent_names, agent_roles, expected_processes
 from zsim.scenario.scenario import Scenario
 from zsim.schema import parameters, plugin, yaml_file
@@ -209,11 +209,19 @@ def own_agent(
     if not isinstance(made, Agent):
         kind = f"{getattr(made, '__module__', '')}:{getattr(made, '__qualname__', type(made).__name__)}"
         given = {"info": info, "scenario": scenario, per: name.partition(".")[2]}
-        given = {key: value for key, value in given.items() if key in signature(made).parameters}
-        filled = parameters.resolved(made, dict(settings), kind, OF_THE_RUN)
-        arguments = given if parameters.has_parameters(made) else given | filled
+        taken = signature(made)
+        given = {key: value for key, value in given.items() if key in taken.parameters}
+        make: Callable[..., Agent] = made
+        if parameters.has_parameters(made):
+            make = parameters.bound(made, dict(settings), kind)
+        else:
+            given |= settings
         try:
-            made = parameters.construct(made, filled, **arguments)
+            taken.bind(**given)
+        except TypeError as error:
+            raise RunError(f"{kind} takes {taken}, and cannot be made: {error}") from None
+        try:
+            made = make(**given)
         except plugin.RAISED as error:
             failure = plugin.user_code_error(error, "before the start")
             if failure is None:

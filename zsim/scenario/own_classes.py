@@ -3,6 +3,7 @@
 Whoever reads `world/info` finds all parameters and messages there, and imports nothing that it names.
 """
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -58,6 +59,35 @@ def _declared(entry: dict[str, Any], where: str) -> dict[str, Any]:
         if about(each) != per:
             raise DocumentError([f"{where}.per is {per!r}, and the key of {each.__name__} is {each.key}; must agree"])
     return {"parameters": given, "declared": [msgspec.to_builtins(message_info(each)) for each in published]}
+
+
+def with_parameters(document: dict[str, Any]) -> list[Fault]:
+    """Fill in the parameters of users' spaces, laws and estimator in a raw document; return what is wrong with them.
+
+    A class that cannot be imported here is left to the processes that need it.
+    """
+    wrong: list[Fault] = []
+    clusters = document.get("clusters")
+    sections = [(f"clusters[{i}]", each) for i, each in enumerate(clusters if isinstance(clusters, list) else [])]
+    named = [(where, each, part, f"{part}_parameters") for where, each in sections for part in ("space", "law")]
+    named.append(("estimation", document.get("estimation"), "algorithm", "parameters"))
+    for where, section, part, field in named:
+        name = section.get(part) if isinstance(section, dict) else None
+        if not (isinstance(name, str) and re.fullmatch(plugin.CLASS_NAME, name)):
+            continue
+        try:
+            kind = plugin.load(name, f"{where}.{part}", object)
+        except DocumentError:
+            continue
+        given = section.get(field, {})
+        try:
+            if parameters.has_parameters(kind):
+                section[field] = parameters.resolved(kind, given, f"{where}.{field}")
+            else:
+                parameters.bound(kind, given, f"{where}.{field}")
+        except DocumentError as error:
+            wrong += [(path, text) for path, _, text in (line.partition(" ") for line in error.faults)]
+    return wrong
 
 
 def messages_of(kind: Any, where: str) -> tuple[type[AgentMessage], ...]:

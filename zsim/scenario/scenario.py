@@ -189,6 +189,7 @@ class ClusterGroup(Spec, frozen=True, kw_only=True):
     name: Name
     size: Annotated[int, Meta(ge=2)]
     space: SpaceName | None = None
+    space_parameters: Given | UnsetType = UNSET
     template_m: Template = []
 
 
@@ -202,6 +203,9 @@ class Cluster(Spec, frozen=True, kw_only=True):
     """Places of the robots, x ahead and y left of the formation; empty: as they stand at the start."""
     law: LawName | UnsetType = UNSET
     """Unset: proportional. Left out of the resolved text then, which names the scenario by its hash."""
+    space_parameters: Given | UnsetType = UNSET
+    law_parameters: Given | UnsetType = UNSET
+    """Of a user's class; unset: none, or its defaults."""
     gains: Gains = Gains()
     plan: ClusterPlan = ClusterPlan()
 
@@ -227,6 +231,9 @@ class Estimation(Spec, frozen=True, kw_only=True):
     flow: bool = True
     use_sightings: bool | UnsetType = UNSET
     """Whether drones of a cluster are located by what they see of each other; unset: not."""
+
+    parameters: Given | UnsetType = UNSET
+    """Of a user's class; unset: none, or its defaults."""
 
     def chosen(self) -> str:
         return self.algorithm if isinstance(self.algorithm, str) else ESTIMATORS[0]

@@ -1,5 +1,6 @@
 """Scenario files: read, override, resolve, check, and write out again as the text of `world/info`."""
 
+import copy
 import hashlib
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -109,6 +110,11 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
         return {**with_defaults(numbers, drone), "sensors": own}
 
     document = {**document, "sensors": _separated(sensors, "sensors", unsound, unread, imports)}
+    if imports and plugin.may_import():
+        document = document | {
+            key: copy.deepcopy(document[key]) for key in ("clusters", "estimation") if key in document
+        }
+        unsound += own_classes.with_parameters(document)
     if "agents" in document:
         document["agents"], wrong = own_classes.with_agents(document["agents"], imports)
         unsound += wrong

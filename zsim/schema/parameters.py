@@ -8,7 +8,7 @@ class Pilot(zsim.Agent):
         ... self.parameters.push_1_s
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from inspect import Parameter, signature
 from typing import Annotated, Any, get_type_hints
 
@@ -16,7 +16,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from zsim.errors import DocumentError
-from zsim.schema.checker import Fault, faults
+from zsim.schema.checker import Fault, faults, show
 from zsim.schema.quantities import Real
 
 COUNT_MAX = 100  # parameters of a class
@@ -72,20 +72,18 @@ def resolved(kind: Callable[..., Any], given: Any, where: str, filled: tuple[str
     return msgspec.to_builtins(msgspec.convert(given, declared))
 
 
-def construct(kind: Callable[..., Any], given: Mapping[str, Any], *args: Any, **named: Any) -> Any:
-    """Return an instance of a class whose `parameters` are there when its constructor is called.
+def bound(kind: Any, given: Any, where: str) -> Any:
+    """Return a class whose instances have these parameters, there when its constructor is called.
 
-    Args:
-        given: as `resolved` has returned them.
-        args, named: of the constructor.
+    Raises:
+        DocumentError: as of `resolved`; or there are some, and the class has no `Parameters`.
     """
-    declared = getattr(kind, "Parameters", None)
-    if declared is None or not isinstance(kind, type):
-        return kind(*args, **named)
-    made: Any = object.__new__(kind)
-    made.parameters = msgspec.convert(given, declared)
-    made.__init__(*args, **named)
-    return made
+    if not has_parameters(kind):
+        if given:
+            raise DocumentError([f"{where} is {show(given)}; must be left out: {kind.__name__} has no Parameters"])
+        return kind
+    own = msgspec.convert(resolved(kind, given or {}, where), kind.Parameters)
+    return type(kind.__name__, (kind,), {"parameters": own, "__module__": kind.__module__, "__doc__": kind.__doc__})
 
 
 def has_parameters(kind: Callable[..., Any]) -> bool:

@@ -12,6 +12,7 @@ from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.roles import agent_names, expected_processes, permits, rights_for
 from zsim.schema import plugin
+from zsim_agents.formation.engagement_setup import engagement_of
 
 MODULE = """
 from typing import Annotated
@@ -78,6 +79,22 @@ class OfElsewhere(Agent):
 
 class NoAgent:
     pass
+
+
+class Law(zsim.ControlLaw):
+    class Parameters(zsim.Parameters):
+        push_1_s: Annotated[float, Meta(ge=0, le=2)] = 0.4
+
+    def __init__(self, space, gains=None):
+        super().__init__(space, gains)
+        self.doubled = 2 * self.parameters.push_1_s
+
+    def rates(self, c, p_W, v_W, c_des, c_dot_des):
+        return 0 * c
+
+
+class Plain(Law):
+    Parameters = None
 """
 BASE: dict[str, Any] = {
     "name": "s",
@@ -175,3 +192,33 @@ def test_an_unresolved_agent_is_not_taken_from_world_info() -> None:
     with pytest.raises(ScenarioError) as raised:
         scenario_file.from_text(yaml.safe_dump({**BASE, "agents": {"pilot": PILOT}}))
     assert has_terms(str(raised.value), "agents.pilot.declared")
+
+
+def of_law(**cluster: Any) -> Any:
+    return scenario_file.resolve({**BASE, "clusters": [{"name": "main", "drones": ["d1", "d2"], **cluster}]})
+
+
+def test_parameters_of_a_law_are_filled_in_overridden_and_there_when_it_is_made(tmp_path: Path) -> None:
+    scenario = of_law(law="flyers:Law")
+    assert scenario.cluster("main").law_parameters == {"push_1_s": 0.4}
+    (tmp_path / "s.yaml").write_text(yaml.safe_dump({**BASE, "clusters": [{"name": "main", "drones": ["d1", "d2"]}]}))
+    overrides = ["clusters.main.law=flyers:Law", "clusters.main.law_parameters.push_1_s=1.5"]
+    scenario = scenario_file.load(tmp_path / "s.yaml", overrides)
+    law = engagement_of(scenario, scenario.cluster("main")).law
+    assert (law.parameters.push_1_s, law.doubled) == (1.5, 3.0)  # type: ignore[attr-defined]
+    with plugin.names_only():
+        assert scenario_file.from_text(scenario_file.to_text(scenario)) == scenario
+
+
+@pytest.mark.parametrize(
+    ("cluster", "terms"),
+    [
+        ({"law": "flyers:Law", "law_parameters": {"push_1_s": 3}}, ("clusters[0].law_parameters.push_1_s", "3", "0", "2")),
+        ({"law": "flyers:Law", "law_parameters": {"push": 1}}, ("clusters[0].law_parameters.push", "push_1_s", "'main'")),
+        ({"law": "flyers:Plain", "law_parameters": {"push": 1}}, ("clusters[0].law_parameters", "Plain", "Parameters")),
+    ],
+)
+def test_those_of_a_law_are_checked_with_the_scenario(cluster: dict[str, Any], terms: tuple[str, ...]) -> None:
+    with pytest.raises(ScenarioError) as raised:
+        of_law(**cluster)
+    assert has_terms(str(raised.value), *terms), str(raised.value)
