@@ -27,15 +27,15 @@ from msgspec import UNSET
 from zsim.contract import keys
 from zsim.contract.flight_messages import ClusterState, Phase, Truth
 from zsim.contract.messages import Info, decode
-from zsim.contract.run_messages import Clock, Event, holding_up
+from zsim.contract.run_messages import EVENT_KINDS, Clock, Event, holding_up
 from zsim.errors import DecodeError, RunError, RunFailedError, ZsimError, printable
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.runner import Runner
 from zsim.scenario.roles import RECORDER, WORLD, expected_processes
-from zsim.schema.checker import suggestion
+from zsim.schema.checker import show, suggestion
 from zsim.transport.connection import find_world
 from zsim.transport.session import RawSample, Session, result_of
-from zsim_analysis.in_process import OwnAgent, with_agents
+from zsim_analysis.in_process import OwnAgent, sequence_of_agents, with_agents
 from zsim_api import run_folder
 from zsim_api.assertions import Assertions
 from zsim_api.flight import LAUNCHER, calling, command_of, raise_failure
@@ -116,7 +116,7 @@ class Federation(Assertions):
             source = scenario_of(scenario).changed(
                 seed=seed, duration_s=duration, set=set, law=law, estimator=estimator
             )
-            own = [each for each in agents if not isinstance(each, str)]
+            own = [each for each in sequence_of_agents(agents) if not isinstance(each, str)]
             named = [each for each in agents if isinstance(each, str)]
             flown, made = calling(lambda: with_agents(source.resolved, own))
             expected = [*expected_processes(flown), *(name for name, _ in started if name), PROCESS]
@@ -175,14 +175,16 @@ class Federation(Assertions):
         """Let time pass until something is the case, and stand there. In realtime it goes on.
 
         Args:
-            what: a phase in which every cluster is, such as "engaged"; the kind of an event, such as "collision",
-                that has happened since the last call; a simulated time [s]; or a function of a `Moment`.
+            what: a phase in which every cluster is, such as "engaged", and is already after a `kill` if it was before;
+                the kind of an event, such as "collision" or "restart", that has happened since the last call; a
+                simulated time [s]; or a function of a `Moment`.
             within_s: wall time.
 
         Returns:
             The moment.
 
         Raises:
+            RunError: there is no such phase or kind of event.
             RunFailedError: the run has ended before, or a program has failed, or it takes longer.
             Exception: what the function has raised.
         """
@@ -455,6 +457,7 @@ class _Watch(Agent):
     def begin(self, condition: Condition) -> None:
         """Let time pass until a condition; to be called with `news` held."""
         self._events = [event for event in self._events if event.t_ns >= self._now_ns]
+        self.moment = self.moment and self.moment._replace(events=())
         self.raised, self.wanted = None, condition
         self.news.notify_all()
 
@@ -495,14 +498,21 @@ def _condition(what: str | float | Condition) -> tuple[Condition, str]:
     """Return what a test waits for as a function of a moment, and as a text."""
     if callable(what):
         return what, getattr(what, "__name__", repr(what))
+    phases = get_args(Phase)
     if isinstance(what, str):
-        if what in get_args(Phase):
+        if what in phases:
 
             def in_phase(moment: Moment) -> bool:
                 return bool(moment.states) and all(state.phase == what for state in moment.states.values())
 
             return in_phase, f"the phase {what!r}"
+        if what not in EVENT_KINDS:
+            hint = suggestion(what, (*phases, *EVENT_KINDS))
+            must = f"must be a phase ({', '.join(phases)}), or a kind of event ({', '.join(EVENT_KINDS)})"
+            raise RunError(f"wait_until: is {what!r}; {hint}{must}")
         return lambda moment: any(event.kind == what for event in moment.events), f"an event of kind {what!r}"
+    if not isinstance(what, int | float):
+        raise RunError(f"wait_until: is {show(what)}; must be a phase, a kind of event, a time [s], or a function")
     return lambda moment: moment.t_s >= what, f"t = {what:g} s"
 
 
