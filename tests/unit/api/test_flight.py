@@ -46,6 +46,11 @@ class Nan(ControlLaw):
         return c * float("nan")
 
 
+class Still(ControlLaw):
+    def rates(self, c: Any, p_W: Any, v_W: Any, c_des: Any, c_dot_des: Any) -> Any:
+        return c * 0.0
+
+
 class TwoRates(ControlLaw):
     def rates(self, c: Any, p_W: Any, v_W: Any, c_des: Any, c_dot_des: Any) -> Any:
         return c[:2]
@@ -96,6 +101,24 @@ def test_what_a_law_returns_amiss_names_class_field_and_shapes(
 
 
 SLOW = functools.partial(Nan, gains=None)
+
+
+def test_a_law_that_fails_in_its_rehearsal_leaves_no_folder(tmp_path: Path) -> None:
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    made = type("Made", (Nan,), {})  # flown by a module in the folder
+    for out in (tmp_path / "run", mine):
+        with pytest.raises(UserCodeError):
+            zsim.run(PAIR, law=made, out=out, progress=False)
+    assert [*tmp_path.rglob("*")] == [mine]
+    zsim.run(PAIR, law=type("Made", (Still,), {}), duration_s=1, out=mine, progress=False)
+    assert [*mine.glob("zsim_own_*.py")]
+    (mine / "notes.txt").write_text("mine")
+    with pytest.raises(UserCodeError):
+        zsim.run(PAIR, law=made, out=mine, force=True, progress=False)
+    assert [*mine.iterdir()] == [mine / "notes.txt"]
+
+
 MISGIVEN: dict[str, tuple[dict[str, Any], type[ZsimError], tuple[str, ...]]] = {
     "a partial for a law": (
         {"law": SLOW},
