@@ -11,6 +11,7 @@ what it does acts at the same gate each time. The fixture `federation` of the py
 """
 
 import os
+import re
 import shlex
 import signal
 import socket
@@ -27,7 +28,7 @@ from msgspec import UNSET
 from zsim.contract import keys
 from zsim.contract.flight_messages import ClusterState, Phase, Truth
 from zsim.contract.messages import Info, decode
-from zsim.contract.run_messages import EVENT_KINDS, Clock, Event, holding_up
+from zsim.contract.run_messages import EVENT_KINDS, Clock, Event, Waiting, holding_up
 from zsim.errors import DecodeError, RunError, RunFailedError, ZsimError, printable
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.runner import Runner
@@ -48,7 +49,8 @@ if TYPE_CHECKING:
 PROCESS = "test.federation"
 PATIENCE_S = 300.0  # wall time; the first run on a machine compiles for one to three minutes, more on a busy one
 PROGRAM_END_S = 5.0  # wall time that programs have to see that the run is over
-LAST_LINES = 10  # of each log
+LAST_LINES = 40  # of a log that tells of a failure
+ENDED = re.compile(r"^(\S+)(?: \(pid \d+\))? ended: ", re.MULTILINE)  # as the launcher says of a process
 
 
 class Moment(NamedTuple):
@@ -318,27 +320,37 @@ class Federation(Assertions):
         self.close()
 
     def diagnosis(self) -> str:
-        """Return how far it has come, who waits for whom, and the last lines of every log, for people."""
-        parts = [self._standing()]
+        """Return for people how far it has come, who waits for whom, and the last lines of the logs.
+
+        First come those of processes that have failed or are waited for, then the launcher's; of the others one line.
+        """
+        clock = self._newest_clock()
+        waiting = [each for each in clock.waiting_for if each.name != PROCESS] if clock else []
+        parts = [self._standing(clock, waiting)]
         if fault := self._program_fault():
             parts.append(fault)
-        for log in sorted((self.folder / run_folder.LOGS).glob("*.log"), key=lambda each: each.stem != LAUNCHER):
-            lines = log.read_text(errors="replace").splitlines()
-            shown = lines[-(4 * LAST_LINES if log.stem == LAUNCHER else LAST_LINES) :]
-            if shown:
+        logs = {log.stem: log.read_text(errors="replace") for log in (self.folder / run_folder.LOGS).glob("*.log")}
+        failed = [name for name, program in self._programs.items() if program.code and not program.asked]
+        failed += ENDED.findall(logs.get(LAUNCHER, ""))
+        whole = [*dict.fromkeys((*failed, *(each.name for each in waiting), LAUNCHER))]
+        for name in (*whole, *sorted(logs.keys() - {*whole})):
+            lines = logs.get(name, "").splitlines()
+            shown = lines[-LAST_LINES:] if name in whole else lines[-1:]
+            if shown and name in whole:
                 before = f" (last {len(shown)} of {len(lines)} lines)" if len(shown) < len(lines) else ""
-                parts.append("\n".join([f"--- {log.name}{before}", *shown]))
+                parts.append("\n".join([f"--- {name}.log{before}", *shown]))
+            elif shown:
+                parts.append(f"--- {name}.log, the last of {len(lines)}: {shown[0]}")
         return "\n".join(parts)
 
-    def _standing(self) -> str:
-        clock = self._newest_clock()
+    def _standing(self, clock: Clock | None, waiting: Sequence[Waiting]) -> str:
         if clock is None:
             return "no clock of a world has come"
-        waiting = [each for each in clock.waiting_for if each.name != PROCESS]
         lines = []
         for each in holding_up(clock.state, waiting) or waiting:
+            on = f" on {each.host}" if each.host else ""
             held = f", held by {', '.join(each.held_by)}" if each.held_by else ""
-            lines.append(f"  {each.name} on {each.host} since {each.since_wall_s:.1f} s{held}")
+            lines.append(f"  {each.name}{on} since {each.since_wall_s:.1f} s{held}")
         if not self._watch.left and self._watch.wanted is None:
             lines.append(f"  {PROCESS}, this test, which waits for nothing at the moment")
         lines.insert(0, f"t = {clock.t_ns / 1e9:.2f} s, {clock.state}; waiting_for:{'' if lines else ' nobody'}")

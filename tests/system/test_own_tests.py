@@ -118,10 +118,15 @@ def test_a_failing_test_says_who_waits_and_keeps_the_record(compiled: None, tmp_
     process = pytest_run(tmp_path, FAILING)
     output = output_of(process)
     assert process.returncode == 1, output
-    assert re.search(r"t = 0.00 s, waiting; waiting_for:\n +ground.main on ", output), output
-    for log in ("zsim-run.log", "estimator.drone1.log", "controller.main.log", "ground.main.log"):
-        assert f"--- {log}" in output
-    assert re.search("here on tcp/127.0.0.1:[0-9]+\n", output)
+    assert re.search(r"t = 0.00 s, waiting; waiting_for:\n +ground.main ", output), output
+    logs = re.findall(r"^--- (\S+).log(.*)", output, re.MULTILINE)
+    names = [name for name, _ in logs]
+    launcher = names.index("zsim-run")
+    first, others = {*names[:launcher]}, {*names[launcher + 1 :]}
+    assert {"estimator.drone2", "ground.main"} <= first  # it was killed, it is waited for
+    assert first | others == {"controller.main", "estimator.drone1", "estimator.drone2", "ground.main", "recorder"}
+    assert [bool(rest) for _, rest in logs] == [place > launcher for place in range(len(logs))]  # one line is all
+    assert re.search("--- ground.main.log\nhere on tcp/127.0.0.1:[0-9]+\n", output)
     kept = tmp_path / "runs/failed/test_mine.py-test_of_a_program_that_hangs/run1"
     assert f"kept in {kept}" in output
     assert (kept / "logs/ground.main.log").exists()
