@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
 from inspect import signature
+from types import FunctionType
 from typing import Any, NamedTuple
 
 from msgspec.structs import replace
@@ -18,6 +19,7 @@ from zsim.scenario.own_classes import messages_of
 from zsim.scenario.roles import AGENTS, agent_names, agent_roles, expected_processes
 from zsim.scenario.scenario import Scenario
 from zsim.schema import parameters, plugin, yaml_file
+from zsim.schema.checker import show
 
 NAMED_MAX = 10  # of the known names in a refusal
 
@@ -207,9 +209,14 @@ def own_agent(
         DocumentError: its parameters, or its messages, are not what is allowed.
     """
     if not isinstance(made, Agent):
-        kind = f"{getattr(made, '__module__', '')}:{getattr(made, '__qualname__', type(made).__name__)}"
+        if not callable(made):
+            raise RunError(f"agent is {show(made)}; must be a zsim.Agent, or a class or a function that makes one")
+        kind = f"{made.__module__}:{made.__qualname__}" if isinstance(made, type | FunctionType) else show(made)
+        try:
+            taken = signature(made)
+        except ValueError as error:  # of a partial, whose arguments it does not take
+            raise RunError(f"{kind} cannot be made: {error}") from None
         given = {"info": info, "scenario": scenario, per: name.partition(".")[2]}
-        taken = signature(made)
         given = {key: value for key, value in given.items() if key in taken.parameters}
         make: Callable[..., Agent] = made
         if parameters.has_parameters(made):

@@ -22,6 +22,7 @@ from zsim.runtime.progress import PERIOD_S, HoldReasons, Screen, SlowStart
 from zsim.runtime.rate_limit import RateLimit
 from zsim.scenario.roles import agent_names, expected_processes, lets_drop
 from zsim.scenario.scenario import Scenario
+from zsim.schema.checker import show
 from zsim_agents.hosting import hosted, own_agent, with_own_agents
 from zsim_world import run_state
 from zsim_world.run.world import World
@@ -69,12 +70,24 @@ def fly(
 
 
 def with_agents(scenario: Scenario, own: Sequence[OwnAgent]) -> tuple[Scenario, list[Agent]]:
-    """Return a resolved scenario that waits for agents of a user's, and ends where one fails; and the agents."""
-    if not own:
+    """Return a resolved scenario that waits for agents of a user's, and ends where one fails; and the agents.
+
+    Raises:
+        RunError: they are not in a sequence, or one is no agent.
+        UserCodeError: the class of one raised.
+    """
+    if not sequence_of_agents(own):
         return scenario, []
     info = World(scenario).info()
     made = [own_agent(each, info, scenario) for each in own]
     return with_own_agents(scenario, [agent.name for agent in made]), made
+
+
+def sequence_of_agents(given: Any, others: str = "") -> Sequence[Any]:
+    """Return what is given for agents; RunError if it is none of `others` nor a sequence, but, say, one agent."""
+    if isinstance(given, str) or not isinstance(given, Sequence):
+        raise RunError(f"agents is {show(given)}; must be {others}a sequence of agents")
+    return given
 
 
 class FlightObserver(Protocol):

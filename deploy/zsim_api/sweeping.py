@@ -1,9 +1,7 @@
 """Flies a scenario many times, with other seeds and other values of its fields: `zsim.sweep` and `zsim sweep`."""
 
-import atexit
 import json
 import re
-import shutil
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import nullcontext
@@ -16,6 +14,7 @@ import numpy as np
 from rich.console import Console
 
 from zsim.errors import RunError, ScenarioError, what_is_missing
+from zsim.output_folder import temporary_folder
 from zsim.runtime.progress import cell
 from zsim.scenario.scenario_file import whole_path
 from zsim.schema import plugin
@@ -106,19 +105,18 @@ def sweep(
         plan = planned(varied.source, varied.document(), texts, runs, keep_records, varied.changes, console)
     except ScenarioError as error:
         raise ScenarioError([_in_python(fault) for fault in error.faults]) from None
-    folder = Path(out) if out is not None else Path(tempfile.mkdtemp(prefix="zsim-sweep-"))
+    folder = Path(out) if out is not None else temporary_folder("sweep-")
     modules = made_modules(_names(plan), [scratch_folder()])
     try:
         rows = flown(plan, folder, workers, client, console=console, modules=tuple(modules))
     except KeyboardInterrupt:
         finished = len(SweepFolder(folder, plan).rows())
-        text = f"interrupted: {finished} of {plan.runs} runs are finished; out={str(folder)!r} goes on"
+        kept = folder if out is not None else folder.replace(tempfile.mkdtemp(prefix="zsim-sweep-"))
+        text = f"interrupted: {finished} of {plan.runs} runs are finished; out={str(kept)!r} goes on"
         console.print(cell(text), soft_wrap=True)
         raise
     except RunError as error:
         raise RunError(_in_python(str(error))) from None
-    if out is None:
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
     design = SweepDesign(plan)
     frame = _frame(read_table(folder / TABLE), design.varied)
     for path, values in vary.items():

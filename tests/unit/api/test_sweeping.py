@@ -237,6 +237,30 @@ def test_a_folder_of_its_own_is_kept_when_interrupted(tmp_path: Path) -> None:
     shutil.rmtree(folder)
 
 
+def test_what_a_killed_sweep_has_left_is_removed_by_the_next_one(tmp_path: Path) -> None:
+    """Its own folder, the modules of what the script defines, and in a worker the record of a run."""
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    environment = {**os.environ, "TMPDIR": str(temporary)}
+    waiting = (
+        WAITING.replace("(flight)", "(run)").replace("flight.", "run.").replace("scenario.seed", "scenario['seed']")
+    )
+    write(tmp_path, script_py=f"OUT = None\n{waiting}", one_yaml=ONE)
+    with subprocess.Popen(
+        [sys.executable, "script.py"], cwd=tmp_path, env=environment, start_new_session=True
+    ) as killed:
+        while not (tmp_path / "flying").exists() and killed.poll() is None:
+            time.sleep(0.05)
+        started = psutil.Process(killed.pid).children(recursive=True)
+        killed.kill()
+    assert psutil.wait_procs(started, PATIENCE_S)[1] == []
+    left = {path.name.partition("-")[0] for path in temporary.glob("*/*")}
+    assert left == {"modules", "sweep", "run"}
+    write(tmp_path, next_py="import zsim; zsim.sweep('one.yaml', {'seed': [1]}, workers=1, progress=False)")
+    subprocess.run([sys.executable, "next.py"], cwd=tmp_path, env=environment, check=True)
+    assert [*temporary.iterdir()] == []
+
+
 def test_the_same_call_flies_what_is_missing(
     near: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -213,8 +213,14 @@ def test_parameters_of_a_law_are_filled_in_overridden_and_there_when_it_is_made(
 @pytest.mark.parametrize(
     ("cluster", "terms"),
     [
-        ({"law": "flyers:Law", "law_parameters": {"push_1_s": 3}}, ("clusters[0].law_parameters.push_1_s", "3", "0", "2")),
-        ({"law": "flyers:Law", "law_parameters": {"push": 1}}, ("clusters[0].law_parameters.push", "push_1_s", "'main'")),
+        (
+            {"law": "flyers:Law", "law_parameters": {"push_1_s": 3}},
+            ("clusters[0].law_parameters.push_1_s", "3", "0", "2"),
+        ),
+        (
+            {"law": "flyers:Law", "law_parameters": {"push": 1}},
+            ("clusters[0].law_parameters.push", "push_1_s", "'main'"),
+        ),
         ({"law": "flyers:Plain", "law_parameters": {"push": 1}}, ("clusters[0].law_parameters", "Plain", "Parameters")),
     ],
 )
