@@ -253,10 +253,12 @@ class _Progress:
         states = (keys.cluster_state(cluster.name) for cluster in scenario.clusters)
         self._watched = {keys.CLOCK, keys.EVENT, *states}
         self._phase = ""
+        self._clock: run_messages.Clock | None = None  # the newest one, if it is not shown
         self._start = SlowStart(screen.say)
 
     def close(self) -> None:
         self._start.over()
+        self._show_clock()
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
         """Show nothing: it holds truth, status and sensors only."""
@@ -270,7 +272,14 @@ class _Progress:
                 self._screen.say(line)
         elif isinstance(message, run_messages.Event):
             self._screen.event({"t_s": message.t_ns / 1e9, "kind": message.kind, "text": message.text})
-        elif isinstance(message, run_messages.Clock) and self._throttle.spend():
-            self._start.over()
-            line = {"t_s": message.t_ns / 1e9, "rate": message.rate, "state": message.state, "phase": self._phase}
+        elif isinstance(message, run_messages.Clock):
+            self._clock = message
+            if self._throttle.spend():
+                self._start.over()
+                self._show_clock()
+
+    def _show_clock(self) -> None:
+        if (clock := self._clock) is not None:
+            line = {"t_s": clock.t_ns / 1e9, "rate": clock.rate, "state": clock.state, "phase": self._phase}
             self._screen.clock({**line, "waiting_for": []})
+            self._clock = None

@@ -13,7 +13,9 @@ from refused import refused
 
 import zsim
 from zsim.errors import RunError, ScenarioError, UserCodeError, ZsimError
+from zsim.runtime.progress import Screen
 from zsim_agents.formation.control_law import ControlLaw
+from zsim_analysis.in_process import fly
 
 STATUS = "drone/*/sensor/status"
 
@@ -65,6 +67,17 @@ def test_an_agent_flies_beside_the_stock_ones(tmp_path: Path) -> None:
     other = zsim.run(PAIR, agents=[Lander], out=tmp_path / "other", progress=False)
     assert other.truth_sha256 == run.truth_sha256
     assert zsim.run(PAIR, out=tmp_path / "none", progress=False).truth_sha256 != run.truth_sha256
+
+
+def test_the_end_of_a_flight_is_shown() -> None:
+    shown: list[dict[str, Any]] = []
+
+    class Shown(Screen):
+        def clock(self, line: dict[str, Any]) -> None:
+            shown.append(line)
+
+    fly(zsim.Scenario(**PAIR).resolved, None, screen=Shown(6.0))
+    assert (shown[-1]["t_s"], shown[-1]["state"], shown[-1]["phase"]) == (6.0, "stopped", "engaged")
 
 
 def test_fields_are_replaced_by_path_by_name_and_by_class(tmp_path: Path) -> None:
