@@ -1,13 +1,16 @@
 """A decentralised formation: every drone has a pilot that knows its own estimate and what the others tell it.
 
 zsim run examples/swarm.yaml
-zsim run examples/swarm.yaml --set agents.pilot.parameters.gain_1_s=0.6 --set radio.loss=0.3
+zsim run examples/swarm.yaml --set agents.pilot.parameters.gain_1_s=0.6
+python examples/swarm.py
 
-Consensus on displacements (Olfati-Saber, Fax and Murray 2007, Proc. IEEE 95(1), section II-D): each pilot flies
+Consensus on displacements (Olfati-Saber, Fax and Murray 2007, Proc. IEEE 95(1)): each pilot flies
 u_i = k sum_j ((p_j - c_j) - (p_i - c_i)) over those that it hears, where c is the place of a drone in the formation.
 The error decays at the rate k lambda_2 of the graph; the centroid stays where it was.
 """
 
+import math
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -81,3 +84,10 @@ class Pilot(zsim.Agent):
     def restore(self, state: dict[str, Any]) -> None:
         self._heard = {drone: (at_ns, p_W) for drone, (at_ns, p_W) in state["heard"].items()}
         self._state, self._p_W = state["state"], state["p_W"]
+
+
+if __name__ == "__main__":
+    run = zsim.run(Path(__file__).with_suffix(".yaml"), duration_s=20, set={"agents.pilot.parameters.gain_1_s": 0.6})
+    for drone in run.drones:
+        place = run.estimate(drone).iloc[-1]
+        print(f"{drone}: {math.hypot(place.position_m_x, place.position_m_y):.2f} m from the origin")
