@@ -6,6 +6,7 @@ leave over. When the others have nothing else left to do, they run what is pure,
 
 import gc
 import os
+import signal
 import sys
 from typing import Any
 
@@ -16,6 +17,11 @@ from zsim_deploy.roles.stop_channel import lower_priority
 
 PURE = ("tests/authority/", "tests/contract/", "tests/unit/")
 LEAST = 3  # workers of which one is quiet
+
+if (
+    signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+):  # as in the background of a shell; those that tests start inherit it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def quiet_one(workers: int) -> str | None:

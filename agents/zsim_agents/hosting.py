@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
 from inspect import signature
+from types import FunctionType
 from typing import Any, NamedTuple
 
 from msgspec.structs import replace
@@ -17,6 +18,7 @@ from zsim.runtime.inbox import output_hold_ns
 from zsim.scenario.roles import AGENTS, agent_names, expected_processes
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin, yaml_file
+from zsim.schema.checker import show
 
 NAMED_MAX = 10  # of the known names in a refusal
 
@@ -197,8 +199,13 @@ def own_agent(
         RunError: the settings are not those that it takes, or what it returns is no agent.
     """
     if not isinstance(made, Agent):
-        kind = f"{getattr(made, '__module__', '')}:{getattr(made, '__qualname__', type(made).__name__)}"
-        taken = signature(made)
+        if not callable(made):
+            raise RunError(f"agent is {show(made)}; must be a zsim.Agent, or a class or a function that makes one")
+        kind = f"{made.__module__}:{made.__qualname__}" if isinstance(made, type | FunctionType) else show(made)
+        try:
+            taken = signature(made)
+        except ValueError as error:  # of a partial, whose arguments it does not take
+            raise RunError(f"{kind} cannot be made: {error}") from None
         given = {"info": info, "scenario": scenario}
         given = {key: value for key, value in given.items() if key in taken.parameters} | dict(settings)
         try:

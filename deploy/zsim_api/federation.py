@@ -11,6 +11,7 @@ what it does acts at the same gate each time. The fixture `federation` of the py
 """
 
 import os
+import re
 import shlex
 import signal
 import socket
@@ -27,15 +28,15 @@ from msgspec import UNSET
 from zsim.contract import keys
 from zsim.contract.flight_messages import ClusterState, Phase, Truth
 from zsim.contract.messages import Info, decode
-from zsim.contract.run_messages import Clock, Event, holding_up
+from zsim.contract.run_messages import EVENT_KINDS, Clock, Event, Waiting, holding_up
 from zsim.errors import DecodeError, RunError, RunFailedError, ZsimError, printable
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.runner import Runner
 from zsim.scenario.roles import RECORDER, WORLD, expected_processes
-from zsim.schema.checker import suggestion
+from zsim.schema.checker import show, suggestion
 from zsim.transport.connection import find_world
 from zsim.transport.session import RawSample, ReceivedSample, Session, result_of
-from zsim_analysis.in_process import OwnAgent, with_agents
+from zsim_analysis.in_process import OwnAgent, sequence_of_agents, with_agents
 from zsim_api import run_folder
 from zsim_api.assertions import Assertions
 from zsim_api.flight import LAUNCHER, calling, command_of, raise_failure
@@ -48,8 +49,9 @@ if TYPE_CHECKING:
 PROCESS = "test.federation"
 PATIENCE_S = 300.0  # wall time; the first run on a machine compiles for one to three minutes, more on a busy one
 PROGRAM_END_S = 5.0  # wall time that programs have to see that the run is over
-LAST_LINES = 10  # of each log
 HARMLESS = (signal.SIGSTOP, signal.SIGCONT)  # signals that end no process
+LAST_LINES = 40  # of a log that tells of a failure
+ENDED = re.compile(r"^(\S+)(?: \(pid \d+\))? ended: ", re.MULTILINE)  # as the launcher says of a process
 
 
 class Moment(NamedTuple):
@@ -117,7 +119,7 @@ class Federation(Assertions):
             source = scenario_of(scenario).changed(
                 seed=seed, duration_s=duration, set=set, law=law, estimator=estimator
             )
-            own = [each for each in agents if not isinstance(each, str)]
+            own = [each for each in sequence_of_agents(agents) if not isinstance(each, str)]
             named = [each for each in agents if isinstance(each, str)]
             flown, made = calling(lambda: with_agents(source.resolved, own))
             expected = [*expected_processes(flown), *(name for name, _ in started if name), PROCESS]
@@ -185,14 +187,16 @@ class Federation(Assertions):
         """Let time pass until something is the case, and stand there. In realtime it goes on.
 
         Args:
-            what: a phase in which every cluster is, such as "engaged"; the kind of an event, such as "collision",
-                that has happened since the last call; a simulated time [s]; or a function of a `Moment`.
+            what: a phase in which every cluster is, such as "engaged", and is already after a `kill` if it was before;
+                the kind of an event, such as "collision" or "restart", that has happened since the last call; a
+                simulated time [s]; or a function of a `Moment`.
             within_s: wall time.
 
         Returns:
             The moment.
 
         Raises:
+            RunError: there is no such phase or kind of event.
             RunFailedError: the run has ended before, or a program has failed, or it takes longer.
             Exception: what the function has raised.
         """
@@ -361,27 +365,37 @@ class Federation(Assertions):
         self.close()
 
     def diagnosis(self) -> str:
-        """Return how far it has come, who waits for whom, and the last lines of every log, for people."""
-        parts = [self._standing()]
+        """Return for people how far it has come, who waits for whom, and the last lines of the logs.
+
+        First come those of processes that have failed or are waited for, then the launcher's; of the others one line.
+        """
+        clock = self._newest_clock()
+        waiting = [each for each in clock.waiting_for if each.name != PROCESS] if clock else []
+        parts = [self._standing(clock, waiting)]
         if fault := self._program_fault():
             parts.append(fault)
-        for log in sorted((self.folder / run_folder.LOGS).glob("*.log"), key=lambda each: each.stem != LAUNCHER):
-            lines = log.read_text(errors="replace").splitlines()
-            shown = lines[-(4 * LAST_LINES if log.stem == LAUNCHER else LAST_LINES) :]
-            if shown:
+        logs = {log.stem: log.read_text(errors="replace") for log in (self.folder / run_folder.LOGS).glob("*.log")}
+        failed = [name for name, program in self._programs.items() if program.code and not program.asked]
+        failed += ENDED.findall(logs.get(LAUNCHER, ""))
+        whole = [*dict.fromkeys((*failed, *(each.name for each in waiting), LAUNCHER))]
+        for name in (*whole, *sorted(logs.keys() - {*whole})):
+            lines = logs.get(name, "").splitlines()
+            shown = lines[-LAST_LINES:] if name in whole else lines[-1:]
+            if shown and name in whole:
                 before = f" (last {len(shown)} of {len(lines)} lines)" if len(shown) < len(lines) else ""
-                parts.append("\n".join([f"--- {log.name}{before}", *shown]))
+                parts.append("\n".join([f"--- {name}.log{before}", *shown]))
+            elif shown:
+                parts.append(f"--- {name}.log, the last of {len(lines)}: {shown[0]}")
         return "\n".join(parts)
 
-    def _standing(self) -> str:
-        clock = self._newest_clock()
+    def _standing(self, clock: Clock | None, waiting: Sequence[Waiting]) -> str:
         if clock is None:
             return "no clock of a world has come"
-        waiting = [each for each in clock.waiting_for if each.name != PROCESS]
         lines = []
         for each in holding_up(clock.state, waiting) or waiting:
+            on = f" on {each.host}" if each.host else ""
             held = f", held by {', '.join(each.held_by)}" if each.held_by else ""
-            lines.append(f"  {each.name} on {each.host} since {each.since_wall_s:.1f} s{held}")
+            lines.append(f"  {each.name}{on} since {each.since_wall_s:.1f} s{held}")
         if not self._watch.left and self._watch.wanted is None:
             lines.append(f"  {PROCESS}, this test, which waits for nothing at the moment")
         lines.insert(0, f"t = {clock.t_ns / 1e9:.2f} s, {clock.state}; waiting_for:{'' if lines else ' nobody'}")
@@ -500,6 +514,7 @@ class _Watch(Agent):
     def begin(self, condition: Condition) -> None:
         """Let time pass until a condition; to be called with `news` held."""
         self._events = [event for event in self._events if event.t_ns >= self._now_ns]
+        self.moment = self.moment and self.moment._replace(events=())
         self.raised, self.wanted = None, condition
         self.news.notify_all()
 
@@ -540,14 +555,21 @@ def _condition(what: str | float | Condition) -> tuple[Condition, str]:
     """Return what a test waits for as a function of a moment, and as a text."""
     if callable(what):
         return what, getattr(what, "__name__", repr(what))
+    phases = get_args(Phase)
     if isinstance(what, str):
-        if what in get_args(Phase):
+        if what in phases:
 
             def in_phase(moment: Moment) -> bool:
                 return bool(moment.states) and all(state.phase == what for state in moment.states.values())
 
             return in_phase, f"the phase {what!r}"
+        if what not in EVENT_KINDS:
+            hint = suggestion(what, (*phases, *EVENT_KINDS))
+            must = f"must be a phase ({', '.join(phases)}), or a kind of event ({', '.join(EVENT_KINDS)})"
+            raise RunError(f"wait_until: is {what!r}; {hint}{must}")
         return lambda moment: any(event.kind == what for event in moment.events), f"an event of kind {what!r}"
+    if not isinstance(what, int | float):
+        raise RunError(f"wait_until: is {show(what)}; must be a phase, a kind of event, a time [s], or a function")
     return lambda moment: moment.t_s >= what, f"t = {what:g} s"
 
 

@@ -99,8 +99,9 @@ def fly_here(
     continued: bool = False,
 ) -> str:
     """Fly a resolved scenario in this process into a run's folder; return why it ended; errors as of `fly`."""
-    run_folder.prepare(folder, scenario, launch, screen.say if screen else lambda _: None, continued)
-    ended = fly(scenario, folder / RECORD, stop_reason, screen, None, launch.changed, own)
+    with nullcontext() if continued else run_folder.left_only_if_flown(folder):
+        run_folder.prepare(folder, scenario, launch, screen.say if screen else lambda _: None, continued)
+        ended = fly(scenario, folder / RECORD, stop_reason, screen, None, launch.changed, own)
     if not stop_reason():
         run_folder.forget_launch(folder)
     return ended

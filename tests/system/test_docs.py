@@ -45,6 +45,7 @@ from forked_commands import run_here
 from msgspec import inspect as types
 
 from zsim.contract import messages
+from zsim.contract.run_messages import EVENT_KINDS
 from zsim.scenario import scenario, scenario_file
 from zsim.schema import quantities
 from zsim.sensors.camera import CAMERAS, BottomCamera, FrontCamera, Hats, SightingModel
@@ -656,13 +657,12 @@ def test_the_protocol_names_every_message_its_fields_and_a_writer() -> None:
 
 def test_the_protocol_names_every_event() -> None:
     code = "".join(path.read_text() for path in sorted((ROOT / "world/zsim_world").rglob("*.py")))
-    kinds = set(re.findall(r"\b(?:event|notice|Incident)\((?:i, )?\s*\"(\w+)\"", code)) | {
-        "join",
-        "restart",
-        "superseded",
-    }
-    text = (ROOT / "docs/protocol.md").read_text()
-    assert sorted(kind for kind in kinds if f"`{kind}`" not in text) == []
+    kinds = set(re.findall(r"\b(?:event|notice|Incident)\((?:i, )?\s*\"(\w+)\"", code))
+    assert kinds <= {*EVENT_KINDS}
+    assert [kind for kind in EVENT_KINDS if f'"{kind}' not in code] == []
+    section = (ROOT / "docs/protocol.md").read_text().partition("\n## Events\n")[2].partition("Endless repetitions")[0]
+    rows = [line.split("|")[1] for line in section.splitlines() if line.startswith("| `")]
+    assert sorted(kind for row in rows for kind in re.findall(r"`(\w+)`", row)) == sorted(EVENT_KINDS)
 
 
 # Links, files and names
