@@ -277,23 +277,6 @@ class Federation(Assertions):
         at = {} if (ahead_s := self._watch.ahead_s) is None else {"at_s": round(self.t_s + ahead_s, 9)}
         return self.ask(keys.CONTROL, "fault_add", **{**at, **fault})
 
-    def start(self, program: str | Sequence[str]) -> None:
-        """Start a program of yours while the flight is under way; one that is named and was killed, again.
-
-        Args:
-            program: as one of `programs`. Time goes on without it, except in place of one that it waits for.
-
-        Raises:
-            RunError: one of this name runs.
-        """
-        name, words = _named(program)
-        if former := self._programs.get(name):
-            if former.code is None and not former.asked:
-                raise RunError(f"start: program is {name!r}, which runs; must have ended, or been killed")
-            former.close()
-        self._known.add(name)
-        self._start(name, words)
-
     def kill(self, process: str, number: int = signal.SIGKILL, within_s: float = PATIENCE_S) -> int:
         """Send a process of the run a signal, kill -9 by default; return its process id.
 
@@ -319,6 +302,21 @@ class Federation(Assertions):
         with suppress(ProcessLookupError):
             os.kill(pid, number)
         return pid
+
+    def start(self, program: str) -> None:
+        """Start a program of yours again that has ended or was killed, by the name that it was given.
+
+        Raises:
+            RunError: there is no such program, or it runs.
+        """
+        former = self._programs.get(program)
+        if former is None:
+            known = ", ".join(self._programs) or "there are none"
+            raise RunError(f"start: program is {program!r}; must be one of {known}")
+        if former.wait(PROGRAM_END_S if former.asked else 0.0) is None:
+            raise RunError(f"start: {program} runs; must have ended")
+        former.close()
+        self._start(program, former.words)
 
     def _check_name(self, process: str, within_s: float) -> None:
         """Raise RunError for a name that nobody has, nor is to have."""

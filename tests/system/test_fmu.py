@@ -183,8 +183,6 @@ self.steps += 1
 self.vx = 0.001 * self.steps + 0.1 * (8.0 - self.x)
 """
 KILLED_S = 4.5  # of 6: both are in the air, the last snapshots are of 4 s
-
-
 PLACES = {"x": "estimate.position_m.0", "vx": "velocity_m_s.0"}
 
 
@@ -207,12 +205,11 @@ def test_those_that_are_killed_and_started_again_fly_the_bits_of_the_undisturbed
         )
         for version in (2, 3)
     ]
-    program = command(made[1].path, "drone3")
-    flight = flights(DUO, agents=made[:1], programs=[program])
+    flight = flights(DUO, agents=made[:1], programs=[command(made[1].path, "drone3")])
     flight.wait_until(KILLED_S)
     flight.kill("fmu.drone2")
     flight.kill("fmu.drone3")
-    flight.start(program)
+    flight.start("fmu.drone3")
     flight.assert_same_bits(zsim.run(DUO, agents=made, out=tmp_path / "alone", progress=False))
     for drone in ("drone2", "drone3"):
         log = (flight.folder / "logs" / f"fmu.{drone}.log").read_text()
@@ -221,11 +218,10 @@ def test_those_that_are_killed_and_started_again_fly_the_bits_of_the_undisturbed
 
 def test_one_that_cannot_give_its_state_says_so_and_begins_afresh(flights: Federations, tmp_path: Path) -> None:
     path = fmus.build(tmp_path, "Forgetful", 3, COUNTED_VARIABLES, COUNTED_LAW.replace("0.1 *", "0 *"), restores=False)
-    program = command(path, "drone3")
-    flight = flights(DUO, duration=5, programs=[program])
+    flight = flights(DUO, duration=5, programs=[command(path, "drone3")])
     flight.wait_until(KILLED_S)
     flight.kill("fmu.drone3")
-    flight.start(program)
+    flight.start("fmu.drone3")
     v_m_s = np.array(flight.run().commands("drone3")["velocity_m_s_x"])
     assert v_m_s.max() == pytest.approx(0.05 * KILLED_S, abs=0.003)
     assert v_m_s[-1] == pytest.approx(0.05 * (5 - KILLED_S), abs=0.003)

@@ -203,6 +203,7 @@ def test_nobody_of_an_unknown_name_is_waited_for(flights: Federations, program: 
     if program.startswith("ground.main"):
         with refused(RunFailedError, "ground.main"):
             flight.kill("ground.main", within_s=0)  # it has the name, and does not join
-        with refused(RunError, "'ground.main'") as raised:
-            flight.start(program)
-        assert raised.type is RunError
+        with refused(RunError, "ground.main", "ended"):
+            flight.start("ground.main")
+        with refused(RunError, "'ground.other'", "ground.main"):
+            flight.start("ground.other")
