@@ -148,6 +148,7 @@ class Federation(Assertions):
         environment |= {"ZSIM_CONNECT": self.endpoint, "ZSIM_FEDERATION": self.name}
         # `python` and `zsim` are those that run the test
         environment["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
+        self._environment = environment
         self._programs: dict[str, Program] = {}
         for i, (name, words) in enumerate(started):
             label = name or f"program-{i + 1}"
@@ -283,14 +284,33 @@ class Federation(Assertions):
                 is_unknown = self.t_s > 0 and process not in self._known and process not in self._pids
                 left_s = max(0.0, until_s - time.monotonic())
                 if is_unknown or self._fault is not None or not self._watch.news.wait(left_s):
-                    known = ", ".join(sorted(self._pids)) or "none"
-                    raise RunFailedError(
-                        f"kill: process is {process!r}; {suggestion(process, list(self._pids))}joined are {known}"
-                    )
+                    known = sorted({*self._known, *self._pids} - {PROCESS})
+                    hint = suggestion(process, known)
+                    raise RunFailedError(f"kill: process is {process!r}; {hint}of the run are {', '.join(known)}")
             self._killed[pid] = process
+            if process in self._programs:
+                self._programs[process].asked = True  # its end is no failure
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
         return pid
+
+    def start(self, program: str) -> None:
+        """Start a program of yours again that has ended or was killed, by the name that it was given.
+
+        Raises:
+            RunError: there is no such program, or it runs.
+        """
+        former = self._programs.get(program)
+        if former is None:
+            known = ", ".join(self._programs) or "there are none"
+            raise RunError(f"start: program is {program!r}; must be one of {known}")
+        if former.wait(PROGRAM_END_S if former.asked else 0.0) is None:
+            raise RunError(f"start: {program} runs; must have ended")
+        former.close()
+        log = self.folder / run_folder.LOGS / f"{program}.log"
+        self._programs[program] = again = Program(former.words, self._environment, log)
+        self._threads.append(threading.Thread(target=self._await_end, args=(again,), daemon=True))
+        self._threads[-1].start()
 
     def _session(self, within_s: float) -> Session:
         until_s = time.monotonic() + within_s

@@ -251,7 +251,7 @@ class Checkout:
             log = self._folder / f"terminal-{len(self._terminals)}-{time.monotonic_ns()}.log"
             with log.open("w") as out:
                 process = subprocess.Popen(
-                    ["bash", "-c", f"exec {text}"],
+                    ["bash", "-c", f"exec env {text}"],
                     cwd=self._folder,
                     env=self._environment,
                     stdin=subprocess.DEVNULL,
@@ -485,6 +485,7 @@ OWN_UNITS = {
     "noise": "channel's", "density": "channel's/√Hz", "bias": "channel's", "bias_walk": "channel's/√s",
     "bias_instability": "channel's", "quantum": "channel's", "madgwick_beta": "rad/s", "values": "m, rad", "target": "m, rad",
 }  # fmt: skip
+FILLED_IN = {("Sensors", "own"), ("OwnAgent", "declared")}  # which no file has
 BY_PRESET = {"rate_hz", "imu", "gps", "mag", "baro", "sonar", "flow"}  # required once the preset is applied
 
 
@@ -518,8 +519,8 @@ def rows(name: str) -> Iterator[list[str]]:
     assert isinstance(infos, types.StructType)
     by_name = {f.name: f.type for f in infos.fields}
     for entry in msgspec.structs.fields(section):
-        if entry.name not in inherited and (name, entry.name) != ("Sensors", "own"):  # which a file has by name
-            yield [f"`{entry.name}`", unit(entry.name), default(name, entry), allowed(by_name[entry.name])]
+        if entry.name not in inherited and (name, entry.name) not in FILLED_IN:
+            yield [f"`{entry.encode_name}`", unit(entry.name), default(name, entry), allowed(by_name[entry.name])]
 
 
 _SENSORS = tuple(kind.settings.__name__ for kind in STOCK.values())

@@ -1,6 +1,8 @@
 """FMUs as processes in the lockstep: `zsim fmu`, with FMUs that pythonfmu3 and pythonfmu build."""
 
 import math
+import shlex
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +11,12 @@ import numpy as np
 import pytest
 from federation import ONE, Federation, Record
 from fmpy.validation import validate_fmu
+from refused import refused
 
 import zsim
 from zsim.contract import flight_messages, keys
 from zsim.contract.flight_messages import Estimate, Mode, Status, Velocity
+from zsim.errors import RunError, RunFailedError
 from zsim.record import RecordReader
 from zsim.runtime.agent import Agent, Output
 from zsim.scenario.scenario import Scenario
@@ -158,3 +162,35 @@ def test_flies_a_drone_as_a_process_with_the_bits_of_the_same_law_in_python(
     with zsim.Simulation(tmp_path / "scenario.yaml", agents=[Waypoint()], record=tmp_path / "law") as same:
         same.run()
     assert truth_sha256(tmp_path / "law") == record.sha256()
+
+
+def test_killed_and_started_again_it_goes_on_to_the_same_bits(waypoint: Path, tmp_path: Path, compiled: None) -> None:
+    words = ("fmu", str(waypoint), "--drone", "drone1", *MAP, "--takeoff", "1", "--frame", "world")
+    command = [sys.executable, "-P", "-m", "zsim_deploy.cli", *words]
+    (tmp_path / "one.yaml").write_text(ONE.replace("expect: []", "expect: [estimator.drone1]"))
+
+    def flown(kills: bool) -> zsim.Run:
+        patient = {"processes.on_death": {"fmu": "wait"}}
+        program = f"fmu.drone1={shlex.join(command)}"
+        with zsim.Federation(tmp_path / "one.yaml", 8, set=patient, programs=[program], out=tmp_path / "run") as flight:
+            flight.wait_until(4.0)
+            if kills:
+                flight.kill("fmu.drone1")
+                flight.start("fmu.drone1")
+            return flight.run()
+
+    undisturbed = flown(kills=False).truth_sha256
+    run = flown(kills=True)
+    assert run.truth_sha256 == undisturbed
+    assert [*run.events[run.events.kind == "restart"].subject] == ["fmu.drone1"]
+
+
+def test_a_process_that_is_not_there_cannot_be_killed(tmp_path: Path, compiled: None) -> None:
+    (tmp_path / "one.yaml").write_text(ONE.replace("expect: []", "expect: [estimator.drone1]"))
+    with zsim.Federation(tmp_path / "one.yaml", 2, out=tmp_path / "run") as flight:
+        flight.wait_until(0.5)
+        with refused(RunFailedError, "'estimator.drone2'", "estimator.drone1"):
+            flight.kill("estimator.drone2")
+        with refused(RunError, "'fmu.drone1'"):
+            flight.start("fmu.drone1")
+        flight.run()

@@ -18,7 +18,7 @@ from msgspec import UNSET
 
 from zsim.errors import DocumentError, NotTrustedError, RunError
 from zsim.scenario.scenario import Cluster, Gains, Scenario
-from zsim.schema import plugin
+from zsim.schema import parameters, plugin
 from zsim_agents.formation.control_law import (
     LAWS,
     ControlLaw,
@@ -64,6 +64,7 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
         space, gains = scenario_space(scenario, cluster), gains_of(cluster.gains)
         name = cluster.law or "proportional"
         law = LAWS.get(name) or plugin.load(name, "law", ControlLaw, is_constructed=True)
+        law = parameters.bound(law, cluster.law_parameters, "law_parameters")
         _rehearse(space, cluster.drones, gains, law)
         limits = EngagementLimits()
         if cluster.gains.sigma_max_m is not UNSET:

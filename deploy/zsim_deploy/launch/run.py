@@ -155,7 +155,10 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
         commands[names[-1]] = ["host", *reach, "--", *names]
     else:
         for role, _, thing in (name.partition(".") for name in names):
-            commands[f"{role}.{thing}"] = [role, *reach, "--", thing]  # a name of the contract may begin with -
+            name = f"{role}.{thing}"  # a name of the contract may begin with -
+            commands[name] = (
+                ["agent", *reach, "--", name] if role in scenario.own_agents else [role, *reach, "--", thing]
+            )
     for agent in options.agents():
         commands[agent.name] = ["agent", "--name", agent.name, *reach, "--", *agent.words()]
     if options.console:
