@@ -18,7 +18,7 @@ from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.bus import Bus
 from zsim.runtime.health import rare_collections
-from zsim.runtime.progress import PERIOD_S, HoldReasons, Screen, SlowStart
+from zsim.runtime.progress import PERIOD_S, HoldReasons, ProgressSink, SlowStart
 from zsim.runtime.rate_limit import RateLimit
 from zsim.scenario.roles import agent_names, expected_processes, lets_drop
 from zsim.scenario.scenario import Scenario
@@ -35,7 +35,7 @@ def fly(
     scenario: Scenario,
     record: Path | None,
     stop_reason: Callable[[], str | None] = lambda: None,
-    screen: Screen | None = None,
+    screen: ProgressSink | None = None,
     run_id: str | None = None,
     changed: Sequence[str] | None = None,
     own: Sequence[OwnAgent] = (),
@@ -246,7 +246,7 @@ class Caller(Agent):
 class _Progress:
     """Shows clock, events and the controllers' reasons on a screen."""
 
-    def __init__(self, scenario: Scenario, screen: Screen) -> None:
+    def __init__(self, scenario: Scenario, screen: ProgressSink) -> None:
         self._screen = screen
         self._throttle = RateLimit(PERIOD_S)
         self._reasons = HoldReasons()

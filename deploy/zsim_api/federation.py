@@ -35,7 +35,7 @@ from zsim.runtime.runner import Runner
 from zsim.scenario.roles import RECORDER, WORLD, expected_processes
 from zsim.schema.checker import show, suggestion
 from zsim.transport.connection import find_world
-from zsim.transport.session import RawSample, Session, result_of
+from zsim.transport.session import RawSample, ReceivedSample, Session, result_of
 from zsim_analysis.in_process import OwnAgent, sequence_of_agents, with_agents
 from zsim_api import run_folder
 from zsim_api.assertions import Assertions
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 PROCESS = "test.federation"
 PATIENCE_S = 300.0  # wall time; the first run on a machine compiles for one to three minutes, more on a busy one
 PROGRAM_END_S = 5.0  # wall time that programs have to see that the run is over
+HARMLESS = (signal.SIGSTOP, signal.SIGCONT)  # signals that end no process
 LAST_LINES = 40  # of a log that tells of a failure
 ENDED = re.compile(r"^(\S+)(?: \(pid \d+\))? ended: ", re.MULTILINE)  # as the launcher says of a process
 
@@ -134,6 +135,7 @@ class Federation(Assertions):
             raise
         self._watch = _Watch()
         self._known = {*expected, WORLD, RECORDER}
+        self._has_others = bool(named or options) or any(not name for name, _ in started)  # of names of their own
         self._clock: Clock | None = None
         self._pids: dict[str, int] = {}
         self._killed: dict[int, str] = {}
@@ -150,14 +152,21 @@ class Federation(Assertions):
         environment["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
         self._environment = environment
         self._programs: dict[str, Program] = {}
-        for i, (name, words) in enumerate(started):
-            label = name or f"program-{i + 1}"
-            self._programs[label] = Program(self._filled(words), environment, logs / f"{label}.log")
-        self._threads = [threading.Thread(target=self._take_part, name=PROCESS, daemon=True)]
-        for program in (self._launcher, *self._programs.values()):
-            self._threads.append(threading.Thread(target=self._await_end, args=(program,), daemon=True))
-        for thread in self._threads:
-            thread.start()
+        self._threads: list[threading.Thread] = []
+        self._follow(self._take_part)
+        self._follow(self._await_end, self._launcher)
+        for name, words in started:
+            self._start(name, words)
+
+    def _follow(self, what: Callable[..., None], *arguments: Program) -> None:
+        self._threads.append(threading.Thread(target=what, args=arguments, daemon=True))
+        self._threads[-1].start()
+
+    def _start(self, name: str, words: Sequence[str]) -> None:
+        label = name or f"program-{len(self._programs) + 1}"
+        log = self.folder / run_folder.LOGS / f"{label}.log"
+        self._programs[label] = Program(self._filled(words), self._environment, log)
+        self._follow(self._await_end, self._programs[label])
 
     def _filled(self, words: Sequence[str]) -> list[str]:
         values = {"{endpoint}": self.endpoint, "{federation}": self.name, "{folder}": str(self.folder)}
@@ -268,30 +277,30 @@ class Federation(Assertions):
         at = {} if (ahead_s := self._watch.ahead_s) is None else {"at_s": round(self.t_s + ahead_s, 9)}
         return self.ask(keys.CONTROL, "fault_add", **{**at, **fault})
 
-    def kill(self, process: str, within_s: float = PATIENCE_S) -> int:
-        """Kill a process of the run, as by kill -9; return its process id.
+    def kill(self, process: str, number: int = signal.SIGKILL, within_s: float = PATIENCE_S) -> int:
+        """Send a process of the run a signal, kill -9 by default; return its process id.
 
         Args:
-            process: name, such as "estimator.drone2", "world", or that of a program of yours that has joined.
+            process: name, such as "estimator.drone2", "world", or that of a program of yours, "ground.main".
+            number: of the signal, such as SIGSTOP, after which it does nothing until SIGCONT.
             within_s: wall time to wait for its joining.
 
         Raises:
+            RunError: nobody has that name, nor is to have it.
             RunFailedError: it has not joined.
         """
         until_s = time.monotonic() + within_s
+        self._check_name(process, within_s)
         with self._watch.news:
             while (pid := self._pids.get(process)) is None or pid in self._killed:
-                is_unknown = self.t_s > 0 and process not in self._known and process not in self._pids
-                left_s = max(0.0, until_s - time.monotonic())
-                if is_unknown or self._fault is not None or not self._watch.news.wait(left_s):
-                    known = sorted({*self._known, *self._pids} - {PROCESS})
-                    hint = suggestion(process, known)
-                    raise RunFailedError(f"kill: process is {process!r}; {hint}of the run are {', '.join(known)}")
-            self._killed[pid] = process
-            if process in self._programs:
-                self._programs[process].asked = True  # its end is no failure
+                if self._fault is not None or not self._watch.news.wait(max(0.0, until_s - time.monotonic())):
+                    raise RunFailedError(f"{self.folder.name}: {self._fault or f'{process} has not joined'}")
+            if number not in HARMLESS:
+                self._killed[pid] = process
+                if process in self._programs:
+                    self._programs[process].asked = True
         with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
+            os.kill(pid, number)
         return pid
 
     def start(self, program: str) -> None:
@@ -307,10 +316,24 @@ class Federation(Assertions):
         if former.wait(PROGRAM_END_S if former.asked else 0.0) is None:
             raise RunError(f"start: {program} runs; must have ended")
         former.close()
-        log = self.folder / run_folder.LOGS / f"{program}.log"
-        self._programs[program] = again = Program(former.words, self._environment, log)
-        self._threads.append(threading.Thread(target=self._await_end, args=(again,), daemon=True))
-        self._threads[-1].start()
+        self._start(program, former.words)
+
+    def _check_name(self, process: str, within_s: float) -> None:
+        """Raise RunError for a name that nobody has, nor is to have."""
+        if process in self._known:
+            return
+        watch = self._watch
+        with watch.news:
+            if self._has_others:  # all for whom time waits have joined by its first gate
+                watch.news.wait_for(lambda: watch.moment is not None or self._fault is not None, within_s)
+            link = self._link
+        for sample in link.get(keys.process("*", "join")) if link else ():  # those of before this test's
+            self._take_process(sample)
+        allowed = sorted({*self._known, *self._pids} - {PROCESS})
+        if process not in allowed:
+            raise RunError(
+                f"kill: process is {process!r}; {suggestion(process, allowed)}must be one of {', '.join(allowed)}"
+            )
 
     def _session(self, within_s: float) -> Session:
         until_s = time.monotonic() + within_s
@@ -437,7 +460,7 @@ class Federation(Assertions):
         with suppress(DecodeError):
             self._clock = decode(keys.CLOCK, payload)
 
-    def _take_process(self, sample: RawSample) -> None:
+    def _take_process(self, sample: RawSample | ReceivedSample) -> None:
         with suppress(DecodeError):
             message = decode(sample.key, sample.payload)
             with self._watch.news:

@@ -84,7 +84,16 @@ def test_a_class_of_a_cell_flies_here_and_as_processes(notebook: Notebook) -> No
     assert sum(each["msg_type"] == "display_data" for each in said) == 1
     assert not [each for each in said if each["msg_type"] == "error"]
     assert " 12.0 / 12 s " in shown[-2]["text/plain"]  # where the line has come to
-    notebook.run("many = zsim.run('pair.yaml', agents=[Lander], out='many', processes=True, progress=False)")
+    said = [*notebook.messages("many = zsim.run('pair.yaml', agents=[Lander], out='many', processes=True)")]
+    assert not [each for each in said if each["msg_type"] == "error"]
+    printed = "".join(each["content"]["text"] for each in said if each["msg_type"] == "stream")
+    assert "2 drones" in printed
+    assert "\x1b" not in printed
+    assert sum(each["msg_type"] == "display_data" for each in said) == 1
+    line = [each["content"]["data"]["text/plain"] for each in said if "data" in each["content"]][-1]
+    assert " 12.0 / 12 s " in line
+    notebook.run("zsim.run('pair.yaml', duration_s=1, out='quiet', processes=True, progress=False)")
+    assert notebook.run("print(chr(27) in open('quiet/logs/zsim-run.log').read())") == "False\n"
     assert notebook.run("print(many.truth_sha256 == run.truth_sha256)") == "True\n"
 
 
@@ -114,10 +123,11 @@ def test_a_mistake_is_shown_with_the_user_s_own_lines_alone(notebook: Notebook) 
         assert frames.count("----> ") == (2 if code == mistaken else 1)
 
 
-def test_an_interrupt_ends_a_flight_with_its_record_whole(notebook: Notebook) -> None:
+@pytest.mark.parametrize("processes", [False, True])
+def test_an_interrupt_ends_a_flight_with_its_record_whole(notebook: Notebook, processes: bool) -> None:
     names = []
     shown = 0
-    for said in notebook.messages("zsim.run('pair.yaml', duration_s=1e5, out='here')"):
+    for said in notebook.messages(f"zsim.run('pair.yaml', duration_s=1e5, out='here', processes={processes})"):
         shown += said["msg_type"] == "update_display_data"
         if shown == 1:  # a second one would not wait for the record
             notebook.manager.interrupt_kernel()

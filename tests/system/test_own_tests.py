@@ -1,4 +1,4 @@
-"""Tests of a user's, by the fixture `federation` of the pytest plugin: each is run by a pytest of its own."""
+"""Tests of a user's, by the fixture `federation` of the pytest plugin: run by a pytest of its own, but for refusals."""
 
 import os
 import re
@@ -8,9 +8,14 @@ from pathlib import Path
 
 import psutil
 import pytest
+import yaml
+from federation import PAIR
+from refused import refused
 from wire import PATIENCE_S
 
+from zsim.errors import RunError, RunFailedError
 from zsim.record import RecordReader
+from zsim_api.pytest_plugin import Federations
 
 HEAD = """
 PAIR = {
@@ -187,3 +192,18 @@ def test_the_plugin_loads_nothing_before_a_test_flies() -> None:
     done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, check=True)
     assert "zsim_api" in done.stdout
     assert [name for name in ("numpy", "zenoh", "zsim", "zsim_analysis", "msgspec") if f"'{name}'" in done.stdout] == []
+
+
+@pytest.mark.parametrize("program", ["ground.main=sleep 600", "sleep 600"], ids=["before time begins", "and after"])
+def test_nobody_of_an_unknown_name_is_waited_for(flights: Federations, program: str) -> None:
+    flight = flights(yaml.safe_load(PAIR), programs=[program])
+    with refused(RunError, "'estimator.drone9'", "estimator.drone1", "estimator.drone2") as raised:
+        flight.kill("estimator.drone9")
+    assert raised.type is RunError
+    if program.startswith("ground.main"):
+        with refused(RunFailedError, "ground.main"):
+            flight.kill("ground.main", within_s=0)  # it has the name, and does not join
+        with refused(RunError, "ground.main", "ended"):
+            flight.start("ground.main")
+        with refused(RunError, "'ground.other'", "ground.main"):
+            flight.start("ground.other")
