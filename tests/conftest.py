@@ -18,7 +18,9 @@ from zsim_deploy.roles.stop_channel import lower_priority
 PURE = ("tests/authority/", "tests/contract/", "tests/unit/")
 LEAST = 3  # workers of which one is quiet
 
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background of a shell; those that tests start inherit it
+if (
+    signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+):  # as in the background of a shell; those that tests start inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

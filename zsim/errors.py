@@ -5,11 +5,43 @@ import re
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import takewhile
 from pathlib import Path
+from types import TracebackType
+
+PACKAGES = frozenset({"zsim", "zsim_world", "zsim_agents", "zsim_bridges", "zsim_analysis", "zsim_api", "zsim_deploy"})
+"""Of zsim: none of these is a user's."""
 
 
 class ZsimError(Exception):
     """Base of everything that a user can cause; the command line prints it without a traceback."""
+
+    def _render_traceback_(self) -> list[str]:
+        """Return what IPython shows of it, which calls this: the way to zsim, without zsim's own, and the lines."""
+        from IPython import get_ipython  # pyright: ignore[reportPrivateImportUsage]
+
+        frames = list(takewhile(lambda each: _package(each) not in PACKAGES, _entries(self.__traceback__)))
+        while frames and _package(frames[-1]) in sys.stdlib_module_names:  # through which zsim calls itself
+            frames.pop()
+        way: TracebackType | None = None
+        for each in reversed(frames):
+            way = TracebackType(way, each.tb_frame, each.tb_lasti, each.tb_lineno)
+        chained = self.__cause__, self.__suppress_context__
+        self.__cause__ = None
+        try:
+            return get_ipython().InteractiveTB.structured_traceback(type(self), self, way)
+        finally:
+            self.__cause__, self.__suppress_context__ = chained
+
+
+def _entries(traceback: TracebackType | None) -> Iterator[TracebackType]:
+    while traceback is not None:
+        yield traceback
+        traceback = traceback.tb_next
+
+
+def _package(entry: TracebackType) -> str:
+    return entry.tb_frame.f_globals.get("__name__", "").partition(".")[0]
 
 
 class DocumentError(ZsimError):

@@ -1,13 +1,16 @@
-"""Folders that commands write into, and the record in the folder of a run.
+"""Folders that commands write into, temporary ones, and the record in the folder of a run.
 
 Files of somebody else in such a folder are not mixed with a command's own unasked. Two processes that write into one
 are kept apart by locks. Some file systems have none (Lustre, some of NFS, FUSE).
 """
 
+import os
+import shutil
 from collections.abc import Collection
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
-from tempfile import TemporaryFile
+from tempfile import TemporaryFile, gettempdir, mkdtemp
 from typing import IO, Any
 
 from zsim.errors import RunError
@@ -71,6 +74,48 @@ def refuse_others(folder: Path, own: Collection[str], force: bool, use: str) -> 
     if others and not force:
         named = ", ".join(others[:OTHERS_NAMED]) + (", …" if len(others) > OTHERS_NAMED else "")
         raise RunError(f"{folder}: holds {named}; give --out an empty folder, or --force to {use} this one")
+
+
+TEMPORARY = "zsim-temporary-"  # begins the names of folders that a process has locked while it lives
+
+
+def temporary_folder(prefix: str) -> Path:
+    """Return a new folder that is removed when this process ends, or, where it is killed, by the next that makes one.
+
+    Args:
+        prefix: with which its name begins.
+    """
+    return Path(mkdtemp(prefix=prefix, dir=_own_temporary(os.getpid())))
+
+
+@cache
+def _own_temporary(_pid: int) -> Path:
+    """Return the folder that holds those of this process; a child that was forked has one of its own."""
+    from multiprocessing.util import Finalize  # also of a process that multiprocessing has started, unlike atexit
+
+    _remove_left()
+    made = Path(mkdtemp(prefix="zsim-unlocked-"))
+    if fcntl is not None:
+        take_lock(os.open(made, os.O_RDONLY))  # which is never closed
+    folder = made.rename(made.with_name(made.name.replace("zsim-unlocked-", TEMPORARY)))
+    Finalize(None, shutil.rmtree, (folder, True), exitpriority=-100)  # once the children have ended
+    return folder
+
+
+def _remove_left() -> None:
+    """Remove temporary folders of processes that were killed: nobody holds their locks."""
+    place = Path(gettempdir())
+    if fcntl is None or no_locks(place):
+        return
+    for folder in place.glob(f"{TEMPORARY}*"):
+        with suppress(OSError):
+            if folder.lstat().st_uid == os.getuid():
+                opened = os.open(folder, os.O_RDONLY)
+                try:
+                    if take_lock(opened):
+                        shutil.rmtree(folder, ignore_errors=True)
+                finally:
+                    os.close(opened)
 
 
 RECORD = "run.mcap"  # in the folder of a run

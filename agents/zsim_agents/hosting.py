@@ -5,18 +5,21 @@ from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
 from inspect import signature
+from types import FunctionType
 from typing import Any, NamedTuple
 
 from msgspec.structs import replace
 
 from zsim.contract import keys
-from zsim.contract.messages import Info
+from zsim.contract.messages import Info, register_messages
 from zsim.errors import DocumentError, NotTrustedError, RunError, ScenarioError
 from zsim.runtime.agent import Agent, AgentGroup, default_name
 from zsim.runtime.inbox import output_hold_ns
-from zsim.scenario.roles import AGENTS, agent_names, expected_processes
+from zsim.scenario.own_classes import messages_of
+from zsim.scenario.roles import AGENTS, agent_names, agent_roles, expected_processes
 from zsim.scenario.scenario import Scenario
-from zsim.schema import plugin, yaml_file
+from zsim.schema import parameters, plugin, yaml_file
+from zsim.schema.checker import show
 
 NAMED_MAX = 10  # of the known names in a refusal
 
@@ -56,6 +59,9 @@ def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> N
     loads: list[Callable[[], Any]] = [
         partial(estimator_class, scenario.estimation.chosen(), f"{source}: estimation.algorithm")
     ]
+    if not elsewhere:
+        own = scenario.own_agents.items()
+        loads += [partial(plugin.load, each.named, f"{source}: agents.{role}.class", Agent) for role, each in own]
     for cluster in () if elsewhere else scenario.clusters:
         where = f"{source}: cluster {cluster.name!r}"
         for part, space in [(where, cluster.space), *((f"{where}, group {g.name!r}", g.space) for g in cluster.groups)]:
@@ -104,13 +110,16 @@ def check_plans(scenario: Scenario, source: str) -> None:
 def hosted(info: Info, scenario: Scenario, patterns: Sequence[str]) -> Agent:
     """Return the agents that match, of all roles, as one; RunError: none match, or the scenario cannot be flown."""
     split = [name.partition(".") for name in agents_of(scenario, patterns)]
-    by_role = {role: [thing for each, _, thing in split if each == role] for role in AGENTS}
+    by_role = {role: [thing for each, _, thing in split if each == role] for role in agent_roles(scenario)}
     members = [agent for role, names in by_role.items() if names for agent in make_agents(role, info, scenario, names)]
-    return AgentGroup(members, output_hold_ns(info))
+    return members[0] if len(members) == 1 else AgentGroup(members, output_hold_ns(info))
 
 
 def make_agents(role: str, info: Info, scenario: Scenario, names: Sequence[str]) -> list[Agent]:
     """Make the agents of one role for drones or clusters: one for all of them, if the role has joint agents."""
+    if own := scenario.own_agents.get(role):
+        kind = plugin.load_any(own.named, f"agents.{role}.class", Agent)
+        return [own_agent(kind, info, scenario, own.parameters, f"{role}.{name}", own.per) for name in names]
     agent = agent_class(role)
     try:
         if AGENTS[role].joint:
@@ -184,29 +193,42 @@ def own_agent(
     scenario: Scenario,
     settings: Mapping[str, Any] = {},
     name: str = "",
+    per: str = "run",
 ) -> Agent:
     """Return an agent of a user's that is ready to join.
 
     Args:
-        made: the agent; or a class or function that makes it of `settings`, and of `info` and `scenario` where it has
-            parameters of these names.
+        made: the agent; or a class or function that makes it of `settings`, its parameters, and of `info`, `scenario`
+            and the name of the `drone` or `cluster` that it is of, where it takes arguments of these names.
         name: of its process; empty for its own.
+        per: "drone" or "cluster" where the name is of an agent of one.
 
     Raises:
         UserCodeError: the class raised.
         RunError: the settings are not those that it takes, or what it returns is no agent.
+        DocumentError: its parameters, or its messages, are not what is allowed.
     """
     if not isinstance(made, Agent):
-        kind = f"{getattr(made, '__module__', '')}:{getattr(made, '__qualname__', type(made).__name__)}"
-        taken = signature(made)
-        given = {"info": info, "scenario": scenario}
-        given = {key: value for key, value in given.items() if key in taken.parameters} | dict(settings)
+        if not callable(made):
+            raise RunError(f"agent is {show(made)}; must be a zsim.Agent, or a class or a function that makes one")
+        kind = f"{made.__module__}:{made.__qualname__}" if isinstance(made, type | FunctionType) else show(made)
+        try:
+            taken = signature(made)
+        except ValueError as error:  # of a partial, whose arguments it does not take
+            raise RunError(f"{kind} cannot be made: {error}") from None
+        given = {"info": info, "scenario": scenario, per: name.partition(".")[2]}
+        given = {key: value for key, value in given.items() if key in taken.parameters}
+        make: Callable[..., Agent] = made
+        if parameters.has_parameters(made):
+            make = parameters.bound(made, dict(settings), kind)
+        else:
+            given |= settings
         try:
             taken.bind(**given)
         except TypeError as error:
             raise RunError(f"{kind} takes {taken}, and cannot be made: {error}") from None
         try:
-            made = made(**given)
+            made = make(**given)
         except plugin.RAISED as error:
             failure = plugin.user_code_error(error, "before the start")
             if failure is None:
@@ -214,6 +236,7 @@ def own_agent(
             raise failure from error
         if not isinstance(made, Agent):
             raise RunError(f"{kind} makes a {type(made).__name__}; must make a zsim.Agent")
+    register_messages(messages_of(type(made), plugin.full_name(type(made))))
     made.bind(info, name)
     return made
 

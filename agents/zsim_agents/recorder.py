@@ -16,9 +16,9 @@ import msgspec
 from msgspec import UNSET
 
 from zsim.contract import keys, messages, run_messages
-from zsim.contract.flight_messages import ClusterState, Command, Estimate
+from zsim.contract.flight_messages import Command
 from zsim.contract.framing import run_key_table
-from zsim.contract.run_messages import Clock, ClusterRequest
+from zsim.contract.run_messages import Clock
 from zsim.errors import DecodeError, NoWorldError, RecordError, RunError, SupersededError
 from zsim.record import Recorded, RecordReader, RecordWriter
 from zsim.record.completeness import GateCount
@@ -39,7 +39,7 @@ QUIET_S = 1.5  # a world whose time stands publishes its clock once a second
 REPLAY_S = 5.0  # a hub answers within milliseconds
 FLUSH_NS = 1_000_000_000  # simulated time after which what was taken is put on disk
 REPEATED_NS = 1_000_000_000  # simulated, after catching up, in which others may repeat what they had published before
-OUTPUTS = (Command, Estimate, ClusterState, ClusterRequest)
+OUTPUTS = (Command, *messages.RELAYED)
 KNOWN_MAX = 2_000_000  # messages remembered: 7 s of 1000 drones
 TAIL_NS = 7_000_000_000  # simulated, at the end of a record; the world's history has 5 s
 Message = tuple[str, bytes]  # key, payload

@@ -18,10 +18,11 @@ from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.bus import Bus
 from zsim.runtime.health import rare_collections
-from zsim.runtime.progress import PERIOD_S, HoldReasons, Screen, SlowStart
+from zsim.runtime.progress import PERIOD_S, HoldReasons, ProgressSink, SlowStart
 from zsim.runtime.rate_limit import RateLimit
 from zsim.scenario.roles import agent_names, expected_processes, lets_drop
 from zsim.scenario.scenario import Scenario
+from zsim.schema.checker import show
 from zsim_agents.hosting import hosted, own_agent, with_own_agents
 from zsim_world import run_state
 from zsim_world.run.world import World
@@ -34,7 +35,7 @@ def fly(
     scenario: Scenario,
     record: Path | None,
     stop_reason: Callable[[], str | None] = lambda: None,
-    screen: Screen | None = None,
+    screen: ProgressSink | None = None,
     run_id: str | None = None,
     changed: Sequence[str] | None = None,
     own: Sequence[OwnAgent] = (),
@@ -69,12 +70,24 @@ def fly(
 
 
 def with_agents(scenario: Scenario, own: Sequence[OwnAgent]) -> tuple[Scenario, list[Agent]]:
-    """Return a resolved scenario that waits for agents of a user's, and ends where one fails; and the agents."""
-    if not own:
+    """Return a resolved scenario that waits for agents of a user's, and ends where one fails; and the agents.
+
+    Raises:
+        RunError: they are not in a sequence, or one is no agent.
+        UserCodeError: the class of one raised.
+    """
+    if not sequence_of_agents(own):
         return scenario, []
     info = World(scenario).info()
     made = [own_agent(each, info, scenario) for each in own]
     return with_own_agents(scenario, [agent.name for agent in made]), made
+
+
+def sequence_of_agents(given: Any, others: str = "") -> Sequence[Any]:
+    """Return what is given for agents; RunError if it is none of `others` nor a sequence, but, say, one agent."""
+    if isinstance(given, str) or not isinstance(given, Sequence):
+        raise RunError(f"agents is {show(given)}; must be {others}a sequence of agents")
+    return given
 
 
 class FlightObserver(Protocol):
@@ -233,17 +246,19 @@ class Caller(Agent):
 class _Progress:
     """Shows clock, events and the controllers' reasons on a screen."""
 
-    def __init__(self, scenario: Scenario, screen: Screen) -> None:
+    def __init__(self, scenario: Scenario, screen: ProgressSink) -> None:
         self._screen = screen
         self._throttle = RateLimit(PERIOD_S)
         self._reasons = HoldReasons()
         states = (keys.cluster_state(cluster.name) for cluster in scenario.clusters)
         self._watched = {keys.CLOCK, keys.EVENT, *states}
         self._phase = ""
+        self._clock: run_messages.Clock | None = None  # the newest one, if it is not shown
         self._start = SlowStart(screen.say)
 
     def close(self) -> None:
         self._start.over()
+        self._show_clock()
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
         """Show nothing: it holds truth, status and sensors only."""
@@ -257,7 +272,14 @@ class _Progress:
                 self._screen.say(line)
         elif isinstance(message, run_messages.Event):
             self._screen.event({"t_s": message.t_ns / 1e9, "kind": message.kind, "text": message.text})
-        elif isinstance(message, run_messages.Clock) and self._throttle.spend():
-            self._start.over()
-            line = {"t_s": message.t_ns / 1e9, "rate": message.rate, "state": message.state, "phase": self._phase}
+        elif isinstance(message, run_messages.Clock):
+            self._clock = message
+            if self._throttle.spend():
+                self._start.over()
+                self._show_clock()
+
+    def _show_clock(self) -> None:
+        if (clock := self._clock) is not None:
+            line = {"t_s": clock.t_ns / 1e9, "rate": clock.rate, "state": clock.state, "phase": self._phase}
             self._screen.clock({**line, "waiting_for": []})
+            self._clock = None

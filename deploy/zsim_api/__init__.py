@@ -7,9 +7,11 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for editors, which do not read _WHERE
+    from zsim.contract.agent_messages import AgentMessage as AgentMessage
     from zsim.errors import ZsimError as ZsimError
     from zsim.runtime.agent import Agent as Agent
     from zsim.runtime.agent import Output as Output
+    from zsim.schema.parameters import Parameters as Parameters
     from zsim_agents.estimation.drone_estimator import DroneEstimator as DroneEstimator
     from zsim_agents.estimation.drone_estimator import StateEstimate as StateEstimate
     from zsim_agents.formation.control_law import ControlLaw as ControlLaw
@@ -41,8 +43,10 @@ if TYPE_CHECKING:  # for editors, which do not read _WHERE
     from zsim_bridges.fmu.agent import Fmu as Fmu
 
 _WHERE = {
+    "zsim.contract.agent_messages": ("AgentMessage",),
     "zsim.errors": ("ZsimError",),
     "zsim.runtime.agent": ("Agent", "Output"),
+    "zsim.schema.parameters": ("Parameters",),
     "zsim_agents.estimation.drone_estimator": ("DroneEstimator", "StateEstimate"),
     "zsim_agents.formation.control_law": ("ControlLaw",),
     "zsim_agents.formation.spaces.cluster_space": ("ClusterSpace",),

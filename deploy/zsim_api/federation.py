@@ -11,6 +11,7 @@ what it does acts at the same gate each time. The fixture `federation` of the py
 """
 
 import os
+import re
 import shlex
 import signal
 import socket
@@ -27,15 +28,15 @@ from msgspec import UNSET
 from zsim.contract import keys
 from zsim.contract.flight_messages import ClusterState, Phase, Truth
 from zsim.contract.messages import Info, decode
-from zsim.contract.run_messages import Clock, Event, holding_up
+from zsim.contract.run_messages import EVENT_KINDS, Clock, Event, Waiting, holding_up
 from zsim.errors import DecodeError, RunError, RunFailedError, ZsimError, printable
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.runner import Runner
 from zsim.scenario.roles import RECORDER, WORLD, expected_processes
-from zsim.schema.checker import suggestion
+from zsim.schema.checker import show, suggestion
 from zsim.transport.connection import find_world
-from zsim.transport.session import RawSample, Session, result_of
-from zsim_analysis.in_process import OwnAgent, with_agents
+from zsim.transport.session import RawSample, ReceivedSample, Session, result_of
+from zsim_analysis.in_process import OwnAgent, sequence_of_agents, with_agents
 from zsim_api import run_folder
 from zsim_api.assertions import Assertions
 from zsim_api.flight import LAUNCHER, calling, command_of, raise_failure
@@ -48,7 +49,9 @@ if TYPE_CHECKING:
 PROCESS = "test.federation"
 PATIENCE_S = 300.0  # wall time; the first run on a machine compiles for one to three minutes, more on a busy one
 PROGRAM_END_S = 5.0  # wall time that programs have to see that the run is over
-LAST_LINES = 10  # of each log
+HARMLESS = (signal.SIGSTOP, signal.SIGCONT)  # signals that end no process
+LAST_LINES = 40  # of a log that tells of a failure
+ENDED = re.compile(r"^(\S+)(?: \(pid \d+\))? ended: ", re.MULTILINE)  # as the launcher says of a process
 
 
 class Moment(NamedTuple):
@@ -116,7 +119,7 @@ class Federation(Assertions):
             source = scenario_of(scenario).changed(
                 seed=seed, duration_s=duration, set=set, law=law, estimator=estimator
             )
-            own = [each for each in agents if not isinstance(each, str)]
+            own = [each for each in sequence_of_agents(agents) if not isinstance(each, str)]
             named = [each for each in agents if isinstance(each, str)]
             flown, made = calling(lambda: with_agents(source.resolved, own))
             expected = [*expected_processes(flown), *(name for name, _ in started if name), PROCESS]
@@ -132,6 +135,7 @@ class Federation(Assertions):
             raise
         self._watch = _Watch()
         self._known = {*expected, WORLD, RECORDER}
+        self._has_others = bool(named or options) or any(not name for name, _ in started)  # of names of their own
         self._clock: Clock | None = None
         self._pids: dict[str, int] = {}
         self._killed: dict[int, str] = {}
@@ -146,15 +150,23 @@ class Federation(Assertions):
         environment |= {"ZSIM_CONNECT": self.endpoint, "ZSIM_FEDERATION": self.name}
         # `python` and `zsim` are those that run the test
         environment["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
+        self._environment = environment
         self._programs: dict[str, Program] = {}
-        for i, (name, words) in enumerate(started):
-            label = name or f"program-{i + 1}"
-            self._programs[label] = Program(self._filled(words), environment, logs / f"{label}.log")
-        self._threads = [threading.Thread(target=self._take_part, name=PROCESS, daemon=True)]
-        for program in (self._launcher, *self._programs.values()):
-            self._threads.append(threading.Thread(target=self._await_end, args=(program,), daemon=True))
-        for thread in self._threads:
-            thread.start()
+        self._threads: list[threading.Thread] = []
+        self._follow(self._take_part)
+        self._follow(self._await_end, self._launcher)
+        for name, words in started:
+            self._start(name, words)
+
+    def _follow(self, what: Callable[..., None], *arguments: Program) -> None:
+        self._threads.append(threading.Thread(target=what, args=arguments, daemon=True))
+        self._threads[-1].start()
+
+    def _start(self, name: str, words: Sequence[str]) -> None:
+        label = name or f"program-{len(self._programs) + 1}"
+        log = self.folder / run_folder.LOGS / f"{label}.log"
+        self._programs[label] = Program(self._filled(words), self._environment, log)
+        self._follow(self._await_end, self._programs[label])
 
     def _filled(self, words: Sequence[str]) -> list[str]:
         values = {"{endpoint}": self.endpoint, "{federation}": self.name, "{folder}": str(self.folder)}
@@ -175,14 +187,16 @@ class Federation(Assertions):
         """Let time pass until something is the case, and stand there. In realtime it goes on.
 
         Args:
-            what: a phase in which every cluster is, such as "engaged"; the kind of an event, such as "collision",
-                that has happened since the last call; a simulated time [s]; or a function of a `Moment`.
+            what: a phase in which every cluster is, such as "engaged", and is already after a `kill` if it was before;
+                the kind of an event, such as "collision" or "restart", that has happened since the last call; a
+                simulated time [s]; or a function of a `Moment`.
             within_s: wall time.
 
         Returns:
             The moment.
 
         Raises:
+            RunError: there is no such phase or kind of event.
             RunFailedError: the run has ended before, or a program has failed, or it takes longer.
             Exception: what the function has raised.
         """
@@ -263,30 +277,63 @@ class Federation(Assertions):
         at = {} if (ahead_s := self._watch.ahead_s) is None else {"at_s": round(self.t_s + ahead_s, 9)}
         return self.ask(keys.CONTROL, "fault_add", **{**at, **fault})
 
-    def kill(self, process: str, within_s: float = PATIENCE_S) -> int:
-        """Kill a process of the run, as by kill -9; return its process id.
+    def kill(self, process: str, number: int = signal.SIGKILL, within_s: float = PATIENCE_S) -> int:
+        """Send a process of the run a signal, kill -9 by default; return its process id.
 
         Args:
-            process: name, such as "estimator.drone2", "world", or that of a program of yours that has joined.
+            process: name, such as "estimator.drone2", "world", or that of a program of yours, "ground.main".
+            number: of the signal, such as SIGSTOP, after which it does nothing until SIGCONT.
             within_s: wall time to wait for its joining.
 
         Raises:
+            RunError: nobody has that name, nor is to have it.
             RunFailedError: it has not joined.
         """
         until_s = time.monotonic() + within_s
+        self._check_name(process, within_s)
         with self._watch.news:
             while (pid := self._pids.get(process)) is None or pid in self._killed:
-                is_unknown = self.t_s > 0 and process not in self._known and process not in self._pids
-                left_s = max(0.0, until_s - time.monotonic())
-                if is_unknown or self._fault is not None or not self._watch.news.wait(left_s):
-                    known = ", ".join(sorted(self._pids)) or "none"
-                    raise RunFailedError(
-                        f"kill: process is {process!r}; {suggestion(process, list(self._pids))}joined are {known}"
-                    )
-            self._killed[pid] = process
+                if self._fault is not None or not self._watch.news.wait(max(0.0, until_s - time.monotonic())):
+                    raise RunFailedError(f"{self.folder.name}: {self._fault or f'{process} has not joined'}")
+            if number not in HARMLESS:
+                self._killed[pid] = process
+                if process in self._programs:
+                    self._programs[process].asked = True
         with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
+            os.kill(pid, number)
         return pid
+
+    def start(self, program: str) -> None:
+        """Start a program of yours again that has ended or was killed, by the name that it was given.
+
+        Raises:
+            RunError: there is no such program, or it runs.
+        """
+        former = self._programs.get(program)
+        if former is None:
+            known = ", ".join(self._programs) or "there are none"
+            raise RunError(f"start: program is {program!r}; must be one of {known}")
+        if former.wait(PROGRAM_END_S if former.asked else 0.0) is None:
+            raise RunError(f"start: {program} runs; must have ended")
+        former.close()
+        self._start(program, former.words)
+
+    def _check_name(self, process: str, within_s: float) -> None:
+        """Raise RunError for a name that nobody has, nor is to have."""
+        if process in self._known:
+            return
+        watch = self._watch
+        with watch.news:
+            if self._has_others:  # all for whom time waits have joined by its first gate
+                watch.news.wait_for(lambda: watch.moment is not None or self._fault is not None, within_s)
+            link = self._link
+        for sample in link.get(keys.process("*", "join")) if link else ():  # those of before this test's
+            self._take_process(sample)
+        allowed = sorted({*self._known, *self._pids} - {PROCESS})
+        if process not in allowed:
+            raise RunError(
+                f"kill: process is {process!r}; {suggestion(process, allowed)}must be one of {', '.join(allowed)}"
+            )
 
     def _session(self, within_s: float) -> Session:
         until_s = time.monotonic() + within_s
@@ -316,27 +363,37 @@ class Federation(Assertions):
         self.close()
 
     def diagnosis(self) -> str:
-        """Return how far it has come, who waits for whom, and the last lines of every log, for people."""
-        parts = [self._standing()]
+        """Return for people how far it has come, who waits for whom, and the last lines of the logs.
+
+        First come those of processes that have failed or are waited for, then the launcher's; of the others one line.
+        """
+        clock = self._newest_clock()
+        waiting = [each for each in clock.waiting_for if each.name != PROCESS] if clock else []
+        parts = [self._standing(clock, waiting)]
         if fault := self._program_fault():
             parts.append(fault)
-        for log in sorted((self.folder / run_folder.LOGS).glob("*.log"), key=lambda each: each.stem != LAUNCHER):
-            lines = log.read_text(errors="replace").splitlines()
-            shown = lines[-(4 * LAST_LINES if log.stem == LAUNCHER else LAST_LINES) :]
-            if shown:
+        logs = {log.stem: log.read_text(errors="replace") for log in (self.folder / run_folder.LOGS).glob("*.log")}
+        failed = [name for name, program in self._programs.items() if program.code and not program.asked]
+        failed += ENDED.findall(logs.get(LAUNCHER, ""))
+        whole = [*dict.fromkeys((*failed, *(each.name for each in waiting), LAUNCHER))]
+        for name in (*whole, *sorted(logs.keys() - {*whole})):
+            lines = logs.get(name, "").splitlines()
+            shown = lines[-LAST_LINES:] if name in whole else lines[-1:]
+            if shown and name in whole:
                 before = f" (last {len(shown)} of {len(lines)} lines)" if len(shown) < len(lines) else ""
-                parts.append("\n".join([f"--- {log.name}{before}", *shown]))
+                parts.append("\n".join([f"--- {name}.log{before}", *shown]))
+            elif shown:
+                parts.append(f"--- {name}.log, the last of {len(lines)}: {shown[0]}")
         return "\n".join(parts)
 
-    def _standing(self) -> str:
-        clock = self._newest_clock()
+    def _standing(self, clock: Clock | None, waiting: Sequence[Waiting]) -> str:
         if clock is None:
             return "no clock of a world has come"
-        waiting = [each for each in clock.waiting_for if each.name != PROCESS]
         lines = []
         for each in holding_up(clock.state, waiting) or waiting:
+            on = f" on {each.host}" if each.host else ""
             held = f", held by {', '.join(each.held_by)}" if each.held_by else ""
-            lines.append(f"  {each.name} on {each.host} since {each.since_wall_s:.1f} s{held}")
+            lines.append(f"  {each.name}{on} since {each.since_wall_s:.1f} s{held}")
         if not self._watch.left and self._watch.wanted is None:
             lines.append(f"  {PROCESS}, this test, which waits for nothing at the moment")
         lines.insert(0, f"t = {clock.t_ns / 1e9:.2f} s, {clock.state}; waiting_for:{'' if lines else ' nobody'}")
@@ -403,7 +460,7 @@ class Federation(Assertions):
         with suppress(DecodeError):
             self._clock = decode(keys.CLOCK, payload)
 
-    def _take_process(self, sample: RawSample) -> None:
+    def _take_process(self, sample: RawSample | ReceivedSample) -> None:
         with suppress(DecodeError):
             message = decode(sample.key, sample.payload)
             with self._watch.news:
@@ -455,6 +512,7 @@ class _Watch(Agent):
     def begin(self, condition: Condition) -> None:
         """Let time pass until a condition; to be called with `news` held."""
         self._events = [event for event in self._events if event.t_ns >= self._now_ns]
+        self.moment = self.moment and self.moment._replace(events=())
         self.raised, self.wanted = None, condition
         self.news.notify_all()
 
@@ -495,14 +553,21 @@ def _condition(what: str | float | Condition) -> tuple[Condition, str]:
     """Return what a test waits for as a function of a moment, and as a text."""
     if callable(what):
         return what, getattr(what, "__name__", repr(what))
+    phases = get_args(Phase)
     if isinstance(what, str):
-        if what in get_args(Phase):
+        if what in phases:
 
             def in_phase(moment: Moment) -> bool:
                 return bool(moment.states) and all(state.phase == what for state in moment.states.values())
 
             return in_phase, f"the phase {what!r}"
+        if what not in EVENT_KINDS:
+            hint = suggestion(what, (*phases, *EVENT_KINDS))
+            must = f"must be a phase ({', '.join(phases)}), or a kind of event ({', '.join(EVENT_KINDS)})"
+            raise RunError(f"wait_until: is {what!r}; {hint}{must}")
         return lambda moment: any(event.kind == what for event in moment.events), f"an event of kind {what!r}"
+    if not isinstance(what, int | float):
+        raise RunError(f"wait_until: is {show(what)}; must be a phase, a kind of event, a time [s], or a function")
     return lambda moment: moment.t_s >= what, f"t = {what:g} s"
 
 

@@ -13,14 +13,14 @@ from rich.console import Console
 
 from zsim.errors import RunError, RunFailedError, UserCodeError, printable
 from zsim.output_folder import RECORD
-from zsim.runtime.progress import NotebookLine, Screen, describe
+from zsim.runtime.progress import JsonProgress, NotebookLine, ProgressSink, Screen, describe
 from zsim.scenario.scenario import Scenario as Resolved
 from zsim.schema import plugin
 from zsim_analysis.in_process import OwnAgent, fly, with_agents
 from zsim_analysis.reading.recorded_flight import read_flight
 from zsim_analysis.reading.shortfall import verdict
 from zsim_api import run_folder
-from zsim_api.programs import Program, search_path
+from zsim_api.programs import PIPE, Program, search_path
 from zsim_api.scenarios import AnyScenario, Scenario, scenario_of
 
 if TYPE_CHECKING:
@@ -76,11 +76,12 @@ def run(
     flown, made = calling(lambda: with_agents(source.resolved, agents))
     folder = run_folder.make_directory(Path(out) if out is not None else None, flown, force)
     source.keep_modules(folder)
+    screen = screen_for(flown.duration_s) if progress else None
     if processes:
-        _fly_as_processes(source, agents, [agent.name for agent in made], options, folder, progress)
+        _fly_as_processes(source, agents, [agent.name for agent in made], options, folder, screen)
     else:
         launch = run_folder.new_launch(in_process=True, changed=source.changes or ())
-        with screen_for(flown.duration_s) if progress else nullcontext() as screen, _ctrl_c() as stop_reason:
+        with screen or nullcontext(), _ctrl_c() as stop_reason:
             calling(lambda: fly_here(flown, folder, launch, made, screen, stop_reason), folder)
         if reason := stop_reason():
             raise KeyboardInterrupt(f"{reason}; zsim.load({str(folder)!r}) reads the record so far")
@@ -94,13 +95,14 @@ def fly_here(
     folder: Path,
     launch: run_folder.Launch,
     own: Sequence[OwnAgent],
-    screen: Screen | None,
+    screen: ProgressSink | None,
     stop_reason: Callable[[], str | None],
     continued: bool = False,
 ) -> str:
     """Fly a resolved scenario in this process into a run's folder; return why it ended; errors as of `fly`."""
-    run_folder.prepare(folder, scenario, launch, screen.say if screen else lambda _: None, continued)
-    ended = fly(scenario, folder / RECORD, stop_reason, screen, None, launch.changed, own)
+    with nullcontext() if continued else run_folder.left_only_if_flown(folder):
+        run_folder.prepare(folder, scenario, launch, screen.say if screen else lambda _: None, continued)
+        ended = fly(scenario, folder / RECORD, stop_reason, screen, None, launch.changed, own)
     if not stop_reason():
         run_folder.forget_launch(folder)
     return ended
@@ -115,24 +117,41 @@ def _fly_as_processes(
     names: Sequence[str],
     options: Sequence[str],
     folder: Path,
-    progress: bool,
+    screen: Screen | None,
 ) -> None:
+    """Fly as `zsim run`, which draws on a terminal itself; in a notebook, it is drawn here."""
     log = folder / run_folder.LOGS / f"{LAUNCHER}.log"
     log.parent.mkdir(exist_ok=True)
-    program = Program(*command_of(source, agents, names, options, folder), None if progress else log)
+    drawn_here = isinstance(screen, NotebookScreen)
+    words, environment = command_of(source, agents, names, options, folder)
+    words += ["--json-progress"] if drawn_here else []
+    program = Program(words, environment, PIPE if drawn_here else None if screen else log)
     try:
-        while True:
-            try:
-                code = program.wait()
-                break
-            except KeyboardInterrupt:
-                program.interrupt()
+        with screen if drawn_here else nullcontext():
+            while True:
+                try:
+                    for line in program.lines() if drawn_here else ():
+                        _show(line, screen, log)
+                    code = program.wait()
+                    break
+                except KeyboardInterrupt:
+                    program.interrupt()
     finally:
         program.close()
     if code == INTERRUPTED:
         raise KeyboardInterrupt(f"interrupted; zsim.load({str(folder)!r}) reads the record so far")
     if code:
         raise_failure(folder, code)
+
+
+def _show(line: str, screen: Screen | None, log: Path) -> None:
+    """Show a line of progress, and keep what else `zsim run` prints: how the run ended is told by the caller."""
+    kind, content = JsonProgress.read(line)
+    if kind:
+        getattr(screen, kind)(content)
+    else:
+        with log.open("a", encoding="utf-8") as file:
+            file.write(line)
 
 
 def command_of(

@@ -28,7 +28,7 @@ import cloudpickle
 import cloudpickle.cloudpickle as cloudpickle_parts
 
 from zsim import __version__
-from zsim.errors import RunError, reason_of
+from zsim.errors import PACKAGES, RunError, reason_of
 from zsim.schema import plugin
 
 PICKLED = "PICKLED"  # what holds the pickle in a module
@@ -113,7 +113,7 @@ def module_folders(names: Iterable[str]) -> list[Path]:
     folders: dict[Path, None] = {}
     for module in modules:
         path, package = getattr(module, "__file__", None) or "", module.__name__.partition(".")[0]
-        if path and package not in plugin.PACKAGES and not plugin.is_library(path):
+        if path and package not in PACKAGES and not plugin.is_library(path):
             steps = module.__name__.count(".") + (Path(path).name == "__init__.py")
             folders[Path(path).resolve().parents[steps]] = None
     return list(folders)

@@ -9,12 +9,13 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from zsim_api import keeper
 
+PIPE = subprocess.PIPE
 GRACE_S = 10.0  # wall time that a program has to end, once it is asked to; `zsim run` ends within 3 s
 KEEPER = (sys.executable, "-I", "-S", keeper.__file__)
 
@@ -25,26 +26,29 @@ class Program:
     Args:
         words: its command line.
         environment: variables that differ from those of this process.
-        output: file that takes its output; None for this process's own.
+        output: file that takes its output; None for this process's own; PIPE for `lines`.
     """
 
     def __init__(
         self,
         words: Sequence[str],
         environment: Mapping[str, str] | None = None,
-        output: Path | None = None,
+        output: Path | int | None = None,
     ) -> None:
         self.words = tuple(words)
         self.asked = False  # whether it has been asked to end from here
         self._lock = threading.Lock()
-        with open(output or os.devnull, "ab") as log:
-            goes_to = log if output else None
+        environment = {**os.environ, **(environment or {})}
+        if output is not None:
+            environment.pop("FORCE_COLOR", None)  # which a notebook's kernel sets: neither of them is a terminal
+        with open(output if isinstance(output, Path) else os.devnull, "ab") as log:
+            goes_to = log if isinstance(output, Path) else output
             self._keeper = subprocess.Popen(
                 [*KEEPER, str(GRACE_S), *words],
                 stdin=subprocess.PIPE,
                 stdout=goes_to,
-                stderr=goes_to,
-                env={**os.environ, **(environment or {})},
+                stderr=subprocess.STDOUT if goes_to == PIPE else goes_to,
+                env=environment,
                 start_new_session=True,
             )
 
@@ -52,6 +56,12 @@ class Program:
     def code(self) -> int | None:
         """Its exit code, None while it runs; 128 + N for a signal, 127 where it could not be started."""
         return self._keeper.poll()
+
+    def lines(self) -> Iterator[str]:
+        """Yield the lines of its output until there are no more; may be called again after an interrupt."""
+        assert self._keeper.stdout is not None
+        for line in self._keeper.stdout:
+            yield line.decode(errors="replace")
 
     def wait(self, timeout_s: float | None = None) -> int | None:
         """Wait for its end, and that of all that it has started; return its exit code, None if it runs still."""

@@ -60,8 +60,8 @@ def federation(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Feder
     It takes what `zsim.Federation` takes, and gives one: `wait_until`, `inject`, `kill`, `ask`, `run`,
     `assert_errors`, `assert_no_collision`, `assert_same_bits`. Each has a free port and a federation's name of its own,
     so that tests run side by side (pytest-xdist). Nothing of it outlives the test. If the test fails, the report shows
-    who waited for whom and the last lines of every log, and records and logs are kept in `runs/failed`
-    (`zsim_failed_runs`).
+    who waited for whom and the last lines of the logs, first of processes that failed or were waited for, and records
+    and logs are kept in `runs/failed` (`zsim_failed_runs`).
     """
     test = re.sub(r"[^\w.-]+", "-", request.node.nodeid.rpartition("/")[2]).strip("-")
     kept = request.config.rootpath / request.config.getini(FAILED_RUNS) / test

@@ -7,8 +7,8 @@ import json
 import shutil
 import time
 import uuid
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,10 @@ def make_directory(out: Path | None, scenario: Scenario, force: bool = False) ->
         names = [first, *(first.with_name(f"{first.name}-{i}") for i in range(2, 1000))]
         out = next(name for name in names if not name.exists())
     with file_fault(out, "cannot be made", OTHER_OUT):
+        is_new = not out.exists()
         out.mkdir(parents=True, exist_ok=True)
+        if is_new:
+            _MADE.add(out.resolve())
         if force:
             _remove_run(out)
         elif any((out / JOURNAL).glob("*.entries")):
@@ -54,6 +57,9 @@ def make_directory(out: Path | None, scenario: Scenario, force: bool = False) ->
             raise RunError(f"{out}: holds a run already; --force replaces it, or give --out another folder")
         refuse_others(out, (*LEFT, LOGS, JOURNAL), force, "fly into")
     return out
+
+
+_MADE: set[Path] = set()  # folders that were not there before
 
 
 def _remove_run(folder: Path) -> None:
@@ -78,8 +84,13 @@ def _remove_run(folder: Path) -> None:
             (folder / name).rmdir()
     if journaled:
         shutil.rmtree(journal)
-    for name in WRITTEN:
-        (folder / name).unlink(missing_ok=True)
+    for path in (*(folder / name for name in WRITTEN), *_modules(folder)):
+        path.unlink(missing_ok=True)
+
+
+def _modules(folder: Path) -> Iterator[Path]:
+    """Yield the modules that were made for a run's classes of a notebook or a script."""
+    return folder.glob(f"{plugin.MADE}*.py")
 
 
 class Launch(msgspec.Struct, frozen=True):
@@ -128,6 +139,23 @@ def forget_launch(folder: Path) -> None:
     with suppress(OSError):
         (folder / JOURNAL / LAUNCH).unlink(missing_ok=True)
         (folder / JOURNAL).rmdir()
+
+
+@contextmanager
+def left_only_if_flown(folder: Path) -> Iterator[None]:
+    """Remove what is prepared for a flight that fails before anything is recorded, and the folder if it was made."""
+    try:
+        yield
+    except BaseException:
+        if not (folder / RECORD).exists():
+            forget_launch(folder)
+            for path in (folder / SCENARIO, *_modules(folder)):
+                with suppress(OSError):
+                    path.unlink()
+            with suppress(OSError):  # it holds something else
+                if folder.resolve() in _MADE:
+                    folder.rmdir()
+        raise
 
 
 def launch_of(folder: Path) -> Launch:

@@ -3,7 +3,6 @@
 import copy
 import json
 import shutil
-import tempfile
 from collections.abc import Mapping
 from functools import cache, cached_property
 from inspect import Parameter, Signature
@@ -13,6 +12,7 @@ from typing import Any, Self, get_type_hints
 import numpy as np
 
 from zsim.errors import ScenarioError
+from zsim.output_folder import temporary_folder
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario as Resolved
 from zsim.schema import plugin, yaml_file
@@ -199,8 +199,4 @@ def scenario_of(given: AnyScenario) -> Scenario:
 @cache
 def scratch_folder() -> Path:
     """Return the folder, until this process ends, of the modules of notebook classes that no run's folder has yet."""
-    _SCRATCH.append(tempfile.TemporaryDirectory(prefix="zsim-", ignore_cleanup_errors=True))
-    return Path(_SCRATCH[0].name)
-
-
-_SCRATCH: list[tempfile.TemporaryDirectory[str]] = []
+    return temporary_folder("modules-")

@@ -30,7 +30,7 @@ from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent
 from zsim.schema.checker import suggestion
 from zsim.sensors.sensor import Sample
-from zsim_analysis.in_process import CALLER, FlightObserver, InProcessFlight, OwnAgent, with_agents
+from zsim_analysis.in_process import CALLER, FlightObserver, InProcessFlight, OwnAgent, sequence_of_agents, with_agents
 from zsim_api.commands import Command
 from zsim_api.flight import calling
 from zsim_api.scenarios import AnyScenario, scenario_of
@@ -116,9 +116,8 @@ class Simulation:
         self.source = scenario_of(scenario).changed(
             seed=seed, duration_s=duration_s, set=set, law=law, estimator=estimator
         )
-        if isinstance(agents, str) and agents != "stock":
-            raise RunError(f"agents is {agents!r}; must be 'stock', None, or a sequence of agents")
-        self._own: Sequence[OwnAgent] = () if agents is None or isinstance(agents, str) else tuple(agents)
+        given = () if agents is None or agents == "stock" else sequence_of_agents(agents, "'stock', None, or ")
+        self._own: Sequence[OwnAgent] = tuple(given)
         self._stock = stock and agents is not None
         self._pristine = {i: _copied(each) for i, each in enumerate(self._own) if isinstance(each, Agent)}
         self._folder, self._writer = folder, None

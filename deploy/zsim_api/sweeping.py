@@ -1,11 +1,9 @@
 """Flies a scenario many times, with other seeds and other values of its fields: `zsim.sweep` and `zsim sweep`."""
 
-import atexit
 import json
 import re
-import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -16,12 +14,13 @@ import numpy as np
 from rich.console import Console
 
 from zsim.errors import RunError, ScenarioError, what_is_missing
+from zsim.output_folder import temporary_folder
 from zsim.runtime.progress import cell
 from zsim.scenario.scenario_file import whole_path
 from zsim.schema import plugin
 from zsim.schema.checker import show
 from zsim_analysis.reading.recorded_flight import RecordedFlight
-from zsim_analysis.sweep.design import METRICS, SweepDesign, SweepPlan, make_plan
+from zsim_analysis.sweep.design import METRICS, SweepDesign, SweepPlan, distinct, make_plan, text_of
 from zsim_analysis.sweep.sweep import TABLE, SweepFolder, SweepRequest, read_table
 from zsim_analysis.sweep.sweep import sweep as swept
 from zsim_analysis.sweep.sweep_run import FIXED, Row, made_modules
@@ -83,8 +82,10 @@ def sweep(
         progress: whether progress is shown.
 
     Returns:
-        frame by number of the run: `seed`, the values by path, `failure` (why the run did not end well, else None),
-        `metrics.NAME`, errors, and the other columns of docs/sweep.md. `attrs["folder"]` is the folder of the sweep,
+        frame by number of the run: `seed`, the values by path, `failure` (why the run did not end well, else NaN),
+        `metrics.NAME`, errors, and the other columns of docs/sweep.md. Texts and numbers that are missing are NaN,
+        flags NA. A class is there by its name, a further one of the same name as `Law-2`. `attrs["folder"]` is the
+        folder of the sweep,
         `attrs["summary"]` what `zsim report` writes as summary.json: means and intervals of each combination.
 
     Raises:
@@ -92,7 +93,7 @@ def sweep(
         RunError: the folder holds something else; workers cannot start; pandas is not installed.
     """
     with what_is_missing():
-        import pandas as pd
+        pass  # before anything is flown
     console = Console(stderr=True, quiet=not progress)
     varied = scenario_of(scenario).changed(seed, duration_s, set, law, estimator)
     functions = [metrics] if callable(metrics) or isinstance(metrics, str) else list(metrics)
@@ -104,23 +105,20 @@ def sweep(
         plan = planned(varied.source, varied.document(), texts, runs, keep_records, varied.changes, console)
     except ScenarioError as error:
         raise ScenarioError([_in_python(fault) for fault in error.faults]) from None
-    folder = Path(out) if out is not None else Path(tempfile.mkdtemp(prefix="zsim-sweep-"))
+    folder = Path(out) if out is not None else temporary_folder("sweep-")
     modules = made_modules(_names(plan), [scratch_folder()])
     try:
         rows = flown(plan, folder, workers, client, console=console, modules=tuple(modules))
     except KeyboardInterrupt:
         finished = len(SweepFolder(folder, plan).rows())
-        text = f"interrupted: {finished} of {plan.runs} runs are finished; out={str(folder)!r} goes on"
+        kept = folder if out is not None else folder.replace(tempfile.mkdtemp(prefix="zsim-sweep-"))
+        text = f"interrupted: {finished} of {plan.runs} runs are finished; out={str(kept)!r} goes on"
         console.print(cell(text), soft_wrap=True)
         raise
     except RunError as error:
         raise RunError(_in_python(str(error))) from None
-    if out is None:
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
     design = SweepDesign(plan)
-    frame = pd.DataFrame(read_table(folder / TABLE)).set_index("run")
-    figures = [column for column in frame if column not in (*FIXED, *design.varied)]
-    frame = frame.astype(dict.fromkeys(figures, float))
+    frame = _frame(read_table(folder / TABLE), design.varied)
     for path, values in vary.items():
         if labels := _labels(values, varied):
             column = whole_path(path, plan.document)
@@ -171,11 +169,29 @@ def _text(path: str, values: Any, scenario: Scenario) -> str:
         raise ScenarioError([f"vary {path}: {error}; must be values as in YAML, or classes"]) from error
 
 
+_DTYPES: dict[Any, Any] = {str: str, str | None: str, bool | None: "boolean", int | None: float, float | None: float}
+
+
+def _frame(rows: Sequence[Row], varied: Collection[str]) -> "pd.DataFrame":
+    """Return a frame of rows by their number; a text or a number that is missing is NaN, a flag NA."""
+    import pandas as pd
+
+    columns: dict[str, pd.Series] = {}
+    for name in rows[0]:
+        dtype = None if name in varied else _DTYPES.get(FIXED.get(name, float | None))
+        values = [row[name] for row in rows]
+        # of None, some versions of pandas make a text
+        columns[name] = pd.Series([np.nan if v is None else v for v in values] if dtype is str else values, dtype=dtype)
+    return pd.DataFrame(columns).set_index("run")
+
+
 def _labels(values: Any, scenario: Scenario) -> dict[str, str]:
     """Return the names of classes and functions among values, by those that the scenario has for them."""
-    given = [] if isinstance(values, str) else [value for value in values if callable(value)]
-    labels = {scenario.named(value): value.__name__ for value in given if hasattr(value, "__name__")}
-    return labels if len({*labels.values()}) == len(given) else {}
+    given = [] if isinstance(values, str) else [*values]
+    texts = [text_of(scenario.named(value)) for value in given]
+    made = {place: value.__name__ for place, value in enumerate(given) if hasattr(value, "__name__")}
+    labels = distinct(texts, made)
+    return {texts[place]: labels[place] for place in made}
 
 
 def _names(plan: SweepPlan) -> list[str]:

@@ -306,6 +306,8 @@ def processes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (
             return planned(name, host, (WORLD, "--listen", listen, "--expect", RECORDER, *pace), None, inventory.port)
         reach = ("--connect", endpoint(placed, places, host), "--federation", scenario.federation)
         words = (COMMANDS.get(role, role), *reach)
+        if role in scenario.own_agents:
+            return planned(name, host, ("agent", *reach), name, None)
         if role in OF_CAMERAS:
             words = (*words, "--name", name)
             thing = thing if thing in {drone.name for drone in scenario.drones} else ""  # none: of all with cameras

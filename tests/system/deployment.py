@@ -33,8 +33,10 @@ GONE_S = 120.0  # wall time within which nobody may be left on any host after it
 class Deployment:
     """One lab with certificates, and the `zsim` commands that run in its launcher's namespace."""
 
-    def __init__(self, lab: Lab, roles: dict[str, Any], secure: bool = True, **more: Any) -> None:
-        self.lab = lab
+    def __init__(
+        self, lab: Lab, roles: dict[str, Any], secure: bool = True, scenario: Path = STEP, **more: Any
+    ) -> None:
+        self.lab, self.scenario = lab, scenario
         self.out = lab.folder / "out"
         self.hosts = str(lab.inventory(roles, insecure=not secure, **more))
         self._env = {"TMPDIR": str(lab.folder), "XDG_RUNTIME_DIR": str(lab.folder)}
@@ -42,7 +44,7 @@ class Deployment:
         self._roles: list[Role] = []
         self._stack = ExitStack()
         if secure:
-            self.here("certs", "init", self.hosts, "--scenario", str(STEP))
+            self.here("certs", "init", self.hosts, "--scenario", str(scenario))
 
     def zsim(self, *arguments: str, prefix: tuple[str, ...] = ()) -> Role:
         """Start a command where the launcher is."""
@@ -62,7 +64,7 @@ class Deployment:
     def up(self, *options: str, prefix: tuple[str, ...] = ()) -> Role:
         """Start a run."""
         where = ["--hosts", self.hosts, "--out", str(self.out)]
-        return self.zsim("up", str(STEP), *where, "--no-report", *options, prefix=prefix)
+        return self.zsim("up", str(self.scenario), *where, "--no-report", *options, prefix=prefix)
 
     def cut(self, name: str) -> float:
         """Cut a host off; return the wall time."""

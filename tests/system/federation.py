@@ -213,7 +213,7 @@ class Federation:
         role = "record" if role == "recorder" else role
         for pid, command in self._processes():
             named = command[3:5] == ["zsim_deploy.cli", role] and (not thing or thing in command[5:])
-            hosted = command[3:5] == ["zsim_deploy.cli", "host"] and name == command[-1]
+            hosted = command[3:5] in (["zsim_deploy.cli", "host"], ["zsim_deploy.cli", "agent"]) and name == command[-1]
             if (named or hosted) and "--launched" in command:
                 return pid
         return pytest.fail(f"{name} does not run")

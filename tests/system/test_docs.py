@@ -45,6 +45,7 @@ from forked_commands import run_here
 from msgspec import inspect as types
 
 from zsim.contract import messages
+from zsim.contract.run_messages import EVENT_KINDS
 from zsim.scenario import scenario, scenario_file
 from zsim.schema import quantities
 from zsim.sensors.camera import CAMERAS, BottomCamera, FrontCamera, Hats, SightingModel
@@ -250,7 +251,7 @@ class Checkout:
             log = self._folder / f"terminal-{len(self._terminals)}-{time.monotonic_ns()}.log"
             with log.open("w") as out:
                 process = subprocess.Popen(
-                    ["bash", "-c", f"exec {text}"],
+                    ["bash", "-c", f"exec env {text}"],
                     cwd=self._folder,
                     env=self._environment,
                     stdin=subprocess.DEVNULL,
@@ -484,6 +485,7 @@ OWN_UNITS = {
     "noise": "channel's", "density": "channel's/√Hz", "bias": "channel's", "bias_walk": "channel's/√s",
     "bias_instability": "channel's", "quantum": "channel's", "madgwick_beta": "rad/s", "values": "m, rad", "target": "m, rad",
 }  # fmt: skip
+FILLED_IN = {("Sensors", "own"), ("OwnAgent", "declared")}  # which no file has
 BY_PRESET = {"rate_hz", "imu", "gps", "mag", "baro", "sonar", "flow"}  # required once the preset is applied
 
 
@@ -517,8 +519,8 @@ def rows(name: str) -> Iterator[list[str]]:
     assert isinstance(infos, types.StructType)
     by_name = {f.name: f.type for f in infos.fields}
     for entry in msgspec.structs.fields(section):
-        if entry.name not in inherited and (name, entry.name) != ("Sensors", "own"):  # which a file has by name
-            yield [f"`{entry.name}`", unit(entry.name), default(name, entry), allowed(by_name[entry.name])]
+        if entry.name not in inherited and (name, entry.name) not in FILLED_IN:
+            yield [f"`{entry.encode_name}`", unit(entry.name), default(name, entry), allowed(by_name[entry.name])]
 
 
 _SENSORS = tuple(kind.settings.__name__ for kind in STOCK.values())
@@ -656,13 +658,12 @@ def test_the_protocol_names_every_message_its_fields_and_a_writer() -> None:
 
 def test_the_protocol_names_every_event() -> None:
     code = "".join(path.read_text() for path in sorted((ROOT / "world/zsim_world").rglob("*.py")))
-    kinds = set(re.findall(r"\b(?:event|notice|Incident)\((?:i, )?\s*\"(\w+)\"", code)) | {
-        "join",
-        "restart",
-        "superseded",
-    }
-    text = (ROOT / "docs/protocol.md").read_text()
-    assert sorted(kind for kind in kinds if f"`{kind}`" not in text) == []
+    kinds = set(re.findall(r"\b(?:event|notice|Incident)\((?:i, )?\s*\"(\w+)\"", code))
+    assert kinds <= {*EVENT_KINDS}
+    assert [kind for kind in EVENT_KINDS if f'"{kind}' not in code] == []
+    section = (ROOT / "docs/protocol.md").read_text().partition("\n## Events\n")[2].partition("Endless repetitions")[0]
+    rows = [line.split("|")[1] for line in section.splitlines() if line.startswith("| `")]
+    assert sorted(kind for row in rows for kind in re.findall(r"`(\w+)`", row)) == sorted(EVENT_KINDS)
 
 
 # Links, files and names

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from federation import ONE, Federation, Record
 from fmpy.validation import validate_fmu
+from refused import has_terms
 
 import zsim
 from zsim.contract import flight_messages, keys
@@ -19,6 +20,7 @@ from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import robot_rates
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_agents.formation.spaces.triad_cluster import TriadCluster
+from zsim_api.pytest_plugin import Federations
 
 GOAL = (2.0, 1.0, 3.0)
 SCENARIO = ONE.replace("expect: []", "expect: [estimator.drone1, fmu.drone1]")
@@ -158,3 +160,70 @@ def test_flies_a_drone_as_a_process_with_the_bits_of_the_same_law_in_python(
     with zsim.Simulation(tmp_path / "scenario.yaml", agents=[Waypoint()], record=tmp_path / "law") as same:
         same.run()
     assert truth_sha256(tmp_path / "law") == record.sha256()
+
+
+# Deaths
+
+DUO = {
+    "name": "duo",
+    "seed": 3,
+    "duration_s": 6,
+    "sensors": {"preset": "paper"},
+    "environment": {"wind": {"gust_m_s": 0.3}},
+    "drones": [{"name": f"drone{number}", "position_m": [4 * number, 0, 0]} for number in (2, 3)],
+    "processes": {"on_death": {"fmu": "wait", "fmu.drone2": "restart"}},
+}
+COUNTED_VARIABLES = """
+variable("x", 0.0, I)
+variable("steps", 0, O, Whole)
+variable("vx", 0.0, O)
+"""
+COUNTED_LAW = """
+self.steps += 1
+self.vx = 0.001 * self.steps + 0.1 * (8.0 - self.x)
+"""
+KILLED_S = 4.5  # of 6: both are in the air, the last snapshots are of 4 s
+PLACES = {"x": "estimate.position_m.0", "vx": "velocity_m_s.0"}
+
+
+def command(path: Path, drone: str) -> str:
+    places = " ".join(f"--map {name}={place}" for name, place in PLACES.items())
+    return f"fmu.{drone}=zsim fmu {path} --drone {drone} {places} --takeoff 0.5 --frame world"
+
+
+def test_those_that_are_killed_and_started_again_fly_the_bits_of_the_undisturbed_flight(
+    flights: Federations, tmp_path: Path
+) -> None:
+    """What they do depends on how many steps they have made; `zsim run` starts one again, the test the other."""
+    made = [
+        zsim.Fmu(
+            fmus.build(tmp_path, f"Counted{version}", version, COUNTED_VARIABLES, COUNTED_LAW),
+            f"drone{version}",
+            PLACES,
+            takeoff_s=0.5,
+            frame="world",
+        )
+        for version in (2, 3)
+    ]
+    flight = flights(DUO, agents=made[:1], programs=[command(made[1].path, "drone3")])
+    flight.wait_until(KILLED_S)
+    flight.kill("fmu.drone2")
+    flight.kill("fmu.drone3")
+    flight.start("fmu.drone3")
+    flight.assert_same_bits(zsim.run(DUO, agents=made, out=tmp_path / "alone", progress=False))
+    for drone in ("drone2", "drone3"):
+        log = (flight.folder / "logs" / f"fmu.{drone}.log").read_text()
+        assert has_terms(log, f"fmu.{drone}:", "4.00", "s")  # of its snapshot
+
+
+def test_one_that_cannot_give_its_state_says_so_and_begins_afresh(flights: Federations, tmp_path: Path) -> None:
+    path = fmus.build(tmp_path, "Forgetful", 3, COUNTED_VARIABLES, COUNTED_LAW.replace("0.1 *", "0 *"), restores=False)
+    flight = flights(DUO, duration=5, programs=[command(path, "drone3")])
+    flight.wait_until(KILLED_S)
+    flight.kill("fmu.drone3")
+    flight.start("fmu.drone3")
+    v_m_s = np.array(flight.run().commands("drone3")["velocity_m_s_x"])
+    assert v_m_s.max() == pytest.approx(0.05 * KILLED_S, abs=0.003)
+    assert v_m_s[-1] == pytest.approx(0.05 * (5 - KILLED_S), abs=0.003)
+    said = (flight.folder / "logs/fmu.drone3.log").read_text().splitlines()
+    assert sum(has_terms(line, "fmu.drone3:", "Forgetful.fmu") for line in said) == 2

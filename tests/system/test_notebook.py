@@ -1,6 +1,7 @@
 """In a notebook: classes of a cell fly, progress is one line below the cell, and an interrupt keeps the record."""
 
 import queue
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from textwrap import dedent
@@ -82,7 +83,17 @@ def test_a_class_of_a_cell_flies_here_and_as_processes(notebook: Notebook) -> No
     assert "<table>" in shown[-1]["text/html"]
     assert sum(each["msg_type"] == "display_data" for each in said) == 1
     assert not [each for each in said if each["msg_type"] == "error"]
-    notebook.run("many = zsim.run('pair.yaml', agents=[Lander], out='many', processes=True, progress=False)")
+    assert " 12.0 / 12 s " in shown[-2]["text/plain"]  # where the line has come to
+    said = [*notebook.messages("many = zsim.run('pair.yaml', agents=[Lander], out='many', processes=True)")]
+    assert not [each for each in said if each["msg_type"] == "error"]
+    printed = "".join(each["content"]["text"] for each in said if each["msg_type"] == "stream")
+    assert "2 drones" in printed
+    assert "\x1b" not in printed
+    assert sum(each["msg_type"] == "display_data" for each in said) == 1
+    line = [each["content"]["data"]["text/plain"] for each in said if "data" in each["content"]][-1]
+    assert " 12.0 / 12 s " in line
+    notebook.run("zsim.run('pair.yaml', duration_s=1, out='quiet', processes=True, progress=False)")
+    assert notebook.run("print(chr(27) in open('quiet/logs/zsim-run.log').read())") == "False\n"
     assert notebook.run("print(many.truth_sha256 == run.truth_sha256)") == "True\n"
 
 
@@ -96,11 +107,31 @@ def test_what_a_cell_does_wrong_is_shown_with_its_line(notebook: Notebook) -> No
     assert notebook.run("print(zsim.load('here').duration_s >= 6)") == "True\n"
 
 
-def test_an_interrupt_ends_a_flight_with_its_record_whole(notebook: Notebook) -> None:
+def test_a_mistake_is_shown_with_the_user_s_own_lines_alone(notebook: Notebook) -> None:
+    mistaken = """
+        def flown():
+            return zsim.Scenario.load('pair.yaml').with_(seed=-1).resolved
+
+        flown()
+    """
+    for code, line in ((mistaken, "seed"), ("zsim.sweep('none.yaml')", "none.yaml"), ("zsim.load('none')", "none")):
+        (error,) = [said["content"] for said in notebook.messages(code) if said["msg_type"] == "error"]
+        frames = re.sub(r"\x1b\[[\d;]*m", "", "\n".join(error["traceback"]))
+        assert re.findall(r"^(?:Cell|File) .*$", frames, re.MULTILINE)[0].startswith("Cell In[")
+        assert ".py" not in frames
+        assert line in frames.splitlines()[-1]
+        assert frames.count("----> ") == (2 if code == mistaken else 1)
+
+
+@pytest.mark.parametrize("processes", [False, True])
+def test_an_interrupt_ends_a_flight_with_its_record_whole(notebook: Notebook, processes: bool) -> None:
     names = []
-    for said in notebook.messages("zsim.run('pair.yaml', duration_s=1e5, out='here')"):
-        if said["msg_type"] == "update_display_data":
+    shown = 0
+    for said in notebook.messages(f"zsim.run('pair.yaml', duration_s=1e5, out='here', processes={processes})"):
+        shown += said["msg_type"] == "update_display_data"
+        if shown == 1:  # a second one would not wait for the record
             notebook.manager.interrupt_kernel()
+            shown += 1
         if said["msg_type"] == "error":
             names.append(said["content"]["ename"])
     assert names == ["KeyboardInterrupt"]

@@ -1,14 +1,18 @@
-"""Sensors, a vehicle, an estimator, a space and a law of the user's own, flown together by `zsim up` on several hosts."""
+"""What is a user's own, flown by `zsim up` on several hosts: sensors, vehicle, estimator, space and law; agents."""
 
 import shutil
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+import yaml
 from deployment import ROLES, START_S, STEP, Deployment, closing
 from federation import Record
 from forked_commands import ROOT
 from lab import Lab
 
+import zsim
 from zsim.record import RecordReader
 from zsim.scenario import scenario_file
 from zsim_analysis.in_process import fly
@@ -50,3 +54,82 @@ def test_they_fly_as_in_one_process(lab: Lab, tmp_path: Path, monkeypatch: pytes
             columns = [[{**message, "source": ""} for message in each.all(key)] for each in (record, one)]
             assert columns[0] == columns[1] != [], key
         assert record.sha256() == one.sha256()
+
+
+@pytest.mark.soak
+def test_drones_that_talk_to_each_other_fly_as_in_one_process(
+    lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    monkeypatch.setenv("PYTHONPATH", str(EXAMPLES))
+    for host in lab.names:
+        lab.environment(host, PYTHONPATH=str(EXAMPLES))
+    pentagon, alone = EXAMPLES / "swarm.yaml", tmp_path / "alone.mcap"
+    fly(scenario_file.load(pentagon, duration_s=DURATION_S), alone)
+    spread = {"world": "h1", "estimator.*": ["h1", "h2", "h3"], "pilot.*": ["h2", "h3", "h1"]}
+    with closing(Deployment(lab, spread, scenario=pentagon)) as deployment, RecordReader(alone) as reader:
+        deployment.up("--duration", str(DURATION_S)).ends(with_code=0, within_s=START_S)
+        record = deployment.record()
+        assert record.sha256() == Record(reader).sha256()
+        assert len(record.all("swarm/drone1/position")) == DURATION_S / 0.02 + 1
+
+
+POLICY = """
+from pathlib import Path
+
+import numpy as np
+import zsim
+
+
+class Trained(zsim.PolicyAgent):
+    observe, action, step_s = "estimate", "velocity", 0.1
+    weights = np.load(Path(__file__).with_name("weights.npy"))
+
+    def policy(self, observations):
+        return {drone: np.tanh(self.weights @ [seen[2] - 2.0, seen[5]]) for drone, seen in observations.items()}
+"""
+
+
+@pytest.mark.soak
+def test_a_trained_policy_flies_on_hosts_with_the_bits_of_its_environment(
+    lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is trained by random search: of some linear policies the one that holds the drones nearest to 2 m."""
+    modules, rng = tmp_path / "modules", np.random.default_rng(1)
+    modules.mkdir()
+    monkeypatch.syspath_prepend(str(modules))
+    monkeypatch.setenv("PYTHONPATH", str(modules))
+    for host in lab.names:
+        lab.environment(host, PYTHONPATH=str(modules))
+    drones = [{"name": f"drone{i}", "position_m": [0.0, 10.0 * i - 10.0, 0.0]} for i in range(3)]
+    pair: dict[str, Any] = {"name": "three", "duration_s": DURATION_S, "drones": drones}
+    (tmp_path / "three.yaml").write_text(yaml.safe_dump(pair))
+    env = zsim.parallel_env(
+        tmp_path / "three.yaml",
+        reward=lambda sim, drone: -abs(sim.truth.position_m[sim.names.index(drone), 2] - 2.0),
+        observe="estimate",
+        action="velocity",
+        step_s=0.1,
+    )
+
+    def episode(weights: Any) -> float:
+        seen, _ = env.reset(seed=5)
+        total = 0.0
+        while env.agents:
+            actions = {drone: np.tanh(weights @ [each[2] - 2.0, each[5]]) for drone, each in seen.items()}
+            seen, rewards, *_ = env.step(actions)
+            total += sum(rewards.values())
+        return total
+
+    up = np.array([0.0, 0.0, 1.0, 0.0])  # of an action
+    tried = [np.outer(up, -rng.uniform(0.0, 1.0, 2)) for _ in range(4)]
+    best = max(tried, key=episode)
+    np.save(modules / "weights.npy", best)
+    (modules / "trained.py").write_text(POLICY)
+    episode(best)
+    pair["agents"] = {"policy": {"class": "trained:Trained", "per": "run"}}
+    (tmp_path / "flown.yaml").write_text(yaml.safe_dump({**pair, "seed": env.sim.source.resolved.seed}))
+    spread = {"world": "h1", "estimator.*": ["h1", "h2"], "policy.main": "h3"}
+    with closing(Deployment(lab, spread, scenario=tmp_path / "flown.yaml")) as deployment:
+        deployment.up().ends(with_code=0, within_s=START_S)
+        assert deployment.record().sha256() == env.sim.truth_sha256

@@ -1,4 +1,4 @@
-"""Tests of a user's, by the fixture `federation` of the pytest plugin: each is run by a pytest of its own."""
+"""Tests of a user's, by the fixture `federation` of the pytest plugin: run by a pytest of its own, but for refusals."""
 
 import os
 import re
@@ -8,9 +8,14 @@ from pathlib import Path
 
 import psutil
 import pytest
+import yaml
+from federation import PAIR
+from refused import refused
 from wire import PATIENCE_S
 
+from zsim.errors import RunError, RunFailedError
 from zsim.record import RecordReader
+from zsim_api.pytest_plugin import Federations
 
 HEAD = """
 PAIR = {
@@ -26,15 +31,27 @@ PAIR = {
 }
 """
 PASSING = """
+import pytest
+from zsim.errors import RunError
+
 def test_gps_dropout_and_a_kill(federation):
     def flown():
         flight = federation(PAIR)
+        for mistyped in ("engagd", "restarts", None):
+            with pytest.raises(RunError) as refused:
+                flight.wait_until(mistyped)
+            assert mistyped is None or f"did you mean {mistyped.replace('gd', 'ged').removesuffix('s')}?" in str(refused.value)
+        assert flight.t_s == 0
         flight.wait_until("engaged")
         at_s = flight.t_s
         flight.inject({"kind": "gps_dropout", "target": "drone2", "for_s": 1})
         flight.kill("estimator.drone2")
-        kinds = [event.kind for event in flight.wait_until("restart").events]
-        assert {"fault", "death", "restart"} <= {*kinds}
+        assert flight.wait_until("engaged").t_s == at_s  # as it was before
+        now = flight.wait_until(lambda now: ("restart", "estimator.drone2") in [(e.kind, e.subject) for e in now.events])
+        assert {"fault", "death", "restart"} <= {event.kind for event in now.events}
+        flight.kill("controller.main")
+        again = flight.wait_until("restart")  # not the former one
+        assert {event.subject for event in again.events if event.kind == "restart"} == {"controller.main"}
         flight.assert_no_collision()
         flight.assert_errors(z_c=0.1, window=(8, 12))
         return flight, at_s
@@ -106,10 +123,15 @@ def test_a_failing_test_says_who_waits_and_keeps_the_record(compiled: None, tmp_
     process = pytest_run(tmp_path, FAILING)
     output = output_of(process)
     assert process.returncode == 1, output
-    assert re.search(r"t = 0.00 s, waiting; waiting_for:\n +ground.main on ", output), output
-    for log in ("zsim-run.log", "estimator.drone1.log", "controller.main.log", "ground.main.log"):
-        assert f"--- {log}" in output
-    assert re.search("here on tcp/127.0.0.1:[0-9]+\n", output)
+    assert re.search(r"t = 0.00 s, waiting; waiting_for:\n +ground.main ", output), output
+    logs = re.findall(r"^--- (\S+).log(.*)", output, re.MULTILINE)
+    names = [name for name, _ in logs]
+    launcher = names.index("zsim-run")
+    first, others = {*names[:launcher]}, {*names[launcher + 1 :]}
+    assert {"estimator.drone2", "ground.main"} <= first  # it was killed, it is waited for
+    assert first | others == {"controller.main", "estimator.drone1", "estimator.drone2", "ground.main", "recorder"}
+    assert [bool(rest) for _, rest in logs] == [place > launcher for place in range(len(logs))]  # one line is all
+    assert re.search("--- ground.main.log\nhere on tcp/127.0.0.1:[0-9]+\n", output)
     kept = tmp_path / "runs/failed/test_mine.py-test_of_a_program_that_hangs/run1"
     assert f"kept in {kept}" in output
     assert (kept / "logs/ground.main.log").exists()
@@ -170,3 +192,18 @@ def test_the_plugin_loads_nothing_before_a_test_flies() -> None:
     done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, check=True)
     assert "zsim_api" in done.stdout
     assert [name for name in ("numpy", "zenoh", "zsim", "zsim_analysis", "msgspec") if f"'{name}'" in done.stdout] == []
+
+
+@pytest.mark.parametrize("program", ["ground.main=sleep 600", "sleep 600"], ids=["before time begins", "and after"])
+def test_nobody_of_an_unknown_name_is_waited_for(flights: Federations, program: str) -> None:
+    flight = flights(yaml.safe_load(PAIR), programs=[program])
+    with refused(RunError, "'estimator.drone9'", "estimator.drone1", "estimator.drone2") as raised:
+        flight.kill("estimator.drone9")
+    assert raised.type is RunError
+    if program.startswith("ground.main"):
+        with refused(RunFailedError, "ground.main"):
+            flight.kill("ground.main", within_s=0)  # it has the name, and does not join
+        with refused(RunError, "ground.main", "ended"):
+            flight.start("ground.main")
+        with refused(RunError, "'ground.other'", "ground.main"):
+            flight.start("ground.other")

@@ -24,7 +24,7 @@ from zsim_world.server import world_process
 
 STANDING_NS = 100_000_000  # instead of a second
 FILES_MAX = 256  # more than a launcher has open before it starts a role
-RENEW_STREAMS = forkserver.renew_streams
+RENEW_STREAMS, RUN_ROLE = forkserver.renew_streams, forkserver._run_role
 
 
 class ForkedServer:
@@ -79,7 +79,18 @@ def end_with_parent() -> None:
     RENEW_STREAMS()
 
 
+def run_role(arguments: list[str], files: list[int]) -> NoReturn:
+    """Run a role with the variables that stand before its arguments, NAME=VALUE each."""
+    while "=" in arguments[0]:
+        name, _, value = arguments.pop(0).partition("=")
+        os.environ[name] = value
+        if name == "PYTHONPATH":
+            sys.path[:0] = value.split(os.pathsep)
+    RUN_ROLE(arguments, files)
+
+
 if __name__ == "__main__":
+    forkserver._run_role = run_role
     forkserver.renew_streams = end_with_parent
     role_launcher.RoleLauncher._start_forkserver = start
     world_process.CLOCK_STANDING_NS = STANDING_NS

@@ -13,10 +13,12 @@ import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
 from zsim.contract import flight_messages, keys, run_messages
+from zsim.contract.agent_messages import AgentMessage, MessageInfo, message_info, type_of_info
 from zsim.errors import DecodeError, RunError
 from zsim.schema.checker import first_fault
+from zsim.schema.declared_message import FieldType, field_types
 from zsim.schema.message import Count, Message, Number, Whole
-from zsim.sensors.sensor import FieldType, Sample, message_type
+from zsim.sensors.sensor import Sample, message_type
 from zsim.sensors.sensor_catalogue import STOCK
 from zsim.sensors.stock_sensors import Baro as Baro
 from zsim.sensors.stock_sensors import Flow as Flow
@@ -71,8 +73,7 @@ class ClusterInfo(Struct, frozen=True):
 class SensorInfo(Struct, frozen=True):
     """A sensor of a user's own: what `drone/{d}/sensor/{name}` carries after `t_ns`, `seq` and `t_sample_ns`.
 
-    `message` is the name of the message; `fields` has by name the type of each: number, number[n] for n of them,
-    whole, or flag.
+    `message` is the name of the message; `fields` has the type of each by name.
     """
 
     name: str
@@ -86,10 +87,10 @@ class Info(Message, frozen=True):
 
     `rate` is simulated per wall seconds, 0 for as fast as possible; `scenario` is YAML text. `replay_of` is the
     run_id of the run that is played back; empty for a flight. `user_sensors` is left out where all sensors are the
-    contract's, `sightings` where the world computes none. `module_folders` are those in which the world has looked for
-    modules that the scenario names, for readers of the record; left out where it names none. `changed` has the
-    texts `a.b.c=value` by which the command line changed the scenario's file; left out where that is not known. Making
-    or decoding an Info registers the messages of its sensors.
+    contract's, `user_messages` where agents exchange none, `sightings` where the world computes none. `module_folders`
+    are those in which the world has looked for modules that the scenario names, for readers of the record; left out
+    where it names none. `changed` has the texts `a.b.c=value` by which the command line changed the scenario's file;
+    left out where that is not known. Making or decoding an Info registers the messages of its sensors and agents.
     """
 
     contract: Count
@@ -113,13 +114,20 @@ class Info(Message, frozen=True):
     sightings: bool | UnsetType = UNSET
     module_folders: tuple[str, ...] | UnsetType = UNSET
     changed: tuple[str, ...] | UnsetType = UNSET
+    user_messages: tuple[MessageInfo, ...] | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         register_sensors(self.own_sensors)
+        for each in filter(MessageInfo.is_sound, self.own_messages):
+            _register(each.key, type_of_info(each), replaces=message_info_of(each.key) != each)
 
     @property
     def own_sensors(self) -> tuple[SensorInfo, ...]:
         return () if self.user_sensors is UNSET else self.user_sensors
+
+    @property
+    def own_messages(self) -> tuple[MessageInfo, ...]:
+        return () if self.user_messages is UNSET else self.user_messages
 
 
 for _name, _kind in STOCK.items():
@@ -128,11 +136,11 @@ keys.on("drone/*/sensor/*", writers="driver", readers="estimator")(Sample)  # th
 TOPICS = keys.TOPICS
 """The contract's keys, `*` in place of a name, with what travels on them; whole once this module is imported."""
 
-RELAYED = (flight_messages.Estimate, flight_messages.ClusterState, run_messages.ClusterRequest)
-"""Messages that agents publish for each other; the world counts them, as it does commands."""
+RELAYED = (flight_messages.Estimate, flight_messages.ClusterState, run_messages.ClusterRequest, AgentMessage)
+"""Messages, or their bases, that agents publish for each other; the world counts them, as it does commands."""
 KEYS_KEPT = 65_536  # keys whose type is remembered; 1000 drones have 15 000, garbage keys push each other out
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
-_OWN_SENSORS: dict[str, type[Sample]] = {}  # of users, by name, as the newest Info has them
+_OWN: dict[str, type[Struct]] = {}  # messages of users by shape of the key, as the newest Info has them
 
 
 def _plain(value: Any) -> Any:
@@ -158,9 +166,7 @@ def shape_of(key: str) -> str:
 def type_of(key: str) -> type[Struct] | None:
     """Return the message type that the contract puts on a key, None for a key that it does not know."""
     shape = shape_of(key)
-    if shape in TOPICS:
-        return TOPICS[shape].message
-    return _OWN_SENSORS.get(shape.removeprefix("drone/*/sensor/"))
+    return TOPICS[shape].message if shape in TOPICS else _OWN.get(shape)
 
 
 def register_sensors(sensors: Iterable[SensorInfo]) -> None:
@@ -168,11 +174,32 @@ def register_sensors(sensors: Iterable[SensorInfo]) -> None:
 
     A sensor whose own name, or that of its message or a field, is invalid is left out: its messages stay unknown.
     """
-    known = [each for each in sensors if all(map(_NAME.fullmatch, (each.name, each.message.lower(), *each.fields)))]
-    types = {sensor.name: message_type(sensor.message, sensor.fields, sensor.name) for sensor in known}
-    if any(_OWN_SENSORS.get(name) is not kind for name, kind in types.items()):
-        _OWN_SENSORS.update(types)
-        for by_key in (type_of, encoding, _reader_of):
+    for each in sensors:
+        if all(map(_NAME.fullmatch, (each.name, each.message.lower(), *each.fields))):
+            _register(f"drone/*/sensor/{each.name}", message_type(each.message, each.fields, each.name))
+
+
+def register_messages(kinds: Iterable[type[AgentMessage]]) -> None:
+    """Register classes of users' messages, of which messages are read here instead of those that `world/info` declares.
+
+    TypeError, ValueError as of `message_info`.
+    """
+    for kind in kinds:
+        _register(message_info(kind).key, kind)
+
+
+def message_info_of(shape: str) -> MessageInfo | None:
+    """Return what is registered of a user's message, by the shape of its key."""
+    kind = _OWN.get(shape)
+    if kind is None or not issubclass(kind, AgentMessage):
+        return None
+    return MessageInfo(shape, kind.__name__, field_types(kind, AgentMessage))
+
+
+def _register(shape: str, kind: type[Struct], replaces: bool = True) -> None:
+    if replaces and _OWN.get(shape) is not kind:
+        _OWN[shape] = kind
+        for by_key in (type_of, is_output, encoding, _reader_of):
             by_key.cache_clear()
 
 
@@ -197,7 +224,12 @@ def command_key(drone: str, command: Struct) -> str:
 def is_output(key: str) -> bool:
     """Tell whether the world counts the messages of a key for the done of the process that publishes them."""
     topic = TOPICS.get(shape_of(key))
-    return topic is not None and topic.message is not None and topic.is_output
+    return is_relayed(type_of(key)) if topic is None else topic.message is not None and topic.is_output
+
+
+def is_relayed(kind: type[Struct] | None) -> bool:
+    """Tell whether agents publish messages of a type for each other."""
+    return kind is not None and issubclass(kind, RELAYED)
 
 
 def output_type(key: str) -> type[Struct]:
@@ -207,7 +239,7 @@ def output_type(key: str) -> type[Struct]:
         raise DecodeError(f"{key:.80}: is no key of the contract; see docs/protocol.md")
     if not is_output(key):
         todo = "return it from `views`" if key.startswith("view/") else "only who this is about writes there"
-        raise DecodeError(f"{key:.80}: is no key of an agent's outputs (commands, estimates, states); {todo}")
+        raise DecodeError(f"{key:.80}: is no key of an agent's outputs (commands, estimates, states, messages); {todo}")
     return kind
 
 

@@ -47,9 +47,18 @@ class Clock(Message, frozen=True):
     waiting_for: tuple[Waiting, ...] = ()
 
 
+EVENT_KINDS = (
+    "join", "restart", "superseded", "doubled", "no_show", "slow_reader", "silent", "silent_end", "standstill", "leave",
+    "death", "drop", "failure", "overdue", "fingerprint", "commander", "release", "mode", "command", "control",
+    "refused", "outputs_missing", "fault", "fault_end", "fault_clear", "collision", "emergency", "landing", "flip",
+    "impact", "battery", "touchdown", "mission", "diverged", "end",
+)  # fmt: skip
+"""All kinds of events; docs/protocol.md says when each comes."""
+
+
 @on("world/event", writers="world", readers="each")
 class Event(Message, frozen=True):
-    """Something that happened once: what, by whom, about whom, in words, and in figures."""
+    """Something that happened once: what (one of EVENT_KINDS), by whom, about whom, in words, and in figures."""
 
     kind: str
     source: str

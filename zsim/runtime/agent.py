@@ -7,6 +7,7 @@
 inputs in the same order, so that the outputs are the same to the bit.
 """
 
+import math
 import re
 from abc import ABC, abstractmethod
 from collections import defaultdict
@@ -19,6 +20,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from zsim.contract import keys, messages
+from zsim.contract.agent_messages import AgentMessage
 from zsim.contract.framing import GateMessages
 from zsim.contract.messages import Info, decode, encode
 from zsim.contract.run_messages import ClusterRequest, ControlAnswer, ControlRequest, Faults
@@ -54,6 +56,8 @@ class Agent(ABC):
     # whether it takes the world's messages of a gate as columns and one buffer, in `receive_gate`
     takes_gates: bool = False
     repeats: tuple[str, ...] = ()  # keys of its outputs that carry the requests that it took, for `repeat`
+    messages: tuple[type[AgentMessage], ...] = ()  # classes of messages of a user's that it publishes
+    thing = ""  # name of the drone or cluster that it is of: the second part of its own name
     _links: LinkFaults | None = None
 
     def __init__(self) -> None:
@@ -63,8 +67,9 @@ class Agent(ABC):
     def bind(self, info: Info, name: str = "") -> None:
         """Fill in what a class of a user's leaves out, before its agent joins the run of `world/info`.
 
-        The name: `agent.` and the class's name; `period_ns`: every gate; `gate_keys`: the status of every drone, and
-        what `reads` has of the estimates and cluster states, which are published at every gate.
+        The name: `agent.` and the class's name; `period_ns`: every gate; `gate_keys`: the status of every drone, or of
+        its own where it is of a drone, and what `reads` has of the estimates and cluster states, which are published at
+        every gate. In `reads`, `{drone}` and `{cluster}` stand for the name of what it is of.
 
         Args:
             name: of the process, in place of the agent's own.
@@ -80,12 +85,15 @@ class Agent(ABC):
             own["name"] = name
         self._declared = {each: own[each] for each in _FILLED if each in own}
         self._seq.clear()
-        statuses = [keys.status(drone.name) for drone in info.drones]
+        drones = [drone.name for drone in info.drones]
+        self.thing = (name or getattr(self, "name", default_name(type(self)))).partition(".")[2]
+        statuses = [keys.status(drone) for drone in ([self.thing] if self.thing in drones else drones)]
         at_gates = [keys.estimate(drone.name) for drone in info.drones]
         at_gates += [keys.cluster_state(cluster.name) for cluster in info.clusters]
         self.name = getattr(self, "name", default_name(type(self)))
         self.period_ns = getattr(self, "period_ns", info.gate_ns)
-        self.reads = getattr(self, "reads", ())
+        reads = getattr(self, "reads", ())
+        self.reads = tuple(each.replace("{drone}", self.thing).replace("{cluster}", self.thing) for each in reads)
         if not hasattr(self, "gate_keys"):
             read = [key for key in at_gates if any(keys.matches(each, key) for each in self.reads)]
             self.gate_keys = (*statuses, *read)
@@ -146,6 +154,8 @@ class Agent(ABC):
         key, message = output
         try:
             kind = messages.output_type(key)
+            if isinstance(message, AgentMessage) and key != message.of(self.thing):
+                raise DecodeError(f"{key}: is another's; must be {message.of(self.thing)}")
             if type(message) is not kind:
                 raise DecodeError(f"{key}: message is a {type(message).__name__}; must be a {kind.__name__}")
             sent = messages.decode(key, encode(message))
@@ -252,6 +262,11 @@ class Agent(ABC):
         stamp = {"t_ns": t_ns, "seq": self.next_seq(key), "source": self.source}
         return Output(key, replace(command, **stamp))
 
+    def message(self, t_ns: int, message: AgentMessage) -> Output:
+        """Return an output of the gate t_ns that others read a gate later; stamp, number and source are filled in."""
+        key = message.of(self.thing)
+        return Output(key, replace(message, t_ns=t_ns, seq=self.next_seq(key), source=self.source))
+
     def next_seq(self, key: str) -> int:
         """Return the next sequence number of one of its keys, from 0."""
         count = self._seq[key]
@@ -282,11 +297,11 @@ class AgentGroup(Agent):
     that its members publish.
 
     Args:
-        members: in any order, all of one period.
+        members: in any order; each steps at the gates of its own period.
         hold_ns: `output_hold_ns` of the run.
 
     Raises:
-        RunError: there are none, their periods differ, or they wait for each other's outputs.
+        RunError: there are none, or they wait for each other's outputs.
     """
 
     def __init__(self, members: Sequence[Agent], hold_ns: int) -> None:
@@ -294,7 +309,7 @@ class AgentGroup(Agent):
         self._members = _in_order(members)
         self._hold_ns = hold_ns
         last = members[-1]
-        self.name, self.period_ns = last.name, last.period_ns
+        self.name, self.period_ns = last.name, math.gcd(*(member.period_ns for member in members))
         served = [name for member in members for name in (member.name, *member.serves)]
         self.serves = tuple(name for name in served if name != self.name)
         self.writes = _joined(member.writes for member in members)
@@ -416,10 +431,6 @@ def _in_order(members: Sequence[Agent]) -> tuple[Agent, ...]:
     """Return the members so that each comes after those whose outputs close its gate, if they can be a group."""
     if not members:
         raise RunError("a group has no members; must have one at least")
-    periods = {member.name: member.period_ns for member in members}
-    if len(set(periods.values())) > 1:
-        listed = ", ".join(f"{name} {period_ns}" for name, period_ns in periods.items())
-        raise RunError(f"period_ns of a group's members is {listed}; must be the same")
     writers = {key: place for place, member in enumerate(members) for key in member.writes}
     waits_for = {i: [writers[key] for key in m.gate_keys if writers.get(key, i) != i] for i, m in enumerate(members)}
     try:

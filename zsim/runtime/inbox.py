@@ -26,9 +26,12 @@ Input = tuple[str, Any]
 def output_hold_ns(info: Info) -> int:
     """Return how long after its stamp an output that closes no gate of its reader is handed out: see `Inbox.hold_ns`.
 
-    In realtime outputs are handed out as they come.
+    By then all have published theirs: the world is ahead of them by the command delay, or by nothing where agents
+    exchange messages. In realtime outputs are handed out as they come.
     """
-    return 0 if info.mode == "realtime" else info.command_delay_ns + info.gate_ns
+    if info.mode == "realtime":
+        return 0
+    return info.gate_ns + (0 if info.own_messages else info.command_delay_ns)
 
 
 def is_held(key: str, gate_keys: Container[str], uncounted: Container[str]) -> bool:

@@ -115,7 +115,18 @@ class RepeatedEvents:
 
 
 class JsonProgress:
-    """Writes progress as JSON lines for a launcher."""
+    """Writes progress as JSON lines for a launcher, or for whoever has started that."""
+
+    @staticmethod
+    def read(text: str) -> tuple[str, Any]:
+        """Return kind and content of a line, as its methods have written it; no kind where a library has printed it."""
+        try:
+            line = json.loads(text)
+        except ValueError:
+            return "", text
+        if not isinstance(line, dict):  # a number is JSON too
+            return "", text
+        return next(((kind, line[kind]) for kind in ("clock", "event", "health", "say") if kind in line), ("", text))
 
     def clock(self, line: dict[str, Any]) -> None:
         self._write("clock", line)
@@ -128,6 +139,9 @@ class JsonProgress:
 
     def say(self, text: str) -> None:
         self._write("say", text)
+
+    def hang_up(self) -> None:
+        """Do nothing: whoever reads the lines tells of what has become of its terminal."""
 
     def _write(self, kind: str, content: Any) -> None:
         try:

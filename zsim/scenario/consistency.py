@@ -14,7 +14,8 @@ from msgspec import UNSET
 from zsim.contract import messages
 from zsim.scenario.faults import Known, flaws, kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
-from zsim.scenario.roles import AGENTS
+from zsim.scenario.own_classes import agent_faults
+from zsim.scenario.roles import AGENTS, MAIN, OPERATOR, ROLES
 from zsim.scenario.scenario import EXTERNAL, SEA_HEIGHT_MAX_M, Scenario, space_name
 from zsim.schema.checker import Fault, listed, show
 from zsim.schema.quantities import COULOMB_PER_MAH, G_M_S2, SEA_LEVEL_KG_M3
@@ -41,6 +42,7 @@ AIR_M_S = 2.0
 # of mass times arm_m squared, chosen: that of the AR.Drone about z is 0.35, of a ring of rotors 1
 INERTIA_MAX_MR2 = 10.0
 LEAST_K1 = -4 / 27  # over the squared tangent of half the diagonal: where r + k1 r^3 turns back
+RESERVED_ROLES = (OPERATOR, "agent", "python", "test")  # of processes that zsim names, beside its roles
 SIGHTED_MAX = 12  # drones of a cluster: each of its estimators has the states of all; the cost grows by the square
 
 
@@ -67,6 +69,9 @@ def cross_faults(
     for index, cluster in clusters:
         yield from _under(f"clusters[{index}]", _shape_faults(cluster, drones))
     yield from _process_faults(scenario.processes, drones, clusters)
+    if isinstance(scenario.agents, dict):
+        sound_agents = {role: each for role, each in scenario.agents.items() if each and each.per}
+        yield from agent_faults(sound_agents, (*ROLES, *RESERVED_ROLES), bool(clusters))
     yield from _injected_faults(scenario, drones, clusters, vehicles, unread)
     window = scenario.report and scenario.report.window_s
     if window is not None and not 0 <= window[0] < window[1]:
@@ -440,6 +445,10 @@ def _injected_faults(
         return
     expected = scenario.processes and scenario.processes.expect
     processes = tuple(name for name in expected or () if name is not None)
+    if isinstance(scenario.agents, dict):
+        things = {"drone": [d.name for _, d in drones], "cluster": [c.name for _, c in clusters], "run": [MAIN]}
+        own = scenario.agents.items()
+        processes += tuple(f"{role}.{thing}" for role, each in own if each for thing in things.get(each.per, ()))
     kinds = kinds_of(declarations([drone for _, drone in drones]))
     rotors = {drone.name: vehicles[drone.model].rotor_names if drone.model in vehicles else () for _, drone in drones}
     external = tuple(drone.name for _, drone in drones if drone.body == EXTERNAL)

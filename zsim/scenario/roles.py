@@ -11,9 +11,10 @@ from typing import Literal, NamedTuple
 from zsim.contract import keys
 from zsim.contract.messages import TOPICS
 from zsim.errors import ScenarioError
-from zsim.scenario.scenario import OnDeath, OnOverdue, Scenario
+from zsim.scenario.scenario import OnDeath, OnOverdue, OwnAgent, Scenario
 from zsim.schema.checker import listed
 
+MAIN = "main"  # thing of an agent that is of the whole run
 OPERATOR, RECORDER, WORLD, ROUTER, DRIVER = "operator", "recorder", "world", "router", "driver"
 
 
@@ -23,7 +24,7 @@ class Role(NamedTuple):
     extra: str  # of the distribution, that a host of it needs; empty for none
     on_death: OnDeath  # what the death of a process means for a run where the scenario does not say
     # what its processes are named after, ROLE.NAME of each drone or cluster; None for roles without an agent
-    about: Literal["drone", "cluster"] | None = None
+    about: Literal["drone", "cluster", "run"] | None = None
     agent: str = ""  # `package.module:Class` of the agent, made of world/info, scenario and name
     joint: bool = False  # one agent may do the work of many, made of all their names
     # what follows where it does not come back and the scenario does not say; `drop` where nothing waits
@@ -49,12 +50,19 @@ ROLES = {
 AGENTS = {name: role for name, role in ROLES.items() if role.about}
 
 
+def agent_roles(scenario: Scenario) -> dict[str, Role]:
+    """Return the roles of a scenario's agents: the stock ones, and those of users' classes."""
+    own = {name: Role("agents", "restart", each.per, each.named) for name, each in scenario.own_agents.items()}
+    return AGENTS | own
+
+
 def things(role: str, scenario: Scenario) -> list[str]:
-    return [entry.name for entry in getattr(scenario, f"{AGENTS[role].about}s")]
+    about = agent_roles(scenario)[role].about
+    return [MAIN] if about == "run" else [entry.name for entry in getattr(scenario, f"{about}s")]
 
 
 def agent_names(scenario: Scenario) -> list[str]:
-    return [f"{role}.{thing}" for role in AGENTS for thing in things(role, scenario)]
+    return [f"{role}.{thing}" for role in agent_roles(scenario) for thing in things(role, scenario)]
 
 
 def expected_processes(scenario: Scenario) -> list[str]:
@@ -169,6 +177,8 @@ def rights_for(process: str, scenario: Scenario) -> Rights:
     if role in ("camera", "detector"):
         sees = (keys.truth("*"),) if role == "camera" else ()
         return combined([own, Rights(reads=sees, asks=sees), _granted(role, drone=watched_drones(thing, scenario))])
+    if role in scenario.own_agents:
+        return combined([own, _granted_own(scenario.own_agents[role], thing, scenario)])
     about = AGENTS[role].about if role in AGENTS else None
     granted = [own]
     if about != "cluster" and thing in [drone.name for drone in scenario.drones]:
@@ -183,6 +193,19 @@ def rights_for(process: str, scenario: Scenario) -> Rights:
         granted.append(_granted("controller", drone=scenario.cluster(thing).drones, cluster=[thing]))
         granted.append(Rights(answers=(keys.cluster_control(thing),)))
     return combined(granted)
+
+
+def _granted_own(agent: OwnAgent, thing: str, scenario: Scenario) -> Rights:
+    """Return what an agent of a user's class may do: read all but the truth, and command the drones that it is of."""
+    drones = [drone.name for drone in scenario.drones]
+    of = {"drone": [thing], "run": drones}
+    own = of.get(agent.per) or scenario.cluster(thing).drones
+    sensed = [keys.GATE, *(key for drone in drones for key in (keys.sensors(drone), keys.gate(drone)))]
+    messages = [each.key for each in scenario.own_messages()]
+    reads = [*sensed, keys.estimate("*"), keys.cluster_state("*"), keys.detections("*"), *messages]
+    writes = [keys.command(drone, "*") for drone in own]
+    writes += [each.key.replace("*", thing) for each in agent.declared or ()]
+    return combined([_granted("each"), Rights(reads=tuple(reads), writes=tuple(writes), asks=tuple(reads))])
 
 
 def _granted(role: str, **names: Sequence[str]) -> Rights:

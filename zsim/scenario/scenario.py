@@ -7,6 +7,8 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 from msgspec import UNSET, Meta, Struct, UnsetType, defstruct, field
 
+from zsim.contract.agent_messages import MessageInfo
+from zsim.schema.parameters import Given
 from zsim.schema.plugin import CLASS_NAME
 from zsim.schema.quantities import G_M_S2, SEA_LEVEL_KG_M3, Fraction, NonNegative, Positive, Real, Vector3
 from zsim.sensors.camera import Hats
@@ -25,6 +27,8 @@ WAYPOINTS_MAX = 10_000  # an hour of them at 3 a second
 CONSTANTS_MAX = 100  # of a user, for the expressions of a trajectory
 ROBOTS_MAX = 64  # drones of a cluster; beyond it a dense Jacobian of 4n x 4n no longer fits a control gate of 20 ms
 METRICS_MAX = 20  # functions
+ROLES_MAX = 20  # of users' agents; each is a process for every drone
+MESSAGES_MAX = 20  # classes of messages that a class of agents publishes
 VARIABLES_MAX = 4 * ROBOTS_MAX  # of a formation: four a robot
 SEA_HEIGHT_MAX_M = 11_000  # m above the sea: end of the layer whose pressure the barometer follows (ISO 2533)
 
@@ -185,6 +189,7 @@ class ClusterGroup(Spec, frozen=True, kw_only=True):
     name: Name
     size: Annotated[int, Meta(ge=2)]
     space: SpaceName | None = None
+    space_parameters: Given | UnsetType = UNSET
     template_m: Template = []
 
 
@@ -198,6 +203,9 @@ class Cluster(Spec, frozen=True, kw_only=True):
     """Places of the robots, x ahead and y left of the formation; empty: as they stand at the start."""
     law: LawName | UnsetType = UNSET
     """Unset: proportional. Left out of the resolved text then, which names the scenario by its hash."""
+    space_parameters: Given | UnsetType = UNSET
+    law_parameters: Given | UnsetType = UNSET
+    """Of a user's class; unset: none, or its defaults."""
     gains: Gains = Gains()
     plan: ClusterPlan = ClusterPlan()
 
@@ -223,6 +231,9 @@ class Estimation(Spec, frozen=True, kw_only=True):
     flow: bool = True
     use_sightings: bool | UnsetType = UNSET
     """Whether drones of a cluster are located by what they see of each other; unset: not."""
+
+    parameters: Given | UnsetType = UNSET
+    """Of a user's class; unset: none, or its defaults."""
 
     def chosen(self) -> str:
         return self.algorithm if isinstance(self.algorithm, str) else ESTIMATORS[0]
@@ -253,6 +264,20 @@ class TimeSteps(Spec, frozen=True, kw_only=True):
     physics_dt_ms: Annotated[float, Meta(gt=0, le=20)] = 2.5  # a twelfth of the rotors' lag, the fastest motion
     command_delay_gates: Annotated[int, Meta(ge=1, le=50)] = 1  # the least with which world and agents work at once
     max_command_age_ms: Positive = 500.0  # as silence.hover_s: an older command counts as silence
+
+
+class OwnAgent(Spec, frozen=True, kw_only=True):
+    """Agents of a user's class, whose processes are named after what each is of: `pilot.drone1`, `watch.main`."""
+
+    named: Annotated[str, Meta(pattern=CLASS_NAME, description="package.module:Class")] = field(name="class")
+    per: Literal["drone", "cluster", "run"] = "drone"
+    parameters: Given = {}
+    """Of the class, see docs/extending.md."""
+    declared: Annotated[list[MessageInfo], Meta(max_length=MESSAGES_MAX)] | UnsetType = UNSET
+    """The messages that the class publishes; filled in, as all its parameters are."""
+
+
+RoleName = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,14}\Z", description="a letter and up to 14 of a-z 0-9 _")]
 
 
 Function = Annotated[str, Meta(pattern=CLASS_NAME)]
@@ -288,6 +313,8 @@ class Scenario(Spec, frozen=True, kw_only=True):
     drones: Annotated[list[Drone], Meta(min_length=1, max_length=DRONES_MAX)]
     clusters: Annotated[list[Cluster], Meta(max_length=CLUSTERS_MAX)] = []
     estimation: Estimation = Estimation()
+    agents: Annotated[dict[RoleName, OwnAgent], Meta(max_length=ROLES_MAX)] | UnsetType = UNSET
+    """Agents of users' classes, by role; unset: none, and left out of the resolved text."""
     processes: Processes = Processes()
     faults: Annotated[list[dict[str, Any]], Meta(max_length=FAULTS_MAX)] = []
     """Faults to inject, each a map; `zsim.scenario.faults.flaws` checks them."""
@@ -299,11 +326,21 @@ class Scenario(Spec, frozen=True, kw_only=True):
     def cluster(self, name: str) -> Cluster:
         return {cluster.name: cluster for cluster in self.clusters}[name]
 
+    @property
+    def own_agents(self) -> dict[str, OwnAgent]:
+        return {} if self.agents is UNSET else self.agents
+
+    def own_messages(self) -> list[MessageInfo]:
+        """Return the messages that users' agents declare, each once, in the order of their keys."""
+        declared = [each for agent in self.own_agents.values() for each in agent.declared or ()]
+        return sorted({each.key: each for each in declared}.values(), key=lambda each: each.key)
+
     def own_code(self) -> list[str]:
         """Return the classes, functions, sensors and vehicles of users that it names, whose modules a rerun needs."""
         spaces = [part.space for cluster in self.clusters for part in (cluster, *cluster.groups)]
         names = [*spaces, *(cluster.law for cluster in self.clusters), self.estimation.chosen()]
         names += self.report.metric_names
+        names += [each.named for each in self.own_agents.values()]
         classes = [name for name in names if isinstance(name, str) and ":" in name]
         sensors = [each["module"] for drone in self.drones for each in (drone.sensors.own or {}).values()]
         models = [drone.model for drone in self.drones if drone.model not in STOCK]

@@ -1,5 +1,6 @@
 """Scenario files: read, override, resolve, check, and write out again as the text of `world/info`."""
 
+import copy
 import hashlib
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -12,6 +13,7 @@ import msgspec
 from msgspec import Struct, structs
 
 from zsim.errors import DocumentError, NotTrustedError, ScenarioError
+from zsim.scenario import own_classes
 from zsim.scenario.consistency import cross_faults
 from zsim.scenario.scenario import DRONES_MAX, VEHICLE_NUMBERS, Document, Scenario, SharedVehicle
 from zsim.schema import plugin, yaml_file
@@ -108,6 +110,15 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
         return {**with_defaults(numbers, drone), "sensors": own}
 
     document = {**document, "sensors": _separated(sensors, "sensors", unsound, unread, imports)}
+    if imports and plugin.may_import():
+        document = document | {
+            key: copy.deepcopy(document[key]) for key in ("clusters", "estimation") if key in document
+        }
+        unsound += own_classes.with_parameters(document)
+    if "agents" in document:
+        document["agents"], wrong = own_classes.with_agents(document["agents"], imports)
+        unsound += wrong
+        document["processes"] = _with_deaths(document.get("processes", {}), document["agents"])
     drones = document.get("drones")
     if isinstance(drones, list) and len(drones) <= DRONES_MAX:
         document["drones"] = [resolved_drone(drone, f"drones[{index}]") for index, drone in enumerate(drones)]
@@ -158,6 +169,14 @@ def _separated(section: Any, where: str, unsound: list[Fault], unread: set[str],
     unsound += [(f"{where}.{path}", text) for path, text in wrong]
     unread |= section.keys() - rest.keys() - own.keys()
     return {**rest, "own": own} if own else rest
+
+
+def _with_deaths(processes: Any, agents: Any) -> Any:
+    """Return a `processes:` section in which users' agents are started again, where it says nothing of their role."""
+    if not (isinstance(processes, dict) and isinstance(agents, dict)):
+        return processes
+    given = processes.get("on_death", {})
+    return {**processes, "on_death": dict.fromkeys(agents, "restart") | given} if isinstance(given, dict) else processes
 
 
 def _vehicle_of(

@@ -193,6 +193,8 @@ def _sound(value: Any, info: types.Type) -> Any:
         if not isinstance(value, list | tuple) or len(value) > (info.max_length or len(value)):
             return None
         return [_sound(item, info.item_type) for item in value]
+    if isinstance(info, types.DictType) and isinstance(info.value_type, types.StructType) and isinstance(value, dict):
+        return {key: _sound(item, info.value_type) for key, item in value.items()}
     return None if any(_check(value, info, "")) else value
 
 

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim import errors
-from zsim.errors import DocumentError, NotTrustedError, UserCodeError, reason_of
+from zsim.errors import PACKAGES, DocumentError, NotTrustedError, UserCodeError, reason_of
 from zsim.schema.checker import show
 
 Object = TypeVar("Object")
@@ -37,8 +37,6 @@ IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # environment variable, for t
 NO_LOOKUP = "unseen"  # or this
 WHERE = "install it, or put it on PYTHONPATH or beside the scenario"
 
-PACKAGES = frozenset({"zsim", "zsim_world", "zsim_agents", "zsim_bridges", "zsim_analysis", "zsim_api", "zsim_deploy"})
-"""Of zsim: none of these is a user's."""
 MADE = "zsim_own_"  # begins the names of modules made for what notebooks and scripts define: zsim_api.own_code
 LIBRARIES = tuple(f"{sysconfig.get_path(part)}{os.sep}" for part in ("stdlib", "purelib", "platlib"))
 
@@ -236,6 +234,8 @@ def _attribute(name: str, where: str, kind: str, is_kind: Callable[[Any], bool])
     module = _imported(module_name, f"{where} is {show(name)}", attribute)
     found = getattr(module, attribute, None)
     if not is_kind(found):
+        if module_name.startswith(MADE):  # it was given in Python
+            raise DocumentError([f"{where} is {show(found)}; must be a {kind.lower()}, or a name module:{kind}"])
         is_one = isfunction if kind == "function" else isclass
         own = [each for each in vars(module).values() if is_one(each) and each.__module__ == module.__name__]
         names = sorted(each.__name__ for each in own if not each.__name__.startswith("_"))

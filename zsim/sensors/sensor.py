@@ -7,28 +7,22 @@ The scenario's section, validation, defaults, latency, noise, faults, key, schem
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType
-from msgspec import inspect as types
 from numpy.typing import NDArray
 
-from zsim.schema.message import Message, Number, Whole
+from zsim.schema.declared_message import FieldName, FieldType, MessageName, declared_type, field_types
+from zsim.schema.message import Message, Whole
 from zsim.schema.quantities import Fraction, NonNegative, Vector3
 
 VALUES_MAX = 6  # numbers of one reading
 RateHz = Annotated[float, Meta(ge=0.01, le=1000)]
 LatencyMs = Annotated[float, Meta(ge=0, le=10_000)]
 CorrelationS = Annotated[float, Meta(ge=0, le=1e6)]
-FieldType = Literal[
-    "number", "whole", "flag", "number[1]", "number[2]", "number[3]", "number[4]", "number[5]", "number[6]"
-]
-"""Type of a message's field: a finite number, some of them, a whole number, or true and false."""
-FieldName = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,31}\Z")]
-MessageName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}\Z")]
+UNSENSED = ("text", "number[]")  # no field of a sensor's message: what it measures has a fixed number of numbers
 
 
 class ErrorModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -203,7 +197,7 @@ class Declaration(Struct, frozen=True, omit_defaults=True):
 
     @classmethod
     def of(cls, kind: SensorType) -> "Declaration":
-        return cls(kind.message.__name__, field_types(kind.message), kind.channels, kind.label)
+        return cls(kind.message.__name__, field_types(kind.message, Sample, UNSENSED), kind.channels, kind.label)
 
 
 def scaled(model: ErrorModel, to_si: float) -> ErrorModel:
@@ -220,49 +214,14 @@ def noise_sigma(model: ErrorModel, rate_hz: float) -> float:
     return math.hypot(white, correlated) if correlated else white
 
 
-_WORDS = {types.FloatType: "number", types.IntType: "whole", types.BoolType: "flag"}
-_TYPES: dict[str, Any] = {"number": Number, "whole": Whole, "flag": bool}
-
-
-def field_types(message: type[Sample]) -> dict[FieldName, FieldType]:
-    """Return the types of a message's own fields.
-
-    Raises:
-        TypeError: a field is of a type that no sensor's message has.
-    """
-    info: Any = types.type_info(message)
-    words: dict[str, Any] = {}
-    for field in info.fields[len(Sample.__struct_fields__) :]:
-        kind = field.type
-        if isinstance(kind, types.TupleType) and all(isinstance(item, types.FloatType) for item in kind.item_types):
-            words[field.name] = f"number[{len(kind.item_types)}]"
-        elif type(kind) in _WORDS:
-            words[field.name] = _WORDS[type(kind)]
-        else:
-            allowed = "must be a number, a tuple of numbers, a whole number or a bool"
-            raise TypeError(f"{message.__name__}.{field.name} is of another type; {allowed}")
-    return words
-
-
 def message_type(name: str, fields: Mapping[str, str], sensor: str = "") -> type[Sample]:
     """Return the message with these fields, of a user's sensor: the same class for the same three."""
-    return _message_type(name, tuple(fields.items()), sensor)
+    return declared_type(name, fields, Sample, (("__sensor__", sensor),))
 
 
 def sensor_of(message: type[Struct]) -> str:
     """Return the name of the user's sensor whose message this is; empty for any other."""
     return getattr(message, "__sensor__", "")
-
-
-@cache
-def _message_type(name: str, fields: tuple[tuple[str, str], ...], sensor: str) -> type[Sample]:
-    own: Any = [
-        (field, tuple[(Number,) * int(word[7:-1])] if "[" in word else _TYPES[word])  # type: ignore[misc]
-        for field, word in fields
-    ]
-    space = {"__sensor__": sensor}
-    message: Any = msgspec.defstruct(name, own, bases=(Sample,), namespace=space, frozen=True, gc=False)
-    return message
 
 
 def as_fields(numbers: Sequence[Any], fields: Mapping[str, str]) -> list[Any]:

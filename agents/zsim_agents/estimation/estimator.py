@@ -15,6 +15,7 @@ from zsim.math.compiled import COMPILES
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.inbox import Input
 from zsim.scenario.scenario import Scenario
+from zsim.schema import parameters
 from zsim_agents.estimation.drone_estimator import EstimatorSet, estimator_class
 from zsim_agents.estimation.estimator_bank import EstimatorBank
 from zsim_agents.estimation.joint_filter import ClusterBanks
@@ -46,6 +47,7 @@ class Estimator(Agent):
         own_class = estimator_class(scenario.estimation.chosen(), "world/info: estimation.algorithm")
         self._build: Callable[[], Any] = partial(EstimatorBank, *settings)
         if own_class:
+            own_class = parameters.bound(own_class, scenario.estimation.parameters, "estimation.parameters")
             self._build = partial(EstimatorSet, own_class, *settings)
         elif scenario.estimation.use_sightings is True:
             self._build = partial(ClusterBanks, scenario, names, gate_s)

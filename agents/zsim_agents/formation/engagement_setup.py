@@ -9,7 +9,7 @@ are left to the flight, in which the guidance refuses them, twice a second anew,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ from msgspec import UNSET
 
 from zsim.errors import DocumentError, NotTrustedError, RunError
 from zsim.scenario.scenario import Cluster, Gains, Scenario
-from zsim.schema import plugin
+from zsim.schema import parameters, plugin
 from zsim_agents.formation.control_law import (
     LAWS,
     ControlLaw,
@@ -64,7 +64,8 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
         space, gains = scenario_space(scenario, cluster), gains_of(cluster.gains)
         name = cluster.law or "proportional"
         law = LAWS.get(name) or plugin.load(name, "law", ControlLaw, is_constructed=True)
-        _rehearse(space, gains, law)
+        law = parameters.bound(law, cluster.law_parameters, "law_parameters")
+        _rehearse(space, cluster.drones, gains, law)
         limits = EngagementLimits()
         if cluster.gains.sigma_max_m is not UNSET:
             limits = replace(limits, sigma_max_m=cluster.gains.sigma_max_m)
@@ -104,12 +105,15 @@ def _refusals_of(scenario: Scenario, cluster: Cluster) -> Iterator[None]:
 
 
 def _rehearse(
-    space: ClusterSpace, gains: FormationGains, law: Callable[[ClusterSpace, FormationGains], ControlLaw]
+    space: ClusterSpace,
+    drones: Sequence[str],
+    gains: FormationGains,
+    law: Callable[[ClusterSpace, FormationGains], ControlLaw],
 ) -> None:
     """Fly a gate of another formation: code is compiled, or loaded, here and not in flight."""
     p_W, yaw = space.inverse(space.specimen(max(gains.separation_min_m, APART_M)))
     c, none, still = space.forward(p_W, yaw), np.zeros((space.n, 3)), np.zeros(space.n)
-    rehearsal = Engagement(space, [f"robot {i + 1}" for i in range(space.n)], gains, law=law)
+    rehearsal = Engagement(space, drones, gains, law=law)
     rehearsal.warm_start("engaged", c)
     rehearsal.step(GateInput(0.0, p_W, yaw, none, none, still, still, ("flying",) * space.n))
     ramp_onto(space, c, c, Hold(c), 0.0, 2.0).value(1.0)

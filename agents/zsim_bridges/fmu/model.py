@@ -9,10 +9,7 @@
 A file that is refused is a RunError; what a running FMU does amiss is a UserCodeError.
 """
 
-import atexit
 import math
-import shutil
-import tempfile
 import weakref
 import zipfile
 from collections import deque
@@ -39,6 +36,7 @@ from fmpy.logging import addLoggerProxy
 from fmpy.model_description import ValidationError, read_model_description
 
 from zsim.errors import RunError, UserCodeError, reason_of
+from zsim.output_folder import temporary_folder
 from zsim.schema.checker import suggestion
 
 Kind = Literal["number", "whole", "flag", "text"]
@@ -380,8 +378,7 @@ def _plain(value: Any, kind: Kind) -> Any:
 @cache
 def _unpacked(path: Path, _mtime_ns: int, _size: int) -> Path:
     """Return the folder in which an FMU is unpacked, once for all its instances in this process."""
-    folder = Path(tempfile.mkdtemp(prefix="zsim_fmu_"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    folder = temporary_folder("fmu-")
     fmpy.extract(path, folder)
     return folder
 

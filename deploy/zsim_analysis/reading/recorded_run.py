@@ -22,7 +22,7 @@ from zsim.output_folder import record_at
 from zsim.record import Recorded, RecordReader
 from zsim.scenario import scenario_file
 from zsim.scenario.faults import PROCESS_KILL
-from zsim.scenario.roles import AGENTS
+from zsim.scenario.roles import agent_roles
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim_agents.hosting import agents_of
@@ -197,7 +197,7 @@ def recorded_agents(reader: RecordReader, info: messages.Info, scenario: Scenari
     joins = [(keys.thing(key), join) for key, join in _read(reader, "process/*/join")]
     ours = [(name, j) for name, j in joins if j.version and j.fingerprint and {name, *j.serves} <= known]
     processes = [AgentProcess(name, (*join.serves, name)) for name, join in dict(ours).items()]
-    roles = [*AGENTS]
+    roles = [*agent_roles(scenario)]
     processes.sort(key=lambda process: (roles.index(process.name.partition(".")[0]), process.name))
     names = frozenset(name for process in processes for name in process.members)
     events: list[run_messages.Event] = [event for _, event in _read(reader, keys.EVENT)]
@@ -270,7 +270,7 @@ def gates(reader: RecordReader, drones: list[str]) -> Iterator[GateInputs]:
             is_input = what in ("join", "done", "bye")
         else:
             is_detection = kind == "drone" and what == keys.SIGHTINGS
-            is_input = is_detection or keys.is_command(key) or messages.type_of(key) in messages.RELAYED
+            is_input = is_detection or keys.is_command(key) or messages.is_relayed(messages.type_of(key))
         if is_input:
             wanted.add(key)
     wanted &= reader.topics().keys()

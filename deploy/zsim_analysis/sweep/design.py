@@ -11,6 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
+from itertools import count
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -113,8 +114,10 @@ class Grid(Struct, frozen=True):
     @property
     def names(self) -> list[str]:
         """Abbreviated values; those cut to the same text as their differing part, or with their number."""
-        names = [_cut(f"{value:g}" if isinstance(value, float) else without_made(value)) for value in self.values]
-        for short in [name for name, count in Counter(names).items() if count > 1]:
+        texts = [f"{value:g}" if isinstance(value, float) else text_of(value) for value in self.values]
+        made = {place: without_made(text) for place, text in enumerate(texts) if text.startswith(plugin.MADE)}
+        names = [*map(_cut, distinct(texts, made))]
+        for short in [name for name, often in Counter(names).items() if often > 1]:
             alike = [place for place, name in enumerate(names) if name == short]
             texts = parts = [text_of(self.values[place]) for place in alike]
             if any(len(text) > SHOWN_MAX for text in texts):  # from the first word in which they differ on
@@ -208,6 +211,20 @@ def without_made(value: Any) -> str:
     """Return a value as text; a class of a notebook or a script without the module that was made for it."""
     text = text_of(value)
     return text.partition(":")[2] if text.startswith(plugin.MADE) else text
+
+
+def distinct(texts: Sequence[str], made: Mapping[int, str]) -> list[str]:
+    """Return texts with other ones in some places, a later one of these that is there already numbered: `Law-2`.
+
+    All classes that a function makes have the same name.
+    """
+    found = [*texts]
+    known = {text for place, text in enumerate(texts) if place not in made}
+    for place, name in made.items():
+        numbered = (f"{name}-{number}" if number > 1 else name for number in count(1))
+        found[place] = next(each for each in numbered if each not in known)
+        known.add(found[place])
+    return found
 
 
 def _cut(text: str) -> str:

@@ -23,7 +23,6 @@ from inspect import signature
 from numbers import Real
 from pathlib import Path
 from shutil import copy, rmtree
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
@@ -33,6 +32,7 @@ from msgspec.structs import replace
 
 from zsim.contract.fingerprint import fingerprint
 from zsim.errors import DocumentError, RecordError, ReportError, reason_of
+from zsim.output_folder import temporary_folder
 from zsim.record import RecordWriter
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
@@ -128,8 +128,11 @@ def fly(task: Task) -> Row:
         RecordError, OSError: its record cannot be written, nor could that of any other run.
     """
     if task.record is None and task.open_run and any(map(_takes_run, task.scenario.report.metric_names)):
-        with TemporaryDirectory(prefix="zsim-run-") as folder:
-            return fly(replace(task, record=str(Path(folder) / "run")))
+        folder = temporary_folder("run-")
+        try:
+            return fly(replace(task, record=str(folder / "run")))
+        finally:
+            rmtree(folder, ignore_errors=True)
     where: Row = {"host": socket.gethostname(), "fingerprint": fingerprint()}
     try:
         with _record(task) as writer:

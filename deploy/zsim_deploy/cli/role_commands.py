@@ -99,7 +99,14 @@ def host_agents(
 @opt.participant_options
 def own_agent(
     reach: opt.WorldAccess,
-    named: Annotated[str, Argument(metavar="MODULE:CLASS", help="A subclass of zsim.Agent.", show_default=False)],
+    named: Annotated[
+        str,
+        Argument(
+            metavar="MODULE:CLASS",
+            help="A subclass of zsim.Agent; or the process name of one of the scenario's agents, as pilot.drone1.",
+            show_default=False,
+        ),
+    ],
     settings: Annotated[
         list[str] | None, Argument(metavar="[NAME=VALUE]...", help="Arguments of the class.", show_default=False)
     ] = None,
@@ -112,6 +119,9 @@ def own_agent(
 
     if not reach.launched:
         plugin.search(Path.cwd())
+    if ":" not in named and not settings:
+        roles.agent(roles.host([named]), reach, named)
+        return
     spec = AgentSpec.parse([named, *(settings or ())], name)
     roles.agent(spec.make, reach, spec.name)
 

@@ -69,6 +69,7 @@ def run(
     ] = False,
     force: opt.Force = False,
     order: Annotated[str, Option(hidden=True)] = "",
+    json_progress: Annotated[bool, Option("--json-progress", hidden=True)] = False,
 ) -> None:
     """Fly a scenario: start every process, show progress, record, report."""
     require("run", opt.FLIGHT_NEEDS | (opt.REPORT_NEEDS if report else {}))
@@ -104,6 +105,7 @@ def run(
         launch = new_launch(mode=mode, rate=pace, changed=tuple(flight.changed()), **how)
         options = RunOptions(scenario, Path(), launch, [name for name in order.split(",") if name])
     options.console, options.cameras, options.detect = shown, cameras, detect
+    options.json_progress = json_progress
     if not options.launch.in_process:
         if options.camera_children():
             require("run", opt.CAMERA_NEEDS)

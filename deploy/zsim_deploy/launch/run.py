@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from zsim.errors import RecordError, RunFailedError, SessionError
 from zsim.output_folder import RECORD
 from zsim.record import repair
-from zsim.runtime.progress import Screen
+from zsim.runtime.progress import JsonProgress, Screen
 from zsim.scenario.roles import driver_lines, expected_processes, watched_drones
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import BottomCamera, FrontCamera
@@ -37,6 +37,9 @@ DEFAULT_PORT = 7447  # Zenoh's own
 PORTS_TRIED = 5  # when other runs that start at this moment take each before our world listens
 
 
+Shown = Screen | JsonProgress
+
+
 @dataclass
 class RunOptions:
     """How to run a scenario."""
@@ -49,6 +52,7 @@ class RunOptions:
     cameras: bool = False
     detect: bool = False
     continued: bool = False  # it goes on where an earlier launch of it was interrupted
+    json_progress: bool = False  # progress is written for a program that has started this one
     supervisor: Supervisor | None = None  # over its processes, once they are started
 
     def status(self) -> dict[str, Any]:
@@ -68,14 +72,18 @@ class RunOptions:
 
 def fly(options: RunOptions) -> Outcome:
     run = run_in_process if options.launch.in_process else run_processes
-    with Screen(options.scenario.duration_s) as screen:
+    with (
+        contextlib.nullcontext(JsonProgress())
+        if options.json_progress
+        else Screen(options.scenario.duration_s) as screen
+    ):
         try:
             return run(options, screen)
         except KeyboardInterrupt as error:
             return Outcome(str(error) or REASONS[signal.SIGINT], interrupted=True)
 
 
-def run_processes(options: RunOptions, screen: Screen) -> Outcome:
+def run_processes(options: RunOptions, screen: Shown) -> Outcome:
     """Run a scenario as real processes; the record is finished in any case.
 
     KeyboardInterrupt, with the reason, where nothing flew yet, or Ctrl-C came twice.
@@ -98,7 +106,7 @@ def run_processes(options: RunOptions, screen: Screen) -> Outcome:
         return outcome
 
 
-def _run(options: RunOptions, screen: Screen, signals: EndSignals) -> Outcome:
+def _run(options: RunOptions, screen: Shown, signals: EndSignals) -> Outcome:
     """Prepare the folder and the fork server, and run on an endpoint; on another one where its port was lost."""
     run_folder.prepare(options.out, options.scenario, options.launch, screen.say, options.continued)
     if options.camera_children() and not options.launch.rate and not options.scenario.gates("camera"):
@@ -117,7 +125,7 @@ def _run(options: RunOptions, screen: Screen, signals: EndSignals) -> Outcome:
                 return outcome
 
 
-def _run_on(options: RunOptions, endpoint: str, screen: Screen, launcher: RoleLauncher, signals: EndSignals) -> Outcome:
+def _run_on(options: RunOptions, endpoint: str, screen: Shown, launcher: RoleLauncher, signals: EndSignals) -> Outcome:
     for line in driver_lines(options.scenario, endpoint):
         screen.say(line)
     supervisor = Supervisor(options.scenario.processes, screen)
@@ -147,7 +155,10 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
         commands[names[-1]] = ["host", *reach, "--", *names]
     else:
         for role, _, thing in (name.partition(".") for name in names):
-            commands[f"{role}.{thing}"] = [role, *reach, "--", thing]  # a name of the contract may begin with -
+            name = f"{role}.{thing}"  # a name of the contract may begin with -
+            commands[name] = (
+                ["agent", *reach, "--", name] if role in scenario.own_agents else [role, *reach, "--", thing]
+            )
     for agent in options.agents():
         commands[agent.name] = ["agent", "--name", agent.name, *reach, "--", *agent.words()]
     if options.console:
@@ -164,7 +175,7 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
     return sorted(children, key=lambda child: rank.get(child.name, len(rank)))
 
 
-def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
+def run_in_process(options: RunOptions, screen: Shown) -> Outcome:
     from zsim_api.flight import fly_here
     from zsim_world.fleet.fleet import DivergedError
 
@@ -215,7 +226,7 @@ def check_open_files(options: RunOptions) -> None:
     require_files(launcher_files(count, len(expected)), f"{count} processes")
 
 
-def free_port(screen: Screen) -> int:
+def free_port(screen: Shown) -> int:
     """Return Zenoh's port, or another free one, shown on the screen, where that is taken."""
     if is_free(DEFAULT_PORT):
         return DEFAULT_PORT

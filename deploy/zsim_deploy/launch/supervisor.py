@@ -3,7 +3,6 @@
 Where a process runs, on this machine (`ChildProcess`) or on another one (`RemoteProcess`), makes no difference here.
 """
 
-import json
 import signal
 import socket
 import time
@@ -16,7 +15,7 @@ from queue import SimpleQueue
 from typing import Any, NamedTuple, Protocol
 
 from zsim.errors import RunError
-from zsim.runtime.progress import ProgressSink
+from zsim.runtime.progress import JsonProgress, ProgressSink
 from zsim.scenario.roles import OnDeath, is_needed, lets_drop, on_death, on_overdue
 from zsim.scenario.scenario import Processes
 from zsim_deploy import USER_FAULT
@@ -135,25 +134,19 @@ class Supervisor:
     # What the world says
 
     def handle_line(self, text: str) -> None:
-        try:
-            line = json.loads(text)
-        except ValueError:
-            return  # not progress: something printed by a library
-        if not isinstance(line, dict):
-            return  # a number that was printed is JSON too
+        kind, content = JsonProgress.read(text)
+        if not kind:
+            return
         self._silent_s = None
         self._world_watch.last_s = time.monotonic()
-        if "clock" in line:
-            self._flies = self._flies or line["clock"].get("state") == "running"
-            self.clock = line["clock"]
-            self._world_watch.clock(line["clock"])
-            self._show.clock(line["clock"])
-        elif "event" in line:
-            self._on_event(line["event"])
-        elif "health" in line:
-            self._show.health(line["health"])
-        elif "say" in line:
-            self._show.say(line["say"])
+        if kind == "clock":
+            self._flies = self._flies or content.get("state") == "running"
+            self.clock = content
+            self._world_watch.clock(content)
+        if kind == "event":
+            self._on_event(content)
+        else:
+            getattr(self._show, kind)(content)
 
     def _on_event(self, event: dict[str, Any]) -> None:
         def give_up() -> None:

@@ -1,5 +1,6 @@
 """`zsim.run`: classes from anywhere, the bits of the command, and how what goes wrong is told."""
 
+import functools
 import signal
 import subprocess
 import sys
@@ -11,8 +12,10 @@ from pair_flight import PAIR
 from refused import refused
 
 import zsim
-from zsim.errors import RunError, ScenarioError, UserCodeError
+from zsim.errors import RunError, ScenarioError, UserCodeError, ZsimError
+from zsim.runtime.progress import Screen
 from zsim_agents.formation.control_law import ControlLaw
+from zsim_analysis.in_process import fly
 
 STATUS = "drone/*/sensor/status"
 
@@ -45,6 +48,11 @@ class Nan(ControlLaw):
         return c * float("nan")
 
 
+class Still(ControlLaw):
+    def rates(self, c: Any, p_W: Any, v_W: Any, c_des: Any, c_dot_des: Any) -> Any:
+        return c * 0.0
+
+
 class TwoRates(ControlLaw):
     def rates(self, c: Any, p_W: Any, v_W: Any, c_des: Any, c_dot_des: Any) -> Any:
         return c[:2]
@@ -59,6 +67,17 @@ def test_an_agent_flies_beside_the_stock_ones(tmp_path: Path) -> None:
     other = zsim.run(PAIR, agents=[Lander], out=tmp_path / "other", progress=False)
     assert other.truth_sha256 == run.truth_sha256
     assert zsim.run(PAIR, out=tmp_path / "none", progress=False).truth_sha256 != run.truth_sha256
+
+
+def test_the_end_of_a_flight_is_shown() -> None:
+    shown: list[dict[str, Any]] = []
+
+    class Shown(Screen):
+        def clock(self, line: dict[str, Any]) -> None:
+            shown.append(line)
+
+    fly(zsim.Scenario(**PAIR).resolved, None, screen=Shown(6.0))
+    assert (shown[-1]["t_s"], shown[-1]["state"], shown[-1]["phase"]) == (6.0, "stopped", "engaged")
 
 
 def test_fields_are_replaced_by_path_by_name_and_by_class(tmp_path: Path) -> None:
@@ -86,12 +105,72 @@ def test_what_a_class_raises_is_raised_after_a_line_that_says_where(
     assert zsim.load(tmp_path / "run").duration_s >= 1.0
 
 
-@pytest.mark.parametrize(("law", "terms"), [(Nan, ("nan", "robot")), (TwoRates, ("(2,);", "(8,),"))])
+@pytest.mark.parametrize(("law", "terms"), [(Nan, ("nan", "d1")), (TwoRates, ("(2,);", "(8,),"))])
 def test_what_a_law_returns_amiss_names_class_field_and_shapes(
     law: type, terms: tuple[str, ...], tmp_path: Path
 ) -> None:
     with refused(UserCodeError, f"{law.__module__}:{law.__qualname__}.rates", *terms):
         zsim.run(PAIR, law=law, out=tmp_path / "run", progress=False)
+
+
+SLOW = functools.partial(Nan, gains=None)
+
+
+def test_a_law_that_fails_in_its_rehearsal_leaves_no_folder(tmp_path: Path) -> None:
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    made = type("Made", (Nan,), {})  # flown by a module in the folder
+    for out in (tmp_path / "run", mine):
+        with pytest.raises(UserCodeError):
+            zsim.run(PAIR, law=made, out=out, progress=False)
+    assert [*tmp_path.rglob("*")] == [mine]
+    zsim.run(PAIR, law=type("Made", (Still,), {}), duration_s=1, out=mine, progress=False)
+    assert [*mine.glob("zsim_own_*.py")]
+    (mine / "notes.txt").write_text("mine")
+    with pytest.raises(UserCodeError):
+        zsim.run(PAIR, law=made, out=mine, force=True, progress=False)
+    assert [*mine.iterdir()] == [mine / "notes.txt"]
+
+
+MISGIVEN: dict[str, tuple[dict[str, Any], type[ZsimError], tuple[str, ...]]] = {
+    "a partial for a law": (
+        {"law": SLOW},
+        ScenarioError,
+        ("law", "functools.partial(<class…", "class", "module:Class"),
+    ),
+    "a partial for an estimator": (
+        {"estimator": SLOW},
+        ScenarioError,
+        ("estimation.algorithm", "functools.partial(<class…"),
+    ),
+    "a function for a law": ({"law": lambda space, gains: Nan(space)}, ScenarioError, ("law", "<function", "class")),
+    "a law for an agent": ({"agents": [Nan]}, RunError, ("(space", "'space'")),
+    "a number for an agent": ({"agents": [5]}, RunError, ("agent", "5", "zsim.Agent")),
+    "a name for an agent": ({"agents": ["mine:Lander"]}, RunError, ("agent", "'mine:Lander'", "zsim.Agent")),
+    "a partial with another argument": (
+        {"agents": [functools.partial(Lander, to_s=3)]},  # pyright: ignore[reportCallIssue]
+        RunError,
+        ("functools.partial(<class…", "arguments"),
+    ),
+    "no sequence": ({"agents": Lander}, RunError, ("agents", "<class", "sequence")),
+    "a text": ({"agents": "mine:Lander"}, RunError, ("agents", "'mine:Lander'", "sequence")),
+}
+
+
+@pytest.mark.parametrize("case", MISGIVEN)
+def test_what_is_given_for_a_class_or_an_agent_is_named_with_what_is_allowed(case: str) -> None:
+    given, kind, terms = MISGIVEN[case]
+    with refused(kind, *terms):
+        zsim.run(PAIR, progress=False, **given)
+    if "agents" in given:
+        with refused(kind, *terms):
+            zsim.Simulation(PAIR, **given)
+
+
+def test_a_partial_makes_an_agent(tmp_path: Path) -> None:
+    agents = [functools.partial(Lander, at_s=1.0)]
+    run = zsim.run(PAIR, agents=agents, duration_s=2, out=tmp_path / "run", progress=False)
+    assert "lander.main" in run.commands("d2", "mode").source.tolist()
 
 
 SCRIPT = """

@@ -21,6 +21,7 @@ import zsim
 from zsim.errors import RunError, ScenarioError
 from zsim.scenario import scenario_file
 from zsim.schema import plugin, yaml_file
+from zsim_agents.formation.control_law import ControlLaw
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.sweep import process_pool
 from zsim_analysis.sweep.process_pool import READY
@@ -77,10 +78,10 @@ def climb_m(run: "zsim.Run") -> dict[str, float]:
 
 @pytest.mark.parametrize("keep", [False, True])
 def test_a_metric_is_given_the_run_or_where_it_says_flight_the_arrays(near: None, tmp_path: Path, keep: bool) -> None:
-    frame = zsim.sweep(
+    frame: Any = zsim.sweep(
         DOCUMENT, {"seed": [4, 6]}, metrics=[climb_m, counts], out=tmp_path, keep_records=keep, progress=False
     )
-    assert frame["metrics_failure"].tolist() == [None, None]
+    assert frame["metrics_failure"].isna().all()
     assert frame["metrics.gates"].tolist() == [26, 26]  # 0.5 s, with the first instant
     assert frame["metrics.drones"].tolist() == [1, 1]
     records = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("run.mcap"))
@@ -100,7 +101,6 @@ def test_a_frame_has_a_row_for_each_run_with_its_values_and_figures(near: None, 
     assert frame.index.name == "run"
     gust = "environment.wind.gust_m_s"
     assert frame[["seed", gust]].to_numpy().tolist() == [[2, 0.0], [2, 0.5], [3, 0.0], [3, 0.5]]
-    assert frame["failure"].isna().all()
     assert frame["metrics.nothing_m"].isna().all()
     assert {str(frame[f"metrics.{name}"].dtype) for name in ("nothing_m", "highest_m")} == {"float64"}
     assert (frame["metrics.drones"] == 1).all()
@@ -237,6 +237,30 @@ def test_a_folder_of_its_own_is_kept_when_interrupted(tmp_path: Path) -> None:
     shutil.rmtree(folder)
 
 
+def test_what_a_killed_sweep_has_left_is_removed_by_the_next_one(tmp_path: Path) -> None:
+    """Its own folder, the modules of what the script defines, and in a worker the record of a run."""
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    environment = {**os.environ, "TMPDIR": str(temporary)}
+    waiting = (
+        WAITING.replace("(flight)", "(run)").replace("flight.", "run.").replace("scenario.seed", "scenario['seed']")
+    )
+    write(tmp_path, script_py=f"OUT = None\n{waiting}", one_yaml=ONE)
+    with subprocess.Popen(
+        [sys.executable, "script.py"], cwd=tmp_path, env=environment, start_new_session=True
+    ) as killed:
+        while not (tmp_path / "flying").exists() and killed.poll() is None:
+            time.sleep(0.05)
+        started = psutil.Process(killed.pid).children(recursive=True)
+        killed.kill()
+    assert psutil.wait_procs(started, PATIENCE_S)[1] == []
+    left = {path.name.partition("-")[0] for path in temporary.glob("*/*")}
+    assert left == {"modules", "sweep", "run"}
+    write(tmp_path, next_py="import zsim; zsim.sweep('one.yaml', {'seed': [1]}, workers=1, progress=False)")
+    subprocess.run([sys.executable, "next.py"], cwd=tmp_path, env=environment, check=True)
+    assert [*temporary.iterdir()] == []
+
+
 def test_the_same_call_flies_what_is_missing(
     near: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -261,6 +285,44 @@ def test_a_run_that_fails_is_a_row_with_its_reason(
     assert frame["seed"].tolist() == [1, 2]
     shown = capsys.readouterr().err.splitlines()
     assert shown[-1] == f"2 of 2 runs failed: {frame['failure'][0]}"
+
+
+def test_what_is_missing_is_alike_in_sweeps_that_failed_and_that_did_not(
+    near: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good: Any = zsim.sweep(DOCUMENT, {"seed": [1, 2]}, progress=False)
+    assert good["failure"].isna().all()
+    assert (good["failure"] != "").all()
+    assert not good["failure"].str.contains("d1").any()
+    assert len(good[~good["crashed"]]) == 2
+    diverge(monkeypatch)
+    bad: Any = zsim.sweep(DOCUMENT, {"seed": [1, 2]}, progress=False)
+    assert bad["failure"].str.contains("d1").all()
+    shared = [column for column in good if column in bad]
+    assert {"failure", "shortfall", "engaged", "collisions", "truth_sha256", "wall_s"} <= {*shared}
+    assert good[shared].dtypes.to_dict() == bad[shared].dtypes.to_dict()
+    missing = [value for column in ("failure", "shortfall") for value in good[column]]
+    assert [*map(type, missing)] == [float] * 4
+
+
+def made_law(gain: float) -> type:
+    class Law(ControlLaw):
+        def rates(self, c: Any, p_W: Any, v_W: Any, c_des: Any, c_dot_des: Any) -> Any:
+            return self.space.inverse_jacobian(c) @ (gain * (c_des - c))
+
+    return Law
+
+
+def test_classes_that_a_function_makes_can_be_told_apart(near: None, tmp_path: Path) -> None:
+    laws = [made_law(0.1), made_law(0.2), made_law(0.3), "proportional"]
+    laws[2].__name__ = "Law 0.3"
+    frame: Any = zsim.sweep(
+        yaml_file.value(PAIR), {"clusters.main.law": laws}, duration_s=0.5, out=tmp_path / "swept", progress=False
+    )
+    assert frame["failure"].isna().all()
+    assert frame["clusters.main.law"].tolist() == ["Law", "Law-2", "Law 0.3", "proportional"]
+    labels = [each["label"] for each in frame.attrs["summary"]["points"]]
+    assert labels[:2] == ["Law", "Law-2"]
 
 
 BAD: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {

@@ -1,8 +1,10 @@
-"""Locks of the folders that commands write into, where there are any."""
+"""Locks of the folders that commands write into, where there are any, and temporary folders."""
 
 import errno
 import fcntl
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -56,3 +58,59 @@ def test_without_locks_everything_goes_on_with_a_warning(
     for federation in ("one", "one@1"):
         control_socket.ControlSocket(federation, {}).close()
     assert capfd.readouterr().err.splitlines() == [warning]  # a run's own was given by the run
+
+
+HOLDER = """
+import multiprocessing
+import sys
+from zsim.output_folder import temporary_folder
+
+if __name__ == "__main__":
+    print(temporary_folder("one-"), flush=True)
+    child = multiprocessing.get_context("spawn").Process(target=temporary_folder, args=("two-",))
+    child.start()
+    child.join()
+    print(child.exitcode, flush=True)
+    sys.stdin.read()
+"""
+LOCKLESS_HOLDER = f"""
+import errno
+import fcntl
+
+def flock(*_):
+    raise OSError(errno.ENOLCK, "")
+
+fcntl.flock = flock
+{HOLDER}"""
+
+
+def holding(folder: Path, script: str = HOLDER) -> tuple[subprocess.Popen[str], Path]:
+    """Start a process that has a temporary folder, and had a child with one; return the folder, too."""
+    (folder / "holder.py").write_text(script)
+    environment = {**os.environ, "TMPDIR": str(folder / "tmp")}
+    words, pipe = [sys.executable, "holder.py"], subprocess.PIPE
+    process = subprocess.Popen(words, cwd=folder, env=environment, stdin=pipe, stdout=pipe, text=True)
+    assert process.stdout is not None
+    made = Path(process.stdout.readline().strip())
+    assert made.is_relative_to(folder / "tmp")
+    assert process.stdout.readline() == "0\n"
+    return process, made
+
+
+@pytest.mark.parametrize("script", [HOLDER, LOCKLESS_HOLDER], ids=["locks", "no locks"])
+def test_a_temporary_folder_goes_with_its_process_or_if_that_is_killed_with_the_next_one(
+    tmp_path: Path, script: str
+) -> None:
+    (tmp_path / "tmp").mkdir()
+    (killed, left), (alive, held) = holding(tmp_path), holding(tmp_path)
+    killed.kill()
+    killed.communicate()
+    assert left.is_dir()
+    another, _ = holding(tmp_path, script)
+    assert held.is_dir()
+    assert left.exists() == (script == LOCKLESS_HOLDER)  # where nothing can be locked, nobody knows
+    for process in (another, alive):
+        process.communicate()
+        assert process.returncode == 0
+    rest = [left.parent] if script == LOCKLESS_HOLDER else []
+    assert [*(tmp_path / "tmp").iterdir()] == rest

@@ -16,7 +16,8 @@ from zsim.contract.framing import GateMessages, key_table
 from zsim.errors import UserCodeError, reason_of
 from zsim.math.compiled import Held, compiled, hold, inlined, kernel
 from zsim.schema import plugin
-from zsim.sensors.sensor import Sample, as_fields, field_types, message_type
+from zsim.schema.declared_message import field_types
+from zsim.sensors.sensor import Sample, as_fields, message_type
 from zsim.sensors.sensor_catalogue import STOCK
 from zsim.vehicles.vehicle import ROTORS_MAX, ROTORS_MIN
 from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, Fleet
@@ -170,7 +171,7 @@ class UserMessages:
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
         self._seen = len(fleet.sensors.names)  # number of the sightings, behind all sensors
-        self._fields = [field_types(kind.message) for kind in fleet.sensors.types[STOCK_SENSORS:]]
+        self._fields = [field_types(kind.message, Sample) for kind in fleet.sensors.types[STOCK_SENSORS:]]
         kinds = zip(fleet.sensors.types[STOCK_SENSORS:], self._fields, strict=True)
         self._messages = [message_type(kind.message.__name__, fields) for kind, fields in kinds]
 

@@ -104,7 +104,7 @@ class Run:
     def learn_handler(self, key: str) -> Handler:
         """Return the handler of a key's messages, and remember it: the same keys come at every gate."""
         kind, (place, name, what) = messages.type_of(key), keys.parts(key)
-        if kind in messages.RELAYED or (kind in OF_CAMERAS and not keys.is_sensor(key)):
+        if messages.is_relayed(kind) or (kind in OF_CAMERAS and not keys.is_sensor(key)):
             handler = self._relay
         elif place == "drone" and name in self.world.external and (what in OF_DRIVERS or what.startswith("sensor/")):
             handler = self._take_of_driver  # and not the world's
@@ -145,7 +145,7 @@ class Run:
         self.history.passed.append(sample)
         key, payload = sample
         kind = messages.type_of(key)
-        is_counted = kind in messages.RELAYED
+        is_counted = messages.is_relayed(kind)
         head = _head(key, payload) if is_counted else messages.decode(key, payload)
         if head.t_ns > self.world.now_ns:
             raise DecodeError(f"{key}: t_ns is {head.t_ns}; must be <= {self.world.now_ns}, the newest gate")

@@ -18,6 +18,7 @@ class RunClock:
     Attributes:
         rate: simulated per wall seconds to pace at; 0 = as fast as possible.
         delay_ns: of commands.
+        ahead_ns: by how much the world may be ahead of the agents.
         now_ns: the newest gate; 0 before the start too.
         next_ns: the gate after it, from which a newcomer is waited for.
         state: as in the message `clock`.
@@ -40,7 +41,7 @@ class RunClock:
         self.mode = mode
         self.rate = rate
         self.gate_ns = round(time.gate_ms * 1e6)
-        self.delay_ns = time.command_delay_gates * self.gate_ns
+        self.delay_ns = self.ahead_ns = time.command_delay_gates * self.gate_ns
         self.now_ns = self.next_ns = 0
         self.state = "waiting"
         self.steps_allowed = self.jumps = 0
@@ -50,7 +51,7 @@ class RunClock:
     @property
     def required_ns(self) -> int:
         """Return the gate whose dones are required for the next one: its commands answer that gate."""
-        return self.now_ns - self.delay_ns
+        return self.now_ns - self.ahead_ns
 
     @property
     def is_halted(self) -> bool:

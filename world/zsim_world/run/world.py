@@ -76,6 +76,8 @@ class World(Coordinator):
     ) -> None:
         check_pace(scenario, mode)
         super().__init__(scenario, mode, rate, wall_ns, run_id, expected_processes(scenario))
+        if scenario.own_messages():  # what is published at a gate is read at the next one
+            self.clock.ahead_ns = 0
         self._changed = UNSET if changed is None else tuple(changed)
         self.fleet = Fleet(scenario)
         self.drivers = ExternalDrones(self.fleet)
@@ -122,6 +124,7 @@ class World(Coordinator):
             sightings=self.fleet.has_sightings or UNSET,
             module_folders=tuple(map(str, plugin.folders())) if s.own_code() else UNSET,
             changed=self._changed,
+            user_messages=tuple(s.own_messages()) or UNSET,
         )
 
     # State

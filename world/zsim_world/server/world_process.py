@@ -407,7 +407,7 @@ class Pipelining:
         self._continues = True
         self._delayed_wall_ns = 0
         self._gates = 0
-        self._ahead_ns = max(0, self._clock.delay_ns - LAG_GATES * self._clock.gate_ns)
+        self._ahead_ns = max(0, self._clock.ahead_ns - LAG_GATES * self._clock.gate_ns)
 
     @property
     def _enabled(self) -> bool:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from zsim.errors import UserCodeError
 from zsim.scenario.scenario import ROBOTS_MAX, Cluster, ClusterGroup, Scenario, space_name
-from zsim.schema import plugin
+from zsim.schema import parameters, plugin
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, checked
 from zsim_agents.formation.spaces.template_cluster import TemplateCluster
 from zsim_agents.formation.spaces.triad_cluster import PairCluster, TriadCluster
@@ -47,9 +47,11 @@ def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
 def _space(spec: Cluster | ClusterGroup, starts: Array) -> ClusterSpace:
     places_m = np.array(spec.template_m or starts, dtype=float)
     name = space_name(spec.space, len(places_m), bool(spec.template_m))
+    given = spec.space_parameters
     if name in STOCK:
+        parameters.bound(STOCK[name], given, "space_parameters")
         return STOCK[name](places_m)
-    own: Any = plugin.load(name, "space", ClusterSpace)
+    own: Any = parameters.bound(plugin.load(name, "space", ClusterSpace), given, "space_parameters")
     try:
         return checked(own.for_places(places_m))
     except TypeError as error:  # also of a call with wrong arguments, which has no frame of the user's

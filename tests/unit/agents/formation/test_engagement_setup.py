@@ -125,7 +125,7 @@ def test_a_space_of_the_user_s_own_gets_the_places_of_its_robots(module: str) ->
         ("law", "formation_of_mine:Other", ("Half", "Lost", "Named", "Nothing", "Raises", "Short", "Still")),
         ("law", "formation_of_mine:Half", ("rates()",)),
         ("law", "formation_of_mine:Short", ("(3,)",)),
-        ("law", "formation_of_mine:Lost", ("formation_of_mine:Lost.rates", "nan", "vz", "robot", "2")),
+        ("law", "formation_of_mine:Lost", ("formation_of_mine:Lost.rates", "nan", "vz", "drone2")),
         ("law", "formation_of_mine:Nothing", ("formation_of_mine:Nothing.rates", "null", "12")),
         ("law", "formation_of_mine:Raises", ("mine:Raises.rates", "ZeroDivisionError", "formation_of_mine.py:29")),
         ("space", "formation_of_mine:Flat", ("formation_of_mine:Flat.forward", "(3,)", "(12,)")),

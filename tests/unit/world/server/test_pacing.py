@@ -14,13 +14,13 @@ class Lagging:
     """A world of one agent that is through with `done` gates; the delay is five gates."""
 
     def __init__(self, delay: int = 5, mode: str = "lockstep", rate: float = 0.0) -> None:
-        self.gate_ns, self.delay_ns = GATE_NS, delay * GATE_NS
+        self.gate_ns, self.ahead_ns = GATE_NS, delay * GATE_NS
         self.mode, self.rate = mode, rate
         self.clock = self
         self.now, self.done = 0, 0
 
     def blocking(self, ahead_ns: int = 0) -> list[str]:
-        needed = self.now - (self.delay_ns - ahead_ns) // GATE_NS
+        needed = self.now - (self.ahead_ns - ahead_ns) // GATE_NS
         return ["estimator.d1"] if self.done < needed else []
 
     def may_advance(self) -> bool:

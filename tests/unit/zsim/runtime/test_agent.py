@@ -167,10 +167,6 @@ def test_requests_and_last_values_go_to_whom_they_belong():
     [
         ([], ("group", "members", "one")),
         (
-            [Member("estimator.d1", [], "b"), Member("controller.main", [], "a", 2 * GATE_NS)],
-            ("period_ns", "estimator.d1 20000000", "controller.main 40000000", "same"),
-        ),
-        (
             [
                 Member("talk.a", [keys.cluster_state("b")], keys.cluster_state("a")),
                 Member("talk.b", [keys.cluster_state("a")], keys.cluster_state("b")),
@@ -178,8 +174,16 @@ def test_requests_and_last_values_go_to_whom_they_belong():
             ("gate_keys", "talk.a", "talk.b", "each other"),
         ),
     ],
-    ids=["nobody", "different periods", "waiting for each other"],
+    ids=["nobody", "waiting for each other"],
 )
 def test_what_cannot_be_a_group_is_refused(members: list[Member], terms: tuple[str, ...]):
     with refused(RunError, *terms):
         AgentGroup(members, HOLD_NS)
+
+
+def test_each_member_steps_at_its_own_period():
+    slow, slower = Member("slow.a", [], "a", 2 * GATE_NS), Member("slower.b", [], "b", 3 * GATE_NS)
+    group = AgentGroup([slow, slower], HOLD_NS)
+    assert group.period_ns == GATE_NS
+    published = {gate: [output.key for output in group.answer(gate * GATE_NS, []) or ()] for gate in range(7)}
+    assert published == {0: ["a", "b"], 1: [], 2: ["a"], 3: ["b"], 4: ["a"], 5: [], 6: ["a", "b"]}

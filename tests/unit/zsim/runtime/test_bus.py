@@ -29,6 +29,7 @@ class Timing(Struct):
     command_delay_ns: int
     gate_ns: int
     mode: str = "lockstep"
+    own_messages: tuple[Any, ...] = ()
 
 
 class Hub:

@@ -12,8 +12,9 @@ from zsim.scenario import scenario_file
 from zsim.scenario.faults import kinds_of
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
+from zsim.schema.declared_message import field_types
 from zsim.sensors import sensor_catalogue
-from zsim.sensors.sensor import as_fields, field_types, message_type
+from zsim.sensors.sensor import Sample, as_fields, message_type
 from zsim.sensors.sensor_catalogue import FIELDS, PRESETS, STOCK, declarations
 
 EXAMPLES = Path(__file__).parents[4] / "examples"
@@ -174,7 +175,7 @@ def test_messages_are_known_wherever_the_info_of_the_run_is():
     assert messages.type_of(key) is None
     messages.register_sensors([messages.SensorInfo("test_ranger", "Ranged", fields)])
     kind: Any = messages.type_of(key)
-    assert field_types(kind) == fields
+    assert field_types(kind, Sample) == fields
     sent = kind(1, 0, 1, *as_fields([1.5, 1, 2, 3, 7, 1], fields))
     assert messages.decode(key, messages.encode(sent)) == sent
     assert (sent.place_m, sent.hits, sent.line_of_sight) == ((1.0, 2.0, 3.0), 7, True)

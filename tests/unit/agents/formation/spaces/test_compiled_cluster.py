@@ -203,7 +203,7 @@ spaces = {
 kind, gains = sys.argv[1], FormationGains()
 space = spaces[kind] if kind in spaces else cluster_space(int(kind))
 n = space.n
-_rehearse(space, gains, ProportionalLaw)
+_rehearse(space, [f"d{i}" for i in range(space.n)], gains, ProportionalLaw)
 before = compiled()
 turn = 2 * np.pi * np.arange(n) / n
 p_W, yaw = np.column_stack((9 * np.cos(turn), 9 * np.sin(turn), np.full(n, 9.0))), np.zeros(n)

@@ -1,0 +1,173 @@
+"""Agents of a user's class, one for each drone, tell each other where they are: the same bits however they are run."""
+
+from itertools import pairwise, permutations
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from federation import Federation
+
+import zsim
+from zsim.errors import UserCodeError
+from zsim.record import RecordReader
+from zsim.runtime.bus import Bus
+from zsim.scenario import scenario_file
+from zsim_agents.hosting import hosted
+from zsim_analysis.in_process import fly
+from zsim_analysis.rerun import rerun_record
+from zsim_world.run.world import World
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+GATE_S = 0.02
+SWARM = """
+name: swarm
+duration_s: 6
+drones:
+  - {name: d1, position_m: [0, 0, 0]}
+  - {name: d2, position_m: [6, 0, 0]}
+  - {name: d3, position_m: [0, 6, 0]}
+agents: {pilot: {class: 'swarm:Pilot', parameters: {takeoff_s: 0.5}}}
+"""
+TALKERS = """
+import zsim
+
+
+class Word(zsim.AgentMessage, frozen=True):
+    key = "talk/{drone}/word"
+    said: float
+
+
+class Talker(zsim.Agent):
+    messages = (Word,)
+    reads = (Word.of(),)
+
+    def __init__(self, drone):
+        super().__init__()
+        self.drone, self.heard, self.new = drone, [], []
+
+    def receive(self, key, message):
+        if key.startswith("talk/"):
+            self.new.append((key.split("/")[1], message.t_ns))
+
+    def step(self, t_ns):
+        self.heard += [[t_ns, *each] for each in self.new]
+        self.new = []
+        return [self.message(t_ns, Word(said=self.said(t_ns)))]
+
+    def said(self, t_ns):
+        return t_ns / 1e9
+
+
+class Nan(Talker):
+    def said(self, t_ns):
+        return float("nan") if t_ns > 300_000_000 else 0.0
+
+
+class Shape(Talker):
+    def said(self, t_ns):
+        return (1.0, 2.0)
+
+
+class Foreign(Talker):
+    def step(self, t_ns):
+        return [zsim.Output(Word.of("d2"), Word(t_ns=t_ns, seq=0, said=0.0))] if self.drone == "d1" else []
+"""
+TALK = """
+name: talk
+duration_s: 0.5
+drones: [{name: d1, position_m: [0, 0, 0]}, {name: d2, position_m: [6, 0, 0]}, {name: d3, position_m: [0, 6, 0]}]
+agents: {talk: {class: 'talkers:%s'}}
+"""
+NAMES = ("talk.d1", "talk.d2", "talk.d3")
+
+
+@pytest.fixture(autouse=True)
+def modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "talkers.py").write_text(TALKERS)
+    for folder in (EXAMPLES, tmp_path):
+        monkeypatch.syspath_prepend(str(folder))
+    monkeypatch.setenv("PYTHONPATH", f"{EXAMPLES}:{tmp_path}")
+
+
+def heard(groups: list[list[str]], gates_max: int) -> dict[str, list[Any]]:
+    """Return what each has heard, in one process with these groups of agents."""
+    scenario = scenario_file.resolve({**_talk("Talker"), "processes": {"expect": list(NAMES)}})
+    world = World(scenario)
+    agents = [hosted(world.info(), scenario, group) for group in groups]
+    bus = Bus(world, agents, lambda: 0)
+    bus.join()
+    while bus.turn(gates_max):
+        pass
+    bus.end()
+    members = [each for agent in agents for each in getattr(agent, "_members", [agent])]
+    return {each.name: each.heard for each in members}
+
+
+def _talk(kind: str) -> dict[str, Any]:
+    return yaml.safe_load(TALK % kind)
+
+
+@pytest.mark.parametrize("gates_max", [1, 10])
+def test_each_hears_all_a_gate_later_in_whatever_order_they_are(gates_max: int) -> None:
+    gates = [round(gate * GATE_S * 1e9) for gate in range(26)]
+    wanted = [[at, drone, sent] for sent, at in pairwise(gates) for drone in ("d1", "d2", "d3")]
+    for order in permutations(NAMES):
+        assert heard([[name] for name in order], gates_max) == dict.fromkeys(NAMES, wanted)
+        assert heard([[*order]], gates_max) == dict.fromkeys(NAMES, wanted)
+        assert heard([[*order[:2]], [order[2]]], gates_max) == dict.fromkeys(NAMES, wanted)
+
+
+@pytest.mark.parametrize(
+    ("kind", "terms"),
+    [
+        ("Nan", ("talk.d1 at 0.32 s", "talkers:Nan.step", "talk/d1/word", "said", "nan")),
+        ("Shape", ("talk.d1 at 0.00 s", "talkers:Shape.step", "talk/d1/word", "said", "[1.0, 2.0]")),
+        ("Foreign", ("talk.d1 at 0.00 s", "talkers:Foreign.step", "talk/d2/word", "talk/d1/word")),
+    ],
+)
+def test_what_cannot_be_sent_ends_the_run_with_class_key_field_and_gate(
+    kind: str, terms: tuple[str, ...], tmp_path: Path
+) -> None:
+    with pytest.raises(UserCodeError) as raised:
+        fly(scenario_file.resolve(_talk(kind)), tmp_path / "run.mcap")
+    assert all(term in str(raised.value) for term in terms), raised.value
+
+
+def test_as_processes_and_flown_again_they_have_the_same_bits(tmp_path: Path, compiled: None) -> None:
+    """Killed in the middle, a pilot goes on from its snapshot."""
+    (tmp_path / "swarm.yaml").write_text(SWARM)
+    alone = zsim.run(tmp_path / "swarm.yaml", out=tmp_path / "alone", progress=False)
+    messages = alone.messages("swarm/d1/position")
+    assert len(messages) == 301
+    assert {"position_m_x", "position_m_y", "position_m_z"} <= {*messages.columns}
+    with zsim.Federation(tmp_path / "swarm.yaml", out=tmp_path / "many") as flight:
+        flight.wait_until(3.0)
+        flight.kill("pilot.d2")
+        run = flight.run()
+    assert run.truth_sha256 == alone.truth_sha256
+    assert "pilot.d2" in [*run.events[run.events.kind == "restart"].subject]
+    said: list[str] = []
+    assert rerun_record(tmp_path / "alone", False, said.append, said.append) == ""
+    with RecordReader(tmp_path / "many" / "run.mcap") as reader:
+        assert "swarm/d3/position" in reader.topics()
+
+
+@pytest.mark.soak
+def test_hosted_they_have_the_same_bits(federation: Federation, tmp_path: Path, compiled: None) -> None:
+    (tmp_path / "swarm.yaml").write_text(SWARM)
+    alone = zsim.run(tmp_path / "swarm.yaml", out=tmp_path / "alone", progress=False)
+    federation.run(SWARM, "--hosted").ends(with_code=0)
+    assert federation.record().sha256() == alone.truth_sha256
+
+
+def test_the_pentagon_closes(tmp_path: Path) -> None:
+    """Consensus on displacements over the complete graph: 5 drones, rate k λ₂ = 0.3 · 5 = 1.5 1/s."""
+    run = zsim.run(EXAMPLES / "swarm.yaml", duration_s=25, out=tmp_path / "run", progress=False)
+    places = {drone: run.estimate(drone).iloc[-1] for drone in run.drones}
+    sides = []
+    for i in range(5):
+        one, other = places[f"drone{i + 1}"], places[f"drone{(i + 1) % 5 + 1}"]
+        d2 = sum((one[f"position_m_{axis}"] - other[f"position_m_{axis}"]) ** 2 for axis in "xy")
+        sides.append(d2**0.5)
+    assert sides == pytest.approx([3.5267] * 5, abs=0.3)  # 2 · 3 m · sin(36°)

@@ -1,0 +1,124 @@
+"""Users' classes in a scenario: their parameters and messages, filled in where the scenario is read.
+
+Whoever reads `world/info` finds all parameters and messages there, and imports nothing that it names.
+"""
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+
+from zsim.contract.agent_messages import AgentMessage, about, message_info
+from zsim.errors import DocumentError, NotTrustedError
+from zsim.scenario.scenario import OwnAgent
+from zsim.schema import parameters, plugin
+from zsim.schema.checker import Fault, faults
+
+OF_THE_RUN = ("info", "scenario", "drone", "cluster")  # arguments of an agent's constructor that are no parameters
+
+
+class Agent:
+    """What the class of an agent must have."""
+
+    def receive(self, key: str, message: Any) -> None: ...
+
+    def step(self, t_ns: int) -> Any: ...
+
+
+def with_agents(section: Any, imports: bool) -> tuple[Any, list[Fault]]:
+    """Return the `agents:` of a scenario with all parameters and messages of their classes, and what is wrong in it.
+
+    Args:
+        imports: whether classes may be imported; else the section must have been filled in, by whoever could.
+    """
+    if not isinstance(section, dict):
+        return section, []
+    filled, wrong = dict(section), list[Fault]()
+    for role, entry in section.items():
+        if any(faults(entry, OwnAgent)) or "declared" in entry:
+            continue
+        where = f"agents.{role}"
+        if not imports:
+            wrong.append((f"{where}.declared", "is missing; must be there in a resolved scenario"))
+            continue
+        try:
+            filled[role] = {**entry, **_declared(entry, where)}
+        except NotTrustedError:
+            continue
+        except DocumentError as error:
+            wrong += [(path, text) for path, _, text in (line.partition(" ") for line in error.faults)]
+    return filled, wrong
+
+
+def _declared(entry: dict[str, Any], where: str) -> dict[str, Any]:
+    kind: Any = plugin.load(entry["class"], f"{where}.class", Agent)
+    given = parameters.resolved(kind, entry.get("parameters", {}), f"{where}.parameters", OF_THE_RUN)
+    published, per = messages_of(kind, f"{where}.class"), entry.get("per", "drone")
+    for each in published:
+        if about(each) != per:
+            raise DocumentError([f"{where}.per is {per!r}, and the key of {each.__name__} is {each.key}; must agree"])
+    return {"parameters": given, "declared": [msgspec.to_builtins(message_info(each)) for each in published]}
+
+
+def with_parameters(document: dict[str, Any]) -> list[Fault]:
+    """Fill in the parameters of users' spaces, laws and estimator in a raw document; return what is wrong with them.
+
+    A class that cannot be imported here is left to the processes that need it.
+    """
+    wrong: list[Fault] = []
+    clusters = document.get("clusters")
+    sections = [(f"clusters[{i}]", each) for i, each in enumerate(clusters if isinstance(clusters, list) else [])]
+    named = [(where, each, part, f"{part}_parameters") for where, each in sections for part in ("space", "law")]
+    named.append(("estimation", document.get("estimation"), "algorithm", "parameters"))
+    for where, section, part, field in named:
+        name = section.get(part) if isinstance(section, dict) else None
+        if not (isinstance(name, str) and re.fullmatch(plugin.CLASS_NAME, name)):
+            continue
+        try:
+            kind = plugin.load(name, f"{where}.{part}", object)
+        except DocumentError:
+            continue
+        given = section.get(field, {})
+        try:
+            if parameters.has_parameters(kind):
+                section[field] = parameters.resolved(kind, given, f"{where}.{field}")
+            else:
+                parameters.bound(kind, given, f"{where}.{field}")
+        except DocumentError as error:
+            wrong += [(path, text) for path, _, text in (line.partition(" ") for line in error.faults)]
+    return wrong
+
+
+def messages_of(kind: Any, where: str) -> tuple[type[AgentMessage], ...]:
+    """Return the classes of the messages that a class of agents publishes; DocumentError if they are none."""
+    classes = getattr(kind, "messages", ())
+    try:
+        for each in classes:
+            if not (isinstance(each, type) and issubclass(each, AgentMessage)):
+                raise TypeError(f"{each!r:.60} is no subclass of zsim.AgentMessage")
+            message_info(each)
+    except (TypeError, ValueError) as error:
+        raise DocumentError([f"{where} is {kind.__name__}, whose messages cannot be used: {error}"]) from error
+    return tuple(classes)
+
+
+def agent_faults(agents: Any, roles: Any, clusters: bool) -> Iterator[Fault]:
+    """Yield what cannot go together of the agents of a scenario.
+
+    Args:
+        agents: by role, as far as they are sound.
+        roles: of zsim, which are no names of a user's.
+        clusters: whether the scenario has any.
+    """
+    writers: dict[str, str] = {}
+    for role, agent in (agents or {}).items():
+        if role in roles:
+            yield f"agents.{role}", f"is a role of zsim; must be another name than {', '.join(roles)}"
+        if agent.per == "cluster" and not clusters:
+            yield f"agents.{role}.per", "is 'cluster', and there are none; must be drone or run"
+        for info in agent.declared or ():
+            first = writers.setdefault(info.key, role)
+            if first != role:
+                what = f"publishes {info.key} as agents.{first} does"
+                yield f"agents.{role}.class", f"{what}; each key must have one writer"
