@@ -13,7 +13,6 @@ FLAGS = (  # as root, without a screen and without a graphics card, in a contain
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--disable-dev-shm-usage",
-    "--disable-gpu-compositing",  # a quarter less of the processor, by a card that is none as well
     "--disable-gpu-rasterization",  # which Debian turns on: a page itself is drawn faster without a card that is none
     "--disable-accelerated-2d-canvas",  # to read pixels of a plot took up to a minute
 )
