@@ -360,7 +360,7 @@ def test_the_pages_of_a_run_s_console_keep_its_report_and_record(federation: Fed
     page.get_by_text("the console has ended with its run").wait_for()
     assert page.locator("#zsim-head .title").text_content().startswith("run over")
     links = page.locator("#zsim-head .files a")
-    with page.context.expect_page() as report:
+    with page.context.expect_page(timeout=1000 * PATIENCE_S) as report:
         links.nth(0).click()
     report.value.wait_for_load_state()
     assert report.value.get_by_role("heading").first.text_content() == "triad"
