@@ -18,7 +18,7 @@ from zsim.schema.checker import Fault, faults
 OF_THE_RUN = ("info", "scenario", "drone", "cluster")  # arguments of an agent's constructor that are no parameters
 
 
-class Agent:
+class AgentMethods:
     """What the class of an agent must have."""
 
     def receive(self, key: str, message: Any) -> None: ...
@@ -52,7 +52,7 @@ def with_agents(section: Any, imports: bool) -> tuple[Any, list[Fault]]:
 
 
 def _declared(entry: dict[str, Any], where: str) -> dict[str, Any]:
-    kind: Any = plugin.load(entry["class"], f"{where}.class", Agent)
+    kind: Any = plugin.load(entry["class"], f"{where}.class", AgentMethods)
     given = parameters.resolved(kind, entry.get("parameters", {}), f"{where}.parameters", OF_THE_RUN)
     published, per = messages_of(kind, f"{where}.class"), entry.get("per", "drone")
     for each in published:
