@@ -172,7 +172,10 @@ def test_of_a_drone_they_may_command_it_and_publish_for_it_only_and_read_all_but
         ({"a": {"class": "flyers:Nobody"}}, ("agents.a.class", "'flyers:Nobody'", "Pilot")),
         ({"a": {"class": "nowhere:Pilot"}}, ("agents.a.class", "'nowhere:Pilot'", "'nowhere'")),
         ({"a": {"class": "flyers"}}, ("agents.a.class", "'flyers'", "package.module:Class")),
-        ({"a": {"class": "flyers:NoAgent"}}, ("agents.a.class", "'flyers:NoAgent'", "receive", "step()", "AgentMethods")),
+        (
+            {"a": {"class": "flyers:NoAgent"}},
+            ("agents.a.class", "'flyers:NoAgent'", "receive", "step()", "AgentMethods"),
+        ),
         ({"a": {"class": "flyers:OfComplex"}}, ("agents.a.class", "Complex.value", "number", "text")),
         (
             {"a": {"class": "flyers:OfElsewhere"}},
