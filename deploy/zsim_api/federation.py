@@ -324,7 +324,7 @@ class Federation(Assertions):
             return
         watch = self._watch
         with watch.news:
-            if self._has_others:  # all for whom time waits have joined by its first gate
+            if self._has_others:  # by the first gate all that the run waits for have joined
                 watch.news.wait_for(lambda: watch.moment is not None or self._fault is not None, within_s)
             link = self._link
         for sample in link.get(keys.process("*", "join")) if link else ():  # those of before this test's

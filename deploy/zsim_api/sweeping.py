@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -85,15 +86,15 @@ def sweep(
         frame by number of the run: `seed`, the values by path, `failure` (why the run did not end well, else NaN),
         `metrics.NAME`, errors, and the other columns of docs/sweep.md. Texts and numbers that are missing are NaN,
         flags NA. A class is there by its name, a further one of the same name as `Law-2`. `attrs["folder"]` is the
-        folder of the sweep,
-        `attrs["summary"]` what `zsim report` writes as summary.json: means and intervals of each combination.
+        folder of the sweep, `attrs["summary"]` what `zsim report` writes as summary.json: means and intervals of each
+        combination.
 
     Raises:
         ScenarioError: with every fault of the values and of the scenarios, a line each.
         RunError: the folder holds something else; workers cannot start; pandas is not installed.
     """
     with what_is_missing():
-        pass  # before anything is flown
+        import_module("pandas")  # before anything is flown
     console = Console(stderr=True, quiet=not progress)
     varied = scenario_of(scenario).changed(seed, duration_s, set, law, estimator)
     functions = [metrics] if callable(metrics) or isinstance(metrics, str) else list(metrics)
