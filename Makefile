@@ -21,7 +21,7 @@ run: $(VENV)/.run ## fly Test 1 of the paper as real processes and report it; in
 	$(BIN)/zsim run $(SCENARIO)
 
 test: $(VENV)/.dev ## run the tests
-	@$(MAKE) --silent --no-print-directory -j2 $(VENV)/.compiled $(VENV)/.translated
+	@$(MAKE) --silent --no-print-directory -j2 $(VENV)/.compiled $(VENV)/.bytecode
 	$(BIN)/pytest -n $(WORKERS) --dist loadgroup -m "not soak"
 
 setup: $(VENV)/.all ## install every extra into .venv: console, cameras, exports, sweeps, hosts, ROS
@@ -80,8 +80,8 @@ $(VENV)/.compiled: pyproject.toml
 		$(BIN)/python -P -m zsim_deploy.roles.warm_up world; world=$$?; wait $$agents && exit $$world
 	@touch $@
 
-# all modules that tests import become bytecode here, once; else each of the WORKERS, which import them all at the same
-# time, does it for itself, a quarter of a minute each
-$(VENV)/.translated: pyproject.toml
-	@$(BIN)/pytest -n 0 --collect-only -q >/dev/null 2>&1 || true # what fails is told by the tests themselves
+# compiles what the tests import to bytecode, once; without it, each of the WORKERS does so at the same time, which takes
+# each a quarter of a minute
+$(VENV)/.bytecode: pyproject.toml
+	@$(BIN)/pytest -n 0 --collect-only -q >/dev/null 2>&1 || true # the tests themselves report what fails
 	@touch $@

@@ -90,9 +90,9 @@ def modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", f"{EXAMPLES}:{tmp_path}")
 
 
-def heard(groups: list[list[str]], gates_max: int) -> dict[str, list[Any]]:
-    """Return what each has heard, in one process with these groups of agents."""
-    scenario = scenario_file.resolve({**_talk("Talker"), "processes": {"expect": list(NAMES)}})
+def heard(groups: list[list[str]], gates_max: int, **more: Any) -> dict[str, list[Any]]:
+    """Return what each has heard, in one process with these groups of agents; `more` of the scenario."""
+    scenario = scenario_file.resolve({**_talk("Talker"), "processes": {"expect": list(NAMES)}, **more})
     world = World(scenario)
     agents = [hosted(world.info(), scenario, group) for group in groups]
     bus = Bus(world, agents, lambda: 0)
@@ -116,6 +116,16 @@ def test_each_hears_all_a_gate_later_in_whatever_order_they_are(gates_max: int) 
         assert heard([[name] for name in order], gates_max) == dict.fromkeys(NAMES, wanted)
         assert heard([[*order]], gates_max) == dict.fromkeys(NAMES, wanted)
         assert heard([[*order[:2]], [order[2]]], gates_max) == dict.fromkeys(NAMES, wanted)
+
+
+@pytest.mark.parametrize("groups", [[["talk.d1"], ["talk.d2"], ["talk.d3"]], [[*NAMES]]], ids=["apart", "together"])
+def test_a_link_between_two_of_them_may_be_cut(groups: list[list[str]]) -> None:
+    cut = {"kind": "link_cut", "target": "talk.d1/talk.d2", "one_way": True, "at_s": 0.1, "for_s": 0.2}
+    whole, lacking = heard(groups, 1), heard(groups, 1, faults=[cut])
+    lost = [entry for entry in whole["talk.d2"] if entry not in lacking["talk.d2"]]
+    assert {drone for _, drone, _ in lost} == {"d1"}
+    assert len(lost) == 10  # gates of 0.2 s
+    assert (whole["talk.d1"], whole["talk.d3"]) == (lacking["talk.d1"], lacking["talk.d3"])
 
 
 @pytest.mark.parametrize(

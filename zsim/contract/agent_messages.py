@@ -1,11 +1,11 @@
 """Messages of users' agents: classes with a key, declared in `world/info` for readers without the class.
 
 class State(zsim.AgentMessage, frozen=True):
-    key = "swarm/{drone}/state"     each drone's agent publishes on the key of its own drone
+    key = "swarm/{drone}/state"  # each drone's agent publishes on the key of its own drone
     position_m: tuple[float, float, float]
     is_leader: bool = False
 
-State.of()            "swarm/*/state", to read those of all
+State.of()  # "swarm/*/state", to read those of all
 """
 
 import math
@@ -27,8 +27,8 @@ class AgentMessage(Struct, frozen=True, kw_only=True, gc=False):
     """Base of the messages of users' agents: `zsim.AgentMessage`.
 
     A subclass has `key`, in which `{drone}`, `{cluster}` or `{run}` stands for the name of what the agent is of, and
-    fields: numbers, tuples of numbers, whole numbers, true and false, text. zsim fills in t_ns, the gate at which it is
-    published, seq, which counts the messages of a key from 0, and source, the process that publishes it.
+    fields: numbers, tuples and lists of numbers, whole numbers, true and false, text. zsim fills in t_ns, the gate at
+    which it is published, seq, which counts the messages of a key from 0, and source, the process that publishes it.
     """
 
     key: ClassVar[str] = ""
@@ -55,12 +55,22 @@ class AgentMessage(Struct, frozen=True, kw_only=True, gc=False):
         return None
 
 
-class MessageInfo(Struct, frozen=True):
-    """A message of users' agents: `key` has `*` in place of a name; `fields` by name, beside t_ns, seq and source."""
+class MessageInfo(Struct, frozen=True, omit_defaults=True):
+    """A message of users' agents: `key` has `*` in place of a name; `fields` by name, beside t_ns, seq and source.
+
+    `role` is the first part of the names of the processes that publish it.
+    """
 
     key: str
     message: str
     fields: dict[str, FieldType]
+    role: str = ""
+
+    def declares(self, kind: object) -> bool:
+        """Tell whether a class is one of these messages."""
+        if not (isinstance(kind, type) and issubclass(kind, AgentMessage)):
+            return False
+        return kind.__name__ == self.message and field_types(kind, AgentMessage) == self.fields
 
     def is_sound(self) -> bool:
         """Tell whether a class can be made of it."""

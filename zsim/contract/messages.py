@@ -16,7 +16,7 @@ from zsim.contract import flight_messages, keys, run_messages
 from zsim.contract.agent_messages import AgentMessage, MessageInfo, message_info, type_of_info
 from zsim.errors import DecodeError, RunError
 from zsim.schema.checker import first_fault
-from zsim.schema.declared_message import FieldType, field_types
+from zsim.schema.declared_message import FieldType
 from zsim.schema.message import Count, Message, Number, Whole
 from zsim.sensors.sensor import Sample, message_type
 from zsim.sensors.sensor_catalogue import STOCK
@@ -119,7 +119,8 @@ class Info(Message, frozen=True):
     def __post_init__(self) -> None:
         register_sensors(self.own_sensors)
         for each in filter(MessageInfo.is_sound, self.own_messages):
-            _register(each.key, type_of_info(each), replaces=message_info_of(each.key) != each)
+            if not each.declares(_OWN.get(each.key)):
+                _register(each.key, type_of_info(each))
 
     @property
     def own_sensors(self) -> tuple[SensorInfo, ...]:
@@ -188,16 +189,8 @@ def register_messages(kinds: Iterable[type[AgentMessage]]) -> None:
         _register(message_info(kind).key, kind)
 
 
-def message_info_of(shape: str) -> MessageInfo | None:
-    """Return what is registered of a user's message, by the shape of its key."""
-    kind = _OWN.get(shape)
-    if kind is None or not issubclass(kind, AgentMessage):
-        return None
-    return MessageInfo(shape, kind.__name__, field_types(kind, AgentMessage))
-
-
-def _register(shape: str, kind: type[Struct], replaces: bool = True) -> None:
-    if replaces and _OWN.get(shape) is not kind:
+def _register(shape: str, kind: type[Struct]) -> None:
+    if _OWN.get(shape) is not kind:
         _OWN[shape] = kind
         for by_key in (type_of, is_output, encoding, _reader_of):
             by_key.cache_clear()

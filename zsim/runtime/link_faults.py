@@ -36,11 +36,16 @@ def uniform(seed: int, link: str, fault: Fault, key: str, t_ns: int, seq: int) -
     return (int.from_bytes(digest, "big") >> 11) * 2.0**-53
 
 
-def senders(key: str, message: Any) -> tuple[str, ...]:
+def senders(key: str, message: Any, roles: Mapping[str, str] = {}) -> tuple[str, ...]:
     """Return the names of the processes that count as the sender of a message.
 
-    Estimators and controllers may share a process, under one name: they are named after the thing of the key.
+    Agents may share a process, under one name: they are named after the thing of the key.
+
+    Args:
+        roles: of users' agents, by the shape of the keys of their messages.
     """
+    if role := roles.get(messages.shape_of(key)):
+        return (f"{role}.{keys.thing(key)}",)
     kind, whose, what = keys.parts(key)
     source = getattr(message, "source", "")
     if kind == "drone" and what.startswith("cmd/"):
@@ -122,6 +127,7 @@ class LinkFaults:
     def __init__(self, info: Info, names: Sequence[str]) -> None:
         self._names = tuple(names)
         self._seed, self._gate_ns = info.seed, info.gate_ns
+        self._roles = {each.key: each.role for each in info.own_messages}
         self._clusters = {cluster.name: cluster.drones for cluster in info.clusters}
         self._list: Faults | None = None  # the newest
         self._faults: list[Fault] = []
@@ -169,7 +175,7 @@ class LinkFaults:
 
         A radio carries what one of its drones sends to a process that is not on that drone.
         """
-        froms, (kind, thing, _) = senders(key, message), keys.parts(key)
+        froms, (kind, thing, _) = senders(key, message, self._roles), keys.parts(key)
         to = stock if keys.is_sensor(key) and (stock := f"estimator.{thing}") in self._names else self._names[0]
 
         def acts(fault: Fault) -> bool:

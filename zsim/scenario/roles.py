@@ -200,9 +200,8 @@ def _granted_own(agent: OwnAgent, thing: str, scenario: Scenario) -> Rights:
     drones = [drone.name for drone in scenario.drones]
     of = {"drone": [thing], "run": drones}
     own = of.get(agent.per) or scenario.cluster(thing).drones
-    sensed = [keys.GATE, *(key for drone in drones for key in (keys.sensors(drone), keys.gate(drone)))]
-    messages = [each.key for each in scenario.own_messages()]
-    reads = [*sensed, keys.estimate("*"), keys.cluster_state("*"), keys.detections("*"), *messages]
+    reads = [keys.GATE, keys.gate("*"), keys.sensors("*"), keys.estimate("*"), keys.detections("*")]
+    reads += [keys.cluster_state("*"), *(each.key for each in scenario.own_messages())]
     writes = [keys.command(drone, "*") for drone in own]
     writes += [each.key.replace("*", thing) for each in agent.declared or ()]
     return combined([_granted("each"), Rights(reads=tuple(reads), writes=tuple(writes), asks=tuple(reads))])

@@ -6,6 +6,7 @@ A file is read by `scenario_file.load`; the limits written here are the ones tha
 from typing import Annotated, Any, Literal, get_type_hints
 
 from msgspec import UNSET, Meta, Struct, UnsetType, defstruct, field
+from msgspec.structs import replace
 
 from zsim.contract.agent_messages import MessageInfo
 from zsim.schema.parameters import Given
@@ -331,9 +332,9 @@ class Scenario(Spec, frozen=True, kw_only=True):
         return {} if self.agents is UNSET else self.agents
 
     def own_messages(self) -> list[MessageInfo]:
-        """Return the messages that users' agents declare, each once, in the order of their keys."""
-        declared = [each for agent in self.own_agents.values() for each in agent.declared or ()]
-        return sorted({each.key: each for each in declared}.values(), key=lambda each: each.key)
+        """Return the messages that users' agents declare, in the order of their keys."""
+        declared = [replace(each, role=role) for role, own in self.own_agents.items() for each in own.declared or ()]
+        return sorted(declared, key=lambda each: each.key)
 
     def own_code(self) -> list[str]:
         """Return the classes, functions, sensors and vehicles of users that it names, whose modules a rerun needs."""

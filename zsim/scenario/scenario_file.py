@@ -27,12 +27,19 @@ from zsim.vehicles.vehicle import Aerodynamics, Vehicle
 EXAMPLE = "scenarios/step.yaml"  # named to whoever gives no scenario
 
 
-def load(path: str | Path, overrides: Iterable[str] = (), modules: Iterable[Path] = (), **values: Any) -> Scenario:
+def load(
+    path: str | Path,
+    overrides: Iterable[str] = (),
+    modules: Iterable[Path] = (),
+    imports: bool = True,
+    **values: Any,
+) -> Scenario:
     """Return the resolved scenario of a YAML file; classes that it names may stand in modules beside it.
 
     Args:
         overrides: texts `a.b.c=value` as given to `--set`, applied in order.
         modules: further folders in which the modules may stand.
+        imports: whether what it names is imported; not needed of a file that is resolved already.
         values: top-level fields that replace the file's, None being ignored (`seed=3`).
 
     Raises:
@@ -43,7 +50,7 @@ def load(path: str | Path, overrides: Iterable[str] = (), modules: Iterable[Path
     document = yaml_file.read(path, EXAMPLE, ScenarioError)
     document.update({key: value for key, value in values.items() if value is not None})
     applied = [apply_override(document, text, yaml_file.value) for text in overrides]
-    return _resolve(document, path.name, [fault for fault in applied if fault])
+    return _resolve(document, path.name, [fault for fault in applied if fault], imports)
 
 
 def resolve(document: dict[str, Any], source: str = "scenario") -> Scenario:

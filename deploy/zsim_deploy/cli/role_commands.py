@@ -42,9 +42,11 @@ def world(
     from zsim_deploy.roles import world_role
 
     path, overrides = flight.path, flight.overrides or ()
-    # its launcher has written what is flown into the run's folder, and has read it where the modules are
+    # its launcher has resolved what is flown into the run's folder, and has read it where the modules are
     modules = plugin.folders() if launched else ()
-    loaded = scenario_file.load(path, overrides, modules, seed=flight.seed, duration_s=flight.duration)
+    loaded = scenario_file.load(
+        path, overrides, modules, imports=not launched, seed=flight.seed, duration_s=flight.duration
+    )
     mode, pace = flight.mode_and_rate()
     changes = [*(changed or ()), *flight.changed()]
     endpoints = listen or [opt.DEFAULT_ENDPOINT]

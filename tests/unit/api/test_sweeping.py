@@ -433,3 +433,10 @@ if __name__ == "__main__":  # for the cluster, whose workers Dask starts
     ], done.stderr
     with refused(RunError, "client", "'object'", "distributed.Client"):
         zsim.sweep(DOCUMENT, {"seed": [1]}, client=object(), out=tmp_path / "other")
+
+
+def test_without_pandas_nothing_is_flown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with refused(RunError, "pandas"):
+        zsim.sweep(DOCUMENT, {"seed": [1]}, duration_s=1, out=tmp_path / "sweep")
+    assert not (tmp_path / "sweep").exists()

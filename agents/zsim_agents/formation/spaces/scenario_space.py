@@ -47,11 +47,10 @@ def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
 def _space(spec: Cluster | ClusterGroup, starts: Array) -> ClusterSpace:
     places_m = np.array(spec.template_m or starts, dtype=float)
     name = space_name(spec.space, len(places_m), bool(spec.template_m))
-    given = spec.space_parameters
+    kind = STOCK.get(name) or plugin.load(name, "space", ClusterSpace)
+    own: Any = parameters.bound(kind, spec.space_parameters, "space_parameters")
     if name in STOCK:
-        parameters.bound(STOCK[name], given, "space_parameters")
-        return STOCK[name](places_m)
-    own: Any = parameters.bound(plugin.load(name, "space", ClusterSpace), given, "space_parameters")
+        return own(places_m)
     try:
         return checked(own.for_places(places_m))
     except TypeError as error:  # also of a call with wrong arguments, which has no frame of the user's

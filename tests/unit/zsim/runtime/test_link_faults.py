@@ -8,6 +8,7 @@ from msgspec.structs import replace
 from refused import has_terms
 
 from zsim.contract import keys
+from zsim.contract.agent_messages import AgentMessage
 from zsim.contract.flight_messages import Estimate, Mode, Status
 from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.messages import ClusterInfo, Imu, Info, Origin, encode
@@ -143,6 +144,8 @@ def test_who_sends():
     assert senders(ESTIMATE, estimate(1, source="controller.main")[1]) == (OTHER,)  # they share a process
     assert senders(ESTIMATE, estimate(1, source="my.filter")[1]) == (OTHER, "my.filter")
     assert senders(STATUS, status(1)[1]) == ("world",)
+    told = AgentMessage(t_ns=0, seq=0, source="pilot.d7")  # of a process that it shares with others
+    assert senders("swarm/d1/place", told, {"swarm/*/place": "pilot"}) == ("pilot.d1",)
     assert senders(keys.command("d1", "mode"), Mode(0, 0, "console.1", "land")) == ("console.1",)
 
 
