@@ -185,16 +185,18 @@ def _file_of(source: Scenario, folder: Path) -> Path:
 
 def raise_failure(folder: Path, code: int) -> None:
     """Raise what ended the processes of a run; nothing where all of it was flown, though not as planned."""
-    record = folder / RECORD
+    record, log = folder / RECORD, folder / run_folder.LOGS / f"{LAUNCHER}.log"
+    said = log.read_text(errors="replace").split("\n") if log.exists() else []
+    last = next((line for line in reversed(said) if line.strip()), f"`zsim run` ended with code {code}")
     if not record.exists():
-        log = folder / run_folder.LOGS / f"{LAUNCHER}.log"
-        said = log.read_text(errors="replace").split("\n") if log.exists() else []
-        last = next((line for line in reversed(said) if line.strip()), f"`zsim run` ended with code {code}")
         raise RunFailedError(f"{folder}: nothing was recorded: {last}")
     failures = [each.text for each in verdict(record).shortfalls if each.kind == "process" and each.fails]
     flight = read_flight(record, motion=False)
-    if not failures and not any(len(track.t_ns) for track in flight.tracks):
-        failures = [str((flight.end or {}).get("reason", "it ended before its first gate"))]
+    flew = any(len(track.t_ns) for track in flight.tracks)
+    if not failures and (
+        not flew or (folder / run_folder.JOURNAL).exists()
+    ):  # it is kept of what ended before its time
+        failures = [str((flight.end or {}).get("reason", last))]
     if failures:
         raise RunFailedError(f"{failures[0]}; the record is {record}, the logs are in {folder / run_folder.LOGS}")
 

@@ -13,6 +13,7 @@ from federation import PAIR, Federation, Record, Role
 from forked_commands import ROOT
 from wire import PATIENCE_S, Client, Received, Subscription
 
+from zsim.errors import RunFailedError
 from zsim.record import RecordReader, repair
 from zsim.record.completeness import record_completeness
 from zsim.scenario import scenario_file
@@ -114,6 +115,15 @@ def test_restart(flights: Federations, alone: Path, name: str, options: tuple[st
     logs = flight.folder / "logs"
     assert "snapshot" in (logs / f"{name}.log").read_text()
     assert re.search(f"{name} .*(died|ended: killed by signal 9).*restart", (logs / "zsim-run.log").read_text())
+
+
+@pytest.mark.parametrize("name", ["controller.main", pytest.param("recorder", marks=pytest.mark.soak)])
+def test_a_run_that_a_death_has_ended_has_failed(flights: Federations, name: str) -> None:
+    flight = flights(yaml.safe_load(PAIR), set={"processes.on_death": {name.partition(".")[0]: "end"}})
+    flight.wait_until(3.0)
+    flight.kill(name)
+    with pytest.raises(RunFailedError):
+        flight.run()
 
 
 @pytest.mark.parametrize("name", ["estimator.drone1", pytest.param("controller.main", marks=pytest.mark.soak)])
