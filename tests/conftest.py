@@ -18,9 +18,8 @@ from zsim_deploy.roles.stop_channel import lower_priority
 PURE = ("tests/authority/", "tests/contract/", "tests/unit/")
 LEAST = 3  # workers of which one is quiet
 
-if (
-    signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-):  # as in the background of a shell; those that tests start inherit it
+# A shell ignores SIGINT for what it runs in the background, and every program that a test starts would inherit that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
