@@ -181,3 +181,18 @@ def test_the_pentagon_closes(tmp_path: Path) -> None:
         d2 = sum((one[f"position_m_{axis}"] - other[f"position_m_{axis}"]) ** 2 for axis in "xy")
         sides.append(d2**0.5)
     assert sides == pytest.approx([3.5267] * 5, abs=0.3)  # 2 · 3 m · sin(36°)
+
+
+def test_their_parameters_are_swept_by_path(tmp_path: Path) -> None:
+    """The takeoff of one run comes after its end."""
+    path = "agents.pilot.parameters.takeoff_s"
+    (tmp_path / "swarm.yaml").write_text(SWARM)
+    frame = zsim.sweep(
+        tmp_path / "swarm.yaml", {path: [0.5, 9.0]}, metrics=climbs, duration_s=4, workers=1, progress=False
+    )
+    assert [*frame[path]] == [0.5, 9.0]
+    assert [*(frame["metrics.climb_m"] > 0.5)] == [True, False]
+
+
+def climbs(run: zsim.Run) -> dict[str, float]:
+    return {"climb_m": run.truth("d1").position_m_z.max()}
