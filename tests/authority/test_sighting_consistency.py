@@ -71,7 +71,7 @@ def fly(scenario: Scenario) -> Relative:
             fleet.advance()
         for sample in samples_of(fleet):
             feed(bank, sample, fleet.gps_sigma_m[sample.drone])
-        for each in fleet.sightings.values():
+        for each in fleet.seen.values():
             message = Sightings(t_ns=each.t_ns, seq=0, t_sample_ns=each.t_sample_ns, camera=each.camera, seen=each.seen)
             bank.receive(each.drone, "sightings", message, each.t_ns * 1e-9)
         estimates = bank.estimate(t_s)

@@ -177,7 +177,11 @@ def cast_ground(o: Vector, d: Vector, far: float) -> float:
 @inlined
 def cast_hull(p_WB: Vector, q_WB: Quaternion, radius: float, o: Vector, d: Vector, far: float) -> float:
     """Return the distance at which a ray meets a drone's hull, a flat body of revolution about its z axis."""
-    at, to = rotate_back(q_WB, subtract(o, p_WB)), rotate_back(q_WB, d)
+    away = subtract(o, p_WB)
+    along, square = dot(away, d), dot(away, away) - radius * radius
+    if square > 0.0 and (along > 0.0 or along * along < square):
+        return far  # it passes the ball about the hull
+    at, to = rotate_back(q_WB, away), rotate_back(q_WB, d)
     up = 1.0 / HULL_FLATNESS
     at, to = (at[0], at[1], up * at[2]), (to[0], to[1], up * to[2])
     first, last = _quadric(dot(to, to), dot(at, to), dot(at, at) - radius * radius)
