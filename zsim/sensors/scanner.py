@@ -32,7 +32,7 @@ Azimuth = Annotated[float, Meta(ge=-360, le=360)]
 
 
 class Range(Sample, frozen=True):
-    """The distance along each beam [m], in the order of `beams`; 0: nothing came back."""
+    """The distance along each beam [m], in the order of `beams`, their names sorted; 0: nothing came back."""
 
     beams: Annotated[tuple[str, ...], Meta(max_length=BEAMS_MAX)]
     ranges_m: Annotated[tuple[Number, ...], Meta(max_length=BEAMS_MAX)]

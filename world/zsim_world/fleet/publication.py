@@ -121,12 +121,13 @@ class GatePublication:
         self._fleetwide = PublishedState(fleet.touching, sigmas_m, commanders, self.counts, rotors, own_messages)
         self._known: dict[str | None, int] = {None: COMMANDER}
         self._words = encoding.words((*firmware.MODES, None))
-        self._room_beside = 0  # bytes of users' messages
+        payloads = self._payloads()
+        self._room_beside = 2 * len(payloads.data)  # bytes of messages that are encoded in Python
         self._make_room(16 * fleet.count)
         # loads or compiles what the first gate needs, and counts nothing
         uncounted = self._fleetwide._replace(counts=self.counts.copy())
         state = PublicationState(self._words, self._seen, uncounted, self._written)
-        publish(hold(state), *fleet.sampled, *self._payloads(), 0)
+        publish(hold(state), *fleet.sampled, *payloads, 0)
 
     def gate(self, commanders: list[str | None]) -> GateMessages:
         """Return the messages of the present gate; `commanders` has the commander of each drone, None for none."""

@@ -196,10 +196,11 @@ def _beams(i: int, name: str, settings: RangeConfig, p_BS: Array, R_BS: Array) -
         for k in range(CONE_RAYS)
     ]
     cone = np.array([(1.0, 0.0, 0.0), *(rim if half else ())])
-    poses = [_pose(mount) for mount in settings.beams.values()]
+    names = sorted(settings.beams)  # the resolved text is sorted too
+    poses = [_pose(settings.beams[beam]) for beam in names]
     origins = np.array([p_BS + _turned(R_BS, p[None])[0] for p, _ in poses])
     rays = _rays(np.concatenate([_turned(R_BS, _turned(R, cone)) for _, R in poses]))
-    fixed = {"beams": tuple(settings.beams), "max_m": settings.max_m}
+    fixed = {"beams": tuple(names), "max_m": settings.max_m}
     return Mounted(i, name, Range, "", settings, origins, rays, len(poses), fixed)
 
 

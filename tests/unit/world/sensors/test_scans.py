@@ -13,6 +13,7 @@ from zsim.math.frames import rotation_matrix
 from zsim.scenario.scenario_file import resolve
 from zsim.sensors.scanner import SCANNERS
 from zsim_world.fleet.fleet import Fleet
+from zsim_world.fleet.publication import GatePublication
 from zsim_world.physics.fleet_arrays import VEHICLE
 from zsim_world.run_state import restore, saved_state
 
@@ -46,7 +47,7 @@ def test_beams_of_a_turned_drone():
     """Its front is to the left of W, so the wall is to its right; the beam up meets nothing."""
     made = fleet((0, 0, 0, 90.0), range={"max_m": 8, "mount": {"position_m": [0, 0, 0.3]}})
     message = taken(made, Range)
-    assert message.beams == ("front", "left", "back", "right", "up")
+    assert message.beams == ("back", "front", "left", "right", "up")
     np.testing.assert_allclose(message.ranges_m, [0, 0, 0, 5.0, 0], atol=1e-6)
 
 
@@ -158,3 +159,12 @@ def test_a_restored_fleet_scans_on_to_the_same_bits():
         made.advance()
         other.advance()
         assert [each.values for each in other.seen.values()] == [each.values for each in made.seen.values()]
+
+
+def test_a_first_scan_that_is_larger_than_all_other_messages_is_published_whole():
+    """It was written behind the end of the buffer once."""
+    made = fleet((0, 0, 1), (3, 0, 1), lidar={"channels": 64, "columns": 360})
+    gate = GatePublication(made).gate([None, None])
+    sizes = [len(payload) for key, payload in gate.pairs if key.endswith("/lidar")]
+    assert len(sizes) == 2
+    assert min(sizes) > 64 * 360 * 4
