@@ -69,14 +69,6 @@ class RadioLinks(Message, frozen=True):
     hears: tuple[tuple[Count, ...], ...]
     reception: tuple[tuple[Number, ...], ...] = ()
 
-    def fault(self) -> str | None:
-        """Return what does not fit together."""
-        if any(place >= len(self.hears) for each in self.hears for place in each):
-            return f"hears names a place beyond its own {len(self.hears)}"
-        if self.reception and [*map(len, self.reception)] != [*map(len, self.hears)]:
-            return "reception differs in shape from hears"
-        return None
-
 
 @on("world/event", writers="world", readers="each")
 class Event(Message, frozen=True):

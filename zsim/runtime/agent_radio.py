@@ -53,11 +53,8 @@ class Receiver:
         if sender == self._place or sender is None or self._place is None:
             return 0
         links = next((each for each in reversed(self._lists) if each.t_ns <= message.t_ns), None)
-        if links is None or sender not in (hears := links.hears[self._place]):
-            return NEVER
-        reception = links.reception[self._place][hears.index(sender)] if links.reception else 1.0
         draw = (self._seed, self._process, key, message.t_ns, message.seq)
-        if uniform("radio", *draw) >= (1.0 - radio.loss) * reception:
+        if links is None or uniform("radio", *draw) >= (1.0 - radio.loss) * _reception(links, self._place, sender):
             return NEVER
         delay_ms = radio.delay_ms + (radio.jitter_ms * uniform("radio_jitter", *draw) if radio.jitter_ms else 0.0)
         return math.ceil(delay_ms * 1e6)
@@ -68,6 +65,16 @@ class Receiver:
     def restore(self, state: State) -> None:
         self._lists.clear()
         self._lists.extend(decode(keys.RADIO, payload) for payload in state["lists"])
+
+
+def _reception(links: RadioLinks, receiver: int, sender: int) -> float:
+    """Return the probability with which a message arrives, 0 where the receiver does not hear the sender."""
+    hears = links.hears[receiver] if receiver < len(links.hears) else ()
+    if sender not in hears:
+        return 0.0
+    chances = links.reception[receiver] if receiver < len(links.reception) else ()
+    place = hears.index(sender)
+    return chances[place] if place < len(chances) else 1.0
 
 
 class Transmitter:

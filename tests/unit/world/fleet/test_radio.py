@@ -50,7 +50,6 @@ def test_who_hears_whom(sections: dict[str, Any], hears: tuple[tuple[int, ...], 
     made = links(**sections)
     assert made.hears == hears
     assert made.reception == ()
-    assert made.fault() is None
 
 
 def test_reception_falls_with_distance_until_nobody_is_a_neighbour() -> None:
