@@ -20,10 +20,11 @@ from zsim.contract import keys
 from zsim.contract.flight_messages import Covariance, Quaternion
 from zsim.contract.framing import GateMessages
 from zsim.contract.messages import Info
-from zsim.contract.run_messages import Bye, ClusterRequest, Event, Join
+from zsim.contract.run_messages import Bye, ClusterRequest, Event, Join, RadioLinks
 from zsim.record import Completeness, RecordReader, completeness
 from zsim.scenario.scenario import Scenario
 from zsim.schema.message import Vector3
+from zsim_analysis.reading.radio_links import RadioHistory
 from zsim_analysis.reading.recorded_run import scenario_of, search_modules
 
 Array = NDArray[np.float64]
@@ -133,6 +134,7 @@ class RecordedFlight:
     # estimates, commands: by drone; empty unless requested
     estimates: dict[str, DroneEstimates] = field(default_factory=dict)
     commands: dict[str, VelocityCommands] = field(default_factory=dict)
+    radio: RadioHistory | None = None  # None where the scenario has none
 
     @property
     def end(self) -> dict[str, Any] | None:
@@ -246,6 +248,7 @@ class FlightReader:
     def __init__(self, answers: bool = False) -> None:
         self._answers = answers
         self._infos: list[Info] = []
+        self._radio: list[RadioLinks] = []
         self._events: list[Event] = []
         self._truth: defaultdict[str, _Rows] = defaultdict(lambda: _Rows(TRUTH_WIDTH, "d"))
         self._status: defaultdict[str, _Rows] = defaultdict(lambda: _Rows(1, "d"))
@@ -267,6 +270,7 @@ class FlightReader:
             group, _, what = keys.parts(key)
             kinds: dict[str, tuple[type[Struct], Callable[[str, Any], None]]] = {
                 keys.INFO: (Info, lambda _, message: self._infos.append(message)),
+                keys.RADIO: (RadioLinks, lambda _, message: self._radio.append(message)),
                 keys.EVENT: (Event, lambda _, message: self._events.append(message)),
                 "process/join": (Join, self._add_process),
                 "process/bye": (Bye, self._add_process),
@@ -403,6 +407,7 @@ class FlightReader:
             began_ns=self._first_wall_ns,
             estimates=estimates,
             commands=self._flown_commands(),
+            radio=RadioHistory(self._radio, len(tracks)) if self._radio else None,
         )
 
     def _flown_commands(self) -> dict[str, VelocityCommands]:
