@@ -140,7 +140,8 @@ def test_a_sample_between_two_gates_is_of_its_instant_and_late_by_its_latency():
     for _ in range(20):
         heights[made.t_ns] = float(made.truth().position_m[0, 2])
         for each in made.seen.values():
-            seen[each.t_sample_ns] = each.t_ns, each.message(0).ranges_m[0]
+            message: Any = each.message(0)
+            seen[each.t_sample_ns] = each.t_ns, message.ranges_m[0]
         made.advance()
     assert sorted(seen)[:4] == [0, 30_000_000, 60_000_000, 90_000_000]
     for t_sample_ns, (t_ns, height) in seen.items():
@@ -158,7 +159,7 @@ def test_a_restored_fleet_scans_on_to_the_same_bits():
     for _ in range(5):
         made.advance()
         other.advance()
-        assert [each.values for each in other.seen.values()] == [each.values for each in made.seen.values()]
+        assert [each.message(0) for each in other.seen.values()] == [each.message(0) for each in made.seen.values()]
 
 
 def test_a_first_scan_that_is_larger_than_all_other_messages_is_published_whole():

@@ -21,7 +21,7 @@ LIDAR: dict[str, Any] = {
     "max_m": 9.0,
     "ranges_m": FOUR,
 }
-LIDAR |= {"elevation_rad": (0.0, 0.1), "azimuth_rad": (0.0, math.pi / 2)}
+LIDAR.update({"elevation_rad": (0.0, 0.1), "azimuth_rad": (0.0, math.pi / 2)})
 
 
 def paths(**sensors: Any) -> list[str]:
@@ -75,7 +75,7 @@ def test_a_lidar_is_read_as_an_array_whose_zeros_are_infinite():
 @pytest.mark.parametrize(
     ("message", "field"),
     [
-        (Lidar(**LIDAR | {"columns": 3}), "ranges_m"),
+        (Lidar(**{**LIDAR, "columns": 3}), "ranges_m"),
         (Range(5, 0, 0, ("a", "b"), (1.0,), 4.0), "ranges_m"),
         (
             Depth(5, 0, 0, camera="front", columns=2, rows=1, focal_px=(1, 1), centre_px=(0, 0), max_m=9, depth_m=FOUR),
