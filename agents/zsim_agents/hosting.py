@@ -245,7 +245,7 @@ def own_agent(
         if not isinstance(made, Agent):
             raise RunError(f"{kind} makes a {type(made).__name__}; must make a zsim.Agent")
     register_messages(messages_of(type(made), plugin.full_name(type(made))))
-    made.bind(info, name)
+    made.bind(info, name, scenario.radio_of_agents)
     return made
 
 

@@ -83,9 +83,8 @@ def test_as_processes_and_after_a_kill_the_bits_are_the_same(tmp_path: Path, com
         ("consensus", {"gain_1_s": 9}, "gain_1_s", ("9", "<= 5")),
         ("consensus", {"centre_m": ["2*q", 0]}, "centre_m[0]", ("2*q", "'q'")),
         ("distance_based", {"places_m": [[0, 0]]}, "places_m", ("1", "5")),
+        ("vasarhelyi", {"centre_m": [0, "1/t"]}, "centre_m[1]", ("1/t", "t = 0")),
         ("bearing_only", {"informed": ["d9"]}, "informed", ("d9", "d1")),
-        ("olfati_saber", {"neighbours": {"d1": ["d1"]}}, "neighbours.d1", ("d1",)),
-        ("vasarhelyi", {"neighbours": {"d7": ["d1"]}}, "neighbours.d7", ("d7", "d1, d2")),
         ("flock", {}, "class", ("flock", "vasarhelyi")),
     ],
 )

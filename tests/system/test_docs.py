@@ -479,7 +479,7 @@ UNITS = {
     "_kg_m2": "kg m²", "_kg_m3": "kg/m³", "_n_s_m": "N s/m", "_n_s2_m2": "N s²/m²", "_n_s2_m": "N s²/m", "_nm_s2": "N m s²", "_n_s2": "N s²", "_1_s2": "1/s²",
     "_1_s": "1/s", "_rad_s": "rad/s", "_deg_s": "deg/s", "_m_s2": "m/s²", "_m_s": "m/s", "_deg": "deg", "_mah": "mAh",
     "_percent": "%", "_kg": "kg", "_hz": "Hz", "_ms": "ms", "_ut": "µT", "_px2": "px²", "_px": "px",
-    "_m": "m", "_s": "s",
+    "_kbit_s": "kbit/s", "_m": "m", "_s": "s",
 }  # fmt: skip
 OWN_UNITS = {
     "noise": "channel's", "density": "channel's/√Hz", "bias": "channel's", "bias_walk": "channel's/√s",

@@ -17,7 +17,7 @@ from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
 from zsim.scenario.own_classes import agent_faults
 from zsim.scenario.roles import AGENTS, MAIN, OPERATOR, ROLES
 from zsim.scenario.scenario import EXTERNAL, SEA_HEIGHT_MAX_M, Scenario, space_name
-from zsim.schema.checker import Fault, listed, show
+from zsim.schema.checker import Fault, listed, show, suggestion
 from zsim.schema.quantities import COULOMB_PER_MAH, G_M_S2, SEA_LEVEL_KG_M3
 from zsim.sensors.camera_model import folds, lens_of
 from zsim.sensors.sensor_catalogue import DECLARED, MODULE, STOCK, declarations, own_sections
@@ -72,6 +72,7 @@ def cross_faults(
     if isinstance(scenario.agents, dict):
         sound_agents = {role: each for role, each in scenario.agents.items() if each and each.per}
         yield from agent_faults(sound_agents, (*ROLES, *RESERVED_ROLES), bool(clusters))
+    yield from _graph_faults(scenario.topology, _names(drones))
     yield from _injected_faults(scenario, drones, clusters, vehicles, unread)
     window = scenario.report and scenario.report.window_s
     if window is not None and not 0 <= window[0] < window[1]:
@@ -436,6 +437,19 @@ def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Ite
             named = listed(known) or f"a {kind}, and there is none"
             allowed = f"must be {role}.NAME of {named}, or a name of your own"
             yield f"processes.expect[{index}]", f"is {name!r}, and no {kind} is {thing!r}; {allowed}"
+
+
+def _graph_faults(topology: Any, drones: list[str]) -> Iterator[Fault]:
+    """Yield what a graph of drones names that is none of them."""
+    graph = getattr(topology, "graph", None)
+    for hearer, heard in graph.items() if isinstance(graph, dict) else ():
+        where = f"topology.graph.{hearer}"
+        if hearer not in drones:
+            yield where, f"is no drone; {suggestion(hearer, drones)}must be one of {listed(drones)}"
+        for place, name in enumerate(heard):
+            others = [each for each in drones if each != hearer]
+            if name not in others:
+                yield f"{where}[{place}]", f"is {show(name)}; must be one of {listed(others)}"
 
 
 def _injected_faults(

@@ -9,8 +9,8 @@ A law is a subclass with one method:
     class Consensus(ShapePilot):
         def velocity(self, now: Sight) -> Array: ...  # (2,) [m/s; W]
 
-Others count while they are heard, engaged, and among the `neighbours` of the drone; they are sorted by name, and all
-sums run in that order, so that the bits do not depend on who was heard first.
+Neighbours are those that a drone hears, by the topology and the radio of the scenario, and that are engaged themselves.
+They are sorted by name, and all sums run in that order, so that the bits do not depend on who was heard first.
 """
 
 import math
@@ -19,7 +19,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from msgspec import Meta, field
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from zsim.contract.agent_messages import AgentMessage
@@ -69,7 +69,7 @@ class Sight(NamedTuple):
     t_s: float
     p_W: Array  # (2,) of its own drone, estimated [m]
     v_W: Array  # (2,) [m/s]
-    heard: list[Heard]  # its neighbours, by name
+    heard: list[Heard]  # by name
     reference: Pose
 
 
@@ -85,8 +85,6 @@ class PilotParameters(Parameters):
     """At most one a gate."""
     silence_s: Annotated[float, Meta(gt=0, le=60)] = 1.0
     """After it, one that is not heard any more is left out; until then its last message holds."""
-    neighbours: dict[str, list[str]] = field(default_factory=dict)
-    """Whose messages a drone uses, by its name; a drone that is not named uses all that it hears."""
     centre_m: tuple[Value, Value] = (0.0, 0.0)
     """Of the formation in W: numbers, or expressions of t, in seconds since `start_s`."""
     start_s: NonNegative = 0.0
@@ -117,7 +115,6 @@ class Pilot(Agent):
         self._gate_ns = round(scenario.time.gate_ms * 1e6)
         self._message_ns = max(self._gate_ns, round(1e9 / own.message_rate_hz))
         self._silence_ns = round(own.silence_s * 1e9)
-        self._neighbours: list[str] | None = own.neighbours.get(drone)
         self._obstacles = [obstacle.row_of(each) for each in scenario.environment.obstacles]
         self._reference = self.reference_of(own)
         self._heard: dict[str, Motion] = {}
@@ -140,13 +137,6 @@ class Pilot(Agent):
     @classmethod
     def flaws(cls, parameters: Mapping[str, Any], scenario: Scenario) -> Iterator[Fault]:
         """Yield path and text of what cannot be flown in a scenario, of parameters as it has them."""
-        drones = [drone.name for drone in scenario.drones]
-        for drone, others in parameters["neighbours"].items():
-            for path, name in [(f"neighbours.{drone}", drone), *((f"neighbours.{drone}", other) for other in others)]:
-                if name not in drones:
-                    yield path, f"names {name!r}; must be one of {', '.join(drones)}"
-            if drone in others:
-                yield f"neighbours.{drone}", "names the drone itself; must be others"
         try:
             cls.reference_of(cls.Parameters(**parameters))
         except ExpressionError as error:
@@ -192,13 +182,12 @@ class Pilot(Agent):
             for name, m in sorted(self._heard.items())
             if m.is_engaged and t_ns - m.t_ns <= self._silence_ns
         ]
-        near = heard if self._neighbours is None else [each for each in heard if each.name in self._neighbours]
-        now = Sight(t_ns / 1e9, self._p_W[:2], self._v_W[:2], near, self._reference.at(t_ns / 1e9))
+        now = Sight(t_ns / 1e9, self._p_W[:2], self._v_W[:2], heard, self._reference.at(t_ns / 1e9))
         v_W = self.velocity(now) + self.avoidance(now.p_W, heard)
         return limited(v_W, self.parameters.speed_max_m_s)
 
     def avoidance(self, p_W: Array, heard: Sequence[Heard]) -> Array:
-        """Return the repulsion (2,) from other drones, neighbours or not, and from obstacles [m/s; W]."""
+        """Return the repulsion (2,) from the drones that it hears, and from obstacles [m/s; W]."""
         reach, gain = self.parameters.avoid_m, self.parameters.avoid_m4_s
         v_W = np.zeros(2)
         for each in heard:

@@ -20,10 +20,11 @@ from zsim.contract import keys
 from zsim.contract.flight_messages import Covariance, Quaternion
 from zsim.contract.framing import GateMessages
 from zsim.contract.messages import Info
-from zsim.contract.run_messages import Bye, ClusterRequest, Event, Join
+from zsim.contract.run_messages import Bye, ClusterRequest, Event, Join, RadioLinks
 from zsim.record import Completeness, RecordReader, completeness
 from zsim.scenario.scenario import Scenario
 from zsim.schema.message import Vector3
+from zsim_analysis.reading.radio_links import RadioHistory
 from zsim_analysis.reading.recorded_run import scenario_of, search_modules
 
 Array = NDArray[np.float64]
@@ -135,6 +136,7 @@ class RecordedFlight:
     commands: dict[str, VelocityCommands] = field(default_factory=dict)
     others: dict[str, int] = field(default_factory=dict)  # number of messages by key, of those that no report reads
     cpu_s: float | None = None  # CPU time from the first gate to the last, of a flight in a process of its own
+    radio: RadioHistory | None = None  # None where the scenario has none
 
     @property
     def end(self) -> dict[str, Any] | None:
@@ -248,6 +250,7 @@ class FlightReader:
     def __init__(self, answers: bool = False) -> None:
         self._answers = answers
         self._infos: list[Info] = []
+        self._radio: list[RadioLinks] = []
         self._events: list[Event] = []
         self._truth: defaultdict[str, _Rows] = defaultdict(lambda: _Rows(TRUTH_WIDTH, "d"))
         self._status: defaultdict[str, _Rows] = defaultdict(lambda: _Rows(1, "d"))
@@ -270,6 +273,7 @@ class FlightReader:
             group, _, what = keys.parts(key)
             kinds: dict[str, tuple[type[Struct], Callable[[str, Any], None]]] = {
                 keys.INFO: (Info, lambda _, message: self._infos.append(message)),
+                keys.RADIO: (RadioLinks, lambda _, message: self._radio.append(message)),
                 keys.EVENT: (Event, lambda _, message: self._events.append(message)),
                 "process/join": (Join, self._add_process),
                 "process/bye": (Bye, self._add_process),
@@ -409,6 +413,7 @@ class FlightReader:
             estimates=estimates,
             commands=self._flown_commands(),
             others=dict(self._others),
+            radio=RadioHistory(self._radio, len(tracks)) if self._radio else None,
         )
 
     def _flown_commands(self) -> dict[str, VelocityCommands]:

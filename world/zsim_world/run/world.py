@@ -23,6 +23,8 @@ from zsim.sensors.sensor_catalogue import declarations
 from zsim_world.fleet.external_drones import ExternalDrones
 from zsim_world.fleet.fleet import DivergedError, Fleet
 from zsim_world.fleet.publication import GatePublication
+from zsim_world.fleet.radio import RadioChannel
+from zsim_world.physics.fleet_arrays import STATE
 from zsim_world.run.commands import CommandIntake
 from zsim_world.run.coordinator import Coordinator
 from zsim_world.run.faults import FaultInjector
@@ -89,6 +91,7 @@ class World(Coordinator):
         self.queue = self._intake.queue
         self._operations |= {**self._intake.operations(), **self.faults.operations()}
         self._publication = GatePublication(self.fleet)
+        self._radio = RadioChannel(scenario) if scenario.radio_of_agents else None
         self.truth_hash = TruthHash(len(self._simulated))
         self._last_ns = round(scenario.duration_s * 1e9) // self.clock.gate_ns * self.clock.gate_ns
         self.statistics.closest_m = self.fleet.closest_m
@@ -194,6 +197,9 @@ class World(Coordinator):
             self._publish_incidents()
         state = fleet.bodies.state
         self.truth_hash.add(clock.now_ns, state[self._simulated] if self.external else state)
+        if self._radio is not None:  # before the gate, which lets agents go on
+            position_m = state[:, STATE.p_WB : STATE.p_WB + 3]
+            self.outbox.put(keys.RADIO, self._radio.links(clock.now_ns, self.outbox.next_seq(keys.RADIO), position_m))
         if gate is not None:
             self.outbox.put(keys.GATE, gate)
         statistics.gate(clock.now_ns, wall_ns)

@@ -1,0 +1,1 @@
+"""References of single drones: paths, the goals of several drones, and the pilot that flies one."""
