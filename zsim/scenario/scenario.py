@@ -9,6 +9,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType, defstruct, field
 from msgspec.structs import replace
 
 from zsim.contract.agent_messages import MessageInfo
+from zsim.errors import PACKAGES
 from zsim.schema.parameters import Given
 from zsim.schema.plugin import CLASS_NAME
 from zsim.schema.quantities import G_M_S2, SEA_LEVEL_KG_M3, Fraction, NonNegative, Positive, Real, Vector3
@@ -267,13 +268,34 @@ class TimeSteps(Spec, frozen=True, kw_only=True):
     max_command_age_ms: Positive = 500.0  # as silence.hover_s: an older command counts as silence
 
 
+LAWS = {
+    "consensus": "zsim_agents.laws.consensus:Consensus",
+    "leader_follower": "zsim_agents.laws.leader_follower:LeaderFollower",
+    "virtual_structure": "zsim_agents.laws.virtual_structure:VirtualStructure",
+    "distance_based": "zsim_agents.laws.distance_based:DistanceBased",
+    "bearing_only": "zsim_agents.laws.bearing_only:BearingOnly",
+    "olfati_saber": "zsim_agents.laws.olfati_saber:OlfatiSaber",
+    "vasarhelyi": "zsim_agents.laws.vasarhelyi:Vasarhelyi",
+}
+"""Formation laws by the names that a scenario may give them: classes of agents, each of which flies a drone."""
+AgentClass = Annotated[
+    str,
+    Meta(
+        pattern=rf"^({'|'.join(LAWS)})\Z|{CLASS_NAME}",
+        description=f"one of {', '.join(LAWS)}, or package.module:Class",
+    ),
+]
+
 LinkTime = Annotated[float, Meta(ge=0, le=60_000)]  # ms, as of the faults of links
 
 
 class OwnAgent(Spec, frozen=True, kw_only=True):
-    """Agents of a user's class, whose processes are named after what each is of: `pilot.drone1`, `watch.main`."""
+    """Agents whose processes are named after what each is of: `pilot.drone1`, `watch.main`.
 
-    named: Annotated[str, Meta(pattern=CLASS_NAME, description="package.module:Class")] = field(name="class")
+    Of a user's class, or of a formation law by its name, which stands for its class once the scenario is resolved.
+    """
+
+    named: AgentClass = field(name="class")
     per: Literal["drone", "cluster", "run"] = "drone"
     parameters: Given = {}
     """Of the class, see docs/extending.md."""
@@ -398,6 +420,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
         names += self.report.metric_names
         names += [each.named for each in self.own_agents.values()]
         classes = [name for name in names if isinstance(name, str) and ":" in name]
+        classes = [name for name in classes if name.partition(".")[0] not in PACKAGES]
         sensors = [each["module"] for drone in self.drones for each in (drone.sensors.own or {}).values()]
         models = [drone.model for drone in self.drones if drone.model not in STOCK]
         return sorted({*classes, *sensors, *models})
