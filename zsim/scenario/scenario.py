@@ -49,6 +49,10 @@ class Spec(Struct, frozen=True, forbid_unknown_fields=True):
     """Base of every section; unknown keys are faults."""
 
 
+Value = Annotated[Real | str, Meta(description="a finite number or an expression")]
+"""Of a variable: in metres or radians, in degrees where the name of an angle ends in `_deg`."""
+
+
 class Piloted(Spec, frozen=True, kw_only=True):
     """How drones that fly by themselves follow where they are to be."""
 
@@ -108,7 +112,7 @@ class DroneReference(Piloted, frozen=True, kw_only=True):
     start_s: NonNegative | None = None
     waypoints: Points = []
     minimum_snap: Points = []
-    expressions: Annotated[dict[str, Real | str], Meta(max_length=4)] = {}
+    expressions: Annotated[dict[str, Value], Meta(max_length=4)] = {}
     constants: Annotated[dict[str, Real], Meta(max_length=CONSTANTS_MAX)] = {}
     duration_s: Positive | None = None
     pieces: Annotated[list[Piece], Meta(max_length=PIECES_MAX)] = []
@@ -242,8 +246,6 @@ class Gains(Spec, frozen=True, kw_only=True):
     heading_sigma_max_deg: HeadingSigma | UnsetType = UNSET  # likewise of its heading; unset: 15 deg
 
 
-Value = Annotated[Real | str, Meta(description="a finite number or an expression")]
-"""Of a variable: in metres or radians, in degrees where the name of an angle ends in `_deg`."""
 Values = Annotated[dict[str, Value], Meta(max_length=VARIABLES_MAX)]  # values by the names of a formation's variables
 
 

@@ -88,9 +88,7 @@ class PiecewisePolynomial:
             v = polynomial.polyder(unit) / duration_s
             a = polynomial.polyder(v) / duration_s
             for k, columns in enumerate((v[:, :2], v[:, 2:3], v[:, 3:], a[:, :2])):
-                square = np.zeros(2 * len(columns) - 1)
-                for column in columns.T:
-                    square = square + polynomial.polymul(column, column)[: len(square)] if column.any() else square
+                square = np.sum([np.convolve(column, column) for column in columns.T], axis=0)
                 most, at = _greatest(square)
                 greatest[k] = max(greatest[k], (math.sqrt(most), float(begin_s + at * duration_s)))
         values, times = zip(*greatest, strict=True)
