@@ -17,7 +17,7 @@ from zsim.runtime.agent import Agent, AgentGroup, default_name
 from zsim.runtime.inbox import output_hold_ns
 from zsim.scenario.own_classes import messages_of
 from zsim.scenario.roles import AGENTS, agent_names, agent_roles, expected_processes
-from zsim.scenario.scenario import Scenario
+from zsim.scenario.scenario import OwnAgent, Scenario
 from zsim.schema import parameters, plugin, yaml_file
 from zsim.schema.checker import show
 
@@ -61,7 +61,7 @@ def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> N
     ]
     if not elsewhere:
         own = scenario.own_agents.items()
-        loads += [partial(plugin.load, each.named, f"{source}: agents.{role}.class", Agent) for role, each in own]
+        loads += [partial(_check_agent, each, f"{source}: agents.{role}", scenario) for role, each in own]
     for cluster in () if elsewhere else scenario.clusters:
         where = f"{source}: cluster {cluster.name!r}"
         for part, space in [(where, cluster.space), *((f"{where}, group {g.name!r}", g.space) for g in cluster.groups)]:
@@ -83,6 +83,14 @@ def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> N
             faults += error.faults
     if faults:
         raise ScenarioError(faults)
+
+
+def _check_agent(own: OwnAgent, where: str, scenario: Scenario) -> None:
+    """Check that the class of agents can be loaded, and what it says itself of its parameters by a method `flaws`."""
+    kind: Any = plugin.load(own.named, f"{where}.class", Agent)
+    flaws = getattr(kind, "flaws", None)
+    if flaws and (found := [f"{where}.parameters.{path} {text}" for path, text in flaws(own.parameters, scenario)]):
+        raise DocumentError(found)
 
 
 def check_plans(scenario: Scenario, source: str) -> None:
@@ -241,7 +249,7 @@ def own_agent(
         if not isinstance(made, Agent):
             raise RunError(f"{kind} makes a {type(made).__name__}; must make a zsim.Agent")
     register_messages(messages_of(type(made), plugin.full_name(type(made))))
-    made.bind(info, name)
+    made.bind(info, name, scenario.radio_of_agents)
     return made
 
 

@@ -24,7 +24,7 @@ from zsim.contract.messages import Info
 from zsim.errors import RunError, UserCodeError
 from zsim.runtime.agent import Agent, Output
 from zsim.scenario import scenario_file
-from zsim.scenario.scenario import Drone, Scenario
+from zsim.scenario.scenario import Drone, Radio, Scenario
 from zsim.schema import plugin
 from zsim.sensors.sensor import Sample
 from zsim.vehicles.vehicle_catalogue import vehicle_of
@@ -271,7 +271,7 @@ class PolicyAgent(Agent):
         """Return the action of every agent by its observation; see `zsim.Interface` for both."""
         raise NotImplementedError
 
-    def bind(self, info: Info, name: str = "") -> None:
+    def bind(self, info: Info, name: str = "", radio: Radio | None = None) -> None:
         """Get ready for the run of `world/info`."""
         scenario = scenario_file.from_text(info.scenario)
         self.interface = Interface(scenario, self.observe, self.action, self.step_s)
@@ -286,7 +286,7 @@ class PolicyAgent(Agent):
         self.counted = tuple(drones) if self.observe == "sensors" else ()
         self._flown = _Received(drones, max(len(drone.rotors) for drone in info.drones))
         self._is_begun = False
-        super().bind(info, name)
+        super().bind(info, name, radio)
 
     def receive(self, key: str, message: Any) -> None:
         """Take what the observations are made of."""

@@ -30,6 +30,7 @@ CONTRACT = {
     "clock": "run_id step state rate waiting_for",
     "world/event": "kind source subject text data",
     "world/faults": "faults",
+    "world/radio": "hears reception",
     "drone/*/sensor/imu": SENSOR + "accel_m_s2 gyro_rad_s",
     "drone/*/sensor/gps": SENSOR
     + "latitude_deg longitude_deg altitude_m position_m velocity_m_s sigma_m fix satellites",

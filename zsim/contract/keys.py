@@ -26,6 +26,7 @@ CLOCK = "clock"
 EVENT = "world/event"
 FAULTS = "world/faults"
 CONTROL = "world/control"
+RADIO = "world/radio"
 VIEW_DRONES = "view/drones"
 BATCH = "@batch"  # everything that passed the hub, see zsim.contract.framing
 GATE = "@gate"  # the world's messages about all drones at a gate

@@ -56,6 +56,20 @@ EVENT_KINDS = (
 """All kinds of events; docs/protocol.md says when each comes."""
 
 
+@on("world/radio", writers="world", readers="each", last="world")
+class RadioLinks(Message, frozen=True):
+    """Who hears whom at a gate, among the agents of drones that exchange messages; where the scenario has a radio.
+
+    Drones are known by their places in `world/info`; the place after the last one is that of the ground station, whose
+    agents are of clusters or of the run, where the radio's `station_m` says that it has one. `hears` has, for each
+    place, those whose messages come through, in rising order; `reception` the probability of each, before the radio's
+    `loss`, and is empty where all are 1.
+    """
+
+    hears: tuple[tuple[Count, ...], ...]
+    reception: tuple[tuple[Number, ...], ...] = ()
+
+
 @on("world/event", writers="world", readers="each")
 class Event(Message, frozen=True):
     """Something that happened once: what (one of EVENT_KINDS), by whom, about whom, in words, and in figures."""

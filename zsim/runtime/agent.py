@@ -26,8 +26,11 @@ from zsim.contract.messages import Info, decode, encode
 from zsim.contract.run_messages import ClusterRequest, ControlAnswer, ControlRequest, Faults
 from zsim.contract.snapshot import State
 from zsim.errors import DecodeError, RunError, UserCodeError
+from zsim.runtime.agent_radio import Transmitter
 from zsim.runtime.inbox import GateRouter, Input, RoutingTable, canonical, is_held
-from zsim.runtime.link_faults import LinkFaults
+from zsim.runtime.links import Links
+from zsim.scenario.roles import MAIN
+from zsim.scenario.scenario import Radio
 from zsim.schema import plugin
 
 _FILLED = ("name", "period_ns", "reads", "gate_keys")  # by `Agent.bind`, where a class leaves them out
@@ -58,13 +61,14 @@ class Agent(ABC):
     repeats: tuple[str, ...] = ()  # keys of its outputs that carry the requests that it took, for `repeat`
     messages: tuple[type[AgentMessage], ...] = ()  # classes of messages of a user's that it publishes
     thing = ""  # name of the drone or cluster that it is of: the second part of its own name
-    _links: LinkFaults | None = None
+    _links: Links | None = None
+    _transmitter: Transmitter | None = None
 
     def __init__(self) -> None:
         self._seq: defaultdict[str, int] = defaultdict(int)
         self._process = ""  # of the group that it is a member of, under whose name it publishes
 
-    def bind(self, info: Info, name: str = "") -> None:
+    def bind(self, info: Info, name: str = "", radio: Radio | None = None) -> None:
         """Fill in what a class of a user's leaves out, before its agent joins the run of `world/info`.
 
         The name: `agent.` and the class's name; `period_ns`: every gate; `gate_keys`: the status of every drone, or of
@@ -73,6 +77,7 @@ class Agent(ABC):
 
         Args:
             name: of the process, in place of the agent's own.
+            radio: over which it exchanges messages with other agents of users; None: they hear each other always.
         """
         if not hasattr(self, "_process"):  # a class whose constructor does not call this one's
             Agent.__init__(self)
@@ -98,6 +103,12 @@ class Agent(ABC):
             read = [key for key in at_gates if any(keys.matches(each, key) for each in self.reads)]
             self.gate_keys = (*statuses, *read)
             self.reads = tuple(dict.fromkeys((*self.reads, *statuses)))
+        self._links, self._transmitter = None, radio and Transmitter(radio, info.gate_ns)
+        things = (*drones, *(cluster.name for cluster in info.clusters), MAIN)
+        exchanged = (each.key.replace("*", thing) for each in info.own_messages for thing in things)
+        if radio and RoutingTable([self.reads]).readers_of_any(exchanged):
+            self._links = Links(info, (self.name, *self.serves), radio)
+            self.reads, self.gate_keys = (*self.reads, keys.RADIO), (*self.gate_keys, keys.RADIO)
 
     @property
     def role(self) -> str:
@@ -117,7 +128,7 @@ class Agent(ABC):
     def update_faults(self, info: Info, faults: Faults) -> None:
         """Take the faults injected into the run; called before the first gate in which one of them acts."""
         if self._links is None and faults.faults:
-            self._links = LinkFaults(info, (self.name, *self.serves))
+            self._links = Links(info, (self.name, *self.serves))
         if self._links is not None:
             self._links.update(faults)
 
@@ -134,7 +145,10 @@ class Agent(ABC):
             if t_ns % self.period_ns:
                 return None
             outputs = self.step(t_ns)
-            return [self._checked(output) for output in outputs] if self._is_own else outputs
+            if not self._is_own:
+                return outputs
+            checked = [self._checked(output) for output in outputs]
+            return [Output(*sent) for sent in self._transmitter.send(t_ns, checked)] if self._transmitter else checked
         except plugin.RAISED as error:
             failure = self.failure(error, t_ns)
             if failure is None:
@@ -242,15 +256,22 @@ class Agent(ABC):
         own = self.snapshot()
         if own is None:
             return None
-        return {"own": own, "seq": dict(self._seq), "links": self._links.snapshot() if self._links else None}
+        return {
+            "own": own,
+            "seq": dict(self._seq),
+            "links": self._links.snapshot() if self._links else None,
+            "transmitter": self._transmitter.snapshot() if self._transmitter else None,
+        }
 
     def resume(self, info: Info, checkpoint: State) -> None:
         """Take over a checkpoint; one of another version of this agent may raise anything."""
         self.restore(checkpoint["own"])
         self._seq = defaultdict(int, checkpoint["seq"])
         if checkpoint["links"] is not None:
-            self._links = self._links or LinkFaults(info, (self.name, *self.serves))
+            self._links = self._links or Links(info, (self.name, *self.serves))
             self._links.restore(checkpoint["links"])
+        if self._transmitter:
+            self._transmitter.restore(checkpoint["transmitter"])
 
     def command(self, t_ns: int, drone: str, command: Struct) -> Output:
         """Return an output of the gate t_ns that commands a drone; stamp, number and source are filled in.

@@ -17,9 +17,10 @@ from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
 from zsim.scenario.own_classes import agent_faults
 from zsim.scenario.roles import AGENTS, MAIN, OPERATOR, ROLES
 from zsim.scenario.scenario import EXTERNAL, PATHS, SEA_HEIGHT_MAX_M, Scenario, space_name
-from zsim.schema.checker import Fault, listed, show
+from zsim.schema.checker import Fault, listed, show, suggestion
 from zsim.schema.quantities import COULOMB_PER_MAH, G_M_S2, SEA_LEVEL_KG_M3
 from zsim.sensors.camera_model import folds, lens_of
+from zsim.sensors.scanner import RAYS_MAX, SCANNERS
 from zsim.sensors.sensor_catalogue import DECLARED, MODULE, STOCK, declarations, own_sections
 from zsim.sensors.stock_sensors import BOARD_RATE_HZ
 from zsim.vehicles.vehicle import Vehicle, lift_shares
@@ -73,6 +74,7 @@ def cross_faults(
     if isinstance(scenario.agents, dict):
         sound_agents = {role: each for role, each in scenario.agents.items() if each and each.per}
         yield from agent_faults(sound_agents, (*ROLES, *RESERVED_ROLES), bool(clusters))
+    yield from _graph_faults(scenario.topology, _names(drones))
     yield from _injected_faults(scenario, drones, clusters, vehicles, unread)
     window = scenario.report and scenario.report.window_s
     if window is not None and not 0 <= window[0] < window[1]:
@@ -505,6 +507,19 @@ def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Ite
             yield f"processes.expect[{index}]", f"is {name!r}, and no {kind} is {thing!r}; {allowed}"
 
 
+def _graph_faults(topology: Any, drones: list[str]) -> Iterator[Fault]:
+    """Yield what a graph of drones names that is none of them."""
+    graph = getattr(topology, "graph", None)
+    for hearer, heard in graph.items() if isinstance(graph, dict) else ():
+        where = f"topology.graph.{hearer}"
+        if hearer not in drones:
+            yield where, f"is no drone; {suggestion(hearer, drones)}must be one of {listed(drones)}"
+        for place, name in enumerate(heard):
+            others = [each for each in drones if each != hearer]
+            if name not in others:
+                yield f"{where}[{place}]", f"is {show(name)}; must be one of {listed(others)}"
+
+
 def _injected_faults(
     scenario: Any, drones: _Entries, clusters: _Entries, vehicles: Mapping[str, Vehicle], unread: Collection[str]
 ) -> Iterator[Fault]:
@@ -531,6 +546,7 @@ def _sighting_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Ite
     for index, drone in drones:
         if drone.sensors is not None:
             yield from _under(f"drones[{index}].sensors", _camera_faults(drone.sensors))
+            yield from _under(f"drones[{index}].sensors", _scanner_faults(drone.sensors))
     hats = scenario.environment and scenario.environment.hats
     known = [drone.name for _, drone in drones]
     for place, name in enumerate(hats.covered or () if hats else ()):
@@ -567,10 +583,29 @@ def _camera_faults(sensors: Any) -> Iterator[Fault]:
             most = f"{1e3 / camera.rate_hz:.4g} ms at rate_hz {camera.rate_hz:g}"
             found = f"is {camera.exposure_ms:g}; must be <= {most}, the time from one picture to the next"
             yield f"{path}.exposure_ms", found
-    looks_at = (sensors.sightings and sensors.sightings.cameras) or ()
-    for place, name in enumerate(looks_at):
-        path = f"sightings.cameras[{place}]"
-        if name in looks_at[:place]:
-            yield path, f"is {name!r}, as cameras[{looks_at.index(name)}]; must be unique"
-        elif name in cameras and not cameras[name]:
-            yield path, f"is {name!r}, which the drone does not have; give it {name}_camera: {{}}"
+    for section in ("sightings", "depth"):
+        used = getattr(sensors, section)
+        looks_at = (used and used.cameras) or ()
+        for place, name in enumerate(looks_at):
+            path = f"{section}.cameras[{place}]"
+            if name in looks_at[:place]:
+                yield path, f"is {name!r}, as cameras[{looks_at.index(name)}]; must be unique"
+            elif name in cameras and not cameras[name]:
+                yield path, f"is {name!r}, which the drone does not have; give it {name}_camera: {{}}"
+
+
+def _scanner_faults(sensors: Any) -> Iterator[Fault]:
+    """Yield what cannot go together of the settings of a drone's beams, lidar and depth images."""
+    for name in SCANNERS:
+        own = getattr(sensors, name)
+        if not own:
+            continue
+        if _known(own.min_m, own.max_m) and own.min_m >= own.max_m:
+            yield f"{name}.min_m", f"is {own.min_m:g}; must be < max_m ({own.max_m:g})"
+        rows = {"lidar": "channels", "depth": "rows"}.get(name)
+        if rows and _known(getattr(own, rows), own.columns) and getattr(own, rows) * own.columns > RAYS_MAX:
+            most = f"must be <= {RAYS_MAX // getattr(own, rows)} with {rows} {getattr(own, rows)}"
+            yield f"{name}.columns", f"is {own.columns}; {most}: {RAYS_MAX} rays a message"
+    azimuth = sensors.lidar and sensors.lidar.azimuth_deg
+    if azimuth and None not in azimuth and not 0 < azimuth[1] - azimuth[0] <= 360:
+        yield "lidar.azimuth_deg", f"is {show(list(azimuth))}; must be [first, last], rising by at most 360"

@@ -9,6 +9,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType, defstruct, field
 from msgspec.structs import replace
 
 from zsim.contract.agent_messages import MessageInfo
+from zsim.errors import PACKAGES
 from zsim.schema.parameters import Given
 from zsim.schema.plugin import CLASS_NAME
 from zsim.schema.quantities import G_M_S2, SEA_LEVEL_KG_M3, Fraction, NonNegative, Positive, Real, Vector3
@@ -367,16 +368,82 @@ class TimeSteps(Spec, frozen=True, kw_only=True):
     max_command_age_ms: Positive = 500.0  # as silence.hover_s: an older command counts as silence
 
 
-class OwnAgent(Spec, frozen=True, kw_only=True):
-    """Agents of a user's class, whose processes are named after what each is of: `pilot.drone1`, `watch.main`."""
+LAWS = {
+    "consensus": "zsim_agents.laws.consensus:Consensus",
+    "leader_follower": "zsim_agents.laws.leader_follower:LeaderFollower",
+    "virtual_structure": "zsim_agents.laws.virtual_structure:VirtualStructure",
+    "distance_based": "zsim_agents.laws.distance_based:DistanceBased",
+    "bearing_only": "zsim_agents.laws.bearing_only:BearingOnly",
+    "olfati_saber": "zsim_agents.laws.olfati_saber:OlfatiSaber",
+    "vasarhelyi": "zsim_agents.laws.vasarhelyi:Vasarhelyi",
+}
+"""Formation laws by the names that a scenario may give them: classes of agents, each of which flies a drone."""
+AgentClass = Annotated[
+    str,
+    Meta(
+        pattern=rf"^({'|'.join(LAWS)})\Z|{CLASS_NAME}",
+        description=f"one of {', '.join(LAWS)}, or package.module:Class",
+    ),
+]
 
-    named: Annotated[str, Meta(pattern=CLASS_NAME, description="package.module:Class")] = field(name="class")
+LinkTime = Annotated[float, Meta(ge=0, le=60_000)]  # ms, as of the faults of links
+
+
+class OwnAgent(Spec, frozen=True, kw_only=True):
+    """Agents whose processes are named after what each is of: `pilot.drone1`, `watch.main`.
+
+    Of a user's class, or of a formation law by its name, which stands for its class once the scenario is resolved.
+    """
+
+    named: AgentClass = field(name="class")
     per: Literal["drone", "cluster", "run"] = "drone"
     parameters: Given = {}
     """Of the class, see docs/extending.md."""
     declared: Annotated[list[MessageInfo], Meta(max_length=MESSAGES_MAX)] | UnsetType = UNSET
     """The messages that the class publishes; filled in, as all its parameters are."""
 
+
+Graph = Annotated[
+    Literal["complete", "ring", "path"] | Annotated[dict[Name, list[Name]], Meta(max_length=DRONES_MAX)],
+    Meta(description="one of complete, ring, path, or a map of each drone to those that it hears"),
+]
+
+
+class Topology(Spec, frozen=True, kw_only=True):
+    """Whose messages the agents of a drone may hear. `topology: ring` and `topology: {a: [b, c]}` give the graph alone.
+
+    A drone hears those that the graph allows, that are within `within_m` and that the radio reaches; of these the
+    `nearest` only. Rings and paths are in the order of the scenario's drones.
+    """
+
+    graph: Graph = "complete"
+    within_m: Positive | None = None
+    nearest: Annotated[int, Meta(ge=1)] | None = None
+    symmetric: bool = False  # whether who is heard by another hears it as well
+
+
+class Radio(Spec, frozen=True, kw_only=True):
+    """What carries the messages of drones' agents to those of other drones, and to a ground station.
+
+    At the distance d between true places, a message is received with the probability
+    (1 - loss) / (1 + exp((d - range_m) / spread_m)), the form of the faults of kind `radio`. Drones that receive less
+    than RECEPTION_MIN of each other are no neighbours.
+    """
+
+    range_m: Positive | None = None  # None: any distance
+    spread_m: NonNegative = 0.0  # 0: everything is received up to range_m, and nothing beyond
+    loss: Fraction = 0.0
+    line_of_sight: bool = False  # whether obstacles are in the way of it
+    delay_ms: LinkTime = 0.0  # a message comes at the first gate after it, at the next one at least
+    jitter_ms: LinkTime = 0.0  # most of a further delay, evenly spread from 0
+    bandwidth_kbit_s: Positive | None = None  # of each agent's transmitter; None: any
+    header_bytes: Annotated[int, Meta(ge=0, le=1000)] = 16  # sent with each message; chosen, as of IEEE 802.15.4
+    queue_max: Annotated[int, Meta(ge=1, le=1000)] = 10  # messages that wait to be sent; beyond it the oldest is lost
+    station_m: Position | None = None
+    """Antenna of the agents of clusters and of the run; None: these are wired to all."""
+
+
+RECEPTION_MIN = 1e-3  # chosen: rarer than that, two drones are no neighbours
 
 RoleName = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,14}\Z", description="a letter and up to 14 of a-z 0-9 _")]
 
@@ -418,6 +485,9 @@ class Scenario(Spec, frozen=True, kw_only=True):
     estimation: Estimation = Estimation()
     agents: Annotated[dict[RoleName, OwnAgent], Meta(max_length=ROLES_MAX)] | UnsetType = UNSET
     """Agents of users' classes, by role; unset: none, and left out of the resolved text."""
+    topology: Topology | UnsetType = UNSET
+    radio: Radio | UnsetType = UNSET
+    """Between agents of drones. Unset: all hear all; left out of the resolved text."""
     processes: Processes = Processes()
     faults: Annotated[list[dict[str, Any]], Meta(max_length=FAULTS_MAX)] = []
     """Faults to inject, each a map; `zsim.scenario.faults.flaws` checks them."""
@@ -440,6 +510,13 @@ class Scenario(Spec, frozen=True, kw_only=True):
     def own_agents(self) -> dict[str, OwnAgent]:
         return {} if self.agents is UNSET else self.agents
 
+    @property
+    def radio_of_agents(self) -> Radio | None:
+        """Return the radio over which users' agents exchange messages; None where all of them hear all."""
+        if self.radio is UNSET and self.topology is UNSET:
+            return None
+        return Radio() if self.radio is UNSET else self.radio
+
     def own_messages(self) -> list[MessageInfo]:
         """Return the messages that users' agents declare, in the order of their keys."""
         declared = [replace(each, role=role) for role, own in self.own_agents.items() for each in own.declared or ()]
@@ -452,6 +529,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
         names += self.report.metric_names
         names += [each.named for each in self.own_agents.values()]
         classes = [name for name in names if isinstance(name, str) and ":" in name]
+        classes = [name for name in classes if name.partition(".")[0] not in PACKAGES]
         sensors = [each["module"] for drone in self.drones for each in (drone.sensors.own or {}).values()]
         models = [drone.model for drone in self.drones if drone.model not in STOCK]
         return sorted({*classes, *sensors, *models})

@@ -129,12 +129,17 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
         document["agents"], wrong = own_classes.with_agents(document["agents"], imports)
         unsound += wrong
         document["processes"] = _with_deaths(document.get("processes", {}), document["agents"])
+    shortened = _is_graph(document.get("topology"))
+    if shortened:
+        document["topology"] = {"graph": document["topology"]}
     drones = document.get("drones")
     if isinstance(drones, list) and len(drones) <= DRONES_MAX:
         document["drones"] = [resolved_drone(drone, f"drones[{index}]") for index, drone in enumerate(drones)]
 
     between = cross_faults(sound(document, Scenario), vehicles, unread)
     flaws = chain(misread, faults(document, Document), unknown, unsound, between)
+    if shortened:
+        flaws = ((re.sub(r"^topology\.graph", "topology", path), text) for path, text in flaws)
     found = first_lines(chain(lines, (f"{source}: {path} {text}{_whose(document, path)}" for path, text in flaws)))
     if found:
         raise ScenarioError(found)
@@ -197,6 +202,13 @@ def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
         unsound += [(path, text) for path, _, text in (line.partition(" ") for line in error.faults)]
         return reference
     return {**{key: value for key, value in reference.items() if key != "file"}, "pieces": pieces}
+
+
+def _is_graph(topology: Any) -> bool:
+    """Tell whether a `topology:` section is a graph alone, by name or as lists of those that each drone hears."""
+    if isinstance(topology, dict):
+        return any(isinstance(heard, list) for heard in topology.values())
+    return isinstance(topology, str)
 
 
 def _with_deaths(processes: Any, agents: Any) -> Any:

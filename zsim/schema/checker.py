@@ -176,7 +176,9 @@ def _sound(value: Any, info: types.Type) -> Any:
     if isinstance(info, types.Metadata):
         return _sound(value, info.type)
     if isinstance(info, types.UnionType) and value is not None:
-        return _sound(value, next(option for option in info.types if not isinstance(option, types.NoneType)))
+        others = [option for option in info.types if not isinstance(option, types.NoneType)]
+        fitting = (option for option in others if not any(_check(value, option, "")))
+        return _sound(value, next(fitting, others[0]))
     if isinstance(info, types.StructType):
         if not isinstance(value, dict):
             return None

@@ -46,6 +46,8 @@ SOLID = (134, 142, 150)
 GHOST, ELLIPSOID, WIND, SIDE = (77, 171, 247), (250, 176, 5), (21, 170, 191), (226, 0, 134)
 PREVIEW = (217, 72, 15)
 PREVIEW_PX = 3.0  # of a previewed way
+RADIO, ONE_WAY = (64, 192, 87), (250, 82, 82)  # links of the radio: both ways, or one
+RADIO_PX = 1.5
 SIDE_PX = 2.0  # of a formation's sides, at any distance
 WIND_M_PER_M_S = 0.5  # length of the arrow
 WIND_MIN_M_S = 0.05  # below it no arrow
@@ -114,6 +116,8 @@ class RunScene:
             poses = [ghosts(self._run.spaces[name], view) for name, view in self._views.clusters.items()]
             shown = [(np.zeros((0, 3)), np.zeros((0, 4))), *(each for each in poses if each is not None)]
             self.nodes.ghosts(np.concatenate([p_W for p_W, _ in shown]), np.concatenate([q for _, q in shown]))
+        if self._views.radio is not None:
+            self.nodes.radio(radio_lines(self._views.radio.hears, drones))
         self._cameras.follow(self._camera_targets(drones))
         return drones
 
@@ -195,6 +199,7 @@ class SceneNodes:
             "/wind", np.array([[(0, 0, 0), (1, 0, 0)]], float), WIND, shaft_radius=0.035, head_radius=0.1,
             head_length=0.22, visible=False,
         )  # fmt: skip
+        self._radio: Any = None
         self._wind_label = scene.add_label("/wind_speed", "", visible=False, anchor="bottom-left")
         self._formation_sides: Any = None
         if clusters:
@@ -257,6 +262,19 @@ class SceneNodes:
             start = np.array([*present[:, :2].mean(axis=0), present[:, 2].max() + WIND_ABOVE_M])
             self._wind.points = np.array([[start, start + WIND_M_PER_M_S * drones.wind_W]])
             self._wind_label.position, self._wind_label.text = start, f"wind {speed:.1f} m/s"
+
+    def radio(self, lines: tuple[Array, Array]) -> None:
+        """Set the lines between drones that hear each other, and those of which one hears the other only."""
+        points = np.concatenate([*lines, np.tile(HIDDEN, (1, 2, 1))]).astype(np.float32)
+        count, weak = len(points), len(lines[0])
+        colours = np.tile(linear(np.array(RADIO)), (count, 2, 1))
+        colours[weak:] = linear(np.array(ONE_WAY))
+        if self._radio is None:
+            self._radio = self._scene.add_line_segments(
+                "/radio", points, colours, thickness=RADIO_PX, thickness_units="screen"
+            )
+        else:
+            self._radio.points, self._radio.colors = points, colours
 
     def estimates(self, ellipsoids: Ellipsoids) -> None:
         node = self._ellipsoids
@@ -373,6 +391,16 @@ class ChosenRing:
         if index != self._chosen:
             self._chosen = index
             self._node.batched_scales = np.full((1, 3), self._radii_m[index])
+
+
+def radio_lines(hears: Sequence[Sequence[int]], drones: DronePoses) -> tuple[Array, Array]:
+    """Return the ends (n, 2, 3) [m] of links between present drones: both ways, then one way."""
+    pairs = {(i, j) for i, heard in enumerate(hears) for j in heard}
+    count, there = len(drones.p_W), drones.present
+    known = {(i, j) for i, j in pairs if max(i, j) < count and there[i] and there[j]}
+    both = sorted((i, j) for i, j in known if i < j and (j, i) in known)
+    single = sorted((i, j) for i, j in known if (j, i) not in known)
+    return tuple(drones.p_W[np.array(each, dtype=int).reshape(-1, 2)] for each in (both, single))  # type: ignore[return-value]
 
 
 def draw_ground(scene: viser.SceneApi, *, dark: bool = False) -> None:

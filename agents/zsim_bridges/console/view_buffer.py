@@ -104,6 +104,7 @@ class ViewBuffer:
         self.healths: dict[str, Health] = {}
         # names of drones whose bodies are external
         self.external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
+        self.radio: run_messages.RadioLinks | None = None  # who hears whom, where the scenario has a radio
         self._links: dict[str, LinkState] = {}
         self.faults: tuple[Fault, ...] = ()  # injected ones, planned and active
         self.log = EventLog(observer.name)
@@ -116,7 +117,7 @@ class ViewBuffer:
     def open(self) -> None:
         """Subscribe, and read the values published last."""
         links = map(keys.link, sorted(self.external))
-        for expression in ("view/**", keys.FAULTS, "process/*/health", *links):
+        for expression in ("view/**", keys.FAULTS, keys.RADIO, "process/*/health", *links):
             self._link.declare_subscriber(expression, self._on_publication)
         for cluster in self._variables:
             self._link.declare_subscriber(keys.cluster_request(cluster), self._on_request)
@@ -221,6 +222,8 @@ class ViewBuffer:
         elif isinstance(message, Health):
             self.healths[keys.thing(key)] = message
             self.losses.note_health(keys.thing(key), message)
+        elif isinstance(message, run_messages.RadioLinks):
+            self.radio = message
         elif isinstance(message, run_messages.Faults):
             self.faults = message.faults
 

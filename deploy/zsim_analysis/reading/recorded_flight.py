@@ -4,7 +4,7 @@
 """
 
 from array import array
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,10 +20,11 @@ from zsim.contract import keys
 from zsim.contract.flight_messages import Covariance, Quaternion
 from zsim.contract.framing import GateMessages
 from zsim.contract.messages import Info
-from zsim.contract.run_messages import Bye, ClusterRequest, Event, Join
+from zsim.contract.run_messages import Bye, ClusterRequest, Event, Join, RadioLinks
 from zsim.record import Completeness, RecordReader, completeness
 from zsim.scenario.scenario import Scenario
 from zsim.schema.message import Vector3
+from zsim_analysis.reading.radio_links import RadioHistory
 from zsim_analysis.reading.recorded_run import scenario_of, search_modules
 
 Array = NDArray[np.float64]
@@ -133,6 +134,9 @@ class RecordedFlight:
     # estimates, commands: by drone; empty unless requested
     estimates: dict[str, DroneEstimates] = field(default_factory=dict)
     commands: dict[str, VelocityCommands] = field(default_factory=dict)
+    others: dict[str, int] = field(default_factory=dict)  # number of messages by key, of those that no report reads
+    cpu_s: float | None = None  # CPU time from the first gate to the last, of a flight in a process of its own
+    radio: RadioHistory | None = None  # None where the scenario has none
 
     @property
     def end(self) -> dict[str, Any] | None:
@@ -246,6 +250,7 @@ class FlightReader:
     def __init__(self, answers: bool = False) -> None:
         self._answers = answers
         self._infos: list[Info] = []
+        self._radio: list[RadioLinks] = []
         self._events: list[Event] = []
         self._truth: defaultdict[str, _Rows] = defaultdict(lambda: _Rows(TRUTH_WIDTH, "d"))
         self._status: defaultdict[str, _Rows] = defaultdict(lambda: _Rows(1, "d"))
@@ -259,6 +264,7 @@ class FlightReader:
         self._first_wall_ns: int | None = None
         self._last_wall_ns = 0
         self._undecoded = 0
+        self._others: Counter[str] = Counter()
         self._handlers: dict[str, _Handler | None] = {}
 
     def handler(self, key: str) -> _Handler | None:
@@ -267,6 +273,7 @@ class FlightReader:
             group, _, what = keys.parts(key)
             kinds: dict[str, tuple[type[Struct], Callable[[str, Any], None]]] = {
                 keys.INFO: (Info, lambda _, message: self._infos.append(message)),
+                keys.RADIO: (RadioLinks, lambda _, message: self._radio.append(message)),
                 keys.EVENT: (Event, lambda _, message: self._events.append(message)),
                 "process/join": (Join, self._add_process),
                 "process/bye": (Bye, self._add_process),
@@ -302,6 +309,8 @@ class FlightReader:
         """Add a message, not encoded, of a flight in this process."""
         if handler := self.handler(key):
             handler[1](keys.parts(key)[1], message)
+        else:
+            self._others[key] += 1
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
         """Add the world's messages of a gate of a flight in this process."""
@@ -403,6 +412,8 @@ class FlightReader:
             began_ns=self._first_wall_ns,
             estimates=estimates,
             commands=self._flown_commands(),
+            others=dict(self._others),
+            radio=RadioHistory(self._radio, len(tracks)) if self._radio else None,
         )
 
     def _flown_commands(self) -> dict[str, VelocityCommands]:

@@ -1,4 +1,4 @@
-"""Figures of drones: plan view; altitude, state and battery; errors of estimates; velocities; distances.
+"""Figures of drones: plan view; altitude, state and battery; errors of estimates; velocities; distances; radio.
 
 Few drones have a line, or a column, each; many are drawn as their spread.
 """
@@ -22,6 +22,7 @@ from zsim.scenario.obstacle import BOX, CENTRE, COSINE, HALF, SHAPE, SINE, row_o
 from zsim.scenario.scenario import Scenario
 from zsim_analysis.reading import drone_errors
 from zsim_analysis.reading.formation import Formation, common_instants
+from zsim_analysis.reading.radio_links import RadioHistory
 from zsim_analysis.reading.recorded_flight import Array, RecordedFlight, Track
 from zsim_analysis.report import figure_style as style
 
@@ -389,4 +390,41 @@ def draw_distances(
             axes.text(0.995, distance_m, f"{name}: {distance_m:.2g} m", color=colour, fontsize=SMALL_PT, **place)
     style.label_time([axes])
     style.legend_above(figure, axes, columns=3)
+    return figure
+
+
+# Radio
+
+
+def draw_radio(radio: RadioHistory, names: Sequence[str], marks: style.TimeMarks) -> Figure:
+    """Return who hears whom how often, and how many others each drone hears over time."""
+    figure = style.new_figure(style.PAGE_IN, 2.6)
+    matrix, axes = figure.subplots(1, 2, width_ratios=(1, 2))
+    style.dress(matrix, "receiver")
+    matrix.grid(visible=False)
+    image = matrix.imshow(100 * radio.share, cmap="Blues", vmin=0, vmax=100, interpolation="nearest")
+    matrix.set_xlabel("sender", fontsize=style.PAPER_PT)
+    ticks = range(len(names)) if len(names) <= NAMED_MAX else []
+    for axis in (matrix.xaxis, matrix.yaxis):
+        axis.set_ticks(ticks, [names[tick] for tick in ticks], fontsize=SMALL_PT)
+    matrix.tick_params(axis="x", rotation=90)
+    scale = figure.colorbar(image, ax=matrix)
+    scale.set_label("% of the run", fontsize=style.PAPER_PT)
+    scale.ax.tick_params(labelsize=SMALL_PT)
+    t_s = radio.t_ns / 1e9
+    style.dress(axes, "drones heard")
+    if len(names) > EACH_MAX:
+        style.draw_spread(axes, t_s, radio.heard.astype(float), style.BLUE)
+    else:
+        for name, colour, heard in zip(names, drone_colours(len(names)), radio.heard.T, strict=True):
+            style.line(axes, t_s, heard, color=colour, lw=1.0, label=name)
+    axes.fill_between(
+        t_s, 0, 1, where=~radio.connected, transform=axes.get_xaxis_transform(), color=style.GREY, alpha=0.3, lw=0,
+        label="not connected",
+    )  # fmt: skip
+    axes.set_ylim(bottom=0)
+    style.draw_marks([axes], marks)
+    style.label_time([axes])
+    style.letter_panels([matrix, axes])
+    style.legend_above(figure, axes, columns=5)
     return figure

@@ -16,7 +16,6 @@ from zsim.scenario.faults import PROCESS_KILL
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.formation import Formation
 from zsim_analysis.reading.recorded_flight import Array, RecordedFlight
-from zsim_analysis.reading.shortfall import CONTROLLER
 
 COLUMN_IN, PAGE_IN = 3.5, 7.16  # widths of a column and of a page of IEEE's conference papers
 DPI = 200  # of PNG files
@@ -288,8 +287,9 @@ def _faults(flight: RecordedFlight) -> Iterator[Band]:
 
 
 def _take_overs(flight: RecordedFlight) -> Iterator[Band]:
-    """Yield the times in which others than a controller flew a drone: from acquisition or first command to release."""
+    """Yield the times in which others than the scenario's agents flew a drone: from acquisition or first command on."""
     since_ns: dict[str, int] = {}
+    planned = {"controller", *(flight.scenario.own_agents if flight.scenario else ())}
     for event in flight.events:
         op, drone, args = event.kind, event.subject, event.data.get("args")
         if event.kind == "control" and event.data.get("ok") is True and isinstance(args, dict):
@@ -297,7 +297,7 @@ def _take_overs(flight: RecordedFlight) -> Iterator[Band]:
         if op not in ("commander", "acquire", "release") or not isinstance(drone, str):
             continue
         commander = "" if op == "release" else event.source
-        if commander and not commander.startswith(CONTROLLER):
+        if commander and commander.partition(".")[0] not in planned:
             since_ns.setdefault(drone, event.t_ns)
         elif (begun_ns := since_ns.pop(drone, None)) is not None:
             yield Band(TAKE_OVER, begun_ns / 1e9, event.t_ns / 1e9)

@@ -20,8 +20,9 @@ from zsim.output_folder import RECORD
 from zsim.presentation import colours_of
 from zsim_analysis.reading.drone_errors import distances, estimate_errors, separations, velocity_responses
 from zsim_analysis.reading.formation import Formation, goal_errors
+from zsim_analysis.reading.radio_links import RadioSummary
 from zsim_analysis.reading.recorded_flight import RecordedFlight
-from zsim_analysis.reading.shortfall import seconds_text, span_text
+from zsim_analysis.reading.shortfall import percent_text, seconds_text, span_text
 from zsim_analysis.report import FORMATS
 from zsim_analysis.report import drone_figures as drones
 from zsim_analysis.report.figure_style import DARK, TAKE_OVER, VERMILION, ReportFigure, mark_figure, time_marks
@@ -108,6 +109,14 @@ def planned_figures(
             f"True distance of {what}; below the first line the controller's guard parts them.",
             partial(drones.draw_distances, apart, separations(flight), colours, marks),
         )
+    if flight.radio:
+        yield PlannedFigure(
+            "radio.png",
+            "Radio",
+            "Who hears whom: share of the run in which a drone is within reach of another, lost messages not counted; "
+            "and how many others a drone hears. Grey: not every drone can reach all, not even over others.",
+            partial(drones.draw_radio, flight.radio, [track.name for track in flight.tracks], marks),
+        )
     if has_truth:
         yield PlannedFigure(
             "drones.png",
@@ -180,7 +189,7 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
     ages = f"p50 {age['p50']:.2f} ms, p99 {age['p99']:.2f} ms, max {age['max']:.2f} ms" if age else "not known"
     factor = "not known" if summary.real_time_factor is None else f"{summary.real_time_factor:.1f}"
     seed = "–" if summary.seed is None else summary.seed
-    separation = summary.min_separation_m
+    separation, radio = summary.min_separation_m, summary.radio
     versions = dict.fromkeys(version for name, version in summary.versions.items() if name != "report")
     kinds, misses = {each.kind for each in summary.shortfalls}, "not known"
     but_for = {
@@ -210,6 +219,7 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
         ("Command age", ages),
         *((f"Link of {drone}", str(link)) for drone, link in summary.links.items()),
         ("Least separation", "no two drones in the air" if separation is None else f"{separation:.2f} m in truth"),
+        *([("Radio", radio_text(radio))] if radio else []),
         ("Truth", f"SHA-256 {summary.truth_sha256}"),
         ("Fingerprint", summary.fingerprint or "not known"),
     ]
@@ -218,6 +228,11 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
 def changed_text(changed: Sequence[str] | None) -> str:
     """Return the differences of a scenario from its file in words."""
     return "not known" if changed is None else ", ".join(changed) or "nothing: as in its file"
+
+
+def radio_text(radio: RadioSummary) -> str:
+    connected = f"all of them are connected {percent_text(radio.connected_share)} % of the time"
+    return f"a drone hears {radio.heard_mean:.2f} others on average, {connected}"
 
 
 def date_text(date: str | None) -> str:

@@ -19,6 +19,7 @@ from zsim.errors import RecordError, printable
 from zsim.presentation import Column, FittedTable
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of, min_separation_m
+from zsim_analysis.reading.radio_links import RadioSummary
 from zsim_analysis.reading.recorded_flight import TRUTH_WIDTH, RecordedFlight, read_flight
 from zsim_analysis.reading.recorded_run import DriverLink, command_age_ms, driver_links
 from zsim_analysis.reading.shortfall import (
@@ -111,6 +112,7 @@ class RunSummary(Struct, frozen=True):
     errors: dict[str, ParameterErrors]
     clusters: dict[str, ClusterErrors]
     min_separation_m: float | None
+    radio: RadioSummary | None  # of the window; None where the scenario has none
     paper_table_1: dict[str, float]
     events: list[EventLine]
     events_left_out: dict[str, int]
@@ -204,6 +206,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         errors=next((cluster.errors for cluster in clusters.values()), {}),
         clusters=clusters,
         min_separation_m=min_separation_m(flight.tracks),
+        radio=flight.radio.summary(window_s) if flight.radio else None,
         paper_table_1=PAPER_TABLE_1,
         events=lines,
         events_left_out=dict(left_out),

@@ -15,7 +15,7 @@ import msgspec
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Ardrone
 from zsim.contract.run_messages import PRIORITY_MAX, ControlRequest, Fault
-from zsim.runtime.link_faults import NEVER, RADIO, WORLD, distance_between, joins, place_of, total_delay_ns
+from zsim.runtime.links import NEVER, RADIO, WORLD, distance_between, joins, place_of, total_delay_ns
 from zsim_world.fleet.external_drones import ExternalDrones
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.run.coordinator import Coordinator

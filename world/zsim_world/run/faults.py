@@ -8,7 +8,7 @@ import msgspec
 
 from zsim.contract import keys
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Fault, Faults
-from zsim.runtime.link_faults import KINDS as LINK_KINDS
+from zsim.runtime.links import KINDS as LINK_KINDS
 from zsim.scenario import faults as fault_kinds
 from zsim.scenario.faults import PROCESS_KILL, Known, flaws
 from zsim.scenario.roles import WORLD, expected_processes

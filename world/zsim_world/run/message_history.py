@@ -10,10 +10,10 @@ from typing import Annotated, Any
 import msgspec
 
 from zsim.contract import keys, messages
-from zsim.contract.flight_messages import ClusterState, Command, Estimate, Reference
+from zsim.contract.flight_messages import Command
 from zsim.contract.framing import Pairs, pairs_of
 from zsim.contract.messages import REFUSALS
-from zsim.contract.run_messages import ClusterRequest, ControlAnswer
+from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError
 from zsim.scenario import roles
 from zsim.schema.message import Count
@@ -178,7 +178,7 @@ class MessageHistory:
 def _identity(key: str, payload: bytes) -> tuple[str, int, int, str] | None:
     """Return (key, t_ns, seq, source), which identify an output; None for messages that no done counts."""
     kind = messages.type_of(key)
-    if kind is None or not issubclass(kind, Command | Estimate | ClusterState | Reference | ClusterRequest):
+    if kind is None or not issubclass(kind, (Command, *messages.RELAYED)):
         return None
     try:
         message = messages.decode(key, payload)

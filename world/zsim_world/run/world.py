@@ -12,6 +12,7 @@ from zsim import CONTRACT, __version__
 from zsim.contract import keys, messages
 from zsim.contract.fingerprint import TruthHash, fingerprint
 from zsim.contract.flight_messages import DroneView, Status, ViewDrones
+from zsim.contract.keys import SIGHTINGS
 from zsim.contract.snapshot import State
 from zsim.errors import UserCodeError
 from zsim.runtime.agent import Output
@@ -23,6 +24,8 @@ from zsim.sensors.sensor_catalogue import declarations
 from zsim_world.fleet.external_drones import ExternalDrones
 from zsim_world.fleet.fleet import DivergedError, Fleet
 from zsim_world.fleet.publication import GatePublication
+from zsim_world.fleet.radio import RadioChannel
+from zsim_world.physics.fleet_arrays import STATE
 from zsim_world.run.commands import CommandIntake
 from zsim_world.run.coordinator import Coordinator
 from zsim_world.run.faults import FaultInjector
@@ -89,6 +92,7 @@ class World(Coordinator):
         self.queue = self._intake.queue
         self._operations |= {**self._intake.operations(), **self.faults.operations()}
         self._publication = GatePublication(self.fleet)
+        self._radio = RadioChannel(scenario) if scenario.radio_of_agents else None
         self.truth_hash = TruthHash(len(self._simulated))
         self._last_ns = round(scenario.duration_s * 1e9) // self.clock.gate_ns * self.clock.gate_ns
         self.statistics.closest_m = self.fleet.closest_m
@@ -121,7 +125,8 @@ class World(Coordinator):
             version=__version__,
             fingerprint=fingerprint(),
             user_sensors=user_sensors or UNSET,
-            sightings=self.fleet.has_sightings or UNSET,
+            sightings=SIGHTINGS in self.fleet.beside or UNSET,
+            scanners=tuple(name for name in self.fleet.beside if name != SIGHTINGS) or UNSET,
             module_folders=tuple(map(str, plugin.folders())) if s.own_code() else UNSET,
             changed=self._changed,
             user_messages=tuple(s.own_messages()) or UNSET,
@@ -194,6 +199,9 @@ class World(Coordinator):
             self._publish_incidents()
         state = fleet.bodies.state
         self.truth_hash.add(clock.now_ns, state[self._simulated] if self.external else state)
+        if self._radio is not None:  # before the gate, which lets agents go on
+            position_m = state[:, STATE.p_WB : STATE.p_WB + 3]
+            self.outbox.put(keys.RADIO, self._radio.links(clock.now_ns, self.outbox.next_seq(keys.RADIO), position_m))
         if gate is not None:
             self.outbox.put(keys.GATE, gate)
         statistics.gate(clock.now_ns, wall_ns)

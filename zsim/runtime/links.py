@@ -1,39 +1,33 @@
-"""What faults of the links do to the messages of a gate, in their receiver: now, later, or never. Pure.
+"""What the links do to the messages of a gate, in their receiver: now, later, or never. Pure.
 
-    inbox ──all messages of a gate──▶ LinkFaults ──▶ agent
+    inbox ──all messages of a gate──▶ Links ──▶ agent
+
+Of messages between users' agents, the radio; of all, the faults that are injected into links.
 
 The barrier has seen the messages; only the agent does not, or sees them later. Whether a message is lost, and how
 late it comes, is drawn from the stream of its link by what the message is (key, t_ns, seq), so that neither the order
 of arrival nor a restart of the receiver changes a draw.
 """
 
-import hashlib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from zsim.contract import keys, messages
+from zsim.contract.agent_messages import AgentMessage
 from zsim.contract.flight_messages import Estimate
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Fault, Faults
 from zsim.contract.snapshot import State
+from zsim.math.random_streams import uniform
+from zsim.runtime.agent_radio import NEVER, Receiver
 from zsim.runtime.inbox import Input, canonical
 from zsim.scenario import faults as fault_kinds
+from zsim.scenario.scenario import Radio
 
 WORLD, RADIO = "world", "radio"
 KINDS = frozenset(name for name, kind in fault_kinds.KINDS.items() if kind.strikes in ("link", RADIO))
-NEVER = None  # as a delay: the message is lost
 Point = Sequence[float]
-
-
-def uniform(seed: int, link: str, fault: Fault, key: str, t_ns: int, seq: int) -> float:
-    """Return the number in [0, 1) that a message draws from the stream of a link for a fault.
-
-    The first 53 bits of BLAKE2b: as even as a double can be, and the same on every machine.
-    """
-    text = f"{seed}|{link}|{fault.kind}|{fault.target}|{fault.from_ns}|{fault.rank}|{key}|{t_ns}|{seq}"
-    digest = hashlib.blake2b(text.encode(), digest_size=8).digest()
-    return (int.from_bytes(digest, "big") >> 11) * 2.0**-53
 
 
 def senders(key: str, message: Any, roles: Mapping[str, str] = {}) -> tuple[str, ...]:
@@ -97,7 +91,8 @@ def total_delay_ns(
     """
     total_ns = 0
     for fault in faults:
-        draw, p = uniform(seed, link, fault, key, message.t_ns, message.seq), fault.parameters
+        p, stream = fault.parameters, (fault.kind, fault.target, fault.from_ns, fault.rank)
+        draw = uniform(seed, link, *stream, key, message.t_ns, message.seq)
         if fault.kind == "link_delay":
             total_ns += math.ceil(p["delay_ms"] * 1e6)
         elif fault.kind == "link_jitter":
@@ -120,14 +115,17 @@ def distance_between(a: Point | None, b: Point | None) -> float | None:
     return math.dist(a, b) if a is not None and b is not None else None
 
 
-class LinkFaults:
+class Links:
     """Holds back, of the messages of a gate for one receiver, what its links deliver later or never.
 
-    `names`: of the receiver; an estimator of several drones has the name of each one's.
+    Args:
+        names: of the receiver; an estimator of several drones has the name of each one's.
+        radio: over which users' agents exchange messages; None where all of them hear all.
     """
 
-    def __init__(self, info: Info, names: Sequence[str]) -> None:
+    def __init__(self, info: Info, names: Sequence[str], radio: Radio | None = None) -> None:
         self._names = tuple(names)
+        self._radio = radio and Receiver(info, radio, self._names[0])
         self._seed, self._gate_ns = info.seed, info.gate_ns
         self._roles = {each.key: each.role for each in info.own_messages}
         self._clusters = {cluster.name: cluster.drones for cluster in info.clusters}
@@ -148,7 +146,7 @@ class LinkFaults:
 
     def act_at(self, t_ns: int) -> bool:
         """Tell whether the inputs of a gate may differ from those that have come."""
-        return bool(self._later) or any(fault_kinds.acts(fault, t_ns) for fault in self._faults)
+        return bool(self._radio or self._later) or any(fault_kinds.acts(fault, t_ns) for fault in self._faults)
 
     def delivered(self, t_ns: int, inputs: Sequence[Input]) -> list[Input]:
         """Return what the receiver is handed at the gate t_ns, in canonical order.
@@ -162,6 +160,9 @@ class LinkFaults:
         handed = [(key, message) for gate_ns, key, message in self._later if gate_ns <= t_ns]
         self._later = [entry for entry in self._later if entry[0] > t_ns]
         for key, message in inputs:
+            if self._radio and key == keys.RADIO:
+                self._radio.take(message)
+                continue
             late_ns = self._delay_ns(key, message, acting)
             if late_ns is None:
                 continue
@@ -177,6 +178,9 @@ class LinkFaults:
 
         A radio carries what one of its drones sends to a process that is not on that drone.
         """
+        over_radio_ns = self._radio.delay_ns(key, message) if self._radio and isinstance(message, AgentMessage) else 0
+        if over_radio_ns is None:
+            return None
         froms, (kind, thing, _) = senders(key, message, self._roles), keys.parts(key)
         to = stock if keys.is_sensor(key) and (stock := f"estimator.{thing}") in self._names else self._names[0]
 
@@ -190,15 +194,23 @@ class LinkFaults:
             place = place_of(to, fault.parameters["place"], self._positions.get)
             return distance_between(self._positions.get(thing), place)
 
-        return total_delay_ns(filter(acts, acting), self._seed, to, key, message, distance_m)
+        of_faults_ns = total_delay_ns(filter(acts, acting), self._seed, to, key, message, distance_m)
+        return None if of_faults_ns is None else over_radio_ns + of_faults_ns
 
     def snapshot(self) -> State:
         later = [[gate_ns, key, messages.encode(message)] for gate_ns, key, message in self._later]
         positions = {drone: list(place) for drone, place in self._positions.items()}
-        return {"later": later, "positions": positions, "list": messages.encode(self._list) if self._list else None}
+        return {
+            "later": later,
+            "positions": positions,
+            "list": messages.encode(self._list) if self._list else None,
+            "radio": self._radio.snapshot() if self._radio else None,
+        }
 
     def restore(self, state: State) -> None:
         if state["list"]:
             self.update(messages.decode(keys.FAULTS, state["list"]))
         self._later = [(gate_ns, key, messages.decode(key, payload)) for gate_ns, key, payload in state["later"]]
         self._positions = state["positions"]
+        if self._radio:
+            self._radio.restore(state["radio"])

@@ -15,7 +15,7 @@ from zsim.contract.messages import ClusterInfo, Imu, Info, Origin, encode
 from zsim.contract.run_messages import ControlRequest, Fault, Faults
 from zsim.contract.snapshot import pack, unpack
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.link_faults import LinkFaults, place_of, senders, uniform
+from zsim.runtime.links import Links, place_of, senders
 from zsim.scenario import scenario_file
 from zsim.scenario.faults import planned
 from zsim_agents.formation.controller import REQUESTS_MAX, Controller
@@ -44,8 +44,8 @@ def status(gate: int) -> Given:
     return STATUS, Status(gate * GATE_NS, gate, "flying", 90.0, False, None, 1)
 
 
-def links(*faults: Fault, names: tuple[str, ...] = (ME,), seed: int = 1) -> LinkFaults:
-    made = LinkFaults(replace(RUN, seed=seed), names)
+def links(*faults: Fault, names: tuple[str, ...] = (ME,), seed: int = 1) -> Links:
+    made = Links(replace(RUN, seed=seed), names)
     made.update(Faults(0, 0, faults))
     return made
 
@@ -54,11 +54,11 @@ def fault(kind: str, target: str = f"{OTHER}/{ME}", number: int = 1, **given: An
     return planned({"kind": kind, "target": target, **given}, number, "test", 0, GATE_NS)
 
 
-def handed_over(made: LinkFaults, t_ns: int, inputs: list[Given]) -> list[Given]:
+def handed_over(made: Links, t_ns: int, inputs: list[Given]) -> list[Given]:
     return made.delivered(t_ns, inputs) if made.act_at(t_ns) else inputs
 
 
-def gates(made: LinkFaults, last: int, given: Any = estimate) -> list[tuple[int, int]]:
+def gates(made: Links, last: int, given: Any = estimate) -> list[tuple[int, int]]:
     """Hand over a message per gate; return (gate of delivery, gate of the message)."""
     handed = [(gate, handed_over(made, gate * GATE_NS, [given(gate)])) for gate in range(1, last + 1)]
     return [(gate, message.t_ns // GATE_NS) for gate, some in handed for _, message in some]
@@ -226,16 +226,6 @@ def test_an_unknown_place_loses_nothing():
     assert place_of("controller.main", {"controller.main": "d9"}, {}.get) is None
 
 
-def test_draws_are_even_and_their_own():
-    cut = fault("link_loss", probability=0.5)
-    draws = [uniform(1, ME, cut, ESTIMATE, gate * GATE_NS, gate) for gate in range(5000)]
-    assert min(draws) >= 0.0
-    assert max(draws) < 1.0
-    assert sum(draws) / len(draws) == pytest.approx(0.5, abs=4 / math.sqrt(12 * len(draws)))
-    assert uniform(1, "controller.b", cut, ESTIMATE, GATE_NS, 1) != draws[1]
-    assert uniform(1, ME, cut, ESTIMATE, GATE_NS, 1) == draws[1]
-
-
 def world() -> World:
     drones = [{"name": name, "position_m": [3 * k, 0, 0]} for k, name in enumerate(("d1", "d2"))]
     given = {"name": "t", "duration_s": 1, "drones": drones, "clusters": [{"name": "main", "drones": ["d1", "d2"]}]}
@@ -272,7 +262,7 @@ def test_a_controller_takes_so_many_requests_between_two_gates():
 
 def test_one_that_is_restored_hands_over_the_same_at_the_same_gates():
     acting = fault("link_delay", delay_ms=100), fault("link_loss", number=2, probability=0.3)
-    made, again = links(*acting), LinkFaults(RUN, (ME,))
+    made, again = links(*acting), Links(RUN, (ME,))
     gates(made, 20)
     again.restore(unpack(pack(made.snapshot())))
     for gate in range(21, 60):

@@ -1,0 +1,93 @@
+"""Who hears whom: graphs, distance, reception, lines of sight, the nearest."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from zsim.contract.run_messages import RadioLinks
+from zsim.errors import ScenarioError
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import RECEPTION_MIN
+from zsim_world.fleet.radio import RadioChannel
+
+LINE_M = [[0.0, 0.0, 2.0], [4.0, 0.0, 2.0], [7.0, 0.0, 2.0], [16.0, 0.0, 2.0]]
+WALL = {"name": "wall", "shape": "box", "position_m": [5.5, 0, 0], "size_m": [0.2, 3, 4]}
+
+
+def scenario(**sections: Any) -> Any:
+    drones = [{"name": f"d{i}", "position_m": [x, 0, 0]} for i, (x, _, _) in enumerate(LINE_M)]
+    return scenario_file.resolve({"name": "t", "duration_s": 1, "drones": drones, **sections})
+
+
+def links(**sections: Any) -> RadioLinks:
+    return RadioChannel(scenario(**sections)).links(0, 0, np.array(LINE_M))
+
+
+@pytest.mark.parametrize(
+    ("sections", "hears"),
+    [
+        ({"topology": "complete"}, ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))),
+        ({"topology": "ring"}, ((1, 3), (0, 2), (1, 3), (0, 2))),
+        ({"topology": "path"}, ((1,), (0, 2), (1, 3), (2,))),
+        ({"topology": {"d1": ["d0", "d3"], "d2": []}}, ((), (0, 3), (), ())),
+        ({"topology": {"graph": {"d1": ["d0", "d3"]}, "symmetric": True}}, ((1,), (0, 3), (), (1,))),
+        ({"topology": {"within_m": 4}}, ((1,), (0, 2), (1,), ())),
+        ({"topology": {"nearest": 1}}, ((1,), (2,), (1,), (2,))),
+        ({"topology": {"nearest": 1, "symmetric": True}}, ((1,), (0, 2), (1, 3), (2,))),
+        ({"topology": {"nearest": 2, "within_m": 7.5}}, ((1, 2), (0, 2), (0, 1), ())),
+        ({"radio": {"range_m": 9}}, ((1, 2), (0, 2), (0, 1, 3), (2,))),
+        ({"radio": {"range_m": 9}, "topology": "ring"}, ((1,), (0, 2), (1, 3), (2,))),
+        (
+            {"radio": {"range_m": 9, "line_of_sight": True}, "environment": {"obstacles": [WALL]}},
+            ((1,), (0,), (3,), (2,)),
+        ),
+        ({"radio": {"range_m": 9, "station_m": [12, 0, 0]}}, ((1, 2), (0, 2, 4), (0, 1, 3, 4), (2, 4), (1, 2, 3))),
+    ],
+)
+def test_who_hears_whom(sections: dict[str, Any], hears: tuple[tuple[int, ...], ...]) -> None:
+    made = links(**sections)
+    assert made.hears == hears
+    assert made.reception == ()
+
+
+def test_reception_falls_with_distance_until_nobody_is_a_neighbour() -> None:
+    made = links(radio={"range_m": 7, "spread_m": 1.0})
+    assert made.hears == ((1, 2), (0, 2, 3), (0, 1, 3), (1, 2))  # 12 m: .0067; 16 m: 1.2e-4 < RECEPTION_MIN
+    at = dict(zip(made.hears[1], made.reception[1], strict=True))
+    assert at == pytest.approx({each: 1 / (1 + math.exp(d - 7)) for each, d in ((0, 4.0), (2, 3.0), (3, 12.0))})
+    assert min(map(min, made.reception)) > RECEPTION_MIN
+
+
+def test_an_obstacle_beside_the_line_is_in_nobodys_way() -> None:
+    beside = {**WALL, "position_m": [5.5, 1.6, 0]}
+    radio = {"range_m": 9, "line_of_sight": True}
+    assert links(radio=radio, environment={"obstacles": [beside]}).hears == links(radio={"range_m": 9}).hears
+
+
+@pytest.mark.parametrize(
+    ("sections", "field", "value"),
+    [
+        ({"topology": "star"}, "topology", "star"),
+        ({"topology": {"d0": ["d9"]}}, "topology.d0[0]", "d9"),
+        ({"topology": {"d0": ["d0"]}}, "topology.d0[0]", "d0"),
+        ({"topology": {"d9": ["d0"]}}, "topology.d9", "d9"),
+        ({"topology": {"graph": {"d0": ["d9"]}}}, "topology.graph.d0[0]", "d9"),
+        ({"topology": {"nearest": 0}}, "topology.nearest", "0"),
+        ({"topology": {"within_m": -1}}, "topology.within_m", "-1"),
+        ({"topology": {"radius_m": 3}}, "topology.radius_m", "within_m"),
+        ({"radio": {"range_m": 0}}, "radio.range_m", "0"),
+        ({"radio": {"loss": 1.5}}, "radio.loss", "1.5"),
+        ({"radio": {"delay_ms": -2}}, "radio.delay_ms", "-2"),
+        ({"radio": {"bandwidth_kbit_s": 0}}, "radio.bandwidth_kbit_s", "0"),
+        ({"radio": {"queue_max": 0}}, "radio.queue_max", "0"),
+        ({"radio": {"station_m": [1, 2]}}, "radio.station_m", "[1, 2]"),
+    ],
+)
+def test_a_faulty_section_is_refused_at_its_place(sections: dict[str, Any], field: str, value: str) -> None:
+    with pytest.raises(ScenarioError) as raised:
+        scenario(**sections)
+    (line,) = raised.value.faults
+    assert f": {field} " in line
+    assert value in line

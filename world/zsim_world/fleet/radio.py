@@ -1,0 +1,105 @@
+"""Who hears whom at a gate: the topology of a scenario over its radio, by the true places of the drones."""
+
+import numpy as np
+from msgspec import UNSET
+from numpy.typing import NDArray
+
+from zsim.contract.run_messages import RadioLinks
+from zsim.math.compiled import kernel
+from zsim.scenario.scenario import RECEPTION_MIN, Radio, Scenario, Topology
+from zsim_world.physics.surfaces import nearest, obstacle_rows
+
+TOUCH_M = 1e-3  # chosen: so near to an obstacle a line has met it
+Matrix = NDArray[np.bool_]
+
+
+class RadioChannel:
+    """The links between N drones, and a ground station where there is one: the place after theirs.
+
+    Raises:
+        ValueError: the scenario has neither a radio nor a topology.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        radio = scenario.radio_of_agents
+        if radio is None:
+            raise ValueError(f"{scenario.name} has no radio")
+        self._radio: Radio = radio
+        self._topology = Topology() if scenario.topology is UNSET else scenario.topology
+        self._count = len(scenario.drones)
+        self._station = np.array([radio.station_m] if radio.station_m is not None else [], dtype=float).reshape(-1, 3)
+        self._allowed = np.pad(
+            allowed([drone.name for drone in scenario.drones], self._topology),
+            (0, len(self._station)),
+            constant_values=True,
+        )
+        np.fill_diagonal(self._allowed, False)
+        self._obstacles = obstacle_rows(scenario.environment)
+
+    def links(self, t_ns: int, seq: int, position_m: NDArray[np.float64]) -> RadioLinks:
+        """Return the message of a gate.
+
+        Args:
+            position_m: of the drones in W, (N, 3).
+        """
+        radio, topology, n = self._radio, self._topology, self._count
+        place_m = np.concatenate([position_m, self._station])
+        x, y, z = (place_m[:, None, axis] - place_m[None, :, axis] for axis in range(3))
+        distance_m = np.sqrt(x * x + y * y + z * z)
+        hears, reception = self._allowed.copy(), np.ones_like(distance_m)
+        if topology.within_m is not None:
+            hears[:n, :n] &= distance_m[:n, :n] <= topology.within_m
+        if radio.range_m is not None and radio.spread_m:
+            exponent = np.minimum((distance_m - radio.range_m) / radio.spread_m, 700.0)  # exp(700) is finite
+            reception = 1.0 / (1.0 + np.exp(exponent))
+            hears &= reception >= RECEPTION_MIN
+        elif radio.range_m is not None:
+            hears &= distance_m <= radio.range_m
+        if radio.line_of_sight and len(self._obstacles):
+            clear_lines(place_m, self._obstacles, hears)
+        if topology.nearest is not None:
+            apart_m = np.where(hears, distance_m, np.inf)[:n, :n]
+            others = np.argsort(apart_m, axis=1, kind="stable")[:, topology.nearest :]
+            np.put_along_axis(hears[:n, :n], others, False, axis=1)
+        if topology.symmetric:
+            hears |= hears.T
+        heard = [np.flatnonzero(row).tolist() for row in hears]
+        soft = radio.range_m is not None and radio.spread_m > 0.0
+        chances = tuple(tuple(row[of].tolist()) for row, of in zip(reception, heard, strict=True)) if soft else ()
+        return RadioLinks(t_ns, seq, tuple(map(tuple, heard)), chances)
+
+
+def allowed(drones: list[str], topology: Topology) -> Matrix:
+    """Return whether the graph lets drone i hear drone j, (N, N)."""
+    n, graph = len(drones), topology.graph
+    if graph == "complete":
+        return np.ones((n, n), dtype=bool)
+    hears = np.zeros((n, n), dtype=bool)
+    if isinstance(graph, dict):
+        for hearer, heard in graph.items():
+            hears[drones.index(hearer), [drones.index(name) for name in heard]] = True
+        return hears
+    for i in range(n if graph == "ring" else n - 1):
+        hears[i, (i + 1) % n] = hears[(i + 1) % n, i] = True
+    return hears
+
+
+@kernel()
+def clear_lines(place_m: NDArray, obstacles: NDArray, hears: NDArray) -> None:
+    """Take out of `hears` the pairs whose line meets an obstacle, by sphere tracing: an obstacle is at least so far."""
+    for i in range(place_m.shape[0]):
+        for j in range(i):
+            if not (hears[i, j] or hears[j, i]):
+                continue
+            x, y, z = place_m[i, 0], place_m[i, 1], place_m[i, 2]
+            dx, dy, dz = place_m[j, 0] - x, place_m[j, 1] - y, place_m[j, 2] - z
+            length = np.sqrt(dx * dx + dy * dy + dz * dz)
+            for m in range(obstacles.shape[0]):
+                along = 0.0
+                while along < length:
+                    share = along / length
+                    free = nearest(obstacles[m], x + share * dx, y + share * dy, z + share * dz)[0]
+                    if free < TOUCH_M:
+                        hears[i, j] = hears[j, i] = False
+                        break
+                    along += free
