@@ -465,7 +465,7 @@ SECTIONS = {
     for name, section in {**vars(scenario), "Limits": vehicle.Limits, "Aerodynamics": vehicle.Aerodynamics}.items()
     if isinstance(section, type)
     and issubclass(section, (scenario.Spec, vehicle.Limits, vehicle.Aerodynamics))
-    and section is not scenario.Spec
+    and section not in (scenario.Spec, scenario.Piloted)  # bases
 } | {
     section.__name__: section
     for section in (

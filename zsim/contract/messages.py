@@ -149,7 +149,10 @@ keys.on("drone/*/sensor/*", writers="driver", readers="estimator")(Sample)  # th
 TOPICS = keys.TOPICS
 """The contract's keys, `*` in place of a name, with what travels on them; whole once this module is imported."""
 
-RELAYED = (flight_messages.Estimate, flight_messages.ClusterState, run_messages.ClusterRequest, AgentMessage)
+RELAYED = (
+    *(flight_messages.Estimate, flight_messages.ClusterState, flight_messages.Reference),
+    *(run_messages.ClusterRequest, AgentMessage),
+)
 """Messages, or their bases, that agents publish for each other; the world counts them, as it does commands."""
 KEYS_KEPT = 65_536  # keys whose type is remembered; 1000 drones have 15 000, garbage keys push each other out
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
