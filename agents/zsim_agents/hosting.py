@@ -17,7 +17,7 @@ from zsim.runtime.agent import Agent, AgentGroup, default_name
 from zsim.runtime.inbox import output_hold_ns
 from zsim.scenario.own_classes import messages_of
 from zsim.scenario.roles import AGENTS, agent_names, agent_roles, expected_processes
-from zsim.scenario.scenario import Scenario
+from zsim.scenario.scenario import OwnAgent, Scenario
 from zsim.schema import parameters, plugin, yaml_file
 from zsim.schema.checker import show
 
@@ -61,7 +61,7 @@ def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> N
     ]
     if not elsewhere:
         own = scenario.own_agents.items()
-        loads += [partial(plugin.load, each.named, f"{source}: agents.{role}.class", Agent) for role, each in own]
+        loads += [partial(_check_agent, each, f"{source}: agents.{role}", scenario) for role, each in own]
     for cluster in () if elsewhere else scenario.clusters:
         where = f"{source}: cluster {cluster.name!r}"
         for part, space in [(where, cluster.space), *((f"{where}, group {g.name!r}", g.space) for g in cluster.groups)]:
@@ -85,10 +85,18 @@ def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> N
         raise ScenarioError(faults)
 
 
-def check_plans(scenario: Scenario, source: str) -> None:
-    """Check the plans of a scenario as its controllers would: expressions, names, templates.
+def _check_agent(own: OwnAgent, where: str, scenario: Scenario) -> None:
+    """Check that the class of agents can be loaded, and what it says itself of its parameters by a method `flaws`."""
+    kind: Any = plugin.load(own.named, f"{where}.class", Agent)
+    flaws = getattr(kind, "flaws", None)
+    if flaws and (found := [f"{where}.parameters.{path} {text}" for path, text in flaws(own.parameters, scenario)]):
+        raise DocumentError(found)
 
-    A run as processes leaves this to its controllers, which load the mathematics of formations anyway.
+
+def check_plans(scenario: Scenario, source: str) -> None:
+    """Check the plans of a scenario as its controllers and pilots would: expressions, names, templates, references.
+
+    A run as processes leaves this to these, which load the mathematics anyway.
 
     Raises:
         ScenarioError: the reasons, a line for each cluster.
@@ -96,6 +104,10 @@ def check_plans(scenario: Scenario, source: str) -> None:
     from zsim_agents.formation.engagement_setup import check_plan
 
     faults = []
+    if scenario.piloted():
+        from zsim_agents.references.flight import flight_faults
+
+        faults += [f"{source}: {path} {text}" for path, text in flight_faults(scenario)]
     for cluster in scenario.clusters:
         try:
             check_plan(scenario, cluster)

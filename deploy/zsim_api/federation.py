@@ -39,6 +39,7 @@ from zsim.transport.session import RawSample, ReceivedSample, Session, result_of
 from zsim_analysis.in_process import OwnAgent, sequence_of_agents, with_agents
 from zsim_api import run_folder
 from zsim_api.assertions import Assertions
+from zsim_api.drone_requests import PilotedDrone
 from zsim_api.flight import LAUNCHER, calling, command_of, raise_failure
 from zsim_api.programs import Program, environment_of, filled, search_path
 from zsim_api.scenarios import AnyScenario, scenario_of
@@ -251,6 +252,10 @@ class Federation(Assertions):
             RunError: no answer came.
         """
         return result_of(self._session(within_s).request(key, op, PROCESS, args))
+
+    def drone(self, name: str) -> PilotedDrone:
+        """Return a drone that can be asked to fly somewhere, where the scenario has a `reference` of it."""
+        return PilotedDrone(name, self.ask)
 
     def inject(self, fault: Mapping[str, Any]) -> Any:
         """Inject a fault, as in a scenario's `faults`; see docs/faults.md.

@@ -11,7 +11,7 @@ import msgspec
 
 from zsim.contract.agent_messages import AgentMessage, about, message_info
 from zsim.errors import DocumentError, NotTrustedError
-from zsim.scenario.scenario import OwnAgent
+from zsim.scenario.scenario import LAWS, OwnAgent
 from zsim.schema import parameters, plugin
 from zsim.schema.checker import Fault, faults
 
@@ -52,13 +52,18 @@ def with_agents(section: Any, imports: bool) -> tuple[Any, list[Fault]]:
 
 
 def _declared(entry: dict[str, Any], where: str) -> dict[str, Any]:
-    kind: Any = plugin.load(entry["class"], f"{where}.class", AgentMethods)
+    name: str = LAWS.get(entry["class"]) or entry["class"]
+    kind: Any = plugin.load(name, f"{where}.class", AgentMethods)
     given = parameters.resolved(kind, entry.get("parameters", {}), f"{where}.parameters", OF_THE_RUN)
     published, per = messages_of(kind, f"{where}.class"), entry.get("per", "drone")
     for each in published:
         if about(each) != per:
             raise DocumentError([f"{where}.per is {per!r}, and the key of {each.__name__} is {each.key}; must agree"])
-    return {"parameters": given, "declared": [msgspec.to_builtins(message_info(each)) for each in published]}
+    return {
+        "class": name,
+        "parameters": given,
+        "declared": [msgspec.to_builtins(message_info(each)) for each in published],
+    }
 
 
 def with_parameters(document: dict[str, Any]) -> list[Fault]:

@@ -15,6 +15,7 @@ from msgspec import Struct, structs
 from zsim.errors import DocumentError, NotTrustedError, ScenarioError
 from zsim.scenario import own_classes
 from zsim.scenario.consistency import cross_faults
+from zsim.scenario.polynomial_file import pieces_of
 from zsim.scenario.scenario import DRONES_MAX, VEHICLE_NUMBERS, Document, Scenario, SharedVehicle
 from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import Fault, faults, first_lines, show, sound, suggestion
@@ -114,6 +115,8 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
         numbers["limits"] = msgspec.to_builtins(vehicle.limits)
         if vehicle.aerodynamics != Aerodynamics():  # else they are left out of the resolved text
             numbers["aerodynamics"] = msgspec.to_builtins(vehicle.aerodynamics)
+        if "reference" in drone:
+            drone = {**drone, "reference": _with_pieces(drone["reference"], f"{where}.reference", unsound)}
         return {**with_defaults(numbers, drone), "sensors": own}
 
     document = {**document, "sensors": _separated(sensors, "sensors", unsound, unread, imports)}
@@ -183,6 +186,24 @@ def _separated(section: Any, where: str, unsound: list[Fault], unread: set[str],
     unsound += [(f"{where}.{path}", text) for path, text in wrong]
     unread |= section.keys() - rest.keys() - own.keys()
     return {**rest, "own": own} if own else rest
+
+
+def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
+    """Return a drone's reference with the pieces of the file that it names, beside the scenario or in this folder."""
+    name = reference.get("file") if isinstance(reference, dict) else None
+    if not isinstance(name, str):
+        return reference
+    if "pieces" in reference:
+        unsound.append((f"{where}.file", "is given beside pieces; must be one of them"))
+        return reference
+    places = [folder / name for folder in (*plugin.folders(), Path())]
+    found = next((place for place in places if place.is_file()), places[0])
+    try:
+        pieces = pieces_of(found, f"{where}.file")
+    except DocumentError as error:
+        unsound += [(path, text) for path, _, text in (line.partition(" ") for line in error.faults)]
+        return reference
+    return {**{key: value for key, value in reference.items() if key != "file"}, "pieces": pieces}
 
 
 def _is_graph(topology: Any) -> bool:

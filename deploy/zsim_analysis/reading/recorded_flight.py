@@ -4,7 +4,7 @@
 """
 
 from array import array
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -134,6 +134,8 @@ class RecordedFlight:
     # estimates, commands: by drone; empty unless requested
     estimates: dict[str, DroneEstimates] = field(default_factory=dict)
     commands: dict[str, VelocityCommands] = field(default_factory=dict)
+    others: dict[str, int] = field(default_factory=dict)  # number of messages by key, of those that no report reads
+    cpu_s: float | None = None  # CPU time from the first gate to the last, of a flight in a process of its own
     radio: RadioHistory | None = None  # None where the scenario has none
 
     @property
@@ -262,6 +264,7 @@ class FlightReader:
         self._first_wall_ns: int | None = None
         self._last_wall_ns = 0
         self._undecoded = 0
+        self._others: Counter[str] = Counter()
         self._handlers: dict[str, _Handler | None] = {}
 
     def handler(self, key: str) -> _Handler | None:
@@ -306,6 +309,8 @@ class FlightReader:
         """Add a message, not encoded, of a flight in this process."""
         if handler := self.handler(key):
             handler[1](keys.parts(key)[1], message)
+        else:
+            self._others[key] += 1
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
         """Add the world's messages of a gate of a flight in this process."""
@@ -407,6 +412,7 @@ class FlightReader:
             began_ns=self._first_wall_ns,
             estimates=estimates,
             commands=self._flown_commands(),
+            others=dict(self._others),
             radio=RadioHistory(self._radio, len(tracks)) if self._radio else None,
         )
 

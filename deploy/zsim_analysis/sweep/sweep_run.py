@@ -16,6 +16,7 @@ are empty. An exception of a function becomes the run's `metrics_failure`, and n
 import math
 import re
 import socket
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -31,6 +32,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from zsim.contract.fingerprint import fingerprint
+from zsim.contract.framing import GateMessages
 from zsim.errors import DocumentError, RecordError, ReportError, reason_of
 from zsim.output_folder import temporary_folder
 from zsim.record import RecordWriter
@@ -181,9 +183,32 @@ def fly_scenario(scenario: Scenario, writer: RecordWriter | None = None) -> tupl
 
     A flight for metrics of the user has the drones' estimates and commands, too.
     """
-    flight, reader = InProcessFlight(scenario), FlightReader(answers=bool(scenario.report.metric_names))
-    flight.run([reader, writer] if writer else [reader])
-    return reader.flight(), flight.world.failure
+    flight, reader, cpu = (
+        InProcessFlight(scenario),
+        FlightReader(answers=bool(scenario.report.metric_names)),
+        _CpuTime(),
+    )
+    flight.run([reader, cpu, writer] if writer else [reader, cpu])
+    flown = reader.flight()
+    flown.cpu_s = cpu.spent_s
+    return flown, flight.world.failure
+
+
+class _CpuTime:
+    """Observes a flight: the CPU time of this process from its first gate to its last."""
+
+    def __init__(self) -> None:
+        self._gates_s: list[float] = []
+
+    @property
+    def spent_s(self) -> float | None:
+        return self._gates_s[-1] - self._gates_s[0] if self._gates_s else None
+
+    def add_message(self, key: str, message: Any, wall_ns: int) -> None:
+        """Nothing: every gate has messages of the world."""
+
+    def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
+        self._gates_s[1:] = [time.process_time()]
 
 
 @contextmanager

@@ -1,0 +1,146 @@
+"""Flocking by Olfati-Saber: a lattice of spacing d that keeps together, moves as one, and flows around obstacles.
+
+    u_i = c1 sum phi_alpha(|z_ij|_s) n_ij + c2 sum a_ij (v_j - v_i)                     alpha: flockmates
+        + c1b sum phi_beta(|z_ik|_s) n_ik + c2b sum b_ik (v_k - v_i)                    beta: obstacles
+        - c1g s1(p_i - p_r) - c2g (v_i - v_r)                                           gamma: where all want to go
+
+Olfati-Saber, Flocking for multi-agent dynamic systems: algorithms and theory, IEEE Trans. Automatic Control 51 (2006),
+Algorithms 2 and 3. u is an acceleration; the pilot integrates it to the velocity that it commands. Each drone hears
+others within r; the last term is its own knowledge of the group's aim. A lattice may settle in several ways: its
+measure is the deviation from d of the sides between those within r.
+"""
+
+import math
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+
+from zsim.contract.snapshot import State
+from zsim.scenario.scenario import Scenario
+from zsim.schema.quantities import NonNegative, Positive
+from zsim_agents.laws.pilot import Array, Heard, Pilot, PilotParameters, Sight, limited, total
+
+EPSILON = 0.1  # of the sigma-norm
+A = B = 5.0  # of phi: 0 < a <= b
+H_ALPHA, H_BETA = 0.2, 0.9  # of the bump function, for flockmates and for obstacles
+
+
+def sigma_norm(z: float) -> float:
+    """Return |z|_s = (sqrt(1 + epsilon z^2) - 1) / epsilon of a length; differentiable at 0."""
+    return (math.sqrt(1.0 + EPSILON * z * z) - 1.0) / EPSILON
+
+
+def sigma_gradient(z: Array) -> Array:
+    """Return n = z / sqrt(1 + epsilon |z|^2), the gradient of the sigma-norm."""
+    return z / math.sqrt(1.0 + EPSILON * total(z * z))
+
+
+def sigma_1(z: float) -> float:
+    return z / math.sqrt(1.0 + z * z)
+
+
+def bump(z: float, h: float) -> float:
+    """Return rho_h(z): 1 up to h, falling smoothly to 0 at 1."""
+    if not 0.0 <= z <= 1.0:
+        return 0.0
+    return 1.0 if z < h else 0.5 * (1.0 + math.cos(math.pi * (z - h) / (1.0 - h)))
+
+
+def phi(z: float) -> float:
+    """Return the uneven sigmoid with phi(0) = 0, between -a and b."""
+    c = abs(A - B) / math.sqrt(4.0 * A * B)
+    return 0.5 * ((A + B) * sigma_1(z + c) + (A - B))
+
+
+def phi_alpha(z: float, d: float, r: float) -> float:
+    """Return the force at a sigma-norm z between flockmates of spacing d and range r [m]: below 0 it repels."""
+    r_alpha = sigma_norm(r)
+    return bump(z / r_alpha, H_ALPHA) * phi(z - sigma_norm(d))
+
+
+def phi_beta(z: float, d: float) -> float:
+    """Return the force at a sigma-norm z from an obstacle that is kept d away [m]; never above 0."""
+    d_beta = sigma_norm(d)
+    return bump(z / d_beta, H_BETA) * (sigma_1(z - d_beta) - 1.0)
+
+
+def alpha_force(p: Array, v: Array, heard: list[Heard], d: float, r: float, c1: float) -> Array:
+    """Return the part of u_i that is of flockmates (dim,) [m/s^2]; c2 = 2 sqrt(c1)."""
+    u = np.zeros(len(p))
+    for each in heard:
+        z = each.p_W - p
+        size = sigma_norm(math.sqrt(total(z * z)))
+        u += c1 * phi_alpha(size, d, r) * sigma_gradient(z)
+        u += 2.0 * math.sqrt(c1) * bump(size / sigma_norm(r), H_ALPHA) * (each.v_W - v)
+    return u
+
+
+def beta_force(v: Array, obstacles: list[tuple[float, Array]], d: float, c1: float) -> Array:
+    """Return the part of u_i that is of obstacles; of each its distance [m] and the direction away from it.
+
+    What it is repelled by stands at the nearest point, and slides along the surface as the drone does.
+    """
+    u = np.zeros(len(v))
+    for distance, away in obstacles:
+        z = -max(distance, 0.0) * away
+        size = sigma_norm(max(distance, 0.0))
+        into = total(v * away) * away
+        u += (
+            c1 * phi_beta(size, d) * sigma_gradient(z) - 2.0 * math.sqrt(c1) * bump(size / sigma_norm(d), H_BETA) * into
+        )
+    return u
+
+
+def gamma_force(p: Array, v: Array, p_r: Array, v_r: Array, c1: float) -> Array:
+    """Return the part of u_i that is of the group's aim, s1(z) = z / sqrt(1 + |z|^2); c2 = 2 sqrt(c1)."""
+    z = p - p_r
+    return -c1 * z / math.sqrt(1.0 + total(z * z)) - 2.0 * math.sqrt(c1) * (v - v_r)
+
+
+def deviation_energy(p: Array, d: float, r: float) -> tuple[float, int]:
+    """Return the normalised deviation energy of places (n, dim) from a lattice [m^2], and the number of its edges.
+
+    E = sum of (|z_ij| - d)^2 over the pairs within r, each direction counted, / (pairs + 1): of the paper's section II.
+    """
+    z = p[:, None] - p[None]
+    lengths = np.sqrt(np.sum(z * z, axis=2))[np.triu_indices(len(p), 1)]
+    near = lengths[lengths < r]
+    return float(2.0 * np.sum((near - d) ** 2) / (2 * len(near) + 1)), len(near)
+
+
+class OlfatiSaber(Pilot):
+    class Parameters(PilotParameters):
+        spacing_m: Positive = 3.5
+        """d."""
+        range_ratio: Annotated[float, Meta(gt=1, le=10)] = 1.2
+        """r / d."""
+        clearance_m: Positive = 2.0
+        """Of obstacles: d'."""
+        alpha_1_s2: NonNegative = 0.2
+        beta_1_s2: NonNegative = 1.0
+        gamma_1_s2: NonNegative = 0.2
+        """c1 of flockmates, obstacles and aim; each c2 is 2 sqrt(c1)."""
+        accel_max_m_s2: Positive = 2.0
+        avoid_m: NonNegative = 0.0
+        """Nearer than this, drones and obstacles repel beside the law; 0: none does."""
+
+    def begin(self, scenario: Scenario) -> None:
+        self._dt = self._gate_ns / 1e9
+        self._commanded = np.zeros(2)  # the velocity of the double integrator
+
+    def velocity(self, now: Sight) -> Array:
+        own, v = self.parameters, self._commanded
+        reach = own.range_ratio * own.spacing_m
+        u = alpha_force(now.p_W, v, now.heard, own.spacing_m, reach, own.alpha_1_s2)
+        u += beta_force(v, self.obstacles_near(now.p_W, own.clearance_m), own.clearance_m, own.beta_1_s2)
+        u += gamma_force(now.p_W, v, now.reference.p_W, now.reference.v_W, own.gamma_1_s2)
+        self._commanded = limited(v + self._dt * limited(u, own.accel_max_m_s2), own.speed_max_m_s)
+        return self._commanded
+
+    def snapshot(self) -> State:
+        return {**super().snapshot(), "commanded": self._commanded}
+
+    def restore(self, state: State) -> None:
+        super().restore(state)
+        self._commanded = np.array(state["commanded"])

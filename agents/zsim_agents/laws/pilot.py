@@ -1,0 +1,266 @@
+"""What the pilots of all formation laws share: an agent per drone that flies it by what it hears of the others.
+
+Each pilot sends where its drone estimates itself, hears the same of others, and computes a horizontal velocity from it.
+It takes off, climbs, engages its law at the height of flight, holds that height, and lands. What flies at one height
+is a plane figure; the laws themselves are written for any number of dimensions.
+
+A law is a subclass with one method:
+
+    class Consensus(ShapePilot):
+        def velocity(self, now: Sight) -> Array: ...  # (2,) [m/s; W]
+
+Neighbours are those that a drone hears, by the topology and the radio of the scenario, and that are engaged themselves.
+They are sorted by name, and all sums run in that order, so that the bits do not depend on who was heard first.
+"""
+
+import math
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from zsim.contract.agent_messages import AgentMessage
+from zsim.contract.flight_messages import Estimate, Mode, Status, Velocity
+from zsim.contract.snapshot import State
+from zsim.runtime.agent import Agent, Output
+from zsim.scenario import obstacle
+from zsim.scenario.scenario import Scenario, Value
+from zsim.schema.checker import Fault
+from zsim.schema.parameters import Parameters
+from zsim.schema.quantities import NonNegative
+from zsim_agents.formation.expression import ExpressionError
+from zsim_agents.laws.reference import Pose, Reference
+
+Array = NDArray[np.float64]
+
+ENGAGE_M = 0.3  # of the height of flight: within it a drone engages its law, and stays engaged
+CLIMB_1_S = 1.0  # gain of the height
+CLIMB_MAX_M_S = 0.8  # of the 1 m/s that the AR.Drone's firmware allows
+ASK_NS = 1_000_000_000  # time between two requests to take off
+UNSTAMPED = (0, 0, "")  # t_ns, seq, source of a command, filled in where it is sent
+AIRBORNE = ("hovering", "flying")
+TINY = 1e-9  # m: two drones in one place have no direction to each other
+
+
+class Motion(AgentMessage, frozen=True):
+    """What a pilot tells the others: where its drone estimates itself in W, and whether its law is engaged."""
+
+    key = "formation/{drone}/motion"
+
+    position_m: tuple[float, float, float]
+    velocity_m_s: tuple[float, float, float]
+    is_engaged: bool
+
+
+class Heard(NamedTuple):
+    """Another drone, as its last message has it."""
+
+    name: str
+    p_W: Array  # (2,) [m]
+    v_W: Array  # (2,) [m/s]
+
+
+class Sight(NamedTuple):
+    """What a pilot computes from at a gate."""
+
+    t_s: float
+    p_W: Array  # (2,) of its own drone, estimated [m]
+    v_W: Array  # (2,) [m/s]
+    heard: list[Heard]  # by name
+    reference: Pose
+
+
+class PilotParameters(Parameters):
+    """What every law has; times are simulated, lengths horizontal."""
+
+    height_m: Annotated[float, Meta(gt=0, le=1000)] = 2.0
+    takeoff_s: NonNegative = 2.0
+    land_s: NonNegative | None = None
+    """None: it flies to the end of the run."""
+    speed_max_m_s: Annotated[float, Meta(gt=0, le=20)] = 1.5
+    message_rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 10.0
+    """At most one a gate."""
+    silence_s: Annotated[float, Meta(gt=0, le=60)] = 1.0
+    """After it, one that is not heard any more is left out; until then its last message holds."""
+    centre_m: tuple[Value, Value] = (0.0, 0.0)
+    """Of the formation in W: numbers, or expressions of t, in seconds since `start_s`."""
+    start_s: NonNegative = 0.0
+    avoid_m: NonNegative = 1.5
+    """Nearer than this, drones and obstacles repel; 0: none does."""
+    avoid_m4_s: NonNegative = 1.0
+    """Gain of the repulsion."""
+
+
+class Pilot(Agent):
+    """Flies one drone by a law; see the module.
+
+    Raises:
+        ExpressionError: a reference is no expression of t.
+    """
+
+    Parameters: Any = PilotParameters
+    parameters: Any
+    messages = (Motion,)
+    reads = ("drone/{drone}/sensor/status", "drone/{drone}/estimate", Motion.of())
+    invariances: tuple[str, ...] = ()
+    """Of `translation`, `rotation`, `scale`: what of a formation's places the law leaves open. Only of ShapePilots."""
+
+    def __init__(self, drone: str, scenario: Scenario) -> None:
+        super().__init__()
+        own = self.parameters
+        self._drone = drone
+        self._gate_ns = round(scenario.time.gate_ms * 1e6)
+        self._message_ns = max(self._gate_ns, round(1e9 / own.message_rate_hz))
+        self._silence_ns = round(own.silence_s * 1e9)
+        self._obstacles = [obstacle.row_of(each) for each in scenario.environment.obstacles]
+        self._reference = self.reference_of(own)
+        self._heard: dict[str, Motion] = {}
+        self._state = "landed"
+        self._p_W = self._v_W = np.zeros(3)
+        self._is_engaged = self._has_flown = False
+        self.begin(scenario)
+
+    def begin(self, scenario: Scenario) -> None:
+        """Prepare what a law needs of the scenario."""
+
+    @staticmethod
+    def reference_of(own: Any) -> Reference:
+        return Reference(own.centre_m, 0.0, 1.0, own.start_s)
+
+    @abstractmethod
+    def velocity(self, now: Sight) -> Array:
+        """Return the velocity (2,) that the law wants [m/s; W]; speed limit and repulsion are applied to it."""
+
+    @classmethod
+    def flaws(cls, parameters: Mapping[str, Any], scenario: Scenario) -> Iterator[Fault]:
+        """Yield path and text of what cannot be flown in a scenario, of parameters as it has them."""
+        try:
+            cls.reference_of(cls.Parameters(**parameters))
+        except ExpressionError as error:
+            yield error.name, error.finding
+
+    # The flight
+
+    def receive(self, key: str, message: Any) -> None:
+        if isinstance(message, Estimate):
+            self._p_W, self._v_W = np.array(message.position_m), np.array(message.velocity_m_s)
+        elif isinstance(message, Status):
+            self._state = message.state
+        else:
+            drone = key.split("/")[1]
+            if drone != self._drone:
+                self._heard[drone] = message
+
+    def step(self, t_ns: int) -> list[Output]:
+        own, outputs = self.parameters, []
+        airborne = self._state in AIRBORNE
+        height_error = own.height_m - float(self._p_W[2])
+        self._has_flown |= airborne
+        self._is_engaged = airborne and (self._is_engaged or abs(height_error) <= ENGAGE_M)
+        if t_ns // self._message_ns != (t_ns - self._gate_ns) // self._message_ns:
+            p_W, v_W = triple(self._p_W), triple(self._v_W)
+            outputs.append(self.message(t_ns, Motion(position_m=p_W, velocity_m_s=v_W, is_engaged=self._is_engaged)))
+        ask = t_ns >= own.takeoff_s * 1e9 and t_ns % ASK_NS < self._gate_ns
+        if own.land_s is not None and t_ns >= own.land_s * 1e9:
+            if airborne and t_ns % ASK_NS < self._gate_ns:
+                outputs.append(self.command(t_ns, self._drone, Mode(*UNSTAMPED, "land")))
+        elif self._state == "landed" and ask and not self._has_flown:
+            outputs.append(self.command(t_ns, self._drone, Mode(*UNSTAMPED, "takeoff")))
+        elif airborne:
+            v_W = self._wanted(t_ns) if self._is_engaged else np.zeros(2)
+            climb = min(max(CLIMB_1_S * height_error, -CLIMB_MAX_M_S), CLIMB_MAX_M_S)
+            command = Velocity(*UNSTAMPED, (float(v_W[0]), float(v_W[1]), climb), 0.0, "world")
+            outputs.append(self.command(t_ns, self._drone, command))
+        return outputs
+
+    def _wanted(self, t_ns: int) -> Array:
+        heard = [
+            Heard(name, np.array(m.position_m[:2]), np.array(m.velocity_m_s[:2]))
+            for name, m in sorted(self._heard.items())
+            if m.is_engaged and t_ns - m.t_ns <= self._silence_ns
+        ]
+        now = Sight(t_ns / 1e9, self._p_W[:2], self._v_W[:2], heard, self._reference.at(t_ns / 1e9))
+        v_W = self.velocity(now) + self.avoidance(now.p_W, heard)
+        return limited(v_W, self.parameters.speed_max_m_s)
+
+    def avoidance(self, p_W: Array, heard: Sequence[Heard]) -> Array:
+        """Return the repulsion (2,) from the drones that it hears, and from obstacles [m/s; W]."""
+        reach, gain = self.parameters.avoid_m, self.parameters.avoid_m4_s
+        v_W = np.zeros(2)
+        for each in heard:
+            away = p_W - each.p_W
+            v_W += repulsion(length(away), reach, gain) * unit(away)
+        for distance, away in self.obstacles_near(p_W, reach):
+            v_W += repulsion(distance, reach, gain) * away
+        return v_W
+
+    def obstacles_near(self, p_W: Array, reach_m: float) -> list[tuple[float, Array]]:
+        """Return distance [m] and direction away (2,) of the obstacles within reach beside the drone."""
+        found = []
+        for row in self._obstacles:
+            distance, x, y, _ = obstacle.nearest(row, float(p_W[0]), float(p_W[1]), float(self._p_W[2]))
+            if distance < reach_m and (x or y):
+                found.append((distance, unit(np.array([x, y]))))
+        return found
+
+    # The state that survives a restart
+
+    def snapshot(self) -> State:
+        heard = {name: [m.t_ns, *m.position_m, *m.velocity_m_s, m.is_engaged] for name, m in self._heard.items()}
+        return {
+            "heard": heard, "state": self._state, "p_W": self._p_W, "v_W": self._v_W,
+            "is_engaged": self._is_engaged, "has_flown": self._has_flown,
+        }  # fmt: skip
+
+    def restore(self, state: State) -> None:
+        self._heard = {
+            name: Motion(t_ns=t_ns, position_m=tuple(pv[:3]), velocity_m_s=tuple(pv[3:]), is_engaged=engaged)
+            for name, (t_ns, *pv, engaged) in state["heard"].items()
+        }
+        self._state, self._p_W, self._v_W = state["state"], np.array(state["p_W"]), np.array(state["v_W"])
+        self._is_engaged, self._has_flown = state["is_engaged"], state["has_flown"]
+
+
+# Vectors, in one order of operations on every processor
+
+
+def repulsion(d: float, D: float, eta: float) -> float:
+    """Return -dV/dd of Khatib's V = eta/2 (1/d - 1/D)^2 for d < D, else 0 (Int. J. Robotics Research 5(1), 1986)."""
+    if d >= D:
+        return 0.0
+    d = max(d, 0.05)  # m: within an estimate's error of contact the speed limit has long cut it
+    return eta * (1.0 / d - 1.0 / D) / (d * d)
+
+
+def length(v: Array) -> float:
+    return math.sqrt(total(v * v))
+
+
+def unit(v: Array) -> Array:
+    """Return v / |v|; the x axis for a vector without direction."""
+    size = length(v)
+    return v / size if size > TINY else np.eye(len(v))[0]
+
+
+def triple(v: Array) -> tuple[float, float, float]:
+    x, y, z = v.tolist()
+    return x, y, z
+
+
+def total(numbers: Array) -> float:
+    """Return the sum of numbers from the first to the last."""
+    return float(sum(numbers.tolist()))
+
+
+def added(terms: Sequence[Array], size: int = 2) -> Array:
+    """Return the sum of vectors from the first to the last."""
+    return sum(terms, np.zeros(size))
+
+
+def limited(v: Array, most: float) -> Array:
+    """Return v, or the vector of its direction and of length `most` where it is longer."""
+    size = length(v)
+    return v * (most / size) if size > most else v

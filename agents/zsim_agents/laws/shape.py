@@ -1,0 +1,84 @@
+"""What the laws share whose formation is a figure: the places of the drones, and who knows where it is to be.
+
+A law that looks at differences leaves open where the figure is, some how it is turned, one how large it is. Two terms,
+the same for all, tie it to the reference:
+
+    u_i = law + v_i*                          feed-forward, of those who know the reference's motion
+              + b_i (p_i* - p_i)              of the informed ones: pinning
+
+Pinning one node of a connected, undirected graph turns the rate k lambda_2(L) of consensus, about the mean, into
+lambda_min(k L + diag(b)), about the reference.
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any
+
+import numpy as np
+from msgspec import Meta, field
+
+from zsim.scenario.scenario import DRONES_MAX, Scenario, Value
+from zsim.schema.checker import Fault
+from zsim.schema.quantities import NonNegative, Positive, Real
+from zsim_agents.laws.pilot import Array, Pilot, PilotParameters, Sight
+from zsim_agents.laws.reference import Reference, polygon
+
+
+class ShapeParameters(PilotParameters):
+    """Of the laws whose formation is a figure."""
+
+    gain_1_s: Annotated[float, Meta(gt=0, le=5)] = 0.3
+    places_m: Annotated[list[tuple[Real, Real]], Meta(max_length=DRONES_MAX)] = field(default_factory=list)
+    """Of the drones, in the scenario's order; empty: the corners of a regular polygon."""
+    radius_m: Positive = 3.0
+    """Of that polygon."""
+    heading_deg: Value = 0.0
+    scale: Value = 1.0
+    """With the heading, as `centre_m`: by how much the places are turned and enlarged."""
+    feedforward: bool = True
+    """Whether all know the reference's motion; else those alone that are informed."""
+    informed: list[str] | None = None
+    """Drones that know where their own place is in W; None: the first one."""
+    pin_1_s: NonNegative = 1.0
+    """Their gain towards it."""
+
+
+class ShapePilot(Pilot):
+    """Flies one drone to its place in a figure; `laws` differ in `velocity`."""
+
+    Parameters = ShapeParameters
+
+    def begin(self, scenario: Scenario) -> None:
+        own, names = self.parameters, [drone.name for drone in scenario.drones]
+        places = np.array(own.places_m) if own.places_m else polygon(len(names), own.radius_m)
+        self._places: dict[str, Array] = dict(zip(names, places, strict=True))
+        self._informed = self._drone in (names[:1] if own.informed is None else own.informed)
+
+    @staticmethod
+    def reference_of(own: Any) -> Reference:
+        return Reference(own.centre_m, own.heading_deg, own.scale, own.start_s)
+
+    def relative(self, now: Sight) -> list[tuple[Array, Array]]:
+        """Return of each neighbour z_ij = p_j - p_i [m; W] and what the places have for it."""
+        own = now.reference.place(self._places[self._drone])[0]
+        return [(each.p_W - now.p_W, now.reference.place(self._places[each.name])[0] - own) for each in now.heard]
+
+    def own_place(self, now: Sight) -> tuple[Array, Array]:
+        """Return p_i* [m; W] and its rate v_i* [m/s]."""
+        c, c_dot = now.reference.place(self._places[self._drone])
+        return now.reference.p_W + c, now.reference.v_W + c_dot
+
+    def tied(self, now: Sight) -> Array:
+        """Return the terms (2,) that tie the figure to the reference [m/s; W]."""
+        p_W, v_W = self.own_place(now)
+        feed = v_W if self.parameters.feedforward or self._informed else np.zeros(2)
+        return feed + self.parameters.pin_1_s * (p_W - now.p_W) if self._informed else feed
+
+    @classmethod
+    def flaws(cls, parameters: Mapping[str, Any], scenario: Scenario) -> Iterator[Fault]:
+        yield from super().flaws(parameters, scenario)
+        drones, places = [drone.name for drone in scenario.drones], parameters["places_m"]
+        if places and len(places) != len(drones):
+            yield "places_m", f"has {len(places)} places; must have {len(drones)}, one for each drone"
+        for name in parameters["informed"] or ():
+            if name not in drones:
+                yield "informed", f"names {name!r}; must be of {', '.join(drones)}"

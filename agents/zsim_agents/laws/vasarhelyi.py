@@ -1,0 +1,93 @@
+"""Flocking by Vasarhelyi et al.: repulsion, and friction that grows as two drones could no longer brake in time.
+
+    v_i = v_flock v_i / |v_i| + sum v_rep_ij + sum v_frict_ij + sum v_wall_is          limited to v_max
+    v_rep_ij   = p_rep (r0_rep - r_ij) away from j,                 r_ij < r0_rep       (1)
+    v_frict_ij = C (|v_ij| - v_ij_max) along v_j - v_i,             |v_ij| > v_ij_max   (2)
+    v_ij_max   = max(v_frict, D(r_ij - r0_frict, a_frict, p_frict))                     (3)
+    D(r, a, p) = 0 for r <= 0;  r p for r p < a / p;  sqrt(2 a r - a^2 / p^2) beyond    (4)
+
+Vasarhelyi, Viragh, Somorjai, Nepusz, Eiben, Vicsek, Optimized flocking of autonomous drones in confined environments,
+Science Robotics 3 (2018). D is the speed from which a drone stops within r, at a deceleration a and exponentially at
+the rate p in the end. A wall or an obstacle is a shill: an imaginary drone at the nearest point that flies away from
+it at v_shill, to which (2) applies with C = 1 and v_frict = 0.
+
+The arena of the paper, a square within which the flock stays, is here about the reference and moves with it; its rate
+is added to what all want. There is no lattice in it: what it promises is that no two meet, and that all fly alike.
+"""
+
+import math
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+
+from zsim.schema.quantities import NonNegative, Positive
+from zsim_agents.laws.pilot import Array, Pilot, PilotParameters, Sight, length, unit
+
+
+def braking(r: float, a: float, p: float) -> float:
+    """Return D(r, a, p) of (4) [m/s]: r [m], a [m/s^2], p [1/s]."""
+    if r <= 0.0:
+        return 0.0
+    return r * p if r * p < a / p else math.sqrt(2.0 * a * r - a * a / (p * p))
+
+
+def repelled(z: Array, r0: float, p: float) -> Array:
+    """Return (1) of z = p_j - p_i [m]: a velocity away from j [m/s]."""
+    r = length(z)
+    return -p * (r0 - r) * unit(z) if r < r0 else np.zeros(len(z))
+
+
+def friction(difference: Array, allowed: float, gain: float) -> Array:
+    """Return (2) of v_j - v_i [m/s]: along it, so that |v_j - v_i| falls."""
+    excess = length(difference) - allowed
+    return gain * excess * unit(difference) if excess > 0.0 else np.zeros(len(difference))
+
+
+class Vasarhelyi(Pilot):
+    class Parameters(PilotParameters):
+        v_flock_m_s: NonNegative = 0.0
+        """Speed at which each keeps flying ahead; 0: it takes the reference's alone."""
+        p_rep_1_s: NonNegative = 0.4
+        r0_rep_m: NonNegative = 3.5
+        c_frict: Annotated[float, Meta(ge=0, le=1)] = 0.3
+        v_frict_m_s: NonNegative = 0.2
+        p_frict_1_s: Positive = 1.0
+        a_frict_m_s2: Positive = 1.0
+        r0_frict_m: NonNegative = 3.5
+        v_shill_m_s: NonNegative = 1.5
+        p_shill_1_s: Positive = 1.0
+        a_shill_m_s2: Positive = 1.0
+        r0_shill_m: NonNegative = 0.0
+        arena_m: NonNegative = 8.0
+        """Side of the square about the reference; 0: there is none."""
+        avoid_m: NonNegative = 0.0
+        """Nearer than this, drones and obstacles repel beside the law; 0: none does."""
+
+    def velocity(self, now: Sight) -> Array:
+        own = self.parameters
+        wanted = now.reference.v_W.copy()
+        if own.v_flock_m_s:
+            wanted += own.v_flock_m_s * unit(now.v_W)
+        for each in now.heard:
+            z, r = each.p_W - now.p_W, length(each.p_W - now.p_W)
+            wanted += repelled(z, own.r0_rep_m, own.p_rep_1_s)
+            brake = braking(r - own.r0_frict_m, own.a_frict_m_s2, own.p_frict_1_s)
+            wanted += friction(each.v_W - now.v_W, max(own.v_frict_m_s, brake), own.c_frict)
+        for distance, away, v_wall in self._walls(now):
+            brake = braking(distance - own.r0_shill_m, own.a_shill_m_s2, own.p_shill_1_s)
+            wanted += friction(v_wall + own.v_shill_m_s * away - now.v_W, brake, 1.0)
+        return wanted
+
+    def _walls(self, now: Sight) -> list[tuple[float, Array, Array]]:
+        """Return of each wall and obstacle its distance [m], the direction away from it, and its own velocity [m/s]."""
+        own, walls = self.parameters, []
+        reach = own.r0_shill_m + own.v_shill_m_s**2 / own.a_shill_m_s2 + 10.0
+        walls += [(distance, away, np.zeros(2)) for distance, away in self.obstacles_near(now.p_W, reach)]
+        for axis in (0, 1) if own.arena_m else ():
+            for side in (-1.0, 1.0):
+                away = np.zeros(2)
+                away[axis] = -side
+                distance = 0.5 * own.arena_m - side * float(now.p_W[axis] - now.reference.p_W[axis])
+                walls.append((distance, away, now.reference.v_W))
+        return walls

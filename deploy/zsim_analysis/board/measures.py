@@ -1,0 +1,222 @@
+"""How well a formation was flown, in figures that all laws share; of true motion, in the window of the report. Pure.
+
+`measures` is a function for `report.metrics`, so that a sweep over parameters of a law has them, too:
+
+    zsim sweep scenario.yaml --vary agents.pilot.parameters.gain_1_s=0.2,0.4 \
+        --set report.metrics=zsim_analysis.board.measures:measures
+
+Only drones count that are in the air: of a formation that has lost one, the figure of the others.
+"""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from zsim.scenario.scenario import Scenario
+from zsim.schema import plugin
+from zsim_agents.formation.spaces.scenario_space import scenario_space
+from zsim_agents.laws.olfati_saber import OlfatiSaber
+from zsim_agents.laws.pilot import AIRBORNE, Motion, Pilot
+from zsim_agents.laws.reference import polygon
+from zsim_agents.laws.shape import ShapePilot
+from zsim_analysis.reading.formation import common_instants, formation, min_separation_m
+from zsim_analysis.reading.recorded_flight import Array, RecordedFlight, Track
+from zsim_analysis.reading.shortfall import window_of
+
+
+class Wanted(NamedTuple):
+    """What a formation was to be, at some instants."""
+
+    centre: Array  # (T, 2) [m; W]
+    places: Array | None  # (T, n, 2) of the drones [m; W]; None where a law has none
+    invariances: tuple[str, ...]  # what of the places the law leaves open
+
+
+class Flown(NamedTuple):
+    """The horizontal motion of a formation within its window."""
+
+    drones: tuple[str, ...]
+    t_s: Array  # (T,)
+    p: Array  # (T, n, 2) true places [m; W]; NaN of drones that are not in the air
+    wanted: Wanted | None
+
+
+def measures(flight: RecordedFlight) -> dict[str, float | None]:
+    """Return the figures of a flight; None where there is none of a kind.
+
+    shape_error_m: root mean square distance of the drones from the figure's places, after the best move, turn or
+        growth of it that the law leaves open; of a lattice the deviation of its sides from the spacing.
+    place_error_m: the same distance with nothing left open. None for flocks, which have no places.
+    centre_error_m: distance of the drones' centre from where it was to be, root mean square.
+    effort_m2_s: integral of the squared horizontal velocity command, mean over the drones.
+    separation_m: least distance of two drones in the air.
+    messages_per_drone_s: sent to others, per drone and simulated second: of pilots their messages; of a controller
+        the estimates that it needs and the commands that it gives.
+    cpu_per_s: CPU time of the whole flight in one process, per simulated second; None of a record.
+    """
+    flown = flown_of(flight)
+    window_s, _ = window_of(flight)
+    length_s = max(flight.last_ns / 1e9, 1e-9)
+    within = [_within(track, window_s) for track in flight.tracks]
+    found: dict[str, float | None] = {
+        "shape_error_m": _shape_error(flight.scenario, flown),
+        "place_error_m": None,
+        "centre_error_m": None,
+        "effort_m2_s": _effort(flight, window_s),
+        "separation_m": min_separation_m(within),
+        "messages_per_drone_s": _messages(flight) / (len(flight.tracks) * length_s),
+        "cpu_per_s": flight.cpu_s / length_s if flight.cpu_s else None,
+    }
+    if flown.wanted is not None:
+        found["centre_error_m"] = _rms(_mean(flown.p) - _centre_of_flying(flown))
+        if flown.wanted.places is not None:
+            found["place_error_m"] = _rms(flown.p - flown.wanted.places)
+    return found
+
+
+def flown_of(flight: RecordedFlight, whole: bool = False) -> Flown:
+    """Return the motion of all drones within the window of the report, or over the whole flight."""
+    (start, end), _ = window_of(flight)
+    if whole:
+        start, end = flight.first_ns / 1e9, flight.last_ns / 1e9
+    tracks = flight.tracks
+    t_ns, rows = common_instants(tracks)
+    chosen = (t_ns >= start * 1e9) & (t_ns <= end * 1e9)
+    p = np.stack([track.p_W[row[chosen], :2] for track, row in zip(tracks, rows, strict=True)], axis=1)
+    t_ns = t_ns[chosen]
+    for column, track in enumerate(tracks):
+        latest = np.searchsorted(track.status_t_ns, t_ns, side="right") - 1
+        aloft = np.array([state in AIRBORNE for state in track.states], bool)
+        p[~aloft[np.maximum(latest, 0)], column] = np.nan
+    t_s = t_ns / 1e9
+    return Flown(tuple(track.name for track in tracks), t_s, p, _wanted(flight, t_s))
+
+
+def shape_errors(flown: Flown) -> Array:
+    """Return at each instant (T,) the root mean square distance from the places that fit best [m]; NaN without any.
+
+    The figure is moved, turned and enlarged as far as the law leaves it open.
+    """
+    wanted = flown.wanted
+    if wanted is None or wanted.places is None:
+        return np.full(len(flown.t_s), np.nan)
+    p, c = (_complex(each) for each in (flown.p, np.where(np.isnan(flown.p), np.nan, wanted.places)))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        if "translation" in wanted.invariances:
+            p, c = p - _mean(p)[:, None], c - _mean(c)[:, None]
+        product, size = np.nansum(c.conj() * p, axis=1), np.nansum(np.abs(c) ** 2, axis=1)
+        turn = product / np.abs(product) if "rotation" in wanted.invariances else np.ones(len(p), complex)
+        growth = (product / turn).real / size if "scale" in wanted.invariances else np.ones(len(p))
+        return np.sqrt(_mean(np.abs(p - (growth * turn)[:, None] * c) ** 2).real)
+
+
+def lattice_errors(p: Array, spacing_m: float, reach_m: float) -> Array:
+    """Return at each instant (T,) the root mean square deviation of the sides within reach from the spacing [m]."""
+    i, j = np.triu_indices(p.shape[1], 1)
+    lengths = np.linalg.norm(p[:, i] - p[:, j], axis=2)
+    squared = np.where(lengths < reach_m, (lengths - spacing_m) ** 2, np.nan)
+    return np.sqrt(_mean(squared))
+
+
+def law_of(scenario: Scenario | None) -> tuple[type[Pilot], Any] | None:
+    """Return the law by which pilots fly a scenario, and its parameters; None where none does."""
+    for own in scenario.own_agents.values() if scenario else ():
+        kind: Any = plugin.load(own.named, "class", object)
+        if issubclass(kind, Pilot):
+            return kind, msgspec.convert(own.parameters, kind.Parameters)
+    return None
+
+
+def _wanted(flight: RecordedFlight, t_s: Array) -> Wanted | None:
+    scenario, law = flight.scenario, law_of(flight.scenario)
+    if scenario is None or not len(t_s):
+        return None
+    if law is None:
+        return _of_cluster(flight, t_s)
+    kind, own = law
+    reference = kind.reference_of(own)
+    poses = [reference.at(float(t)) for t in t_s]
+    centre = np.array([pose.p_W for pose in poses])
+    if not issubclass(kind, ShapePilot):
+        return Wanted(centre, None, ())
+    n = len(scenario.drones)
+    c = np.array(own.places_m) if own.places_m else polygon(n, own.radius_m)
+    turns = np.array([pose.turn for pose in poses])
+    return Wanted(centre, centre[:, None] + np.einsum("tij,nj->tni", turns, c), kind.invariances)
+
+
+def _of_cluster(flight: RecordedFlight, t_s: Array) -> Wanted | None:
+    """Return what the one cluster of a flight was to be, by its controller's reference."""
+    states = flight.clusters
+    found = formation(states[0], flight.tracks, flight.scenario) if len(states) == 1 and flight.scenario else None
+    names = [track.name for track in flight.tracks]
+    if found is None or flight.scenario is None or sorted(found.drones) != sorted(names):
+        return None
+    space = scenario_space(flight.scenario, flight.scenario.clusters[0])
+    rows = np.clip(np.searchsorted(found.t_s, t_s, side="right") - 1, 0, None)
+    order = [found.drones.index(name) for name in names]
+    places = np.array([space.inverse(found.desired[row])[0][order, :2] for row in rows])
+    return Wanted(np.mean(places, axis=1), places, ("translation",))
+
+
+def _shape_error(scenario: Scenario | None, flown: Flown) -> float | None:
+    law = law_of(scenario)
+    if law and issubclass(law[0], OlfatiSaber):
+        spacing_m = law[1].spacing_m
+        return _root_mean_square(lattice_errors(flown.p, spacing_m, law[1].range_ratio * spacing_m))
+    return _root_mean_square(shape_errors(flown))
+
+
+def _centre_of_flying(flown: Flown) -> Array:
+    """Return where the centre of the drones in the air was to be (T, 2): without places, that of all."""
+    assert flown.wanted is not None
+    places = flown.wanted.places
+    return flown.wanted.centre if places is None else _mean(np.where(np.isnan(flown.p), np.nan, places))
+
+
+def _effort(flight: RecordedFlight, window_s: tuple[float, float]) -> float | None:
+    efforts = []
+    for track in flight.tracks:
+        commands = flight.commands.get(track.name)
+        if commands is None:
+            continue
+        t_s = commands.t_ns / 1e9
+        chosen = (t_s >= window_s[0]) & (t_s <= window_s[1])
+        if chosen.sum() > 1:
+            squared = np.sum(commands.velocity[chosen, :2] ** 2, axis=1)
+            efforts.append(float(np.sum(squared[:-1] * np.diff(t_s[chosen]))))
+    return float(np.mean(efforts)) if efforts else None
+
+
+def _messages(flight: RecordedFlight) -> int:
+    if law_of(flight.scenario):
+        return sum(count for key, count in flight.others.items() if key.endswith(Motion.key.rpartition("/")[2]))
+    heard = sum(len(each.t_ns) for each in flight.estimates.values())
+    return heard + sum(len(each.t_ns) for each in flight.commands.values()) if flight.clusters else 0
+
+
+def _within(track: Track, window_s: tuple[float, float]) -> Track:
+    chosen = (track.t_ns >= window_s[0] * 1e9) & (track.t_ns <= window_s[1] * 1e9)
+    return replace(track, t_ns=track.t_ns[chosen], truth=track.truth[chosen])
+
+
+def _complex(p: Array) -> Any:
+    return p[..., 0] + 1j * p[..., 1]
+
+
+def _mean(values: Any) -> Any:
+    """Return the mean over the drones, the second axis; NaN where there is none."""
+    known = ~np.isnan(values)
+    count = known.sum(axis=1)
+    return np.where(count > 0, np.nansum(values, axis=1) / np.maximum(count, 1), np.nan)
+
+
+def _rms(vectors: Array) -> float | None:
+    return _root_mean_square(np.linalg.norm(vectors, axis=-1))
+
+
+def _root_mean_square(values: Array) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else None

@@ -1,0 +1,99 @@
+"""Pilots of the formation laws fly: each forms what it promises; the same bits as processes and after a kill."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+import zsim
+from zsim.errors import ScenarioError
+from zsim.scenario import scenario_file
+from zsim_analysis.board.measures import measures
+from zsim_analysis.sweep.sweep_run import fly_scenario
+
+BASE = """
+name: laws
+duration_s: 28
+sensors:
+  gps: {position_m: {noise: 0.05}}
+drones:
+  - {name: d1, position_m: [4, 1, 0]}
+  - {name: d2, position_m: [2, 5, 0]}
+  - {name: d3, position_m: [-5, 3, 0]}
+  - {name: d4, position_m: [-3, -2, 0]}
+  - {name: d5, position_m: [2, -5, 0]}
+agents: {pilot: {class: consensus, parameters: {takeoff_s: 0.5}}}
+report: {window_s: [24, 28], metrics: 'zsim_analysis.board.measures:measures'}
+"""
+MOVING: dict[str, Any] = {"centre_m": ["0.4*t", 1], "start_s": 8.0}
+
+
+def scenario(law: str, **parameters: Any) -> Any:
+    document = yaml.safe_load(BASE)
+    document["agents"]["pilot"]["class"] = law
+    document["agents"]["pilot"]["parameters"] |= parameters
+    return document
+
+
+@pytest.mark.parametrize(
+    ("law", "parameters", "shape_m", "centre_m"),
+    [
+        ("consensus", MOVING, 0.25, 0.5),
+        ("leader_follower", MOVING, 1.2, 1.5),  # behind by v / k for each that stands between
+        ("virtual_structure", MOVING, 0.25, 0.3),
+        ("distance_based", MOVING, 0.25, 0.5),
+        ("bearing_only", MOVING, 0.25, 1.0),  # its size comes by what the two informed ones pull
+        ("olfati_saber", MOVING, 0.6, 1.0),
+        ("vasarhelyi", MOVING, None, 1.5),
+    ],
+)
+def test_each_law_flies_what_it_promises(
+    law: str, parameters: dict[str, Any], shape_m: float | None, centre_m: float
+) -> None:
+    flight, failure = fly_scenario(scenario_file.resolve(scenario(law, **parameters)))
+    assert failure is None
+    found = measures(flight)
+    assert found["centre_error_m"] is not None
+    assert found["centre_error_m"] < centre_m
+    assert (found["shape_error_m"] is None) == (shape_m is None)
+    assert (found["shape_error_m"] or 0.0) < (shape_m or 1.0)
+    assert found["separation_m"] is not None
+    assert found["separation_m"] > 1.5
+    assert found["messages_per_drone_s"] == pytest.approx(10.0, rel=0.01)
+    assert found["effort_m2_s"] is not None
+
+
+def test_as_processes_and_after_a_kill_the_bits_are_the_same(tmp_path: Path, compiled: None) -> None:
+    """The flock's pilot has the state of a double integrator beside what it has heard."""
+    file = tmp_path / "flock.yaml"
+    file.write_text(yaml.safe_dump({**scenario("olfati_saber"), "duration_s": 7, "report": {}}))
+    alone = zsim.run(file, out=tmp_path / "alone", progress=False)
+    with zsim.Federation(file, out=tmp_path / "many") as flight:
+        flight.wait_until(5.0)
+        flight.kill("pilot.d2")
+        run = flight.run()
+    assert run.truth_sha256 == alone.truth_sha256
+    assert "pilot.d2" in [*run.events[run.events.kind == "restart"].subject]
+
+
+@pytest.mark.parametrize(
+    ("law", "parameters", "path", "terms"),
+    [
+        ("consensus", {"gain_1_s": 9}, "gain_1_s", ("9", "<= 5")),
+        ("consensus", {"centre_m": ["2*q", 0]}, "centre_m[0]", ("2*q", "'q'")),
+        ("distance_based", {"places_m": [[0, 0]]}, "places_m", ("1", "5")),
+        ("vasarhelyi", {"centre_m": [0, "1/t"]}, "centre_m[1]", ("1/t", "t = 0")),
+        ("bearing_only", {"informed": ["d9"]}, "informed", ("d9", "d1")),
+        ("flock", {}, "class", ("flock", "vasarhelyi")),
+    ],
+)
+def test_what_cannot_be_flown_is_refused(
+    law: str, parameters: dict[str, Any], path: str, terms: tuple[str, ...], tmp_path: Path
+) -> None:
+    (tmp_path / "laws.yaml").write_text(yaml.safe_dump(scenario(law, **parameters)))
+    with pytest.raises(ScenarioError) as raised:
+        zsim.run(tmp_path / "laws.yaml", out=tmp_path / "run", progress=False)
+    (line,) = raised.value.faults
+    assert f".{path} " in line
+    assert all(term in line for term in terms), line
