@@ -33,6 +33,8 @@ PIECES_MAX = 5000  # polynomials of one path
 STAGES_MAX = 100  # of drones that change places
 METRICS_MAX = 20  # functions
 ROLES_MAX = 20  # of users' agents; each is a process for every drone
+PROGRAMS_MAX = 100  # of users, beside agents
+WORDS_MAX = 1000  # of a command line
 MESSAGES_MAX = 20  # classes of messages that a class of agents publishes
 VARIABLES_MAX = 4 * ROBOTS_MAX  # of a formation: four a robot
 SEA_HEIGHT_MAX_M = 11_000  # m above the sea: end of the layer whose pressure the barometer follows (ISO 2533)
@@ -401,6 +403,15 @@ class TimeSteps(Spec, frozen=True, kw_only=True):
     max_command_age_ms: Positive = 500.0  # as silence.hover_s: an older command counts as silence
 
 
+class OwnProgram(Spec, frozen=True, kw_only=True):
+    """A program in any language that is started with the run; its name is that of the process as which it joins."""
+
+    command: Annotated[list[str], Meta(min_length=1, max_length=WORDS_MAX)]
+    """`{endpoint}`, `{federation}`, `{folder}` (of the run) and `{name}` are replaced."""
+    joins: bool = True  # the run waits for it, at its start and at every gate
+    start_timeout_s: Positive | UnsetType = UNSET  # unset: as of all processes
+
+
 LAWS = {
     "consensus": "zsim_agents.laws.consensus:Consensus",
     "leader_follower": "zsim_agents.laws.leader_follower:LeaderFollower",
@@ -518,6 +529,8 @@ class Scenario(Spec, frozen=True, kw_only=True):
     estimation: Estimation = Estimation()
     agents: Annotated[dict[RoleName, OwnAgent], Meta(max_length=ROLES_MAX)] | UnsetType = UNSET
     """Agents of users' classes, by role; unset: none, and left out of the resolved text."""
+    programs: Annotated[dict[Name, OwnProgram], Meta(max_length=PROGRAMS_MAX)] | UnsetType = UNSET
+    """Programs of users, by the name of the process; unset: none, and left out of the resolved text."""
     topology: Topology | UnsetType = UNSET
     radio: Radio | UnsetType = UNSET
     """Between agents of drones. Unset: all hear all; left out of the resolved text."""
@@ -542,6 +555,10 @@ class Scenario(Spec, frozen=True, kw_only=True):
     @property
     def own_agents(self) -> dict[str, OwnAgent]:
         return {} if self.agents is UNSET else self.agents
+
+    @property
+    def own_programs(self) -> dict[str, OwnProgram]:
+        return {} if self.programs is UNSET else self.programs
 
     @property
     def radio_of_agents(self) -> Radio | None:
