@@ -80,7 +80,7 @@ class Pilot(zsim.Agent):
         elif self._state in ("hovering", "flying"):
             v = self._velocity(t_ns)
             climb = min(max(own.height_m - self._p_W[2], -0.5), 0.5)
-            outputs.append(self.command(t_ns, self._drone, zsim.velocity(*v.tolist(), climb)))
+            outputs.append(self.command(t_ns, self._drone, zsim.velocity(float(v[0]), float(v[1]), climb)))
         return outputs
 
     def _levelled(self, scan: Any) -> np.ndarray:

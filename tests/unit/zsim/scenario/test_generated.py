@@ -70,7 +70,7 @@ def test_a_corridor_is_as_wide_as_told_and_closed_at_its_bends():
     for first, second in pairwise(lefts):  # the ends of two walls are within one another
         yaw = np.radians(first.yaw_deg)
         end = np.array(first.position_m[:2]) + 0.5 * (first.size_m[0] - 0.2) * np.array([np.cos(yaw), np.sin(yaw)])
-        assert nearest(rows[walls.index(second)], *end.tolist(), 1.0)[0] < 0.0
+        assert nearest(rows[walls.index(second)], float(end[0]), float(end[1]), 1.0)[0] < 0.0
 
 
 @pytest.mark.parametrize(
