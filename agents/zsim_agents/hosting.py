@@ -94,9 +94,9 @@ def _check_agent(own: OwnAgent, where: str, scenario: Scenario) -> None:
 
 
 def check_plans(scenario: Scenario, source: str) -> None:
-    """Check the plans of a scenario as its controllers would: expressions, names, templates.
+    """Check the plans of a scenario as its controllers and pilots would: expressions, names, templates, references.
 
-    A run as processes leaves this to its controllers, which load the mathematics of formations anyway.
+    A run as processes leaves this to these, which load the mathematics anyway.
 
     Raises:
         ScenarioError: the reasons, a line for each cluster.
@@ -104,6 +104,10 @@ def check_plans(scenario: Scenario, source: str) -> None:
     from zsim_agents.formation.engagement_setup import check_plan
 
     faults = []
+    if scenario.piloted():
+        from zsim_agents.references.flight import flight_faults
+
+        faults += [f"{source}: {path} {text}" for path, text in flight_faults(scenario)]
     for cluster in scenario.clusters:
         try:
             check_plan(scenario, cluster)

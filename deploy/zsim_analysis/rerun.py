@@ -270,7 +270,7 @@ class RerunBus(Bus):
         requests: defaultdict[int, list[tuple[str, ControlRequest]]] = defaultdict(list)
         for key, request in agents.requests:
             control = ControlRequest(request.op, request.args, request.source)
-            requests[request.t_ns].append((keys.cluster_control(keys.thing(key)), control))
+            requests[request.t_ns].append((keys.control_of(key), control))
         hold_ns = output_hold_ns(info)
         groups = [
             AgentsWithRequests(hosted(info, scenario, process.members), dict(requests), hold_ns)
@@ -344,7 +344,7 @@ class RerunBus(Bus):
             return
         if key == keys.EVENT:
             self._feed_event(message)
-        elif isinstance(message, messages.RELAYED):  # estimates, and outputs about clusters
+        elif isinstance(message, messages.RELAYED):  # estimates, references, and outputs about clusters
             role = "estimator" if isinstance(message, flight_messages.Estimate) else "controller"
             is_request = isinstance(message, run_messages.ClusterRequest)
             source = (message.controller if is_request else message.source) or f"{role}.{keys.thing(key)}"

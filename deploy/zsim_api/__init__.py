@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # for editors, which do not read _WHERE
     from zsim_agents.estimation.drone_estimator import StateEstimate as StateEstimate
     from zsim_agents.formation.control_law import ControlLaw as ControlLaw
     from zsim_agents.formation.spaces.cluster_space import ClusterSpace as ClusterSpace
+    from zsim_agents.references.assignment import assign as assign
     from zsim_api.commands import Command as Command
     from zsim_api.commands import ardrone as ardrone
     from zsim_api.commands import attitude as attitude
@@ -24,6 +25,7 @@ if TYPE_CHECKING:  # for editors, which do not read _WHERE
     from zsim_api.commands import rotors as rotors
     from zsim_api.commands import takeoff as takeoff
     from zsim_api.commands import velocity as velocity
+    from zsim_api.drone_requests import PilotedDrone as PilotedDrone
     from zsim_api.environments import any_of as any_of
     from zsim_api.environments import collided as collided
     from zsim_api.environments import far_away as far_away
@@ -50,7 +52,9 @@ _WHERE = {
     "zsim_agents.estimation.drone_estimator": ("DroneEstimator", "StateEstimate"),
     "zsim_agents.formation.control_law": ("ControlLaw",),
     "zsim_agents.formation.spaces.cluster_space": ("ClusterSpace",),
+    "zsim_agents.references.assignment": ("assign",),
     "zsim_api.commands": ("Command", "ardrone", "attitude", "emergency", "land", "rotors", "takeoff", "velocity"),
+    "zsim_api.drone_requests": ("PilotedDrone",),
     "zsim_api.environments": (
         *("any_of", "collided", "far_away", "flipped"),
         *("gym_env", "parallel_env", "vector_env"),

@@ -32,6 +32,7 @@ from zsim.schema.checker import suggestion
 from zsim.sensors.sensor import Sample
 from zsim_analysis.in_process import CALLER, FlightObserver, InProcessFlight, OwnAgent, sequence_of_agents, with_agents
 from zsim_api.commands import Command
+from zsim_api.drone_requests import PilotedDrone
 from zsim_api.flight import calling
 from zsim_api.scenarios import AnyScenario, scenario_of
 from zsim_world.physics.fleet_arrays import STATE
@@ -238,6 +239,15 @@ class Simulation:
         if not answer.ok:
             raise RequestRefusedError(answer.error)
         return answer.result or {}
+
+    def drone(self, name: str) -> PilotedDrone:
+        """Return a drone that can be asked to fly somewhere, where the scenario has a `reference` of it.
+
+        Raises:
+            RunError: no drone has that name.
+        """
+        self._place(name)
+        return PilotedDrone(name, self.ask)
 
     def inject(self, fault: Mapping[str, Any]) -> dict[str, Any]:
         """Inject a fault, as in a scenario's `faults`, from the next gate on; see docs/faults.md."""

@@ -16,7 +16,6 @@ from consistency import band, feed
 from fleet_samples import samples_of
 from numpy.typing import NDArray
 
-from zsim.contract.flight_messages import Sightings
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import SightingModel
@@ -71,9 +70,8 @@ def fly(scenario: Scenario) -> Relative:
             fleet.advance()
         for sample in samples_of(fleet):
             feed(bank, sample, fleet.gps_sigma_m[sample.drone])
-        for each in fleet.sightings.values():
-            message = Sightings(t_ns=each.t_ns, seq=0, t_sample_ns=each.t_sample_ns, camera=each.camera, seen=each.seen)
-            bank.receive(each.drone, "sightings", message, each.t_ns * 1e-9)
+        for each in fleet.seen.values():
+            bank.receive(each.drone, "sightings", each.message(0), each.t_ns * 1e-9)
         estimates = bank.estimate(t_s)
         if abs(t_s - TAKEOFF_S) < GATE_S / 2:
             assert [fleet.takeoff(i) for i in range(3)] == [None] * 3

@@ -62,6 +62,8 @@ CONTRACT = {
     "sensors",
     "cluster/*/state": "phase drones names value desired desired_rate trajectory_t_s margin reason",
     "cluster/*/request": "op args source ok",
+    "drone/*/request": "op args source ok",
+    "drone/*/reference": "phase position_m velocity_m_s yaw_rad yaw_rate_rad_s path_t_s source",
     "process/*/join": "run_id incarnation role host pid period_ns version fingerprint",
     "process/*/done": "run_id incarnation done_ns sent",
     "process/*/snapshot": "source version state",
@@ -83,7 +85,7 @@ LENGTHS = {"covariance": 36, "accel_m_s2": 3, "gyro_rad_s": 3, "orientation_wxyz
 SHAPES = sorted(CONTRACT)
 INT64 = -(2**63), 2**63 - 1
 NULLABLE = {
-    *("commander", "trajectory_t_s", "until_ns"),
+    *("commander", "trajectory_t_s", "path_t_s", "until_ns"),
     *("age_ms", "loss_percent", "round_trip_ms", "clock_offset_ms"),
 }
 FREE = {"data", "args", "parameters"}  # fields of free content

@@ -49,6 +49,7 @@ from zsim.contract.run_messages import EVENT_KINDS
 from zsim.scenario import scenario, scenario_file
 from zsim.schema import quantities
 from zsim.sensors.camera import CAMERAS, BottomCamera, FrontCamera, Hats, SightingModel
+from zsim.sensors.scanner import DepthConfig, LidarConfig, RangeConfig
 from zsim.sensors.sensor import ErrorModel, Mount, Sensor
 from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, STOCK, Sensors
 from zsim.vehicles import vehicle
@@ -457,13 +458,14 @@ _INFO: dict[str, Any] = {
 
 # The reference of fields: a table after `<!-- fields: Name -->` for each section of zsim/scenario/scenario.py
 
+SCANNER_SECTIONS = (RangeConfig, LidarConfig, DepthConfig)
 CAMERA_SECTIONS = (FrontCamera, BottomCamera, SightingModel, Hats)
 SECTIONS = {
     name: section
     for name, section in {**vars(scenario), "Limits": vehicle.Limits, "Aerodynamics": vehicle.Aerodynamics}.items()
     if isinstance(section, type)
     and issubclass(section, (scenario.Spec, vehicle.Limits, vehicle.Aerodynamics))
-    and section is not scenario.Spec
+    and section not in (scenario.Spec, scenario.Piloted)  # bases
 } | {
     section.__name__: section
     for section in (
@@ -472,13 +474,14 @@ SECTIONS = {
         Mount,
         ErrorModel,
         *CAMERA_SECTIONS,
+        *SCANNER_SECTIONS,
         *(kind.settings for kind in STOCK.values()),
     )
 }
 UNITS = {
     "_kg_m2": "kg m²", "_kg_m3": "kg/m³", "_n_s_m": "N s/m", "_n_s2_m2": "N s²/m²", "_n_s2_m": "N s²/m", "_nm_s2": "N m s²", "_n_s2": "N s²", "_1_s2": "1/s²",
     "_1_s": "1/s", "_rad_s": "rad/s", "_deg_s": "deg/s", "_m_s2": "m/s²", "_m_s": "m/s", "_deg": "deg", "_mah": "mAh",
-    "_percent": "%", "_kg": "kg", "_hz": "Hz", "_ms": "ms", "_ut": "µT", "_px2": "px²", "_px": "px",
+    "_percent": "%", "_kg": "kg", "_hz": "Hz", "_ms": "ms", "_ut": "µT", "_px2": "px²", "_px": "px", "_1_m": "1/m",
     "_kbit_s": "kbit/s", "_m": "m", "_s": "s",
 }  # fmt: skip
 OWN_UNITS = {
@@ -523,7 +526,7 @@ def rows(name: str) -> Iterator[list[str]]:
             yield [f"`{entry.encode_name}`", unit(entry.name), default(name, entry), allowed(by_name[entry.name])]
 
 
-_SENSORS = tuple(kind.settings.__name__ for kind in STOCK.values())
+_SENSORS = tuple(kind.__name__ for kind in (*(kind.settings for kind in STOCK.values()), *SCANNER_SECTIONS))
 
 
 def unit(name: str) -> str:

@@ -20,6 +20,7 @@ Covariance = Annotated[tuple[Number, ...], Meta(min_length=36, max_length=36)]
 DroneState = Literal["landed", "taking_off", "hovering", "flying", "landing", "emergency"]
 Connection = Literal["waiting", "connected", "armed", "lost"]
 Phase = Literal["idle", "taking_off", "assembling", "engaged", "landing", "held"]
+ReferencePhase = Literal["waiting", "approaching", "path", "holding", "over"]
 PICTURE_MAX = 4_000_000  # bytes; a JPEG of 1920 x 1080 at full quality is below it
 SEEN_MAX = 1000  # of one picture
 JPEG_BEGINS = b"\xff\xd8\xff"  # SOI, then the next marker: ISO/IEC 10918-1, B.1
@@ -30,7 +31,7 @@ SidePx = Annotated[int, Meta(ge=1, le=16_384)]
 # Drones
 
 
-@on("drone/*/sensor/status", writers="world driver", readers="estimator controller", last="world")
+@on("drone/*/sensor/status", writers="world driver", readers="estimator controller reference", last="world")
 class Status(Message, frozen=True):
     """The state of a drone, last in every gate.
 
@@ -57,7 +58,7 @@ class Truth(Message, frozen=True):
     rotor_rad_s: Rotors
 
 
-@on("drone/*/cmd/*", writers="controller operator", is_output=True)
+@on("drone/*/cmd/*", writers="controller reference operator", is_output=True)
 @on("drone/*/accepted/*", writers="world", readers="driver")
 class Command(Message, frozen=True):
     """Base of what is sent to a drone; `source` is the sender's process name."""
@@ -140,7 +141,13 @@ class LinkState(Message, frozen=True):
 # Estimates and formations
 
 
-@on("drone/*/estimate", writers="estimator driver", readers="estimator controller", last="world", is_output=True)
+@on(
+    "drone/*/estimate",
+    writers="estimator driver",
+    readers="estimator controller reference",
+    last="world",
+    is_output=True,
+)
 class Estimate(Message, frozen=True):
     """Where an estimator believes its drone to be: position and velocity in W, attitude B to W.
 
@@ -183,6 +190,23 @@ class ClusterState(Message, frozen=True):
 
     def fault(self) -> str | None:
         return length_fault(self, ("names", "value", "desired", "desired_rate"), 4 * len(self.drones))
+
+
+@on("drone/*/reference", writers="reference", last="world", is_output=True)
+class Reference(Message, frozen=True):
+    """Where a drone that flies by itself is to be: position and velocity in W, heading.
+
+    `phase`: `waiting` on the ground, `approaching` the beginning of its path or a place, on the `path`, `holding` a
+    place, `over` once it is to land. `path_t_s` is the path's own time, None where none is flown.
+    """
+
+    phase: ReferencePhase
+    position_m: Vector3
+    velocity_m_s: Vector3
+    yaw_rad: Number
+    yaw_rate_rad_s: Number
+    path_t_s: Number | None
+    source: str
 
 
 # Cameras

@@ -36,15 +36,14 @@ T = TypeVar("T")
 def key_table(drones: Sequence[str], own: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the keys of the world's messages about some drones, drone by drone in the order of KINDS.
 
-    `own` names the users' sensors of the run, and the sightings; their keys follow those of KINDS.
+    `own` names the users' sensors of the run, the sightings and the scanners; their keys follow those of KINDS.
     """
     kinds = (*KINDS, *own)
     return tuple(keys.truth(d) if kind == "truth" else keys.sensor(d, kind) for d in drones for kind in kinds)
 
 
 def run_key_table(info: messages.Info) -> tuple[str, ...]:
-    beside = [sensor.name for sensor in info.own_sensors] + [keys.SIGHTINGS] * (info.sightings is True)
-    return key_table([drone.name for drone in info.drones], beside)
+    return key_table([drone.name for drone in info.drones], info.sensors_beside)
 
 
 @lru_cache(maxsize=8)

@@ -112,6 +112,23 @@ def driver(drone: str) -> str:
     return f"drone/{drone}/driver"
 
 
+def reference(drone: str) -> str:
+    return f"drone/{drone}/reference"
+
+
+def drone_control(drone: str) -> str:
+    return f"drone/{drone}/control"
+
+
+def drone_request(drone: str) -> str:
+    return f"drone/{drone}/request"
+
+
+def control_of(request_key: str) -> str:
+    """Return the key on which a request was made that is on record on another."""
+    return f"{request_key.rpartition('/')[0]}/control"
+
+
 def camera(drone: str, name: str) -> str:
     return f"drone/{drone}/camera/{name}"
 

@@ -18,6 +18,10 @@ from zsim.errors import DecodeError, RunError
 from zsim.schema.checker import first_fault
 from zsim.schema.declared_message import FieldType
 from zsim.schema.message import Count, Message, Number, Whole
+from zsim.sensors.scanner import SCANNERS
+from zsim.sensors.scanner import Depth as Depth
+from zsim.sensors.scanner import Lidar as Lidar
+from zsim.sensors.scanner import Range as Range
 from zsim.sensors.sensor import Sample, message_type
 from zsim.sensors.sensor_catalogue import STOCK
 from zsim.sensors.stock_sensors import Baro as Baro
@@ -87,10 +91,11 @@ class Info(Message, frozen=True):
 
     `rate` is simulated per wall seconds, 0 for as fast as possible; `scenario` is YAML text. `replay_of` is the
     run_id of the run that is played back; empty for a flight. `user_sensors` is left out where all sensors are the
-    contract's, `user_messages` where agents exchange none, `sightings` where the world computes none. `module_folders`
-    are those in which the world has looked for modules that the scenario names, for readers of the record; left out
-    where it names none. `changed` has the texts `a.b.c=value` by which the command line changed the scenario's file;
-    left out where that is not known. Making or decoding an Info registers the messages of its sensors and agents.
+    contract's, `user_messages` where agents exchange none, `sightings` where the world computes none, `scanners`
+    where no drone has one of range, lidar, depth. `module_folders` are those in which the world has looked for modules
+    that the scenario names, for readers of the record; left out where it names none. `changed` has the texts
+    `a.b.c=value` by which the command line changed the scenario's file; left out where that is not known. Making or
+    decoding an Info registers the messages of its sensors and agents.
     """
 
     contract: Count
@@ -115,6 +120,7 @@ class Info(Message, frozen=True):
     module_folders: tuple[str, ...] | UnsetType = UNSET
     changed: tuple[str, ...] | UnsetType = UNSET
     user_messages: tuple[MessageInfo, ...] | UnsetType = UNSET
+    scanners: tuple[str, ...] | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         register_sensors(self.own_sensors)
@@ -127,17 +133,26 @@ class Info(Message, frozen=True):
         return () if self.user_sensors is UNSET else self.user_sensors
 
     @property
+    def sensors_beside(self) -> tuple[str, ...]:
+        """Names of the sensors besides the contract's six that the run's drones have, in the order of their keys."""
+        seen = (keys.SIGHTINGS,) * (self.sightings is True)
+        return (*(each.name for each in self.own_sensors), *seen, *(() if self.scanners is UNSET else self.scanners))
+
+    @property
     def own_messages(self) -> tuple[MessageInfo, ...]:
         return () if self.user_messages is UNSET else self.user_messages
 
 
-for _name, _kind in STOCK.items():
-    keys.on(f"drone/*/sensor/{_name}", writers="world")(_kind.message)
+for _name, _message in {**{name: kind.message for name, kind in STOCK.items()}, **SCANNERS}.items():
+    keys.on(f"drone/*/sensor/{_name}", writers="world")(_message)
 keys.on("drone/*/sensor/*", writers="driver", readers="estimator")(Sample)  # those of the users' sensors too
 TOPICS = keys.TOPICS
 """The contract's keys, `*` in place of a name, with what travels on them; whole once this module is imported."""
 
-RELAYED = (flight_messages.Estimate, flight_messages.ClusterState, run_messages.ClusterRequest, AgentMessage)
+RELAYED = (
+    *(flight_messages.Estimate, flight_messages.ClusterState, flight_messages.Reference),
+    *(run_messages.ClusterRequest, AgentMessage),
+)
 """Messages, or their bases, that agents publish for each other; the world counts them, as it does commands."""
 KEYS_KEPT = 65_536  # keys whose type is remembered; 1000 drones have 15 000, garbage keys push each other out
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")

@@ -183,7 +183,7 @@ class Faults(Message, frozen=True):
 
 
 class ControlRequest(Struct, frozen=True):
-    """What is asked of `world/control` and `cluster/{c}/control`."""
+    """What is asked of `world/control`, `cluster/{c}/control` and `drone/{d}/control`."""
 
     op: str
     args: dict[str, Any] = {}
@@ -206,8 +206,9 @@ class ControlAnswer(Struct, frozen=True):
 
 
 @on("cluster/*/request", writers="controller", is_output=True)
+@on("drone/*/request", writers="reference", is_output=True)
 class ClusterRequest(Message, frozen=True):
-    """A request on `cluster/{c}/control` as the controller took it, before its outputs of the gate `t_ns`.
+    """A request on `cluster/{c}/control` or `drone/{d}/control` as it was taken, before the outputs of the gate `t_ns`.
 
     `source` is who asked; `error` is why it is refused. `controller` is the process that answered.
     """

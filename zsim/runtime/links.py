@@ -46,11 +46,13 @@ def senders(key: str, message: Any, roles: Mapping[str, str] = {}) -> tuple[str,
         return (source,)
     if kind == "drone" and what == "estimate":
         named = f"estimator.{whose}"
+    elif kind == "drone" and what in ("reference", "request"):
+        named = f"reference.{whose}"
     elif kind == "cluster":
         named = f"controller.{whose}"
     else:
         return (whose,) if kind == "process" else (WORLD,)
-    is_shared = source.partition(".")[0] in ("estimator", "controller")
+    is_shared = source.partition(".")[0] in ("estimator", "controller", "reference")
     return (named,) if is_shared or not source else (named, source)  # another process that does its work
 
 

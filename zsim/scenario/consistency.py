@@ -16,10 +16,11 @@ from zsim.scenario.faults import Known, flaws, kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
 from zsim.scenario.own_classes import agent_faults
 from zsim.scenario.roles import AGENTS, MAIN, OPERATOR, ROLES
-from zsim.scenario.scenario import EXTERNAL, SEA_HEIGHT_MAX_M, Scenario, space_name
+from zsim.scenario.scenario import EXTERNAL, PATHS, SEA_HEIGHT_MAX_M, Scenario, space_name
 from zsim.schema.checker import Fault, listed, show, suggestion
 from zsim.schema.quantities import COULOMB_PER_MAH, G_M_S2, SEA_LEVEL_KG_M3
 from zsim.sensors.camera_model import folds, lens_of
+from zsim.sensors.scanner import RAYS_MAX, SCANNERS
 from zsim.sensors.sensor_catalogue import DECLARED, MODULE, STOCK, declarations, own_sections
 from zsim.sensors.stock_sensors import BOARD_RATE_HZ
 from zsim.vehicles.vehicle import Vehicle, lift_shares
@@ -68,10 +69,13 @@ def cross_faults(
         yield from _under(f"clusters[{index}]", _plan_faults(cluster))
     for index, cluster in clusters:
         yield from _under(f"clusters[{index}]", _shape_faults(cluster, drones))
+    yield from _reference_faults(scenario, drones, clusters)
     yield from _process_faults(scenario.processes, drones, clusters)
     if isinstance(scenario.agents, dict):
         sound_agents = {role: each for role, each in scenario.agents.items() if each and each.per}
         yield from agent_faults(sound_agents, (*ROLES, *RESERVED_ROLES), bool(clusters))
+    if isinstance(scenario.programs, dict):
+        yield from _program_faults(scenario.programs, (*ROLES, *RESERVED_ROLES, *(scenario.agents or ())))
     yield from _graph_faults(scenario.topology, _names(drones))
     yield from _injected_faults(scenario, drones, clusters, vehicles, unread)
     window = scenario.report and scenario.report.window_s
@@ -421,6 +425,72 @@ def _plan_faults(cluster: Any) -> Iterator[Fault]:
             yield path, f"is {after.at_s:g}; must be > {before.at_s:g}, the one before"
 
 
+def _reference_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
+    """Yield what cannot go together of drones' references and exchanges, and of who else flies them."""
+    flown_by = {name: f"cluster {c.name!r}" for _, c in clusters for _, name in _entries(c.drones)}
+    for index, drone in drones:
+        if not drone.reference:
+            continue
+        path = f"drones[{index}].reference"
+        if drone.name in flown_by:
+            other = flown_by[drone.name]
+            yield path, f"is given, and {other} flies the drone; must be left out, or the drone out of the cluster"
+        elif drone.name is not None:
+            flown_by[drone.name] = path
+        yield from _under(path, _path_faults(drone.reference))
+    known = _names(drones)
+    exchanges = scenario.exchanges if isinstance(scenario.exchanges, list) else []
+    for index, exchange in _entries(exchanges):
+        path = f"exchanges[{index}]"
+        for place, name in _entries(exchange.drones):
+            at = f"{path}.drones[{place}]"
+            if len(known) == len(drones) and name not in known:
+                yield at, f"is {name!r}; must be one of the drones {listed(list(dict.fromkeys(known)))}"
+            elif name in flown_by:
+                yield at, f"is {name!r}, which {flown_by[name]} flies; a drone has one of cluster, reference, exchange"
+            flown_by.setdefault(name, path)
+        before_s = exchange.takeoff_s
+        for number, stage in _entries(exchange.stages):
+            at = f"{path}.stages[{number}]"
+            if _known(stage.places_m, exchange.drones) and len(stage.places_m) != len(exchange.drones):
+                count = len(exchange.drones)
+                yield f"{at}.places_m", f"has {len(stage.places_m)} places; must have {count}, one for each drone"
+            if _known(stage.start_s, before_s) and stage.start_s < before_s:
+                yield f"{at}.start_s", f"is {stage.start_s:g}; must be >= {before_s:g}, the end of what is before it"
+            if _known(stage.start_s, stage.over_s):
+                before_s = stage.start_s + stage.over_s
+        yield from _under(path, _landing_faults(exchange, before_s))
+
+
+def _path_faults(reference: Any) -> Iterator[Fault]:
+    """Yield what is wrong between the fields of one drone's reference."""
+    given = [name for name in PATHS if getattr(reference, name)]
+    if len(given) > 1:
+        yield given[1], f"is given beside {given[0]}; must be one of {', '.join(PATHS)}"
+    if given and reference.start_s is None:
+        yield "start_s", f"is missing; must say when {given[0]} begins"
+    if not given and reference.start_s is not None:
+        yield "start_s", f"is {reference.start_s:g}, and nothing begins; must be left out, or one of {', '.join(PATHS)}"
+    if _known(reference.start_s, reference.takeoff_s) and reference.start_s < reference.takeoff_s:
+        yield "start_s", f"is {reference.start_s:g}; must be >= takeoff_s ({reference.takeoff_s:g})"
+    for name in ("constants", "duration_s"):
+        if getattr(reference, name) and "expressions" not in given:
+            yield name, "is given; must be left out without expressions"
+    for name in ("waypoints", "minimum_snap"):
+        points = _entries(getattr(reference, name))
+        if name == "minimum_snap" and len(points) == 1:
+            yield name, "has 1 entry; must have 2 or more"
+        for (_, before), (index, after) in pairwise(points):
+            if _known(before.at_s, after.at_s) and after.at_s <= before.at_s:
+                yield f"{name}[{index}].at_s", f"is {after.at_s:g}; must be > {before.at_s:g}, the one before"
+    yield from _landing_faults(reference, reference.start_s or reference.takeoff_s)
+
+
+def _landing_faults(piloted: Any, from_s: float | None) -> Iterator[Fault]:
+    if _known(piloted.land_s, from_s) and piloted.land_s <= from_s:
+        yield "land_s", f"is {piloted.land_s:g}; must be > {from_s:g}, when it is still to fly"
+
+
 def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
     action = ((processes and processes.on_death) or {}).get("world")
     if action is not None and action not in WORLD_DEATHS:
@@ -437,6 +507,15 @@ def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Ite
             named = listed(known) or f"a {kind}, and there is none"
             allowed = f"must be {role}.NAME of {named}, or a name of your own"
             yield f"processes.expect[{index}]", f"is {name!r}, and no {kind} is {thing!r}; {allowed}"
+
+
+def _program_faults(programs: Mapping[str, Any], roles: Sequence[str]) -> Iterator[Fault]:
+    for name, program in programs.items():
+        if (role := name.partition(".")[0]) in roles:
+            allowed = f"must begin with another word than {', '.join(roles)}"
+            yield f"programs.{name}", f"is named like a process of the role {role}; {allowed}"
+        if program and program.command and not program.command[0]:
+            yield f"programs.{name}.command[0]", "is empty; must be a program"
 
 
 def _graph_faults(topology: Any, drones: list[str]) -> Iterator[Fault]:
@@ -478,6 +557,7 @@ def _sighting_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Ite
     for index, drone in drones:
         if drone.sensors is not None:
             yield from _under(f"drones[{index}].sensors", _camera_faults(drone.sensors))
+            yield from _under(f"drones[{index}].sensors", _scanner_faults(drone.sensors))
     hats = scenario.environment and scenario.environment.hats
     known = [drone.name for _, drone in drones]
     for place, name in enumerate(hats.covered or () if hats else ()):
@@ -514,10 +594,29 @@ def _camera_faults(sensors: Any) -> Iterator[Fault]:
             most = f"{1e3 / camera.rate_hz:.4g} ms at rate_hz {camera.rate_hz:g}"
             found = f"is {camera.exposure_ms:g}; must be <= {most}, the time from one picture to the next"
             yield f"{path}.exposure_ms", found
-    looks_at = (sensors.sightings and sensors.sightings.cameras) or ()
-    for place, name in enumerate(looks_at):
-        path = f"sightings.cameras[{place}]"
-        if name in looks_at[:place]:
-            yield path, f"is {name!r}, as cameras[{looks_at.index(name)}]; must be unique"
-        elif name in cameras and not cameras[name]:
-            yield path, f"is {name!r}, which the drone does not have; give it {name}_camera: {{}}"
+    for section in ("sightings", "depth"):
+        used = getattr(sensors, section)
+        looks_at = (used and used.cameras) or ()
+        for place, name in enumerate(looks_at):
+            path = f"{section}.cameras[{place}]"
+            if name in looks_at[:place]:
+                yield path, f"is {name!r}, as cameras[{looks_at.index(name)}]; must be unique"
+            elif name in cameras and not cameras[name]:
+                yield path, f"is {name!r}, which the drone does not have; give it {name}_camera: {{}}"
+
+
+def _scanner_faults(sensors: Any) -> Iterator[Fault]:
+    """Yield what cannot go together of the settings of a drone's beams, lidar and depth images."""
+    for name in SCANNERS:
+        own = getattr(sensors, name)
+        if not own:
+            continue
+        if _known(own.min_m, own.max_m) and own.min_m >= own.max_m:
+            yield f"{name}.min_m", f"is {own.min_m:g}; must be < max_m ({own.max_m:g})"
+        rows = {"lidar": "channels", "depth": "rows"}.get(name)
+        if rows and _known(getattr(own, rows), own.columns) and getattr(own, rows) * own.columns > RAYS_MAX:
+            most = f"must be <= {RAYS_MAX // getattr(own, rows)} with {rows} {getattr(own, rows)}"
+            yield f"{name}.columns", f"is {own.columns}; {most}: {RAYS_MAX} rays a message"
+    azimuth = sensors.lidar and sensors.lidar.azimuth_deg
+    if azimuth and None not in azimuth and not 0 < azimuth[1] - azimuth[0] <= 360:
+        yield "lidar.azimuth_deg", f"is {show(list(azimuth))}; must be [first, last], rising by at most 360"

@@ -38,9 +38,8 @@ def pieces_of(path: Path, where: str) -> list[dict[str, Any]]:
     rows = [_without_end([cell.strip() for cell in row]) for row in rows]
     header = tuple(cell.lower().replace(" ", "") for cell in rows[0]) if rows else ()
     if header != HEADER:
-        first = ", ".join(header[:3]) or "nothing"
         needed = f"must begin with the header duration, x^0 to x^7, y^0, …, yaw^7: {len(HEADER)} columns"
-        raise DocumentError([f"{where} is {show(str(path))}, which begins with {first}; {needed}"])
+        raise DocumentError([f"{where} is {show(str(path))}, which does not; {needed}"])
     pieces, wrong = [], []
     for number, row in enumerate(rows[1:], start=2):
         if not row:

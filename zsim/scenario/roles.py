@@ -16,6 +16,7 @@ from zsim.schema.checker import listed
 
 MAIN = "main"  # thing of an agent that is of the whole run
 OPERATOR, RECORDER, WORLD, ROUTER, DRIVER = "operator", "recorder", "world", "router", "driver"
+PILOT = "reference"  # of a drone that has a reference of its own, not of every drone
 
 
 class Role(NamedTuple):
@@ -36,6 +37,7 @@ ROLES = {
     "recorder": Role("record", "restart"),
     "estimator": Role("agents", "restart", "drone", "zsim_agents.estimation.estimator:Estimator", joint=True),
     "controller": Role("agents", "restart", "cluster", "zsim_agents.formation.controller:Controller"),
+    "reference": Role("agents", "restart", "drone", "zsim_agents.references.pilot:Pilot"),
     "camera": Role("cameras", "restart", on_overdue="drop"),
     "detector": Role("cameras", "restart", on_overdue="drop"),
     "console": Role("console", "drop", on_overdue="drop"),
@@ -58,6 +60,8 @@ def agent_roles(scenario: Scenario) -> dict[str, Role]:
 
 def things(role: str, scenario: Scenario) -> list[str]:
     about = agent_roles(scenario)[role].about
+    if role == PILOT:
+        return [*scenario.piloted()]
     return [MAIN] if about == "run" else [entry.name for entry in getattr(scenario, f"{about}s")]
 
 
@@ -70,7 +74,8 @@ def expected_processes(scenario: Scenario) -> list[str]:
     if scenario.processes.expect is not None:
         return list(scenario.processes.expect)
     cameras = [drone.name for drone in scenario.drones if scenario.gates("camera") and drone.sensors.cameras()]
-    return [*agent_names(scenario), *(f"camera.{name}" for name in cameras)]
+    programs = [name for name, each in scenario.own_programs.items() if each.joins]
+    return [*agent_names(scenario), *(f"camera.{name}" for name in cameras), *programs]
 
 
 def on_death(actions: Mapping[str, OnDeath], name: str, role: str | None = None) -> OnDeath:
@@ -169,7 +174,7 @@ def rights_for(process: str, scenario: Scenario) -> Rights:
     if process == RECORDER:
         return combined([own, _READER])
     if role == OPERATOR:
-        requests = Rights(asks=(keys.CONTROL, keys.cluster_control("*"), keys.driver("*")))
+        requests = Rights(asks=(keys.CONTROL, keys.cluster_control("*"), keys.drone_control("*"), keys.driver("*")))
         return combined([own, _READER, _granted(role, drone=["*"]), requests])
     if role == DRIVER:
         is_external = thing in scenario.external()
@@ -179,6 +184,10 @@ def rights_for(process: str, scenario: Scenario) -> Rights:
         return combined([own, Rights(reads=sees, asks=sees), _granted(role, drone=watched_drones(thing, scenario))])
     if role in scenario.own_agents:
         return combined([own, _granted_own(scenario.own_agents[role], thing, scenario)])
+    if role == PILOT:
+        is_piloted = thing in scenario.piloted()
+        answers = Rights(reads=(keys.gate(thing),), answers=(keys.drone_control(thing),))
+        return combined([own, *[_granted(PILOT, drone=[thing]), answers] * is_piloted])
     about = AGENTS[role].about if role in AGENTS else None
     granted = [own]
     if about != "cluster" and thing in [drone.name for drone in scenario.drones]:

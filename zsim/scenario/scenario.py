@@ -28,8 +28,13 @@ PROCESSES_MAX = 4 * DRONES_MAX  # an estimator a drone, a controller a cluster, 
 WAYPOINTS_MAX = 10_000  # an hour of them at 3 a second
 CONSTANTS_MAX = 100  # of a user, for the expressions of a trajectory
 ROBOTS_MAX = 64  # drones of a cluster; beyond it a dense Jacobian of 4n x 4n no longer fits a control gate of 20 ms
+POINTS_MAX = 1000  # of a path of one drone
+PIECES_MAX = 5000  # polynomials of one path
+STAGES_MAX = 100  # of drones that change places
 METRICS_MAX = 20  # functions
 ROLES_MAX = 20  # of users' agents; each is a process for every drone
+PROGRAMS_MAX = 100  # of users, beside agents
+WORDS_MAX = 1000  # of a command line
 MESSAGES_MAX = 20  # classes of messages that a class of agents publishes
 VARIABLES_MAX = 4 * ROBOTS_MAX  # of a formation: four a robot
 SEA_HEIGHT_MAX_M = 11_000  # m above the sea: end of the layer whose pressure the barometer follows (ISO 2533)
@@ -45,6 +50,103 @@ Position = tuple[Coordinate, Coordinate, Coordinate]
 
 class Spec(Struct, frozen=True, forbid_unknown_fields=True):
     """Base of every section; unknown keys are faults."""
+
+
+Value = Annotated[Real | str, Meta(description="a finite number or an expression")]
+"""Of a variable: in metres or radians, in degrees where the name of an angle ends in `_deg`."""
+
+
+class Piloted(Spec, frozen=True, kw_only=True):
+    """How drones that fly by themselves follow where they are to be."""
+
+    takeoff_s: NonNegative = 0.0
+    land_s: NonNegative | None = None
+    fit: bool = False
+    """Whether what is too fast for the drone is flown more slowly; else it is refused."""
+    gain_1_s: Annotated[float, Meta(gt=0, le=2)] = 0.6  # of the position; chosen, as that of formations
+    lead_s: Annotated[float, Meta(ge=0, le=2)] = 0.4  # the AR.Drone's: 0.33 s of its velocity loop, 0.11 s of its tilt
+
+
+class PathPoint(Spec, frozen=True, kw_only=True):
+    at_s: NonNegative
+    position_m: Position
+    yaw_deg: Real | None = None
+    """None: as before, and at the first point as the drone starts."""
+
+
+Points = Annotated[list[PathPoint], Meta(max_length=POINTS_MAX)]
+Terms = Annotated[list[Real], Meta(max_length=8)]  # coefficients of t^0, t^1, ...
+
+
+class Piece(Spec, frozen=True, kw_only=True):
+    """Polynomials of the time from its beginning [m, rad]."""
+
+    duration_s: Annotated[float, Meta(gt=0, le=3600)]
+    x: Terms = []
+    y: Terms = []
+    z: Terms = []
+    yaw: Terms = []
+
+
+Laps = Annotated[float, Meta(ge=0.25, le=1000)]
+
+
+class Circle(Spec, frozen=True, kw_only=True):
+    """From (radius, 0) counter-clockwise; a helix where it climbs."""
+
+    radius_m: Positive
+    period_s: Positive
+    laps: Laps = 1.0
+    climb_m: Real = 0.0
+
+
+class FigureEight(Spec, frozen=True, kw_only=True):
+    """Along x, from its crossing."""
+
+    length_m: Positive
+    width_m: Positive
+    period_s: Positive
+    laps: Laps = 1.0
+
+
+class DroneReference(Piloted, frozen=True, kw_only=True):
+    """Where one drone is to be; without a path, it takes off and waits for requests."""
+
+    start_s: NonNegative | None = None
+    waypoints: Points = []
+    minimum_snap: Points = []
+    expressions: Annotated[dict[str, Value], Meta(max_length=4)] = {}
+    constants: Annotated[dict[str, Real], Meta(max_length=CONSTANTS_MAX)] = {}
+    duration_s: Positive | None = None
+    pieces: Annotated[list[Piece], Meta(max_length=PIECES_MAX)] = []
+    file: str | UnsetType = UNSET
+    """Of pieces, which replace it when the scenario is read."""
+    circle: Circle | UnsetType = UNSET
+    figure_eight: FigureEight | UnsetType = UNSET
+    origin_m: Vector3 = (0.0, 0.0, 0.0)
+    time_scale: Annotated[float, Meta(ge=0.01, le=1000)] = 1.0
+
+    def paths(self) -> list[str]:
+        """Return the names of the fields that give a path."""
+        return [name for name in PATHS if getattr(self, name)]
+
+
+PATHS = ("waypoints", "minimum_snap", "expressions", "pieces", "circle", "figure_eight")
+
+
+class Stage(Spec, frozen=True, kw_only=True):
+    """Places to which drones fly at once, each to one of them."""
+
+    start_s: NonNegative
+    over_s: Positive
+    places_m: Annotated[list[Position], Meta(min_length=1, max_length=DRONES_MAX)]
+
+
+class Exchange(Piloted, frozen=True, kw_only=True):
+    """Drones of which any may fly to any place: each stage is assigned for the least sum of squared ways."""
+
+    drones: Annotated[list[Name], Meta(min_length=1, max_length=DRONES_MAX)]
+    stages: Annotated[list[Stage], Meta(min_length=1, max_length=STAGES_MAX)]
 
 
 class Drone(Spec, frozen=True, kw_only=True):
@@ -70,6 +172,8 @@ class Drone(Spec, frozen=True, kw_only=True):
     takeoff_height_m: TakeoffHeight = ARDRONE2.takeoff_height_m
     limits: Limits = ARDRONE2.limits
     aerodynamics: Aerodynamics | UnsetType = UNSET  # unset: none but `drag_n_s_m`, and left out of the resolved text
+    reference: DroneReference | UnsetType = UNSET
+    """Unset: none, and left out of the resolved text."""
     sensors: Sensors
 
     @property
@@ -145,8 +249,6 @@ class Gains(Spec, frozen=True, kw_only=True):
     heading_sigma_max_deg: HeadingSigma | UnsetType = UNSET  # likewise of its heading; unset: 15 deg
 
 
-Value = Annotated[Real | str, Meta(description="a finite number or an expression")]
-"""Of a variable: in metres or radians, in degrees where the name of an angle ends in `_deg`."""
 Values = Annotated[dict[str, Value], Meta(max_length=VARIABLES_MAX)]  # values by the names of a formation's variables
 
 
@@ -268,6 +370,15 @@ class TimeSteps(Spec, frozen=True, kw_only=True):
     max_command_age_ms: Positive = 500.0  # as silence.hover_s: an older command counts as silence
 
 
+class OwnProgram(Spec, frozen=True, kw_only=True):
+    """A program in any language that is started with the run; its name is that of the process as which it joins."""
+
+    command: Annotated[list[str], Meta(min_length=1, max_length=WORDS_MAX)]
+    """`{endpoint}`, `{federation}`, `{folder}` (of the run) and `{name}` are replaced."""
+    joins: bool = True  # the run waits for it, at its start and at every gate
+    start_timeout_s: Positive | UnsetType = UNSET  # unset: as of all processes
+
+
 LAWS = {
     "consensus": "zsim_agents.laws.consensus:Consensus",
     "leader_follower": "zsim_agents.laws.leader_follower:LeaderFollower",
@@ -380,9 +491,13 @@ class Scenario(Spec, frozen=True, kw_only=True):
     silence: Silence = Silence()
     drones: Annotated[list[Drone], Meta(min_length=1, max_length=DRONES_MAX)]
     clusters: Annotated[list[Cluster], Meta(max_length=CLUSTERS_MAX)] = []
+    exchanges: Annotated[list[Exchange], Meta(max_length=DRONES_MAX)] | UnsetType = UNSET
+    """Unset: none, and left out of the resolved text."""
     estimation: Estimation = Estimation()
     agents: Annotated[dict[RoleName, OwnAgent], Meta(max_length=ROLES_MAX)] | UnsetType = UNSET
     """Agents of users' classes, by role; unset: none, and left out of the resolved text."""
+    programs: Annotated[dict[Name, OwnProgram], Meta(max_length=PROGRAMS_MAX)] | UnsetType = UNSET
+    """Programs of users, by the name of the process; unset: none, and left out of the resolved text."""
     topology: Topology | UnsetType = UNSET
     radio: Radio | UnsetType = UNSET
     """Between agents of drones. Unset: all hear all; left out of the resolved text."""
@@ -397,9 +512,20 @@ class Scenario(Spec, frozen=True, kw_only=True):
     def cluster(self, name: str) -> Cluster:
         return {cluster.name: cluster for cluster in self.clusters}[name]
 
+    def piloted(self) -> dict[str, DroneReference | Exchange]:
+        """Return the drones that have a reference of their own, or change places, with what they fly."""
+        exchanges = [] if self.exchanges is UNSET else self.exchanges
+        found: dict[str, DroneReference | Exchange] = {name: each for each in exchanges for name in each.drones}
+        found |= {drone.name: drone.reference for drone in self.drones if drone.reference is not UNSET}
+        return {drone.name: found[drone.name] for drone in self.drones if drone.name in found}
+
     @property
     def own_agents(self) -> dict[str, OwnAgent]:
         return {} if self.agents is UNSET else self.agents
+
+    @property
+    def own_programs(self) -> dict[str, OwnProgram]:
+        return {} if self.programs is UNSET else self.programs
 
     @property
     def radio_of_agents(self) -> Radio | None:
@@ -433,7 +559,14 @@ class Scenario(Spec, frozen=True, kw_only=True):
 
 
 _SECTIONS = ("limits", "aerodynamics")
-_OWN = ("name", "body", "position_m", "yaw_deg", "sensors")  # fields of a drone that are not of its vehicle
+_OWN = (
+    "name",
+    "body",
+    "position_m",
+    "yaw_deg",
+    "reference",
+    "sensors",
+)  # fields of a drone that are not of its vehicle
 _SHARED = {name: kind for name, kind in get_type_hints(Drone, include_extras=True).items() if name not in _OWN}
 SharedVehicle: Any = defstruct(
     "SharedVehicle",

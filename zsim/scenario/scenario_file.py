@@ -15,6 +15,7 @@ from msgspec import Struct, structs
 from zsim.errors import DocumentError, NotTrustedError, ScenarioError
 from zsim.scenario import own_classes
 from zsim.scenario.consistency import cross_faults
+from zsim.scenario.polynomial_file import pieces_of
 from zsim.scenario.scenario import DRONES_MAX, VEHICLE_NUMBERS, Document, Scenario, SharedVehicle
 from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import Fault, faults, first_lines, show, sound, suggestion
@@ -114,6 +115,8 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
         numbers["limits"] = msgspec.to_builtins(vehicle.limits)
         if vehicle.aerodynamics != Aerodynamics():  # else they are left out of the resolved text
             numbers["aerodynamics"] = msgspec.to_builtins(vehicle.aerodynamics)
+        if "reference" in drone:
+            drone = {**drone, "reference": _with_pieces(drone["reference"], f"{where}.reference", unsound)}
         return {**with_defaults(numbers, drone), "sensors": own}
 
     document = {**document, "sensors": _separated(sensors, "sensors", unsound, unread, imports)}
@@ -125,7 +128,9 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
     if "agents" in document:
         document["agents"], wrong = own_classes.with_agents(document["agents"], imports)
         unsound += wrong
-        document["processes"] = _with_deaths(document.get("processes", {}), document["agents"])
+        document["processes"] = _with_deaths(document.get("processes", {}), document["agents"], "restart")
+    if "programs" in document:
+        document["processes"] = _with_deaths(document.get("processes", {}), document["programs"], "end")
     shortened = _is_graph(document.get("topology"))
     if shortened:
         document["topology"] = {"graph": document["topology"]}
@@ -183,6 +188,24 @@ def _separated(section: Any, where: str, unsound: list[Fault], unread: set[str],
     return {**rest, "own": own} if own else rest
 
 
+def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
+    """Return a drone's reference with the pieces of the file that it names, beside the scenario or in this folder."""
+    name = reference.get("file") if isinstance(reference, dict) else None
+    if not isinstance(name, str):
+        return reference
+    if "pieces" in reference:
+        unsound.append((f"{where}.file", "is given beside pieces; must be one of them"))
+        return reference
+    places = [folder / name for folder in (*plugin.folders(), Path())]
+    found = next((place for place in places if place.is_file()), places[0])
+    try:
+        pieces = pieces_of(found, f"{where}.file")
+    except DocumentError as error:
+        unsound += [(path, text) for path, _, text in (line.partition(" ") for line in error.faults)]
+        return reference
+    return {**{key: value for key, value in reference.items() if key != "file"}, "pieces": pieces}
+
+
 def _is_graph(topology: Any) -> bool:
     """Tell whether a `topology:` section is a graph alone, by name or as lists of those that each drone hears."""
     if isinstance(topology, dict):
@@ -190,12 +213,12 @@ def _is_graph(topology: Any) -> bool:
     return isinstance(topology, str)
 
 
-def _with_deaths(processes: Any, agents: Any) -> Any:
-    """Return a `processes:` section in which users' agents are started again, where it says nothing of their role."""
-    if not (isinstance(processes, dict) and isinstance(agents, dict)):
+def _with_deaths(processes: Any, own: Any, action: str) -> Any:
+    """Return a `processes:` section with what the death of users' roles or programs means, where it does not say so."""
+    if not (isinstance(processes, dict) and isinstance(own, dict)):
         return processes
     given = processes.get("on_death", {})
-    return {**processes, "on_death": dict.fromkeys(agents, "restart") | given} if isinstance(given, dict) else processes
+    return {**processes, "on_death": dict.fromkeys(own, action) | given} if isinstance(given, dict) else processes
 
 
 def _vehicle_of(

@@ -13,6 +13,7 @@ from zsim.schema import plugin
 from zsim.schema.checker import Fault, faults, field_path, show, suggestion
 from zsim.sensors import stock_sensors
 from zsim.sensors.camera import CAMERAS, BottomCamera, Camera, FrontCamera, SightingModel
+from zsim.sensors.scanner import DepthConfig, LidarConfig, RangeConfig
 from zsim.sensors.sensor import VALUES_MAX, Declaration, Sample, Sensor, SensorType, as_fields
 from zsim.sensors.stock_sensors import BaroConfig, FlowConfig, GpsConfig, ImuConfig, MagConfig, SonarConfig
 
@@ -41,6 +42,9 @@ class Sensors(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     bottom_camera: BottomCamera | UnsetType = UNSET
     sightings: SightingModel | UnsetType = UNSET
     """What a detector makes of the cameras' pictures, without pictures: computed by the world."""
+    range: RangeConfig | UnsetType = UNSET
+    lidar: LidarConfig | UnsetType = UNSET
+    depth: DepthConfig | UnsetType = UNSET
     own: dict[str, dict[str, Any]] | UnsetType = UNSET
     """A user's sensors, by name: settings with every field, `module` and `declared`. A file has them beside the
     others, see `flattened`."""

@@ -65,8 +65,7 @@ class Estimator(Agent):
         else:
             # One subscription per sensor: the process sleeps until status, the last of a gate, and wakes once. Users'
             # sensors are read because status counts them.
-            users = (*(sensor.name for sensor in info.own_sensors), *([keys.SIGHTINGS] * (info.sightings is True)))
-            kinds = (*keys.SENSORS, *users, "status")
+            kinds = (*keys.SENSORS, *info.sensors_beside, "status")
             self.reads = (*(keys.sensor(drone, kind) for drone in read for kind in kinds), *self.uncounted)
         self._last: dict[str, flight_messages.Estimate] = {}
         self._view_key = keys.estimates_view(self.name)

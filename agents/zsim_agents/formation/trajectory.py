@@ -37,6 +37,20 @@ class TrajectoryError(ValueError):
         self.at = at
 
 
+class Variables(Protocol):
+    """What a reference has to know of its variables; of a cluster space, or the place of one drone."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def in_radians(self) -> Any: ...
+
+    def index(self, name: str) -> int: ...
+
+    def difference(self, c_to: Array, c_from: Array) -> Array: ...
+
+
 class Reference(Protocol):
     """A motion in cluster space; duration_s is the time after which it stands still, None where it never does.
 
@@ -93,7 +107,7 @@ class ExpressionTrajectory:
 
     def __init__(
         self,
-        space: ClusterSpace,
+        space: Variables,
         expressions: Mapping[str, str | float],
         base: Array,
         constants: Mapping[str, float] | None = None,
@@ -143,7 +157,7 @@ class WaypointTrajectory:
         TrajectoryError: names the waypoint and its fault.
     """
 
-    def __init__(self, space: ClusterSpace, waypoints: Sequence[Mapping[str, object]], base: Array) -> None:
+    def __init__(self, space: Variables, waypoints: Sequence[Mapping[str, object]], base: Array) -> None:
         if not 1 <= len(waypoints) <= WAYPOINTS_MAX:
             raise TrajectoryError(f"trajectory: {len(waypoints)} waypoints; allowed: 1 to {WAYPOINTS_MAX}")
         self._times: list[float] = []
@@ -270,7 +284,7 @@ class Variable(NamedTuple):
     scale: float  # from a user's unit
 
 
-def variable_of(space: ClusterSpace, name: object, where: str, at: str = "") -> Variable:
+def variable_of(space: Variables, name: object, where: str, at: str = "") -> Variable:
     """Return the variable of a name: one of the space's, or an angle's with `_deg`; TrajectoryError: there is none."""
     text = str(name)
     angle = text.removesuffix(DEGREES)
@@ -282,7 +296,7 @@ def variable_of(space: ClusterSpace, name: object, where: str, at: str = "") -> 
         raise TrajectoryError(str(error), f"{where}:", at) from None
 
 
-def named_values(space: ClusterSpace, values: object, where: str, base: Array, at: str = "") -> Array:
+def named_values(space: Variables, values: object, where: str, base: Array, at: str = "") -> Array:
     """Return base (4n,) with values by name: numbers, or expressions without t.
 
     Raises:
@@ -307,7 +321,7 @@ def named_values(space: ClusterSpace, values: object, where: str, base: Array, a
     return c
 
 
-def _refuse_twice(space: ClusterSpace, variable: Variable, given: set[int], place: tuple[str, str]) -> None:
+def _refuse_twice(space: Variables, variable: Variable, given: set[int], place: tuple[str, str]) -> None:
     """Refuse a variable that is given in two units; note that it is given now."""
     if variable.entry in given:
         name = space.names[variable.entry]
@@ -315,7 +329,7 @@ def _refuse_twice(space: ClusterSpace, variable: Variable, given: set[int], plac
     given.add(variable.entry)
 
 
-def _refuse_turns(space: ClusterSpace, variable: Variable, value: float, place: tuple[str, str]) -> None:
+def _refuse_turns(space: Variables, variable: Variable, value: float, place: tuple[str, str]) -> None:
     """Refuse a target angle beyond one turn: given in radians, it is meant in degrees."""
     if not space.in_radians[variable.entry] or abs(value * variable.scale) <= ANGLE_MAX_RAD:
         return

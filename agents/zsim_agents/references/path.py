@@ -88,9 +88,7 @@ class PiecewisePolynomial:
             v = polynomial.polyder(unit) / duration_s
             a = polynomial.polyder(v) / duration_s
             for k, columns in enumerate((v[:, :2], v[:, 2:3], v[:, 3:], a[:, :2])):
-                square = np.zeros(2 * len(columns) - 1)
-                for column in columns.T:
-                    square = square + polynomial.polymul(column, column)[: len(square)] if column.any() else square
+                square = np.sum([np.convolve(column, column) for column in columns.T], axis=0)
                 most, at = _greatest(square)
                 greatest[k] = max(greatest[k], (math.sqrt(most), float(begin_s + at * duration_s)))
         values, times = zip(*greatest, strict=True)
@@ -146,28 +144,33 @@ def minimum_snap(
 
 
 def move(
-    start: Array, goal: Array, limits: PathLimits, over_s: float = 0.0, end: EndMotion | None = None
+    start: Array,
+    goal: Array,
+    limits: PathLimits,
+    over_s: float = 0.0,
+    begin: EndMotion | None = None,
+    end: EndMotion | None = None,
 ) -> PiecewisePolynomial:
-    """Return the minimum-snap way from rest at one place to another (4,), within limits.
+    """Return the minimum-snap way from one place to another (4,), within limits.
 
-    It lasts over_s, or longer where the limits need that, and ends at rest or in the motion `end`. The yaw turns by the
-    shorter way.
+    It lasts over_s, or longer where the limits need that. It begins and ends at rest, or in the motions that are given.
+    The yaw turns by the shorter way.
 
     Raises:
-        TrajectoryError: the motion at its end is beyond the limits.
+        TrajectoryError: the motion at an end is beyond the limits.
     """
     turned = start[3] + math.remainder(goal[3] - start[3], math.tau)
     places = np.array([start, [*goal[:3], turned]])
-    if end is None:
+    if begin is None and end is None:
         unit = minimum_snap((0.0, 1.0), places).peaks().factor(limits)
         return minimum_snap((0.0, max(over_s, LEAST_S, round_up(unit))), places)
     length_s = max(over_s, LEAST_S)
-    while length_s < MOVE_MAX_S:  # the end does not slow down with the rest, so there is no factor
-        path = minimum_snap((0.0, length_s), places, None, end)
+    while length_s < MOVE_MAX_S:  # the ends do not slow down with the rest, so there is no factor
+        path = minimum_snap((0.0, length_s), places, begin, end)
         if path.peaks().factor(limits) <= 1.0:
             return path
         length_s *= GROWTH
-    raise TrajectoryError("begins faster than a way to it may end")
+    raise TrajectoryError("is faster at an end than the limits of the way there")
 
 
 def round_up(factor: float) -> float:
@@ -201,8 +204,9 @@ class Scaled:
 
 def peaks_of(path: Reference) -> Peaks:
     """Return the peaks of any path: exact ones of polynomials, of others refined between samples."""
-    if isinstance(path, PiecewisePolynomial | Scaled):
-        return path.peaks()
+    own: Callable[[], Peaks] | None = getattr(path, "peaks", None)
+    if own is not None:
+        return own()
     end_s = HORIZON_S if path.duration_s is None else path.duration_s
     count = min(max(math.ceil(end_s / SAMPLE_S) + 1, SAMPLES_MIN), SAMPLES_MAX)
     times = np.linspace(0.0, end_s, count)

@@ -25,7 +25,7 @@ CAMERA_KEYS = (keys.camera("*", "*"), keys.camera_info("*", "*"), keys.detection
 """Of cameras, renderers and detectors of clients' own."""
 CLIENT_KEYS = (*COUNTED_KEYS, keys.cluster_view("*"), keys.estimates_view("*"), *CAMERA_KEYS)
 """Keys of the contract on which clients publish."""
-CONTROL_KEYS = (keys.CONTROL, keys.cluster_control("*"))  # requests go there
+CONTROL_KEYS = (keys.CONTROL, keys.cluster_control("*"), keys.drone_control("*"))  # requests go there
 RESERVED_KEYS = (
     "world/**",
     keys.CLOCK,
@@ -36,8 +36,10 @@ RESERVED_KEYS = (
     keys.accepted("*", "*"),
     keys.link("*"),
     keys.driver("*"),
-    CONTROL_KEYS[1],
+    *CONTROL_KEYS[1:],
     keys.cluster_request("*"),
+    keys.drone_request("*"),
+    keys.reference("*"),
 )
 """Keys on which the world, or a process in its own name, publishes: a client's message would be taken for theirs.
 

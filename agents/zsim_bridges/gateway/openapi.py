@@ -14,7 +14,7 @@ from zsim_bridges.gateway.client_messages import is_client_key
 JSON_PREFIX = "/json/"
 ONE_PICTURE = ".jpg"  # end of the path of a single picture
 DEFAULTED = ("t_ns", "seq", "source")  # fields that a client may leave out
-CONTROL_PATHS = ("world/control", "cluster/{cluster}/control")
+CONTROL_PATHS = ("world/control", "cluster/{cluster}/control", "drone/{drone}/control")
 _REF = "#/components/schemas/{name}"
 _OWN_KEY = {"type": "string", "pattern": "^[A-Za-z0-9_.-]{1,64}$"}  # of a client's own key; Zenoh takes more
 _ERRORS = {

@@ -177,7 +177,7 @@ class RecordedAgents(NamedTuple):
 
     processes: tuple[AgentProcess, ...]  # whose agents can be run again; empty if there is a reason not to
     why_not: str  # that reason
-    requests: tuple[tuple[str, run_messages.ClusterRequest], ...]  # to their controllers, in order
+    requests: tuple[tuple[str, run_messages.ClusterRequest], ...]  # to their controllers and pilots, each in order
     fingerprints: frozenset[str]  # numeric, of these processes
     truth_sha256: str | None  # as reported by the world at the end of the run, None if the record has no end
     failure: str  # of a user's code in one of these processes, by which the run ended; empty if there was none
@@ -205,7 +205,7 @@ def recorded_agents(reader: RecordReader, info: messages.Info, scenario: Scenari
     return RecordedAgents(
         processes=() if why_not else tuple(processes),
         why_not=why_not,
-        requests=tuple(_read(reader, "cluster/*/request")),
+        requests=(*_read(reader, "cluster/*/request"), *_read(reader, "drone/*/request")),
         fingerprints=frozenset(join.fingerprint for _, join in ours),
         truth_sha256=next((e.data.get("truth_sha256") for e in reversed(events) if e.kind == "end"), None),
         failure=next((event.text for event in events if _ends_by_failure(event, names)), ""),

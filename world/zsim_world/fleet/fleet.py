@@ -16,12 +16,14 @@ from msgspec import UNSET
 from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import DroneState, state_refusal
+from zsim.contract.keys import SIGHTINGS
 from zsim.contract.messages import RotorInfo
 from zsim.errors import RunError
 from zsim.math.compiled import hold
 from zsim.math.frames import quaternion_from_heading, quaternion_from_rpy
 from zsim.scenario import obstacle
 from zsim.scenario.scenario import Drone, Scenario
+from zsim.sensors.scanner import SCANNERS
 from zsim.sensors.sensor import noise_sigma
 from zsim.vehicles.vehicle import Vehicle
 from zsim.vehicles.vehicle_catalogue import vehicle_of
@@ -50,12 +52,14 @@ from zsim_world.physics.fleet_arrays import (
     state_arrays,
     vehicle_row,
 )
+from zsim_world.physics.rays import TRIANGLE, scene
 from zsim_world.physics.simd import body_blocks
 from zsim_world.physics.surfaces import BALLS, POINTS, SLOTS_MAX, contact_points, obstacle_rows
 from zsim_world.run_state import IN_PLACE, PART, Saved
 from zsim_world.sensors import sensor_set
 from zsim_world.sensors.noise import NoiseTable
 from zsim_world.sensors.sampler import Sampled, Sampler, with_more
+from zsim_world.sensors.scans import Scan, ScanSampler
 from zsim_world.sensors.sensor_set import FleetSensors, fleet_sensors
 from zsim_world.sensors.sightings import PictureSightings, SightingSampler
 from zsim_world.vehicles import firmware, observer
@@ -106,8 +110,9 @@ class Fleet:
         gps_sigma_m: of each drone's fixes.
         impairment: what faults do to it.
         bodies, boards: the arrays that the kernel works on; to be read only.
-        sampled: what fell due for publication in the last gate; a sighting is of the sensor behind all of `sensors`.
-        sightings: among these, by the row of `sampled`.
+        beside: the sensors that see other drones and obstacles, behind all of `sensors`: sightings and scanners.
+        sampled: what fell due for publication in the last gate.
+        seen: what those sensors saw among it, by the row of `sampled`.
         closest_m: least distance between two drones over the last gate; inf for a single one.
         collisions: the pairs of drones whose hulls began to touch in the last gate.
         touching: whether a drone's hull touched another's in the last gate, (N,).
@@ -121,7 +126,7 @@ class Fleet:
         "arrays": IN_PLACE,
         "_streams": IN_PLACE,
         "_sampler": PART,
-        "_sightings": PART,
+        "_seeing": PART,
     }
     sampled: Sampled
     closest_m: float
@@ -151,10 +156,19 @@ class Fleet:
         self._streams = self._noise.streams
         self._w = _initial_arrays(scenario, vehicles, self.sensors, self._noise)
         self._sampler = Sampler(scenario, self.sensors, self._w.senses)
-        has_some = any(drone.sensors.sightings is not UNSET and not drone.is_external for drone in scenario.drones)
         hulls = self._w.bodies.vehicle[:, VEHICLE.hull_radius]
-        self._sightings = SightingSampler(scenario, hulls.copy()) if has_some else None
-        self.sightings: dict[int, PictureSightings] = {}
+        simulated = [drone.sensors for drone in scenario.drones if not drone.is_external]
+        scanned = [name for name in SCANNERS if any(getattr(each, name) is not UNSET for each in simulated)]
+        has_sightings = any(each.sightings is not UNSET for each in simulated)
+        self.beside = (*([SIGHTINGS] if has_sightings else []), *scanned)
+        self._seeing: list[SightingSampler | ScanSampler] = []
+        if has_sightings:
+            self._seeing.append(SightingSampler(scenario, hulls.copy()))
+        if scanned:
+            self._seeing.append(
+                ScanSampler(scenario, hulls.copy(), scene(self._w.bodies.obstacle, np.empty((0, TRIANGLE))))
+            )
+        self.seen: dict[int, PictureSightings | Scan] = {}
         self._held = hold(self._w)
         self.bodies, self.boards = self._w.bodies, self._w.boards
         self.impairment = Impairment(self._w, self.names, vehicles, self.sensors)
@@ -199,29 +213,26 @@ class Fleet:
             self.collisions = [(int(i), int(j)) for i, j in np.argwhere(self.bodies.touched)]
             self.touching[np.argwhere(self.bodies.touched | self.bodies.touching).ravel()] = True
         self.sampled = self._sampler.due(logged, self.t_ns)
-        if self._sightings:
-            self.sightings = {}
-            if sightings := self._sightings.due(self.bodies.state, self.t_ns):
-                self._insert_sightings(sightings)
+        if self._seeing:
+            self.seen = {}
+            seen = [each for sampler in self._seeing for each in sampler.due(self.bodies.state, self.t_ns)]
+            if seen:
+                self._insert_seen(seen)
 
-    def _insert_sightings(self, sightings: list[PictureSightings]) -> None:
-        """Insert sightings into the samples of the gate, after those of the same drone and time."""
-        number = len(self.sensors.names)
-        sightings.sort()
-        rows = [(number, each.drone, each.t_ns, each.t_sample_ns) for each in sightings]
+    def _insert_seen(self, seen: list[PictureSightings | Scan]) -> None:
+        """Insert what was seen into the samples of the gate, after those of the same drone and time."""
+        number = {name: len(self.sensors.names) + place for place, name in enumerate(self.beside)}
+        seen.sort(key=lambda each: (each.t_ns, each.drone, number[each.sensor], each.t_sample_ns, each.camera))
+        rows = [(number[each.sensor], each.drone, each.t_ns, each.t_sample_ns) for each in seen]
         whose, values, places = with_more(*self.sampled, np.array(rows, dtype=np.int64))
         self.sampled = Sampled(whose, values)
-        self.sightings = dict(zip(places.tolist(), sightings, strict=True))
+        self.seen = dict(zip(places.tolist(), seen, strict=True))
 
     # What is the case
 
     @property
     def t_ns(self) -> int:
         return self._tick * self._tick_ns
-
-    @property
-    def has_sightings(self) -> bool:
-        return self._sightings is not None
 
     def rotor_info(self, i: int) -> tuple[RotorInfo, ...]:
         """Return the rotors of a drone as `world/info` names them."""

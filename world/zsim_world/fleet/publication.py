@@ -9,9 +9,8 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.contract import encoding, flight_messages, keys, messages
+from zsim.contract import encoding, flight_messages, messages
 from zsim.contract.encoding import GAP, Layouts, Program, TextTable
-from zsim.contract.flight_messages import Sightings
 from zsim.contract.framing import GateMessages, key_table
 from zsim.errors import UserCodeError, reason_of
 from zsim.math.compiled import Held, compiled, hold, inlined, kernel
@@ -106,7 +105,7 @@ class GatePublication:
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
-        own = [*fleet.sensors.names[STOCK_SENSORS:], *([keys.SIGHTINGS] if fleet.has_sightings else [])]
+        own = [*fleet.sensors.names[STOCK_SENSORS:], *fleet.beside]
         self._encoder = UserMessages(fleet) if own else None
         self.table = key_table(fleet.names, own)
         bodies = fleet.bodies
@@ -122,12 +121,13 @@ class GatePublication:
         self._fleetwide = PublishedState(fleet.touching, sigmas_m, commanders, self.counts, rotors, own_messages)
         self._known: dict[str | None, int] = {None: COMMANDER}
         self._words = encoding.words((*firmware.MODES, None))
-        self._room_beside = 0  # bytes of users' messages
+        payloads = self._payloads()
+        self._room_beside = 2 * len(payloads.data)  # bytes of messages that are encoded in Python
         self._make_room(16 * fleet.count)
         # loads or compiles what the first gate needs, and counts nothing
         uncounted = self._fleetwide._replace(counts=self.counts.copy())
         state = PublicationState(self._words, self._seen, uncounted, self._written)
-        publish(hold(state), *fleet.sampled, *self._payloads(), 0)
+        publish(hold(state), *fleet.sampled, *payloads, 0)
 
     def gate(self, commanders: list[str | None]) -> GateMessages:
         """Return the messages of the present gate; `commanders` has the commander of each drone, None for none."""
@@ -170,33 +170,29 @@ class GatePublication:
 class UserMessages:
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
-        self._seen = len(fleet.sensors.names)  # number of the sightings, behind all sensors
         self._fields = [field_types(kind.message, Sample) for kind in fleet.sensors.types[STOCK_SENSORS:]]
         kinds = zip(fleet.sensors.types[STOCK_SENSORS:], self._fields, strict=True)
         self._messages = [message_type(kind.message.__name__, fields) for kind, fields in kinds]
 
     def encoded(self, counts: NDArray[np.int64]) -> UserPayloads:
         """Return the messages of a gate; counts (N, kinds) of messages that each key has had."""
-        sightings = self._fleet.sightings
-        if not (sightings or self._messages):
+        seen = self._fleet.seen
+        if not (seen or self._messages):
             return NO_PAYLOADS
         whose, values = self._fleet.sampled
-        places = [*sightings]
+        places = [*seen]
         if self._messages:
             places = np.flatnonzero(whose[:, WHOSE.sensor] >= STOCK_SENSORS).tolist()
         sizes, data = np.zeros(len(whose), dtype=np.int64), bytearray()
         seq: dict[tuple[int, int], int] = {}
         for m in places:
-            sighting = sightings.get(m)
             s, i, t_ns, t_sample_ns = whose[m].tolist()
-            if sighting is not None:
-                s, i, t_ns, t_sample_ns = self._seen, sighting.drone, sighting.t_ns, sighting.t_sample_ns
             number = seq.get((i, s), counts.item(i, s + 2))
             seq[i, s] = number + 1
-            if sighting is None:
-                message = self._message(s, i, (t_ns, number, t_sample_ns), values[m])
+            if m in seen:
+                message = seen[m].message(number)
             else:
-                message = Sightings(t_ns, number, t_sample_ns=t_sample_ns, camera=sighting.camera, seen=sighting.seen)
+                message = self._message(s, i, (t_ns, number, t_sample_ns), values[m])
             payload = messages.encode(message)
             sizes[m] = len(payload)
             data += payload

@@ -96,7 +96,10 @@ class Playback(Coordinator):
         self._recorded = info
         self._played = played
         self._operations |= {"seek": self._seek, "timeline": self._timeline, "views": self._views_of_past}
-        self.refused_queries = tuple(keys.cluster_control(cluster.name) for cluster in scenario.clusters)
+        self.refused_queries = (
+            *(keys.cluster_control(cluster.name) for cluster in scenario.clusters),
+            *(keys.drone_control(drone) for drone in scenario.piloted()),
+        )
         self._cameras = {drone.name: drone.sensors.cameras() for drone in scenario.drones}
         self._table = run_key_table(info)
         self._kinds = len(self._table) // len(self.names)  # of messages about a drone
@@ -469,6 +472,8 @@ def _author(recorded: Recorded) -> str:
     kind = messages.type_of(recorded.key)
     if kind is flight_messages.Estimate:
         return f"estimator.{keys.thing(recorded.key)}"
+    if recorded.key.startswith("drone/") and kind in (flight_messages.Reference, run_messages.ClusterRequest):
+        return f"{roles.PILOT}.{keys.thing(recorded.key)}"
     if kind in (flight_messages.ClusterState, run_messages.ClusterRequest):
         return f"controller.{keys.thing(recorded.key)}"
     if kind is None or not issubclass(kind, SOURCED):

@@ -12,6 +12,7 @@ from zsim import CONTRACT, __version__
 from zsim.contract import keys, messages
 from zsim.contract.fingerprint import TruthHash, fingerprint
 from zsim.contract.flight_messages import DroneView, Status, ViewDrones
+from zsim.contract.keys import SIGHTINGS
 from zsim.contract.snapshot import State
 from zsim.errors import UserCodeError
 from zsim.runtime.agent import Output
@@ -124,7 +125,8 @@ class World(Coordinator):
             version=__version__,
             fingerprint=fingerprint(),
             user_sensors=user_sensors or UNSET,
-            sightings=self.fleet.has_sightings or UNSET,
+            sightings=SIGHTINGS in self.fleet.beside or UNSET,
+            scanners=tuple(name for name in self.fleet.beside if name != SIGHTINGS) or UNSET,
             module_folders=tuple(map(str, plugin.folders())) if s.own_code() else UNSET,
             changed=self._changed,
             user_messages=tuple(s.own_messages()) or UNSET,

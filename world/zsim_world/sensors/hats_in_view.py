@@ -30,6 +30,7 @@ from zsim.math.rotation import (
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import Lens, camera_pose, lens_of, pixel, spread
 from zsim_world.physics.fleet_arrays import STATE
+from zsim_world.physics.rays import HULL_FLATNESS
 from zsim_world.physics.rigid_body import four, vector
 from zsim_world.physics.surfaces import nearest
 
@@ -51,7 +52,6 @@ CAMERA = columns(  # as mounted on a drone
     "CameraColumns", (Field("lens", "1, px", 11), Field("p_BK", "m", 3), Field("q_BK", "1", 4))
 )
 AHEAD_MIN = 0.05  # cosine to the axis; flatter rays never fall on a picture of 150 deg
-HULL_FLATNESS = 0.25  # height over width of a hull, the AR.Drone's rounded: 0.13 m of 0.52 m
 RIM_WIDE, RIM_HIGH = 1.15, 0.14  # radius and height of the rotors' rim, in radii of a hull; fitted to pictures
 POINTS = 32  # of its edge, that are looked at
 COSINES, SINES = (np.array([f(2.0 * math.pi * k / POINTS) for k in range(POINTS)]) for f in (math.cos, math.sin))

@@ -14,7 +14,8 @@ import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-from zsim.contract.flight_messages import Seen
+from zsim.contract.flight_messages import Seen, Sightings
+from zsim.contract.keys import SIGHTINGS
 from zsim.math.compiled import Field, Held, columns, compiled, hold, inlined, kernel
 from zsim.math.random_streams import stream
 from zsim.math.rotation import Vector
@@ -22,8 +23,8 @@ from zsim.scenario.obstacle import COLUMNS, row_of
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import Camera, Hats, SightingModel
 from zsim.sensors.camera_model import Lens, camera_pose, undistorted
-from zsim_world.physics.fleet_arrays import STATE
-from zsim_world.run_state import IN_PLACE, Saved
+from zsim_world.run_state import IN_PLACE, PART, Saved
+from zsim_world.sensors.exposures import Between, Exposures
 from zsim_world.sensors.hats_in_view import CAMERA, VIEW, camera_row, hats_in_view, mounted, poses_between
 from zsim_world.sensors.noise import WORDS, fill, words
 
@@ -41,6 +42,13 @@ class PictureSightings(NamedTuple):
     camera: str
     seen: tuple[Seen, ...]  # in an order that does not tell whose hats they are
 
+    @property
+    def sensor(self) -> str:
+        return SIGHTINGS
+
+    def message(self, seq: int) -> Sightings:
+        return Sightings(self.t_ns, seq, t_sample_ns=self.t_sample_ns, camera=self.camera, seen=self.seen)
+
 
 class Surroundings(NamedTuple):
     """The W cameras and what they look at, for compiled code; N drones."""
@@ -56,12 +64,11 @@ class Surroundings(NamedTuple):
     obstacles: Array  # (O, COLUMNS)
 
 
-class _Exposures(NamedTuple):
-    """When a camera takes pictures, and the delay until its sightings are published."""
+class _Pictures(NamedTuple):
+    """Whose pictures a detector looks at, and the delay from an exposure to its sightings' publication."""
 
     drone: int
     name: str
-    rate_hz: float
     latency_ns: int
 
 
@@ -70,12 +77,8 @@ class SightingSampler:
 
     SAVED: ClassVar[Saved] = {
         "_streams": IN_PLACE,
-        "_counts": list[int],
-        "_due_ns": list[int],
-        "_next_ns": int,
+        "_exposures": PART,
         "_later": list[PictureSightings],
-        "_former": np.ndarray,
-        "_former_ns": int,
     }
 
     def __init__(self, scenario: Scenario, hulls: Array) -> None:
@@ -83,10 +86,12 @@ class SightingSampler:
         hats = Hats() if env.hats is UNSET else env.hats
         light = 1.0 if env.light is UNSET else env.light
         watching = list(_watching(scenario))
-        self._exposures = [
-            _Exposures(i, name, camera.rate_hz, round((camera.latency_ms + model.latency_ms) * 1e6))
+        self._pictures = [
+            _Pictures(i, name, round((camera.latency_ms + model.latency_ms) * 1e6))
             for i, name, camera, model in watching
         ]
+        gate_ns = round(scenario.time.gate_ms * 1e6)
+        self._exposures = Exposures([camera.rate_hz for *_, camera, _ in watching], gate_ns)
         generators = [stream(scenario.seed, f"{scenario.drones[i].name}/sightings/{name}") for i, name, *_ in watching]
         detectors = [
             _detector(camera, model, hats, light, rng)
@@ -106,46 +111,27 @@ class SightingSampler:
         )
         self._held = hold(surroundings)
         self._streams = np.array([words(rng) for rng in generators], dtype=np.uint64).reshape(-1, WORDS.size)
-        self._counts = [0] * len(watching)
-        self._due_ns = [0] * len(watching)  # the next picture of each
-        self._next_ns = 0  # the soonest of all
         self._later: list[PictureSightings] = []
-        self._gate_ns = round(scenario.time.gate_ms * 1e6)
-        self._former = np.empty((0, STATE.size))  # states of the last gate before a picture
-        self._former_ns = 0
 
     def due(self, state: Array, now_ns: int) -> list[PictureSightings]:
         """Return what is due by a gate, given the state of all drones there, (N, STATE.size or more)."""
-        if self._next_ns <= now_ns:
-            self._look(state[:, : STATE.size].copy(), now_ns)
-        if self._next_ns <= now_ns + self._gate_ns:  # a picture before the next gate needs this state
-            self._former, self._former_ns = state[:, : STATE.size].copy(), now_ns
+        pictures, between = self._exposures.until(state, now_ns)
+        if between is not None:
+            self._look(pictures, between)
         if not self._later:
             return []
         due = [sighting for sighting in self._later if sighting.t_ns <= now_ns]
         self._later = [sighting for sighting in self._later if sighting.t_ns > now_ns]
         return due
 
-    def _look(self, now: Array, now_ns: int) -> None:
-        """Take all pictures up to a gate, and keep their sightings until they are due."""
-        pictures: list[tuple[int, int]] = []  # instant and camera
-        for w, exposures in enumerate(self._exposures):
-            while self._due_ns[w] <= now_ns:
-                pictures.append((self._due_ns[w], w))
-                self._counts[w] += 1
-                self._due_ns[w] = round(self._counts[w] * 1e9 / exposures.rate_hz)
-        pictures.sort()
-        self._next_ns = min(self._due_ns)
-        first = not len(self._former)
-        former, former_ns = (now, now_ns) if first else (self._former, self._former_ns)
+    def _look(self, pictures: list[tuple[int, int]], between: Between) -> None:
+        """Look at pictures, by instant and camera, and keep their sightings until they are due."""
         which = np.array(pictures, dtype=np.int64)
         seen: list[list[Seen]] = [[] for _ in pictures]
-        for picture, x, y, z, range_m, sigma, sigma_m in look(
-            which, former, former_ns, now, now_ns, self._held, self._streams
-        ).tolist():
+        for picture, x, y, z, range_m, sigma, sigma_m in look(which, *between, self._held, self._streams).tolist():
             seen[int(picture)].append(Seen((x, y, z), range_m, sigma, sigma_m))
         for (at_ns, w), of_picture in zip(pictures, seen, strict=True):
-            drone, name, _, latency_ns = self._exposures[w]
+            drone, name, latency_ns = self._pictures[w]
             self._later.append(PictureSightings(at_ns + latency_ns, drone, at_ns, name, tuple(of_picture)))
 
 

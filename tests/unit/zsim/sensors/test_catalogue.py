@@ -14,6 +14,7 @@ from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim.schema.declared_message import field_types
 from zsim.sensors import sensor_catalogue
+from zsim.sensors.scanner import SCANNERS
 from zsim.sensors.sensor import Sample, as_fields, message_type
 from zsim.sensors.sensor_catalogue import FIELDS, PRESETS, STOCK, declarations
 
@@ -46,7 +47,7 @@ def paths(**given: Any) -> list[str]:
 
 def test_the_stock_sensors_are_those_of_a_scenario():
     assert tuple(STOCK) == FIELDS[2 : 2 + len(STOCK)] == keys.SENSORS
-    assert FIELDS[2 + len(STOCK) :] == ("front_camera", "bottom_camera", keys.SIGHTINGS)
+    assert FIELDS[2 + len(STOCK) :] == ("front_camera", "bottom_camera", keys.SIGHTINGS, *SCANNERS)
     for name, kind in STOCK.items():
         assert messages.type_of(keys.sensor("d1", name)) is kind.message
         assert {channel.settings for channel in kind.channels} < set(kind.settings.__struct_fields__)
@@ -85,7 +86,7 @@ def test_a_module_that_declares_another_message_than_the_scenario_is_refused():
 @pytest.mark.parametrize(
     ("sensors", "where"),
     [
-        ({"lidar": {"rate_hz": 5}}, "sensors.lidar"),
+        ({"sodar": {"rate_hz": 5}}, "sensors.sodar"),
         ({"own": {"rate_hz": 5}}, "sensors.own"),
         ({"Uwb": UWB}, "sensors.Uwb"),
         ({"status": UWB}, "sensors.status"),

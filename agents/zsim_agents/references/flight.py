@@ -1,0 +1,382 @@
+"""The flights of a scenario's drones that have references of their own: take-off, the way to a path, the path. Pure.
+
+A flight is judged before it is flown: its speeds, turns and horizontal accelerations against the drone's limits, its
+heights, and its distance from the flights of the others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zsim.contract.flight_messages import ReferencePhase
+from zsim.errors import DocumentError, NotTrustedError, RunError
+from zsim.scenario.scenario import Drone, DroneReference, Exchange, PathPoint, Piloted, Scenario
+from zsim.vehicles.vehicle_catalogue import vehicle_of
+from zsim_agents.formation.expression import ExpressionError
+from zsim_agents.formation.spaces.cluster_space import Array
+from zsim_agents.formation.trajectory import ExpressionTrajectory, Reference, TrajectoryError, WaypointTrajectory
+from zsim_agents.references.assignment import assign, first_approach
+from zsim_agents.references.generators import Laps, circle, figure_eight
+from zsim_agents.references.path import (
+    EndMotion,
+    PathLimits,
+    Peaks,
+    PiecewisePolynomial,
+    Scaled,
+    minimum_snap,
+    move,
+    peaks_of,
+    round_up,
+)
+
+READY_S = 4.0  # least from the order to take off to the first way: an AR.Drone takes 4 s or more
+SHARE = 0.8  # of the drone's limits, as in formations: the rest is for the feedback
+WAY_SHARE = 0.5  # of them, for the way to a path, which nobody wants to be fast; chosen
+ROUNDING = 1.0 + 1e-9  # of a factor that just fits
+HEIGHT_MIN_M = 0.2  # over the ground, chosen: above most of the ground effect of the smallest
+SAMPLES_MAX, SAMPLE_S = 4001, 0.05  # of heights
+PLACE_NAMES = ("x", "y", "z", "yaw")
+QUANTITIES = (
+    ("horizontal speed", "m/s"),
+    ("climb", "m/s"),
+    ("yaw rate", "rad/s"),
+    ("horizontal acceleration", "m/s^2"),
+)
+
+
+class FlightError(ValueError):
+    """A flight is not possible; `path` is of the field below the reference or the exchange, the text follows it."""
+
+    def __init__(self, path: str, text: str) -> None:
+        super().__init__(f"{path} {text}".strip())
+        self.path, self.text = path, text
+
+
+class Place:
+    """The variables of one drone, as those of a cluster space."""
+
+    names = PLACE_NAMES
+    in_radians = np.array([False, False, False, True])
+
+    def index(self, name: str) -> int:
+        if name not in self.names:
+            raise ValueError(f"{name[:40]!r} is unknown; allowed: {', '.join(self.names)}, yaw_deg")
+        return self.names.index(name)
+
+    def difference(self, c_to: Array, c_from: Array) -> Array:
+        change = c_to - c_from
+        change[3] = math.remainder(change[3], math.tau)
+        return change
+
+
+class Leg(NamedTuple):
+    """A part of a flight: a path from start_s of simulated time on."""
+
+    start_s: float
+    path: Reference
+    phase: ReferencePhase
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """Where a drone is to be at every simulated time [s]: a `Reference`.
+
+    Before its first leg it is at `hover` (4,), to which the take-off leads; each leg holds its end until the next.
+    """
+
+    hover: Array
+    legs: tuple[Leg, ...] = ()
+
+    @property
+    def duration_s(self) -> float | None:
+        if not self.legs:
+            return 0.0
+        last = self.legs[-1].path.duration_s
+        return None if last is None else self.legs[-1].start_s + last
+
+    def leg_at(self, t_s: float) -> Leg | None:
+        return next((leg for leg in reversed(self.legs) if leg.start_s <= t_s), None)
+
+    def value(self, t_s: float) -> tuple[Array, Array]:
+        leg = self.leg_at(t_s)
+        return (self.hover, np.zeros(4)) if leg is None else leg.path.value(t_s - leg.start_s)
+
+    def phase(self, t_s: float) -> tuple[ReferencePhase, float | None]:
+        """Return what is flown, and the path's own time where it is a path."""
+        leg = self.leg_at(t_s)
+        if leg is None:
+            return "holding", None
+        own_s, end_s = t_s - leg.start_s, leg.path.duration_s
+        if end_s is not None and own_s > end_s:
+            return "holding", None
+        return leg.phase, own_s if leg.phase == "path" else None
+
+    def peaks(self) -> Peaks:
+        """Return the peaks of all legs."""
+        each = [peaks_of(leg.path) for leg in self.legs]
+        speed, climb, turn, accel = np.max([[0.0] * 4, *(peaks[:4] for peaks in each)], axis=0).tolist()
+        return Peaks(speed, climb, turn, accel, at_s=(0.0, 0.0, 0.0, 0.0))
+
+
+def limits_of(drone: Drone, gravity_m_s2: float) -> PathLimits:
+    """Return what a path may ask of a drone at most: the limits of its firmware, its tilt as an acceleration."""
+    own = drone.limits
+    accel = gravity_m_s2 * math.tan(math.radians(own.tilt_deg))
+    return PathLimits(own.horizontal_speed_m_s, own.vertical_speed_m_s, math.radians(own.yaw_rate_deg_s), accel)
+
+
+def hover_of(drone: Drone) -> Array:
+    """Return where a drone hovers after its take-off (4,)."""
+    x, y, z = drone.position_m
+    return np.array([x, y, z + drone.takeoff_height_m, math.radians(drone.yaw_deg)])
+
+
+def flight_of(scenario: Scenario, drone: str) -> Flight:
+    """Return the flight of a drone that has a reference, or is in an exchange; FlightError: it cannot be flown."""
+    flown = scenario.piloted()[drone]
+    if isinstance(flown, Exchange):
+        return exchange_flights(scenario, flown)[drone]
+    spec = scenario.drone(drone)
+    limits, hover = limits_of(spec, scenario.environment.gravity_m_s2), hover_of(spec)
+    if flown.start_s is None:
+        return Flight(hover)
+    path = fitted_path(flown, limits, hover[3], spec.limits.altitude_m)
+    way = way_to(hover, path, limits)
+    from_s, least_s = flown.start_s - (way.duration_s or 0.0), flown.takeoff_s + READY_S
+    if from_s < least_s:
+        needed = f"must be >= {least_s + (way.duration_s or 0.0):.2f}: it takes off at {flown.takeoff_s:g} s, then the"
+        raise FlightError("start_s", f"is {flown.start_s:g}; {needed} way to the path takes {way.duration_s:.2f} s")
+    return Flight(hover, (Leg(from_s, way, "approaching"), Leg(flown.start_s, path, "path")))
+
+
+def way_to(start: Array, path: Reference, limits: PathLimits, begin: EndMotion | None = None) -> PiecewisePolynomial:
+    """Return the way from a place (4,) onto the beginning of a path, in its motion; FlightError: it is too fast."""
+    place, rate = path.value(0.0)
+    end = EndMotion(rate, np.zeros(4), np.zeros(4)) if rate.any() else None
+    own = limits.share(SHARE if rate.any() else WAY_SHARE)
+    try:
+        return move(start, place, own, begin=begin, end=end)
+    except TrajectoryError as error:
+        raise FlightError("", str(error)) from None
+
+
+def fitted_path(spec: DroneReference, limits: PathLimits, yaw: float, altitude_max_m: float) -> Reference:
+    """Return the path of a reference, as slow as it asks for, or as the limits need where it is to fit.
+
+    Raises:
+        FlightError: it cannot be read, is too fast, too low or too high; names the field.
+    """
+    (kind,) = spec.paths()
+    try:
+        own = _paths_of(spec, yaw)[kind]()
+        origin = np.array([*spec.origin_m, 0.0])
+        path = Scaled(own, spec.time_scale, origin)
+        factor = peaks_of(path).factor(limits.share(SHARE))
+        if factor > ROUNDING:
+            if not spec.fit:
+                raise FlightError("", _too_fast(path.peaks(), limits, factor, f"time_scale {spec.time_scale:g}"))
+            path = replace(path, factor=spec.time_scale * round_up(factor))
+        _check_heights(path, altitude_max_m)
+    except TrajectoryError as error:
+        raise FlightError(f"{kind}", str(error)) from None
+    except ExpressionError as error:
+        raise FlightError(f"expressions.{error.name}" if error.name else "expressions", error.finding) from None
+    return path
+
+
+def _paths_of(spec: DroneReference, yaw: float) -> Mapping[str, Callable[[], Reference]]:
+    """Return what makes the path of each kind; `yaw` is the heading [rad] of one that has none."""
+    base = np.array([0.0, 0.0, 0.0, yaw])
+
+    def expressions() -> Reference:
+        return ExpressionTrajectory(Place(), spec.expressions, base, spec.constants, spec.duration_s)
+
+    def laps(curve: Any, of: Any) -> Reference:
+        return Laps(lambda angle: _turned(curve(angle), yaw), of.period_s, of.laps)
+
+    round_, eight = spec.circle, spec.figure_eight
+    return {
+        "waypoints": lambda: WaypointTrajectory(Place(), _named(spec.waypoints), base),
+        "minimum_snap": lambda: _through(spec.minimum_snap, yaw),
+        "expressions": expressions,
+        "pieces": lambda: _polynomials(spec),
+        "circle": lambda: laps(circle(round_.radius_m, round_.climb_m), round_) if round_ else Flight(base),
+        "figure_eight": lambda: laps(figure_eight(eight.length_m, eight.width_m), eight) if eight else Flight(base),
+    }
+
+
+def _turned(at: tuple[Array, Array], yaw: float) -> tuple[Array, Array]:
+    at[0][3] = yaw
+    return at
+
+
+def _named(points: Sequence[PathPoint]) -> list[dict[str, Any]]:
+    """Return points as waypoints by the names of variables."""
+    named = []
+    for point in points:
+        values: dict[str, float] = dict(zip(PLACE_NAMES, point.position_m, strict=False))
+        if point.yaw_deg is not None:
+            values["yaw_deg"] = point.yaw_deg
+        named.append({"at_s": point.at_s, "values": values})
+    return named
+
+
+def _through(points: Sequence[PathPoint], yaw: float) -> Reference:
+    """Return the minimum-snap path through points, which begins at the time of the first; yaw by the shorter way."""
+    places = np.empty((len(points), 4))
+    for row, point in zip(places, points, strict=True):
+        wanted = yaw if point.yaw_deg is None else math.radians(point.yaw_deg)
+        yaw += math.remainder(wanted - yaw, math.tau)
+        row[:] = *point.position_m, yaw
+    times = [point.at_s for point in points]
+    path = minimum_snap([t - times[0] for t in times], places)
+    if not times[0]:
+        return path
+    rest = np.zeros((1, *path.coefficients.shape[1:]))
+    rest[0, 0] = places[0]
+    durations = np.concatenate(([times[0]], path.durations_s))
+    return PiecewisePolynomial(durations, np.concatenate((rest, path.coefficients)))
+
+
+def _polynomials(spec: DroneReference) -> Reference:
+    coefficients = np.zeros((len(spec.pieces), 8, 4))
+    for own, piece in zip(coefficients, spec.pieces, strict=True):
+        for k, terms in enumerate((piece.x, piece.y, piece.z, piece.yaw)):
+            own[: len(terms), k] = terms
+    return PiecewisePolynomial(np.array([piece.duration_s for piece in spec.pieces]), coefficients)
+
+
+def _too_fast(peaks: Peaks, limits: PathLimits, factor: float, now: str) -> str:
+    """Return what of a path is beyond the limits, and the factor that would fit."""
+    shares = [own / most for own, most in zip(peaks[:4], limits, strict=True)]
+    weighed = [*shares[:3], math.sqrt(shares[3] * SHARE)]  # as in `Peaks.factor`, which this explains
+    worst = int(np.argmax(weighed))
+    what, unit = QUANTITIES[worst]
+    found = f"needs a {what} of {peaks[worst]:.3g} {unit} at {peaks.at_s[worst]:.2f} s"
+    allowed = f"must be at most {SHARE * limits[worst]:.3g}, {SHARE:g} of the drone's limit"
+    return f"{found}; {allowed}: fly it {round_up(factor):g} times as slowly ({now}), or set fit: true"
+
+
+def _check_heights(path: Reference, altitude_max_m: float) -> None:
+    end_s = path.duration_s
+    end_s = 600.0 if end_s is None else end_s
+    times = np.linspace(0.0, end_s, min(max(math.ceil(end_s / SAMPLE_S) + 1, 2), SAMPLES_MAX)).tolist()
+    heights = [float(path.value(t)[0][2]) for t in times]
+    low = int(np.argmin(heights))
+    if heights[low] < HEIGHT_MIN_M:
+        found = f"leads to z = {heights[low]:.2f} m at {times[low]:.2f} s"
+        raise FlightError("", f"{found}; must be >= {HEIGHT_MIN_M:g} m: raise origin_m[2]")
+    high = int(np.argmax(heights))
+    if heights[high] > altitude_max_m:
+        found = f"leads to z = {heights[high]:.2f} m at {times[high]:.2f} s"
+        raise FlightError("", f"{found}; must be <= {altitude_max_m:g} m, its limits.altitude_m")
+
+
+def exchange_flights(scenario: Scenario, exchange: Exchange) -> dict[str, Flight]:
+    """Return the flights of an exchange by drone: each stage assigned, straight, with one function of time for all.
+
+    Raises:
+        FlightError: a stage is too fast, too low, or begins too early.
+    """
+    specs = [scenario.drone(name) for name in exchange.drones]
+    gravity = scenario.environment.gravity_m_s2
+    limits = [limits_of(spec, gravity).share(SHARE) for spec in specs]
+    places = np.array([hover_of(spec) for spec in specs])
+    hovers, legs = places.copy(), [list[Leg]() for _ in specs]
+    free_s = exchange.takeoff_s + READY_S
+    for number, stage in enumerate(exchange.stages):
+        at = f"stages[{number}]"
+        if stage.start_s < free_s:
+            raise FlightError(f"{at}.start_s", f"is {stage.start_s:g}; must be >= {free_s:.2f}, when all are ready")
+        for index, (_, _, z) in enumerate(stage.places_m):
+            if z < HEIGHT_MIN_M:
+                raise FlightError(f"{at}.places_m[{index}][2]", f"is {z:g}; must be >= {HEIGHT_MIN_M:g}")
+        goals = places.copy()
+        goals[:, :3] = np.array(stage.places_m)[assign(places[:, :3], np.array(stage.places_m))]
+        ways = [minimum_snap((0.0, 1.0), np.array(ends)) for ends in zip(places, goals, strict=True)]
+        least_s = max(way.peaks().factor(own) for way, own in zip(ways, limits, strict=True))
+        over_s = stage.over_s
+        if least_s > over_s * ROUNDING:
+            if not exchange.fit:
+                needed = f"must be >= {round_up(least_s):g} for the longest way, or set fit: true"
+                raise FlightError(f"{at}.over_s", f"is {over_s:g}; {needed}")
+            over_s = round_up(least_s)
+        for own, way in zip(legs, ways, strict=True):
+            scale = over_s ** np.arange(way.coefficients.shape[1])[:, None]
+            slowed = PiecewisePolynomial(np.array([over_s]), way.coefficients / scale)
+            own.append(Leg(stage.start_s, slowed, "path"))
+        places, free_s = goals, stage.start_s + over_s
+    pairs = zip(exchange.drones, hovers, legs, strict=True)
+    return {name: Flight(hover, tuple(own)) for name, hover, own in pairs}
+
+
+def land_s_of(flown: Piloted) -> float:
+    return math.inf if flown.land_s is None else flown.land_s
+
+
+# All of a scenario
+
+
+def flight_faults(scenario: Scenario) -> Iterator[tuple[str, str]]:
+    """Yield path and text of what cannot be flown of all references, and where two of them come too near."""
+    flights: dict[str, Flight] = {}
+    exchanges = [] if not isinstance(scenario.exchanges, list) else scenario.exchanges
+    sound = True
+    for index, exchange in enumerate(exchanges):
+        try:
+            flights |= exchange_flights(scenario, exchange)
+        except FlightError as fault:
+            sound = False
+            yield f"exchanges[{index}]{'.' * bool(fault.path)}{fault.path}", fault.text
+    for index, drone in enumerate(scenario.drones):
+        if isinstance(drone.reference, DroneReference):
+            try:
+                flights[drone.name] = flight_of(scenario, drone.name)
+            except FlightError as fault:
+                sound = False
+                path = f"drones[{index}].reference{'.' * bool(fault.path)}{fault.path}"
+                yield path, f"{fault.text} (drone {drone.name!r})"
+    if sound and (text := too_near(scenario, flights)):
+        yield "drones", text
+
+
+def too_near(scenario: Scenario, flights: Mapping[str, Flight]) -> str | None:
+    """Return which drones' flights come nearer than both need for themselves; None if none do."""
+    names = [*flights]
+    try:
+        clearance = np.array([vehicle_of(scenario.drone(name).model).airframe.clearance_m for name in names])
+    except (NotTrustedError, DocumentError):
+        return None  # that of a user's vehicle, which is not read here
+    ends = [flight.duration_s for flight in flights.values()]
+    until_s = min(max((scenario.duration_s if end is None else end for end in ends), default=0.0), scenario.duration_s)
+    if len(names) < 2 or until_s <= 0.0:
+        return None
+    found = first_approach([*flights.values()], clearance, until_s)
+    if found is None:
+        return None
+    pair = f"{names[found.first]} and {names[found.second]}"
+    least = float(clearance[found.first] + clearance[found.second])
+    near = f"{pair} are {found.distance_m:.2f} m apart at {found.t_s:.2f} s"
+    return f"have references by which {near}; must be >= {least:g} m"
+
+
+def checked_flight(scenario: Scenario, drone: str) -> Flight:
+    """Return the flight of a drone; of the first one that has any, all are compared with each other.
+
+    Raises:
+        RunError: it cannot be flown.
+    """
+    try:
+        flight = flight_of(scenario, drone)
+    except FlightError as fault:
+        raise RunError(f"reference of {drone}: {fault}") from fault
+    if drone == next(iter(scenario.piloted())):
+        wrong = next(flight_faults(scenario), None)
+        if wrong is not None:
+            raise RunError(f"{wrong[0]} {wrong[1]}")
+    return flight

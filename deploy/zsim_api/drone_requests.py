@@ -1,0 +1,64 @@
+"""A drone that flies by a reference of its own, asked from Python: `sim.drone("drone1").goto((1, 2, 3))`."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from zsim.contract import keys
+
+Ask = Callable[..., dict[str, Any]]
+"""`ask` of a `Simulation` or a `Federation`: key, op and arguments; RequestRefusedError with the reason."""
+
+
+class PilotedDrone:
+    """The requests to the pilot of one drone; see docs/references.md.
+
+    Each acts from the next gate on, and raises RequestRefusedError with the reason: the drone has no `reference` in the
+    scenario, is not in the air, or cannot fly what is asked.
+
+    Attributes:
+        name: of the drone.
+    """
+
+    def __init__(self, name: str, ask: Ask) -> None:
+        self.name = name
+        self._ask, self._key = ask, keys.drone_control(name)
+
+    def goto(
+        self, position_m: Sequence[float] | np.ndarray, yaw_deg: float | None = None, over_s: float | None = None
+    ) -> float:
+        """Fly to a place in W, to rest there; return the simulated time [s] of arrival.
+
+        Args:
+            yaw_deg: heading there; None for the present one.
+            over_s: how long; None, or less than the drone's limits need, for as fast as these let it.
+        """
+        given = {"yaw_deg": yaw_deg, "over_s": over_s}
+        place = [float(each) for each in position_m]
+        result = self._ask(self._key, "goto", position_m=place, **{k: v for k, v in given.items() if v is not None})
+        return float(result["until_s"])
+
+    def follow(self, **path: Any) -> float | None:
+        """Fly to the beginning of a path, then the path; return the simulated time [s] of its end, None if it has none.
+
+        Args:
+            path: fields of a reference as in a scenario: `minimum_snap=[{"at_s": 0, "position_m": [0, 0, 2]}, …]`,
+                `circle={"radius_m": 2, "period_s": 10}`, `fit=True`, `origin_m=…`.
+        """
+        return self._ask(self._key, "follow", **path)["until_s"]
+
+    def hold(self) -> None:
+        """Come to rest."""
+        self._ask(self._key, "hold")
+
+    def land(self) -> None:
+        """Land where it is."""
+        self._ask(self._key, "land")
+
+    def takeoff(self) -> None:
+        """Take off again after a landing."""
+        self._ask(self._key, "takeoff")
+
+    def __repr__(self) -> str:
+        return f"<PilotedDrone {self.name}>"

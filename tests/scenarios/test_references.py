@@ -1,0 +1,98 @@
+"""Drones along references of their own: how well, with the same bits however they are run, and as they are asked."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import zsim
+from zsim.errors import RequestRefusedError
+from zsim_analysis.rerun import rerun_record
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+AXES = ["position_m_x", "position_m_y", "position_m_z"]
+SHORT = """
+name: short
+duration_s: 12
+drones:
+  - name: d1
+    model: crazyflie2
+    position_m: [0, 0, 0]
+    reference:
+      {takeoff_s: 0.2, start_s: 6, lead_s: 0.55, land_s: 11,
+       minimum_snap: [{at_s: 0, position_m: [0.5, 0, 0.7]}, {at_s: 2, position_m: [1, 0.5, 0.7]}, {at_s: 4, position_m: [1, 1, 1]}]}
+  - {name: d2, model: crazyflie2, position_m: [3, 0, 0], reference: {takeoff_s: 0.2}}
+"""
+
+
+def off(run: zsim.Run, drone: str, phase: str = "path") -> np.ndarray:
+    """Return how far the truth is from the reference [m] while it is in a phase."""
+    reference, truth = run.messages(f"drone/{drone}/reference"), run.truth(drone)
+    at = reference.index[reference.phase == phase]
+    return np.linalg.norm(truth.loc[at, AXES].to_numpy() - reference.loc[at, AXES].to_numpy(), axis=1)
+
+
+def test_six_drones_fly_the_public_swap(tmp_path: Path) -> None:
+    """Each stays with its reference, nobody comes near another, and all land where another one started."""
+    run = zsim.run(EXAMPLES / "swap.yaml", out=tmp_path / "run", progress=False)
+    assert run.as_planned, run.shortfalls
+    errors = [off(run, drone) for drone in run.drones]
+    assert all(np.sqrt(np.mean(each**2)) < 0.12 for each in errors)
+    truth = [run.truth(drone)[AXES].to_numpy() for drone in run.drones]
+    apart = [np.linalg.norm(a - b, axis=1).min() for i, a in enumerate(truth) for b in truth[:i]]
+    assert min(apart) > 0.2  # two clearances; the references come to 0.305 m
+    for drone, other in zip(truth, reversed(truth), strict=True):
+        assert np.linalg.norm((drone[-1] - other[0])[:2]) < 0.3
+
+
+def test_as_processes_after_a_death_and_flown_again_they_have_the_same_bits(tmp_path: Path, compiled: None) -> None:
+    (tmp_path / "short.yaml").write_text(SHORT)
+    alone = zsim.run(tmp_path / "short.yaml", out=tmp_path / "alone", progress=False)
+    assert off(alone, "d1").max() < 0.3
+    with zsim.Federation(tmp_path / "short.yaml", out=tmp_path / "many") as flight:
+        flight.wait_until(7.0)
+        flight.kill("reference.d1")
+        run = flight.run()
+    assert run.truth_sha256 == alone.truth_sha256
+    assert "reference.d1" in [*run.events[run.events.kind == "restart"].subject]
+    said: list[str] = []
+    assert rerun_record(tmp_path / "many", False, said.append, said.append) == ""
+
+
+def test_a_drone_flies_where_it_is_asked_to_and_a_rerun_does_too(tmp_path: Path) -> None:
+    (tmp_path / "short.yaml").write_text(SHORT)
+    with zsim.Simulation(tmp_path / "short.yaml", duration_s=30, record=tmp_path / "run") as sim:
+        with pytest.raises(RequestRefusedError):
+            sim.drone("d2").goto((3, 2, 1))  # it has not taken off
+        sim.run(until_s=5)
+        d2 = sim.drone("d2")
+        until_s = d2.goto((3, 2, 1), yaw_deg=90)
+        sim.run(until_s=until_s - 1)
+        before = sim.snapshot()
+        sim.run(until_s=until_s + 2)
+        assert sim.truth.position_m[1] == pytest.approx([3, 2, 1], abs=0.25)
+        assert sim.estimates.yaw_rad[1] == pytest.approx(np.pi / 2, abs=0.15)
+        d2.follow(circle={"radius_m": 0.5, "period_s": 6}, origin_m=(3, 2, 1))
+        sim.run(until_s=until_s + 4)
+        d2.hold()
+        sim.run(until_s=until_s + 7)
+        assert np.linalg.norm(sim.truth.velocity_m_s[1]) < 0.15
+        d2.land()
+        sim.run(until_s=29.9)
+        assert sim.state("d2") == "landed"
+        assert before is not None
+    said: list[str] = []
+    assert rerun_record(tmp_path / "run", False, said.append, said.append) == ""
+
+
+@pytest.mark.parametrize("op", ["goto", "follow"])
+def test_who_has_no_pilot_cannot_be_asked(op: str, tmp_path: Path) -> None:
+    arguments: dict[str, Any] = {
+        "goto": {"position_m": (0, 0, 1)},
+        "follow": {"circle": {"radius_m": 1, "period_s": 9}},
+    }[op]
+    scenario = {"name": "one", "duration_s": 1, "drones": [{"name": "d1", "position_m": [0, 0, 0]}]}
+    drone = zsim.Simulation(scenario).drone("d1")
+    with pytest.raises(RequestRefusedError):
+        getattr(drone, op)(**arguments)

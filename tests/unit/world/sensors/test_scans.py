@@ -1,0 +1,171 @@
+"""Scans of a fleet against closed forms: directions, errors, other drones, instants, and what is lost."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from zsim.contract import messages
+from zsim.contract.messages import Depth, Lidar, Range
+from zsim.contract.snapshot import pack, unpack
+from zsim.math.frames import rotation_matrix
+from zsim.scenario.scenario_file import resolve
+from zsim.sensors.scanner import SCANNERS
+from zsim_world.fleet.fleet import Fleet
+from zsim_world.fleet.publication import GatePublication
+from zsim_world.physics.fleet_arrays import VEHICLE
+from zsim_world.run_state import restore, saved_state
+
+WALL = {"name": "wall", "shape": "box", "position_m": [6, 0, 0], "size_m": [2, 40, 20]}  # its face is at x = 5
+EXACT = {"noise_m": 0, "noise_share": 0, "noise_1_m": 0, "bias_m": 0}
+
+
+def fleet(*places: tuple[float, ...], obstacles: Any = (WALL,), **sensors: Any) -> Fleet:
+    """Return drones that stand, or fall, at these places; scanners are exact unless told otherwise."""
+    scanners = {name: EXACT | each if name in SCANNERS else each for name, each in sensors.items()}
+    document: dict[str, Any] = {
+        "name": "scans",
+        "duration_s": 10,
+        "environment": {"obstacles": [*obstacles]},
+        "sensors": scanners,
+        "drones": [
+            {"name": f"d{i}", "position_m": place[:3], "yaw_deg": sum(place[3:])} for i, place in enumerate(places)
+        ],
+    }
+    return Fleet(resolve(document))
+
+
+def taken(fleet: Fleet, kind: Any, drone: int = 0) -> Any:
+    """Return the message of a kind of the last gate, as readers get it."""
+    (scan,) = (each for each in fleet.seen.values() if each.drone == drone and isinstance(each.message(0), kind))
+    key = f"drone/d{drone}/sensor/{scan.sensor}"
+    return messages.decode(key, messages.encode(scan.message(0)))
+
+
+def test_beams_of_a_turned_drone():
+    """Its front is to the left of W, so the wall is to its right; the beam up meets nothing."""
+    made = fleet((0, 0, 0, 90.0), range={"max_m": 8, "mount": {"position_m": [0, 0, 0.3]}})
+    message = taken(made, Range)
+    assert message.beams == ("back", "front", "left", "right", "up")
+    np.testing.assert_allclose(message.ranges_m, [0, 0, 0, 5.0, 0], atol=1e-6)
+
+
+def test_a_beam_begins_at_its_mount_and_a_cone_finds_what_is_beside_its_axis():
+    """A post of 1 cm, 0.2 m beside the axis 4 m ahead, is 2.86 deg off."""
+    post = {"name": "post", "shape": "cylinder", "position_m": [4, 0.2, 0], "radius_m": 0.01, "height_m": 3}
+    ahead = {"beams": {"ahead": {"position_m": [1, 0, 0.5]}}, "max_m": 8}
+    (far,) = taken(fleet((0, 0, 0), obstacles=[post, WALL], range=ahead), Range).ranges_m
+    assert far == pytest.approx(4.0, abs=1e-6)
+    cone = ahead | {"cone_deg": 2 * math.degrees(math.atan2(0.2, 3.0))}
+    (near,) = taken(fleet((0, 0, 0), obstacles=[post, WALL], range=cone), Range).ranges_m
+    assert near == pytest.approx(math.hypot(3.0, 0.2) - 0.01, abs=1e-4)
+
+
+def test_a_lidar_is_what_its_message_says_and_its_wall_is_flat():
+    settings = {"channels": 3, "columns": 90, "elevation_deg": [-10, 10], "azimuth_deg": [-45, 45], "max_m": 30}
+    made = fleet((0, 0, 1), lidar=settings)
+    message, truth = taken(made, Lidar), made.truth()
+    points = message.ranges()[..., None] * message.directions()
+    points_W = truth.position_m[0] + points @ rotation_matrix(truth.orientation_wxyz[0]).T
+    np.testing.assert_allclose(points_W[message.directions()[..., 2] > -0.1][:, 0], 5.0, atol=1e-5)
+    assert message.ranges().shape == (3, 90)
+    assert message.azimuth_rad == pytest.approx((-math.pi / 4, math.radians(1.0)))
+
+
+def test_a_depth_image_is_flat_where_the_wall_is_and_its_pixels_are_the_camera_s():
+    camera = {"mount": {"position_m": [0, 0, 3]}}
+    made = fleet((0, 0, 0), front_camera=camera, depth={"columns": 16, "rows": 9, "max_m": 8})
+    message = taken(made, Depth)
+    np.testing.assert_allclose(message.depths()[:5], 5.0, atol=1e-5)  # its upper half: depth, not distance
+    assert message.centre_px == pytest.approx((7.5, 4.0))
+    # tan of half the diagonal of 92 deg, over 16 x 9 pixels
+    assert message.focal_px == pytest.approx(2 * (math.hypot(16, 9) / 2 / math.tan(math.radians(46)),))
+
+
+def test_drones_see_each_other_and_not_themselves():
+    made = fleet((0, 0, 0), (3, 0, 0), obstacles=(), range={"max_m": 8, "beams": {"ahead": {}}})
+    (seen,), (nothing,) = (taken(made, Range, drone).ranges_m for drone in (0, 1))
+    assert seen == pytest.approx(3.0 - made.bodies.vehicle[1, VEHICLE.hull_radius], abs=1e-6)
+    assert nothing == 0.0
+
+
+def test_nothing_comes_back_from_beyond_or_below_the_range():
+    for limits in ({"max_m": 4.99}, {"min_m": 5.01, "max_m": 8}):
+        assert taken(fleet((0, 0, 0), range={"beams": {"a": {}}} | limits), Range).ranges_m == (0.0,)
+
+
+@pytest.mark.parametrize(
+    ("errors", "sigma"), [({"noise_m": 0.05}, 0.05), ({"noise_share": 0.02}, 0.1), ({"noise_1_m": 0.004}, 0.1)]
+)
+def test_noise_is_that_of_the_settings(errors: dict[str, float], sigma: float):
+    """Of 4000 beams at 5 m: sigma within 4 standard errors, no mean."""
+    rate = {"beams": {f"b{i}": {"position_m": [0, 0, 1]} for i in range(50)}, "max_m": 8, "rate_hz": 50}
+    made, seen = fleet((0, 0, 0), range=rate | errors), []
+    for _ in range(80):
+        seen += taken(made, Range).ranges_m
+        made.advance()
+    assert np.std(seen) == pytest.approx(sigma, rel=4 / math.sqrt(2 * len(seen)))
+    assert np.mean(seen) == pytest.approx(5.0, abs=4 * sigma / math.sqrt(len(seen)))
+
+
+def test_a_bias_is_of_the_sensor_and_a_quantum_of_each_reading():
+    several = {"beams": {"a": {}, "b": {"position_m": [1, 0, 0]}}, "max_m": 8}
+    first, second = taken(fleet((0, 0, 0), range=several | {"bias_m": 0.1}), Range).ranges_m
+    assert first - second == pytest.approx(1.0, abs=1e-6)
+    assert first != pytest.approx(5.0, abs=1e-4)
+    (rounded, _) = taken(fleet((0.03, 0, 0), range=several | {"quantum_m": 0.25}), Range).ranges_m
+    assert rounded == 5.0
+
+
+def test_rays_and_messages_are_lost_as_often_as_told():
+    beams = {f"b{i}": {} for i in range(40)}
+    missed = {"beams": beams, "max_m": 8, "rate_hz": 50, "miss": 0.25}
+    made, lost = fleet((0, 0, 0), range=missed), 0
+    for _ in range(50):
+        lost += taken(made, Range).ranges_m.count(0.0)
+        made.advance()
+    assert lost / 2000 == pytest.approx(0.25, abs=4 * math.sqrt(0.25 * 0.75 / 2000))
+    made, kept = fleet((0, 0, 0), range=missed | {"dropout": 0.5}), 0
+    for _ in range(400):
+        kept += len(made.seen)
+        made.advance()
+    assert kept / 400 == pytest.approx(0.5, abs=4 * math.sqrt(0.25 / 400))
+
+
+def test_a_sample_between_two_gates_is_of_its_instant_and_late_by_its_latency():
+    """A drone that falls from 30 m: the beam down measures the height at t_sample_ns, published 30 ms later."""
+    down = {"beams": {"down": {"rpy_deg": [0, 90, 0]}}, "max_m": 50, "rate_hz": 1000 / 30, "latency_ms": 30}
+    made, heights, seen = fleet((0, 0, 30), obstacles=(), range=down), {}, {}
+    for _ in range(20):
+        heights[made.t_ns] = float(made.truth().position_m[0, 2])
+        for each in made.seen.values():
+            message: Any = each.message(0)
+            seen[each.t_sample_ns] = each.t_ns, message.ranges_m[0]
+        made.advance()
+    assert sorted(seen)[:4] == [0, 30_000_000, 60_000_000, 90_000_000]
+    for t_sample_ns, (t_ns, height) in seen.items():
+        assert t_ns == t_sample_ns + 30_000_000
+        expected = np.interp(t_sample_ns, [*heights], [*heights.values()])  # 0.5 g (10 ms)^2 is 0.5 mm
+        assert height == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_restored_fleet_scans_on_to_the_same_bits():
+    settings = {"noise_m": 0.1, "miss": 0.1, "latency_ms": 15, "rate_hz": 40}
+    made, other = (fleet((0, 0, 1), lidar=settings) for _ in range(2))
+    for _ in range(5):
+        made.advance()
+    restore(other, unpack(pack(saved_state(made))))
+    for _ in range(5):
+        made.advance()
+        other.advance()
+        assert [each.message(0) for each in other.seen.values()] == [each.message(0) for each in made.seen.values()]
+
+
+def test_a_first_scan_that_is_larger_than_all_other_messages_is_published_whole():
+    """It was written behind the end of the buffer once."""
+    made = fleet((0, 0, 1), (3, 0, 1), lidar={"channels": 64, "columns": 360})
+    gate = GatePublication(made).gate([None, None])
+    sizes = [len(payload) for key, payload in gate.pairs if key.endswith("/lidar")]
+    assert len(sizes) == 2
+    assert min(sizes) > 64 * 360 * 4

@@ -1,0 +1,89 @@
+"""Settings and messages of sensors that measure along rays: what is refused, and what a reader gets."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from zsim.contract import messages
+from zsim.contract.messages import Depth, Lidar, Range
+from zsim.errors import DecodeError, ScenarioError
+from zsim.scenario.scenario_file import resolve
+
+FOUR = np.array([1.5, 0.0, 2.0, 3.0], dtype="<f4").tobytes()
+LIDAR: dict[str, Any] = {
+    "t_ns": 5,
+    "seq": 0,
+    "t_sample_ns": 0,
+    "channels": 2,
+    "columns": 2,
+    "max_m": 9.0,
+    "ranges_m": FOUR,
+}
+LIDAR.update({"elevation_rad": (0.0, 0.1), "azimuth_rad": (0.0, math.pi / 2)})
+
+
+def paths(**sensors: Any) -> list[str]:
+    drones = [{"name": "d1", "position_m": [0, 0, 0], "sensors": sensors}]
+    with pytest.raises(ScenarioError) as refused:
+        resolve({"name": "t", "duration_s": 1, "drones": drones})
+    return [line.removeprefix("scenario: drones[0].sensors.").split(" ")[0] for line in refused.value.faults]
+
+
+@pytest.mark.parametrize(
+    ("section", "settings", "field"),
+    [
+        ("range", {"beams": {}}, "beams"),
+        ("range", {"beams": {"Front": {}}}, "beams.Front"),
+        ("range", {"beams": {"front": {"rpy_deg": [0, 90]}}}, "beams.front.rpy_deg"),
+        ("range", {"cone_deg": 61}, "cone_deg"),
+        ("range", {"rate_hz": 0}, "rate_hz"),
+        ("range", {"min_m": 0}, "min_m"),
+        ("range", {"min_m": 5}, "min_m"),  # beyond max_m
+        ("range", {"max_m": -1}, "max_m"),
+        ("range", {"miss": 1.1}, "miss"),
+        ("lidar", {"channels": 0}, "channels"),
+        ("lidar", {"columns": 5000}, "columns"),
+        ("lidar", {"channels": 100, "columns": 1001}, "columns"),  # too many rays
+        ("lidar", {"elevation_deg": [-91, 0]}, "elevation_deg[0]"),
+        ("lidar", {"azimuth_deg": [-200, 200]}, "azimuth_deg"),  # more than a turn
+        ("lidar", {"azimuth_deg": [10, 10]}, "azimuth_deg"),
+        ("lidar", {"noise_m": -0.1}, "noise_m"),
+        ("lidar", {"noise_share": "much"}, "noise_share"),
+        ("lidar", {"bias_m": -1}, "bias_m"),
+        ("lidar", {"quantum_m": -1}, "quantum_m"),
+        ("lidar", {"dropout": 2}, "dropout"),
+        ("lidar", {"module": "lidar"}, "module"),
+        ("depth", {}, "cameras[0]"),  # the drone has no front camera
+        ("depth", {"cameras": ["left"]}, "cameras[0]"),
+        ("depth", {"cameras": ["bottom"], "rows": 0}, "rows"),
+        ("depth", {"cameras": ["bottom"], "noise_1_m": -1}, "noise_1_m"),
+    ],
+)
+def test_what_is_refused(section: str, settings: dict[str, Any], field: str):
+    assert paths(bottom_camera={}, **{section: settings}) == [f"{section}.{field}"]
+
+
+def test_a_lidar_is_read_as_an_array_whose_zeros_are_infinite():
+    message = messages.decode("drone/d1/sensor/lidar", messages.encode(Lidar(**LIDAR)))
+    np.testing.assert_array_equal(message.ranges(), [[1.5, math.inf], [2.0, 3.0]])
+    np.testing.assert_allclose(message.directions()[0], [[1, 0, 0], [0, 1, 0]], atol=1e-12)
+    np.testing.assert_allclose(message.directions()[1, 0], [math.cos(0.1), 0, math.sin(0.1)])
+
+
+@pytest.mark.parametrize(
+    ("message", "field"),
+    [
+        (Lidar(**{**LIDAR, "columns": 3}), "ranges_m"),
+        (Range(5, 0, 0, ("a", "b"), (1.0,), 4.0), "ranges_m"),
+        (
+            Depth(5, 0, 0, camera="front", columns=2, rows=1, focal_px=(1, 1), centre_px=(0, 0), max_m=9, depth_m=FOUR),
+            "depth_m",
+        ),
+    ],
+)
+def test_a_message_of_another_size_than_it_says_is_refused(message: Any, field: str):
+    with pytest.raises(DecodeError) as refused:
+        messages.decode(f"drone/d1/sensor/{type(message).__name__.lower()}", messages.encode(message))
+    assert field in str(refused.value).split()

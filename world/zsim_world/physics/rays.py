@@ -1,0 +1,239 @@
+"""Where rays meet ground, obstacles, triangles and the hulls of drones: exact, compiled, the same bits everywhere.
+
+Every convex solid is an intersection of slabs, or a quadric between two of them, so a ray is inside of it from the
+last entry to the first exit (Kay and Kajiya, SIGGRAPH 1986). Triangles: Moeller and Trumbore, J. Graphics Tools 2
+(1997), from both sides. Obstacles and triangles are the leaves of one tree of boxes, walked from near to far, so that
+a ray through a forest looks at a few trunks. Drones move, and are few: a caster compares each ray with those in reach.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim.math.compiled import inlined, noinline
+from zsim.math.rotation import Quaternion, Vector, dot, rotate_back, subtract
+from zsim.scenario.obstacle import BOX, CENTRE, COLUMNS, COSINE, CYLINDER, HALF, SHAPE, SINE, SPHERE
+
+LEAF = 4  # parts of a leaf at most, chosen: a box costs about as much as a cylinder
+DEPTH = 64  # boxes that may wait while a ray is followed; each step down halves the parts
+MARGIN_M = 1e-6  # m, by which boxes are larger than what is in them, against rounding
+HUGE = 1e300  # in place of 1 / 0: a product with it is never 0 times infinity
+HULL_FLATNESS = 0.25  # height over width of a hull, the AR.Drone's rounded: 0.13 m of 0.52 m
+TRIANGLE = 9  # numbers of a triangle: a corner and the two edges from it
+
+Array = NDArray[np.float64]
+
+
+class Scene(NamedTuple):
+    """What does not move: M obstacles, T triangles, and the tree of K boxes over both, in which the first is on top."""
+
+    solid: NDArray  # (M, COLUMNS), rows of zsim.scenario.obstacle
+    triangle: NDArray  # (T, TRIANGLE), m, in W
+    bounds: NDArray  # (K, 6), least and greatest x, y, z [m]
+    link: NDArray  # int32 (K, 2): the second child (the first follows) and 0; of a leaf its first part and their count
+    part: NDArray  # int32 (M + T,), obstacles by their number, triangles by M plus theirs
+
+
+def scene(solid: Array, triangle: Array) -> Scene:
+    """Return the scene of some obstacles, (M, COLUMNS), and triangles, (T, TRIANGLE)."""
+    solid, triangle = solid.reshape(-1, COLUMNS), triangle.reshape(-1, TRIANGLE)
+    corners = np.concatenate([triangle[:, :3], triangle[:, :3] + triangle[:, 3:6], triangle[:, :3] + triangle[:, 6:]])
+    corners = corners.reshape(3, -1, 3)
+    boxes = [_bounds_of(row) for row in solid.tolist()]
+    low = np.concatenate([np.array([low for low, _ in boxes]).reshape(-1, 3), corners.min(axis=0)])
+    high = np.concatenate([np.array([high for _, high in boxes]).reshape(-1, 3), corners.max(axis=0)])
+    bounds, link, part = _tree(low - MARGIN_M, high + MARGIN_M)
+    return Scene(solid, triangle, bounds, link, part)
+
+
+def _bounds_of(row: Sequence[float]) -> tuple[list[float], list[float]]:
+    """Return the least and the greatest corner of an obstacle."""
+    half, c, s = row[HALF : HALF + 3], abs(row[COSINE]), abs(row[SINE])
+    if row[SHAPE] == BOX:
+        half = [c * half[0] + s * half[1], s * half[0] + c * half[1], half[2]]
+    else:
+        half = [half[0], half[0], half[0] if row[SHAPE] == SPHERE else half[2]]
+    centre = row[CENTRE : CENTRE + 3]
+    return [x - h for x, h in zip(centre, half, strict=True)], [x + h for x, h in zip(centre, half, strict=True)]
+
+
+def _tree(low: Array, high: Array) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:
+    """Return bounds, links and parts of the tree over P boxes, (P, 3) each: halves along the longest side."""
+    part, middle = np.arange(len(low), dtype=np.int32), 0.5 * (low + high)
+    bounds: list[Array] = []
+    link: list[tuple[int, int]] = []
+    waiting = [(0, len(part), -1)] if len(part) else []
+    while waiting:
+        first, end, parent = waiting.pop()
+        if parent >= 0:
+            link[parent] = (len(link), 0)
+        own = part[first:end]
+        bounds.append(np.concatenate([low[own].min(axis=0), high[own].max(axis=0)]))
+        if end - first <= LEAF:
+            link.append((first, end - first))
+            continue
+        axis = int(np.ptp(middle[own], axis=0).argmax())
+        part[first:end] = own[np.argsort(middle[own, axis], kind="stable")]
+        half = (first + end) // 2
+        waiting += [(half, end, len(link)), (first, half, -1)]
+        link.append((0, 0))
+    links = np.array(link, dtype=np.int32).reshape(-1, 2)
+    return np.array(bounds).reshape(-1, 6), links, part
+
+
+def stack() -> tuple[NDArray[np.int32], Array]:
+    """Return room for the boxes that wait while a ray is followed, for `cast`."""
+    return np.empty(DEPTH, dtype=np.int32), np.empty(DEPTH)
+
+
+@inlined
+def inverse(x: float) -> float:
+    return 1.0 / x if x != 0.0 else HUGE
+
+
+@inlined
+def _slab(o: float, per: float, half: float) -> tuple[float, float]:
+    """Return when a ray enters and leaves |x| <= half, given 1 / its speed along x."""
+    a, b = (-half - o) * per, (half - o) * per
+    return (a, b) if a < b else (b, a)
+
+
+@inlined
+def _quadric(a: float, b: float, c: float) -> tuple[float, float]:
+    """Return when a ray enters and leaves a t^2 + 2 b t + c <= 0; (1, 0) if never."""
+    if a == 0.0:
+        return (-HUGE, HUGE) if c <= 0.0 else (1.0, 0.0)
+    under = b * b - a * c
+    if under < 0.0:
+        return 1.0, 0.0
+    root = math.sqrt(under)
+    q = -b - root if b > 0.0 else root - b  # both roots without cancellation
+    if q == 0.0:
+        return 0.0, 0.0
+    first, second = c / q, q / a
+    return (first, second) if first < second else (second, first)
+
+
+@inlined
+def _met(first: float, last: float, far: float) -> float:
+    """Return where a ray that is inside from `first` to `last` meets the solid, 0 if it begins there; else `far`."""
+    if first > last or last < 0.0:
+        return far
+    return min(max(first, 0.0), far)
+
+
+@inlined
+def cast_solid(row: NDArray, o: Vector, d: Vector, far: float) -> float:
+    """Return the distance at which a ray from o along the unit vector d meets an obstacle, `far` if not before."""
+    ox, oy, oz = o[0] - row[CENTRE], o[1] - row[CENTRE + 1], o[2] - row[CENTRE + 2]
+    radius = row[HALF]
+    if row[SHAPE] == SPHERE:
+        along, square = ox * d[0] + oy * d[1] + oz * d[2], ox * ox + oy * oy + oz * oz
+        first, last = _quadric(1.0, along, square - radius * radius)
+        return _met(first, last, far)
+    first, last = _slab(oz, inverse(d[2]), row[HALF + 2])
+    if row[SHAPE] == CYLINDER:
+        along, square = ox * d[0] + oy * d[1], ox * ox + oy * oy
+        enter, leave = _quadric(d[0] * d[0] + d[1] * d[1], along, square - radius * radius)
+        return _met(max(first, enter), min(last, leave), far)
+    c, s = row[COSINE], row[SINE]
+    enter, leave = _slab(c * ox + s * oy, inverse(c * d[0] + s * d[1]), radius)
+    first, last = max(first, enter), min(last, leave)
+    enter, leave = _slab(c * oy - s * ox, inverse(c * d[1] - s * d[0]), row[HALF + 1])
+    return _met(max(first, enter), min(last, leave), far)
+
+
+@inlined
+def cast_triangle(row: NDArray, o: Vector, d: Vector, far: float) -> float:
+    """Return the distance at which a ray meets a triangle, `far` if not before."""
+    ax, ay, az, bx, by, bz = row[3], row[4], row[5], row[6], row[7], row[8]
+    px, py, pz = d[1] * bz - d[2] * by, d[2] * bx - d[0] * bz, d[0] * by - d[1] * bx
+    det = ax * px + ay * py + az * pz
+    if det == 0.0:
+        return far
+    tx, ty, tz = o[0] - row[0], o[1] - row[1], o[2] - row[2]
+    u = (tx * px + ty * py + tz * pz) / det
+    if u < 0.0 or u > 1.0:
+        return far
+    qx, qy, qz = ty * az - tz * ay, tz * ax - tx * az, tx * ay - ty * ax
+    v = (d[0] * qx + d[1] * qy + d[2] * qz) / det
+    if v < 0.0 or u + v > 1.0:
+        return far
+    t = (bx * qx + by * qy + bz * qz) / det
+    return t if 0.0 <= t < far else far
+
+
+@inlined
+def cast_ground(o: Vector, d: Vector, far: float) -> float:
+    """Return the distance at which a ray meets z = 0 from above, `far` if not before."""
+    if d[2] >= 0.0 or o[2] < 0.0:
+        return far
+    return min(-o[2] / d[2], far)
+
+
+@inlined
+def cast_hull(p_WB: Vector, q_WB: Quaternion, radius: float, o: Vector, d: Vector, far: float) -> float:
+    """Return the distance at which a ray meets a drone's hull, a flat body of revolution about its z axis."""
+    away = subtract(o, p_WB)
+    along, square = dot(away, d), dot(away, away) - radius * radius
+    if square > 0.0 and (along > 0.0 or along * along < square):
+        return far  # it passes the ball about the hull
+    at, to = rotate_back(q_WB, away), rotate_back(q_WB, d)
+    up = 1.0 / HULL_FLATNESS
+    at, to = (at[0], at[1], up * at[2]), (to[0], to[1], up * to[2])
+    first, last = _quadric(dot(to, to), dot(at, to), dot(at, at) - radius * radius)
+    return _met(first, last, far)
+
+
+@inlined
+def _box(bounds: NDArray, o: Vector, per: Vector, far: float) -> float:
+    """Return the distance at which a ray enters a box, `far` or more if not before."""
+    first, last = 0.0, far
+    for k in range(3):
+        a, b = (bounds[k] - o[k]) * per[k], (bounds[k + 3] - o[k]) * per[k]
+        if a > b:
+            a, b = b, a
+        first = a if a > first else first
+        last = b if b < last else last
+    return first if first <= last else far
+
+
+@noinline
+def cast(scene: Scene, waiting: NDArray, entered: NDArray, o: Vector, d: Vector, far: float) -> float:
+    """Return the distance [m] at which a ray meets ground, obstacle or triangle; `far` if not before.
+
+    Args:
+        waiting, entered: of `stack`, overwritten.
+        o, d: where it begins [m], and the unit vector along it, in W.
+    """
+    best, count = cast_ground(o, d, far), scene.solid.shape[0]
+    if scene.bounds.shape[0] == 0:
+        return best
+    per = (inverse(d[0]), inverse(d[1]), inverse(d[2]))
+    node, at, depth = 0, _box(scene.bounds[0], o, per, best), 0
+    while True:
+        while at < best:
+            first, parts = scene.link[node, 0], scene.link[node, 1]
+            if parts > 0:
+                for n in range(first, first + parts):
+                    m = scene.part[n]
+                    if m < count:
+                        best = cast_solid(scene.solid[m], o, d, best)
+                    else:
+                        best = cast_triangle(scene.triangle[m - count], o, d, best)
+                break
+            near, other = node + 1, first
+            at, away = _box(scene.bounds[near], o, per, best), _box(scene.bounds[other], o, per, best)
+            if away < at:
+                near, other, at, away = other, near, away, at
+            if away < best:
+                waiting[depth], entered[depth] = other, away
+                depth += 1
+            node = near
+        if depth == 0:
+            return best
+        depth -= 1
+        node, at = waiting[depth], entered[depth]

@@ -1,0 +1,301 @@
+"""Distances along the rays of beams, lidars and depth cameras: of true poses, with errors. Compiled.
+
+All rays of a message are of one instant, between two gates too. They meet ground, obstacles and the hulls of other
+drones (zsim_world.physics.rays), not that of their own. Each sensor has a random stream, from which every message takes
+the same number of numbers: two for each of its values, one for itself.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from zsim.contract.messages import Depth, Lidar, Range
+from zsim.math.compiled import Field, Held, columns, hold, inlined, kernel
+from zsim.math.frames import quaternion_from_rpy, rotation_matrix
+from zsim.math.random_streams import stream
+from zsim.math.rotation import add, dot, matrix, product, subtract
+from zsim.scenario.scenario import Scenario
+from zsim.sensors.camera import Camera
+from zsim.sensors.camera_model import camera_pose, lens_of, undistorted
+from zsim.sensors.scanner import SINGLE, DepthConfig, LidarConfig, RangeConfig, Scanner, along, scanners
+from zsim.sensors.sensor import Mount, Sample
+from zsim_world.physics.fleet_arrays import STATE
+from zsim_world.physics.rays import DEPTH, Scene, cast, cast_hull
+from zsim_world.physics.rigid_body import four, vector
+from zsim_world.run_state import IN_PLACE, PART, Saved
+from zsim_world.sensors.equations import rounded
+from zsim_world.sensors.exposures import Between, Exposures
+from zsim_world.sensors.hats_in_view import poses_between
+from zsim_world.sensors.noise import WORDS, fill, words
+
+CONE_RAYS = 8  # about the axis of a beam with a cone, beside that along it
+SHARE_MIN = 0.2  # of the length of a ray that its depth is, at the edge of a picture of 150 deg: 0.26
+MOUNT_MAX_M = 2.0  # m, chosen: no sensor is farther from the middle of its drone where others are left out
+RAY = columns("RayColumns", (Field("direction_B", "1", 3), Field("share", "1")))  # of a distance, that is measured
+SCANNER = columns(
+    "ScannerColumns",
+    (
+        Field("drone", "1"),
+        Field("origin", "1"),  # first of its rays' origins
+        Field("apart", "1"),  # 1: every value has an origin of its own, 0: all have one
+        Field("first", "1"),  # of its rays
+        Field("values", "1"),
+        Field("rays", "1"),  # of each value, which is the least of them
+        Field("min", "m"),
+        Field("max", "m"),
+        Field("noise", "m"),
+        Field("share", "1"),
+        Field("square", "1/m"),
+        Field("bias", "m"),  # of this run
+        Field("quantum", "m"),
+        Field("miss", "1"),  # a ray is missed when its standard normal number is below this
+        Field("drop", "1"),  # likewise a message
+    ),
+)
+
+Array = NDArray[np.float64]
+
+
+class Scan(NamedTuple):
+    """A message of a scanner, without its number."""
+
+    t_ns: int
+    drone: int
+    t_sample_ns: int
+    kind: type[Sample]
+    sensor: str
+    camera: str  # of a depth image
+    values: bytes  # float32
+    fixed: dict[str, Any]  # fields that are the same in every message
+
+    def message(self, seq: int) -> Any:
+        values: Any = self.values
+        name = "depth_m" if self.kind is Depth else "ranges_m"
+        if self.kind is Range:
+            values = tuple(np.frombuffer(values, SINGLE).tolist())
+        return self.kind(self.t_ns, seq, t_sample_ns=self.t_sample_ns, **self.fixed, **{name: values})
+
+
+class WaitingScan(NamedTuple):
+    """A scan that is not due yet."""
+
+    t_ns: int
+    t_sample_ns: int
+    place: int  # of its sensor
+    values: bytes
+
+
+class Mounted(NamedTuple):
+    """A sensor of a drone, and its rays in B: those of a value together."""
+
+    drone: int
+    sensor: str
+    kind: type[Sample]
+    camera: str
+    settings: Scanner
+    origins: Array  # m, one for all or one for each value, (1 or values, 3)
+    rays: Array  # (values * k, RAY.size)
+    values: int
+    fixed: dict[str, Any]
+
+
+class ScanScene(NamedTuple):
+    """The W sensors and what they look at, for compiled code; N drones."""
+
+    scene: Scene
+    hulls: NDArray[np.float64]  # (N,), radii [m]
+    scanners: NDArray[np.float64]  # (W, SCANNER.size)
+    origins: NDArray[np.float64]  # of all sensors, (O, 3), m in B
+    rays: NDArray[np.float64]  # of all sensors, (R, RAY.size)
+
+
+class ScanSampler:
+    """Makes the scans of a fleet, gate by gate; `hulls`: radius of each drone's [m], (N,)."""
+
+    SAVED: ClassVar[Saved] = {"_streams": IN_PLACE, "_exposures": PART, "_later": list[WaitingScan]}
+
+    def __init__(self, scenario: Scenario, hulls: Array, scene: Scene) -> None:
+        self._mounted = [*_mounted(scenario)]
+        own = ["/".join(filter(None, (scenario.drones[m.drone].name, m.sensor, m.camera))) for m in self._mounted]
+        generators = [stream(scenario.seed, name) for name in own]
+        rows, first, origin = np.zeros((len(own), SCANNER.size)), 0, 0
+        for row, each, rng in zip(rows, self._mounted, generators, strict=True):
+            _fill_row(row, each, first, origin, rng)
+            first, origin = first + len(each.rays), origin + len(each.origins)
+        self._streams = np.array([words(rng) for rng in generators], dtype=np.uint64).reshape(-1, WORDS.size)
+        origins, rays = (np.concatenate([getattr(m, part) for m in self._mounted]) for part in ("origins", "rays"))
+        self._held = hold(ScanScene(scene, hulls, rows, origins, rays))
+        gate_ns = round(scenario.time.gate_ms * 1e6)
+        self._exposures = Exposures([each.settings.rate_hz for each in self._mounted], gate_ns)
+        self._later: list[WaitingScan] = []
+
+    def due(self, state: Array, now_ns: int) -> list[Scan]:
+        """Return what is due by a gate, given the state of all drones there, (N, STATE.size or more)."""
+        samples, between = self._exposures.until(state, now_ns)
+        for at_ns, place in samples:
+            self._scan(at_ns, place, between)
+        if not self._later:
+            return []
+        due = [self._made(each) for each in self._later if each.t_ns <= now_ns]
+        self._later = [each for each in self._later if each.t_ns > now_ns]
+        return due
+
+    def _scan(self, at_ns: int, place: int, between: Between | None) -> None:
+        """Take a sample and keep it until it is due."""
+        assert between is not None  # where there are samples
+        poses = poses_between(*between, at_ns)
+        values = scan(self._held, place, poses, self._streams[place])
+        if len(values):
+            latency_ns = round(self._mounted[place].settings.latency_ms * 1e6)
+            self._later.append(WaitingScan(at_ns + latency_ns, at_ns, place, values.astype(SINGLE).tobytes()))
+
+    def _made(self, waiting: WaitingScan) -> Scan:
+        m = self._mounted[waiting.place]
+        return Scan(waiting.t_ns, m.drone, waiting.t_sample_ns, m.kind, m.sensor, m.camera, waiting.values, m.fixed)
+
+
+def _mounted(scenario: Scenario) -> Iterator[Mounted]:
+    """Yield every scanner of a simulated drone, a depth sensor once for each of its cameras."""
+    for i, drone in enumerate(scenario.drones):
+        if drone.is_external:
+            continue
+        for name, settings in scanners(drone.sensors).items():
+            p_BS, R_BS = _pose(settings.mount)
+            if isinstance(settings, RangeConfig):
+                yield _beams(i, name, settings, p_BS, R_BS)
+            elif isinstance(settings, LidarConfig):
+                yield _lidar(i, name, settings, p_BS, R_BS)
+            elif isinstance(settings, DepthConfig):
+                for camera in settings.cameras:
+                    yield _depth(i, name, settings, camera, drone.sensors.cameras()[camera])
+
+
+def _pose(mount: Mount) -> tuple[Array, Array]:
+    return np.array(mount.position_m, dtype=float), rotation_matrix(quaternion_from_rpy(np.radians(mount.rpy_deg)))
+
+
+def _turned(R: Array, vectors: Array) -> Array:
+    """Return R v for vectors (M, 3), summed in one order everywhere."""
+    return (R * vectors[:, None, :]).sum(axis=2)
+
+
+def _rays(directions_B: Array, share: Array | float = 1.0) -> Array:
+    rays = np.ones((len(directions_B), RAY.size))
+    rays[:, :3], rays[:, 3] = directions_B, share
+    return rays
+
+
+def _beams(i: int, name: str, settings: RangeConfig, p_BS: Array, R_BS: Array) -> Mounted:
+    half, turn = math.radians(0.5 * settings.cone_deg), 2.0 * math.pi / CONE_RAYS
+    rim = [
+        (math.cos(half), math.sin(half) * math.cos(k * turn), math.sin(half) * math.sin(k * turn))
+        for k in range(CONE_RAYS)
+    ]
+    cone = np.array([(1.0, 0.0, 0.0), *(rim if half else ())])
+    names = sorted(settings.beams)  # the resolved text is sorted too
+    poses = [_pose(settings.beams[beam]) for beam in names]
+    origins = np.array([p_BS + _turned(R_BS, p[None])[0] for p, _ in poses])
+    rays = _rays(np.concatenate([_turned(R_BS, _turned(R, cone)) for _, R in poses]))
+    fixed = {"beams": tuple(names), "max_m": settings.max_m}
+    return Mounted(i, name, Range, "", settings, origins, rays, len(poses), fixed)
+
+
+def _lidar(i: int, name: str, settings: LidarConfig, p_BS: Array, R_BS: Array) -> Mounted:
+    channels, count = settings.channels, settings.columns
+    (low, high), (first, last) = np.radians(settings.elevation_deg).tolist(), np.radians(settings.azimuth_deg).tolist()
+    elevation = (low, (high - low) / (channels - 1) if channels > 1 else 0.0)
+    azimuth = (first, (last - first) / count)
+    fixed = {"channels": channels, "columns": count, "elevation_rad": elevation, "azimuth_rad": azimuth}
+    up = elevation[0] + elevation[1] * np.arange(channels)[:, None]
+    directions = along(up, azimuth[0] + azimuth[1] * np.arange(count)[None, :]).reshape(-1, 3)
+    fixed["max_m"] = settings.max_m
+    return Mounted(i, name, Lidar, "", settings, p_BS[None], _rays(_turned(R_BS, directions)), channels * count, fixed)
+
+
+def _depth(i: int, name: str, settings: DepthConfig, camera: str, of: Camera) -> Mounted:
+    """Return the rays through the middles of a depth image's pixels, which are the camera's in blocks."""
+    pose, lens, rows, count = camera_pose(of), lens_of(of), settings.rows, settings.columns
+    wide, high = lens.width / count, lens.height / rows  # of its pixels, in the camera's
+    places: Any = np.meshgrid((np.arange(count) + 0.5) * wide - 0.5, (np.arange(rows) + 0.5) * high - 0.5)
+    x, y = undistorted(lens, *(place.ravel() for place in places))
+    length = np.sqrt(x * x + y * y + 1.0)
+    directions = np.stack([x, y, np.ones_like(x)], axis=1) / length[:, None]
+    fixed = {"camera": camera, "columns": count, "rows": rows, "max_m": settings.max_m}
+    fixed["focal_px"] = (lens.fx / wide, lens.fy / high)
+    fixed["centre_px"] = ((lens.cx + 0.5) / wide - 0.5, (lens.cy + 0.5) / high - 0.5)
+    rays = _rays(_turned(pose.R_BK, directions), 1.0 / length)
+    return Mounted(i, name, Depth, camera, settings, pose.p_BK[None], rays, rows * count, fixed)
+
+
+def _fill_row(row: Array, mounted: Mounted, first: int, origin: int, rng: np.random.Generator) -> None:
+    """Write the row of a sensor; its bias is drawn first from its stream."""
+    own, values = mounted.settings, mounted.values
+    row[SCANNER.drone], row[SCANNER.first], row[SCANNER.origin] = mounted.drone, first, origin
+    row[SCANNER.apart], row[SCANNER.values] = len(mounted.origins) > 1, values
+    row[SCANNER.rays] = len(mounted.rays) // values
+    row[SCANNER.min], row[SCANNER.max], row[SCANNER.quantum] = own.min_m, own.max_m, own.quantum_m
+    row[SCANNER.noise], row[SCANNER.share], row[SCANNER.square] = own.noise_m, own.noise_share, own.noise_1_m
+    row[SCANNER.bias] = own.bias_m * rng.standard_normal()
+    row[SCANNER.miss], row[SCANNER.drop] = ndtri(own.miss), ndtri(own.dropout)
+
+
+@kernel()
+def scan(held: Held, place: int, poses: NDArray, stream: NDArray) -> NDArray:
+    """Return the values of a message of one sensor [m], 0 where nothing came back; none if the message is lost.
+
+    Args:
+        held: a ScanScene, by `hold`.
+        place: of the sensor.
+        poses: states of all drones, (N, STATE.size or more).
+        stream: words of its random stream, (WORDS.size,), moved on.
+    """
+    scene, hulls, scanners, origins, rays = held.content
+    row = scanners[place]
+    i, values, each = int(row[SCANNER.drone]), int(row[SCANNER.values]), int(row[SCANNER.rays])
+    drawn = np.empty(2 * values + 1)
+    fill(drawn, stream)
+    if drawn[2 * values] < row[SCANNER.drop]:
+        return np.empty(0)
+    p_WB, q_WB = vector(poses[i], STATE.p_WB), four(poses[i], STATE.q_WB)
+    R_WB, most, out = matrix(q_WB), row[SCANNER.max], np.empty(values)
+    near, count = np.empty(len(hulls), np.int64), 0
+    for j in range(len(hulls)):
+        away = subtract(vector(poses[j], STATE.p_WB), p_WB)
+        reach = most / SHARE_MIN + hulls[j] + MOUNT_MAX_M
+        if j != i and dot(away, away) < reach * reach:
+            near[count] = j
+            count += 1
+    waiting, entered = np.empty(DEPTH, np.int32), np.empty(DEPTH)
+    at, ray = int(row[SCANNER.origin]), int(row[SCANNER.first])
+    o = add(p_WB, product(R_WB, vector(origins[at], 0)))
+    for v in range(values):
+        if row[SCANNER.apart] != 0.0:
+            o = add(p_WB, product(R_WB, vector(origins[at + v], 0)))
+        least = math.inf
+        for _ in range(each):
+            d, share = product(R_WB, vector(rays[ray], RAY.direction_B)), rays[ray, RAY.share]
+            far = most / share
+            met = cast(scene, waiting, entered, o, d, far)
+            for k in range(count):
+                j = near[k]
+                met = cast_hull(vector(poses[j], STATE.p_WB), four(poses[j], STATE.q_WB), hulls[j], o, d, met)
+            if met < far:
+                least = min(least, met * share)
+            ray += 1
+        out[v] = _measured(row, least, drawn[2 * v], drawn[2 * v + 1])
+    return out
+
+
+@inlined
+def _measured(row: NDArray, distance: float, noise: float, chance: float) -> float:
+    """Return what a sensor says of a distance, given two standard normal numbers."""
+    if distance == math.inf or chance < row[SCANNER.miss]:
+        return 0.0
+    share, square = row[SCANNER.share] * distance, row[SCANNER.square] * distance * distance
+    sigma = math.sqrt(row[SCANNER.noise] * row[SCANNER.noise] + share * share + square * square)
+    measured = rounded(distance, row[SCANNER.bias], sigma * noise, row[SCANNER.quantum])
+    return measured if row[SCANNER.min] <= measured <= row[SCANNER.max] else 0.0

@@ -1,0 +1,179 @@
+"""Sensors that measure distances along rays: beams, lidars, depth cameras. Messages and settings.
+
+The world casts the rays at ground, obstacles and the hulls of other drones (zsim_world.sensors.scans). Not one of these
+is there unless the scenario has its section; `status` counts their messages as those of all sensors.
+
+A distance of 0 says that nothing came back: there is nothing within the sensor's range, or the ray was missed. No
+message of the contract has an infinity, and no ray measures 0, whose range begins above it.
+"""
+
+import math
+from typing import Annotated, Any
+
+import numpy as np
+from msgspec import UNSET, Meta, field
+from numpy.typing import NDArray
+
+from zsim.schema.message import Count, Number
+from zsim.schema.quantities import Fraction, NonNegative, Positive
+from zsim.sensors.camera import CameraName
+from zsim.sensors.sensor import Mount, RateHz, Sample, Sensor
+
+RAYS_MAX = 100_000  # of one message, which then has 400 kB
+BEAMS_MAX = 64
+CHANNELS_MAX, COLUMNS_MAX = 128, 4096
+SINGLE = np.dtype("<f4")
+BeamName = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,31}\Z")]
+ChannelCount = Annotated[int, Meta(ge=1, le=CHANNELS_MAX)]
+ColumnCount = Annotated[int, Meta(ge=1, le=COLUMNS_MAX)]
+RayBytes = Annotated[bytes, Meta(max_length=4 * RAYS_MAX)]
+Elevation = Annotated[float, Meta(ge=-90, le=90)]
+Azimuth = Annotated[float, Meta(ge=-360, le=360)]
+
+
+class Range(Sample, frozen=True):
+    """The distance along each beam [m], in the order of `beams`, their names sorted; 0: nothing came back."""
+
+    beams: Annotated[tuple[str, ...], Meta(max_length=BEAMS_MAX)]
+    ranges_m: Annotated[tuple[Number, ...], Meta(max_length=BEAMS_MAX)]
+    max_m: Number
+
+    def fault(self) -> str | None:
+        if len(self.beams) == len(self.ranges_m):
+            return None
+        return f"ranges_m has {len(self.ranges_m)} entries; must have {len(self.beams)}, as beams"
+
+
+class Lidar(Sample, frozen=True):
+    """A scan: `channels` rows of `columns` distances [m], little-endian float32; 0: nothing came back.
+
+    Ray (j, k) points up by elevation_rad[0] + j elevation_rad[1] and to the left of the sensor's x axis by
+    azimuth_rad[0] + k azimuth_rad[1].
+    """
+
+    channels: Count
+    columns: Count
+    elevation_rad: tuple[Number, Number]
+    azimuth_rad: tuple[Number, Number]
+    max_m: Number
+    ranges_m: RayBytes
+
+    def fault(self) -> str | None:
+        return _size_fault("ranges_m", self.ranges_m, self.channels, self.columns)
+
+    def ranges(self) -> NDArray[np.float32]:
+        """Return the distances, (channels, columns) [m]; inf where nothing came back."""
+        return _without_zeros(self.ranges_m, self.channels)
+
+    def directions(self) -> NDArray[np.float64]:
+        """Return the unit vectors along the rays in the axes of the sensor, (channels, columns, 3)."""
+        up = self.elevation_rad[0] + self.elevation_rad[1] * np.arange(self.channels)[:, None]
+        left = self.azimuth_rad[0] + self.azimuth_rad[1] * np.arange(self.columns)[None, :]
+        return along(up, left)
+
+
+class Depth(Sample, frozen=True, kw_only=True):
+    """A depth image of a camera: `rows` of `columns` depths along its axis [m], little-endian float32; 0: none.
+
+    `focal_px` and `centre_px` are those of this image, by x to the right and y down.
+    """
+
+    camera: CameraName
+    columns: Count
+    rows: Count
+    focal_px: tuple[Number, Number]
+    centre_px: tuple[Number, Number]
+    max_m: Number
+    depth_m: RayBytes
+
+    def fault(self) -> str | None:
+        return _size_fault("depth_m", self.depth_m, self.rows, self.columns)
+
+    def depths(self) -> NDArray[np.float32]:
+        """Return the depths, (rows, columns) [m]; inf where nothing came back."""
+        return _without_zeros(self.depth_m, self.rows)
+
+
+def along(up: NDArray[Any], left: NDArray[Any]) -> NDArray[np.float64]:
+    """Return unit vectors by elevation and azimuth [rad], (rows of up, columns of left, 3)."""
+    level = np.cos(up)
+    return np.stack(np.broadcast_arrays(level * np.cos(left), level * np.sin(left), np.sin(up)), axis=-1)
+
+
+def _size_fault(name: str, data: bytes, rows: int, columns: int) -> str | None:
+    if len(data) == SINGLE.itemsize * rows * columns:
+        return None
+    return f"{name} has {len(data)} bytes; must have {SINGLE.itemsize} for each of {rows} x {columns} rays"
+
+
+def _without_zeros(data: bytes, rows: int) -> NDArray[np.float32]:
+    ranges = np.frombuffer(data, SINGLE).reshape(rows, -1)
+    return np.where(ranges > 0.0, ranges, np.float32(math.inf))
+
+
+class Scanner(Sensor, frozen=True, kw_only=True):
+    """What all of them have: range, and the errors of every ray, added in quadrature."""
+
+    min_m: Positive
+    max_m: Positive
+    noise_m: NonNegative = 0.0  # standard deviation, white, of every ray by itself
+    noise_share: NonNegative = 0.0  # likewise, as a share of the distance
+    noise_1_m: NonNegative = 0.0  # likewise, over the square of the distance: of stereo
+    bias_m: NonNegative = 0.0  # constant over a run and the same for all rays, standard deviation over runs
+    quantum_m: NonNegative = 0.0  # step of the converter; 0: none
+    miss: Fraction = 0.0  # probability that nothing comes back along a ray, independent per ray
+
+
+def deck() -> dict[str, Mount]:
+    """Return the beams of the Multi-ranger deck of the Crazyflie: ahead, to the left, back, to the right, up."""
+    turned = {"front": (0.0, 0.0), "left": (0.0, 90.0), "back": (0.0, 180.0), "right": (0.0, -90.0), "up": (-90.0, 0.0)}
+    return {name: Mount(rpy_deg=(0.0, pitch, yaw)) for name, (pitch, yaw) in turned.items()}
+
+
+class RangeConfig(Scanner, frozen=True, kw_only=True):
+    """Beams, each along x of its mount in the body; the sensor's own mount turns and moves them all."""
+
+    rate_hz: RateHz = 20.0  # Hz, of 33 to 140 ms a measurement (data sheet of the VL53L1X)
+    beams: Annotated[dict[BeamName, Mount], Meta(min_length=1, max_length=BEAMS_MAX)] = field(default_factory=deck)
+    cone_deg: Annotated[float, Meta(ge=0, le=60)] = 0.0  # apex angle; the nearest of what is in it is measured
+    min_m: Positive = 0.04  # m, data sheet of the VL53L1X
+    max_m: Positive = 4.0  # m, likewise, in the dark
+    noise_m: NonNegative = 0.01  # m, chosen: half of the 20 mm by which a distance may be wrong (data sheet)
+    bias_m: NonNegative = 0.01  # m, chosen: the other half
+
+
+class LidarConfig(Scanner, frozen=True, kw_only=True):
+    """Rows (channels) of rays at even angles about the sensor's z axis; the default turns in one plane."""
+
+    rate_hz: RateHz = 5.5  # Hz, RPLIDAR A1, as all that follows
+    channels: ChannelCount = 1
+    columns: ColumnCount = 360
+    elevation_deg: tuple[Elevation, Elevation] = (0.0, 0.0)
+    """Of the first and the last channel, upwards."""
+    azimuth_deg: tuple[Azimuth, Azimuth] = (-180.0, 180.0)
+    """Of the first column, and where one after the last would be, to the left."""
+    min_m: Positive = 0.15
+    max_m: Positive = 12.0
+    noise_share: NonNegative = 0.01  # its "resolution" is below 1 % of the distance
+
+
+class DepthConfig(Scanner, frozen=True, kw_only=True):
+    """Depth images of some of the drone's cameras, through their lenses; its mount is theirs."""
+
+    rate_hz: RateHz = 15.0
+    cameras: Annotated[list[CameraName], Meta(min_length=1, max_length=2)] = field(default_factory=lambda: ["front"])
+    columns: ColumnCount = 80  # chosen: a tenth of a D435's
+    rows: Annotated[int, Meta(ge=1, le=2160)] = 45
+    min_m: Positive = 0.3  # m, chosen: about the least of a D435 at 848 pixels
+    max_m: Positive = 10.0
+    noise_1_m: NonNegative = 0.0038  # 1/m, sigma = s z^2 / (f B): s 0.08 px, B 0.05 m and 848 px over 90 deg
+
+
+SCANNERS: dict[str, type[Sample]] = {"range": Range, "lidar": Lidar, "depth": Depth}
+"""Messages by the sensor's name, in the order of their keys."""
+
+
+def scanners(sensors: object) -> dict[str, Scanner]:
+    """Return the scanners of a drone's `sensors:` by name, in the order of SCANNERS."""
+    found = {name: getattr(sensors, name) for name in SCANNERS}
+    return {name: settings for name, settings in found.items() if settings is not UNSET}
