@@ -17,6 +17,7 @@ from zsim import __version__
 from zsim.contract.fingerprint import TruthHash
 from zsim.errors import RecordError, printable
 from zsim.presentation import Column, FittedTable
+from zsim.scenario.obstacle import least_distances
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of, min_separation_m
 from zsim_analysis.reading.radio_links import RadioSummary
@@ -112,6 +113,7 @@ class RunSummary(Struct, frozen=True):
     errors: dict[str, ParameterErrors]
     clusters: dict[str, ClusterErrors]
     min_separation_m: float | None
+    obstacle_distance_m: dict[str, float]  # least, from each drone's centre to a surface; empty without obstacles
     radio: RadioSummary | None  # of the window; None where the scenario has none
     paper_table_1: dict[str, float]
     events: list[EventLine]
@@ -206,6 +208,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         errors=next((cluster.errors for cluster in clusters.values()), {}),
         clusters=clusters,
         min_separation_m=min_separation_m(flight.tracks),
+        obstacle_distance_m=obstacle_distances_m(flight),
         radio=flight.radio.summary(window_s) if flight.radio else None,
         paper_table_1=PAPER_TABLE_1,
         events=lines,
@@ -215,6 +218,13 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         record=facts,
         notes=list(_notes(flight, facts, formations, window_s, window_note)),
     )
+
+
+def obstacle_distances_m(flight: RecordedFlight) -> dict[str, float]:
+    """Return by drone the least true distance [m] of its centre from an obstacle, below 0 inside of one."""
+    obstacles = flight.scenario.environment.obstacles if flight.scenario else []
+    tracks = [track for track in flight.tracks if obstacles and len(track.t_ns)]
+    return {track.name: float(least_distances(obstacles, track.p_W).min()) for track in tracks}
 
 
 def _record_facts(flight: RecordedFlight, last_ns: int) -> RecordFacts:
