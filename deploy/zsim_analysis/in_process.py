@@ -127,6 +127,11 @@ class InProcessFlight:
                 "processes.gating is [camera]; must be left out in one process, which has no cameras: "
                 "fly it as processes, or with --set processes.gating=[]"
             )
+        if scenario.own_programs:
+            raise RunError(
+                f"programs has {', '.join(scenario.own_programs)}; must be left out in one process, which starts no "
+                "programs: fly it as processes, or with --set programs={}"
+            )
         if not stock:
             scenario = replace(scenario, processes=replace(scenario.processes, expect=[]))
         self.world = World(scenario, "lockstep", 0.0, time.monotonic_ns, run_id, changed)

@@ -41,7 +41,7 @@ from zsim_api import run_folder
 from zsim_api.assertions import Assertions
 from zsim_api.drone_requests import PilotedDrone
 from zsim_api.flight import LAUNCHER, calling, command_of, raise_failure
-from zsim_api.programs import Program, search_path
+from zsim_api.programs import Program, environment_of, filled, search_path
 from zsim_api.scenarios import AnyScenario, scenario_of
 
 if TYPE_CHECKING:
@@ -148,10 +148,7 @@ class Federation(Assertions):
         command, environment = command_of(source, own, [agent.name for agent in made], launched, self.folder)
         environment["PYTHONPATH"] = search_path([*modules, environment["PYTHONPATH"]])
         self._launcher = Program(command, environment, logs / f"{LAUNCHER}.log")
-        environment |= {"ZSIM_CONNECT": self.endpoint, "ZSIM_FEDERATION": self.name}
-        # `python` and `zsim` are those that run the test
-        environment["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
-        self._environment = environment
+        self._environment = environment | environment_of(self.endpoint, self.name)
         self._programs: dict[str, Program] = {}
         self._threads: list[threading.Thread] = []
         self._follow(self._take_part)
@@ -166,15 +163,9 @@ class Federation(Assertions):
     def _start(self, name: str, words: Sequence[str]) -> None:
         label = name or f"program-{len(self._programs) + 1}"
         log = self.folder / run_folder.LOGS / f"{label}.log"
-        self._programs[label] = Program(self._filled(words), self._environment, log)
+        values = {"endpoint": self.endpoint, "federation": self.name, "folder": str(self.folder), "name": label}
+        self._programs[label] = Program(filled(words, values), self._environment, log)
         self._follow(self._await_end, self._programs[label])
-
-    def _filled(self, words: Sequence[str]) -> list[str]:
-        values = {"{endpoint}": self.endpoint, "{federation}": self.name, "{folder}": str(self.folder)}
-        filled = list(words)
-        for mark, value in values.items():
-            filled = [word.replace(mark, value) for word in filled]
-        return filled
 
     # Time
 

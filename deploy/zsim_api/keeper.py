@@ -3,8 +3,9 @@
     python -I -S keeper.py GRACE_S WORD...
 
 Standard input is a pipe from the caller, which ends with it: then the program is asked to end (SIGTERM), and killed if
-it has not within the grace. Signals are passed on to its process group. What a program leaves behind it has the same
-grace, and is killed. The exit code is the program's; 128 + N for a signal, as in shells, and 127 where it cannot start.
+it has not within the grace. Signals are passed on to its process group; SIGUSR1 kills it, and all that it has started.
+What a program leaves behind it has the same grace, and is killed. The exit code is the program's; 128 + N for a signal,
+as in shells, and 127 where it cannot start.
 
 This file is run by its path and imports the standard library alone, so that it costs some milliseconds.
 """
@@ -44,6 +45,7 @@ def main(grace_s: float, words: list[str]) -> int:
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, forward)
+    signal.signal(signal.SIGUSR1, lambda *_: threading.Thread(target=_kill_children, daemon=True).start())
     if sys.platform == "linux":  # whatever a program detaches becomes a child of this process
         ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     try:

@@ -27,6 +27,7 @@ class Program:
         words: its command line.
         environment: variables that differ from those of this process.
         output: file that takes its output; None for this process's own; PIPE for `lines`.
+        folder: in which it runs; None: the current one.
     """
 
     def __init__(
@@ -34,6 +35,7 @@ class Program:
         words: Sequence[str],
         environment: Mapping[str, str] | None = None,
         output: Path | int | None = None,
+        folder: Path | None = None,
     ) -> None:
         self.words = tuple(words)
         self.asked = False  # whether it has been asked to end from here
@@ -49,6 +51,7 @@ class Program:
                 stdout=goes_to,
                 stderr=subprocess.STDOUT if goes_to == PIPE else goes_to,
                 env=environment,
+                cwd=folder,
                 start_new_session=True,
             )
 
@@ -73,6 +76,15 @@ class Program:
         """Send it what Ctrl-C sends."""
         self._keeper.send_signal(signal.SIGINT)
 
+    def kill(self) -> None:
+        """Kill it, and all that it has started, at once."""
+        self._keeper.send_signal(signal.SIGUSR1)
+
+    @property
+    def pid(self) -> int:
+        """Of the keeper, which lives as long as the program."""
+        return self._keeper.pid
+
     def close(self) -> int:
         """Ask it to end if it runs, kill what has not ended within GRACE_S, and return its exit code."""
         with self._lock:
@@ -81,6 +93,19 @@ class Program:
             with suppress(OSError):
                 self._keeper.stdin.close()
             return self._keeper.wait()
+
+
+def filled(words: Sequence[str], values: Mapping[str, str]) -> list[str]:
+    """Return a command line with the values in place of their names: `{endpoint}` and so on."""
+    for name, value in values.items():
+        words = [word.replace(f"{{{name}}}", value) for word in words]
+    return [*words]
+
+
+def environment_of(endpoint: str, federation: str) -> dict[str, str]:
+    """Return the variables with which a program finds a run; `python` and `zsim` are those that run this process."""
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
+    return {"ZSIM_CONNECT": endpoint, "ZSIM_FEDERATION": federation, "PATH": path}
 
 
 def search_path(folders: Sequence[str | Path]) -> str:

@@ -74,6 +74,8 @@ def cross_faults(
     if isinstance(scenario.agents, dict):
         sound_agents = {role: each for role, each in scenario.agents.items() if each and each.per}
         yield from agent_faults(sound_agents, (*ROLES, *RESERVED_ROLES), bool(clusters))
+    if isinstance(scenario.programs, dict):
+        yield from _program_faults(scenario.programs, (*ROLES, *RESERVED_ROLES, *(scenario.agents or ())))
     yield from _graph_faults(scenario.topology, _names(drones))
     yield from _injected_faults(scenario, drones, clusters, vehicles, unread)
     window = scenario.report and scenario.report.window_s
@@ -505,6 +507,15 @@ def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Ite
             named = listed(known) or f"a {kind}, and there is none"
             allowed = f"must be {role}.NAME of {named}, or a name of your own"
             yield f"processes.expect[{index}]", f"is {name!r}, and no {kind} is {thing!r}; {allowed}"
+
+
+def _program_faults(programs: Mapping[str, Any], roles: Sequence[str]) -> Iterator[Fault]:
+    for name, program in programs.items():
+        if (role := name.partition(".")[0]) in roles:
+            allowed = f"must begin with another word than {', '.join(roles)}"
+            yield f"programs.{name}", f"is named like a process of the role {role}; {allowed}"
+        if program and program.command and not program.command[0]:
+            yield f"programs.{name}.command[0]", "is empty; must be a program"
 
 
 def _graph_faults(topology: Any, drones: list[str]) -> Iterator[Fault]:

@@ -74,7 +74,8 @@ def expected_processes(scenario: Scenario) -> list[str]:
     if scenario.processes.expect is not None:
         return list(scenario.processes.expect)
     cameras = [drone.name for drone in scenario.drones if scenario.gates("camera") and drone.sensors.cameras()]
-    return [*agent_names(scenario), *(f"camera.{name}" for name in cameras)]
+    programs = [name for name, each in scenario.own_programs.items() if each.joins]
+    return [*agent_names(scenario), *(f"camera.{name}" for name in cameras), *programs]
 
 
 def on_death(actions: Mapping[str, OnDeath], name: str, role: str | None = None) -> OnDeath:

@@ -33,6 +33,8 @@ PIECES_MAX = 5000  # polynomials of one path
 STAGES_MAX = 100  # of drones that change places
 METRICS_MAX = 20  # functions
 ROLES_MAX = 20  # of users' agents; each is a process for every drone
+PROGRAMS_MAX = 100  # of users, beside agents
+WORDS_MAX = 1000  # of a command line
 MESSAGES_MAX = 20  # classes of messages that a class of agents publishes
 VARIABLES_MAX = 4 * ROBOTS_MAX  # of a formation: four a robot
 SEA_HEIGHT_MAX_M = 11_000  # m above the sea: end of the layer whose pressure the barometer follows (ISO 2533)
@@ -204,6 +206,37 @@ class Obstacle(Spec, frozen=True, kw_only=True):
     yaw_deg: Real = 0.0
 
 
+Span = tuple[Positive, Positive]
+Seed = Annotated[int, Meta(ge=0, le=2**62)]
+
+
+class Forest(Spec, frozen=True, kw_only=True):
+    """Trunks at random places, which become obstacles; see zsim.scenario.generated."""
+
+    trees: Annotated[int, Meta(ge=1, le=OBSTACLES_MAX)]
+    area_m: tuple[Coordinate, Coordinate, Coordinate, Coordinate]
+    """West, south, east, north: where their middles are."""
+    radius_m: Span = (0.1, 0.25)  # chosen: trunks of 20 to 50 cm
+    height_m: Span = (6.0, 10.0)  # chosen
+    gap_m: NonNegative = 1.5  # between any two, chosen: three hulls of an AR.Drone
+    clear_m: NonNegative = 2.0  # about the place where a drone starts, chosen
+    seed: Seed | UnsetType = UNSET  # unset: the scenario's
+
+
+class Corridor(Spec, frozen=True, kw_only=True):
+    """Walls on both sides of a way that bends at random, which become obstacles; see zsim.scenario.generated."""
+
+    segments: Annotated[int, Meta(ge=1, le=100)]
+    length_m: Positive = 6.0  # of a segment, chosen
+    turn_deg: Annotated[float, Meta(ge=0, le=90)] = 40.0  # the most, to either side, from segment to segment; chosen
+    width_m: Positive = 3.0  # between the walls, chosen
+    wall_m: Positive = 0.2  # thickness, chosen
+    height_m: Positive = 3.0  # chosen
+    start_m: tuple[Coordinate, Coordinate] = (0.0, 0.0)
+    heading_deg: Real = 0.0  # of the first segment, from east to north
+    seed: Seed | UnsetType = UNSET  # unset: the scenario's
+
+
 class Environment(Spec, frozen=True, kw_only=True):
     """The field of the flight: default Buenos Aires, where the paper comes from."""
 
@@ -215,6 +248,8 @@ class Environment(Spec, frozen=True, kw_only=True):
     air_density_kg_m3: Positive = SEA_LEVEL_KG_M3
     wind: Wind = Wind()
     obstacles: Annotated[list[Obstacle], Meta(max_length=OBSTACLES_MAX)] = []
+    forest: Forest | UnsetType = UNSET  # this and `corridor` become obstacles, and are left out of the resolved text
+    corridor: Corridor | UnsetType = UNSET
     hats: Hats | UnsetType = UNSET  # unset: the defaults, and left out of the resolved text
     light: Annotated[float, Meta(ge=0.02, le=1)] | UnsetType = UNSET  # of a clear day, for the cameras; unset: 1
 
@@ -368,6 +403,15 @@ class TimeSteps(Spec, frozen=True, kw_only=True):
     max_command_age_ms: Positive = 500.0  # as silence.hover_s: an older command counts as silence
 
 
+class OwnProgram(Spec, frozen=True, kw_only=True):
+    """A program in any language that is started with the run; its name is that of the process as which it joins."""
+
+    command: Annotated[list[str], Meta(min_length=1, max_length=WORDS_MAX)]
+    """`{endpoint}`, `{federation}`, `{folder}` (of the run) and `{name}` are replaced."""
+    joins: bool = True  # the run waits for it, at its start and at every gate
+    start_timeout_s: Positive | UnsetType = UNSET  # unset: as of all processes
+
+
 LAWS = {
     "consensus": "zsim_agents.laws.consensus:Consensus",
     "leader_follower": "zsim_agents.laws.leader_follower:LeaderFollower",
@@ -473,7 +517,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
 
     name: Name
     federation: Name = "zsim"
-    seed: Annotated[int, Meta(ge=0, le=2**62)] = 1
+    seed: Seed = 1
     duration_s: Annotated[float, Meta(gt=0, le=1e6)]
     time: TimeSteps = TimeSteps()
     environment: Environment = Environment()
@@ -485,6 +529,8 @@ class Scenario(Spec, frozen=True, kw_only=True):
     estimation: Estimation = Estimation()
     agents: Annotated[dict[RoleName, OwnAgent], Meta(max_length=ROLES_MAX)] | UnsetType = UNSET
     """Agents of users' classes, by role; unset: none, and left out of the resolved text."""
+    programs: Annotated[dict[Name, OwnProgram], Meta(max_length=PROGRAMS_MAX)] | UnsetType = UNSET
+    """Programs of users, by the name of the process; unset: none, and left out of the resolved text."""
     topology: Topology | UnsetType = UNSET
     radio: Radio | UnsetType = UNSET
     """Between agents of drones. Unset: all hear all; left out of the resolved text."""
@@ -509,6 +555,10 @@ class Scenario(Spec, frozen=True, kw_only=True):
     @property
     def own_agents(self) -> dict[str, OwnAgent]:
         return {} if self.agents is UNSET else self.agents
+
+    @property
+    def own_programs(self) -> dict[str, OwnProgram]:
+        return {} if self.programs is UNSET else self.programs
 
     @property
     def radio_of_agents(self) -> Radio | None:

@@ -15,6 +15,7 @@ from msgspec import Struct, structs
 from zsim.errors import DocumentError, NotTrustedError, ScenarioError
 from zsim.scenario import own_classes
 from zsim.scenario.consistency import cross_faults
+from zsim.scenario.generated import with_generated
 from zsim.scenario.polynomial_file import pieces_of
 from zsim.scenario.scenario import DRONES_MAX, VEHICLE_NUMBERS, Document, Scenario, SharedVehicle
 from zsim.schema import plugin, yaml_file
@@ -119,6 +120,8 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
             drone = {**drone, "reference": _with_pieces(drone["reference"], f"{where}.reference", unsound)}
         return {**with_defaults(numbers, drone), "sensors": own}
 
+    document, wrong = with_generated(document)
+    unsound += wrong
     document = {**document, "sensors": _separated(sensors, "sensors", unsound, unread, imports)}
     if imports and plugin.may_import():
         document = document | {
@@ -128,7 +131,9 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
     if "agents" in document:
         document["agents"], wrong = own_classes.with_agents(document["agents"], imports)
         unsound += wrong
-        document["processes"] = _with_deaths(document.get("processes", {}), document["agents"])
+        document["processes"] = _with_deaths(document.get("processes", {}), document["agents"], "restart")
+    if "programs" in document:
+        document["processes"] = _with_deaths(document.get("processes", {}), document["programs"], "end")
     shortened = _is_graph(document.get("topology"))
     if shortened:
         document["topology"] = {"graph": document["topology"]}
@@ -211,12 +216,12 @@ def _is_graph(topology: Any) -> bool:
     return isinstance(topology, str)
 
 
-def _with_deaths(processes: Any, agents: Any) -> Any:
-    """Return a `processes:` section in which users' agents are started again, where it says nothing of their role."""
-    if not (isinstance(processes, dict) and isinstance(agents, dict)):
+def _with_deaths(processes: Any, own: Any, action: str) -> Any:
+    """Return a `processes:` section with what the death of users' roles or programs means, where it does not say so."""
+    if not (isinstance(processes, dict) and isinstance(own, dict)):
         return processes
     given = processes.get("on_death", {})
-    return {**processes, "on_death": dict.fromkeys(agents, "restart") | given} if isinstance(given, dict) else processes
+    return {**processes, "on_death": dict.fromkeys(own, action) | given} if isinstance(given, dict) else processes
 
 
 def _vehicle_of(

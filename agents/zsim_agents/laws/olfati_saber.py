@@ -115,11 +115,11 @@ class OlfatiSaber(Pilot):
         """d."""
         range_ratio: Annotated[float, Meta(gt=1, le=10)] = 1.2
         """r / d."""
-        clearance_m: Positive = 2.0
+        clearance_m: Positive = 1.5
         """Of obstacles: d'."""
         alpha_1_s2: NonNegative = 0.2
         beta_1_s2: NonNegative = 1.0
-        gamma_1_s2: NonNegative = 0.2
+        gamma_1_s2: NonNegative = 0.6
         """c1 of flockmates, obstacles and aim; each c2 is 2 sqrt(c1)."""
         accel_max_m_s2: Positive = 2.0
         avoid_m: NonNegative = 0.0

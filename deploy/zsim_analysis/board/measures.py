@@ -5,7 +5,8 @@
     zsim sweep scenario.yaml --vary agents.pilot.parameters.gain_1_s=0.2,0.4 \
         --set report.metrics=zsim_analysis.board.measures:measures
 
-Only drones count that are in the air: of a formation that has lost one, the figure of the others.
+Only drones count that are in the air: of a formation that has lost one, the figure of the others. What they were to
+fly is what their plan says, also where they were held.
 """
 
 from dataclasses import replace
@@ -16,14 +17,21 @@ import numpy as np
 
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
-from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_agents.laws.olfati_saber import OlfatiSaber
 from zsim_agents.laws.pilot import AIRBORNE, Motion, Pilot
-from zsim_agents.laws.reference import polygon
+from zsim_agents.laws.reference import Reference, polygon
 from zsim_agents.laws.shape import ShapePilot
-from zsim_analysis.reading.formation import common_instants, formation, min_separation_m
+from zsim_analysis.reading.formation import common_instants, min_separation_m
 from zsim_analysis.reading.recorded_flight import Array, RecordedFlight, Track
 from zsim_analysis.reading.shortfall import window_of
+
+
+class Figure(NamedTuple):
+    """What a formation is to be."""
+
+    reference: Reference
+    places: Array | None  # (n, 2) of the drones [m]; None where a law has none
+    invariances: tuple[str, ...]  # what of the places the law leaves open
 
 
 class Wanted(NamedTuple):
@@ -37,26 +45,28 @@ class Wanted(NamedTuple):
 class Flown(NamedTuple):
     """The horizontal motion of a formation within its window."""
 
-    drones: tuple[str, ...]
     t_s: Array  # (T,)
     p: Array  # (T, n, 2) true places [m; W]; NaN of drones that are not in the air
     wanted: Wanted | None
 
 
-def measures(flight: RecordedFlight) -> dict[str, float | None]:
+def measures(flight: RecordedFlight, figure: Figure | None = None) -> dict[str, float | None]:
     """Return the figures of a flight; None where there is none of a kind.
 
     shape_error_m: root mean square distance of the drones from the figure's places, after the best move, turn or
         growth of it that the law leaves open; of a lattice the deviation of its sides from the spacing.
     place_error_m: the same distance with nothing left open. None for flocks, which have no places.
     centre_error_m: distance of the drones' centre from where it was to be, root mean square.
-    effort_m2_s: integral of the squared horizontal velocity command, mean over the drones.
+    effort_m2_s: integral of the squared horizontal velocity command over the whole flight, mean over the drones.
     separation_m: least distance of two drones in the air.
     messages_per_drone_s: sent to others, per drone and simulated second: of pilots their messages; of a controller
         the estimates that it needs and the commands that it gives.
     cpu_per_s: CPU time of the whole flight in one process, per simulated second; None of a record.
+
+    Args:
+        figure: that was to be flown; None: that of the pilots' parameters.
     """
-    flown = flown_of(flight)
+    flown = flown_of(flight, figure)
     window_s, _ = window_of(flight)
     length_s = max(flight.last_ns / 1e9, 1e-9)
     within = [_within(track, window_s) for track in flight.tracks]
@@ -64,7 +74,7 @@ def measures(flight: RecordedFlight) -> dict[str, float | None]:
         "shape_error_m": _shape_error(flight.scenario, flown),
         "place_error_m": None,
         "centre_error_m": None,
-        "effort_m2_s": _effort(flight, window_s),
+        "effort_m2_s": _effort(flight),
         "separation_m": min_separation_m(within),
         "messages_per_drone_s": _messages(flight) / (len(flight.tracks) * length_s),
         "cpu_per_s": flight.cpu_s / length_s if flight.cpu_s else None,
@@ -76,7 +86,7 @@ def measures(flight: RecordedFlight) -> dict[str, float | None]:
     return found
 
 
-def flown_of(flight: RecordedFlight, whole: bool = False) -> Flown:
+def flown_of(flight: RecordedFlight, figure: Figure | None = None, whole: bool = False) -> Flown:
     """Return the motion of all drones within the window of the report, or over the whole flight."""
     (start, end), _ = window_of(flight)
     if whole:
@@ -90,12 +100,14 @@ def flown_of(flight: RecordedFlight, whole: bool = False) -> Flown:
         latest = np.searchsorted(track.status_t_ns, t_ns, side="right") - 1
         aloft = np.array([state in AIRBORNE for state in track.states], bool)
         p[~aloft[np.maximum(latest, 0)], column] = np.nan
-    t_s = t_ns / 1e9
-    return Flown(tuple(track.name for track in tracks), t_s, p, _wanted(flight, t_s))
+    t_s, figure = t_ns / 1e9, figure or figure_of(flight.scenario)
+    return Flown(t_s, p, _wanted(figure, t_s) if figure else None)
 
 
 def shape_errors(flown: Flown) -> Array:
-    """Return at each instant (T,) the root mean square distance from the places that fit best [m]; NaN without any.
+    """Return at each instant (T,) the root mean square distance from the places that fit best [m].
+
+    NaN without places, and with less than two drones in the air.
 
     The figure is moved, turned and enlarged as far as the law leaves it open.
     """
@@ -109,7 +121,8 @@ def shape_errors(flown: Flown) -> Array:
         product, size = np.nansum(c.conj() * p, axis=1), np.nansum(np.abs(c) ** 2, axis=1)
         turn = product / np.abs(product) if "rotation" in wanted.invariances else np.ones(len(p), complex)
         growth = (product / turn).real / size if "scale" in wanted.invariances else np.ones(len(p))
-        return np.sqrt(_mean(np.abs(p - (growth * turn)[:, None] * c) ** 2).real)
+        errors = np.sqrt(_mean(np.abs(p - (growth * turn)[:, None] * c) ** 2).real)
+    return np.where((~np.isnan(p)).sum(axis=1) > 1, errors, np.nan)
 
 
 def lattice_errors(p: Array, spacing_m: float, reach_m: float) -> Array:
@@ -129,36 +142,24 @@ def law_of(scenario: Scenario | None) -> tuple[type[Pilot], Any] | None:
     return None
 
 
-def _wanted(flight: RecordedFlight, t_s: Array) -> Wanted | None:
-    scenario, law = flight.scenario, law_of(flight.scenario)
-    if scenario is None or not len(t_s):
+def figure_of(scenario: Scenario | None) -> Figure | None:
+    """Return the figure that the pilots of a scenario were told of; None where none is flown by a law."""
+    if scenario is None or (law := law_of(scenario)) is None:
         return None
-    if law is None:
-        return _of_cluster(flight, t_s)
     kind, own = law
-    reference = kind.reference_of(own)
-    poses = [reference.at(float(t)) for t in t_s]
-    centre = np.array([pose.p_W for pose in poses])
     if not issubclass(kind, ShapePilot):
-        return Wanted(centre, None, ())
-    n = len(scenario.drones)
-    c = np.array(own.places_m) if own.places_m else polygon(n, own.radius_m)
-    turns = np.array([pose.turn for pose in poses])
-    return Wanted(centre, centre[:, None] + np.einsum("tij,nj->tni", turns, c), kind.invariances)
+        return Figure(kind.reference_of(own), None, ())
+    places = np.array(own.places_m) if own.places_m else polygon(len(scenario.drones), own.radius_m)
+    return Figure(kind.reference_of(own), places, kind.invariances)
 
 
-def _of_cluster(flight: RecordedFlight, t_s: Array) -> Wanted | None:
-    """Return what the one cluster of a flight was to be, by its controller's reference."""
-    states = flight.clusters
-    found = formation(states[0], flight.tracks, flight.scenario) if len(states) == 1 and flight.scenario else None
-    names = [track.name for track in flight.tracks]
-    if found is None or flight.scenario is None or sorted(found.drones) != sorted(names):
-        return None
-    space = scenario_space(flight.scenario, flight.scenario.clusters[0])
-    rows = np.clip(np.searchsorted(found.t_s, t_s, side="right") - 1, 0, None)
-    order = [found.drones.index(name) for name in names]
-    places = np.array([space.inverse(found.desired[row])[0][order, :2] for row in rows])
-    return Wanted(np.mean(places, axis=1), places, ("translation",))
+def _wanted(figure: Figure, t_s: Array) -> Wanted:
+    poses = [figure.reference.at(float(t)) for t in t_s]
+    centre = np.array([pose.p_W for pose in poses]).reshape(-1, 2)
+    if figure.places is None:
+        return Wanted(centre, None, figure.invariances)
+    turns = np.array([pose.turn for pose in poses]).reshape(-1, 2, 2)
+    return Wanted(centre, centre[:, None] + np.einsum("tij,nj->tni", turns, figure.places), figure.invariances)
 
 
 def _shape_error(scenario: Scenario | None, flown: Flown) -> float | None:
@@ -176,17 +177,14 @@ def _centre_of_flying(flown: Flown) -> Array:
     return flown.wanted.centre if places is None else _mean(np.where(np.isnan(flown.p), np.nan, places))
 
 
-def _effort(flight: RecordedFlight, window_s: tuple[float, float]) -> float | None:
+def _effort(flight: RecordedFlight) -> float | None:
     efforts = []
     for track in flight.tracks:
         commands = flight.commands.get(track.name)
         if commands is None:
             continue
-        t_s = commands.t_ns / 1e9
-        chosen = (t_s >= window_s[0]) & (t_s <= window_s[1])
-        if chosen.sum() > 1:
-            squared = np.sum(commands.velocity[chosen, :2] ** 2, axis=1)
-            efforts.append(float(np.sum(squared[:-1] * np.diff(t_s[chosen]))))
+        squared = np.sum(commands.velocity[:, :2] ** 2, axis=1)
+        efforts.append(float(np.sum(squared[:-1] * np.diff(commands.t_ns / 1e9))))
     return float(np.mean(efforts)) if efforts else None
 
 

@@ -66,6 +66,7 @@ class Task(Struct, frozen=True):
     scenario: Scenario  # resolved, with the run's seed
     record: str | None = None  # folder for the record, None to keep none
     open_run: Callable[[Path], Any] | None = None  # makes a `zsim.Run` of a record, for metrics
+    more: Callable[[RecordedFlight], Mapping[str, Any]] | None = None  # returns further columns, of values as in JSON
 
 
 class RunResult(Struct, frozen=True, kw_only=True):
@@ -111,7 +112,7 @@ def engaged_column(cluster: str) -> str:
     return f"clusters.{cluster}.engaged_s"
 
 
-def make_row(result: RunResult, varied: Mapping[str, Any], errors: Mapping[str, float | None]) -> Row:
+def make_row(result: RunResult, varied: Mapping[str, Any], errors: Mapping[str, Any]) -> Row:
     """Return the row of a run: first its number, point, seed and varied values, then its results."""
     columns: Row = msgspec.structs.asdict(result)
     inputs = {name: columns.pop(name) for name in ("run", "point", "seed")}
@@ -138,7 +139,7 @@ def fly(task: Task) -> Row:
     where: Row = {"host": socket.gethostname(), "fingerprint": fingerprint()}
     try:
         with _record(task) as writer:
-            flight, diverged = fly_scenario(task.scenario, writer)
+            flight, diverged = fly_scenario(task.scenario, writer, answers=task.more is not None)
         formations = formations_of(flight)
         summary = summarise(flight, formations, Path())  # the end event makes the record unnecessary
     except (RecordError, OSError):
@@ -175,19 +176,19 @@ def fly(task: Task) -> Row:
         for parameter, errors in cluster.errors.items():
             for statistic, value in msgspec.structs.asdict(errors).items():
                 columns[f"{prefix}.{parameter}.{statistic}"] = value if counts else None
-    return make_row(result, task.varied, {**columns, **metrics})
+    more = task.more(flight) if task.more and not diverged else {}
+    return make_row(result, task.varied, {**columns, **metrics, **more})
 
 
-def fly_scenario(scenario: Scenario, writer: RecordWriter | None = None) -> tuple[RecordedFlight, Exception | None]:
+def fly_scenario(
+    scenario: Scenario, writer: RecordWriter | None = None, answers: bool = False
+) -> tuple[RecordedFlight, Exception | None]:
     """Fly a resolved scenario; return the flight, and the error by which it diverged if it did.
 
-    A flight for metrics of the user has the drones' estimates and commands, too.
+    With `answers`, and for metrics of the user, it has the drones' estimates and commands, too.
     """
-    flight, reader, cpu = (
-        InProcessFlight(scenario),
-        FlightReader(answers=bool(scenario.report.metric_names)),
-        _CpuTime(),
-    )
+    flight, cpu = InProcessFlight(scenario), _CpuTime()
+    reader = FlightReader(answers or bool(scenario.report.metric_names))
     flight.run([reader, cpu, writer] if writer else [reader, cpu])
     flown = reader.flight()
     flown.cpu_s = cpu.spent_s

@@ -23,6 +23,7 @@ from zsim.errors import (
 from zsim_deploy import INTERRUPTED, USER_FAULT
 from zsim_deploy.arguments import HOSTS, POKE, TRANSLATE, endpoint_origin, note, say
 from zsim_deploy.cli import (
+    board_command,
     bridge_commands,
     federation_commands,
     fmu_command,
@@ -51,7 +52,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-for _family in (run_commands, role_commands, hosts_commands, federation_commands, bridge_commands, fmu_command):
+_FAMILIES = (run_commands, board_command, role_commands, hosts_commands, federation_commands, bridge_commands)
+for _family in (*_FAMILIES, fmu_command):
     app.add_typer(_family.app)
 for _panel, _group in (
     (POKE, federation_commands.faults),

@@ -35,6 +35,8 @@ class RemoteProcess:
     folder and takes away when it ends; brought again whenever it is started again.
     """
 
+    is_program = False
+
     def __init__(
         self,
         name: str,

@@ -56,6 +56,8 @@ class ChildProcess:
     `on_line` takes every line of its standard output; None sends that to the log too.
     """
 
+    is_program = False
+
     def __init__(
         self,
         name: str,

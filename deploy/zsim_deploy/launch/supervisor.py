@@ -40,6 +40,7 @@ class RunProcess(Protocol):
     name: str
     role: str
     restarts: int
+    is_program: bool  # of a user's: its pid is not that as which it joins
 
     @property
     def pid(self) -> int: ...
@@ -110,7 +111,8 @@ class Supervisor:
         with handled_by(on_signal):
             try:
                 for child in self.members:
-                    child.start()
+                    if not child.is_program:  # these may connect only once, so the world is to be there
+                        child.start()
                 self._watch(look)
                 self._finish()
             finally:
@@ -174,8 +176,8 @@ class Supervisor:
         It has left its place to the one that is dead now, or has ended with 0 without a bye, as by `os._exit(0)`.
         """
         for child in self.members:
-            if child.name == name and child.pid == pid and child.code in (0, None):
-                self._lost[name] = pid
+            if child.name == name and (child.pid == pid or child.is_program) and child.code in (0, None):
+                self._lost[name] = child.pid
                 self._dead.discard(name)
             elif child.name == name and child.code == SUPERSEDED and name in self._dead:
                 self._show.say(f"{name} is started again, since the process that took its place is dead")
@@ -188,6 +190,7 @@ class Supervisor:
     def _watch(self, look: Callable[[], None]) -> None:
         world = next(child for child in self.members if child.role == "world")
         self._silent_s = time.monotonic() + SILENT_S
+        to_start = [child for child in self.members if child.is_program]
         while world.code is None or self._restarts_world(world):
             if self._interrupted:
                 self._reason = self._interrupted
@@ -204,6 +207,8 @@ class Supervisor:
                         outcome.set_result(act())
                     except Exception as error:  # whatever it is, the run goes on
                         outcome.set_exception(error)
+            while to_start and self._world_watch.last_s is not None:
+                to_start.pop().start()
             self._release_replaced()
             if self._silent_s is not None and time.monotonic() > self._silent_s:
                 self._silent_s = None
@@ -225,9 +230,10 @@ class Supervisor:
 
     def _on_exit(self, child: RunProcess, world: RunProcess) -> None:
         """Apply on_death to a role that ended while the world runs."""
-        if child.code == SUPERSEDED or (child.code == 0 and self._lost.get(child.name) != child.pid):
+        is_superseded = child.code == SUPERSEDED and not child.is_program
+        if is_superseded or (child.code == 0 and self._lost.get(child.name) != child.pid):
             self._dead.add(child.name)
-            if child.code == SUPERSEDED:
+            if is_superseded:
                 self._show.say(child.last_log_line())
             return
         action = self._apply_on_death(child, self._flies)

@@ -337,9 +337,10 @@ class Coordinator(ABC):
 
     def _start_timeout_s(self, name: str) -> float:
         """Return how long a run waits at its start for a process that is expected [s, wall]."""
-        asked_s = self.scenario.processes.start_timeout_s
-        if asked_s is not UNSET:
-            return asked_s
+        program = self.scenario.own_programs.get(name)
+        for section in (program, self.scenario.processes):
+            if section is not None and section.start_timeout_s is not UNSET:
+                return section.start_timeout_s
         if not self.is_launched:
             return math.inf
         is_started = name in self._agent_names or name.partition(".")[0] in ROLES

@@ -19,7 +19,7 @@ from zsim.scenario import scenario_file
 from zsim_api.run_folder import new_launch
 from zsim_deploy.arguments import changed_fields
 from zsim_deploy.launch import run
-from zsim_deploy.launch.role_launcher import RoleLauncher
+from zsim_deploy.launch.role_launcher import ChildProcess, RoleLauncher
 from zsim_deploy.launch.run import RunOptions
 from zsim_deploy.launch.supervisor import Outcome
 
@@ -102,7 +102,7 @@ def test_a_port_taken_in_between_is_another_port(
 def lines_of(made: RunOptions) -> dict[str, list[str]]:
     """Return the arguments of every process of a run."""
     children = run._children(made, "tcp/127.0.0.1:20001", FakeSupervisor(), NoRoleLauncher(print))  # type: ignore[arg-type]
-    return {child.name: child._arguments for child in children}
+    return {child.name: child._arguments for child in children if isinstance(child, ChildProcess)}
 
 
 def test_the_world_is_told_what_was_changed_of_the_file_and_no_name_is_taken_for_an_option(tmp_path: Path):

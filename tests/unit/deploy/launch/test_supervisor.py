@@ -40,6 +40,8 @@ class Show:
 class Member:
     """A process that ends with the codes given, one per start; None lives until it is told to stop."""
 
+    is_program = False
+
     def __init__(self, name: str, *codes: int | None, lives_for: int = 0) -> None:
         self.name, self.role = name, name.split(".")[0]
         self.restarts, self.pid = 0, 0

@@ -1,0 +1,239 @@
+"""Flies a board: every law in every scenario with every seed, on all cores; and its table of means.
+
+The folder of a board:
+
+    journal.jsonl    finished flights, a line of JSON each; the same command goes on with it
+    board.csv        the figures of each flight
+    board.md         their means over the seeds, a row for each law in each scenario
+    summary.json     the same, for programs
+    report.html      the table and the figures
+"""
+
+import csv
+import hashlib
+import io
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+from rich.console import Console
+
+from zsim import __version__
+from zsim.errors import ReportError, RunError, ScenarioError
+from zsim.output_folder import refuse_others, take_lock
+from zsim.scenario import scenario_file
+from zsim_agents.hosting import check_classes
+from zsim_agents.laws.reference import Reference, polygon
+from zsim_analysis.board.entries import CLUSTER_SPACE, about, resolved, shipped
+from zsim_analysis.board.measures import Figure, flown_of, measures, shape_errors
+from zsim_analysis.reading.recorded_flight import RecordedFlight
+from zsim_analysis.sweep.process_pool import ProcessPool, cores
+from zsim_analysis.sweep.sweep import Journal, SweepScreen, failures, read_journal
+from zsim_analysis.sweep.sweep_run import Row, Task
+
+JOURNAL, CSV, MARKDOWN = "journal.jsonl", "board.csv", "board.md"
+OWN_FILES = (JOURNAL, CSV, MARKDOWN, "summary.json", "report.html", "figures", ".lock")
+TRACK_S = 0.5  # between the instants of a flight that are kept for the figures
+DECIMALS = 3  # of the places that are kept: a millimetre
+SERIES = ("track_t_s", "track_m", "track_shape_m")  # columns of a row that are no figure
+
+
+class Measure(Struct, frozen=True):
+    """A column of the board."""
+
+    name: str  # of the row
+    title: str
+    unit: str
+    digits: int
+
+
+MEASURES = (
+    Measure("shape_error_m", "shape error", "m", 2),
+    Measure("place_error_m", "place error", "m", 2),
+    Measure("centre_error_m", "centre error", "m", 2),
+    Measure("effort_m2_s", "control effort", "m²/s", 1),
+    Measure("separation_m", "least separation", "m", 2),
+    Measure("messages_per_drone_s", "messages per drone", "1/s", 1),
+    Measure("cpu_per_s", "CPU per simulated second", "ms", 1),
+    Measure("contacts", "contacts", "", 0),
+)
+
+
+class Entry(Struct, frozen=True):
+    """The flights of a law in a scenario: the means of its figures over the seeds, with least and greatest."""
+
+    scenario: str
+    law: str
+    flights: int
+    failed: int
+    means: dict[str, float | None]
+    least: dict[str, float | None]
+    greatest: dict[str, float | None]
+
+
+class Board(Struct, frozen=True):
+    """All that was flown, in the order in which it was asked for."""
+
+    laws: list[str]
+    scenarios: list[str]
+    seeds: int
+    version: str
+    entries: list[Entry]
+
+    def entry(self, scenario: str, law: str) -> Entry:
+        return next(each for each in self.entries if (each.scenario, each.law) == (scenario, law))
+
+
+class BoardRequest(Struct, frozen=True):
+    """What to fly, where to, and by how many processes."""
+
+    laws: list[str]
+    scenarios: list[str]
+    seeds: int
+    out: Path
+    workers: int | None = None  # None: one per core
+    force: bool = False  # whether the folder may hold other files
+    console: Console | None = None  # where progress is shown, None: stderr
+
+
+def fly_board(request: BoardRequest) -> list[Row]:
+    """Fly what the folder does not hold yet; return the rows of all flights.
+
+    Raises:
+        ScenarioError: a law cannot be flown; a line for each fault.
+        RunError: the folder holds something else, or cannot be written; workers cannot start.
+        KeyboardInterrupt: the finished flights are in the journal.
+    """
+    tasks = _tasks(request)
+    try:
+        request.out.mkdir(parents=True, exist_ok=True)
+        if not (request.out / JOURNAL).exists():
+            refuse_others(request.out, OWN_FILES, request.force, "write a board into")
+        lock = (request.out / ".lock").open("w")
+    except OSError as error:
+        raise RunError(f"{request.out}: cannot be made ({error.strerror}); give --out another folder") from error
+    with lock:
+        if not take_lock(lock):
+            raise RunError(f"{request.out}: another board is flown there; give --out another folder")
+        known = {row["identity"]: row for row in read_journal(request.out / JOURNAL)}
+        missing = [task for task in tasks if task.varied["identity"] not in known]
+        with SweepScreen(len(tasks), len(tasks) - len(missing), request.console) as screen:
+            what = f"{len(request.laws)} laws, {len(request.scenarios)} scenarios, {request.seeds} seeds"
+            screen.say(f"board: {what}, into {request.out}")
+            if missing:
+                pool = ProcessPool(min(request.workers or cores(), len(missing)), screen.say)
+                with Journal(request.out / JOURNAL) as journal, closing(pool.rows(iter(missing))) as rows:
+                    for row in rows:
+                        journal.append(row)
+                        known[row["identity"]] = row
+                        screen.finished(row["failure"] is not None)
+            found = [known[task.varied["identity"]] for task in tasks]
+            for line in failures(found):
+                screen.say(line)
+    return found
+
+
+def _tasks(request: BoardRequest) -> list[Task]:
+    """Return the flights of a board, seed by seed, so that a part of it has all laws."""
+    tasks: list[Task] = []
+    faults: list[str] = []
+    for law in request.laws:  # each is checked once, in the first scenario
+        try:
+            check_classes(resolved(law, request.scenarios[0], 1), law)
+        except ScenarioError as error:
+            faults += error.faults
+    if faults:
+        raise ScenarioError(faults)
+    for seed in range(1, request.seeds + 1):
+        for scenario in request.scenarios:
+            for law in request.laws:
+                flown = resolved(law, scenario, seed)
+                text = f"{__version__}\n{scenario_file.to_text(flown)}"
+                varied = {"scenario": scenario, "law": law, "identity": hashlib.sha256(text.encode()).hexdigest()}
+                tasks.append(Task(len(tasks), 0, varied, flown, more=partial(columns, law, scenario)))
+    return tasks
+
+
+def columns(law: str, scenario: str, flight: RecordedFlight) -> dict[str, Any]:
+    """Return the figures of a flight, and where its drones were, every TRACK_S."""
+    figure = planned_figure(scenario) if law == CLUSTER_SPACE else None
+    flown = flown_of(flight, figure, whole=True)
+    step = max(1, round(TRACK_S / float(np.median(np.diff(flown.t_s))))) if len(flown.t_s) > 1 else 1
+    series = dict(
+        zip(SERIES, (flown.t_s[::step], flown.p[::step], shape_errors(flown)[::step]), strict=True)
+    )  # fmt: skip
+    found = measures(flight, figure)
+    cpu = found["cpu_per_s"]
+    contacts = sum(event.kind == "collision" for event in flight.events)
+    kept = {name: np.round(values, DECIMALS).tolist() for name, values in series.items()}
+    return {**found, "cpu_per_s": None if cpu is None else 1e3 * cpu, "contacts": float(contacts), **kept}
+
+
+def planned_figure(scenario: str) -> Figure:
+    """Return what the stock controller is told to fly."""
+    entry, flight = shipped()["scenarios"][scenario], shipped()["flight"]
+    places = polygon(len(shipped()["base"]["drones"]), flight["radius_m"])
+    return Figure(Reference(entry["centre_m"], 0.0, 1.0, flight["start_s"]), places, ("translation",))
+
+
+def board_of(request: BoardRequest, rows: Sequence[Row]) -> Board:
+    """Return the means of the flights over the seeds; of those that did not fail."""
+    entries = []
+    for scenario in request.scenarios:
+        for law in request.laws:
+            of = [row for row in rows if (row["scenario"], row["law"]) == (scenario, law)]
+            flown = [row for row in of if row["failure"] is None]
+            values = {each.name: [row[each.name] for row in flown if row[each.name] is not None] for each in MEASURES}
+            folded = [
+                {name: float(fold(given)) if given else None for name, given in values.items()}
+                for fold in (np.mean, min, max)
+            ]
+            entries.append(Entry(scenario, law, len(of), len(of) - len(flown), *folded))
+    return Board(request.laws, request.scenarios, request.seeds, __version__, entries)
+
+
+def cells(entry: Entry) -> list[str]:
+    """Return the figures of a law as texts, in the order of MEASURES; where all of its flights failed, a dash each."""
+    values = [(each, entry.means[each.name]) for each in MEASURES]
+    return ["–" if value is None else f"{value:.{each.digits}f}" for each, value in values]
+
+
+def heads() -> list[str]:
+    return [f"{each.title} ({each.unit})" if each.unit else each.title for each in MEASURES]
+
+
+def markdown(board: Board) -> str:
+    """Return the table of the board."""
+    return "".join(_markdown(board))
+
+
+def _markdown(board: Board) -> Iterator[str]:
+    for scenario in board.scenarios:
+        yield f"### {scenario}\n\n{about(scenario)[0].upper()}{about(scenario)[1:]}.\n\n"
+        yield f"| law | {' | '.join(heads())} |\n|---|{'--:|' * len(MEASURES)}\n"
+        for law in board.laws:
+            yield f"| {law} | {' | '.join(cells(board.entry(scenario, law)))} |\n"
+        yield "\n"
+
+
+def write_tables(out: Path, board: Board, rows: Sequence[Row]) -> None:
+    """Write board.csv and board.md; ReportError: the folder cannot be written."""
+    names = ["scenario", "law", "seed", "failure", *(each.name for each in MEASURES), "truth_sha256"]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, names, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    try:
+        (out / CSV).write_text(text.getvalue(), encoding="utf-8")
+        (out / MARKDOWN).write_text(markdown(board), encoding="utf-8")
+    except OSError as error:
+        raise ReportError(f"{out}: cannot be written ({error.strerror})") from error
+
+
+def summary_of(board: Board) -> bytes:
+    return msgspec.json.format(msgspec.json.encode(board), indent=2) + b"\n"

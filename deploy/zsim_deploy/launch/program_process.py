@@ -1,0 +1,76 @@
+"""A program of a user's that is started with a run, watched like the run's own processes."""
+
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from zsim_api.programs import Program
+from zsim_deploy.launch.supervisor import end_text
+
+LEAVES_S = 2.0  # wall time that a program has to see that the run is over, before it is interrupted
+
+
+class ProgramProcess:
+    """A program, its output in the log of its name; see `RunProcess`.
+
+    Args:
+        folder: in which it runs; None: the current one.
+    """
+
+    is_program = True
+
+    def __init__(
+        self, name: str, words: Sequence[str], logs: Path, environment: Mapping[str, str], folder: Path | None
+    ) -> None:
+        self.name = name
+        self.role = name.partition(".")[0]
+        self.restarts = 0
+        self._words, self._environment, self._folder = words, environment, folder
+        self._log = logs / f"{name}.log"
+        self._program: Program | None = None
+        self._asked: threading.Timer | None = None
+
+    def start(self) -> None:
+        if self._program is not None:
+            self._program.close()
+        self._program = Program(self._words, self._environment, self._log, self._folder)
+
+    @property
+    def pid(self) -> int:
+        return self._program.pid if self._program else 0
+
+    @property
+    def code(self) -> int | None:
+        """Return its exit code, None while it lives; negative for a signal."""
+        code = self._program.code if self._program else None
+        return code if code is None or code <= 128 else 128 - code
+
+    def outcome(self) -> str:
+        return end_text(self.code, self.last_log_line())
+
+    def last_log_line(self) -> str:
+        try:
+            lines = self._log.read_text(errors="replace").strip().splitlines()
+        except OSError:
+            return ""
+        return lines[-1] if lines else ""
+
+    def request_stop(self, reason: str) -> None:
+        """Interrupt it, as Ctrl-C does, unless it leaves by itself within LEAVES_S."""
+        if self._program is not None and self._asked is None:
+            self._asked = threading.Timer(LEAVES_S, self._program.interrupt)
+            self._asked.daemon = True
+            self._asked.start()
+
+    def wait(self, timeout_s: float) -> bool:
+        return self._program is None or self._program.wait(max(0.0, timeout_s)) is not None
+
+    def kill(self) -> None:
+        if self._program is not None:
+            self._program.kill()
+
+    def close(self) -> None:
+        if self._asked is not None:
+            self._asked.cancel()
+        if self._program is not None:
+            self._program.close()

@@ -1,0 +1,58 @@
+"""The measures of a board on motions of which they are known."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from zsim_agents.laws.reference import polygon
+from zsim_analysis.board.measures import Flown, Wanted, lattice_errors, shape_errors
+
+C = polygon(5, 3.0)
+T = np.arange(4.0)
+MOVED = np.array([3.0, 4.0])
+
+
+def turned(c: NDArray[Any], degrees: float) -> NDArray[Any]:
+    s, k = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
+    return c @ np.array([[k, s], [-s, k]])
+
+
+def error(p: NDArray[Any], *invariances: str) -> float:
+    wanted = np.broadcast_to(C, (4, 5, 2))
+    flown = Flown(T, np.broadcast_to(p, (4, 5, 2)).copy(), Wanted(np.zeros((4, 2)), wanted, invariances))
+    return float(shape_errors(flown)[0])
+
+
+@pytest.mark.parametrize(
+    ("p", "invariances", "wanted"),
+    [
+        (C + MOVED, (), 5.0),
+        (C + MOVED, ("translation",), 0.0),
+        (turned(C, 60), ("translation",), 3.0),  # each at the end of a chord of its circle
+        (turned(C, 60) + 7, ("translation", "rotation"), 0.0),
+        (1.5 * C - 2, ("translation",), 1.5),
+        (1.5 * C - 2, ("translation", "rotation"), 1.5),
+        (1.5 * C - 2, ("translation", "scale"), 0.0),
+        (C * [1, -1], ("translation", "rotation"), 3.0 * math.sqrt(2)),  # a mirrored figure is another one
+    ],
+)  # fmt: skip
+def test_a_figure_errs_by_what_its_law_does_not_leave_open(p: Any, invariances: tuple[str, ...], wanted: float) -> None:
+    assert error(p, *invariances) == pytest.approx(wanted, abs=1e-9)
+
+
+def test_drones_on_the_ground_do_not_count() -> None:
+    lost = C + MOVED
+    lost[4] = np.nan
+    assert error(lost, "translation") == pytest.approx(0.0, abs=1e-9)
+    lost[1:] = np.nan
+    assert math.isnan(error(lost, "translation"))
+
+
+def test_a_lattice_errs_by_the_sides_within_reach() -> None:
+    triangle = np.array([[[0.0, 0], [3.5, 0], [1.75, 3.5 * math.sqrt(0.75)], [1.75, 20]]])
+    assert lattice_errors(triangle, 3.5, 4.2)[0] == pytest.approx(0.0, abs=1e-12)
+    assert lattice_errors(triangle, 3.0, 4.2)[0] == pytest.approx(0.5)
+    assert math.isnan(lattice_errors(triangle, 1.0, 1.2)[0])
