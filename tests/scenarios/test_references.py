@@ -88,6 +88,23 @@ def test_a_drone_flies_where_it_is_asked_to_and_a_rerun_does_too(tmp_path: Path)
     assert rerun_record(tmp_path / "run", False, said.append, said.append) == ""
 
 
+def test_a_slower_path_is_swept_and_kept_to_better(tmp_path: Path) -> None:
+    (tmp_path / "short.yaml").write_text(SHORT)
+    path = "drones.d1.reference.time_scale"
+    options: dict[str, Any] = {"workers": 1, "progress": False, "set": {"drones.d1.reference.land_s": 17}}
+    frame = zsim.sweep(tmp_path / "short.yaml", {path: [1, 2.5]}, duration_s=18, **options)
+    fast, slow = frame["tracking.d1.path_rms_m"]
+    assert 0.0 < slow < fast < 0.2
+
+
+@pytest.mark.soak
+def test_hosted_they_have_the_same_bits(federation: Any, tmp_path: Path, compiled: None) -> None:
+    (tmp_path / "short.yaml").write_text(SHORT)
+    alone = zsim.run(tmp_path / "short.yaml", out=tmp_path / "alone", progress=False)
+    federation.run(SHORT, "--hosted").ends(with_code=0)
+    assert federation.record().sha256() == alone.truth_sha256
+
+
 @pytest.mark.parametrize("op", ["goto", "follow"])
 def test_who_has_no_pilot_cannot_be_asked(op: str, tmp_path: Path) -> None:
     arguments: dict[str, Any] = {

@@ -32,6 +32,7 @@ from zsim_bridges.console.picture import (
     ellipsoids,
     formation_shape,
     ghosts,
+    reference_lines,
     rotor_angles,
     rotor_poses,
     short_names,
@@ -82,6 +83,7 @@ class RunScene:
         arms_m = [drone.arm_m for drone in run.scenario.drones]
         self.nodes = SceneNodes(server, run.info.drones, arms_m, robots, len(run.spaces))
         self.nodes.obstacles(run.scenario.environment.obstacles)
+        self.nodes.references(reference_lines(run.scenario))
         cameras.restart()
 
     def clicked(self, event: viser.SceneClickEvent) -> str | None:
@@ -231,6 +233,12 @@ class SceneNodes:
                 self._scene.add_cylinder(name, radius=each.radius_m or 0.0, height=height_m, position=centre, **look)
             else:
                 self._scene.add_icosphere(name, radius=each.radius_m or 0.0, position=(x, y, z), **look)
+
+    def references(self, lines: Array) -> None:
+        """Draw the paths of drones that fly by themselves, as segments (M, 2, 3) [m; W]."""
+        if len(lines):
+            look: Any = {"thickness": SIDE_PX, "thickness_units": "screen"}
+            self._scene.add_line_segments("/references", lines.astype(np.float32), GHOST, **look)
 
     def on_click(self, act: Callable[[viser.SceneClickEvent], None]) -> None:
         """Call back with viser's event of each click into the scene.

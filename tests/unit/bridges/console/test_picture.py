@@ -199,3 +199,16 @@ def test_trails_are_seen_on_dark_ground_and_light_ones_are_as_they_were(count: i
         seen = lightened(colour)
         assert (luminance(seen) + 0.05) / (luminance(DARK[0]) + 0.05) > CONTRAST_MIN
         assert luminance(colour) < LUMINANCE_MIN or list(seen) == list(colour)
+
+
+def test_paths_of_drones_that_fly_by_themselves_are_lines_from_their_hover_to_their_end():
+    scenario = scenario_file.load(SCENARIOS.parent / "examples" / "exchange.yaml")
+    lines = pic.reference_lines(scenario)
+    assert lines.shape == (4 * 2 * (pic.PATH_POINTS - 1), 2, 3)
+    assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).max() < 0.6
+    first = lines[: pic.PATH_POINTS - 1]
+    assert first[0, 0] == pytest.approx([0, 0, 1])  # over its start
+    assert isinstance(scenario.exchanges, list)
+    ends = np.array(scenario.exchanges[0].stages[0].places_m)
+    assert np.linalg.norm(ends - first[-1, 1], axis=1).min() < 1e-9
+    assert len(pic.reference_lines(scenario_file.load(SCENARIOS / "step.yaml"))) == 0
