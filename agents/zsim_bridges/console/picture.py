@@ -89,6 +89,16 @@ def drone_poses(view: ViewDrones, names: Sequence[str]) -> DronePoses:
     return DronePoses(view.t_ns, tuple(names), p_W, q_WB, rotor, wind)
 
 
+def radio_lines(hears: Sequence[Sequence[int]], drones: DronePoses) -> tuple[Array, Array]:
+    """Return the ends (n, 2, 3) [m] of the links between drones that are there: those both ways, and those one way."""
+    there = drones.present
+    links = {(i, j) for i, heard in enumerate(hears) for j in heard if max(i, j) < len(there) and there[i] and there[j]}
+    both = sorted((i, j) for i, j in links if i < j and (j, i) in links)
+    single = sorted((i, j) for i, j in links if (j, i) not in links)
+    ends = [drones.p_W[np.array(each, dtype=int).reshape(-1, 2)] for each in (both, single)]
+    return ends[0], ends[1]
+
+
 def drone_on_ray(
     drones: DronePoses, radii_m: Array, origin_W: Sequence[float], direction_W: Sequence[float]
 ) -> str | None:

@@ -33,6 +33,7 @@ from zsim_bridges.console.picture import (
     formation_shape,
     ghosts,
     reference_lines,
+    radio_lines,
     rotor_angles,
     rotor_poses,
     short_names,
@@ -399,16 +400,6 @@ class ChosenRing:
         if index != self._chosen:
             self._chosen = index
             self._node.batched_scales = np.full((1, 3), self._radii_m[index])
-
-
-def radio_lines(hears: Sequence[Sequence[int]], drones: DronePoses) -> tuple[Array, Array]:
-    """Return the ends (n, 2, 3) [m] of links between present drones: both ways, then one way."""
-    pairs = {(i, j) for i, heard in enumerate(hears) for j in heard}
-    count, there = len(drones.p_W), drones.present
-    known = {(i, j) for i, j in pairs if max(i, j) < count and there[i] and there[j]}
-    both = sorted((i, j) for i, j in known if i < j and (j, i) in known)
-    single = sorted((i, j) for i, j in known if (j, i) not in known)
-    return tuple(drones.p_W[np.array(each, dtype=int).reshape(-1, 2)] for each in (both, single))  # type: ignore[return-value]
 
 
 def draw_ground(scene: viser.SceneApi, *, dark: bool = False) -> None:

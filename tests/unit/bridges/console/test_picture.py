@@ -47,6 +47,14 @@ def test_a_view_becomes_arrays_in_which_drones_keep_their_places():
     assert not pic.drone_poses(ViewDrones(7, 0, ()), ("d0",)).present.any()
 
 
+def test_links_of_the_radio_are_lines_between_drones_that_are_there():
+    views = tuple(DroneView(f"d{i}", (i, 0.0, 0.0), LEVEL, (1.0,) * 4, "flying", 80.0) for i in (0, 1, 3))
+    drones = pic.drone_poses(ViewDrones(7, 0, views), ("d0", "d1", "d2", "d3"))
+    both, single = pic.radio_lines(((1, 2), (0, 3, 4), (0,), (), (0, 1, 2, 3)), drones)  # the station's is the fifth
+    assert both[:, :, 0].tolist() == [[0, 1]]
+    assert single[:, :, 0].tolist() == [[1, 3]]
+
+
 def test_many_names_are_shown_by_what_tells_them_apart():
     assert pic.short_names(["drone1", "drone2", "drone30"]) == ["1", "2", "30"]
     assert pic.short_names(["drone10", "drone11"]) == ["10", "11"]
