@@ -16,7 +16,15 @@ from zsim.scenario.faults import Known, flaws, kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
 from zsim.scenario.own_classes import agent_faults
 from zsim.scenario.roles import AGENTS, MAIN, OPERATOR, ROLES
-from zsim.scenario.scenario import EXTERNAL, PATHS, SEA_HEIGHT_MAX_M, Scenario, space_name
+from zsim.scenario.scenario import (
+    EXTERNAL,
+    PATHS,
+    SEA_HEIGHT_MAX_M,
+    DroneReference,
+    Exchange,
+    Scenario,
+    space_name,
+)
 from zsim.schema.checker import Fault, listed, show, suggestion
 from zsim.schema.quantities import COULOMB_PER_MAH, G_M_S2, SEA_LEVEL_KG_M3
 from zsim.sensors.camera_model import folds, lens_of
@@ -99,6 +107,12 @@ def unflown_plans(scenario: Scenario) -> list[str]:
             what = "nothing of it is flown" if "take-off" in late[0] or len(late) == len(planned) else "not flown"
             line = f"the run ends at {scenario.duration_s:g} s, before {' and '.join(late)}: {what}"
             lines.append(f"clusters[{index}].plan: {line} (cluster {cluster.name!r})")
+    for name, flown in scenario.piloted().items():
+        begins = [flown.takeoff_s, *([stage.start_s for stage in flown.stages] if isinstance(flown, Exchange) else [])]
+        begins += [flown.start_s] if isinstance(flown, DroneReference) and flown.start_s is not None else []
+        if max(begins) >= scenario.duration_s:
+            late = f"before its reference begins at {max(begins):g} s"
+            lines.append(f"drones.{name}: the run ends at {scenario.duration_s:g} s, {late}: not flown")
     return lines
 
 
