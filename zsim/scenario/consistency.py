@@ -68,6 +68,8 @@ def cross_faults(
     yield from _start_faults(drones, vehicles)
     obstacles = _entries(scenario.environment and scenario.environment.obstacles)
     yield from _obstacle_faults(obstacles, drones, vehicles)
+    surfaces = scenario.environment and scenario.environment.surfaces
+    yield from _name_faults("environment.surfaces", _entries(surfaces or []))
     for index, drone in drones:
         yield from _under(f"drones[{index}]", _drone_faults(drone, scenario, vehicles))
     yield from _own_sensor_faults(drones)
