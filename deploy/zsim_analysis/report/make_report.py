@@ -5,7 +5,7 @@ sweeps as well.
 """
 
 import base64
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -204,7 +204,7 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
     ages = f"p50 {age['p50']:.2f} ms, p99 {age['p99']:.2f} ms, max {age['max']:.2f} ms" if age else "not known"
     factor = "not known" if summary.real_time_factor is None else f"{summary.real_time_factor:.1f}"
     seed = "–" if summary.seed is None else summary.seed
-    separation, radio = summary.min_separation_m, summary.radio
+    separation, radio, nearest = summary.min_separation_m, summary.radio, summary.obstacle_distance_m
     versions = dict.fromkeys(version for name, version in summary.versions.items() if name != "report")
     kinds, misses = {each.kind for each in summary.shortfalls}, "not known"
     but_for = {
@@ -234,6 +234,7 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
         ("Command age", ages),
         *((f"Link of {drone}", str(link)) for drone, link in summary.links.items()),
         ("Least separation", "no two drones in the air" if separation is None else f"{separation:.2f} m in truth"),
+        *([("Distance to obstacles", obstacle_text(nearest))] if nearest else []),
         *([("Radio", radio_text(radio))] if radio else []),
         ("Truth", f"SHA-256 {summary.truth_sha256}"),
         ("Fingerprint", summary.fingerprint or "not known"),
@@ -243,6 +244,12 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
 def changed_text(changed: Sequence[str] | None) -> str:
     """Return the differences of a scenario from its file in words."""
     return "not known" if changed is None else ", ".join(changed) or "nothing: as in its file"
+
+
+def obstacle_text(distances_m: Mapping[str, float]) -> str:
+    """Return the least of all drones' distances from obstacles, and whose it is."""
+    nearest = min(distances_m, key=lambda drone: distances_m[drone])
+    return f"at least {distances_m[nearest]:.2f} m in truth, of {nearest}, from its centre to a surface"
 
 
 def radio_text(radio: RadioSummary) -> str:
