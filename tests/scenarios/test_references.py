@@ -38,7 +38,9 @@ def test_six_drones_fly_the_public_swap(tmp_path: Path) -> None:
     run = zsim.run(EXAMPLES / "swap.yaml", out=tmp_path / "run", progress=False)
     assert run.as_planned, run.shortfalls
     errors = [off(run, drone) for drone in run.drones]
-    assert all(np.sqrt(np.mean(each**2)) < 0.12 for each in errors)
+    tracking = [run.summary.tracking[drone].path_rms_m for drone in run.drones]
+    assert tracking == pytest.approx([float(np.sqrt(np.mean(each**2))) for each in errors])
+    assert all(each is not None and each < 0.12 for each in tracking)
     truth = [run.truth(drone)[AXES].to_numpy() for drone in run.drones]
     apart = [np.linalg.norm(a - b, axis=1).min() for i, a in enumerate(truth) for b in truth[:i]]
     assert min(apart) > 0.2  # two clearances; the references come to 0.305 m
@@ -84,6 +86,37 @@ def test_a_drone_flies_where_it_is_asked_to_and_a_rerun_does_too(tmp_path: Path)
         assert before is not None
     said: list[str] = []
     assert rerun_record(tmp_path / "run", False, said.append, said.append) == ""
+
+
+def test_a_slower_path_is_swept_and_kept_to_better(tmp_path: Path) -> None:
+    (tmp_path / "short.yaml").write_text(SHORT)
+    path = "drones.d1.reference.time_scale"
+    options: dict[str, Any] = {"workers": 1, "progress": False, "set": {"drones.d1.reference.land_s": 17}}
+    frame = zsim.sweep(tmp_path / "short.yaml", {path: [1, 2.5]}, duration_s=18, **options)
+    fast, slow = frame["tracking.d1.path_rms_m"]
+    assert 0.0 < slow < fast < 0.2
+
+
+@pytest.mark.soak
+def test_hosted_they_have_the_same_bits(federation: Any, tmp_path: Path, compiled: None) -> None:
+    (tmp_path / "short.yaml").write_text(SHORT)
+    alone = zsim.run(tmp_path / "short.yaml", out=tmp_path / "alone", progress=False)
+    federation.run(SHORT, "--hosted").ends(with_code=0)
+    assert federation.record().sha256() == alone.truth_sha256
+
+
+def test_it_goes_on_from_a_snapshot_to_the_same_bits(tmp_path: Path) -> None:
+    (tmp_path / "short.yaml").write_text(SHORT)
+    sim = zsim.Simulation(tmp_path / "short.yaml")
+    sim.run(until_s=5)
+    sim.drone("d2").goto((3, 1, 1))
+    sim.run(until_s=6)
+    before = sim.snapshot()
+    sim.run(until_s=9)
+    once = sim.truth_sha256
+    sim.restore(before)
+    sim.run(until_s=9)
+    assert sim.truth_sha256 == once
 
 
 @pytest.mark.parametrize("op", ["goto", "follow"])

@@ -66,6 +66,7 @@ LONG = (
     "estimation.md",
     "extending.md",
     "faults.md",
+    "project.md",
     "records.md",
     "sweep.md",
 )  # what they show has tests of its own

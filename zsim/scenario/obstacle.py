@@ -5,14 +5,18 @@ cylinder: radius, nothing, half of the height; of a sphere: radius).
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 BOX, CYLINDER, SPHERE = range(3)
 SHAPES = ("box", "cylinder", "sphere")
 SHAPE, CENTRE, COSINE, SINE, HALF = 0, 1, 4, 5, 6
 COLUMNS = 9
 TINY = 1e-12  # m, so that a point on an axis has a direction
+PAIRS_MAX = 1_000_000  # of points and obstacles that are compared at once
 WIDE = 1e9  # m, half of the side that a cylinder does not have
 
 
@@ -54,3 +58,24 @@ def nearest(row: Sequence[float], x: float, y: float, z: float) -> tuple[float, 
         if round_:
             nx, ny = nx * qx / r, nx * qy / r
     return distance, c * nx - s * ny, s * nx + c * ny, nz
+
+
+def least_distances(obstacles: Iterable[Any], p_W: ArrayLike) -> NDArray[np.float64]:
+    """Return the distance [m] of each point (T, 3) from the nearest of some obstacles of a scenario, as `nearest` does.
+
+    inf where there are none.
+    """
+    points, rows = np.asarray(p_W, dtype=float).reshape(-1, 3), np.array([*map(row_of, obstacles)]).reshape(-1, COLUMNS)
+    least, step = np.full(len(points), np.inf), max(1, PAIRS_MAX // max(len(rows), 1))
+    for first in range(0, len(points) if len(rows) else 0, step):
+        x, y, z = (points[first : first + step, None, k] - rows[:, CENTRE + k] for k in range(3))
+        c, s, shape, half = rows[:, COSINE], rows[:, SINE], rows[:, SHAPE], rows[:, HALF:]
+        r = np.hypot(x, y)
+        across = np.where(shape == BOX, np.abs(c * x + s * y), r) - half[:, 0]
+        along = np.where(shape == BOX, np.abs(c * y - s * x) - half[:, 1], -np.inf)
+        over = np.abs(z) - half[:, 2]
+        most = np.maximum(np.maximum(across, along), over)
+        outside = np.sqrt(np.maximum(across, 0.0) ** 2 + np.maximum(along, 0.0) ** 2 + np.maximum(over, 0.0) ** 2)
+        solid = np.where(most > 0.0, outside, most)
+        least[first : first + step] = np.where(shape == SPHERE, np.hypot(r, z) - half[:, 0], solid).min(axis=1)
+    return least

@@ -206,6 +206,37 @@ class Obstacle(Spec, frozen=True, kw_only=True):
     yaw_deg: Real = 0.0
 
 
+Span = tuple[Positive, Positive]
+Seed = Annotated[int, Meta(ge=0, le=2**62)]
+
+
+class Forest(Spec, frozen=True, kw_only=True):
+    """Trunks at random places, which become obstacles; see zsim.scenario.generated."""
+
+    trees: Annotated[int, Meta(ge=1, le=OBSTACLES_MAX)]
+    area_m: tuple[Coordinate, Coordinate, Coordinate, Coordinate]
+    """West, south, east, north: where their middles are."""
+    radius_m: Span = (0.1, 0.25)  # chosen: trunks of 20 to 50 cm
+    height_m: Span = (6.0, 10.0)  # chosen
+    gap_m: NonNegative = 1.5  # between any two, chosen: three hulls of an AR.Drone
+    clear_m: NonNegative = 2.0  # about the place where a drone starts, chosen
+    seed: Seed | UnsetType = UNSET  # unset: the scenario's
+
+
+class Corridor(Spec, frozen=True, kw_only=True):
+    """Walls on both sides of a way that bends at random, which become obstacles; see zsim.scenario.generated."""
+
+    segments: Annotated[int, Meta(ge=1, le=100)]
+    length_m: Positive = 6.0  # of a segment, chosen
+    turn_deg: Annotated[float, Meta(ge=0, le=90)] = 40.0  # the most, to either side, from segment to segment; chosen
+    width_m: Positive = 3.0  # between the walls, chosen
+    wall_m: Positive = 0.2  # thickness, chosen
+    height_m: Positive = 3.0  # chosen
+    start_m: tuple[Coordinate, Coordinate] = (0.0, 0.0)
+    heading_deg: Real = 0.0  # of the first segment, from east to north
+    seed: Seed | UnsetType = UNSET  # unset: the scenario's
+
+
 class Environment(Spec, frozen=True, kw_only=True):
     """The field of the flight: default Buenos Aires, where the paper comes from."""
 
@@ -217,6 +248,8 @@ class Environment(Spec, frozen=True, kw_only=True):
     air_density_kg_m3: Positive = SEA_LEVEL_KG_M3
     wind: Wind = Wind()
     obstacles: Annotated[list[Obstacle], Meta(max_length=OBSTACLES_MAX)] = []
+    forest: Forest | UnsetType = UNSET  # this and `corridor` become obstacles, and are left out of the resolved text
+    corridor: Corridor | UnsetType = UNSET
     hats: Hats | UnsetType = UNSET  # unset: the defaults, and left out of the resolved text
     light: Annotated[float, Meta(ge=0.02, le=1)] | UnsetType = UNSET  # of a clear day, for the cameras; unset: 1
 
@@ -484,7 +517,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
 
     name: Name
     federation: Name = "zsim"
-    seed: Annotated[int, Meta(ge=0, le=2**62)] = 1
+    seed: Seed = 1
     duration_s: Annotated[float, Meta(gt=0, le=1e6)]
     time: TimeSteps = TimeSteps()
     environment: Environment = Environment()

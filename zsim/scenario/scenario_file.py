@@ -15,6 +15,7 @@ from msgspec import Struct, structs
 from zsim.errors import DocumentError, NotTrustedError, ScenarioError
 from zsim.scenario import own_classes
 from zsim.scenario.consistency import cross_faults
+from zsim.scenario.generated import with_generated
 from zsim.scenario.polynomial_file import pieces_of
 from zsim.scenario.scenario import DRONES_MAX, VEHICLE_NUMBERS, Document, Scenario, SharedVehicle
 from zsim.schema import plugin, yaml_file
@@ -119,6 +120,8 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
             drone = {**drone, "reference": _with_pieces(drone["reference"], f"{where}.reference", unsound)}
         return {**with_defaults(numbers, drone), "sensors": own}
 
+    document, wrong = with_generated(document)
+    unsound += wrong
     document = {**document, "sensors": _separated(sensors, "sensors", unsound, unread, imports)}
     if imports and plugin.may_import():
         document = document | {

@@ -9,13 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import ReferencePhase
 from zsim.errors import DocumentError, NotTrustedError, RunError
-from zsim.scenario.scenario import Drone, DroneReference, Exchange, PathPoint, Piloted, Scenario
+from zsim.scenario.scenario import STAGES_MAX, Drone, DroneReference, Exchange, PathPoint, Piloted, Scenario
 from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_agents.formation.expression import ExpressionError
 from zsim_agents.formation.spaces.cluster_space import Array
@@ -285,9 +287,11 @@ def exchange_flights(scenario: Scenario, exchange: Exchange) -> dict[str, Flight
     """
     specs = [scenario.drone(name) for name in exchange.drones]
     gravity = scenario.environment.gravity_m_s2
-    limits = [limits_of(spec, gravity).share(SHARE) for spec in specs]
+    limits = np.array([limits_of(spec, gravity).share(SHARE) for spec in specs])  # columns as in PathLimits
     places = np.array([hover_of(spec) for spec in specs])
-    hovers, legs = places.copy(), [list[Leg]() for _ in specs]
+    hovers, stages = places.copy(), list[tuple[float, float, Array]]()
+    unit = minimum_snap((0.0, 1.0), np.array([[0.0] * 4, [1.0, 0.0, 0.0, 0.0]]))
+    rise, peaks = unit.coefficients[0, :, 0], unit.peaks()
     free_s = exchange.takeoff_s + READY_S
     for number, stage in enumerate(exchange.stages):
         at = f"stages[{number}]"
@@ -297,22 +301,32 @@ def exchange_flights(scenario: Scenario, exchange: Exchange) -> dict[str, Flight
             if z < HEIGHT_MIN_M:
                 raise FlightError(f"{at}.places_m[{index}][2]", f"is {z:g}; must be >= {HEIGHT_MIN_M:g}")
         goals = places.copy()
-        goals[:, :3] = np.array(stage.places_m)[assign(places[:, :3], np.array(stage.places_m))]
-        ways = [minimum_snap((0.0, 1.0), np.array(ends)) for ends in zip(places, goals, strict=True)]
-        least_s = max(way.peaks().factor(own) for way, own in zip(ways, limits, strict=True))
+        goals[:, :3] = np.array(stage.places_m)[_assigned(places[:, :3].tobytes(), tuple(stage.places_m))]
+        ways = goals - places
+        aside_m, up_m = np.hypot(ways[:, 0], ways[:, 1]), np.abs(ways[:, 2])
+        speeds = peaks.speed_m_s * np.maximum(aside_m / limits[:, 0], up_m / limits[:, 1])
+        least_s = float(np.maximum(speeds, np.sqrt(peaks.accel_m_s2 * aside_m / limits[:, 3])).max())
         over_s = stage.over_s
         if least_s > over_s * ROUNDING:
             if not exchange.fit:
                 needed = f"must be >= {round_up(least_s):g} for the longest way, or set fit: true"
                 raise FlightError(f"{at}.over_s", f"is {over_s:g}; {needed}")
             over_s = round_up(least_s)
-        for own, way in zip(legs, ways, strict=True):
-            scale = over_s ** np.arange(way.coefficients.shape[1])[:, None]
-            slowed = PiecewisePolynomial(np.array([over_s]), way.coefficients / scale)
-            own.append(Leg(stage.start_s, slowed, "path"))
+        coefficients = (rise / over_s ** np.arange(len(rise)))[:, None] * ways[:, None, :]
+        coefficients[:, 0] += places
+        stages.append((stage.start_s, over_s, coefficients))
         places, free_s = goals, stage.start_s + over_s
-    pairs = zip(exchange.drones, hovers, legs, strict=True)
-    return {name: Flight(hover, tuple(own)) for name, hover, own in pairs}
+
+    def legs(k: int) -> Iterator[Leg]:
+        for start_s, over_s, coefficients in stages:
+            yield Leg(start_s, PiecewisePolynomial(np.array([over_s]), coefficients[k : k + 1]), "path")
+
+    return {name: Flight(hovers[k], tuple(legs(k))) for k, name in enumerate(exchange.drones)}
+
+
+@lru_cache(maxsize=STAGES_MAX)  # each of its drones' pilots asks for the same
+def _assigned(starts_m: bytes, goals_m: tuple[tuple[float, float, float], ...]) -> NDArray[np.intp]:
+    return assign(np.frombuffer(starts_m).reshape(-1, 3), np.array(goals_m))
 
 
 def land_s_of(flown: Piloted) -> float:

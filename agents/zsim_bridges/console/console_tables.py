@@ -205,6 +205,8 @@ def _drone_cells(row: DroneRow, figures: FlightFigures | None, selected: bool, c
     lag = "no estimate" if drone.lag_ms is None else f"lag {drone.lag_ms:.0f} ms"
     lag_colour = AMBER if drone.lag_ms is not None and drone.lag_ms > LATE_MS else "inherit"
     who = f"{escape(drone.commander or 'nobody')} · {_coloured(lag, lag_colour)} · GPS {escape(row.gps)}"
+    if figures is not None and figures.obstacle_m is not None:
+        who += f" · {figures.obstacle_m:.1f} m from an obstacle"
     failsafe = drone.failsafe if drone.state in ("landing", "landed", "emergency") else ""
     faults = f"⚠ {', '.join(row.faults)}" if row.faults else ""
     notes = [(who, GREY), (escape(failsafe), RED), (escape(faults), AMBER), (escape(row.link[0]), row.link[1])]

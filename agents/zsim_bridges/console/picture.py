@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import EstimateView, ViewCluster, ViewDrones
 from zsim.math import frames
+from zsim.scenario.scenario import Scenario
 from zsim.vehicles.vehicle import ROTORS_MAX
 from zsim_agents.formation.flight_plan import REFUSALS, Follow, MoveTo, read_request
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
+from zsim_agents.references.flight import FlightError, flight_of
 
 Array = NDArray[np.float64]
 
@@ -24,6 +26,7 @@ SIGMAS = 2.0  # of an ellipsoid
 SHARE_WITHIN = 1 - math.erfc(SIGMAS / math.sqrt(2)) - math.sqrt(2 / math.pi) * SIGMAS * math.exp(-(SIGMAS**2) / 2)
 """Of a Gaussian in three dimensions, within 2 sigma: chi-squared of three degrees of freedom at 4, 0.739."""
 RADIUS_MAX_M = 60.0  # of an ellipsoid: one of before the first fix would enclose the viewer
+PATH_POINTS = 120  # of a part of a drone's reference: smooth at the size of a page
 SHAPED_PHASES = frozenset({"assembling", "engaged", "held"})  # phases in which a formation has a desired shape
 CORNER_SHARE = 0.25  # of the way from a corner to the opposite side; where its angle is written, clear of names
 CLICK_RAD = 0.012  # half the angle within which a click hits a small, far drone; chosen: about five pixels
@@ -86,6 +89,16 @@ def drone_poses(view: ViewDrones, names: Sequence[str]) -> DronePoses:
     return DronePoses(view.t_ns, tuple(names), p_W, q_WB, rotor, wind)
 
 
+def radio_lines(hears: Sequence[Sequence[int]], drones: DronePoses) -> tuple[Array, Array]:
+    """Return the ends (n, 2, 3) [m] of the links between drones that are there: those both ways, and those one way."""
+    there = drones.present
+    links = {(i, j) for i, heard in enumerate(hears) for j in heard if max(i, j) < len(there) and there[i] and there[j]}
+    both = sorted((i, j) for i, j in links if i < j and (j, i) in links)
+    single = sorted((i, j) for i, j in links if (j, i) not in links)
+    ends = [drones.p_W[np.array(each, dtype=int).reshape(-1, 2)] for each in (both, single)]
+    return ends[0], ends[1]
+
+
 def drone_on_ray(
     drones: DronePoses, radii_m: Array, origin_W: Sequence[float], direction_W: Sequence[float]
 ) -> str | None:
@@ -144,6 +157,23 @@ def ellipsoids(estimates: Sequence[EstimateView]) -> Ellipsoids:
     P = np.array([estimate.covariance_m2 for estimate in estimates]).reshape(-1, 6)
     sigma_m, q = frames.principal_axes(P[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]])
     return Ellipsoids(p, q, np.clip(SIGMAS * sigma_m, 0.01, RADIUS_MAX_M))
+
+
+def reference_lines(scenario: Scenario) -> Array:
+    """Return the paths of all drones that fly by themselves as segments (M, 2, 3) [m; W], as the scenario has them."""
+    lines = [np.zeros((0, 2, 3))]
+    for drone in scenario.piloted():
+        try:
+            legs = flight_of(scenario, drone).legs
+        except FlightError:
+            continue  # its pilot says so
+        for leg in legs:
+            length_s = leg.path.duration_s
+            end_s = scenario.duration_s - leg.start_s if length_s is None else length_s
+            times = np.linspace(0.0, max(end_s, 0.0), PATH_POINTS).tolist()
+            p_W = np.array([leg.path.value(t_s)[0][:3] for t_s in times])
+            lines.append(np.stack((p_W[:-1], p_W[1:]), axis=1))
+    return np.concatenate(lines)
 
 
 def ghosts(space: ClusterSpace, view: ViewCluster) -> tuple[Array, Array] | None:

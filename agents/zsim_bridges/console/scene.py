@@ -32,6 +32,8 @@ from zsim_bridges.console.picture import (
     ellipsoids,
     formation_shape,
     ghosts,
+    radio_lines,
+    reference_lines,
     rotor_angles,
     rotor_poses,
     short_names,
@@ -82,6 +84,7 @@ class RunScene:
         arms_m = [drone.arm_m for drone in run.scenario.drones]
         self.nodes = SceneNodes(server, run.info.drones, arms_m, robots, len(run.spaces))
         self.nodes.obstacles(run.scenario.environment.obstacles)
+        self.nodes.references(reference_lines(run.scenario))
         cameras.restart()
 
     def clicked(self, event: viser.SceneClickEvent) -> str | None:
@@ -231,6 +234,12 @@ class SceneNodes:
                 self._scene.add_cylinder(name, radius=each.radius_m or 0.0, height=height_m, position=centre, **look)
             else:
                 self._scene.add_icosphere(name, radius=each.radius_m or 0.0, position=(x, y, z), **look)
+
+    def references(self, lines: Array) -> None:
+        """Draw the paths of drones that fly by themselves, as segments (M, 2, 3) [m; W]."""
+        if len(lines):
+            look: Any = {"thickness": SIDE_PX, "thickness_units": "screen"}
+            self._scene.add_line_segments("/references", lines.astype(np.float32), GHOST, **look)
 
     def on_click(self, act: Callable[[viser.SceneClickEvent], None]) -> None:
         """Call back with viser's event of each click into the scene.
@@ -391,16 +400,6 @@ class ChosenRing:
         if index != self._chosen:
             self._chosen = index
             self._node.batched_scales = np.full((1, 3), self._radii_m[index])
-
-
-def radio_lines(hears: Sequence[Sequence[int]], drones: DronePoses) -> tuple[Array, Array]:
-    """Return the ends (n, 2, 3) [m] of links between present drones: both ways, then one way."""
-    pairs = {(i, j) for i, heard in enumerate(hears) for j in heard}
-    count, there = len(drones.p_W), drones.present
-    known = {(i, j) for i, j in pairs if max(i, j) < count and there[i] and there[j]}
-    both = sorted((i, j) for i, j in known if i < j and (j, i) in known)
-    single = sorted((i, j) for i, j in known if (j, i) not in known)
-    return tuple(drones.p_W[np.array(each, dtype=int).reshape(-1, 2)] for each in (both, single))  # type: ignore[return-value]
 
 
 def draw_ground(scene: viser.SceneApi, *, dark: bool = False) -> None:

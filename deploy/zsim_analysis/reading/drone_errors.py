@@ -4,6 +4,7 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from msgspec import Struct
 
 from zsim.errors import ZsimError
 from zsim.math.frames import wrap_angle
@@ -14,6 +15,7 @@ from zsim_analysis.reading.recorded_flight import Array, RecordedFlight
 SIGMAS = 2.0  # half width of the band that is drawn, in standard deviations
 DEGREES = 6  # of freedom of a drone's NEES: position and velocity
 ESTIMATES_MAX = 200_000  # of a flight, which take a second to evaluate
+FLOWN = ("approaching", "path", "holding")  # phases of a reference in the air
 POSITION, YAW = (0, 1, 2), 3  # columns of errors and velocities: x, y, z, heading
 INSTANTS = 1500  # at which distances are computed, spread over the flight: more than a figure has pixels
 
@@ -71,6 +73,52 @@ def nees(error: Array, covariance: Array) -> Array:
     along = np.einsum("kij,ki->kj", vectors, error)
     squares = np.sum(along**2 / np.where(definite[:, None], values, 1.0), axis=1)
     return np.where(definite, squares, np.nan)
+
+
+class ReferenceErrors(NamedTuple):
+    """Truth − reference of one drone at K instants, from its first in the air to its last."""
+
+    t_s: Array  # (K,) simulated time
+    error: Array  # (K, 4) x, y, z in W [m], heading wrapped to ±π [rad]
+    reference: Array  # (K, 3) where it was to be, in W [m]
+    on_path: np.ndarray  # (K,) bool: on its path, not on the way to it or holding a place
+
+
+class Tracking(Struct, frozen=True):
+    """How well one drone kept to its reference, within a window and in the air; None if it was not."""
+
+    true_rms_m: float | None
+    true_max_m: float | None
+    yaw_rms_rad: float | None
+    path_rms_m: float | None  # while on its path
+
+
+def reference_errors(flight: RecordedFlight) -> dict[str, ReferenceErrors]:
+    """Return the errors of every drone that has both truth and a reference on record."""
+    errors = {}
+    for track in flight.tracks:
+        if track.external or (own := flight.references.get(track.name)) is None:
+            continue
+        flown = np.isin(own.phases, FLOWN)
+        t_ns, there, here = np.intersect1d(track.t_ns, own.t_ns[flown], assume_unique=True, return_indices=True)
+        place = own.place[flown][here]
+        yaw = wrap_angle(track.yaw[there] - place[:, 3])
+        error = np.column_stack([track.p_W[there] - place[:, :3], yaw])
+        on_path = np.array(own.phases)[flown][here] == "path"
+        if len(t_ns):
+            errors[track.name] = ReferenceErrors(t_ns / 1e9, error, place[:, :3], on_path)
+    return errors
+
+
+def tracking_of(errors: ReferenceErrors, window_s: tuple[float, float]) -> Tracking:
+    rows = (errors.t_s >= window_s[0]) & (errors.t_s <= window_s[1])
+    off = np.linalg.norm(errors.error[:, :3], axis=1)
+
+    def rms(values: Array) -> float | None:
+        return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
+
+    greatest = float(off[rows].max()) if rows.any() else None
+    return Tracking(rms(off[rows]), greatest, rms(errors.error[rows, 3]), rms(off[rows & errors.on_path]))
 
 
 def velocity_responses(flight: RecordedFlight) -> dict[str, VelocityResponse]:

@@ -77,6 +77,15 @@ class DroneEstimates:
 
 
 @dataclass
+class DroneReferences:
+    """Where one drone that flies by itself was to be."""
+
+    t_ns: Times  # (K,) ascending and unique
+    place: Array  # (K, 4) x, y, z in W [m], yaw [rad, not wrapped]
+    phases: list[str]
+
+
+@dataclass
 class VelocityCommands:
     """Velocity commands of one drone that were sent by its commander."""
 
@@ -137,6 +146,7 @@ class RecordedFlight:
     others: dict[str, int] = field(default_factory=dict)  # number of messages by key, of those that no report reads
     cpu_s: float | None = None  # CPU time from the first gate to the last, of a flight in a process of its own
     radio: RadioHistory | None = None  # None where the scenario has none
+    references: dict[str, DroneReferences] = field(default_factory=dict)  # of drones that fly by themselves, by drone
 
     @property
     def end(self) -> dict[str, Any] | None:
@@ -161,8 +171,8 @@ class RecordedFlight:
 def read_flight(path: Path, answers: bool = False, motion: bool = True) -> RecordedFlight:
     """Return the flight of a record; raises RecordError if there is none.
 
-    With `answers` it includes the drones' estimates and velocity commands; without `motion`, the truth and status
-    messages of one instant per second only.
+    With `answers` it includes the drones' estimates and velocity commands; without `motion`, the truth, status
+    and reference messages of one instant per second only.
     """
     with RecordReader(path) as reader:
         flight = FlightReader(answers)
@@ -172,7 +182,7 @@ def read_flight(path: Path, answers: bool = False, motion: bool = True) -> Recor
                 flight.add(message.key, message.payload, message.wall_ns)
             whole = completeness(reader)
         else:
-            sampled = {key for key in wanted if keys.leaf(key) in ("truth", "status")}
+            sampled = {key for key in wanted if keys.leaf(key) in ("truth", "status", "reference")}
             others = {key for key in wanted if keys.parts(key)[0] != "drone"}
             whole = completeness(reader, others, sampled, flight.add)
         recorded = flight.flight(sum(reader.topics().values()), whole)
@@ -217,6 +227,13 @@ class _Estimate(Struct):
     yaw_sigma_rad: float
 
 
+class _Reference(Struct):
+    t_ns: int
+    phase: str
+    position_m: Vector3
+    yaw_rad: float
+
+
 class _Velocity(Struct):
     t_ns: int
     source: str
@@ -256,6 +273,7 @@ class FlightReader:
         self._status: defaultdict[str, _Rows] = defaultdict(lambda: _Rows(1, "d"))
         self._commanders: defaultdict[str, list[tuple[int, str]]] = defaultdict(list)
         self._estimates: defaultdict[str, _Rows] = defaultdict(lambda: _Rows(3 + 3 + 1 + 1 + 36, "f"))
+        self._references: defaultdict[str, _Rows] = defaultdict(lambda: _Rows(3 + 1, "d"))
         self._commands: defaultdict[tuple[str, str], _Rows] = defaultdict(lambda: _Rows(3 + 1 + 1, "f"))
         self._states: dict[str, _Rows] = {}
         self._members: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {}  # names of variables, drones
@@ -279,6 +297,7 @@ class FlightReader:
                 "process/bye": (Bye, self._add_process),
                 "drone/truth": (_Truth, self._add_truth),
                 "drone/sensor/status": (_Status, self._add_status),
+                "drone/reference": (_Reference, self._add_reference),
                 "cluster/state": (_State, self._add_state),
                 "cluster/request": (ClusterRequest, lambda name, message: self._requests[name].append(message)),
             }
@@ -345,6 +364,13 @@ class FlightReader:
         rows.values.extend((estimate.yaw_rad, estimate.yaw_sigma_rad))
         rows.values.extend(estimate.covariance)
 
+    def _add_reference(self, drone: str, reference: _Reference) -> None:
+        rows = self._references[drone]
+        rows.t_ns.append(reference.t_ns)
+        rows.values.extend(reference.position_m)
+        rows.values.append(reference.yaw_rad)
+        rows.texts.append((intern(reference.phase),))
+
     def _add_command(self, drone: str, command: _Velocity) -> None:
         rows = self._commands[drone, command.source]
         rows.t_ns.append(command.t_ns)
@@ -398,6 +424,10 @@ class FlightReader:
             t_ns, values, _ = rows.by_time()
             p_W, v_W, yaw, sigma, covariance = np.split(values.astype(np.float64), (3, 6, 7, 8), axis=1)
             estimates[drone] = DroneEstimates(t_ns, p_W, v_W, yaw[:, 0], sigma[:, 0], covariance.reshape(-1, 6, 6))
+        references = {}
+        for drone, rows in self._references.items():
+            t_ns, place, texts = rows.by_time()
+            references[drone] = DroneReferences(t_ns, place, [phase for (phase,) in texts])
         return RecordedFlight(
             info=info,
             scenario=scenario_of(info),
@@ -414,6 +444,7 @@ class FlightReader:
             commands=self._flown_commands(),
             others=dict(self._others),
             radio=RadioHistory(self._radio, len(tracks)) if self._radio else None,
+            references=references,
         )
 
     def _flown_commands(self) -> dict[str, VelocityCommands]:

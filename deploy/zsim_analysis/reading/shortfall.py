@@ -16,13 +16,14 @@ from zsim.contract.run_messages import Event
 from zsim.errors import NotTrustedError
 from zsim.record import Completeness
 from zsim.record.completeness import SECOND_NS
-from zsim.scenario.roles import WORLD, agent_names, expected_processes, lets_drop
+from zsim.scenario.roles import PILOT, WORLD, agent_names, expected_processes, lets_drop
 from zsim.scenario.scenario import Cluster, ClusterPlan, Processes, Scenario
 from zsim_agents.formation.flight_check import HELD_ON_REQUEST
 from zsim_agents.formation.flight_plan import REFUSALS, Follow, MoveTo, plan_of, waiting_step
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_agents.formation.trajectory import Hold, Reference, variable_of
+from zsim_analysis.reading.drone_errors import FLOWN
 from zsim_analysis.reading.formation import cluster_of
 from zsim_analysis.reading.recorded_flight import Array, ClusterStates, RecordedFlight, read_flight
 
@@ -35,7 +36,7 @@ SAMPLE_NS = 100_000_000  # of a reference that is compared with the plan's
 STRAYED_M, STRAYED_S = 5.0, 3  # chosen: twice the least distance of drones, and successive seconds so far away
 SETTLED_S = 10.0  # chosen: time from its engagement that a formation has until its drones are in their places
 SAME = 1e-3  # m or rad within which the reference is the plan's: both are computed by the same formulas
-CONTROLLER, CONSOLE = "controller.", "console"  # prefixes of names: of controllers, and of operators' programs
+CONTROLLER, CONSOLE = ("controller.", f"{PILOT}."), "console"  # prefixes of names: who flies by plan, and operators
 INCIDENTS = ("emergency", "flip", "impact", "touchdown", "battery", "landing")  # events of drones
 CRASHES = ("emergency", "flip", "impact", "touchdown")  # incidents by which a drone comes down
 ONE_HIT_NS = 500_000_000  # chosen: a touchdown within this time of an impact is part of it
@@ -47,7 +48,8 @@ class Shortfall(Struct, frozen=True):
     """A deviation of a flight from its plan, or an incident."""
 
     # of a drone: emergency, flip, impact, touchdown, battery, landing (its first incident), mission (not flown to its
-    # end), strayed (far from its place), override (flown by others); of a cluster: plan (a step refused to the end,
+    # end), strayed (far from its place or reference), reference (never
+    # taken off by it), override (flown by others); of a cluster: plan (a step refused to the end,
     # or flown in part), engagement (never), held (for long), request (led by others), early (the run ended before it
     # was due), window (contains instants at which a cluster was not engaged); collision; process (an expected one
     # died, failed, or never joined); record (incomplete)
@@ -79,6 +81,7 @@ def shortfalls(flight: RecordedFlight, window_s: tuple[float, float]) -> list[Sh
     """Return the shortfalls of a flight, failures first; empty for one that flew its plan."""
     lines = [*_incidents(flight), *_collisions_and_missions(flight)]
     lines += [line for states in flight.clusters for line in _of_cluster(states, flight, window_s)]
+    lines += [line for drone in flight.references for line in _of_reference(drone, flight)]
     lines += [*_overrides(flight), *_processes(flight)]
     if not flight.completeness.complete:
         text = f"the record is {flight.completeness}"
@@ -305,6 +308,30 @@ def _interventions(drone: str, flight: RecordedFlight) -> Iterator[_Intervention
             yield _Intervention(event.t_ns, flight.last_ns, text)
 
 
+def _of_reference(drone: str, flight: RecordedFlight) -> Iterator[Shortfall]:
+    """Yield that a drone did not fly its reference, or was far from it."""
+    own = flight.references[drone]
+    track = next((each for each in flight.tracks if each.name == drone), None)
+    flown = np.isin(own.phases, FLOWN)
+    piloted = flight.scenario.piloted() if flight.scenario else {}
+    takeoff_s, end_s = piloted[drone].takeoff_s if drone in piloted else 0.0, flight.last_ns / 1e9
+    if not flown.any():
+        if end_s - takeoff_s >= ENGAGES_S:
+            state = track.states[-1] if track and track.states else "unknown"
+            text = f"{drone}: did not take off by its reference at {seconds_text(takeoff_s)} s; it is {state}"
+            yield Shortfall("reference", drone, takeoff_s, text, True)
+        return
+    if track is None or track.external:
+        return
+    _, rows = np.unique(own.t_ns // SECOND_NS, return_index=True)  # the same where only one a second is read
+    rows = rows[flown[rows]]
+    t_ns, at, mine = np.intersect1d(own.t_ns[rows], track.t_ns, assume_unique=True, return_indices=True)
+    away_m = np.linalg.norm(track.p_W[mine] - own.place[rows][at, :3], axis=1)
+    for act in _interventions(drone, flight):
+        away_m[act.covers(t_ns)] = 0.0
+    yield from _far(drone, t_ns, away_m, "its reference", flight)
+
+
 # Formations
 
 
@@ -392,13 +419,17 @@ def _strayed(
         away_m = np.linalg.norm(track.p_W[mine] - places_W[at, i], axis=1)
         for act in _interventions(drone, flight):
             away_m[act.covers(t_ns)] = 0.0
-        stretches = np.split(np.arange(len(t_ns)), np.flatnonzero(np.diff(away_m > STRAYED_M)) + 1)
-        long = [each for each in stretches if len(each) >= STRAYED_S and away_m[each[0]] > STRAYED_M]
-        if long:
-            from_ns, most_m = int(t_ns[long[0][0]]), max(float(away_m[each].max()) for each in long)
-            text = f"{drone}: up to {most_m:.0f} m from its place in the formation, from {from_ns / 1e9:.0f} s on"
-            text += _active_faults(drone, (from_ns, 0), flight)
-            yield Shortfall("strayed", drone, from_ns / 1e9, text, True)
+        yield from _far(drone, t_ns, away_m, "its place in the formation", flight)
+
+
+def _far(drone: str, t_ns: NDArray[np.int64], away_m: Array, what: str, flight: RecordedFlight) -> Iterator[Shortfall]:
+    """Yield that a drone was far from where it was to be, by its distances once a second, if it was for long."""
+    stretches = np.split(np.arange(len(t_ns)), np.flatnonzero(np.diff(away_m > STRAYED_M)) + 1)
+    long = [each for each in stretches if len(each) >= STRAYED_S and away_m[each[0]] > STRAYED_M]
+    if long:
+        from_ns, most_m = int(t_ns[long[0][0]]), max(float(away_m[each].max()) for each in long)
+        text = f"{drone}: up to {most_m:.0f} m from {what}, from {from_ns / 1e9:.0f} s on"
+        yield Shortfall("strayed", drone, from_ns / 1e9, f"{text}{_active_faults(drone, (from_ns, 0), flight)}", True)
 
 
 def _held(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:

@@ -58,6 +58,10 @@ def draw_plan(flight: RecordedFlight, formations: Sequence[Formation]) -> Figure
             x, y = (desired[:: max(1, len(desired) // 4000), formation.column(name)] for name in ("x_c", "y_c"))
             axes.plot(x, y, color=style.BLACK, lw=0.9, zorder=3, label=f"{formation.name}, desired")
         _draw_outlines(axes, formation, flight.tracks)
+    for number, each in enumerate(drone_errors.reference_errors(flight).values()):
+        x, y = each.reference[:: max(1, len(each.reference) // 4000), :2].T
+        named = None if number else "references"
+        axes.plot(x, y, color=style.BLACK, lw=0.7, ls=(0, (4, 2)), zorder=3, label=named)
     style.legend_above(figure, axes, columns=3)
     return figure
 
@@ -355,6 +359,37 @@ def _draw_many_velocities(responses: Mapping[str, drone_errors.VelocityResponse]
         style.dress(axes, quantity)
         style.draw_spread(axes, t_s, table, style.BLUE)
     grid[0, 0].set_title("flown − commanded", fontsize=style.PAPER_PT)
+    style.draw_marks(grid[:, 0], marks)
+    style.finish(figure, grid[:, 0], grid, 3)
+    return figure
+
+
+OFF = ("east (m)", "north (m)", "up (m)", "heading (deg)")  # of truth − reference
+
+
+def draw_references(
+    errors: Mapping[str, drone_errors.ReferenceErrors], colours: Mapping[str, str], marks: style.TimeMarks
+) -> Figure:
+    """Return truth − reference of every drone that flies by itself; of many their spread."""
+    figure = style.new_figure(style.COLUMN_IN, 0.9 + 0.85 * len(OFF))
+    grid = figure.subplots(len(OFF), 1, squeeze=False, sharex=True)
+    t_s = reduce(np.union1d, (each.t_s for each in errors.values()))
+    for i, axes in enumerate(grid[:, 0]):
+        style.dress(axes, OFF[i])
+        scale = math.degrees(1.0) if i == drone_errors.YAW else 1.0
+        axes.axhline(0, color=style.BLACK, lw=0.5, zorder=1)
+        if len(errors) > NAMED_MAX:
+            values = np.full((len(t_s), len(errors)), np.nan)
+            for k, each in enumerate(errors.values()):
+                values[np.searchsorted(t_s, each.t_s), k] = scale * each.error[:, i]
+            style.draw_spread(axes, t_s, values, style.BLUE)
+            continue
+        for name, each in errors.items():
+            gaps = np.diff(each.t_s, prepend=each.t_s[0]) > GAP_S
+            whole = np.where(gaps, np.nan, scale * each.error[:, i])
+            style.line(axes, each.t_s, whole, color=colours[name], lw=0.5, zorder=2)
+            on_path = np.where(each.on_path, whole, np.nan)
+            style.line(axes, each.t_s, on_path, color=colours[name], lw=1.2, zorder=3, label=name)
     style.draw_marks(grid[:, 0], marks)
     style.finish(figure, grid[:, 0], grid, 3)
     return figure

@@ -13,6 +13,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from msgspec import Struct
 
 from zsim.scenario.faults import PROCESS_KILL
+from zsim.scenario.roles import PILOT
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.formation import Formation
 from zsim_analysis.reading.recorded_flight import Array, RecordedFlight
@@ -289,7 +290,7 @@ def _faults(flight: RecordedFlight) -> Iterator[Band]:
 def _take_overs(flight: RecordedFlight) -> Iterator[Band]:
     """Yield the times in which others than the scenario's agents flew a drone: from acquisition or first command on."""
     since_ns: dict[str, int] = {}
-    planned = {"controller", *(flight.scenario.own_agents if flight.scenario else ())}
+    planned = {"controller", PILOT, *(flight.scenario.own_agents if flight.scenario else ())}
     for event in flight.events:
         op, drone, args = event.kind, event.subject, event.data.get("args")
         if event.kind == "control" and event.data.get("ok") is True and isinstance(args, dict):

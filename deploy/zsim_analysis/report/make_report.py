@@ -5,7 +5,7 @@ sweeps as well.
 """
 
 import base64
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,13 @@ from matplotlib.figure import Figure
 from zsim.errors import ReportError
 from zsim.output_folder import RECORD
 from zsim.presentation import colours_of
-from zsim_analysis.reading.drone_errors import distances, estimate_errors, separations, velocity_responses
+from zsim_analysis.reading.drone_errors import (
+    distances,
+    estimate_errors,
+    reference_errors,
+    separations,
+    velocity_responses,
+)
 from zsim_analysis.reading.formation import Formation, goal_errors
 from zsim_analysis.reading.radio_links import RadioSummary
 from zsim_analysis.reading.recorded_flight import RecordedFlight
@@ -28,7 +34,7 @@ from zsim_analysis.report import drone_figures as drones
 from zsim_analysis.report.figure_style import DARK, TAKE_OVER, VERMILION, ReportFigure, mark_figure, time_marks
 from zsim_analysis.report.formation_figures import ROWS_MAX, draw_errors, draw_parameters, numbered, parameter_groups
 from zsim_analysis.report.paper import PAPER_NOTE, flies_paper_test
-from zsim_analysis.report.summary import PAPER_COLUMN, RunSummary, error_table, judge
+from zsim_analysis.report.summary import PAPER_COLUMN, RunSummary, error_table, judge, tracking_table
 
 FAULTS_MAX = 6  # at the head of a page
 REFERENCE = (
@@ -109,6 +115,14 @@ def planned_figures(
             f"True distance of {what}; below the first line the controller's guard parts them.",
             partial(drones.draw_distances, apart, separations(flight), colours, marks),
         )
+    if off := reference_errors(flight):
+        yield PlannedFigure(
+            "references.png",
+            "Errors against the drones' references",
+            "Truth − reference of every drone that flies by itself, in the air: thick on its path, thin on the way "
+            "to it or holding a place. Of many drones: median, 5 to 95 % and extremes.",
+            partial(drones.draw_references, off, colours, marks),
+        )
     if flight.radio:
         yield PlannedFigure(
             "radio.png",
@@ -178,6 +192,7 @@ def page(summary: RunSummary, pictures: Sequence[Picture]) -> str:
         window=span_text(summary.window_s),
         paper_column=PAPER_COLUMN,
         tables={name: error_table(cluster) for name, cluster in summary.clusters.items()},
+        tracking=tracking_table(summary) if summary.tracking else None,
         paper_note=PAPER_NOTE if any(cluster.paper_std for cluster in summary.clusters.values()) else "",
         figures=sources(pictures),
     )
@@ -189,7 +204,7 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
     ages = f"p50 {age['p50']:.2f} ms, p99 {age['p99']:.2f} ms, max {age['max']:.2f} ms" if age else "not known"
     factor = "not known" if summary.real_time_factor is None else f"{summary.real_time_factor:.1f}"
     seed = "–" if summary.seed is None else summary.seed
-    separation, radio = summary.min_separation_m, summary.radio
+    separation, radio, nearest = summary.min_separation_m, summary.radio, summary.obstacle_distance_m
     versions = dict.fromkeys(version for name, version in summary.versions.items() if name != "report")
     kinds, misses = {each.kind for each in summary.shortfalls}, "not known"
     but_for = {
@@ -219,6 +234,7 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
         ("Command age", ages),
         *((f"Link of {drone}", str(link)) for drone, link in summary.links.items()),
         ("Least separation", "no two drones in the air" if separation is None else f"{separation:.2f} m in truth"),
+        *([("Distance to obstacles", obstacle_text(nearest))] if nearest else []),
         *([("Radio", radio_text(radio))] if radio else []),
         ("Truth", f"SHA-256 {summary.truth_sha256}"),
         ("Fingerprint", summary.fingerprint or "not known"),
@@ -228,6 +244,12 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
 def changed_text(changed: Sequence[str] | None) -> str:
     """Return the differences of a scenario from its file in words."""
     return "not known" if changed is None else ", ".join(changed) or "nothing: as in its file"
+
+
+def obstacle_text(distances_m: Mapping[str, float]) -> str:
+    """Return the least of all drones' distances from obstacles, and whose it is."""
+    nearest = min(distances_m, key=lambda drone: distances_m[drone])
+    return f"at least {distances_m[nearest]:.2f} m in truth, of {nearest}, from its centre to a surface"
 
 
 def radio_text(radio: RadioSummary) -> str:

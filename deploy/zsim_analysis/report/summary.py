@@ -17,7 +17,9 @@ from zsim import __version__
 from zsim.contract.fingerprint import TruthHash
 from zsim.errors import RecordError, printable
 from zsim.presentation import Column, FittedTable
+from zsim.scenario.obstacle import least_distances
 from zsim_agents.formation.spaces.cluster_space import unit
+from zsim_analysis.reading.drone_errors import Tracking, reference_errors, tracking_of
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of, min_separation_m
 from zsim_analysis.reading.radio_links import RadioSummary
 from zsim_analysis.reading.recorded_flight import TRUTH_WIDTH, RecordedFlight, read_flight
@@ -112,6 +114,8 @@ class RunSummary(Struct, frozen=True):
     errors: dict[str, ParameterErrors]
     clusters: dict[str, ClusterErrors]
     min_separation_m: float | None
+    obstacle_distance_m: dict[str, float]  # least, from each drone's centre to a surface; empty without obstacles
+    tracking: dict[str, Tracking]  # against the references of single drones, of the window
     radio: RadioSummary | None  # of the window; None where the scenario has none
     paper_table_1: dict[str, float]
     events: list[EventLine]
@@ -206,6 +210,8 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         errors=next((cluster.errors for cluster in clusters.values()), {}),
         clusters=clusters,
         min_separation_m=min_separation_m(flight.tracks),
+        obstacle_distance_m=obstacle_distances_m(flight),
+        tracking={name: tracking_of(each, window_s) for name, each in reference_errors(flight).items()},
         radio=flight.radio.summary(window_s) if flight.radio else None,
         paper_table_1=PAPER_TABLE_1,
         events=lines,
@@ -215,6 +221,13 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         record=facts,
         notes=list(_notes(flight, facts, formations, window_s, window_note)),
     )
+
+
+def obstacle_distances_m(flight: RecordedFlight) -> dict[str, float]:
+    """Return by drone the least true distance [m] of its centre from an obstacle, below 0 inside of one."""
+    obstacles = flight.scenario.environment.obstacles if flight.scenario else []
+    tracks = [track for track in flight.tracks if obstacles and len(track.t_ns)]
+    return {track.name: float(least_distances(obstacles, track.p_W).min()) for track in tracks}
 
 
 def _record_facts(flight: RecordedFlight, last_ns: int) -> RecordFacts:
@@ -279,7 +292,7 @@ def _notes(
     for formation in formations:
         if not formation.within(window_s).any():
             yield f"Cluster {formation.name} published no state inside the window."
-    if not flight.clusters:
+    if not flight.clusters and not flight.references:
         yield "The scenario has no cluster: there is no table of errors."
     own = flight.info.fingerprint if flight.info else ""
     if others := [p.name for p in flight.processes if own and p.fingerprint and p.fingerprint != own]:
@@ -346,6 +359,27 @@ def error_table(cluster: ClusterErrors) -> ErrorTable:
     return ErrorTable(list(GROUP_COLUMNS), rows, single)
 
 
+TRACKING_COLUMNS = {  # by their names on the page
+    "drone": Column("drone", "name"),
+    "true RMS (m)": Column("true\nRMS (m)", right=True),
+    "on path (m)": Column("on\npath (m)", worth=3, right=True),
+    "greatest (m)": Column("greatest\n(m)", worth=2, right=True),
+    "heading (rad)": Column("heading\n(rad)", worth=1, right=True),
+}
+
+
+def tracking_table(summary: RunSummary) -> ErrorTable:
+    """Return the errors of single drones against their references, a row each; of many the worst."""
+    ranked = sorted(summary.tracking.items(), key=lambda item: -(item[1].true_rms_m or 0.0))
+    shown = dict(ranked[:SINGLY_MAX])
+    rows = [
+        [name, *map(_number, (each.true_rms_m, each.path_rms_m, each.true_max_m, each.yaw_rms_rad))]
+        for name, each in summary.tracking.items()
+        if name in shown
+    ]
+    return ErrorTable(list(TRACKING_COLUMNS), rows)
+
+
 def _number(value: float | None) -> str:
     return "–" if value is None else f"{value:.4f}"
 
@@ -355,7 +389,14 @@ def terminal_text(summary: RunSummary) -> Group:
     notes = [(f"note: {summary.window_note}", False)] if summary.window_note else []
     marks = [*marks_of(summary.shortfalls), *notes]
     lines = [Text(printable(mark), style="bold red" if fails else "yellow") for mark, fails in marks]
-    return Group(*lines, *(table(summary, name) for name in summary.clusters))
+    tables = [table(summary, name) for name in summary.clusters]
+    if summary.tracking:
+        title = f"Errors against the drones' references from {span_text(summary.window_s)}"
+        caption = "true = truth − reference, in the air; on path: not on the way to it, nor holding a place"
+        content = tracking_table(summary)
+        columns = [TRACKING_COLUMNS[name] for name in content.columns]
+        tables.append(FittedTable(columns, content.rows, title, caption, lines=HEAVY_HEAD))
+    return Group(*lines, *tables)
 
 
 def table(summary: RunSummary, cluster: str) -> FittedTable:

@@ -176,6 +176,9 @@ def fly(task: Task) -> Row:
         for parameter, errors in cluster.errors.items():
             for statistic, value in msgspec.structs.asdict(errors).items():
                 columns[f"{prefix}.{parameter}.{statistic}"] = value if counts else None
+    for name, tracking in [] if diverged else summary.tracking.items():
+        for statistic, value in msgspec.structs.asdict(tracking).items():
+            columns[f"tracking.{name}.{statistic}"] = value if summary.as_planned else None
     more = task.more(flight) if task.more and not diverged else {}
     return make_row(result, task.varied, {**columns, **metrics, **more})
 

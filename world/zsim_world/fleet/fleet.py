@@ -21,7 +21,6 @@ from zsim.contract.messages import RotorInfo
 from zsim.errors import RunError
 from zsim.math.compiled import hold
 from zsim.math.frames import quaternion_from_heading, quaternion_from_rpy
-from zsim.scenario import obstacle
 from zsim.scenario.scenario import Drone, Scenario
 from zsim.sensors.scanner import SCANNERS
 from zsim.sensors.sensor import noise_sigma
@@ -72,7 +71,6 @@ GPS_SATELLITES = 9  # as in a real navdata packet of the AR.Drone
 TAKEOFF_CHARGE = 2.0  # of the charge at which it lands: below, it does not take off
 UPRIGHT_COSINE = 0.87  # 30 deg, beyond which it does not take off
 QUATERNION_SQUARE_MIN = 1e-6  # shorter, a quaternion has no direction
-ON_ROOF_M = 0.01  # m, chosen: so near to an obstacle a drone starts upon it
 NOISE_GATES = 8  # gates between two refills of the noise: that of 100 drones then fits a cache of 1 MB
 
 
@@ -165,9 +163,7 @@ class Fleet:
         if has_sightings:
             self._seeing.append(SightingSampler(scenario, hulls.copy()))
         if scanned:
-            self._seeing.append(
-                ScanSampler(scenario, hulls.copy(), scene(self._w.bodies.obstacle, np.empty((0, TRIANGLE))))
-            )
+            self._seeing.append(ScanSampler(scenario, hulls.copy(), self._w.scene))
         self.seen: dict[int, PictureSightings | Scan] = {}
         self._held = hold(self._w)
         self.bodies, self.boards = self._w.bodies, self._w.boards
@@ -390,7 +386,8 @@ def _initial_arrays(
     air[WIND.steady : WIND.steady + 3] = wind.steady_m_s
     air[WIND.gust], air[WIND.correlation] = wind.gust_m_s, wind.gust_correlation
     air[WIND.length], air[WIND.speed_min] = wind.gust_length_m, wind.gust_speed_min_m_s
-    return Arrays(time, bodies, boards, numbers, senses, air, noise.gust, watched)
+    seen = scene(bodies.obstacle, np.empty((0, TRIANGLE)))
+    return Arrays(time, bodies, boards, numbers, senses, air, noise.gust, watched, seen)
 
 
 def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) -> Bodies:
@@ -443,7 +440,6 @@ def _boards(scenario: Scenario, vehicles: Sequence[Vehicle], row: np.ndarray, ro
     both = list(zip(vehicles, drones, strict=True))
     setting = np.array([firmware.settings(vehicle, drone) for vehicle, drone in both])
     calibration = np.array([_calibration(drone, scenario) for drone in drones])
-    obstacles = obstacle_rows(scenario.environment)
     rows = zip(drones, row, calibration, strict=True)
     mounts = calibration[:, CALIBRATION.imu_turn : CALIBRATION.imu_turn + 4]
     return Boards(
@@ -453,7 +449,7 @@ def _boards(scenario: Scenario, vehicles: Sequence[Vehicle], row: np.ndarray, ro
         setpoint=np.zeros((n, firmware.SETPOINT.size)),
         set_tick=np.zeros(n, dtype=np.int64),
         memory=np.zeros((n, firmware.MEMORY.size)),
-        belief=np.array([_first_belief(drone, own, board, obstacles, each) for drone, own, board in rows]),
+        belief=np.array([_first_belief(drone, own, board, each) for drone, own, board in rows]),
         actuator=sound_actuators(n, each),
         device=np.zeros((n, DEVICE.size)),
         lanes=board_blocks(row, rotors, setting, mounts),
@@ -479,13 +475,10 @@ def _senses(scenario: Scenario, sensors: FleetSensors, noise: NoiseTable) -> Sen
     )
 
 
-def _first_belief(
-    drone: Drone, row: np.ndarray, calibration: np.ndarray, obstacles: np.ndarray, rotors: int
-) -> np.ndarray:
+def _first_belief(drone: Drone, row: np.ndarray, calibration: np.ndarray, rotors: int) -> np.ndarray:
     """Return the belief at power-up: level, heading unknown until the first magnetometer sample.
 
-    Where the field gives none, the heading is the true one at the start. A drone that starts on a roof knows its
-    height, like one that has landed there.
+    Where the field gives none, the heading is the true one at the start.
     """
     belief = np.zeros(BELIEF.size + rotors)
     belief[BELIEF.q_WB] = 1.0
@@ -493,10 +486,6 @@ def _first_belief(
         belief[BELIEF.heading] = math.radians(drone.yaw_deg)
         belief[BELIEF.q_WB : BELIEF.q_WB + 4] = quaternion_from_heading(belief[BELIEF.heading])
     belief[BELIEF.height] = row[VEHICLE.stand_height]
-    roof_m = drone.position_m[2]
-    is_on_roof = any(abs(obstacle.nearest(solid, *drone.position_m)[0]) < ON_ROOF_M for solid in obstacles)
-    if is_on_roof and roof_m > observer.FLOOR_MIN_M:
-        belief[BELIEF.height] = belief[BELIEF.stand_height] = roof_m + row[VEHICLE.stand_height]
     belief[BELIEF.still_steps] = observer.STILL_STEPS_MIN
     return belief
 

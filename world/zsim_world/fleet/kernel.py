@@ -29,6 +29,7 @@ from zsim_world.physics.fleet_arrays import (
     PerRotor,
     Senses,
 )
+from zsim_world.physics.rays import Scene
 from zsim_world.physics.rigid_body import drained, four, put, put_four, vector
 from zsim_world.physics.simd import accelerate, lead, line_up, move
 from zsim_world.physics.surfaces import meet_obstacles
@@ -49,6 +50,7 @@ from zsim_world.sensors.equations import (
     pressure,
     sonar,
 )
+from zsim_world.sensors.over_obstacles import flow_over, sonar_over
 from zsim_world.sensors.sensor_set import CONFIG, NEVER, SCHEDULE
 from zsim_world.vehicles import firmware
 from zsim_world.vehicles.observer import DEVICE, STEP_S
@@ -120,7 +122,7 @@ def _read(s: int, value: NDArray, config: NDArray, bias: NDArray, noise: NDArray
 
 
 @inlined
-def _sample(s: int, i: int, bodies: Bodies, noise: NoiseRows, senses: Senses, value: NDArray) -> bool:
+def _sample(s: int, i: int, bodies: Bodies, noise: NoiseRows, senses: Senses, scene: Scene, value: NDArray) -> bool:
     """Write a reading of sensor s of drone i into value (6,); return False if it is lost."""
     config, accel = senses.config[i, s], bodies.accel[i]
     p, v, q, rate = body.pose(bodies.state[i])
@@ -128,6 +130,13 @@ def _sample(s: int, i: int, bodies: Bodies, noise: NoiseRows, senses: Senses, va
     mounted = MountedSensor(vector(config, CONFIG.p_BS), four(config, CONFIG.q_BS), config[CONFIG.limit_max])
     site = Site(bodies.vehicle[i, VEHICLE.gravity], vector(senses.place, PLACE.field_W))
     first, second = _ideal(s, x, mounted, site)
+    if scene.part.shape[0] > 0:
+        if s == ss.SONAR:
+            first = sonar_over(x, mounted, first, scene)
+        elif s == ss.FLOW:
+            beam = senses.config[i, ss.SONAR]
+            ranging = MountedSensor(vector(beam, CONFIG.p_BS), four(beam, CONFIG.q_BS), beam[CONFIG.limit_max])
+            first = flow_over(x, mounted, ranging, first, scene)
     put(value, 0, first)
     put(value, 3, second)
     at = noise.at[s] + noise.cursor[i, s] * noise.width[i, s]
@@ -181,7 +190,7 @@ def _due(plan: NDArray, tick: int) -> bool:
 
 @inlined
 def _sense(
-    tick: int, step: bool, logged: int, bodies: Bodies, device: NDArray, noise: NoiseRows, senses: Senses
+    tick: int, step: bool, logged: int, bodies: Bodies, device: NDArray, noise: NoiseRows, senses: Senses, scene: Scene
 ) -> int:
     """Take all samples that are due at this tick; return the length of the log.
 
@@ -189,12 +198,12 @@ def _sense(
     """
     for i in range(bodies.state.shape[0]):
         if step:
-            logged = _take(ss.IMU, i, tick, logged, bodies, device[i], noise, senses)
+            logged = _take(ss.IMU, i, tick, logged, bodies, device[i], noise, senses, scene)
         if senses.soonest[i] <= tick:
             senses.soonest[i] = NEVER
             for s in range(ss.IMU + 1, len(ss.CHANNELS)):
                 while senses.schedule[i, s, SCHEDULE.due] <= tick:
-                    logged = _take(s, i, tick, logged, bodies, device[i], noise, senses)
+                    logged = _take(s, i, tick, logged, bodies, device[i], noise, senses, scene)
                 senses.soonest[i] = min(senses.soonest[i], senses.schedule[i, s, SCHEDULE.due])
             for s in range(len(ss.CHANNELS), senses.schedule.shape[1]):
                 while _due(senses.schedule[i, s], tick):
@@ -220,11 +229,19 @@ def _expose(s: int, i: int, tick: int, bodies: Bodies, senses: Senses) -> None:
 
 @inlined
 def _take(
-    s: int, i: int, tick: int, logged: int, bodies: Bodies, device: NDArray, noise: NoiseRows, senses: Senses
+    s: int,
+    i: int,
+    tick: int,
+    logged: int,
+    bodies: Bodies,
+    device: NDArray,
+    noise: NoiseRows,
+    senses: Senses,
+    scene: Scene,
 ) -> int:
     """Sample sensor s of drone i, for the firmware and, if due, for the log; return the length of the log."""
     value = senses.value[logged]
-    kept = _sample(s, i, bodies, noise, senses, value)
+    kept = _sample(s, i, bodies, noise, senses, scene, value)
     if kept:
         _register(device, s, value)
     if _due(senses.schedule[i, s], tick) and kept:
@@ -272,7 +289,7 @@ def advance(held: Held, ticks: int) -> tuple[int, float, int, bool]:
 
 @inlined
 def _advance(w: Arrays, ticks: int) -> tuple[int, float, int, bool]:
-    time, bodies, boards, noise, senses, wind, gust, watched = w
+    time, bodies, boards, noise, senses, wind, gust, watched, scene = w
     clock, device = time.clock, boards.device
     logged, least = 0, math.inf
     bodies.touched.fill(0)
@@ -296,7 +313,7 @@ def _advance(w: Arrays, ticks: int) -> tuple[int, float, int, bool]:
             accelerate(bodies)
             if ticks > 0:
                 watch(bodies, boards.memory, watched, clock[CLOCK.tick] // clock[CLOCK.ticks_per_step])
-        logged = _sense(clock[CLOCK.tick], step, logged, bodies, device, noise, senses)
+        logged = _sense(clock[CLOCK.tick], step, logged, bodies, device, noise, senses, scene)
     incidents = 0
     for i in range(watched.found.size):
         incidents |= watched.found[i]

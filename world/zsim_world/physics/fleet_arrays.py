@@ -19,6 +19,7 @@ from zsim.math.compiled import Field, columns, inlined
 from zsim.scenario.scenario import Drone, Environment
 from zsim.schema.quantities import COULOMB_PER_MAH, SEA_LEVEL_KG_M3
 from zsim.vehicles.vehicle import Aerodynamics, Vehicle, allocation, lift_shares, mixing
+from zsim_world.physics.rays import Scene
 
 REFERENCE_DENSITY_KG_M3 = SEA_LEVEL_KG_M3  # thrust, torque and drag of a vehicle hold there
 
@@ -195,14 +196,15 @@ class Arrays(NamedTuple):
     wind: NDArray  # (air.WIND.size,)
     gust: NDArray  # (N, 3), m/s
     watched: Watched
+    scene: Scene
 
 
 def state_arrays(group: tuple[object, ...]) -> Iterator[NDArray]:
-    """Yield the arrays that make up the state of a fleet: all but the near pairs, which are found anew."""
+    """Yield the arrays that make up the state of a fleet: not near pairs, found anew, nor the scene, which stays."""
     for member in group:
         if isinstance(member, np.ndarray):
             yield member
-        elif isinstance(member, tuple) and not isinstance(member, NearPairs):
+        elif isinstance(member, tuple) and not isinstance(member, NearPairs | Scene):
             yield from state_arrays(member)
 
 

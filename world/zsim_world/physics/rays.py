@@ -35,6 +35,8 @@ class Scene(NamedTuple):
     bounds: NDArray  # (K, 6), least and greatest x, y, z [m]
     link: NDArray  # int32 (K, 2): the second child (the first follows) and 0; of a leaf its first part and their count
     part: NDArray  # int32 (M + T,), obstacles by their number, triangles by M plus theirs
+    waiting: NDArray  # int32 (DEPTH,), boxes that wait while a ray is followed
+    entered: NDArray  # (DEPTH,), m, where the ray enters them
 
 
 def scene(solid: Array, triangle: Array) -> Scene:
@@ -46,7 +48,7 @@ def scene(solid: Array, triangle: Array) -> Scene:
     low = np.concatenate([np.array([low for low, _ in boxes]).reshape(-1, 3), corners.min(axis=0)])
     high = np.concatenate([np.array([high for _, high in boxes]).reshape(-1, 3), corners.max(axis=0)])
     bounds, link, part = _tree(low - MARGIN_M, high + MARGIN_M)
-    return Scene(solid, triangle, bounds, link, part)
+    return Scene(solid, triangle, bounds, link, part, np.empty(DEPTH, dtype=np.int32), np.empty(DEPTH))
 
 
 def _bounds_of(row: Sequence[float]) -> tuple[list[float], list[float]]:
@@ -82,11 +84,6 @@ def _tree(low: Array, high: Array) -> tuple[Array, NDArray[np.int32], NDArray[np
         link.append((0, 0))
     links = np.array(link, dtype=np.int32).reshape(-1, 2)
     return np.array(bounds).reshape(-1, 6), links, part
-
-
-def stack() -> tuple[NDArray[np.int32], Array]:
-    """Return room for the boxes that wait while a ray is followed, for `cast`."""
-    return np.empty(DEPTH, dtype=np.int32), np.empty(DEPTH)
 
 
 @inlined
@@ -202,14 +199,9 @@ def _box(bounds: NDArray, o: Vector, per: Vector, far: float) -> float:
 
 
 @noinline
-def cast(scene: Scene, waiting: NDArray, entered: NDArray, o: Vector, d: Vector, far: float) -> float:
-    """Return the distance [m] at which a ray meets ground, obstacle or triangle; `far` if not before.
-
-    Args:
-        waiting, entered: of `stack`, overwritten.
-        o, d: where it begins [m], and the unit vector along it, in W.
-    """
-    best, count = cast_ground(o, d, far), scene.solid.shape[0]
+def cast_parts(scene: Scene, o: Vector, d: Vector, far: float) -> float:
+    """Return the distance [m] at which a ray meets obstacle or triangle; arguments as of `cast`."""
+    best, count, waiting, entered = far, scene.solid.shape[0], scene.waiting, scene.entered
     if scene.bounds.shape[0] == 0:
         return best
     per = (inverse(d[0]), inverse(d[1]), inverse(d[2]))
@@ -237,3 +229,13 @@ def cast(scene: Scene, waiting: NDArray, entered: NDArray, o: Vector, d: Vector,
             return best
         depth -= 1
         node, at = waiting[depth], entered[depth]
+
+
+@inlined
+def cast(scene: Scene, o: Vector, d: Vector, far: float) -> float:
+    """Return the distance [m] at which a ray meets ground, obstacle or triangle; `far` if not before.
+
+    Args:
+        o, d: where it begins [m], and the unit vector along it, in W.
+    """
+    return cast_parts(scene, o, d, cast_ground(o, d, far))

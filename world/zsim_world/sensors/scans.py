@@ -24,7 +24,7 @@ from zsim.sensors.camera_model import camera_pose, lens_of, undistorted
 from zsim.sensors.scanner import SINGLE, DepthConfig, LidarConfig, RangeConfig, Scanner, along, scanners
 from zsim.sensors.sensor import Mount, Sample
 from zsim_world.physics.fleet_arrays import STATE
-from zsim_world.physics.rays import DEPTH, Scene, cast, cast_hull
+from zsim_world.physics.rays import Scene, cast, cast_hull
 from zsim_world.physics.rigid_body import four, vector
 from zsim_world.run_state import IN_PLACE, PART, Saved
 from zsim_world.sensors.equations import rounded
@@ -269,7 +269,6 @@ def scan(held: Held, place: int, poses: NDArray, stream: NDArray) -> NDArray:
         if j != i and dot(away, away) < reach * reach:
             near[count] = j
             count += 1
-    waiting, entered = np.empty(DEPTH, np.int32), np.empty(DEPTH)
     at, ray = int(row[SCANNER.origin]), int(row[SCANNER.first])
     o = add(p_WB, product(R_WB, vector(origins[at], 0)))
     for v in range(values):
@@ -279,7 +278,7 @@ def scan(held: Held, place: int, poses: NDArray, stream: NDArray) -> NDArray:
         for _ in range(each):
             d, share = product(R_WB, vector(rays[ray], RAY.direction_B)), rays[ray, RAY.share]
             far = most / share
-            met = cast(scene, waiting, entered, o, d, far)
+            met = cast(scene, o, d, far)
             for k in range(count):
                 j = near[k]
                 met = cast_hull(vector(poses[j], STATE.p_WB), four(poses[j], STATE.q_WB), hulls[j], o, d, met)

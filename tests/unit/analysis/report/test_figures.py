@@ -17,10 +17,11 @@ from msgspec.structs import replace
 from synthetic_record import Flown
 
 from zsim.contract.flight_messages import ClusterState
-from zsim.contract.run_messages import Event
+from zsim.contract.run_messages import Event, RadioLinks
 from zsim.presentation import drone_colours
 from zsim_analysis.reading.drone_errors import Distances, EstimateErrors, Separations, VelocityResponse
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of, goal_errors
+from zsim_analysis.reading.radio_links import RadioHistory
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.report import FORMATS, make_report
 from zsim_analysis.report.drone_figures import (
@@ -29,6 +30,7 @@ from zsim_analysis.report.drone_figures import (
     draw_drones,
     draw_estimates,
     draw_plan,
+    draw_radio,
     draw_velocities,
 )
 from zsim_analysis.report.figure_style import (
@@ -95,6 +97,21 @@ def large(count: int) -> Formation:
     return Formation("main", tuple(names(count)), named, T_S, *pair, ["engaged"] * len(T_S))
 
 
+def radio(count: int) -> RadioHistory:
+    """Return the links of so many drones in a path that breaks in the middle of the run."""
+    path = tuple(tuple(j for j in (i - 1, i + 1) if 0 <= j < count) for i in range(count))
+    broken = ((), *path[1:])
+    return RadioHistory([RadioLinks(round(t * 1e9), 0, path if t < T_S.mean() else broken) for t in T_S], count)
+
+
+def test_the_radio_is_drawn_with_the_times_at_which_not_all_reach_all() -> None:
+    figure = draw_radio(radio(3), names(3), MARKS)
+    assert {"drone1", "drone2", "drone3", "not connected"} <= legend_of(figure)
+    share = np.asarray(figure.axes[0].images[0].get_array())
+    assert share[1, 0] == 100
+    assert 40 < share[0, 1] < 60
+
+
 def legend_of(figure: Figure) -> set[str]:
     """Return what the legend above a figure names, each once."""
     texts = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
@@ -133,6 +150,7 @@ def test_figures_of_drones_fit_a_page(count: int) -> None:
         draw_estimates(estimates(count), colours(count), WINDOW_S, MARKS),
         draw_velocities(responses(count), colours(count), MARKS),
         draw_distances(apart(min(count, 3)), Separations(2.0, 1.5, 0.52), colours(count), MARKS),
+        draw_radio(radio(count), names(count), MARKS),
     ):
         fits(figure)
         assert len(figure.axes) <= 20

@@ -47,6 +47,14 @@ def test_a_view_becomes_arrays_in_which_drones_keep_their_places():
     assert not pic.drone_poses(ViewDrones(7, 0, ()), ("d0",)).present.any()
 
 
+def test_links_of_the_radio_are_lines_between_drones_that_are_there():
+    views = tuple(DroneView(f"d{i}", (i, 0.0, 0.0), LEVEL, (1.0,) * 4, "flying", 80.0) for i in (0, 1, 3))
+    drones = pic.drone_poses(ViewDrones(7, 0, views), ("d0", "d1", "d2", "d3"))
+    both, single = pic.radio_lines(((1, 2), (0, 3, 4), (0,), (), (0, 1, 2, 3)), drones)  # the station's is the fifth
+    assert both[:, :, 0].tolist() == [[0, 1]]
+    assert single[:, :, 0].tolist() == [[1, 3]]
+
+
 def test_many_names_are_shown_by_what_tells_them_apart():
     assert pic.short_names(["drone1", "drone2", "drone30"]) == ["1", "2", "30"]
     assert pic.short_names(["drone10", "drone11"]) == ["10", "11"]
@@ -199,3 +207,16 @@ def test_trails_are_seen_on_dark_ground_and_light_ones_are_as_they_were(count: i
         seen = lightened(colour)
         assert (luminance(seen) + 0.05) / (luminance(DARK[0]) + 0.05) > CONTRAST_MIN
         assert luminance(colour) < LUMINANCE_MIN or list(seen) == list(colour)
+
+
+def test_paths_of_drones_that_fly_by_themselves_are_lines_from_their_hover_to_their_end():
+    scenario = scenario_file.load(SCENARIOS.parent / "examples" / "exchange.yaml")
+    lines = pic.reference_lines(scenario)
+    assert lines.shape == (4 * 2 * (pic.PATH_POINTS - 1), 2, 3)
+    assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).max() < 0.6
+    first = lines[: pic.PATH_POINTS - 1]
+    assert first[0, 0] == pytest.approx([0, 0, 1])  # over its start
+    assert isinstance(scenario.exchanges, list)
+    ends = np.array(scenario.exchanges[0].stages[0].places_m)
+    assert np.linalg.norm(ends - first[-1, 1], axis=1).min() < 1e-9
+    assert len(pic.reference_lines(scenario_file.load(SCENARIOS / "step.yaml"))) == 0

@@ -14,6 +14,7 @@ from zsim.contract.messages import DroneInfo
 from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health, Waiting
 from zsim.math import frames
 from zsim.runtime.participant import Participant
+from zsim.scenario.scenario import Obstacle
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.console_server import console_state
 from zsim_bridges.console.console_tables import TableRows
@@ -343,6 +344,15 @@ def view(t_s: float, x_m: float, battery: float = 80.0) -> ViewDrones:
     )
 
 
+def test_a_drone_s_distance_is_that_to_the_nearest_obstacle():
+    poles = [
+        Obstacle(name=f"p{x}", shape="cylinder", position_m=(x, 0, 0), radius_m=0.5, height_m=9) for x in (3.0, 9.0)
+    ]
+    meter = FlightMeter(poles)
+    meter.update(view(0.0, 5.0))
+    assert meter.figures["drone1"].obstacle_m == pytest.approx(1.5)
+
+
 def test_figures_of_flight_come_from_where_a_drone_was():
     meter = FlightMeter()
     for step in range(10):
@@ -351,7 +361,7 @@ def test_figures_of_flight_come_from_where_a_drone_was():
     assert figures.speed_m_s == pytest.approx(math.hypot(2.0, 1.0))
     assert figures.climb_m_s == pytest.approx(1.0)
     assert figures.heading_deg == pytest.approx(90.0)
-    assert figures.battery_left_s is None
+    assert (figures.battery_left_s, figures.obstacle_m) == (None, None)
     meter.update(view(40.0, 0.0, 70.0))
     assert meter.figures["drone1"].battery_left_s == pytest.approx(70.0 / 0.25)
     meter.update(view(1.0, 50.0))  # a replay that goes back begins anew

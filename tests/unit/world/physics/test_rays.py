@@ -11,7 +11,7 @@ from zsim.math.rotation import Vector
 from zsim.scenario.obstacle import COLUMNS, nearest, row_of
 from zsim.scenario.scenario import Obstacle
 from zsim_world.physics import rays
-from zsim_world.physics.rays import TRIANGLE, cast, scene, stack
+from zsim_world.physics.rays import TRIANGLE, cast, scene
 
 FAR = 100.0
 MM = 1e-3
@@ -43,7 +43,7 @@ def unit(*d) -> Vector:
 
 
 def distance(held, o, d, far=FAR):
-    return cast(held, *stack(), vector(o), unit(*d), far)
+    return cast(held, vector(o), unit(*d), far)
 
 
 def triangles(corners):
@@ -150,7 +150,7 @@ def test_a_forest_agrees_with_independent_casters():
     for _ in range(150):
         o, d = vector(rng.uniform((-25, -25, 0.1), (25, 25, 7))), unit(*rng.normal(0, (1, 1, 0.3)))
         expected = min(stepped(rows.tolist(), o, d), moeller_trumbore(corners, o, d))
-        assert cast(held, *stack(), o, d, FAR) == pytest.approx(expected, abs=MM)
+        assert cast(held, o, d, FAR) == pytest.approx(expected, abs=MM)
         met += expected < FAR
     assert met > 80
 
@@ -166,4 +166,4 @@ def test_a_tree_finds_what_a_list_finds():
             expected = rays.cast_ground(o, d, FAR)
             for row in rows:
                 expected = rays.cast_solid(row, o, d, expected)
-            assert cast(held, *stack(), o, d, FAR) == expected
+            assert cast(held, o, d, FAR) == expected

@@ -9,6 +9,7 @@ from refused import has_terms
 
 from zsim.contract import keys
 from zsim.errors import ScenarioError
+from zsim.scenario import obstacle
 from zsim.scenario.obstacle import nearest, row_of
 from zsim.scenario.scenario import Obstacle, Scenario
 from zsim.scenario.scenario_file import resolve
@@ -144,3 +145,17 @@ def test_a_drone_may_start_on_a_roof_and_takes_off_from_it():
         fleet.advance()
     assert fleet.status(0)[0] == "hovering"
     assert fleet.truth().position_m[0, 2] == pytest.approx(2.5 + ARDRONE2.takeoff_height_m, abs=0.15)
+
+
+def test_least_distances_are_those_of_nearest_in_blocks_too(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(obstacle, "PAIRS_MAX", 7)
+    solids = [
+        Obstacle(name="box", shape="box", position_m=(1, 2, 0), size_m=(2, 1, 3), yaw_deg=30),
+        Obstacle(name="pole", shape="cylinder", position_m=(-2, 1, 0.5), radius_m=0.4, height_m=2),
+        Obstacle(name="ball", shape="sphere", position_m=(0, -2, 1), radius_m=0.8),
+    ]
+    points = np.random.default_rng(1).uniform((-4, -4, 0), (4, 4, 4), (200, 3))
+    expected = [min(nearest(row_of(each), *point)[0] for each in solids) for point in points.tolist()]
+    np.testing.assert_allclose(obstacle.least_distances(solids, points), expected, atol=1e-12)
+    assert min(expected) < 0.0
+    assert obstacle.least_distances([], points).min() == np.inf

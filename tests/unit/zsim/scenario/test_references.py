@@ -113,6 +113,16 @@ def test_what_cannot_be_is_refused_with_field_and_value(reference: dict[str, Any
     assert any(all(term.rstrip("…") in line for term in terms) for line in text.splitlines()), text
 
 
+def test_only_drones_that_have_a_pilot_are_waited_for_or_lose_it() -> None:
+    flown = {"waypoints": ONE, "start_s": 10}
+    kill = {"kind": "process_kill", "at_s": 5}
+    resolve(flown, faults=[{**kill, "target": "reference.d1"}], processes={"expect": ["reference.d1"]})
+    with refused(ScenarioError, "processes.expect[0]", "'reference.d2'", "reference.NAME", "d1"):
+        resolve(flown, processes={"expect": ["reference.d2"]})
+    with refused(ScenarioError, "faults[0].target", "'reference.d2'"):
+        resolve(flown, faults=[{**kill, "target": "reference.d2"}])
+
+
 def test_a_drone_has_one_who_flies_it() -> None:
     cluster = [{"name": "main", "drones": ["d1", "d2"]}]
     with refused(ScenarioError, "drones[0].reference", "'main'", "(drone 'd1')"):
