@@ -8,6 +8,7 @@ from inspect import signature
 from types import FunctionType
 from typing import Any, NamedTuple
 
+from msgspec import UNSET
 from msgspec.structs import replace
 
 from zsim.contract import keys
@@ -18,6 +19,7 @@ from zsim.runtime.inbox import output_hold_ns
 from zsim.scenario.own_classes import messages_of
 from zsim.scenario.roles import AGENTS, agent_names, agent_roles, expected_processes
 from zsim.scenario.scenario import OwnAgent, Scenario
+from zsim.scenario.scenario_file import to_text
 from zsim.schema import parameters, plugin, yaml_file
 from zsim.schema.checker import show
 
@@ -131,6 +133,8 @@ def make_agents(role: str, info: Info, scenario: Scenario, names: Sequence[str])
     """Make the agents of one role for drones or clusters: one for all of them, if the role has joint agents."""
     if own := scenario.own_agents.get(role):
         kind = plugin.load_any(own.named, f"agents.{role}.class", Agent)
+        if own.map is False:
+            info, scenario = without_map(info, scenario)
         return [own_agent(kind, info, scenario, own.parameters, f"{role}.{name}", own.per) for name in names]
     agent = agent_class(role)
     try:
@@ -186,6 +190,12 @@ def process_name(made: Agent | Callable[..., Agent]) -> str:
     """Return the name under which an agent of a user's takes part that has not been made yet."""
     name = getattr(made, "name", None)
     return name if isinstance(name, str) else default_name(type(made) if isinstance(made, Agent) else made)
+
+
+def without_map(info: Info, scenario: Scenario) -> tuple[Info, Scenario]:
+    """Return what an agent is given to which the scenario does not grant the map: no obstacles, no surfaces."""
+    bare = replace(scenario, environment=replace(scenario.environment, obstacles=[], surfaces=UNSET))
+    return replace(info, scenario=to_text(bare)), bare
 
 
 def with_own_agents(scenario: Scenario, names: Sequence[str]) -> Scenario:

@@ -1,14 +1,18 @@
 """Drones that cross a forest by their lidars: none touches a trunk, and the bits are the same however they are flown."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import zsim
+from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.obstacle import nearest, row_of
 from zsim.vehicles.ardrone2 import VEHICLE
+from zsim_agents.hosting import hosted
+from zsim_world.run.world import World
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -48,3 +52,43 @@ def test_as_processes_they_have_the_same_bits_though_a_pilot_is_killed(tmp_path:
     scans = [(each.messages("drone/drone3/sensor/lidar")).ranges_m.tolist() for each in (alone, run)]
     assert len(scans[0]) == 91
     assert scans[0] == scans[1]
+
+
+MAPPERS = """
+import zsim
+
+
+class Mapper(zsim.Agent):
+    def __init__(self, info, scenario):
+        super().__init__()
+        self.seen = len(scenario.environment.obstacles), "tree1" in info.scenario
+
+    def receive(self, key, message): ...
+
+    def step(self, t_ns):
+        return []
+"""
+
+
+@pytest.mark.parametrize(("given", "seen"), [({}, (3, True)), ({"map": True}, (3, True)), ({"map": False}, (0, False))])
+def test_an_agent_has_the_map_where_the_scenario_grants_it(
+    given: dict[str, bool], seen: tuple[int, bool], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "mappers.py").write_text(MAPPERS)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    document = {
+        "name": "map",
+        "duration_s": 1,
+        "environment": {"forest": {"trees": 3, "area_m": [5, 5, 15, 15]}},
+        "drones": [{"name": "d1", "position_m": [0, 0, 0]}],
+        "agents": {"mapper": {"class": "mappers:Mapper", **given}},
+    }
+    scenario = scenario_file.resolve(document)
+    agent: Any = hosted(World(scenario).info(), scenario, ["mapper.d1"])
+    assert agent.seen == seen
+
+
+def test_a_map_is_granted_or_not() -> None:
+    with pytest.raises(ScenarioError) as refused:
+        scenario_file.load(EXAMPLES / "forest.yaml", ["agents.pilot.map=maybe"])
+    assert [line.split(" ")[1] for line in refused.value.faults] == ["agents.pilot.map"]

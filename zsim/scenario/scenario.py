@@ -470,6 +470,8 @@ class OwnAgent(Spec, frozen=True, kw_only=True):
     per: Literal["drone", "cluster", "run"] = "drone"
     parameters: Given = {}
     """Of the class, see docs/extending.md."""
+    map: bool | UnsetType = UNSET
+    """Whether it is given the obstacles and surfaces of the scenario; unset: it is."""
     declared: Annotated[list[MessageInfo], Meta(max_length=MESSAGES_MAX)] | UnsetType = UNSET
     """The messages that the class publishes; filled in, as all its parameters are."""
 
