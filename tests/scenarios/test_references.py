@@ -105,6 +105,20 @@ def test_hosted_they_have_the_same_bits(federation: Any, tmp_path: Path, compile
     assert federation.record().sha256() == alone.truth_sha256
 
 
+def test_it_goes_on_from_a_snapshot_to_the_same_bits(tmp_path: Path) -> None:
+    (tmp_path / "short.yaml").write_text(SHORT)
+    sim = zsim.Simulation(tmp_path / "short.yaml")
+    sim.run(until_s=5)
+    sim.drone("d2").goto((3, 1, 1))
+    sim.run(until_s=6)
+    before = sim.snapshot()
+    sim.run(until_s=9)
+    once = sim.truth_sha256
+    sim.restore(before)
+    sim.run(until_s=9)
+    assert sim.truth_sha256 == once
+
+
 @pytest.mark.parametrize("op", ["goto", "follow"])
 def test_who_has_no_pilot_cannot_be_asked(op: str, tmp_path: Path) -> None:
     arguments: dict[str, Any] = {

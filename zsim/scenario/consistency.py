@@ -15,7 +15,7 @@ from zsim.contract import messages
 from zsim.scenario.faults import Known, flaws, kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
 from zsim.scenario.own_classes import agent_faults
-from zsim.scenario.roles import AGENTS, MAIN, OPERATOR, ROLES
+from zsim.scenario.roles import AGENTS, MAIN, OPERATOR, PILOT, ROLES
 from zsim.scenario.scenario import (
     EXTERNAL,
     PATHS,
@@ -68,6 +68,8 @@ def cross_faults(
     yield from _start_faults(drones, vehicles)
     obstacles = _entries(scenario.environment and scenario.environment.obstacles)
     yield from _obstacle_faults(obstacles, drones, vehicles)
+    surfaces = scenario.environment and scenario.environment.surfaces
+    yield from _name_faults("environment.surfaces", _entries(surfaces or []))
     for index, drone in drones:
         yield from _under(f"drones[{index}]", _drone_faults(drone, scenario, vehicles))
     yield from _own_sensor_faults(drones)
@@ -78,7 +80,7 @@ def cross_faults(
     for index, cluster in clusters:
         yield from _under(f"clusters[{index}]", _shape_faults(cluster, drones))
     yield from _reference_faults(scenario, drones, clusters)
-    yield from _process_faults(scenario.processes, drones, clusters)
+    yield from _process_faults(scenario, drones, clusters)
     if isinstance(scenario.agents, dict):
         sound_agents = {role: each for role, each in scenario.agents.items() if each and each.per}
         yield from agent_faults(sound_agents, (*ROLES, *RESERVED_ROLES), bool(clusters))
@@ -505,12 +507,21 @@ def _landing_faults(piloted: Any, from_s: float | None) -> Iterator[Fault]:
         yield "land_s", f"is {piloted.land_s:g}; must be > {from_s:g}, when it is still to fly"
 
 
-def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
+def _piloted(scenario: Any, drones: _Entries) -> _Entries:
+    """Return the drones that fly by a reference of their own, or change places."""
+    exchanges = _entries(scenario.exchanges if isinstance(scenario.exchanges, list) else [])
+    exchanged = {name for _, exchange in exchanges for _, name in _entries(exchange.drones)}
+    return [(index, drone) for index, drone in drones if drone.reference or drone.name in exchanged]
+
+
+def _process_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
+    processes = scenario.processes
     action = ((processes and processes.on_death) or {}).get("world")
     if action is not None and action not in WORLD_DEATHS:
         yield "processes.on_death.world", f"is {action!r}; must be {' or '.join(WORLD_DEATHS)}"
     first: dict[str, int] = {}
     things = {role: (each.about, drones if each.about == "drone" else clusters) for role, each in AGENTS.items()}
+    things[PILOT] = "drone with a reference", _piloted(scenario, drones)
     for index, name in _entries(processes and processes.expect):
         if first.setdefault(name, index) != index:
             yield f"processes.expect[{index}]", f"is {name!r}, as expect[{first[name]}]; must be unique"
@@ -558,6 +569,7 @@ def _injected_faults(
         things = {"drone": [d.name for _, d in drones], "cluster": [c.name for _, c in clusters], "run": [MAIN]}
         own = scenario.agents.items()
         processes += tuple(f"{role}.{thing}" for role, each in own if each for thing in things.get(each.per, ()))
+    processes += tuple(f"{PILOT}.{drone.name}" for _, drone in _piloted(scenario, drones))
     kinds = kinds_of(declarations([drone for _, drone in drones]))
     rotors = {drone.name: vehicles[drone.model].rotor_names if drone.model in vehicles else () for _, drone in drones}
     external = tuple(drone.name for _, drone in drones if drone.body == EXTERNAL)

@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 
 from zsim.contract import keys
 from zsim.contract.run_messages import Fault
-from zsim.scenario.roles import AGENTS
+from zsim.scenario.roles import AGENTS, PILOT
 from zsim.schema import yaml_file
 from zsim.schema.checker import Fault as Flaw
 from zsim.schema.checker import listed, show, suggestion
@@ -244,7 +244,8 @@ class Known(NamedTuple):
     unread: Collection[str] = ()  # sensors whose modules are not imported, or faulty: what can fail of them is unknown
 
     def things(self) -> dict[str, tuple[str, ...]]:
-        return {name: self.drones if role.about == "drone" else self.clusters for name, role in AGENTS.items()}
+        roles = {name: role.about for name, role in AGENTS.items() if name != PILOT}  # not every drone has a pilot
+        return {name: self.drones if about == "drone" else self.clusters for name, about in roles.items()}
 
     def takes_part(self, process: str) -> bool:
         role, _, thing = process.partition(".")

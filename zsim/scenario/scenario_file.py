@@ -199,10 +199,8 @@ def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
     if "pieces" in reference:
         unsound.append((f"{where}.file", "is given beside pieces; must be one of them"))
         return reference
-    places = [folder / name for folder in (*plugin.folders(), Path())]
-    found = next((place for place in places if place.is_file()), places[0])
     try:
-        pieces = pieces_of(found, f"{where}.file")
+        pieces = pieces_of(plugin.beside(name), f"{where}.file")
     except DocumentError as error:
         unsound += [(path, text) for path, _, text in (line.partition(" ") for line in error.faults)]
         return reference

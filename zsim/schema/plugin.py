@@ -59,6 +59,12 @@ def folders() -> tuple[Path, ...]:
     return tuple(map(Path, filter(None, os.environ.get(FOLDERS, "").split(os.pathsep))))
 
 
+def beside(name: str) -> Path:
+    """Return the path of a file that a scenario names: in the folders of its modules, or in this one."""
+    places = [folder / name for folder in (*folders(), Path())]
+    return next((place for place in places if place.is_file()), places[0])
+
+
 @contextmanager
 def names_only(wanted: bool = True, looked_up: bool = True) -> Iterator[list[str]]:
     """Import nothing that documents name, here and in processes started from here, unless `wanted` is False.

@@ -2,7 +2,7 @@
 
     u_i = c1 sum phi_alpha(|z_ij|_s) n_ij + c2 sum a_ij (v_j - v_i)                     alpha: flockmates
         + c1b sum phi_beta(|z_ik|_s) n_ik + c2b sum b_ik (v_k - v_i)                    beta: obstacles
-        - c1g s1(p_i - p_r) - c2g (v_i - v_r)                                           gamma: where all want to go
+        - c1g (p_i - p_r) - c2g (v_i - v_r)                                             gamma: where all want to go
 
 Olfati-Saber, Flocking for multi-agent dynamic systems: algorithms and theory, IEEE Trans. Automatic Control 51 (2006),
 Algorithms 2 and 3. u is an acceleration; the pilot integrates it to the velocity that it commands. Each drone hears
@@ -93,9 +93,8 @@ def beta_force(v: Array, obstacles: list[tuple[float, Array]], d: float, c1: flo
 
 
 def gamma_force(p: Array, v: Array, p_r: Array, v_r: Array, c1: float) -> Array:
-    """Return the part of u_i that is of the group's aim, s1(z) = z / sqrt(1 + |z|^2); c2 = 2 sqrt(c1)."""
-    z = p - p_r
-    return -c1 * z / math.sqrt(1.0 + total(z * z)) - 2.0 * math.sqrt(c1) * (v - v_r)
+    """Return the part of u_i that is of the group's aim (dim,) [m/s^2]; c2 = 2 sqrt(c1)."""
+    return -c1 * (p - p_r) - 2.0 * math.sqrt(c1) * (v - v_r)
 
 
 def deviation_energy(p: Array, d: float, r: float) -> tuple[float, int]:
@@ -119,7 +118,7 @@ class OlfatiSaber(Pilot):
         """Of obstacles: d'."""
         alpha_1_s2: NonNegative = 0.2
         beta_1_s2: NonNegative = 1.0
-        gamma_1_s2: NonNegative = 0.6
+        gamma_1_s2: NonNegative = 0.1
         """c1 of flockmates, obstacles and aim; each c2 is 2 sqrt(c1)."""
         accel_max_m_s2: Positive = 2.0
         avoid_m: NonNegative = 0.0

@@ -6,6 +6,7 @@ and it stands still at the nearest end outside of [0, duration_s].
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -68,17 +69,22 @@ class PiecewisePolynomial:
         self.durations_s, self.coefficients = np.asarray(durations_s, float), np.asarray(coefficients, float)
         self.begins_s = np.concatenate(([0.0], np.cumsum(self.durations_s)))
         self.duration_s: float | None = float(self.begins_s[-1])
+        self._begins: list[float] = self.begins_s[:-1].tolist()
+        self._axes: list[list[list[float]]] = self.coefficients.swapaxes(1, 2)[:, :, ::-1].tolist()  # t^7 first
 
     def value(self, t_s: float) -> tuple[Array, Array]:
-        end_s = float(self.begins_s[-1])
-        clamped = min(max(t_s, 0.0), end_s)
-        piece = min(int(np.searchsorted(self.begins_s, clamped, side="right")) - 1, len(self.durations_s) - 1)
-        local, own = clamped - float(self.begins_s[piece]), self.coefficients[piece]
-        place, rate = own[-1].copy(), np.zeros(4)
-        for coefficient in own[-2::-1]:
-            rate = rate * local + place
-            place = place * local + coefficient
-        return place, rate if clamped == t_s else np.zeros(4)
+        clamped = min(max(t_s, 0.0), float(self.begins_s[-1]))
+        piece = bisect.bisect_right(self._begins, clamped) - 1
+        local = clamped - self._begins[piece]
+        place, rate = [], []
+        for highest, *others in self._axes[piece]:  # in floats: numpy takes five times as long
+            value, slope = highest, 0.0
+            for coefficient in others:
+                slope = slope * local + value
+                value = value * local + coefficient
+            place.append(value)
+            rate.append(slope)
+        return np.array(place), np.array(rate) if clamped == t_s else np.zeros(4)
 
     def peaks(self) -> Peaks:
         """Return the peaks, by the roots of the derivative of each squared quantity."""

@@ -34,12 +34,27 @@ def board(
         str | None, Option("--format", help="pdf, svg or pdf,svg: figures are written so too.", show_default=False)
     ] = None,
     force: Annotated[bool, Option("--force", help="Use a folder that holds other files, too.")] = False,
+    papers: Annotated[
+        bool, Option("--papers", help="Fly nothing: compute figures of the laws' papers again, numbers side by side.")
+    ] = False,
 ) -> None:
     """Fly formation laws in the same scenarios, with the same seeds and sensors: one table, with figures."""
     require("sweep", SWEEP_NEEDS)
     from rich.console import Console
 
     from zsim.runtime.progress import PipedConsole, cell
+
+    if papers:
+        if laws or scenarios or formats:
+            raise BadParameter("--papers flies no law in a scenario; leave --laws, --scenarios and --format out")
+        from zsim_analysis.board.paper_figures import terminal_table, write_papers
+
+        place = out or Path("runs") / "papers"
+        with Console(stderr=True).status("computing …") as status:
+            found = write_papers(place, lambda text: status.update(cell(text)))
+        PipedConsole().print(terminal_table(found))
+        say(f"figures: {place}")
+        return
     from zsim_analysis.board.board import BoardRequest, fly_board
     from zsim_analysis.board.board_report import make_board_report, terminal_text
     from zsim_analysis.board.entries import LAW_NAMES, chosen, scenario_names

@@ -9,6 +9,7 @@ from refused import has_terms, refused
 from zsim.contract import keys
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
+from zsim.scenario.consistency import unflown_plans
 from zsim.scenario.polynomial_file import HEADER
 from zsim.scenario.roles import agent_names, permits, rights_for
 
@@ -111,6 +112,23 @@ def test_what_cannot_be_is_refused_with_field_and_value(reference: dict[str, Any
         resolve(reference)
     text = str(raised.value).replace("'", "")
     assert any(all(term.rstrip("…") in line for term in terms) for line in text.splitlines()), text
+
+
+def test_only_drones_that_have_a_pilot_are_waited_for_or_lose_it() -> None:
+    flown = {"waypoints": ONE, "start_s": 10}
+    kill = {"kind": "process_kill", "at_s": 5}
+    resolve(flown, faults=[{**kill, "target": "reference.d1"}], processes={"expect": ["reference.d1"]})
+    with refused(ScenarioError, "processes.expect[0]", "'reference.d2'", "reference.NAME", "d1"):
+        resolve(flown, processes={"expect": ["reference.d2"]})
+    with refused(ScenarioError, "faults[0].target", "'reference.d2'"):
+        resolve(flown, faults=[{**kill, "target": "reference.d2"}])
+
+
+def test_what_begins_after_the_end_of_the_run_is_told() -> None:
+    late = resolve({"waypoints": ONE, "start_s": 30})
+    assert [has_terms(line, "drones.d1", "30", "30") for line in unflown_plans(late)] == [True]
+    assert unflown_plans(resolve({"waypoints": ONE, "start_s": 29})) == []
+    assert len(unflown_plans(resolve(exchanges=[EXCHANGE], duration_s=8))) == 2
 
 
 def test_a_drone_has_one_who_flies_it() -> None:

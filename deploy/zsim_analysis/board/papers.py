@@ -1,0 +1,227 @@
+"""Figures of the laws' papers, computed again with the laws as they fly, ideal agents in place of drones.
+
+margins     R. Olfati-Saber, R. M. Murray, Consensus problems in networks of agents with switching topology and
+            time-delays, IEEE Trans. Automatic Control 49 (2004): consensus decays at lambda_2, and oscillates from
+            the delay pi / (2 lambda_n) on, if own states are as late as those of others
+flocking    R. Olfati-Saber, Flocking for multi-agent dynamic systems: algorithms and theory, IEEE Trans. Automatic
+            Control 51 (2006): relative connectivity, deviation energy and velocity mismatch of a flock in free space
+            with the paper's parameters, with and without the term of the group's aim
+bearings    S. Zhao, D. Zelazo, Bearing rigidity and almost global bearing-only formation stabilization, IEEE Trans.
+            Automatic Control 61 (2016): centroid and scale stay, and the figure is reached from almost everywhere
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from functools import cache, partial
+from typing import NamedTuple
+
+import numpy as np
+from msgspec import Struct
+from scipy.spatial import KDTree
+
+from zsim.math.random_streams import stream
+from zsim_agents.laws.bearing_only import bearing_only
+from zsim_agents.laws.consensus import consensus
+from zsim_agents.laws.olfati_saber import alpha_force, deviation_energy, gamma_force
+from zsim_agents.laws.pilot import Heard
+from zsim_agents.laws.reference import polygon
+from zsim_analysis.reading.recorded_flight import Array
+
+Graph = list[tuple[int, int]]
+N = 5
+PATH: Graph = [(0, 1), (1, 2), (2, 3), (3, 4)]
+RING: Graph = [*PATH, (4, 0)]
+GRAPHS: dict[str, Graph] = {
+    "path": PATH,
+    "ring": RING,
+    "star": [(0, 1), (0, 2), (0, 3), (0, 4)],
+    "complete": [(i, j) for i in range(N) for j in range(i + 1, N)],
+    "house": [(0, 1), (1, 2), (2, 3), (3, 0), (0, 4), (1, 4)],
+}
+STEPS_OF_DELAY = 120  # of Euler in a delay
+DELAYS = 80  # for which a network is integrated at margins
+D, R, FLOCK, AREA_STD = 7.0, 8.4, 150, 50.0  # of the paper: spacing and range [m], agents, spread of their starts [m]
+FLOCK_C1 = {"alpha": 3.0, "gamma": 0.1}  # chosen: the paper leaves them open
+REACHED_M = 1e-3
+STARTS = 10  # random ones of figures by bearings
+FLOCK_H_S, FLOCK_S = 0.02, 30.0
+
+
+class Line(Struct, frozen=True):
+    """A number of a paper beside the one computed here."""
+
+    paper: str
+    what: str
+    expected: float
+    found: float
+
+
+def neighbours(graph: Graph, i: int) -> list[int]:
+    return sorted([b for a, b in graph if a == i] + [a for a, b in graph if b == i])
+
+
+def laplacian(graph: Graph) -> Array:
+    L = np.zeros((N, N))
+    for i, j in graph:
+        L[[i, j], [j, i]] -= 1.0
+        L[[i, j], [i, j]] += 1.0
+    return L
+
+
+def consensus_rate(graph: Graph, h: float = 0.005) -> float:
+    """Return the rate at which the errors of consensus decay at last [1/s], k = 1."""
+    near = [neighbours(graph, i) for i in range(N)]
+    zero = np.zeros(1)
+    p = np.array([[1.0], [-2.0], [0.5], [3.0], [-1.0]])
+    p -= np.mean(p)
+    sizes = []
+    for _ in range(round(12.0 / (np.linalg.eigvalsh(laplacian(graph))[1] * h))):
+        p = p + h * np.array([consensus([(p[j] - p[i], zero) for j in near[i]], 1.0) for i in range(N)])
+        sizes.append(float(np.linalg.norm(p)))
+    half = np.log(sizes[len(sizes) // 2 :])
+    return float(-(half[-1] - half[0]) / (h * (len(half) - 1)))
+
+
+def delay_margin(graph: Graph) -> float:
+    """Return the delay of all states from which on consensus no longer settles [s].
+
+    The network is integrated for many delays at a time, each a dimension with a step of its own; the margin is where
+    the growth of the fastest mode changes its sign.
+    """
+    near, values, vectors = [neighbours(graph, i) for i in range(N)], *np.linalg.eigh(laplacian(graph))
+    delays = np.linspace(0.8, 1.2, DELAYS) * math.pi / (2.0 * values[-1])
+    h, zero = delays / STEPS_OF_DELAY, np.zeros(DELAYS)
+    past = [np.repeat(vectors[:, -1:], DELAYS, axis=1)] * (STEPS_OF_DELAY + 1)
+    peaks = []
+    for _ in range(2):  # the amplitude over as many periods, four delays each, early and late
+        peak = np.zeros(DELAYS)
+        for _ in range(10 * 4 * STEPS_OF_DELAY):
+            late = past.pop(0)
+            u = np.array([consensus([(late[j] - late[i], zero) for j in near[i]], 1.0) for i in range(N)])
+            past.append(past[-1] + h * u)
+            peak = np.maximum(peak, np.abs(past[-1]).max(axis=0))
+        peaks.append(peak)
+    growth = np.log(peaks[1] / peaks[0])
+    return float(np.interp(0.0, growth, delays))
+
+
+class FlockTrack(NamedTuple):
+    """A flock in free space, a second apart."""
+
+    t_s: Array  # (T,)
+    connectivity: Array  # rank of the Laplacian / (n - 1): 1 where the flock is one
+    energy: Array  # deviation energy / d^2
+    mismatch: Array  # mean |v_i - mean v| [m/s]
+    p: Array  # (n, 2) at the end [m]
+
+
+@cache
+def free_flock(n: int = FLOCK, with_aim: bool = True, seed: int = 1) -> FlockTrack:
+    """Return a flock that starts scattered as in the paper's section on simulations, with its parameters."""
+    draw = stream(seed, "papers/flock")
+    p, v = draw.normal(0.0, AREA_STD, (n, 2)), draw.uniform(-2.0, -1.0, (n, 2))
+    rows = []
+    every = round(1.0 / FLOCK_H_S)
+    for step in range(round(FLOCK_S / FLOCK_H_S) + 1):
+        pairs = KDTree(p).query_ball_point(p, R)
+        if step % every == 0:
+            energy, _ = deviation_energy(p, D, R)
+            scatter = float(np.mean(np.linalg.norm(v - np.mean(v, axis=0), axis=1)))
+            rows.append((step * FLOCK_H_S, _connectivity(pairs), energy / D**2, scatter))
+        u = np.zeros((n, 2))
+        for i in range(n):
+            heard = [Heard("", p[j], v[j]) for j in sorted(pairs[i]) if j != i]
+            u[i] = alpha_force(p[i], v[i], heard, D, R, FLOCK_C1["alpha"])
+            if with_aim:
+                u[i] += gamma_force(p[i], v[i], np.zeros(2), np.zeros(2), FLOCK_C1["gamma"])
+        v = v + FLOCK_H_S * u
+        p = p + FLOCK_H_S * v
+    t_s, connectivity, energy, mismatch = np.array(rows).T
+    return FlockTrack(t_s, connectivity, energy, mismatch, p)
+
+
+def _connectivity(pairs: list[list[int]]) -> float:
+    """Return (n - components) / (n - 1), which is the rank of the Laplacian over its greatest."""
+    group = list(range(len(pairs)))
+
+    def root(i: int) -> int:
+        while group[i] != i:
+            i = group[i]
+        return i
+
+    for i, near in enumerate(pairs):
+        for j in near:
+            group[root(i)] = root(j)
+    return (len(pairs) - sum(root(i) == i for i in range(len(pairs)))) / (len(pairs) - 1)
+
+
+class BearingTrack(NamedTuple):
+    """A figure by bearings from one start."""
+
+    t_s: Array  # (T,)
+    error: Array  # sum over the edges of |g - g*|
+    centroid_drift: float  # greatest [m]
+    scale_drift: float  # greatest, of the scale
+    distance: Array  # |p - p*|, p* of the start's centroid and scale
+
+
+@cache
+def bearing_flight(seed: int = 1, h: float = 0.05, duration_s: float = 80.0) -> BearingTrack:
+    """Return the pentagon with two diagonals from a random start, integrated by Runge and Kutta's fourth order."""
+    graph, c = [*RING, (0, 2), (0, 3)], polygon(N, 1.0)
+    near = [neighbours(graph, i) for i in range(N)]
+
+    def bearing(p: Array, i: int, j: int) -> Array:
+        z = p[j] - p[i]
+        return z / math.sqrt(z @ z)
+
+    wanted = {(i, j): bearing(c, i, j) for i in range(N) for j in near[i]}
+
+    def u(p: Array) -> Array:
+        return np.array([bearing_only([(bearing(p, i, j), wanted[i, j]) for j in near[i]], 1.0) for i in range(N)])
+
+    p = stream(seed, "papers/bearings").uniform(-2.0, 2.0, (N, 2))
+    first, scale = np.mean(p, axis=0), _scale(p)
+    target = first + scale * c / _scale(c)
+    rows, drifts = [], [(0.0, 0.0)]
+    for step in range(round(duration_s / h)):
+        if step % 10 == 0:
+            error = sum(float(np.linalg.norm(bearing(p, i, j) - wanted[i, j])) for i, j in graph)
+            rows.append((step * h, error, float(np.linalg.norm(p - target))))
+            drifts.append((float(np.linalg.norm(np.mean(p, axis=0) - first)), abs(_scale(p) - scale)))
+        k1 = u(p)
+        k2 = u(p + h / 2 * k1)
+        k3 = u(p + h / 2 * k2)
+        p = p + h / 6 * (k1 + 2 * k2 + 2 * k3 + u(p + h * k3))
+    t_s, error, distance = np.array(rows).T
+    return BearingTrack(t_s, error, max(a for a, _ in drifts), max(b for _, b in drifts), distance)
+
+
+def _scale(p: Array) -> float:
+    arms = p - np.mean(p, axis=0)
+    return math.sqrt(float(np.mean(np.sum(arms * arms, axis=1))))
+
+
+def lines(progress: Callable[[str], None] = lambda _: None) -> Iterator[Line]:
+    """Yield the numbers of the papers beside those that the laws give here."""
+    for name, graph in GRAPHS.items():
+        progress(f"consensus, {name} …")
+        values = np.linalg.eigvalsh(laplacian(graph))
+        line = partial(Line, "Olfati-Saber, Murray 2004")
+        yield line(f"rate of consensus, {name} (1/s)", float(values[1]), consensus_rate(graph))
+        yield line(f"delay margin, {name} (s)", math.pi / (2 * float(values[-1])), delay_margin(graph))
+    for with_aim in (True, False):
+        progress(f"a flock of {FLOCK}, {'with' if with_aim else 'without'} an aim …")
+        track = free_flock(with_aim=with_aim)
+        what = "with its aim" if with_aim else "without, for comparison"
+        line = partial(Line, "Olfati-Saber 2006")
+        yield line(f"relative connectivity of {FLOCK}, {what}", 1.0, float(track.connectivity[-1]))
+        yield line(f"deviation energy / d^2, {what}", 0.0, float(track.energy[-1]))
+        yield line(f"velocity mismatch (m/s), {what}", 0.0, float(track.mismatch[-1]))
+    progress("figures by bearings …")
+    tracks = [bearing_flight(seed) for seed in range(1, STARTS + 1)]
+    line = partial(Line, "Zhao, Zelazo 2016")
+    yield line("drift of the centroid (m)", 0.0, max(track.centroid_drift for track in tracks))
+    yield line("drift of the scale (m)", 0.0, max(track.scale_drift for track in tracks))
+    reached = sum(float(track.distance[-1] < REACHED_M) for track in tracks)
+    yield line(f"starts of {STARTS} from which the figure is reached", float(STARTS), reached)
