@@ -489,7 +489,7 @@ OWN_UNITS = {
     "noise": "channel's", "density": "channel's/√Hz", "bias": "channel's", "bias_walk": "channel's/√s",
     "bias_instability": "channel's", "quantum": "channel's", "madgwick_beta": "rad/s", "values": "m, rad", "target": "m, rad",
 }  # fmt: skip
-FILLED_IN = {("Sensors", "own"), ("OwnAgent", "declared")}  # which no file has
+FILLED_IN = {("Sensors", "own"), ("OwnAgent", "declared"), ("Surface", "triangles")}  # which no file has
 BY_PRESET = {"rate_hz", "imu", "gps", "mag", "baro", "sonar", "flow"}  # required once the preset is applied
 
 

@@ -1,7 +1,8 @@
-"""Obstacles that a seed places: a forest of trunks, and the walls of a winding corridor.
+"""Obstacles that a seed places, a forest of trunks and the walls of a winding corridor; and what files have.
 
 They become entries of `environment.obstacles` where a scenario is resolved, so that the record, and all who read it,
-have each of them. The same seed gives the same obstacles, rounded to a millimetre, on every machine.
+have each of them; a surface has its triangles then in place of its file. The same seed gives the same obstacles,
+rounded to a millimetre, on every machine.
 """
 
 import math
@@ -12,21 +13,30 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from zsim.errors import DocumentError
 from zsim.math.random_streams import stream
-from zsim.scenario.scenario import Corridor, Forest, Position, Scenario
+from zsim.scenario.scenario import OBSTACLES_MAX, Cloud, Corridor, Forest, Position, Scenario
+from zsim.scenario.surface_file import TRIANGLES_MAX, packed, points_of, triangles_of, unpacked
+from zsim.schema import plugin
 from zsim.schema.checker import Fault, faults, sound
 
 TRIES_MAX = 500  # places for a trunk, after which the forest is taken for full; chosen
 Entry = dict[str, Any]
-_KINDS = {"forest": Forest, "corridor": Corridor}
+_KINDS = {"forest": Forest, "corridor": Corridor, "cloud": Cloud}
 
 
 def with_generated(document: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]:
-    """Return a raw document whose `forest:` and `corridor:` have become obstacles, and their faults."""
+    """Return a raw document whose forest, corridor and cloud are obstacles, and whose surfaces are read; and faults."""
     environment = document.get("environment")
-    if not isinstance(environment, dict) or not _KINDS.keys() & environment.keys():
+    if not isinstance(environment, dict):
         return document, []
-    given, wrong = environment.get("obstacles", []), []
+    wrong: list[Fault] = []
+    if isinstance(environment.get("surfaces"), list):
+        surfaces, wrong = _read_surfaces(environment["surfaces"])
+        environment = {**environment, "surfaces": surfaces}
+    if not _KINDS.keys() & environment.keys():
+        return {**document, "environment": environment}, wrong
+    given = environment.get("obstacles", [])
     obstacles = [*given] if isinstance(given, list) else []
     parts = sound(document, Scenario)
     starts = [drone.position_m for drone in parts.drones or () if drone and drone.position_m]
@@ -37,11 +47,13 @@ def with_generated(document: dict[str, Any]) -> tuple[dict[str, Any], list[Fault
         found = [*faults(environment[name], kind, where)]
         wrong += found
         if not found:
-            settings = msgspec.convert(environment[name], kind)
-            seed = parts.seed if settings.seed is msgspec.UNSET else settings.seed
-            rng = stream(0 if seed is None else seed, name)
-            make = _forest if name == "forest" else _corridor
-            entries, fault = make(settings, rng, starts, where)
+            settings: Any = msgspec.convert(environment[name], kind)
+            if name == "cloud":
+                entries, fault = _boxes(settings, where)
+            else:
+                seed = parts.seed if settings.seed is msgspec.UNSET else settings.seed
+                rng = stream(0 if seed is None else seed, name)
+                entries, fault = (_forest if name == "forest" else _corridor)(settings, rng, starts, where)
             wrong += [fault] if fault else []
             obstacles += entries
     rest = {name: value for name, value in environment.items() if name not in _KINDS}
@@ -106,3 +118,76 @@ def _corridor(
             }
             entries.append(wall)
     return entries, None
+
+
+def _boxes(own: Cloud, where: str) -> tuple[list[Entry], Fault | None]:
+    """Return boxes for the occupied cells of a cloud of points: in runs up, then along x."""
+    try:
+        points = points_of(plugin.beside(own.file), f"{where}.file")
+    except DocumentError as error:
+        return [], _fault(error)
+    cells, counts = np.unique(np.floor(points / own.cell_m).astype(np.int64), axis=0, return_counts=True)
+    runs: dict[tuple[int, int], list[list[int]]] = {}  # first and last z of each, by x and y
+    for x, y, z in cells[counts >= own.points_min].tolist():
+        column = runs.setdefault((x, y), [])
+        if column and column[-1][1] == z - 1:
+            column[-1][1] = z
+        else:
+            column.append([z, z])
+    rows: dict[tuple[int, int, int], list[list[int]]] = {}  # first and last x of each, by y and both z
+    for (x, y), column in sorted(runs.items()):
+        for low, high in column:
+            row = rows.setdefault((y, low, high), [])
+            if row and row[-1][1] == x - 1:
+                row[-1][1] = x
+            else:
+                row.append([x, x])
+    found = sorted((x, y, z) for (y, *z), row in rows.items() for x in row)
+    if len(found) > OBSTACLES_MAX:
+        return [], (
+            f"{where}.cell_m",
+            f"is {own.cell_m:g}, which makes {len(found)} boxes; must make <= {OBSTACLES_MAX}",
+        )
+    entries: list[Entry] = []
+    for (first, last), y, (low, high) in found:
+        middle = [0.5 * (first + last + 1), y + 0.5, float(low)]
+        sides = [last + 1 - first, 1, high + 1 - low]
+        place = [round(p + own.cell_m * m, 3) for p, m in zip(own.position_m, middle, strict=True)]
+        size = [round(own.cell_m * side, 3) for side in sides]
+        entries.append({"name": f"cloud{len(entries) + 1}", "shape": "box", "position_m": place, "size_m": size})
+    return entries, None
+
+
+def _read_surfaces(given: list[Any]) -> tuple[list[Any], list[Fault]]:
+    """Return the entries of `surfaces:` with their triangles in place of their files, and what is wrong with these."""
+    surfaces, wrong, count = [], [], 0
+    for index, entry in enumerate(given):
+        where, triangles = f"environment.surfaces[{index}]", None
+        surfaces.append(entry)
+        if not isinstance(entry, dict):
+            continue
+        file, text = entry.get("file"), entry.get("triangles")
+        try:
+            if ("file" in entry) == ("triangles" in entry):
+                wrong.append((f"{where}.file", f"is {'given beside triangles' if file else 'missing'}; must be given"))
+            elif isinstance(file, str) and file:
+                cell_m = entry.get("cell_m")
+                cell_m = float(cell_m) if isinstance(cell_m, int | float) and cell_m > 0 else None
+                triangles = triangles_of(plugin.beside(file), f"{where}.file", cell_m)
+                surfaces[-1] = {name: value for name, value in entry.items() if name != "file"}
+                surfaces[-1]["triangles"] = packed(triangles)
+            elif isinstance(text, str):
+                triangles = unpacked(text)
+        except DocumentError as error:
+            wrong.append(_fault(error))
+        except ValueError as error:
+            wrong.append((f"{where}.triangles", str(error)))
+        count += 0 if triangles is None else len(triangles)
+    if count > TRIANGLES_MAX:
+        wrong.append(("environment.surfaces", f"have {count} triangles; must have at most {TRIANGLES_MAX}"))
+    return surfaces, wrong
+
+
+def _fault(error: DocumentError) -> Fault:
+    path, _, text = error.faults[0].partition(" ")
+    return path, text

@@ -22,6 +22,7 @@ from zsim.vehicles.vehicle_catalogue import STOCK
 TEMPLATE_FROM = 5  # robots; below it the variables of the triad are fewer to name, and as well conditioned
 DRONES_MAX = 1000  # one world integrates them all
 OBSTACLES_MAX = 1000  # every drone is compared with each, in every step
+SURFACES_MAX = 100
 FAULTS_MAX = 1000  # injected ones, planned and active; each is looked at wherever one begins or ends
 CLUSTERS_MAX = DRONES_MAX // 2  # each has two drones at least, which no other has
 PROCESSES_MAX = 4 * DRONES_MAX  # an estimator a drone, a controller a cluster, and twice as many of a user's own
@@ -237,6 +238,30 @@ class Corridor(Spec, frozen=True, kw_only=True):
     seed: Seed | UnsetType = UNSET  # unset: the scenario's
 
 
+class Cloud(Spec, frozen=True, kw_only=True):
+    """A cloud of points from a file, whose occupied cells become boxes; see zsim.scenario.generated."""
+
+    file: Annotated[str, Meta(min_length=1, max_length=1000)]
+    """.pcd, .ply or .csv, beside the scenario or in this folder."""
+    cell_m: Positive
+    points_min: Annotated[int, Meta(ge=1, le=1_000_000)] = 1  # in a cell that is occupied
+    position_m: Position = (0.0, 0.0, 0.0)
+
+
+class Surface(Spec, frozen=True, kw_only=True):
+    """Triangles that sensors see and nothing touches, from a file; see zsim.scenario.surface_file."""
+
+    name: Name
+    file: Annotated[str, Meta(min_length=1, max_length=1000)] | UnsetType = UNSET
+    """.stl, .obj or .ply, or a height map .csv or .npy; beside the scenario or in this folder."""
+    cell_m: Positive | None = None  # of a height map: between two of its heights
+    position_m: Position = (0.0, 0.0, 0.0)
+    yaw_deg: Real = 0.0
+    scale: Positive = 1.0  # metres, of a unit of the file
+    triangles: str | UnsetType = UNSET
+    """In place of `file`, filled in."""
+
+
 class Environment(Spec, frozen=True, kw_only=True):
     """The field of the flight: default Buenos Aires, where the paper comes from."""
 
@@ -250,6 +275,8 @@ class Environment(Spec, frozen=True, kw_only=True):
     obstacles: Annotated[list[Obstacle], Meta(max_length=OBSTACLES_MAX)] = []
     forest: Forest | UnsetType = UNSET  # this and `corridor` become obstacles, and are left out of the resolved text
     corridor: Corridor | UnsetType = UNSET
+    cloud: Cloud | UnsetType = UNSET  # likewise
+    surfaces: Annotated[list[Surface], Meta(max_length=SURFACES_MAX)] | UnsetType = UNSET
     hats: Hats | UnsetType = UNSET  # unset: the defaults, and left out of the resolved text
     light: Annotated[float, Meta(ge=0.02, le=1)] | UnsetType = UNSET  # of a clear day, for the cameras; unset: 1
 
@@ -448,7 +475,7 @@ class OwnAgent(Spec, frozen=True, kw_only=True):
 
 
 Graph = Annotated[
-    Literal["complete", "ring", "path"] | Annotated[dict[Name, list[Name]], Meta(max_length=DRONES_MAX)],
+    Literal["complete", "ring", "path"] | Annotated[dict[str, list[str]], Meta(max_length=DRONES_MAX)],
     Meta(description="one of complete, ring, path, or a map of each drone to those that it hears"),
 ]
 

@@ -17,7 +17,7 @@ from zsim.scenario import own_classes
 from zsim.scenario.consistency import cross_faults
 from zsim.scenario.generated import with_generated
 from zsim.scenario.polynomial_file import pieces_of
-from zsim.scenario.scenario import DRONES_MAX, VEHICLE_NUMBERS, Document, Scenario, SharedVehicle
+from zsim.scenario.scenario import DRONES_MAX, VEHICLE_NUMBERS, Document, Scenario, SharedVehicle, Topology
 from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import Fault, faults, first_lines, show, sound, suggestion
 from zsim.sensors.error_units import in_channel_units
@@ -199,10 +199,8 @@ def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
     if "pieces" in reference:
         unsound.append((f"{where}.file", "is given beside pieces; must be one of them"))
         return reference
-    places = [folder / name for folder in (*plugin.folders(), Path())]
-    found = next((place for place in places if place.is_file()), places[0])
     try:
-        pieces = pieces_of(found, f"{where}.file")
+        pieces = pieces_of(plugin.beside(name), f"{where}.file")
     except DocumentError as error:
         unsound += [(path, text) for path, _, text in (line.partition(" ") for line in error.faults)]
         return reference
@@ -212,7 +210,8 @@ def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
 def _is_graph(topology: Any) -> bool:
     """Tell whether a `topology:` section is a graph alone, by name or as lists of those that each drone hears."""
     if isinstance(topology, dict):
-        return any(isinstance(heard, list) for heard in topology.values())
+        named = any(isinstance(heard, list) for heard in topology.values())
+        return named and not topology.keys() & set(Topology.__struct_fields__)
     return isinstance(topology, str)
 
 

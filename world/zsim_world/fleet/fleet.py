@@ -22,6 +22,7 @@ from zsim.errors import RunError
 from zsim.math.compiled import hold
 from zsim.math.frames import quaternion_from_heading, quaternion_from_rpy
 from zsim.scenario.scenario import Drone, Scenario
+from zsim.scenario.surface_file import placed
 from zsim.sensors.scanner import SCANNERS
 from zsim.sensors.sensor import noise_sigma
 from zsim.vehicles.vehicle import Vehicle
@@ -386,7 +387,8 @@ def _initial_arrays(
     air[WIND.steady : WIND.steady + 3] = wind.steady_m_s
     air[WIND.gust], air[WIND.correlation] = wind.gust_m_s, wind.gust_correlation
     air[WIND.length], air[WIND.speed_min] = wind.gust_length_m, wind.gust_speed_min_m_s
-    seen = scene(bodies.obstacle, np.empty((0, TRIANGLE)))
+    surfaces = () if place.surfaces is UNSET else place.surfaces
+    seen = scene(bodies.obstacle, np.concatenate([np.empty((0, TRIANGLE)), *map(placed, surfaces)]))
     return Arrays(time, bodies, boards, numbers, senses, air, noise.gust, watched, seen)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from zsim.scenario.scenario_file import resolve
+from zsim.scenario.surface_file import packed
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.physics.fleet_arrays import STATE
 from zsim_world.sensors.sampler import WHOSE
@@ -17,13 +18,13 @@ BALL = {"name": "ball", "shape": "sphere", "position_m": [5, 0, 1], "radius_m": 
 HEIGHT_M, SPEED_M_S = 2.5, 1.0
 
 
-def samples(sensor: int, x_m: float, obstacles: Any = (TABLE, BALL), **sensors: Any) -> np.ndarray:
+def samples(sensor: int, x_m: float, obstacles: Any = (TABLE, BALL), surfaces: Any = (), **sensors: Any) -> np.ndarray:
     """Return what a sensor says of a drone that is level 2.5 m over x_m and moves east, without noise."""
     sections = {"sonar": {"range_m": EXACT}, "flow": {"velocity_m_s": EXACT}}
     document: dict[str, Any] = {
         "name": "over",
         "duration_s": 1,
-        "environment": {"obstacles": [*obstacles]},
+        "environment": {"obstacles": [*obstacles], "surfaces": [*surfaces]},
         "sensors": {name: {**each, **sensors.get(name, {})} for name, each in sections.items()},
         "drones": [{"name": "d1", "position_m": [20, 0, 0]}],
     }
@@ -72,3 +73,9 @@ def test_flow_is_right_where_both_see_one_surface(camera_m: float, sonar_m: floa
     ahead = samples(FLOW, 0.0, **mounts)[0]
     level = samples(FLOW, 0.0, obstacles=[], **mounts)[0]
     assert ahead / level == pytest.approx(ratio, rel=0.01)
+
+
+def test_a_sonar_measures_to_a_surface_too():
+    plane = packed(np.array([[-9.0, -9.0, 1.2, 9.0, -9.0, 1.2, 0.0, 9.0, 1.2]]))
+    surface = {"name": "deck", "triangles": plane}
+    assert samples(SONAR, 3.0, surfaces=[surface])[0] == pytest.approx(HEIGHT_M - 1.2, abs=0.03)

@@ -1,0 +1,128 @@
+"""Meshes, height maps and clouds of points: what is read, what sensors see of it, and what is refused."""
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from zsim.errors import ScenarioError
+from zsim.scenario import scenario_file
+from zsim.scenario.obstacle import COLUMNS
+from zsim.scenario.surface_file import placed
+from zsim.schema import plugin
+from zsim_world.physics.rays import cast, scene
+
+CORNERS = np.array([[[0, -1, 0], [0, 1, 0], [0, 0, 2]], [[2, -1, 0], [2, 1, 0], [2, 0, 2]]], dtype="<f4")  # x = 0 and 2
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Write the same two triangles in every format; height maps and clouds of other shapes."""
+    monkeypatch.setenv(plugin.FOLDERS, str(tmp_path))
+    facets = b"".join(struct.pack("<12fH", 0, 0, 0, *each.ravel(), 0) for each in CORNERS)
+    (tmp_path / "binary.stl").write_bytes(bytes(80) + struct.pack("<I", len(CORNERS)) + facets)
+    loops = "".join(
+        "facet normal 0 0 0\nouter loop\n"
+        + "".join("vertex {} {} {}\n".format(*p) for p in each)
+        + "endloop\nendfacet\n"
+        for each in CORNERS.tolist()
+    )
+    (tmp_path / "text.stl").write_text(f"solid t\n{loops}endsolid t\n")
+    points = CORNERS.reshape(-1, 3).tolist()
+    vertices = "".join("v {} {} {}\n".format(*p) for p in points)
+    (tmp_path / "mesh.obj").write_text(f"{vertices}f 1 2 3\nf 4 5 6\n")
+    (tmp_path / "hill.csv").write_text("0,0,0\n0,3,0\n0,0,0\n")
+    np.save(tmp_path / "hill.npy", [[0, 0, 0], [0, 3, 0], [0, 0, 0]])
+    (tmp_path / "bad.csv").write_text("0,much\n")
+    (tmp_path / "nan.csv").write_text("0,0\n0,nan\n")
+    (tmp_path / "torn.stl").write_bytes(bytes(80) + struct.pack("<I", 9) + facets)
+    (tmp_path / "points.csv").write_text("0.1,0.1,0.1\n0.4,0.2,0.7\n1.7,0.1,0.2\n9,9,nan\n")
+    head = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 3\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
+    (tmp_path / "points.pcd").write_text(f"{head}POINTS 3\nDATA ascii\n0.1 0.1 0.1\n0.4 0.2 0.7\n1.7 0.1 0.2\n")
+    properties = "element vertex 3\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    (tmp_path / "points.ply").write_text(f"ply\nformat ascii 1.0\n{properties}0.1 0.1 0.1\n0.4 0.2 0.7\n1.7 0.1 0.2\n")
+    return tmp_path
+
+
+def resolved(**environment: Any) -> Any:
+    drones = [{"name": "d1", "position_m": [-9, 0, 0]}]
+    return scenario_file.resolve({"name": "t", "duration_s": 1, "environment": environment, "drones": drones})
+
+
+def seen(made: Any, o: Any, d: Any) -> float:
+    triangles = np.concatenate([placed(each) for each in made.environment.surfaces])
+    return cast(scene(np.empty((0, COLUMNS)), triangles), o, d, 50.0)
+
+
+@pytest.mark.parametrize("file", ["binary.stl", "text.stl", "mesh.obj"])
+def test_a_mesh_is_seen_where_it_is_placed(file: str):
+    pytest.importorskip("trimesh")
+    made = resolved(surfaces=[{"name": "m", "file": file, "position_m": [5, 3, 0], "yaw_deg": 90, "scale": 2}])
+    assert seen(made, (5.0, -4.0, 1.0), (0.0, 1.0, 0.0)) == pytest.approx(7.0, abs=1e-6)  # turned: y = 3
+    assert seen(made, (5.0, 4.0, 1.0), (0.0, 1.0, 0.0)) == pytest.approx(3.0, abs=1e-6)  # and y = 3 + 2 * 2
+    assert seen(made, (5.0, -4.0, 4.1), (0.0, 1.0, 0.0)) == 50.0  # above its top
+
+
+@pytest.mark.parametrize("file", ["hill.csv", "hill.npy"])
+def test_a_height_map_is_flat_between_its_heights(file: str):
+    made = resolved(surfaces=[{"name": "hill", "file": file, "cell_m": 4}])
+    for x, y, height in ((0.0, 0.0, 3.0), (2.0, 0.0, 1.5), (0.0, -1.0, 2.25), (3.9, 3.9, 0.075)):
+        assert seen(made, (x, y, 9.0), (0.0, 0.0, -1.0)) == pytest.approx(9.0 - height, abs=1e-5)
+
+
+def test_the_resolved_text_needs_no_file(folder: Path):
+    made = resolved(surfaces=[{"name": "hill", "file": "hill.csv", "cell_m": 4}])
+    text = scenario_file.to_text(made)
+    (folder / "hill.csv").unlink()
+    assert scenario_file.from_text(text) == made
+
+
+@pytest.mark.parametrize("file", ["points.csv", "points.pcd", "points.ply"])
+def test_a_cloud_becomes_boxes_of_its_occupied_cells(file: str):
+    """Cells of 0.5 m: two above each other make one box, the third is apart."""
+    if not file.endswith("csv"):
+        pytest.importorskip("trimesh")
+        pytest.importorskip("pypcd4")
+    first, second = resolved(cloud={"file": file, "cell_m": 0.5, "position_m": [2, 0, 0]}).environment.obstacles
+    assert (first.position_m, first.size_m) == ((2.25, 0.25, 0.0), (0.5, 0.5, 1.0))
+    assert (second.position_m, second.size_m) == ((3.75, 0.25, 0.0), (0.5, 0.5, 0.5))
+
+
+@pytest.mark.parametrize(
+    ("environment", "field"),
+    [
+        ({"surfaces": [{"name": "m"}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "file": "nowhere.csv", "cell_m": 1}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "file": "hill.txt"}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "file": "hill.csv"}]}, "surfaces[0].file"),  # without cell_m
+        ({"surfaces": [{"name": "m", "file": "bad.csv", "cell_m": 1}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "file": "nan.csv", "cell_m": 1}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "file": "torn.stl"}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "file": 5}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "triangles": "no"}]}, "surfaces[0].triangles"),
+        ({"surfaces": [{"name": "m", "file": "hill.csv", "cell_m": 0}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "file": "hill.csv", "cell_m": 1, "scale": 0}]}, "surfaces[0].scale"),
+        ({"surfaces": [{"name": "m", "file": "hill.csv", "cell_m": 1, "yaw_deg": "n"}]}, "surfaces[0].yaw_deg"),
+        ({"surfaces": [{"name": "m", "file": "hill.csv", "cell_m": 1}] * 2}, "surfaces[1].name"),
+        ({"cloud": {"file": "nowhere.csv", "cell_m": 1}}, "cloud.file"),
+        ({"cloud": {"file": "hill.npy", "cell_m": 1}}, "cloud.file"),
+        ({"cloud": {"file": "points.csv", "cell_m": 0}}, "cloud.cell_m"),
+        ({"cloud": {"file": "points.csv", "cell_m": 1, "points_min": 0}}, "cloud.points_min"),
+        ({"cloud": {"file": "points.csv"}}, "cloud.cell_m"),
+    ],
+)
+def test_what_is_refused(environment: dict[str, Any], field: str):
+    with pytest.raises(ScenarioError) as refused:
+        resolved(**environment)
+    found = [line.removeprefix("scenario: environment.").split(" ")[0] for line in refused.value.faults]
+    assert field in found
+    assert {each.partition(".")[0] for each in found} == {field.partition(".")[0]}
+
+
+def test_more_triangles_than_a_scenario_can_carry_are_refused(folder: Path):
+    np.save(folder / "large.npy", np.zeros((200, 200)))
+    with pytest.raises(ScenarioError) as refused:
+        resolved(surfaces=[{"name": "m", "file": "large.npy", "cell_m": 1}])
+    assert [line.split(" ")[1] for line in refused.value.faults] == ["environment.surfaces"]
