@@ -61,6 +61,8 @@ def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> N
     loads: list[Callable[[], Any]] = [
         partial(estimator_class, scenario.estimation.chosen(), f"{source}: estimation.algorithm")
     ]
+    metrics = scenario.report.metric_names
+    loads += [partial(plugin.load_function, each, f"{source}: report.metrics") for each in metrics]
     if not elsewhere:
         own = scenario.own_agents.items()
         loads += [partial(_check_agent, each, f"{source}: agents.{role}", scenario) for role, each in own]

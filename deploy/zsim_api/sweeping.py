@@ -77,7 +77,7 @@ def sweep(
         seed, duration_s, set, law, estimator: for all runs, as of `zsim.run`.
         workers: processes; None: one per core.
         client: a `distributed.Client`, whose workers are used instead.
-        out: folder of the sweep, which `zsim report` reads; one that is not finished is gone on with. None: a folder
+        out: folder of the sweep, which `zsim report` reads; an unfinished one is continued. None: a folder
             that is removed when this process ends.
         keep_records: whether the record of every run is kept, in `runs/` of the folder.
         progress: whether progress is shown.

@@ -9,6 +9,7 @@ import yaml
 from federation import Federation
 
 import zsim
+from zsim.contract.messages import decode
 from zsim.errors import UserCodeError
 from zsim.record import RecordReader
 from zsim.runtime.bus import Bus
@@ -73,6 +74,34 @@ class Shape(Talker):
         return (1.0, 2.0)
 
 
+class Bare(Talker):  # the message itself, in place of an output of it
+    def step(self, t_ns):
+        return [Word(said=0.0)]
+
+
+class Nothing(Talker):
+    def step(self, t_ns):
+        super().step(t_ns)
+
+
+class Number(Talker):
+    def step(self, t_ns):
+        return [t_ns]
+
+
+class Unlisted(Talker):
+    messages = ()
+
+    def step(self, t_ns):
+        return [Word(said=0.0)]
+
+
+class BySource(Talker):
+    def receive(self, key, message):
+        if key.startswith("talk/"):
+            self.new.append((message.source, message.t_ns))
+
+
 class Foreign(Talker):
     def step(self, t_ns):
         return [zsim.Output(Word.of("d2"), Word(t_ns=t_ns, seq=0, said=0.0))] if self.drone == "d1" else []
@@ -94,9 +123,9 @@ def modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", f"{EXAMPLES}:{tmp_path}")
 
 
-def heard(groups: list[list[str]], gates_max: int, **more: Any) -> dict[str, list[Any]]:
+def heard(groups: list[list[str]], gates_max: int, kind: str = "Talker", **more: Any) -> dict[str, list[Any]]:
     """Return what each has heard, in one process with these groups of agents; `more` of the scenario."""
-    scenario = scenario_file.resolve({**_talk("Talker"), "processes": {"expect": list(NAMES)}, **more})
+    scenario = scenario_file.resolve({**_talk(kind), "processes": {"expect": list(NAMES)}, **more})
     world = World(scenario)
     agents = [hosted(world.info(), scenario, group) for group in groups]
     bus = Bus(world, agents, lambda: 0)
@@ -122,6 +151,19 @@ def test_each_hears_all_a_gate_later_in_whatever_order_they_are(gates_max: int) 
         assert heard([[*order[:2]], [order[2]]], gates_max) == dict.fromkeys(NAMES, wanted)
 
 
+def test_the_source_of_a_message_is_its_agent_in_whatever_process(tmp_path: Path) -> None:
+    apart = heard([[name] for name in NAMES], 1, kind="BySource")
+    assert {source for _, source, _ in apart["talk.d2"]} == {*NAMES}
+    assert heard([[*NAMES]], 1, kind="BySource") == apart
+
+
+def test_a_message_may_stand_for_its_output(tmp_path: Path) -> None:
+    fly(scenario_file.resolve(_talk("Bare")), tmp_path / "run.mcap")
+    with RecordReader(tmp_path / "run.mcap") as reader:
+        sent = [decode(each.key, each.payload) for each in reader.messages(["talk/d3/word"])]
+    assert [(each.seq, each.source) for each in sent] == [(seq, "talk.d3") for seq in range(26)]
+
+
 @pytest.mark.parametrize("groups", [[["talk.d1"], ["talk.d2"], ["talk.d3"]], [[*NAMES]]], ids=["apart", "together"])
 def test_a_link_between_two_of_them_may_be_cut(groups: list[list[str]]) -> None:
     cut = {"kind": "link_cut", "target": "talk.d1/talk.d2", "one_way": True, "at_s": 0.1, "for_s": 0.2}
@@ -137,6 +179,9 @@ def test_a_link_between_two_of_them_may_be_cut(groups: list[list[str]]) -> None:
     [
         ("Nan", ("talk.d1 at 0.32 s", "talkers:Nan.step", "talk/d1/word", "said", "nan")),
         ("Shape", ("talk.d1 at 0.00 s", "talkers:Shape.step", "talk/d1/word", "said", "[1.0, 2.0]")),
+        ("Nothing", ("talk.d1 at 0.00 s", "talkers:Nothing.step", "null")),
+        ("Number", ("talk.d1 at 0.00 s", "talkers:Number.step", "0")),
+        ("Unlisted", ("talk.d1 at 0.00 s", "talkers:Unlisted.step", "talk/d1/word", "Word", "messages")),
         ("Foreign", ("talk.d1 at 0.00 s", "talkers:Foreign.step", "talk/d2/word", "talk/d1/word")),
     ],
 )

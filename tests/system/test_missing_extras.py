@@ -54,6 +54,7 @@ COMMANDS = [
     (["export", "{run}", "--format", "mat"], "export"),
     (["export", "{run}", "--format", "foxglove"], "export"),
     (["sweep", STEP, "--runs", "2", "--out", "{new}"], "sweep"),
+    (["board", "--seeds", "1", "--out", "{new}"], "sweep"),
     (["console"], "console"),
     (["gateway"], "gateway"),
     (["ros1"], "ros1"),

@@ -39,9 +39,15 @@ class AgentMessage(Struct, frozen=True, kw_only=True, gc=False):
 
     @classmethod
     def of(cls, thing: str = "*") -> str:
-        """Return the key of the messages of one drone's or cluster's agent; by default the expression of all keys."""
-        head, _, leaf = cls.key.split("/")
-        return f"{head}/{thing}/{leaf}"
+        """Return the key of the messages of one drone's or cluster's agent; by default the expression of all keys.
+
+        Raises:
+            ValueError: the class's key is none.
+        """
+        parts = KEY.fullmatch(cls.key)
+        if parts is None:
+            raise ValueError(f"{cls.__name__}.key is {cls.key!r:.60}; must be like {KEY_ALLOWED}")
+        return f"{parts[1]}/{thing}/{parts[3]}"
 
     def fault(self) -> str | None:
         """Return what is wrong with a message that has come; a class may declare its numbers as plain floats."""

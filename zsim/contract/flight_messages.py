@@ -192,7 +192,7 @@ class ClusterState(Message, frozen=True):
         return length_fault(self, ("names", "value", "desired", "desired_rate"), 4 * len(self.drones))
 
 
-@on("drone/*/reference", writers="reference", last="world", is_output=True)
+@on("drone/*/reference", writers="reference", readers="reference", last="world", is_output=True)
 class Reference(Message, frozen=True):
     """Where a drone that flies by itself is to be: position and velocity in W, heading.
 

@@ -32,6 +32,7 @@ from zsim.runtime.links import Links
 from zsim.scenario.roles import MAIN
 from zsim.scenario.scenario import Radio
 from zsim.schema import plugin
+from zsim.schema.checker import show
 
 _FILLED = ("name", "period_ns", "reads", "gate_keys")  # by `Agent.bind`, where a class leaves them out
 
@@ -145,10 +146,12 @@ class Agent(ABC):
             if t_ns % self.period_ns:
                 return None
             outputs = self.step(t_ns)
-            if not self._is_own:
-                return outputs
-            checked = [self._checked(output) for output in outputs]
-            return [Output(*sent) for sent in self._transmitter.send(t_ns, checked)] if self._transmitter else checked
+            if self._is_own:
+                if not isinstance(outputs, list | tuple) or isinstance(outputs, Output):
+                    what = f"{plugin.full_name(type(self))}.step returns {show(outputs)}"
+                    raise UserCodeError(f"{what}; must return a list of outputs, which may be empty")
+                outputs = [self._checked(t_ns, output) for output in outputs]
+            return [Output(*sent) for sent in self._transmitter.send(t_ns, outputs)] if self._transmitter else outputs
         except plugin.RAISED as error:
             failure = self.failure(error, t_ns)
             if failure is None:
@@ -163,22 +166,35 @@ class Agent(ABC):
     def _is_own(self) -> bool:
         return plugin.is_own(type(self))
 
-    def _checked(self, output: Output) -> Output:
-        """Return an output of a user's class as it would be received, with this process as its sender."""
-        key, message = output
+    def _checked(self, t_ns: int, output: Any) -> Output:
+        """Return an output of a user's class as it would be received, with its sender.
+
+        A message of the class's own may stand for itself, and lack stamp and number.
+        """
         try:
+            if isinstance(output, AgentMessage):
+                output = self.message(t_ns, output)
+            if not (isinstance(output, tuple) and len(output) == 2 and isinstance(output[0], str)):
+                allowed = "must be of self.command, self.message or zsim.Output"
+                raise DecodeError(f"{show(output)}: is no output; {allowed}")
+            key, message = output
+            if isinstance(message, AgentMessage) and type(message) not in self.messages:
+                raise DecodeError(f"{key}: {type(message).__name__} is no message of its class; must be in `messages`")
             kind = messages.output_type(key)
             if isinstance(message, AgentMessage) and key != message.of(self.thing):
                 raise DecodeError(f"{key}: is another's; must be {message.of(self.thing)}")
+            if isinstance(message, AgentMessage) and message.seq < 0:
+                message = self.message(t_ns, message).message
             if type(message) is not kind:
                 raise DecodeError(f"{key}: message is a {type(message).__name__}; must be a {kind.__name__}")
             sent = messages.decode(key, encode(message))
             field = "controller" if isinstance(sent, ClusterRequest) else "source"
+            own = self.name if isinstance(sent, AgentMessage) else self.source
             sender = getattr(sent, field)
-            if sender not in ("", self.source):
-                allowed = f"must be {self.source!r}, the agent's own name, or empty"
+            if sender not in ("", own):
+                allowed = f"must be {own!r}, the agent's own name, or empty"
                 raise DecodeError(f"{key}: {field} is {sender!r}; {allowed}")
-            return Output(key, replace(sent, **{field: self.source}))
+            return Output(key, replace(sent, **{field: own}))
         except (DecodeError, *messages.REFUSALS) as error:
             raise UserCodeError(f"{plugin.full_name(type(self))}.step returns {error}") from error
 
@@ -285,8 +301,8 @@ class Agent(ABC):
 
     def message(self, t_ns: int, message: AgentMessage) -> Output:
         """Return an output of the gate t_ns that others read a gate later; stamp, number and source are filled in."""
-        key = message.of(self.thing)
-        return Output(key, replace(message, t_ns=t_ns, seq=self.next_seq(key), source=self.source))
+        key = message.of(self.thing)  # its source is the agent, whatever process it shares: its reader may go by it
+        return Output(key, replace(message, t_ns=t_ns, seq=self.next_seq(key), source=self.name))
 
     def next_seq(self, key: str) -> int:
         """Return the next sequence number of one of its keys, from 0."""

@@ -536,7 +536,7 @@ def _process_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Iter
 
 def _program_faults(programs: Mapping[str, Any], roles: Sequence[str]) -> Iterator[Fault]:
     for name, program in programs.items():
-        if (role := name.partition(".")[0]) in roles:
+        if (role := str(name).partition(".")[0]) in roles:
             allowed = f"must begin with another word than {', '.join(roles)}"
             yield f"programs.{name}", f"is named like a process of the role {role}; {allowed}"
         if program and program.command and not program.command[0]:
@@ -553,7 +553,9 @@ def _graph_faults(topology: Any, drones: list[str]) -> Iterator[Fault]:
         for place, name in enumerate(heard):
             others = [each for each in drones if each != hearer]
             if name not in others:
-                yield f"{where}[{place}]", f"is {show(name)}; must be one of {listed(others)}"
+                itself = ", the drone itself" if name == hearer else ""
+                close = suggestion(name, others)
+                yield f"{where}[{place}]", f"is {show(name)}{itself}; {close}must be one of {listed(others)}"
 
 
 def _injected_faults(

@@ -18,8 +18,8 @@ from zsim.schema.checker import Fault, faults
 OF_THE_RUN = ("info", "scenario", "drone", "cluster")  # arguments of an agent's constructor that are no parameters
 
 
-class AgentMethods:
-    """What the class of an agent must have."""
+class Agent:
+    """What the class of an agent must have: those of zsim.Agent, which is not loaded here."""
 
     def receive(self, key: str, message: Any) -> None: ...
 
@@ -53,7 +53,7 @@ def with_agents(section: Any, imports: bool) -> tuple[Any, list[Fault]]:
 
 def _declared(entry: dict[str, Any], where: str) -> dict[str, Any]:
     name: str = LAWS.get(entry["class"]) or entry["class"]
-    kind: Any = plugin.load(name, f"{where}.class", AgentMethods)
+    kind: Any = plugin.load(name, f"{where}.class", Agent)
     given = parameters.resolved(kind, entry.get("parameters", {}), f"{where}.parameters", OF_THE_RUN)
     published, per = messages_of(kind, f"{where}.class"), entry.get("per", "drone")
     for each in published:

@@ -210,7 +210,7 @@ def _granted_own(agent: OwnAgent, thing: str, scenario: Scenario) -> Rights:
     of = {"drone": [thing], "run": drones}
     own = of.get(agent.per) or scenario.cluster(thing).drones
     reads = [keys.GATE, keys.gate("*"), keys.sensors("*"), keys.estimate("*"), keys.detections("*")]
-    reads += [keys.cluster_state("*"), *(each.key for each in scenario.own_messages())]
+    reads += [keys.cluster_state("*"), keys.reference("*"), *(each.key for each in scenario.own_messages())]
     writes = [keys.command(drone, "*") for drone in own]
     writes += [each.key.replace("*", thing) for each in agent.declared or ()]
     return combined([_granted("each"), Rights(reads=tuple(reads), writes=tuple(writes), asks=tuple(reads))])

@@ -477,7 +477,7 @@ class OwnAgent(Spec, frozen=True, kw_only=True):
 
 
 Graph = Annotated[
-    Literal["complete", "ring", "path"] | Annotated[dict[Name, list[Name]], Meta(max_length=DRONES_MAX)],
+    Literal["complete", "ring", "path"] | Annotated[dict[str, list[str]], Meta(max_length=DRONES_MAX)],
     Meta(description="one of complete, ring, path, or a map of each drone to those that it hears"),
 ]
 

@@ -17,7 +17,7 @@ from zsim.scenario import own_classes
 from zsim.scenario.consistency import cross_faults
 from zsim.scenario.generated import with_generated
 from zsim.scenario.polynomial_file import pieces_of
-from zsim.scenario.scenario import DRONES_MAX, VEHICLE_NUMBERS, Document, Scenario, SharedVehicle
+from zsim.scenario.scenario import DRONES_MAX, VEHICLE_NUMBERS, Document, Scenario, SharedVehicle, Topology
 from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import Fault, faults, first_lines, show, sound, suggestion
 from zsim.sensors.error_units import in_channel_units
@@ -210,7 +210,8 @@ def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
 def _is_graph(topology: Any) -> bool:
     """Tell whether a `topology:` section is a graph alone, by name or as lists of those that each drone hears."""
     if isinstance(topology, dict):
-        return any(isinstance(heard, list) for heard in topology.values())
+        named = any(isinstance(heard, list) for heard in topology.values())
+        return named and not topology.keys() & set(Topology.__struct_fields__)
     return isinstance(topology, str)
 
 

@@ -53,10 +53,10 @@ def field_types(message: type[Struct], base: type[Struct], but: Collection[str] 
             continue
         word = _word(field.type)
         if word is None or word in but:
-            allowed = [
-                word for word in ("number", "tuple of numbers", "whole number", "bool", "text") if word not in but
-            ]
-            raise TypeError(f"{message.__name__}.{field.name} is of another type; must be a {', '.join(allowed)}")
+            words_allowed = ("number", "tuple or list of numbers", "whole number", "bool", "text")
+            allowed = ", ".join(each for each in words_allowed if each not in but)
+            found = getattr(message, "__annotations__", {}).get(field.name, "another type")
+            raise TypeError(f"{message.__name__}.{field.name} is {found!s:.60}; must be a {allowed}")
         words[field.name] = word
     return words
 

@@ -269,7 +269,7 @@ def _imported(name: str, what: str, attribute: str = "") -> ModuleType:
     except RAISED as error:
         if isinstance(error, ModuleNotFoundError) and (lacking := errors.missing(error)):
             raise DocumentError([f"{what}, which cannot be imported: {lacking}"]) from error
-        raise DocumentError([f"{what}, which cannot be imported ({reason_of(error)}); {WHERE}"]) from error
+        raise DocumentError([f"{what}, which cannot be imported ({reason_of(error)})"]) from error
 
 
 def _find(name: str, what: str, attribute: str) -> None:
@@ -290,11 +290,13 @@ def _find(name: str, what: str, attribute: str) -> None:
     if not attribute or spec is None or not (spec.origin or "").endswith(".py"):
         return
     try:
-        bound = _bound(ast.parse(Path(spec.origin or "").read_bytes()))
+        tree = ast.parse(Path(spec.origin or "").read_bytes())
+        bound = _bound(tree)
     except (OSError, SyntaxError, ValueError) as error:
         raise DocumentError([f"{what}, which cannot be imported ({reason_of(error)})"]) from error
     if attribute not in bound and "*" not in bound:
-        raise DocumentError([f"{what}; must be of {name}: {', '.join(sorted(bound)) or 'it defines nothing'}"])
+        own = sorted(bound - _imported_names(tree)) or ["it defines nothing"]
+        raise DocumentError([f"{what}; must be of {name}: {', '.join(own)}"])
 
 
 def _bound(body: ast.AST) -> set[str]:
@@ -311,6 +313,11 @@ def _bound(body: ast.AST) -> set[str]:
         else:
             names |= _bound(node)
     return names
+
+
+def _imported_names(tree: ast.AST) -> set[str]:
+    imports = (node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom))
+    return {alias.asname or alias.name for node in imports for alias in node.names}
 
 
 def _other_arguments(loaded: type, kind: type, method: str) -> tuple[str, str] | None:

@@ -82,7 +82,10 @@ class Vasarhelyi(Pilot):
     def _walls(self, now: Sight) -> list[tuple[float, Array, Array]]:
         """Return of each wall and obstacle its distance [m], the direction away from it, and its own velocity [m/s]."""
         own, walls = self.parameters, []
-        reach = own.r0_shill_m + own.v_shill_m_s**2 / own.a_shill_m_s2 + 10.0
+        most, final = own.v_shill_m_s + own.speed_max_m_s, own.a_shill_m_s2 / own.p_shill_1_s
+        reach = own.r0_shill_m + (most * most + final * final) / (
+            2.0 * own.a_shill_m_s2
+        )  # beyond it (4) allows any speed
         walls += [(distance, away, np.zeros(2)) for distance, away in self.obstacles_near(now.p_W, reach)]
         for axis in (0, 1) if own.arena_m else ():
             for side in (-1.0, 1.0):

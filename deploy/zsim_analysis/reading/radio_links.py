@@ -1,5 +1,6 @@
 """Who heard whom during a flight, of the world's `RadioLinks`."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -10,11 +11,13 @@ from scipy.sparse.csgraph import connected_components
 
 from zsim.contract.run_messages import RadioLinks
 
+CONNECTS = 0.5  # probability from which on a link counts for the connection of all; the range is where it is so much
+
 
 class RadioSummary(Struct, frozen=True):
     """How well drones heard each other, on average over the instants of a window."""
 
-    heard_mean: float  # drones that a drone hears
+    heard_mean: float  # drones whose messages arrive at a drone, as far as they do: 4 that lose a half are 2
     connected_share: float  # of the instants: every drone's messages could reach all, over others too
 
 
@@ -23,21 +26,25 @@ class RadioHistory:
 
     Attributes:
         t_ns: instants, ascending.
-        heard: how many others each drone heard at each, (K, N).
-        connected: whether the graph was strongly connected, (K,).
-        share: of the instants at which drone i heard drone j, (N, N).
+        heard: sum of the probabilities with which a message of each other drone arrives, (K, N).
+        connected: whether the graph of the links above CONNECTS, before the loss, was strongly connected, (K,).
+        share: probability with which a message of drone j arrives at drone i, mean over the instants, (N, N).
+
+    Args:
+        loss: of the radio, whatever the distance.
     """
 
-    def __init__(self, links: list[RadioLinks], drones: int) -> None:
+    def __init__(self, links: Sequence[RadioLinks], drones: int, loss: float = 0.0) -> None:
         by_time = {each.t_ns: each for each in links}
         self.t_ns: NDArray[np.int64] = np.array(sorted(by_time), np.int64)
-        known = [_graph(by_time[t_ns].hears, drones) for t_ns in self.t_ns.tolist()]
-        self.heard: NDArray[np.int64] = np.array([hears.sum(axis=1) for hears, _ in known]).reshape(-1, drones)
-        self.connected: NDArray[np.bool_] = np.array([connected for _, connected in known], bool)
-        total = np.zeros((drones, drones))
-        for hears, _ in known:
-            total += hears
-        self.share = total / max(1, len(known))
+        self.heard: NDArray[np.float64] = np.empty((len(self.t_ns), drones))
+        self.connected: NDArray[np.bool_] = np.empty(len(self.t_ns), bool)
+        self.share: NDArray[np.float64] = np.zeros((drones, drones))
+        for k, t_ns in enumerate(self.t_ns.tolist()):
+            reception, self.connected[k] = _graph(by_time[t_ns].hears, by_time[t_ns].reception, drones)
+            arrives = (1.0 - loss) * reception
+            self.heard[k] = arrives.sum(axis=1)
+            self.share += arrives / len(self.t_ns)
 
     def summary(self, window_s: tuple[float, float]) -> RadioSummary | None:
         within = (self.t_ns >= window_s[0] * 1e9) & (self.t_ns <= window_s[1] * 1e9)
@@ -46,11 +53,16 @@ class RadioHistory:
         return RadioSummary(float(self.heard[within].mean()), float(self.connected[within].mean()))
 
 
-@lru_cache(maxsize=1024)  # links change rarely
-def _graph(hears: tuple[tuple[int, ...], ...], drones: int) -> tuple[NDArray[np.bool_], bool]:
-    """Return whether drone i hears drone j, (N, N), and whether all reach all."""
-    matrix = np.zeros((drones, drones), dtype=bool)
-    for i, heard in enumerate(hears[:drones]):
-        matrix[i, [j for j in heard if j < drones]] = True
-    parts, _ = connected_components(csr_array(matrix), directed=True, connection="strong")
+@lru_cache(maxsize=1024)  # links change rarely where reception does not depend on the distance
+def _graph(
+    hears: tuple[tuple[int, ...], ...], reception: tuple[tuple[float, ...], ...], drones: int
+) -> tuple[NDArray[np.float64], bool]:
+    """Return the reception of drone j at drone i, (N, N), and whether all reach all."""
+    matrix = np.zeros((drones, drones))
+    chances = reception or [(1.0,) * len(heard) for heard in hears]
+    for i, row in enumerate(zip(hears[:drones], chances[:drones], strict=False)):
+        for j, chance in zip(*row, strict=False):
+            if j < drones:
+                matrix[i, j] = chance
+    parts, _ = connected_components(csr_array(matrix >= CONNECTS), directed=True, connection="strong")
     return matrix, parts == 1

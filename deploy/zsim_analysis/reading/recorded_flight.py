@@ -443,9 +443,16 @@ class FlightReader:
             estimates=estimates,
             commands=self._flown_commands(),
             others=dict(self._others),
-            radio=RadioHistory(self._radio, len(tracks)) if self._radio else None,
+            radio=self._radio_history(info, len(tracks)),
             references=references,
         )
+
+    def _radio_history(self, info: Info | None, drones: int) -> RadioHistory | None:
+        if not self._radio:
+            return None
+        scenario = scenario_of(info)
+        radio = scenario.radio_of_agents if scenario else None
+        return RadioHistory(self._radio, drones, radio.loss if radio else 0.0)
 
     def _flown_commands(self) -> dict[str, VelocityCommands]:
         """Return the commands of each drone that were obeyed, by time.

@@ -430,6 +430,9 @@ def draw_distances(
 
 # Radio
 
+CELLS_MAX = 6  # drones whose cells have room for a number
+DARK_SHARE = 0.6  # from which on a cell is dark
+
 
 def draw_radio(radio: RadioHistory, names: Sequence[str], marks: style.TimeMarks) -> Figure:
     """Return who hears whom how often, and how many others each drone hears over time."""
@@ -443,20 +446,26 @@ def draw_radio(radio: RadioHistory, names: Sequence[str], marks: style.TimeMarks
     for axis in (matrix.xaxis, matrix.yaxis):
         axis.set_ticks(ticks, [names[tick] for tick in ticks], fontsize=SMALL_PT)
     matrix.tick_params(axis="x", rotation=90)
+    for i, j in np.ndindex(radio.share.shape) if len(names) <= CELLS_MAX else ():
+        if i != j:
+            look = {"ha": "center", "va": "center", "fontsize": SMALL_PT}
+            colour = "white" if radio.share[i, j] > DARK_SHARE else style.BLACK
+            matrix.text(j, i, f"{100 * radio.share[i, j]:.0f}", color=colour, **look)
     scale = figure.colorbar(image, ax=matrix)
-    scale.set_label("% of the run", fontsize=style.PAPER_PT)
+    scale.set_label("messages that arrive (%)", fontsize=style.PAPER_PT)
     scale.ax.tick_params(labelsize=SMALL_PT)
     t_s = radio.t_ns / 1e9
     style.dress(axes, "drones heard")
     if len(names) > EACH_MAX:
-        style.draw_spread(axes, t_s, radio.heard.astype(float), style.BLUE)
+        style.draw_spread(axes, t_s, radio.heard, style.BLUE)
     else:
         for name, colour, heard in zip(names, drone_colours(len(names)), radio.heard.T, strict=True):
             style.line(axes, t_s, heard, color=colour, lw=1.0, label=name)
-    axes.fill_between(
-        t_s, 0, 1, where=~radio.connected, transform=axes.get_xaxis_transform(), color=style.GREY, alpha=0.3, lw=0,
-        label="not connected",
-    )  # fmt: skip
+    if not radio.connected.all():
+        axes.fill_between(
+            t_s, 0, 1, where=~radio.connected, transform=axes.get_xaxis_transform(), color=style.GREY, alpha=0.3, lw=0,
+            label="not connected",
+        )  # fmt: skip
     axes.set_ylim(bottom=0)
     style.draw_marks([axes], marks)
     style.label_time([axes])

@@ -127,8 +127,9 @@ def planned_figures(
         yield PlannedFigure(
             "radio.png",
             "Radio",
-            "Who hears whom: share of the run in which a drone is within reach of another, lost messages not counted; "
-            "and how many others a drone hears. Grey: not every drone can reach all, not even over others.",
+            "(a) Share of the messages of a drone that arrive at another, over the whole run, by range and loss. (b) "
+            "Drones heard, those whose messages arrive in part counted in part. Grey: not every drone reaches all by "
+            "links that carry half of the messages or more, not even over others.",
             partial(drones.draw_radio, flight.radio, [track.name for track in flight.tracks], marks),
         )
     if has_truth:
@@ -253,8 +254,8 @@ def obstacle_text(distances_m: Mapping[str, float]) -> str:
 
 
 def radio_text(radio: RadioSummary) -> str:
-    connected = f"all of them are connected {percent_text(radio.connected_share)} % of the time"
-    return f"a drone hears {radio.heard_mean:.2f} others on average, {connected}"
+    connected = f"all are connected {percent_text(radio.connected_share)} % of the time"
+    return f"within the window, a drone hears {radio.heard_mean:.2f} others on average, and {connected}"
 
 
 def date_text(date: str | None) -> str:

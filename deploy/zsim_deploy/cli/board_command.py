@@ -27,7 +27,7 @@ def board(
     scenarios: Annotated[str | None, Option(help="Names with commas (default all).", show_default=False)] = None,
     seeds: Annotated[int, Option(min=1, max=1000, help="Flights of each law in each scenario.")] = 3,
     out: Annotated[
-        Path | None, Option("--out", "-o", help="Folder (default runs/board-TIME); an unfinished one is gone on with.")
+        Path | None, Option("--out", "-o", help="Folder (default runs/board-TIME); an unfinished one is continued.")
     ] = None,
     workers: Annotated[int | None, Option(min=1, max=1024, help="Processes (default: one per core).")] = None,
     formats: Annotated[

@@ -278,7 +278,7 @@ def sweep(
     seed: opt.Seed = None,
     duration: opt.Duration = None,
     out: Annotated[
-        Path | None, Option(help="Folder (default runs/NAME-sweep-TIME); one that is not finished is gone on with.")
+        Path | None, Option(help="Folder (default runs/NAME-sweep-TIME); an unfinished one is continued.")
     ] = None,
     workers: Annotated[int | None, Option(min=1, max=1024, help="Processes (default: one per core).")] = None,
     dask: Annotated[str | None, Option(help="Scheduler of a Dask cluster that flies the runs instead.")] = None,

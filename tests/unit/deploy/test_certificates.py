@@ -589,5 +589,5 @@ def test_a_process_that_takes_the_place_of_ours_has_its_rights(scenario: Any, pr
 )
 def test_a_process_about_nothing_known_hears_what_all_are_told(scenario: Any, process: str) -> None:
     found = roles.rights_for(process, scenario)
-    assert set(found.reads) == {"world/info", "clock", "world/event", "world/faults"}
+    assert set(found.reads) == {"world/info", "clock", "world/event", "world/faults", "world/radio"}
     assert all(key.startswith(f"process/{process}/") for key in found.writes)

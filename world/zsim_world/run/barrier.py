@@ -220,8 +220,10 @@ class Barrier:
         return None
 
     def count_output(self, name: str) -> None:
-        """Count one output of a participant that has arrived."""
+        """Count one output that has arrived, of a participant or of one whose work it does."""
         participant = self.participants.get(name)
+        if participant is None:
+            participant = next((each for each in self.participants.values() if name in each.join.serves), None)
         if participant is None:
             return
         if participant.missing:

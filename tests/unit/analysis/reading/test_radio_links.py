@@ -30,3 +30,12 @@ def test_means_are_those_of_the_window() -> None:
     assert summary.heard_mean == pytest.approx((2 / 3 + 2 / 3 + 1) / 3)
     assert summary.connected_share == pytest.approx(1 / 3)
     assert history(RING).summary((5.0, 9.0)) is None
+
+
+def test_what_arrives_in_part_counts_in_part() -> None:
+    """d0 hears d1 at 0.8 and d2 at 0.3, which does not connect; a quarter of all is lost."""
+    links = [RadioLinks(0, 0, ((1, 2), (0, 2), (0, 1)), ((0.8, 0.3), (0.8, 0.4), (0.3, 0.4)))]
+    made = RadioHistory(links, 3, loss=0.25)
+    np.testing.assert_allclose(made.heard, 0.75 * np.array([[1.1, 1.2, 0.7]]))
+    np.testing.assert_allclose(made.share[0], [0, 0.6, 0.225])
+    assert made.connected.tolist() == [False]

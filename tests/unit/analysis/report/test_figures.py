@@ -108,7 +108,7 @@ def test_the_radio_is_drawn_with_the_times_at_which_not_all_reach_all() -> None:
     figure = draw_radio(radio(3), names(3), MARKS)
     assert {"drone1", "drone2", "drone3", "not connected"} <= legend_of(figure)
     share = np.asarray(figure.axes[0].images[0].get_array())
-    assert share[1, 0] == 100
+    assert share[1, 0] == pytest.approx(100)
     assert 40 < share[0, 1] < 60
 
 

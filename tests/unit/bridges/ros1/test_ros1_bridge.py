@@ -155,9 +155,7 @@ class Link:
 
 def test_who_is_too_slow_goes_on_with_the_newest_gates(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("zsim_bridges.vehicle_links.server.BACKLOG", 3)
-    about: Any = type(
-        "Info", (), {"drones": [messages.DroneInfo("drone1", "ardrone2")], "own_sensors": (), "sightings": False}
-    )()
+    about: Any = type("Info", (), {"drones": [messages.DroneInfo("drone1", "ardrone2")], "sensors_beside": ()})()
     table = key_table(["drone1"])
 
     def payload(gate: int) -> bytes:

@@ -174,7 +174,7 @@ def test_of_a_drone_they_may_command_it_and_publish_for_it_only_and_read_all_but
         ({"a": {"class": "flyers"}}, ("agents.a.class", "'flyers'", "package.module:Class")),
         (
             {"a": {"class": "flyers:NoAgent"}},
-            ("agents.a.class", "'flyers:NoAgent'", "receive", "step()", "AgentMethods"),
+            ("agents.a.class", "'flyers:NoAgent'", "receive", "step()", "Agent"),
         ),
         ({"a": {"class": "flyers:OfComplex"}}, ("agents.a.class", "Complex.value", "number", "text")),
         (

@@ -425,7 +425,7 @@ def test_names_are_of_the_contract(value: str):
         ({"sensors": 5}, ("step.yaml", "sensors", "5", "map")),
         ({"sensors": {"preset": "best"}}, ("step.yaml", "sensors.preset", "'best'", "ardrone2", "paper")),
         ({"sensors": {"preset": ["paper"]}}, ("step.yaml", "sensors.preset", "['paper']", "ardrone2", "paper")),
-        ({"sensors": {"lidar": {}}}, ("step.yaml", "sensors.lidar", "known", "as_printed", "baro")),
+        ({"sensors": {"radar": {}}}, ("step.yaml", "sensors.radar", "known", "as_printed", "baro")),
         ({"sensors": {"imu": 3}}, ("step.yaml", "sensors.imu", "3", "map")),
         ({"drones": [drone("a", sensors=3)]}, ("step.yaml", "drones[0].sensors", "3", "map", "'a'")),
         ({"drones": [drone("a", position_m=[1, 2])]}, ("drones[0].position_m", "[1, 2]", "list", "3")),
