@@ -97,7 +97,7 @@ BOX = {"obstacles": [{"name": "box", "shape": "box", "position_m": [10, 0, 0], "
 def test_a_drone_that_is_flown_onto_an_obstacle_touches_it_in_flight():
     fleet = airborne(environment=BOX)
     fleet.bodies.state[0, STATE.p_WB : STATE.p_WB + 3] = 10.0, 0.0, 1.5
-    assert ("touchdown", 0, {"other": "box"}) in descend(fleet, 5.0)
+    assert ("touchdown", 0, {"other": "box"}) in descend(fleet, 8.0)
 
 
 def test_a_hard_hit_on_an_obstacle_names_it():
