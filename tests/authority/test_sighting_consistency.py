@@ -89,7 +89,7 @@ def relative(J: Array, n: int, i: int) -> Array:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("i", [0, 1])
+@pytest.mark.parametrize("i", [pytest.param(0, marks=pytest.mark.soak), 1])
 def test_the_errors_of_relative_positions_are_as_large_as_the_filter_says(i: int) -> None:
     runs = flown()
     e, P = runs.error[:, :, i], runs.covariance[:, :, i]

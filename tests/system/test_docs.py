@@ -62,12 +62,16 @@ RUN_S = 4.0  # simulated seconds of a run that has no other process to serve
 LONG = (
     "cameras.md",
     "clients.md",
+    "decentralised.md",
     "deployment.md",
     "estimation.md",
     "extending.md",
     "faults.md",
+    "laws.md",
+    "obstacles.md",
     "project.md",
     "records.md",
+    "references.md",
     "sweep.md",
 )  # what they show has tests of its own
 PATIENCE_S = 600  # wall seconds for one block on a machine that does other work as well

@@ -17,6 +17,8 @@ SIZE_MAX = 1_000_000  # bytes of a notebook, with its pictures
 nbformat = pytest.importorskip("nbformat", reason="nbclient is not installed")
 nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed")
 pytest.importorskip("ipykernel", reason="ipykernel is not installed")
+SOAKED = ("2-own-estimator", "3-own-law")  # classes in cells have tests of their own
+AT_ONCE = [pytest.param(each, marks=[pytest.mark.soak] if each.stem in SOAKED else []) for each in NOTEBOOKS]
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
 
@@ -64,7 +66,7 @@ def test_it_holds_what_a_whole_run_shows(path: Path) -> None:
 
 
 @pytest.mark.slow
-@each_notebook
+@pytest.mark.parametrize("path", AT_ONCE, ids=lambda each: each.stem)
 def test_it_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert pictures(executed(path, tmp_path, monkeypatch, short=True)) == pictures(nbformat.read(path, as_version=4))
 

@@ -165,7 +165,7 @@ def test_side_by_side(federation, number):
 """
 
 
-@pytest.mark.parametrize("kind", ["test", "script"])
+@pytest.mark.parametrize("kind", [pytest.param("test", marks=pytest.mark.soak), "script"])
 def test_kill_9_leaves_nothing_running(compiled: None, tmp_path: Path, kind: str) -> None:
     process = pytest_run(tmp_path, KILLED_TEST, "-s") if kind == "test" else python_run(tmp_path, KILLED_SCRIPT)
     assert process.stdout is not None
@@ -180,6 +180,7 @@ def test_kill_9_leaves_nothing_running(compiled: None, tmp_path: Path, kind: str
         assert reader.complete
 
 
+@pytest.mark.soak
 def test_side_by_side(compiled: None, tmp_path: Path) -> None:
     process = pytest_run(tmp_path, SIDE_BY_SIDE, "-n", "2")
     output = output_of(process)

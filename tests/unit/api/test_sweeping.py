@@ -404,7 +404,7 @@ def test_an_interrupted_cell_ends_its_workers_and_the_kernel_goes_on(tmp_path: P
     assert [row["seed"] for row in read_table(tmp_path / "swept/sweep.parquet")] == [1]
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_client_s_workers_are_given_a_script_s_modules(tmp_path: Path) -> None:
     """They run in a folder from which they would not find them."""
     pytest.importorskip("distributed")
