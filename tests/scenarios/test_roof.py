@@ -1,12 +1,14 @@
 """A pair that lands on the roof of a box 8 m away, rests there and takes off again; and one over whose edge it tips."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from operated_flight import OperatedFlight
 
+import zsim
 from zsim.scenario.scenario_file import resolve
 from zsim.vehicles.ardrone2 import VEHICLE
 
@@ -79,3 +81,14 @@ def test_a_drone_that_lands_half_over_the_edge_tips_over() -> None:
     assert tilt > 30.0
     assert flight.places_m["drone1"][2] < 0.3
     assert math.isclose(flight.places_m["drone2"][2], ROOF_M + STAND_M, abs_tol=1e-3)
+
+
+def test_a_drone_that_starts_on_a_roof_knows_its_height(tmp_path: Path) -> None:
+    """The sonar, which alone gives the first heights, measures over the roof."""
+    roof = {"name": "roof", "shape": "box", "position_m": [0, 0, 0], "size_m": [4, 4, 3]}
+    drone = {"name": "d1", "position_m": [0, 0, 3], "reference": {"takeoff_s": 0.5}}
+    document = {"name": "roof", "duration_s": 6, "environment": {"obstacles": [roof]}, "drones": [drone]}
+    run = zsim.run(zsim.Scenario(**document), out=tmp_path / "run", progress=False)
+    error_m = run.estimate("d1").position_m_z - run.truth("d1").position_m_z
+    assert error_m.abs().max() < 0.1
+    assert run.truth("d1").position_m_z.iloc[-1] == pytest.approx(4.0, abs=0.1)

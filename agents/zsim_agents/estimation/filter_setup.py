@@ -15,6 +15,7 @@ from scipy.special import chdtri
 
 from zsim.contract.keys import SENSORS
 from zsim.math.rotation import LEVEL, matrix_from_rpy
+from zsim.scenario.obstacle import nearest, row_of
 from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim.sensors.sensor import ErrorModel, Sensor, scaled
 from zsim.sensors.sensor_catalogue import Sensors
@@ -54,6 +55,7 @@ LEVELLING_S = 60.0  # s; long against manoeuvres of seconds, short against the g
 CLONE_EVERY_S = 0.1  # s, chosen: process noise of half of it is small to any sensor's noise
 CLONED_FROM = 0.01  # of a reading's variance, chosen: less process noise since its instant is neglected
 COMPASS_SIGMA_RAD = 2.0 * SET_DOWN_SIGMA_RAD  # chosen: a worse reading is used, but not to start with
+ON_ROOF_M = 0.01  # m, chosen: so near to an obstacle a drone starts upon it
 POSITION_SIGMA_M = 100.0  # m: a start anywhere on the field
 VELOCITY_SIGMA_M_S = 1.0  # m/s: a start at rest, or in gentle flight
 TILT_SIGMA_RAD = 0.05  # rad: ground that is level to 3 deg
@@ -212,6 +214,16 @@ class DroneSetup:
                 longest_s = max(longest_s, late_s + self._gate_s)
         return math.ceil(longest_s / CLONE_EVERY_S) + 1 if longest_s else 0
 
+    def _floor_m(self) -> float:
+        """Return z of the roof that the drone starts upon, 0 on the ground.
+
+        Its first heights come from the sonar alone, and so would be wrong by the height of the roof. Over other
+        obstacles the sonar is as wrong, and its readings are refused as outliers.
+        """
+        x, y, z = self._drone.position_m
+        on_roof = any(abs(nearest(row_of(each), x, y, z)[0]) < ON_ROOF_M for each in self._environment.obstacles)
+        return z if on_roof else 0.0
+
     def setting(self) -> list[float]:
         """Return the columns SETTING."""
         sensors, imu = self._drone.sensors, self._drone.sensors.imu
@@ -229,6 +241,7 @@ class DroneSetup:
             levelling_time_s(self._beta, self._direction_sigma),
             CLONE_EVERY_S,
             *self._environment.magnetic_field_ut,
+            self._floor_m(),
         ]
         for name in SENSORS:  # the columns SENSOR
             section: Sensor = getattr(sensors, name)

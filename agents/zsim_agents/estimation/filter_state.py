@@ -85,6 +85,7 @@ SETTING = columns(
         Field("levelling", "s"),
         Field("clone_every", "s"),
         Field("field_W", "uT", 3),
+        Field("floor", "m"),  # z of what it starts upon, over which the sonar measures
         Field("sensors", "1", len(SENSORS) * SENSOR.size),
     ),
 )

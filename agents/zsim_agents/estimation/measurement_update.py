@@ -217,7 +217,7 @@ def predict(H: Array, at: int, kind: int, setting: Array, past: Moment, lag: flo
     elif kind == BARO:
         out[at] = write_baro(H, at, p, R, arm, lag)
     elif kind == SONAR:
-        out[at] = write_sonar(H, at, p, R, arm, vector(setting, aid + SENSOR.down_B), lag)
+        out[at] = write_sonar(H, at, p, R, arm, vector(setting, aid + SENSOR.down_B), setting[SETTING.floor], lag)
     else:
         put(out, at, write_flow(H, at, v, R, w, arm))
 
@@ -450,8 +450,8 @@ def write_baro(H: Array, i: int, p: Vector, R: Matrix, arm: Vector, lag: float) 
 
 
 @inlined
-def write_sonar(H: Array, i: int, p: Vector, R: Matrix, arm: Vector, down_B: Vector, lag: float) -> float:
-    """Sonar at p_BS = `arm` that looks along `down_B` at the ground z_W = 0: height / cosine [m]; one row.
+def write_sonar(H: Array, i: int, p: Vector, R: Matrix, arm: Vector, down_B: Vector, floor: float, lag: float) -> float:
+    """Sonar at p_BS = `arm` that looks along `down_B` at the ground z_W = `floor`: height / cosine [m]; one row.
 
     Returns 0 with an empty row if the sonar does not look down.
     """
@@ -460,7 +460,7 @@ def write_sonar(H: Array, i: int, p: Vector, R: Matrix, arm: Vector, down_B: Vec
     cosine = -ray[2]
     if cosine < COSINE_MIN:
         return 0.0
-    height = p[2] + offset[2]
+    height = p[2] + offset[2] - floor
     per_cosine = height / (cosine * cosine)
     H[i, POSITION + 2] = 1.0 / cosine
     H[i, VELOCITY + 2] = -lag / cosine

@@ -52,7 +52,7 @@ def baro(H, p, v, R):
 
 
 def sonar(H, p, v, R):
-    return (write_sonar(H, 1, p, R, ARM, triple(-MOUNT.as_matrix()[:, 2]), LAG),)
+    return (write_sonar(H, 1, p, R, ARM, triple(-MOUNT.as_matrix()[:, 2]), 0.4, LAG),)
 
 
 def flow(H, p, v, R):
@@ -89,13 +89,13 @@ def test_predictions_are_what_the_geometry_says():
     assert mag(H, triple(P_W), triple(V_W), flat(ATTITUDE)) == pytest.approx(seen)
     ray = (ATTITUDE * MOUNT).apply([0.0, 0.0, -1.0])
     (distance,) = sonar(H, triple(P_W), triple(V_W), flat(ATTITUDE))
-    assert (p + distance * ray)[2] == pytest.approx(0.0)
+    assert (p + distance * ray)[2] == pytest.approx(0.4)  # the floor
 
 
 def test_a_sonar_that_looks_up_says_nothing():
     H = np.zeros((1, 12))
     up = (0.0, 0.0, 1.0)
-    assert write_sonar(H, 0, (0.0, 0.0, 3.0), matrix(LEVEL), ZERO, up, 0.0) == 0.0
+    assert write_sonar(H, 0, (0.0, 0.0, 3.0), matrix(LEVEL), ZERO, up, 0.0, 0.0) == 0.0
     assert not H.any()
 
 
