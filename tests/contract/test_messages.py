@@ -38,6 +38,9 @@ CONTRACT = {
     "drone/*/sensor/baro": SENSOR + "pressure_pa altitude_m",
     "drone/*/sensor/sonar": SENSOR + "range_m valid",
     "drone/*/sensor/flow": SENSOR + "velocity_m_s quality",
+    "drone/*/sensor/range": SENSOR + "beams ranges_m max_m",
+    "drone/*/sensor/lidar": SENSOR + "channels columns elevation_rad azimuth_rad max_m ranges_m",
+    "drone/*/sensor/depth": SENSOR + "camera columns rows focal_px centre_px max_m depth_m",
     "drone/*/sensor/status": "state battery_percent collision commander count",
     "drone/*/truth": "position_m velocity_m_s orientation_wxyz angular_velocity_rad_s accel_m_s2 rotor_rad_s",
     **{f"drone/*/camera/{name}": "t_sample_ns source width height format data" for name in ("front", "bottom")},
@@ -165,6 +168,11 @@ def _matched(plain: dict[str, Any]) -> dict[str, Any]:
         for name in ("names", "value", "desired", "desired_rate"):
             filler = ["x"] if name == "names" else [2.0]
             plain[name] = (plain[name] + filler * 8)[: 4 * len(plain["drones"])]
+    elif "beams" in plain:
+        count = min(len(plain["beams"]), len(plain["ranges_m"]))
+        plain["beams"], plain["ranges_m"] = plain["beams"][:count], plain["ranges_m"][:count]
+    elif rays := {"ranges_m", "depth_m"} & plain.keys():
+        plain |= {"columns": 3, "channels" if "channels" in plain else "rows": 1, rays.pop(): bytes(12)}
     elif "names" in plain:
         count = min(len(plain[name]) for name in ("names", "value", "desired"))
         for name in ("names", "value", "desired"):
@@ -298,7 +306,7 @@ def test_encoding_names_the_message(shape: str):
         "drone",
         "drone/d",
         "drone/d/sensor",
-        "drone/d/sensor/lidar",
+        "drone/d/sensor/radar",
         "drone/d/cmd/velocity/x",
         "worlds/info",
         "process/p",

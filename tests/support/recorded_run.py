@@ -10,6 +10,7 @@ from synthetic_pictures import jpeg
 from zsim.contract import messages
 from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
+from zsim.sensors.scanner import Depth, Lidar
 from zsim_analysis.in_process import fly
 
 SCENARIO: dict[str, Any] = {
@@ -52,6 +53,8 @@ def payload(kind: type[msgspec.Struct], t_ns: int) -> bytes:
     info = inspect.type_info(kind)
     assert isinstance(info, inspect.StructType)
     values = {field.name: _some(field.type) for field in info.fields}
+    if kind in (Lidar, Depth):
+        values["ranges_m" if kind is Lidar else "depth_m"] = bytes(4 * 7 * 7)  # float32, of 7 rows and 7 columns
     return msgspec.msgpack.encode({**values, "t_ns": t_ns, "seq": 0})
 
 
