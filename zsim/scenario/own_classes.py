@@ -18,7 +18,7 @@ from zsim.schema.checker import Fault, faults
 OF_THE_RUN = ("info", "scenario", "drone", "cluster")  # arguments of an agent's constructor that are no parameters
 
 
-class Agent:
+class AgentMethods:
     """What the class of an agent must have: those of zsim.Agent, which is not loaded here."""
 
     def receive(self, key: str, message: Any) -> None: ...
@@ -53,7 +53,7 @@ def with_agents(section: Any, imports: bool) -> tuple[Any, list[Fault]]:
 
 def _declared(entry: dict[str, Any], where: str) -> dict[str, Any]:
     name: str = LAWS.get(entry["class"]) or entry["class"]
-    kind: Any = plugin.load(name, f"{where}.class", Agent)
+    kind: Any = plugin.load(name, f"{where}.class", AgentMethods)
     given = parameters.resolved(kind, entry.get("parameters", {}), f"{where}.parameters", OF_THE_RUN)
     published, per = messages_of(kind, f"{where}.class"), entry.get("per", "drone")
     for each in published:

@@ -37,7 +37,7 @@ ROLES = {
     "recorder": Role("record", "restart"),
     "estimator": Role("agents", "restart", "drone", "zsim_agents.estimation.estimator:Estimator", joint=True),
     "controller": Role("agents", "restart", "cluster", "zsim_agents.formation.controller:Controller"),
-    "reference": Role("agents", "restart", "drone", "zsim_agents.references.pilot:Pilot"),
+    "reference": Role("agents", "restart", "drone", "zsim_agents.references.pilot:ReferencePilot"),
     "camera": Role("cameras", "restart", on_overdue="drop"),
     "detector": Role("cameras", "restart", on_overdue="drop"),
     "console": Role("console", "drop", on_overdue="drop"),

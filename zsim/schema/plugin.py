@@ -109,7 +109,7 @@ def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Cal
     missing = [m for m, each in own.items() if not callable(each) or getattr(each, "__isabstractmethod__", False)]
     if missing:
         lacks = f"{where} is {show(name)}, which has no {', '.join(missing)}()"
-        raise DocumentError([f"{lacks}; must have the methods of {kind.__name__}"])
+        raise DocumentError([f"{lacks}; must have the methods of {kind.__name__.removesuffix('Methods')}"])
     for method in ["__init__", *methods] if is_constructed else methods:
         if (found := _other_arguments(loaded, kind, method)) is not None:
             taken, given = found

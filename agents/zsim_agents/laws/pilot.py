@@ -32,7 +32,7 @@ from zsim.schema.checker import Fault
 from zsim.schema.parameters import Parameters
 from zsim.schema.quantities import NonNegative
 from zsim_agents.formation.expression import ExpressionError
-from zsim_agents.laws.reference import Pose, Reference
+from zsim_agents.laws.reference import FormationReference, Pose
 
 Array = NDArray[np.float64]
 
@@ -127,8 +127,8 @@ class Pilot(Agent):
         """Prepare what a law needs of the scenario."""
 
     @staticmethod
-    def reference_of(own: Any) -> Reference:
-        return Reference(own.centre_m, 0.0, 1.0, own.start_s)
+    def reference_of(own: Any) -> FormationReference:
+        return FormationReference(own.centre_m, 0.0, 1.0, own.start_s)
 
     @abstractmethod
     def velocity(self, now: Sight) -> Array:

@@ -30,7 +30,7 @@ class Pose(NamedTuple):
         return turned(self.turn, c), turned(self.turn_rate, c)
 
 
-class Reference:
+class FormationReference:
     """The motion of a formation from `start_s` on; before, it stands where it begins.
 
     Args:

@@ -20,7 +20,7 @@ from zsim.scenario.scenario import DRONES_MAX, Scenario, Value
 from zsim.schema.checker import Fault
 from zsim.schema.quantities import NonNegative, Positive, Real
 from zsim_agents.laws.pilot import Array, Pilot, PilotParameters, Sight
-from zsim_agents.laws.reference import Reference, polygon
+from zsim_agents.laws.reference import FormationReference, polygon
 
 
 class ShapeParameters(PilotParameters):
@@ -54,8 +54,8 @@ class ShapePilot(Pilot):
         self._informed = self._drone in (names[:1] if own.informed is None else own.informed)
 
     @staticmethod
-    def reference_of(own: Any) -> Reference:
-        return Reference(own.centre_m, own.heading_deg, own.scale, own.start_s)
+    def reference_of(own: Any) -> FormationReference:
+        return FormationReference(own.centre_m, own.heading_deg, own.scale, own.start_s)
 
     def relative(self, now: Sight) -> list[tuple[Array, Array]]:
         """Return of each neighbour z_ij = p_j - p_i [m; W] and what the places have for it."""

@@ -32,7 +32,7 @@ K_YAW_1_S = 1.0  # of the heading; chosen: below the yaw loop's bandwidth by a d
 REQUESTS_MAX = 1000  # between two gates, as of a controller
 
 
-class Pilot(Agent):
+class ReferencePilot(Agent):
     """Flies one drone along its reference.
 
     Raises:

@@ -28,7 +28,7 @@ from zsim.errors import ReportError, RunError, ScenarioError
 from zsim.output_folder import refuse_others, take_lock
 from zsim.scenario import scenario_file
 from zsim_agents.hosting import check_classes
-from zsim_agents.laws.reference import Reference, polygon
+from zsim_agents.laws.reference import FormationReference, polygon
 from zsim_analysis.board.entries import CLUSTER_SPACE, about, resolved, shipped
 from zsim_analysis.board.measures import Figure, flown_of, measures, shape_errors
 from zsim_analysis.reading.recorded_flight import RecordedFlight
@@ -178,7 +178,7 @@ def planned_figure(scenario: str) -> Figure:
     """Return what the stock controller is told to fly."""
     entry, flight = shipped()["scenarios"][scenario], shipped()["flight"]
     places = polygon(len(shipped()["base"]["drones"]), flight["radius_m"])
-    return Figure(Reference(entry["centre_m"], 0.0, 1.0, flight["start_s"]), places, ("translation",))
+    return Figure(FormationReference(entry["centre_m"], 0.0, 1.0, flight["start_s"]), places, ("translation",))
 
 
 def board_of(request: BoardRequest, rows: Sequence[Row]) -> Board:

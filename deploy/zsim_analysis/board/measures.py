@@ -19,7 +19,7 @@ from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim_agents.laws.olfati_saber import OlfatiSaber
 from zsim_agents.laws.pilot import AIRBORNE, Motion, Pilot
-from zsim_agents.laws.reference import Reference, polygon
+from zsim_agents.laws.reference import FormationReference, polygon
 from zsim_agents.laws.shape import ShapePilot
 from zsim_analysis.reading.formation import common_instants, min_separation_m
 from zsim_analysis.reading.recorded_flight import Array, RecordedFlight, Track
@@ -29,7 +29,7 @@ from zsim_analysis.reading.shortfall import window_of
 class Figure(NamedTuple):
     """What a formation is to be."""
 
-    reference: Reference
+    reference: FormationReference
     places: Array | None  # (n, 2) of the drones [m]; None where a law has none
     invariances: tuple[str, ...]  # what of the places the law leaves open
 

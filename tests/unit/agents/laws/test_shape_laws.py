@@ -10,7 +10,7 @@ from zsim_agents.laws.bearing_only import bearing_only, bearing_rigidity_matrix
 from zsim_agents.laws.consensus import consensus
 from zsim_agents.laws.distance_based import distance_based, rigidity_matrix
 from zsim_agents.laws.pilot import repulsion
-from zsim_agents.laws.reference import Reference, polygon
+from zsim_agents.laws.reference import FormationReference, polygon
 from zsim_agents.laws.virtual_structure import virtual_structure
 
 Array = NDArray[np.float64]
@@ -153,7 +153,7 @@ def test_a_chain_of_followers_lags_behind_a_leader_that_moves() -> None:
 
 
 def test_a_virtual_structure_that_moves_turns_and_grows_is_joined_at_the_rate_k() -> None:
-    reference, k, h, c = Reference(("2*t", "sin(t)"), "30*t", "1 + t/10"), 0.8, 1e-3, np.array([1.0, 0.5])
+    reference, k, h, c = FormationReference(("2*t", "sin(t)"), "30*t", "1 + t/10"), 0.8, 1e-3, np.array([1.0, 0.5])
     p, errors = np.array([3.0, -2.0]), []
     for step in range(4000):
         pose = reference.at(step * h)
