@@ -248,7 +248,7 @@ def test_hosted_they_have_the_same_bits(federation: Federation, tmp_path: Path, 
 
 
 def test_the_pentagon_closes(tmp_path: Path) -> None:
-    """Consensus on displacements over the complete graph: 5 drones, rate k λ₂ = 0.3 · 5 = 1.5 1/s."""
+    """Consensus on displacements over a radio of 8 m that loses 30 %, the last positions heard being held."""
     run = zsim.run(EXAMPLES / "swarm.yaml", duration_s=25, out=tmp_path / "run", progress=False)
     places = {drone: run.estimate(drone).iloc[-1] for drone in run.drones}
     sides = []

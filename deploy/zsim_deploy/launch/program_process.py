@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from zsim_api.programs import Program
-from zsim_deploy.launch.supervisor import end_text
+from zsim_deploy.launch.supervisor import end_text, last_line
 
 LEAVES_S = 2.0  # wall time that a program has to see that the run is over, before it is interrupted
 
@@ -49,11 +49,7 @@ class ProgramProcess:
         return end_text(self.code, self.last_log_line())
 
     def last_log_line(self) -> str:
-        try:
-            lines = self._log.read_text(errors="replace").strip().splitlines()
-        except OSError:
-            return ""
-        return lines[-1] if lines else ""
+        return last_line(self._log)
 
     def request_stop(self, reason: str) -> None:
         """Interrupt it, as Ctrl-C does, unless it leaves by itself within LEAVES_S."""

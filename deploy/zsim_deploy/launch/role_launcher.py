@@ -21,7 +21,7 @@ from typing import IO, Protocol
 
 from zsim.runtime.progress import SlowStart
 from zsim_deploy import SAFE_PATH
-from zsim_deploy.launch.supervisor import end_text
+from zsim_deploy.launch.supervisor import end_text, last_line
 
 SINGLE_THREADED = {
     "OPENBLAS_NUM_THREADS": "1",
@@ -102,11 +102,7 @@ class ChildProcess:
         return end_text(self.code, self.last_log_line())
 
     def last_log_line(self) -> str:
-        try:
-            lines = self._log.read_text(errors="replace").strip().splitlines()
-        except OSError:
-            return ""
-        return lines[-1] if lines else ""
+        return last_line(self._log)
 
     def request_stop(self, reason: str) -> None:
         """Ask it to leave; harmless when it is gone."""

@@ -61,6 +61,15 @@ def end_text(code: int | None, last_line: str) -> str:
     return f"exit code {code}" + (f": {last_line}" if last_line else "")
 
 
+def last_line(log: Path) -> str:
+    """Return the last line of a log, empty where there is none."""
+    try:
+        lines = log.read_text(errors="replace").strip().splitlines()
+    except OSError:
+        return ""
+    return lines[-1] if lines else ""
+
+
 def status_row(role: str, host: str, pid: int, state: str, restarts: int = 0) -> dict[str, Any]:
     figures = dict.fromkeys(("lag_ms", "messages_per_s", "round_trip_ms"))
     return {"role": role, "host": host, "pid": pid or None, "state": state, "restarts": restarts, **figures}
