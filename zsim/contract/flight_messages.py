@@ -4,7 +4,6 @@ SI units and radians, the unit in the name. W is the world frame (ENU), B the bo
 turn B to W.
 """
 
-import math
 from collections.abc import Sequence
 from operator import itemgetter
 from typing import Annotated, Any, Literal, get_args
@@ -12,6 +11,7 @@ from typing import Annotated, Any, Literal, get_args
 from msgspec import Meta, Struct
 
 from zsim.contract.keys import on
+from zsim.math import elementary as el
 from zsim.schema.message import Count, Message, Number, Vector3, Whole
 
 Quaternion = tuple[Number, Number, Number, Number]
@@ -404,7 +404,7 @@ def truth_fault(truth: Truth, rotors: int) -> str | None:
         values: Sequence[float] = getattr(truth, name)
         if max(map(abs, values)) > most:
             return f"{name} is {_shown(values)}; each must be within {most:g} {unit}"
-    if abs(math.hypot(*truth.orientation_wxyz) - 1.0) > UNIT_SLACK:
+    if abs(el.length(truth.orientation_wxyz) - 1.0) > UNIT_SLACK:
         return f"orientation_wxyz is {_shown(truth.orientation_wxyz)}; must be a quaternion of length 1"
     if len(truth.rotor_rad_s) != rotors:
         return f"rotor_rad_s has {len(truth.rotor_rad_s)} speeds; must have {rotors}, as the drone has rotors"

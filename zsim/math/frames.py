@@ -9,15 +9,18 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from zsim.math import elementary as el
 from zsim.math.compiled import kernel
 
 Array = NDArray[np.float64]
+
+_sin, _cos, _asin, _atan2 = map(el.elementwise, (el.sin, el.cos, el.asin, el.atan2))
 
 WGS84_A_M = 6_378_137.0  # m, semi-major axis, WGS 84 (NIMA TR8350.2, table 3.1)
 WGS84_F = 1.0 / 298.257223563  # flattening, WGS 84 (NIMA TR8350.2, table 3.1)
 _E2 = WGS84_F * (2.0 - WGS84_F)
 _B_M = WGS84_A_M * (1.0 - WGS84_F)
-_CURVATURE_M = (WGS84_A_M**2 - _B_M**2) / _B_M
+_CURVATURE_M = (WGS84_A_M * WGS84_A_M - _B_M * _B_M) / _B_M
 _STEPS = 4  # each gains a factor of about 300: 1e-15 rad after four for heights below 1000 km
 
 
@@ -31,20 +34,21 @@ def geodetic_to_ecef(geodetic: ArrayLike) -> Array:
     """Return Earth-centred, Earth-fixed coordinates [m] of (latitude_deg, longitude_deg, height_m)."""
     lat_deg, lon_deg, height = np.moveaxis(np.asarray(geodetic, dtype=float), -1, 0)
     lat, lon = np.radians(lat_deg), np.radians(lon_deg)
-    normal = WGS84_A_M / np.sqrt(1.0 - _E2 * np.sin(lat) ** 2)
-    level = (normal + height) * np.cos(lat)
-    up = (normal * (1.0 - _E2) + height) * np.sin(lat)
-    return np.stack([level * np.cos(lon), level * np.sin(lon), up], axis=-1)
+    sine = _sin(lat)
+    normal = WGS84_A_M / np.sqrt(1.0 - _E2 * sine * sine)
+    level = (normal + height) * _cos(lat)
+    up = (normal * (1.0 - _E2) + height) * sine
+    return np.stack([level * _cos(lon), level * _sin(lon), up], axis=-1)
 
 
 def enu_rows(latitude_deg: float, longitude_deg: float) -> Array:
     """Return the unit vectors east, north, up as rows in Earth-fixed components."""
-    lat, lon = np.radians(latitude_deg), np.radians(longitude_deg)
+    (ns, nc), (es, ec) = el.sin_cos(math.radians(latitude_deg)), el.sin_cos(math.radians(longitude_deg))
     return np.array(
         [
-            [-np.sin(lon), np.cos(lon), 0.0],
-            [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
-            [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
+            [-es, ec, 0.0],
+            [-ns * ec, -ns * es, nc],
+            [nc * ec, nc * es, ns],
         ]
     )
 
@@ -71,16 +75,16 @@ def geodetic(position_m: Array, rows: Array, place_m: Array) -> Array:
         x = place_m[0] + (e * rows[0, 0] + n * rows[1, 0] + u * rows[2, 0])
         y = place_m[1] + (e * rows[0, 1] + n * rows[1, 1] + u * rows[2, 1])
         z = place_m[2] + (e * rows[0, 2] + n * rows[1, 2] + u * rows[2, 2])
-        level = math.hypot(x, y)
-        lat = math.atan2(z, level * (1.0 - _E2))
+        level = el.hypot(x, y)
+        lat = el.atan2(z, level * (1.0 - _E2))
         for _ in range(_STEPS):
-            parametric = math.atan2((1.0 - WGS84_F) * math.sin(lat), math.cos(lat))
-            s, c = math.sin(parametric), math.cos(parametric)
-            lat = math.atan2(z + _CURVATURE_M * s * s * s, level - _E2 * WGS84_A_M * c * c * c)
-        s = math.sin(lat)
+            parametric = el.atan2((1.0 - WGS84_F) * el.sin(lat), el.cos(lat))
+            s, c = el.sin(parametric), el.cos(parametric)
+            lat = el.atan2(z + _CURVATURE_M * s * s * s, level - _E2 * WGS84_A_M * c * c * c)
+        s = el.sin(lat)
         coordinates[i, 0] = math.degrees(lat)
-        coordinates[i, 1] = math.degrees(math.atan2(y, x))
-        coordinates[i, 2] = level * math.cos(lat) + z * s - WGS84_A_M * math.sqrt(1.0 - _E2 * s * s)
+        coordinates[i, 1] = math.degrees(el.atan2(y, x))
+        coordinates[i, 2] = level * el.cos(lat) + z * s - WGS84_A_M * math.sqrt(1.0 - _E2 * s * s)
     return coordinates
 
 
@@ -150,13 +154,13 @@ def principal_axes(covariance: ArrayLike) -> tuple[Array, Array]:
 
 def rotate(q: ArrayLike, v: ArrayLike) -> Array:
     """Return R(q) v: body components to world components."""
-    return np.einsum("...ij,...j->...i", rotation_matrix(q), np.asarray(v, dtype=float))
+    return (rotation_matrix(q) * np.asarray(v, dtype=float)[..., None, :]).sum(axis=-1)
 
 
 def quaternion_from_rpy(rpy_rad: ArrayLike) -> Array:
     """Return the quaternion of R = Rz(yaw) Ry(pitch) Rx(roll) for angles (..., 3) in the order roll, pitch, yaw."""
     half = 0.5 * np.asarray(rpy_rad, dtype=float)
-    (cr, cp, cy), (sr, sp, sy) = np.moveaxis(np.cos(half), -1, 0), np.moveaxis(np.sin(half), -1, 0)
+    (cr, cp, cy), (sr, sp, sy) = np.moveaxis(_cos(half), -1, 0), np.moveaxis(_sin(half), -1, 0)
     return np.stack(
         [
             cr * cp * cy + sr * sp * sy,
@@ -171,20 +175,20 @@ def quaternion_from_rpy(rpy_rad: ArrayLike) -> Array:
 def rpy_from_quaternion(q: ArrayLike) -> Array:
     """Return roll, pitch, yaw [rad] of R = Rz(yaw) Ry(pitch) Rx(roll); pitch in [-pi/2, pi/2]."""
     w, x, y, z = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - x * z), -1.0, 1.0))
+    roll = _atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = _asin(np.clip(2 * (w * y - x * z), -1.0, 1.0))
     return np.stack([roll, pitch, heading(q)], axis=-1)
 
 
 def heading(q: ArrayLike) -> Array:
     """Return the heading [rad]: the angle of the body's x axis from east, counter-clockwise seen from above."""
     w, x, y, z = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return _atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def turned_about_up(v: tuple[float, float, float], angle_rad: float) -> tuple[float, float, float]:
     """Return a vector turned about z, counter-clockwise seen from above; by a heading: heading frame to W."""
-    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    c, s = el.cos(angle_rad), el.sin(angle_rad)
     return c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
 
 
@@ -192,4 +196,4 @@ def quaternion_from_heading(heading_rad: ArrayLike) -> Array:
     """Return the quaternion of a level body with that heading."""
     half = 0.5 * np.asarray(heading_rad, dtype=float)
     zero = np.zeros_like(half)
-    return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
+    return np.stack([_cos(half), zero, zero, _sin(half)], axis=-1)

@@ -6,6 +6,7 @@ a rotation matrix, which is given by its rows.
 
 import math
 
+from zsim.math import elementary as el
 from zsim.math.compiled import inlined, portable
 
 Vector = tuple[float, float, float]
@@ -95,7 +96,7 @@ def from_rotation_vector(r: Vector) -> Quaternion:
     """Return the quaternion of a turn by |r| radians about r."""
     angle = norm(r)
     half = 0.5 * angle
-    return turn_about(r, angle, math.sin(half), math.cos(half))
+    return turn_about(r, angle, el.sin(half), el.cos(half))
 
 
 @inlined
@@ -117,7 +118,7 @@ def rate(q: Quaternion, w_WB_B: Vector) -> Quaternion:
 def heading(q: Quaternion) -> float:
     """Return the heading [rad]: the angle of the body's x axis from east, counter-clockwise seen from above."""
     north, east = forwards(q)
-    return math.atan2(north, east)
+    return el.atan2(north, east)
 
 
 @inlined
@@ -129,7 +130,7 @@ def forwards(q: Quaternion) -> tuple[float, float]:
 
 @inlined
 def about_z(angle: float) -> Quaternion:
-    return (math.cos(0.5 * angle), 0.0, 0.0, math.sin(0.5 * angle))
+    return (el.cos(0.5 * angle), 0.0, 0.0, el.sin(0.5 * angle))
 
 
 @inlined
@@ -164,9 +165,9 @@ def matrix(q: Quaternion) -> Matrix:
 @portable
 def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Matrix:
     """Return R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    sr, cr = math.sin(roll), math.cos(roll)
-    sp, cp = math.sin(pitch), math.cos(pitch)
-    sy, cy = math.sin(yaw), math.cos(yaw)
+    sr, cr = el.sin(roll), el.cos(roll)
+    sp, cp = el.sin(pitch), el.cos(pitch)
+    sy, cy = el.sin(yaw), el.cos(yaw)
     return (
         (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
         (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
@@ -232,8 +233,8 @@ def attitude_between(s: float, q0: Quaternion, q1: Quaternion) -> Quaternion:
     cosine *= sign
     a, b = 1.0 - s, s * sign
     if cosine < COSINE_MAX:
-        angle = math.acos(cosine)
-        a, b = math.sin((1.0 - s) * angle) / math.sin(angle), sign * math.sin(s * angle) / math.sin(angle)
+        angle = el.acos(cosine)
+        a, b = el.sin((1.0 - s) * angle) / el.sin(angle), sign * el.sin(s * angle) / el.sin(angle)
     return normalised((a * q0[0] + b * q1[0], a * q0[1] + b * q1[1], a * q0[2] + b * q1[2], a * q0[3] + b * q1[3]))
 
 

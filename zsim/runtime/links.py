@@ -19,6 +19,7 @@ from zsim.contract.flight_messages import Estimate
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Fault, Faults
 from zsim.contract.snapshot import State
+from zsim.math import elementary as el
 from zsim.math.random_streams import uniform
 from zsim.runtime.agent_radio import NEVER, Receiver
 from zsim.runtime.inbox import Input, canonical
@@ -104,7 +105,7 @@ def total_delay_ns(
             d_m = distance_m(fault)
             if d_m is not None:
                 exponent = min((d_m - p["range_m"]) / p["spread_m"], 700.0)  # exp(700) is the last finite one
-                if draw >= 1.0 / (1.0 + math.exp(exponent)):
+                if draw >= 1.0 / (1.0 + el.exp(exponent)):
                     return NEVER
         else:  # link_cut
             return NEVER
@@ -112,7 +113,7 @@ def total_delay_ns(
 
 
 def distance_between(a: Point | None, b: Point | None) -> float | None:
-    return math.dist(a, b) if a is not None and b is not None else None
+    return el.distance(a, b) if a is not None and b is not None else None
 
 
 class Links:

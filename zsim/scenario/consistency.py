@@ -12,6 +12,8 @@ import numpy as np
 from msgspec import UNSET
 
 from zsim.contract import messages
+from zsim.math import elementary as el
+from zsim.math.linear import singular_values
 from zsim.scenario.faults import Known, flaws, kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
 from zsim.scenario.own_classes import agent_faults
@@ -225,7 +227,9 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
     gravity = scenario.environment and scenario.environment.gravity_m_s2
     vehicle = vehicles.get(drone.model) if drone.model else None
     if vehicle and _known(drone.thrust_n_s2, high):
-        scale = (drone.thrust_n_s2 / vehicle.thrust_n_s2) ** 0.25  # of a rotor; larger may be a wrong unit of that
+        scale = math.sqrt(
+            math.sqrt(drone.thrust_n_s2 / vehicle.thrust_n_s2)
+        )  # of a rotor; larger may be a wrong unit of that
         radius_m = vehicle.rotor_radius_m * min(1.0, scale)
         if radius_m * high > TIP_MAX_M_S:
             tip = f"so that the tip of a rotor of {radius_m:.3g} m moves at {radius_m * high:.0f} m/s"
@@ -236,7 +240,7 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
     if vehicle and _known(drone.mass_kg, drone.thrust_n_s2):
         yield from _drag_faults(drone, len(vehicle.rotors))
     if _known(drone.mass_kg, drone.arm_m, drone.inertia_kg_m2) and None not in drone.inertia_kg_m2:
-        greatest = INERTIA_MAX_MR2 * drone.mass_kg * drone.arm_m**2
+        greatest = INERTIA_MAX_MR2 * drone.mass_kg * el.square(drone.arm_m)
         if max(drone.inertia_kg_m2) > greatest:
             found = f"is {list(drone.inertia_kg_m2)}; sane: at most {greatest:.3g}, ten times mass_kg arm_m^2"
             yield "inertia_kg_m2", f"{found}; check its unit, kg m^2"
@@ -263,10 +267,10 @@ def _drag_faults(drone: Any, rotors: int) -> Iterator[Fault]:
     speeds = {
         "drag_n_s_m": (v, "N s/m"),
         "aerodynamics.linear_drag_n_s_m": (v, "N s/m"),
-        "aerodynamics.quadratic_drag_n_s2_m2": (v**2, "N s^2/m^2"),
+        "aerodynamics.quadratic_drag_n_s2_m2": (el.square(v), "N s^2/m^2"),
         "aerodynamics.rotor_drag_n_s2_m": (of_rotors * v, "N s^2/m"),
         "aerodynamics.rotor_inflow_n_s2_m": (of_rotors * v, "N s^2/m"),
-        "aerodynamics.rotor_lift_n_s2_m2": (rotors * v**2, "N s^2/m^2"),
+        "aerodynamics.rotor_lift_n_s2_m2": (rotors * el.square(v), "N s^2/m^2"),
     }
     for path, (factor, unit) in speeds.items():
         section, _, name = path.rpartition(".")
@@ -287,7 +291,7 @@ def _hover_faults(drone: Any, vehicle: Vehicle, environment: Any) -> Iterator[Fa
     thrust, torque = drone.thrust_n_s2, drone.torque_nm_s2
     low, high = drone.rotor_min_rad_s, drone.rotor_max_rad_s
     weight = drone.mass_kg * environment.gravity_m_s2
-    lift = count * thrust * high**2 / shares.max()
+    lift = count * thrust * el.square(high) / shares.max()
     most = LIFT_SHARE_MAX * lift / environment.gravity_m_s2
     if drone.mass_kg >= most:
         yield "mass_kg", f"is {drone.mass_kg:g}; must be < {most:.3f}, nine tenths of what its rotors lift"
@@ -297,8 +301,8 @@ def _hover_faults(drone: Any, vehicle: Vehicle, environment: Any) -> Iterator[Fa
         units = "check their units, N s^2, rad/s and kg (thrust = thrust_n_s2 times speed^2)"
         yield "thrust_n_s2", f"is {thrust:g}, {flown}; sane: {100 * THRUST_SHARE_MIN:g} to 90 %; {units}"
         return
-    tilt, lean = drone.limits and drone.limits.tilt_deg, math.degrees(math.acos(weight / (LIFT_SHARE_MAX * lift)))
-    cut = math.degrees(math.acos(vehicle.firmware.tilt_cut_cosine))
+    tilt, lean = drone.limits and drone.limits.tilt_deg, math.degrees(el.acos(weight / (LIFT_SHARE_MAX * lift)))
+    cut = math.degrees(el.acos(vehicle.firmware.tilt_cut_cosine))
     if tilt is not None and tilt > (most_deg := max(lean, TILT_FREE_DEG)):
         yield "limits.tilt_deg", f"is {tilt:g}; must be <= {most_deg:.1f}; its rotors carry its weight up to {lean:.1f}"
     if tilt is not None and tilt >= cut:
@@ -424,8 +428,8 @@ def _template_faults(spec: Any, starts: list[Any], robots: int) -> Iterator[Faul
 def _in_line(places: list[Any]) -> bool:
     """Return whether places (n, 3) are within a line, in the root mean square."""
     p = np.array(places, dtype=float)
-    widths = np.linalg.svd(p - p.mean(axis=0), compute_uv=False) / np.sqrt(len(p))
-    return bool(np.hypot(*widths[1:]) < TEMPLATE_WIDTH_MIN_M)
+    widths = singular_values(p - p.mean(axis=0)) / np.sqrt(len(p))
+    return el.length(widths[1:].tolist()) < TEMPLATE_WIDTH_MIN_M
 
 
 def _plan_faults(cluster: Any) -> Iterator[Fault]:
@@ -614,7 +618,7 @@ def _camera_faults(sensors: Any) -> Iterator[Fault]:
         path = f"{name}_camera"
         of_lens = camera.width_px, camera.height_px, camera.diagonal_deg, camera.distortion
         if None not in of_lens and None not in camera.distortion and folds(lens_of(camera)):
-            least = LEAST_K1 / math.tan(math.radians(camera.diagonal_deg) / 2) ** 2
+            least = LEAST_K1 / el.tan(math.radians(camera.diagonal_deg) / 2) ** 2
             given = f"is {list(camera.distortion)}, which folds a picture of {camera.diagonal_deg:g} deg"
             needed = f"must give every pixel a ray of its own, k1 alone more than {least:.3f}"
             yield f"{path}.distortion", f"{given}; {needed}"

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from zsim.errors import DocumentError
+from zsim.math import elementary as el
 from zsim.math.random_streams import stream
 from zsim.scenario.scenario import OBSTACLES_MAX, Cloud, Corridor, Forest, Position, Scenario
 from zsim.scenario.surface_file import TRIANGLES_MAX, packed, points_of, triangles_of, unpacked
@@ -78,8 +79,12 @@ def _forest(
         for _ in range(TRIES_MAX):
             x, y = (round(each, 3) for each in rng.uniform((west, south), (east, north)).tolist())
             radius, height = (round(rng.uniform(*span), 3) for span in (own.radius_m, own.height_m))
-            away = np.hypot(places[:count, 0] - x, places[:count, 1] - y) - places[:count, 2] - radius
-            from_starts = np.hypot(clear[:, 0] - x, clear[:, 1] - y) - radius
+            away = (
+                np.sqrt(np.square(places[:count, 0] - x) + np.square(places[:count, 1] - y))
+                - places[:count, 2]
+                - radius
+            )
+            from_starts = np.sqrt(np.square(clear[:, 0] - x) + np.square(clear[:, 1] - y)) - radius
             if (away >= own.gap_m).all() and (from_starts >= own.clear_m).all():
                 break
         else:
@@ -100,21 +105,21 @@ def _corridor(
     middles = [own.start_m]
     for heading in headings:
         x, y = middles[-1]
-        middles.append((x + own.length_m * math.cos(heading), y + own.length_m * math.sin(heading)))
+        middles.append((x + own.length_m * el.cos(heading), y + own.length_m * el.sin(heading)))
     bends = [*zip(middles, headings, turns, strict=False), (middles[-1], headings[-1], 0.0)]
     entries: list[Entry] = []
     for side, off in (("left", 1.0), ("right", -1.0)):
         corners = []  # of the middle line of the walls: on the bisector of each bend
         for (x, y), heading, turn in bends:
-            across, away = heading - 0.5 * turn, 0.5 * off * (own.width_m + own.wall_m) / math.cos(0.5 * turn)
-            corners.append((x - away * math.sin(across), y + away * math.cos(across)))
+            across, away = heading - 0.5 * turn, 0.5 * off * (own.width_m + own.wall_m) / el.cos(0.5 * turn)
+            corners.append((x - away * el.sin(across), y + away * el.cos(across)))
         for k, ((ax, ay), (bx, by)) in enumerate(pairwise(corners)):
             wall = {
                 "name": f"wall{k + 1}_{side}",
                 "shape": "box",
                 "position_m": [round(0.5 * (ax + bx), 3), round(0.5 * (ay + by), 3), 0.0],
-                "size_m": [round(math.hypot(bx - ax, by - ay) + own.wall_m, 3), own.wall_m, own.height_m],
-                "yaw_deg": round(math.degrees(math.atan2(by - ay, bx - ax)), 3),
+                "size_m": [round(el.hypot(bx - ax, by - ay) + own.wall_m, 3), own.wall_m, own.height_m],
+                "yaw_deg": round(math.degrees(el.atan2(by - ay, bx - ax)), 3),
             }
             entries.append(wall)
     return entries, None

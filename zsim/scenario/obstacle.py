@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from zsim.math import elementary as el
+
 BOX, CYLINDER, SPHERE = range(3)
 SHAPES = ("box", "cylinder", "sphere")
 SHAPE, CENTRE, COSINE, SINE, HALF = 0, 1, 4, 5, 6
@@ -30,7 +32,7 @@ def row_of(obstacle: Any) -> list[float]:
     else:
         half = [obstacle.radius_m, 0.0, 0.0]
     yaw = math.radians(obstacle.yaw_deg)
-    return [float(SHAPES.index(obstacle.shape)), x, y, z + half[2], math.cos(yaw), math.sin(yaw), *half]
+    return [float(SHAPES.index(obstacle.shape)), x, y, z + half[2], el.cos(yaw), el.sin(yaw), *half]
 
 
 def nearest(row: Sequence[float], x: float, y: float, z: float) -> tuple[float, float, float, float]:
@@ -70,12 +72,12 @@ def least_distances(obstacles: Iterable[Any], p_W: ArrayLike) -> NDArray[np.floa
     for first in range(0, len(points) if len(rows) else 0, step):
         x, y, z = (points[first : first + step, None, k] - rows[:, CENTRE + k] for k in range(3))
         c, s, shape, half = rows[:, COSINE], rows[:, SINE], rows[:, SHAPE], rows[:, HALF:]
-        r = np.hypot(x, y)
+        r = np.sqrt(x * x + y * y)
         across = np.where(shape == BOX, np.abs(c * x + s * y), r) - half[:, 0]
         along = np.where(shape == BOX, np.abs(c * y - s * x) - half[:, 1], -np.inf)
         over = np.abs(z) - half[:, 2]
         most = np.maximum(np.maximum(across, along), over)
         outside = np.sqrt(np.maximum(across, 0.0) ** 2 + np.maximum(along, 0.0) ** 2 + np.maximum(over, 0.0) ** 2)
         solid = np.where(most > 0.0, outside, most)
-        least[first : first + step] = np.where(shape == SPHERE, np.hypot(r, z) - half[:, 0], solid).min(axis=1)
+        least[first : first + step] = np.where(shape == SPHERE, np.sqrt(r * r + z * z) - half[:, 0], solid).min(axis=1)
     return least

@@ -7,6 +7,7 @@ Formats other than numbers in text are read by trimesh and pypcd4, of the extra 
 import base64
 import binascii
 import importlib
+import math
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.errors import DocumentError, missing
+from zsim.math import elementary as el
 from zsim.schema.checker import show
 
 TRIANGLES_MAX = 40_000  # of all surfaces: with them a resolved scenario stays below the 4 MB of a file
@@ -131,8 +133,7 @@ def unpacked(text: str) -> Array:
 
 def placed(surface: Any) -> Array:
     """Return the triangles of a surface of a scenario in W, (T, 9): a corner, and the two edges from it [m]."""
-    yaw = np.radians(surface.yaw_deg)
-    c, s = float(np.cos(yaw)), float(np.sin(yaw))
+    s, c = el.sin_cos(math.radians(surface.yaw_deg))
     x, y, z = np.moveaxis(surface.scale * unpacked(surface.triangles).reshape(-1, 3, 3), 2, 0)
     corners = np.stack([c * x - s * y, s * x + c * y, z], axis=2) + np.array(surface.position_m)
     first = corners[:, 0]

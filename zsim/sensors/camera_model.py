@@ -10,8 +10,10 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.math import elementary as el
 from zsim.math.compiled import portable
 from zsim.math.frames import quaternion_from_matrix
+from zsim.math.linear import product
 from zsim.math.rotation import Quaternion, matrix_from_rpy
 from zsim.sensors.camera import Camera
 
@@ -52,15 +54,15 @@ class CameraPose(NamedTuple):
 
 def lens_of(camera: Camera) -> Lens:
     """Return the lens of a camera: square pixels, the diagonal field of view, the axis in the picture's middle."""
-    half_px = math.hypot(camera.width_px, camera.height_px) / 2
-    focal_px = half_px / math.tan(math.radians(camera.diagonal_deg) / 2)
+    half_px = el.hypot(camera.width_px, camera.height_px) / 2
+    focal_px = half_px / el.tan(math.radians(camera.diagonal_deg) / 2)
     centre = (camera.width_px - 1) / 2, (camera.height_px - 1) / 2
     return Lens(focal_px, focal_px, *centre, *camera.distortion, camera.width_px, camera.height_px)
 
 
 def camera_pose(camera: Camera) -> CameraPose:
     R_BS = np.array(matrix_from_rpy(*map(math.radians, camera.mount.rpy_deg)))
-    return CameraPose(np.array(camera.mount.position_m), R_BS @ R_SK)
+    return CameraPose(np.array(camera.mount.position_m), product(R_BS, R_SK))
 
 
 def camera_matrix(lens: Lens) -> Array:
@@ -111,7 +113,8 @@ def folds(lens: Lens) -> bool:
         share = np.linspace(0.0, 1.0, FOLD_GRID)[:, None]
         xx, xy, yy = distortion_slopes(lens, share * x, share * y)
         at_x, at_y = distorted(lens, x, y)
-        off_px = np.hypot(lens.fx * at_x + lens.cx - u.ravel(), lens.fy * at_y + lens.cy - v.ravel())
+        off_u, off_v = lens.fx * at_x + lens.cx - u.ravel(), lens.fy * at_y + lens.cy - v.ravel()
+        off_px = np.sqrt(off_u * off_u + off_v * off_v)
     return not (np.all(off_px < FOLD_PX) and np.all(xx * yy - xy * xy > 0.0) and np.all(xx > 0.0))
 
 

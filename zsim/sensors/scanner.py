@@ -14,6 +14,7 @@ import numpy as np
 from msgspec import UNSET, Meta, field
 from numpy.typing import NDArray
 
+from zsim.math import elementary as el
 from zsim.schema.message import Count, Number
 from zsim.schema.quantities import Fraction, NonNegative, Positive
 from zsim.sensors.camera import CameraName
@@ -96,8 +97,9 @@ class Depth(Sample, frozen=True, kw_only=True):
 
 def along(up: NDArray[Any], left: NDArray[Any]) -> NDArray[np.float64]:
     """Return unit vectors by elevation and azimuth [rad], (rows of up, columns of left, 3)."""
-    level = np.cos(up)
-    return np.stack(np.broadcast_arrays(level * np.cos(left), level * np.sin(left), np.sin(up)), axis=-1)
+    sine, cosine = el.elementwise(el.sin), el.elementwise(el.cos)
+    level = cosine(up)
+    return np.stack(np.broadcast_arrays(level * cosine(left), level * sine(left), sine(up)), axis=-1)
 
 
 def _size_fault(name: str, data: bytes, rows: int, columns: int) -> str | None:

@@ -14,6 +14,8 @@ import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType
 from numpy.typing import NDArray
 
+from zsim.math import elementary as el
+from zsim.math.linear import product
 from zsim.schema.declared_message import FieldName, FieldType, MessageName, declared_type, field_types
 from zsim.schema.message import Message, Whole
 from zsim.schema.quantities import Fraction, NonNegative, Vector3
@@ -46,11 +48,11 @@ class ErrorModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     def correlated_sigma(self) -> float:
         if not self.correlation_time_s:
             return 0.0
-        return math.hypot(self.noise, 0.0 if self.bias_instability is UNSET else self.bias_instability)
+        return el.hypot(self.noise, 0.0 if self.bias_instability is UNSET else self.bias_instability)
 
     def white_sigma(self, rate_hz: float) -> float:
         """Return the standard deviation of white noise per sample, without the rounding of the converter."""
-        return math.hypot(0.0 if self.correlation_time_s else self.noise, self.density * math.sqrt(rate_hz))
+        return el.hypot(0.0 if self.correlation_time_s else self.noise, self.density * math.sqrt(rate_hz))
 
 
 class Mount(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -124,23 +126,23 @@ class SensorTruth(Struct, frozen=True):
     @property
     def p_WS(self) -> NDArray[np.float64]:
         """Position of the sensor in W [m]: p_WB + R_WB p_BS."""
-        return self.p_WB + self.R_WB @ self.p_BS
+        return self.p_WB + product(self.R_WB, self.p_BS)
 
     @property
     def v_WS(self) -> NDArray[np.float64]:
         """Velocity of the sensor in W [m/s]: v_WB + R_WB (w × p_BS)."""
-        return self.v_WB + self.R_WB @ np.cross(self.w_WB_B, self.p_BS)
+        return self.v_WB + product(self.R_WB, np.cross(self.w_WB_B, self.p_BS))
 
     @property
     def a_WS(self) -> NDArray[np.float64]:
         """Acceleration of the sensor in W [m/s^2]: a_WB + R_WB (alpha × p_BS + w × (w × p_BS))."""
         turning = np.cross(self.w_WB_B, np.cross(self.w_WB_B, self.p_BS))
-        return self.a_WB + self.R_WB @ (np.cross(self.alpha_B, self.p_BS) + turning)
+        return self.a_WB + product(self.R_WB, np.cross(self.alpha_B, self.p_BS) + turning)
 
     @property
     def R_WS(self) -> NDArray[np.float64]:
         """Rotation, sensor components to world components, (3, 3)."""
-        return self.R_WB @ self.R_BS
+        return product(self.R_WB, self.R_BS)
 
 
 Equation = Callable[[SensorTruth, Any, Any], Sequence[float]]
@@ -211,7 +213,7 @@ def scaled(model: ErrorModel, to_si: float) -> ErrorModel:
 def noise_sigma(model: ErrorModel, rate_hz: float) -> float:
     """Return the standard deviation of a sample's noise, white or correlated, about its bias."""
     white, correlated = model.white_sigma(rate_hz), model.correlated_sigma
-    return math.hypot(white, correlated) if correlated else white
+    return el.hypot(white, correlated) if correlated else white
 
 
 def message_type(name: str, fields: Mapping[str, str], sensor: str = "") -> type[Sample]:

@@ -12,6 +12,8 @@ from typing import Annotated, Literal
 import numpy as np
 from msgspec import Meta, Struct
 
+from zsim.math import elementary as el
+from zsim.math import linear
 from zsim.schema.quantities import Fraction, NonNegative, Positive, Real
 
 ROTORS_MIN, ROTORS_MAX = 4, 8  # fewer cannot hold a hover at every heading; more do not go into a message
@@ -170,11 +172,11 @@ class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             raise ValueError(f"rotors has {count} entries; must have {ROTORS_MIN} to {ROTORS_MAX}")
         if len(set(names)) < count:
             raise ValueError(f"rotors has the names {', '.join(names)}; must be distinct")
-        farthest = max(math.hypot(rotor.x_m, rotor.y_m) for rotor in self.rotors)
+        farthest = max(el.hypot(rotor.x_m, rotor.y_m) for rotor in self.rotors)
         if not math.isclose(self.arm_m, farthest, rel_tol=ARM_MISS_MAX):
             what = f"arm_m is {self.arm_m:g}, but the farthest of rotors is {farthest:.4g} m from the centre"
             raise ValueError(f"{what}; must be the same: give both, and airframe and rotor_radius_m that fit")
-        strengths = np.linalg.svd(np.vstack([np.ones(count), allocation(self)]), compute_uv=False)
+        strengths = linear.singular_values(np.vstack([np.ones(count), allocation(self)]))
         if strengths[-1] < RANK_MIN * strengths[0]:
             raise ValueError(
                 "rotors cannot give thrust, roll, pitch and yaw apart from each other; place them about the centre"
@@ -213,13 +215,12 @@ def is_balanced(vehicle: Vehicle) -> bool:
 def mixing(vehicle: Vehicle) -> np.ndarray:
     """Return the thrust of each rotor for a unit of roll, pitch and yaw, (R, 3), without any thrust in all.
 
-    The pseudo-inverse of `allocation`, of an unbalanced vehicle of it below a row of thrust. Rounded to twelve digits,
-    so that the numbers do not depend on the library of linear algebra.
+    The pseudo-inverse of `allocation`, of an unbalanced vehicle of it below a row of thrust.
     """
     layout = allocation(vehicle)
     if is_balanced(vehicle):
-        return _rounded(np.linalg.pinv(layout))
-    return _rounded(np.linalg.pinv(np.vstack([np.ones(layout.shape[1]), layout]))[:, 1:])
+        return linear.pseudo_inverse(layout)
+    return linear.pseudo_inverse(np.vstack([np.ones(layout.shape[1]), layout]))[:, 1:]
 
 
 def lift_shares(vehicle: Vehicle) -> np.ndarray:
@@ -227,8 +228,4 @@ def lift_shares(vehicle: Vehicle) -> np.ndarray:
     layout, count = allocation(vehicle), len(vehicle.rotors)
     if is_balanced(vehicle):
         return np.ones(count)
-    return count * _rounded(np.linalg.pinv(np.vstack([np.ones(count), layout]))[:, :1])[:, 0]
-
-
-def _rounded(matrix: np.ndarray) -> np.ndarray:
-    return np.array([[float(f"{x:.12g}") for x in row] for row in matrix])
+    return count * linear.pseudo_inverse(np.vstack([np.ones(count), layout]))[:, 0]

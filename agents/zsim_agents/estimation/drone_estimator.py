@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from zsim.contract.snapshot import State
 from zsim.errors import UserCodeError
+from zsim.math import elementary as el
 from zsim.scenario.scenario import ESTIMATORS, Drone, Environment, Estimation
 from zsim.schema import plugin
 from zsim.schema.checker import show
@@ -157,7 +158,7 @@ def _plain(estimate: StateEstimate, estimator: DroneEstimator, drone: str) -> St
         wrong = ""
         if field in ("covariance", "yaw_sigma_rad") and (least := min(numbers[:: STATES + 1])) < 0.0:
             wrong = f"the {'variance' if field == 'covariance' else 'value'} {least:g}; must be >= 0"
-        elif field == "orientation_wxyz" and abs((norm := math.hypot(*numbers)) - 1.0) > NORM_TOLERANCE:
+        elif field == "orientation_wxyz" and abs((norm := el.length(numbers)) - 1.0) > NORM_TOLERANCE:
             wrong = f"the norm {norm:g}; must be 1"
         if wrong:
             raise UserCodeError(f"{what} {field} with {wrong}")

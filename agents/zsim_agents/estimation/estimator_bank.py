@@ -17,6 +17,7 @@ from zsim.contract.flight_messages import Estimate
 from zsim.contract.framing import GateMessages
 from zsim.contract.keys import SENSORS
 from zsim.contract.snapshot import State
+from zsim.math import elementary as el
 from zsim.math.compiled import Held, hold, inlined, portable
 from zsim.math.rotation import axpy, multiply, normalised, scaled
 from zsim.scenario.scenario import Drone, Environment, Estimation
@@ -159,7 +160,7 @@ class EstimatorBank:
         put(row, NOMINAL.a_WB, acceleration(state[2], state[5], setting[SETTING.gravity]))
         row[NOMINAL.gyro_bias : NOMINAL.gyro_bias + 3] = last.gyro_bias_rad_s
         P[:6, :6] = np.reshape(last.covariance, (6, 6))
-        set_variance(P, YAW, last.yaw_sigma_rad**2)
+        set_variance(P, YAW, el.square(last.yaw_sigma_rad))
         self.rows.counts[i, COUNT.heading_known] = last.yaw_sigma_rad < HEADING_SIGMA_RAD
 
     def snapshot(self) -> State:

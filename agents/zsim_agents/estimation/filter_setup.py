@@ -11,9 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from zsim.contract.keys import SENSORS
+from zsim.math import elementary as el
+from zsim.math.distributions import chi_square_quantile
 from zsim.math.rotation import LEVEL, matrix_from_rpy
 from zsim.scenario.obstacle import nearest, row_of
 from zsim.scenario.scenario import Drone, Environment, Estimation
@@ -183,12 +184,20 @@ class DroneSetup:
             self.own += bias.axes
         self.size = self.own + self.clones * CLONED
         self.variance, self.walk, self.decay = np.zeros(self.size), np.zeros(self.size), np.zeros(self.size)
-        self.variance[POSITION : POSITION + 3] = POSITION_SIGMA_M**2
-        self.variance[VELOCITY : VELOCITY + 3] = VELOCITY_SIGMA_M_S**2
-        self.variance[ATTITUDE : ATTITUDE + 3] = TILT_SIGMA_RAD**2, TILT_SIGMA_RAD**2, HEADING_SIGMA_RAD**2
+        self.variance[POSITION : POSITION + 3] = el.square(POSITION_SIGMA_M)
+        self.variance[VELOCITY : VELOCITY + 3] = el.square(VELOCITY_SIGMA_M_S)
+        self.variance[ATTITUDE : ATTITUDE + 3] = (
+            el.square(TILT_SIGMA_RAD),
+            el.square(TILT_SIGMA_RAD),
+            el.square(HEADING_SIGMA_RAD),
+        )
         for name, bias in self.biases.items():
             span = slice(self.first[name], self.first[name] + bias.axes)
-            self.variance[span], self.walk[span], self.decay[span] = bias.sigma**2, bias.walk**2, bias.decay_1_s
+            self.variance[span], self.walk[span], self.decay[span] = (
+                el.square(bias.sigma),
+                el.square(bias.walk),
+                bias.decay_1_s,
+            )
 
     def _clone_count(self) -> int:
         """Return how many clones late readings need, by what process noise adds to position and velocity meanwhile.
@@ -197,8 +206,8 @@ class DroneSetup:
         T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 6.2).
         """
         sensors, longest_s = self._drone.sensors, 0.0
-        white = self._accel_sigma**2 / sensors.imu.rate_hz  # m^2/s^3
-        tilt = self._gyro_sigma**2 / sensors.imu.rate_hz + self._tilt_density
+        white = el.square(self._accel_sigma) / sensors.imu.rate_hz  # m^2/s^3
+        tilt = el.square(self._gyro_sigma) / sensors.imu.rate_hz + self._tilt_density
         walk = self._gravity * self._gravity * tilt  # m^2/s^5
         for channel in AIDING:
             section: Sensor = getattr(sensors, channel.sensor)
@@ -207,10 +216,10 @@ class DroneSetup:
             if late_s <= self._gate_s or not is_used:
                 continue
             if channel.field == "velocity_m_s":
-                gained = white * late_s + walk * late_s**3 / 3.0  # m^2/s^2
+                gained = white * late_s + walk * el.power(late_s, 3) / 3.0  # m^2/s^2
             else:
-                gained = white * late_s**3 / 3.0 + walk * late_s**5 / 20.0  # m^2
-            if gained > CLONED_FROM * channel.sigma(sensors) ** 2:
+                gained = white * el.power(late_s, 3) / 3.0 + walk * el.power(late_s, 5) / 20.0  # m^2
+            if gained > CLONED_FROM * el.square(channel.sigma(sensors)):
                 longest_s = max(longest_s, late_s + self._gate_s)
         return math.ceil(longest_s / CLONE_EVERY_S) + 1 if longest_s else 0
 
@@ -235,8 +244,8 @@ class DroneSetup:
             max(JOLT_SIGMAS * self._accel_sigma, JOLT_MIN_M_S2),
             self._age_max_s,
             math.radians(self._drone.yaw_deg),
-            self._accel_sigma**2,
-            self._gyro_sigma**2,
+            el.square(self._accel_sigma),
+            el.square(self._gyro_sigma),
             self._tilt_density,
             levelling_time_s(self._beta, self._direction_sigma),
             CLONE_EVERY_S,
@@ -249,13 +258,13 @@ class DroneSetup:
             correlated = 0.0
             for channel in AIDING:
                 if channel.sensor == name:
-                    variance += [channel.sigma(sensors) ** 2] * channel.axes
+                    variance += [el.square(channel.sigma(sensors))] * channel.axes
                     if channel.field == "position_m":
                         correlated = channel.error(sensors).correlated_sigma
             variance += [0.0] * (VALUES_MAX - len(variance))
             R_BS = np.array(matrix_from_rpy(*map(math.radians, section.mount.rpy_deg)))
             row += [*variance, *section.mount.position_m, *R_BS.flat, *-R_BS[:, 2]]
-            row += [PATIENCE_S.get(name, math.inf), correlated**2]
+            row += [PATIENCE_S.get(name, math.inf), el.square(correlated)]
         assert len(row) == SETTING.size
         return row
 
@@ -263,8 +272,8 @@ class DroneSetup:
         """Return the columns LAYOUT."""
         estimation, mag, mount = self._estimation, self._drone.sensors.mag.field_ut, self._drone.sensors.imu.mount
         # whether one reading of the magnetometer gives a heading as good as setting the drone down by eye does
-        horizontal_ut = math.hypot(*self._environment.magnetic_field_ut[:2])
-        sideways_ut = math.hypot(HEADING_CHANNEL.sigma(self._drone.sensors), math.hypot(mag.bias, mag.correlated_sigma))
+        horizontal_ut = el.length(self._environment.magnetic_field_ut[:2])
+        sideways_ut = el.hypot(HEADING_CHANNEL.sigma(self._drone.sensors), el.hypot(mag.bias, mag.correlated_sigma))
         has_compass = estimation.magnetometer and sideways_ut <= COMPASS_SIGMA_RAD * horizontal_ut
         flags = (
             mount.rpy_deg != ZERO or mount.position_m != ZERO,
@@ -308,8 +317,8 @@ def biases_of(sensors: Sensors, estimation: Estimation) -> dict[BiasName, Bias]:
     def as_walk(error: ErrorModel) -> Bias:
         if not error.correlated_sigma:
             return Bias(3, error.bias, error.bias_walk)
-        sigma = math.hypot(error.bias, error.correlated_sigma)
-        return Bias(3, sigma, math.hypot(error.bias_walk, gauss_markov_walk(error)))
+        sigma = el.hypot(error.bias, error.correlated_sigma)
+        return Bias(3, sigma, el.hypot(error.bias_walk, gauss_markov_walk(error)))
 
     accel = as_walk(sensors.imu.accel_m_s2)
     gyro = as_walk(scaled(sensors.imu.gyro_deg_s, math.radians(1.0)))
@@ -331,7 +340,7 @@ def biases_of(sensors: Sensors, estimation: Estimation) -> dict[BiasName, Bias]:
 
 def innovation_limits(gate_probability: float) -> Array:
     """Return the limits of y^T S^-1 y by the number of rows, (DOF_MAX + 1,)."""
-    return np.append(0.0, chdtri(np.arange(1, DOF_MAX + 1), 1.0 - gate_probability))
+    return np.array([0.0, *(chi_square_quantile(gate_probability, dof) for dof in range(1, DOF_MAX + 1))])
 
 
 def white_sigma(error: ErrorModel, rate_hz: float) -> float:
@@ -340,7 +349,7 @@ def white_sigma(error: ErrorModel, rate_hz: float) -> float:
     Noise, density * sqrt(rate) and the converter's rounding (uniform: quantum^2/12) in quadrature.
     """
     noise = 0.0 if error.correlation_time_s else error.noise
-    return math.sqrt(noise**2 + error.density**2 * rate_hz + error.quantum**2 / 12.0)
+    return math.sqrt(el.square(noise) + el.square(error.density) * rate_hz + el.square(error.quantum) / 12.0)
 
 
 def accel_sigma(imu: ImuConfig) -> float:

@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from zsim.math.compiled import portable
+from zsim.math.linear import product_with
 
 Array = np.ndarray
 DOF_MAX = 6  # rows of the largest block, GPS with position and velocity
@@ -192,8 +193,7 @@ def joseph(P: Array, H: Array, variance: Array, K: Array) -> Array:
             if h != 0.0:
                 for i in range(n):
                     A[i, k] -= K[i, j] * h
-    AP = A @ P
-    updated = AP @ A.T
+    updated = product_with(product_with(A, P), np.ascontiguousarray(A.T))
     for i in range(n):
         for j in range(m):
             weighted = K[i, j] * variance[j]

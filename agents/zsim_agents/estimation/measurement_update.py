@@ -13,6 +13,7 @@ import math
 
 import numpy as np
 
+from zsim.math import elementary as el
 from zsim.math.compiled import inlined, portable
 from zsim.math.rotation import Matrix, Vector, add, column, composed, cross, heading, matrix, product, transposed
 from zsim_agents.estimation import strapdown
@@ -114,7 +115,7 @@ def start_heading(rows: Rows, i: int, P: Array, t_s: float, readings: Array, fir
             R_BS = matrix_at(setting, SETTING.sensors + MAG * SENSOR.size + SENSOR.R_BS)
             seen = product(matrix(quaternion(row, NOMINAL.q_WB)), product(R_BS, vector(readings[at], READING.values)))
             field = vector(setting, SETTING.field_W)
-            angle = math.atan2(field[1], field[0]) - math.atan2(seen[1], seen[0])
+            angle = el.atan2(field[1], field[0]) - el.atan2(seen[1], seen[0])
             _turn_heading(row, counts, setting[SETTING.gravity], angle)  # its variance follows from the update
             return
         at = after[at]

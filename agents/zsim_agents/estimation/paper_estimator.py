@@ -14,16 +14,17 @@ import math
 from typing import Any
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
 from zsim.contract.messages import Gps, Imu
 from zsim.contract.snapshot import State
-from zsim.math import frames
+from zsim.math import elementary as el
+from zsim.math import frames, linear
 from zsim.math.rotation import Quaternion, Vector
 from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim.sensors.sensor import ErrorModel, noise_sigma
 from zsim_agents.estimation.drone_estimator import StateEstimate
+from zsim_agents.estimation.kalman_update import joseph
 from zsim_agents.estimation.strapdown import madgwick_step
 
 YAW = 3  # place in the state
@@ -73,7 +74,7 @@ class PaperEstimator:
         self._t_s = t_s
         yaw = float(frames.heading(self._q))
         position = self._velocity_variance() * self._flow_period_s * dt  # each error is held for its period
-        drift = (self._gyro_sigma**2 * self._imu_period_s + self._gyro_bias**2 * DRIFT_S) * dt
+        drift = (el.square(self._gyro_sigma) * self._imu_period_s + el.square(self._gyro_bias) * DRIFT_S) * dt
         noise = np.diag([position, position, position, drift])
         self._filter.reckon(self._velocity or (0.0, 0.0, 0.0), yaw, noise, dt)
         if self._fix:
@@ -82,7 +83,7 @@ class PaperEstimator:
         turn = frames.quaternion_from_heading(self._filter.x[YAW] - yaw)
         self._q = _quaternion(frames.quaternion_multiply(turn, self._q))
         yaw = float(self._filter.x[YAW])
-        velocity = rotation_z(yaw) @ (self._velocity or (0.0, 0.0, 0.0))
+        velocity = linear.product(rotation_z(yaw), self._velocity or (0.0, 0.0, 0.0))
         covariance = np.zeros((6, 6))
         covariance[:3, :3], covariance[3:, 3:] = self._filter.P[:3, :3], self._velocity_variance() * np.eye(3)
         return StateEstimate(
@@ -125,34 +126,33 @@ class PaperEstimator:
 
     def _velocity_variance(self) -> float:
         """Return the variance per axis of the velocity used by dead reckoning [m^2/s^2]."""
-        return (self._speed_sigma if self._velocity else SPEED_SIGMA_M_S) ** 2
+        return el.square(self._speed_sigma if self._velocity else SPEED_SIGMA_M_S)
 
 
-class DeadReckoningFilter(ExtendedKalmanFilter):
-    """Position and heading, (p_WB, yaw), by dead reckoning and fixes."""
+class DeadReckoningFilter:
+    """Position and heading, x = (p_WB, yaw) with covariance P (4, 4), by dead reckoning and fixes.
+
+    The equations, and in the end their numbers to rounding, are those of filterpy's ExtendedKalmanFilter.
+    """
 
     def __init__(self, yaw: float) -> None:
-        super().__init__(dim_x=4, dim_z=3)
         self.x = np.array([0.0, 0.0, 0.0, yaw])
-        self.P = np.diag([POSITION_SIGMA_M**2] * 3 + [YAW_SIGMA_RAD**2])
-        self._next = self.x
+        self.P = np.diag([el.square(POSITION_SIGMA_M)] * 3 + [el.square(YAW_SIGMA_RAD)])
 
     def reckon(self, u: Vector, yaw: float, Q: NDArray[np.float64], dt: float) -> None:
         """Move for `dt` [s] with the velocity u [m/s; heading frame], to a heading [rad] known from its rate."""
-        step = rotation_z(yaw) @ u * dt
-        self._next = np.append(self.x[:3] + step, yaw)
-        self.F = np.eye(4)
-        self.F[:2, YAW] = -step[1], step[0]  # d(Rz(yaw) u)/d yaw
-        self.Q = Q
-        self.predict()
-
-    def predict_x(self, u: float = 0) -> None:  # to that of dead reckoning, which is not linear
-        self.x = self._next
+        step = linear.product(rotation_z(yaw), u) * dt
+        self.x = np.append(self.x[:3] + step, yaw)
+        F = np.eye(4)
+        F[:2, YAW] = -step[1], step[0]  # d(Rz(yaw) u)/d yaw
+        self.P = linear.product(linear.product(F, self.P), F.T) + Q
 
     def correct(self, fix: Gps, variance_factor: float) -> None:
         """Use a fix of the GPS receiver, its variance multiplied by a factor."""
-        H, R = np.eye(3, 4), np.eye(3) * fix.sigma_m**2 * variance_factor
-        self.update(np.array(fix.position_m), lambda x: H, lambda x: x[:3], R=R)
+        H, variance = np.eye(3, 4), np.full(3, el.square(fix.sigma_m) * variance_factor)
+        K = linear.solve(self.P[:3, :3] + np.diag(variance), self.P[:3]).T  # P H^T S^-1, of symmetric P and S
+        self.x = self.x + linear.product(K, np.array(fix.position_m) - self.x[:3])
+        self.P = joseph(self.P, H, variance, K)
 
 
 def correlation_factor(error: ErrorModel, rate_hz: float) -> float:
@@ -164,14 +164,14 @@ def correlation_factor(error: ErrorModel, rate_hz: float) -> float:
     """
     if not error.correlated_sigma:
         return 1.0
-    a = math.exp(-1.0 / (rate_hz * error.correlation_time_s))
-    share = (error.correlated_sigma / noise_sigma(error, rate_hz)) ** 2
+    a = el.exp(-1.0 / (rate_hz * error.correlation_time_s))
+    share = el.square(error.correlated_sigma / noise_sigma(error, rate_hz))
     return 1.0 + share * 2.0 * a / (1.0 - a)
 
 
 def rotation_z(yaw: float) -> NDArray[np.float64]:
     """Return Rz(yaw), (3, 3)."""
-    c, s = math.cos(yaw), math.sin(yaw)
+    c, s = el.cos(yaw), el.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 

@@ -19,6 +19,7 @@ import math
 
 import numpy as np
 
+from zsim.math import elementary as el
 from zsim.math.compiled import inlined, portable
 from zsim.math.rotation import (
     Matrix,
@@ -75,7 +76,7 @@ GYRO_MAX_RAD_S = 100.0  # rad/s, 5700 deg/s: likewise
 MANOEUVRE_M_S2 = 0.3  # m/s^2, standard deviation of the acceleration in gusts of 0.5 m/s (0.16) and in transit
 MANOEUVRE_S = 0.5  # s, its correlation time
 LOST_TURN_RAD_S = 0.5  # rad/s, standard deviation of the rate during a missing gyroscope sample
-COAST_TURN_DENSITY = LOST_TURN_RAD_S**2 * 2.0 * MANOEUVRE_S  # rad^2/s
+COAST_TURN_DENSITY = el.square(LOST_TURN_RAD_S) * 2.0 * MANOEUVRE_S  # rad^2/s
 COAST_VELOCITY_DENSITY = 1.0  # m^2/s^3: 1 m/s after 1 s without an IMU
 
 

@@ -11,6 +11,7 @@ import math
 import operator
 from collections.abc import Callable, Mapping
 
+from zsim.math import elementary as el
 from zsim.scenario.scenario import CONSTANTS_MAX
 
 Dual = tuple[float, float]
@@ -159,11 +160,17 @@ def _divide(a: Dual, b: Dual) -> Dual:
     return value, (a[1] - value * b[1]) / b[0]
 
 
+def _in_domain(value: float) -> float:
+    if not math.isfinite(value):  # before min or max could pass over it
+        raise ValueError("outside of the domain of a function")
+    return value
+
+
 def _power(a: Dual, b: Dual) -> Dual:
     base, exponent = a[0], b[0]
-    value = math.pow(base, exponent)
-    rate = exponent * math.pow(base, exponent - 1) * a[1] if exponent and a[1] else 0.0
-    return value, rate + value * math.log(base) * b[1] if b[1] else rate
+    value = _in_domain(el.power(base, exponent))
+    rate = exponent * el.power(base, exponent - 1) * a[1] if exponent and a[1] else 0.0
+    return value, rate + value * el.log(base) * b[1] if b[1] else rate
 
 
 def _unary(
@@ -172,7 +179,7 @@ def _unary(
     """Return a function of a dual number; `rate_of` takes argument, value and a rate of the argument that is not 0."""
 
     def apply(a: Dual) -> Dual:
-        value = function(a[0])
+        value = _in_domain(function(a[0]))
         return value, rate_of(a[0], value, a[1]) if a[1] else 0.0
 
     return apply
@@ -190,15 +197,15 @@ _UNARY: dict[type[ast.unaryop], Callable[[Dual], Dual]] = {
     ast.UAdd: _unary(operator.pos, lambda x, y, rate: rate),
 }
 _FUNCTIONS: dict[str, tuple[Callable[..., Dual], int, int]] = {  # with the least and greatest number of arguments
-    "sin": (_unary(math.sin, lambda x, y, rate: math.cos(x) * rate), 1, 1),
-    "cos": (_unary(math.cos, lambda x, y, rate: -math.sin(x) * rate), 1, 1),
-    "tan": (_unary(math.tan, lambda x, y, rate: (1 + y * y) * rate), 1, 1),
-    "asin": (_unary(math.asin, lambda x, y, rate: rate / math.sqrt(1 - x * x)), 1, 1),
-    "acos": (_unary(math.acos, lambda x, y, rate: -rate / math.sqrt(1 - x * x)), 1, 1),
-    "atan": (_unary(math.atan, lambda x, y, rate: rate / (1 + x * x)), 1, 1),
+    "sin": (_unary(el.sin, lambda x, y, rate: el.cos(x) * rate), 1, 1),
+    "cos": (_unary(el.cos, lambda x, y, rate: -el.sin(x) * rate), 1, 1),
+    "tan": (_unary(el.tan, lambda x, y, rate: (1 + y * y) * rate), 1, 1),
+    "asin": (_unary(el.asin, lambda x, y, rate: rate / math.sqrt(1 - x * x)), 1, 1),
+    "acos": (_unary(el.acos, lambda x, y, rate: -rate / math.sqrt(1 - x * x)), 1, 1),
+    "atan": (_unary(el.atan, lambda x, y, rate: rate / (1 + x * x)), 1, 1),
     "sqrt": (_unary(math.sqrt, lambda x, y, rate: rate / (2 * y)), 1, 1),
-    "exp": (_unary(math.exp, lambda x, y, rate: y * rate), 1, 1),
-    "log": (_unary(math.log, lambda x, y, rate: rate / x), 1, 1),
+    "exp": (_unary(el.exp, lambda x, y, rate: y * rate), 1, 1),
+    "log": (_unary(el.log, lambda x, y, rate: rate / x), 1, 1),
     "abs": (_unary(abs, lambda x, y, rate: math.copysign(1.0, x) * rate if x else 0.0), 1, 1),
     "min": (lambda *parts: min(parts, key=lambda part: part[0]), 2, 16),
     "max": (lambda *parts: max(parts, key=lambda part: part[0]), 2, 16),

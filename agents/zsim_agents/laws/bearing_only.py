@@ -15,6 +15,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import ArrayLike
 
+from zsim.math import elementary as el
 from zsim.scenario.scenario import Scenario
 from zsim_agents.laws.pilot import Array, Sight, added, total, unit
 from zsim_agents.laws.shape import ShapeParameters, ShapePilot
@@ -38,8 +39,8 @@ def bearing_rigidity_matrix(p: ArrayLike, edges: list[tuple[int, int]]) -> Array
     R = np.zeros((len(edges), d, n, d))
     for row, (i, j) in enumerate(edges):
         z = places[j] - places[i]
-        size = float(np.sqrt(z @ z))
-        P = (np.eye(d) - np.outer(z, z) / size**2) / size
+        size = el.length(z.tolist())
+        P = (np.eye(d) - np.outer(z, z) / (size * size)) / size
         R[row, :, j], R[row, :, i] = P, -P
     return R.reshape(len(edges) * d, n * d)
 

@@ -51,5 +51,5 @@ class DistanceBased(ShapePilot):
 
     def velocity(self, now: Sight) -> Array:
         relative = [(z, total(c * c)) for z, c in self.relative(now)]
-        mean = sum(squared for _, squared in relative) / max(len(relative), 1)
+        mean = total(np.array([squared for _, squared in relative])) / max(len(relative), 1)
         return distance_based(relative, self.parameters.gain_1_s / max(mean, 1e-6)) + self.tied(now)

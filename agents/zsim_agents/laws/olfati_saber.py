@@ -17,6 +17,7 @@ import numpy as np
 from msgspec import Meta
 
 from zsim.contract.snapshot import State
+from zsim.math import elementary as el
 from zsim.scenario.scenario import Scenario
 from zsim.schema.quantities import NonNegative, Positive
 from zsim_agents.laws.pilot import Array, Heard, Pilot, PilotParameters, Sight, limited, total
@@ -44,7 +45,7 @@ def bump(z: float, h: float) -> float:
     """Return rho_h(z): 1 up to h, falling smoothly to 0 at 1."""
     if not 0.0 <= z <= 1.0:
         return 0.0
-    return 1.0 if z < h else 0.5 * (1.0 + math.cos(math.pi * (z - h) / (1.0 - h)))
+    return 1.0 if z < h else 0.5 * (1.0 + el.cos(math.pi * (z - h) / (1.0 - h)))
 
 
 def phi(z: float) -> float:

@@ -252,7 +252,10 @@ def triple(v: Array) -> tuple[float, float, float]:
 
 def total(numbers: Array) -> float:
     """Return the sum of numbers from the first to the last."""
-    return float(sum(numbers.tolist()))
+    result = 0.0
+    for number in numbers.tolist():  # Python's sum() differs between versions
+        result += number
+    return result
 
 
 def added(terms: Sequence[Array], size: int = 2) -> Array:

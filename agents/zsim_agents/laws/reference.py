@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.math import elementary as el
 from zsim_agents.formation.expression import Expression
 
 Array = NDArray[np.float64]
@@ -59,7 +60,7 @@ class FormationReference:
         if since_s < 0.0:
             vx = vy = turn_deg_s = s_dot = 0.0
         psi, w = math.radians(psi_deg), math.radians(turn_deg_s)
-        c, sn = math.cos(psi), math.sin(psi)
+        c, sn = el.cos(psi), el.sin(psi)
         turn = np.array([[s * c, -s * sn], [s * sn, s * c]])
         turn_rate = np.array([[s_dot * c - s * w * sn, -s_dot * sn - s * w * c],
                               [s_dot * sn + s * w * c, s_dot * c - s * w * sn]])  # fmt: skip
@@ -74,4 +75,4 @@ def turned(matrix: Array, c: Array) -> Array:
 def polygon(count: int, radius_m: float) -> Array:
     """Return the corners (count, 2) of a regular polygon about the origin, the first one on the x axis [m]."""
     angles = [2 * math.pi * i / count for i in range(count)]
-    return radius_m * np.array([[math.cos(angle), math.sin(angle)] for angle in angles])
+    return radius_m * np.array([[el.cos(angle), el.sin(angle)] for angle in angles])

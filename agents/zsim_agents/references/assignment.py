@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.math import elementary as el
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.formation.trajectory import Reference
 from zsim_agents.references.path import peaks_of
@@ -75,7 +76,7 @@ def first_approach(paths: Sequence[Reference], least_m: Array, until_s: float) -
     if len(paths) < 2:
         return None
     peaks = [peaks_of(path) for path in paths]
-    speed = np.array([math.hypot(each.speed_m_s, each.climb_m_s) for each in peaks])
+    speed = np.array([el.hypot(each.speed_m_s, each.climb_m_s) for each in peaks])
     steps = max(2, math.ceil(until_s / STEP_S) + 1)
     times = np.linspace(0.0, until_s, steps).tolist()
     places = np.array([[path.value(t)[0][:3] for path in paths] for t in times])
@@ -96,7 +97,7 @@ def _nearer(
     """Return the first distance below least_m that is found between two instants, and when; None: there is none."""
 
     def apart(t_s: float) -> float:
-        return float(np.linalg.norm(a.value(t_s)[0][:3] - b.value(t_s)[0][:3]))
+        return el.distance(a.value(t_s)[0][:3].tolist(), b.value(t_s)[0][:3].tolist())
 
     open_ = [(from_s, apart(from_s), to_s, apart(to_s))]
     while open_:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import ReferencePhase
 from zsim.errors import DocumentError, NotTrustedError, RunError
+from zsim.math import elementary as el
 from zsim.scenario.scenario import STAGES_MAX, Drone, DroneReference, Exchange, PathPoint, Piloted, Scenario
 from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_agents.formation.expression import ExpressionError
@@ -128,7 +129,7 @@ class Flight:
 def limits_of(drone: Drone, gravity_m_s2: float) -> PathLimits:
     """Return what a path may ask of a drone at most: the limits of its firmware, its tilt as an acceleration."""
     own = drone.limits
-    accel = gravity_m_s2 * math.tan(math.radians(own.tilt_deg))
+    accel = gravity_m_s2 * el.tan(math.radians(own.tilt_deg))
     return PathLimits(own.horizontal_speed_m_s, own.vertical_speed_m_s, math.radians(own.yaw_rate_deg_s), accel)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from zsim.math import elementary as el
 from zsim_agents.formation.spaces.cluster_space import Array
 
 RAMP = 0.25  # of a lap's time, in which the speed along the curve rises from rest, and falls again; chosen
@@ -19,7 +20,7 @@ def circle(radius_m: float, climb_m: float = 0.0) -> Curve:
     """Return a circle around the origin, from (radius, 0) counter-clockwise; it climbs so much in a lap."""
 
     def at(angle: float) -> tuple[Array, Array]:
-        c, s, rise = radius_m * math.cos(angle), radius_m * math.sin(angle), climb_m / math.tau
+        c, s, rise = radius_m * el.cos(angle), radius_m * el.sin(angle), climb_m / math.tau
         return np.array([c, s, rise * angle, 0.0]), np.array([-s, c, rise, 0.0])
 
     return at
@@ -30,8 +31,8 @@ def figure_eight(length_m: float, width_m: float) -> Curve:
 
     def at(angle: float) -> tuple[Array, Array]:
         x, y = length_m / 2.0, width_m / 2.0
-        place = np.array([x * math.sin(angle), y * math.sin(2.0 * angle), 0.0, 0.0])
-        return place, np.array([x * math.cos(angle), 2.0 * y * math.cos(2.0 * angle), 0.0, 0.0])
+        place = np.array([x * el.sin(angle), y * el.sin(2.0 * angle), 0.0, 0.0])
+        return place, np.array([x * el.cos(angle), 2.0 * y * el.cos(2.0 * angle), 0.0, 0.0])
 
     return at
 
@@ -64,5 +65,5 @@ class Laps:
         s = t / self._ramp_s
         if s >= 1.0:
             return self._rate * (t - 0.5 * self._ramp_s), self._rate
-        rate = self._rate * s**3 * (10.0 - s * (15.0 - 6.0 * s))
-        return self._rate * self._ramp_s * s**4 * (2.5 - s * (3.0 - s)), rate
+        rate = self._rate * s * s * s * (10.0 - s * (15.0 - 6.0 * s))
+        return self._rate * self._ramp_s * s * s * s * s * (2.5 - s * (3.0 - s)), rate

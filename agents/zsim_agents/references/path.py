@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial import polynomial
 
+from zsim.math import elementary as el
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.formation.trajectory import Reference, TrajectoryError
 
@@ -221,7 +222,7 @@ def peaks_of(path: Reference) -> Peaks:
         rate = path.value(t_s)[1]
         before, after = max(0.0, t_s - DIFFERENCE_S), min(end_s, t_s + DIFFERENCE_S)
         accel = (path.value(after)[1] - path.value(before)[1]) / max(after - before, STILL)
-        return np.array([math.hypot(*rate[:2]), abs(rate[2]), abs(rate[3]), math.hypot(*accel[:2])])
+        return np.array([el.length(rate[:2]), abs(rate[2]), abs(rate[3]), el.length(accel[:2])])
 
     table = np.array([quantities(t_s) for t_s in times.tolist()])
     found = [_refined(lambda t, k=k: float(quantities(t)[k]), times, table[:, k]) for k in range(4)]

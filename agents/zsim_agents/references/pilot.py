@@ -15,6 +15,7 @@ from zsim.contract import flight_messages, keys, messages
 from zsim.contract.flight_messages import Estimate, Mode, ReferencePhase, Status, Velocity
 from zsim.contract.run_messages import ClusterRequest, ControlAnswer, ControlRequest
 from zsim.contract.snapshot import State
+from zsim.math import elementary as el
 from zsim.runtime.agent import Agent, Output
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.flight_check import AGE_MAX_S, AIRBORNE, RESEND_S
@@ -123,7 +124,7 @@ class ReferencePilot(Agent):
             v + gain * (p - (at + moving * age_s))
             for v, p, (at, moving) in zip(ahead[:3].tolist(), place[:3].tolist(), here, strict=True)
         )
-        speed = math.hypot(x, y)
+        speed = el.hypot(x, y)
         share = min(1.0, own.speed_m_s / speed) if speed else 1.0
         turn = float(ahead[3]) + K_YAW_1_S * math.remainder(float(place[3]) - estimate.yaw_rad, math.tau)
         most = own.yaw_rate_rad_s

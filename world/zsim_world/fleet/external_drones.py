@@ -4,7 +4,6 @@ A driver publishes a pose for a gate now and then. Between two poses the drone m
 as a pose is trusted; then it stands still.
 """
 
-import math
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -19,6 +18,7 @@ from zsim.contract.flight_messages import (
     state_refusal,
     truth_fault,
 )
+from zsim.math import elementary as el
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.physics.fleet_arrays import STATE, VEHICLE
 from zsim_world.run_state import Saved
@@ -67,7 +67,7 @@ class ExternalDrones:
             return fault
         row = np.empty(STATE.size + len(message.rotor_rad_s))
         row[STATE.p_WB : STATE.p_WB + 3], row[STATE.v_WB : STATE.v_WB + 3] = message.position_m, message.velocity_m_s
-        length = math.hypot(*message.orientation_wxyz)
+        length = el.length(message.orientation_wxyz)
         row[STATE.q_WB : STATE.q_WB + 4] = np.divide(message.orientation_wxyz, length)
         row[STATE.w_WB_B : STATE.w_WB_B + 3] = message.angular_velocity_rad_s
         most = self._fleet.bodies.vehicle.item(i, VEHICLE.rotor_max)

@@ -6,9 +6,10 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
 
 from zsim.contract.run_messages import Fault
+from zsim.math import elementary as el
+from zsim.math.distributions import normal_probability, normal_quantile
 from zsim.scenario.faults import sensor_parts
 from zsim.vehicles.vehicle import Vehicle
 from zsim_world.physics.air import WIND
@@ -116,7 +117,7 @@ def dropped(limit: float, probability: float) -> float:
     """Return the standard normal number below which a sample is lost, where `limit` is that without the fault."""
     if probability == 1.0:
         return math.inf
-    return float(ndtri(1.0 - (1.0 - ndtr(limit)) * (1.0 - probability)))
+    return normal_quantile(1.0 - (1.0 - normal_probability(limit)) * (1.0 - probability))
 
 
 def gust_m_s(fault: Fault, t_ns: int) -> NDArray[np.float64]:
@@ -126,4 +127,4 @@ def gust_m_s(fault: Fault, t_ns: int) -> NDArray[np.float64]:
     """
     assert fault.until_ns is not None  # a gust always has a length
     phase = 2.0 * math.pi * (t_ns - fault.from_ns) / (fault.until_ns - fault.from_ns)
-    return 0.5 * (1.0 - math.cos(phase)) * np.array(fault.parameters["velocity_m_s"])
+    return 0.5 * (1.0 - el.cos(phase)) * np.array(fault.parameters["velocity_m_s"])

@@ -19,6 +19,8 @@ from zsim.contract.flight_messages import DroneState, state_refusal
 from zsim.contract.keys import SIGHTINGS
 from zsim.contract.messages import RotorInfo
 from zsim.errors import RunError
+from zsim.math import elementary as el
+from zsim.math import linear
 from zsim.math.compiled import hold
 from zsim.math.frames import quaternion_from_heading, quaternion_from_rpy
 from zsim.scenario.scenario import Drone, Scenario
@@ -401,8 +403,8 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
         state[i, STATE.p_WB : STATE.p_WB + 3] = drone.position_m
         state[i, STATE.p_WB + 2] += row[i, VEHICLE.stand_height]
         state[i, STATE.q_WB : STATE.q_WB + 4] = quaternion_from_heading(yaw)
-        turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
-        anchor[i] = np.array(drone.position_m[:2]) + contact_points(row[i])[:, :2] @ turn.T
+        turn = np.array([[el.cos(yaw), -el.sin(yaw)], [el.sin(yaw), el.cos(yaw)]])
+        anchor[i] = np.array(drone.position_m[:2]) + linear.product(contact_points(row[i])[:, :2], turn.T)
     aero = np.array([aero_row(drone, scenario.environment) for drone in drones])
     external = np.array([i for i, drone in enumerate(drones) if drone.is_external], dtype=np.int64)
     pairs = np.zeros((n * (n - 1) // 2, 2), dtype=np.int32)  # yet to be found, since no drone is at its origin
@@ -499,6 +501,6 @@ def _calibration(drone: Drone, scenario: Scenario) -> np.ndarray:
     board[CALIBRATION.imu_turn : CALIBRATION.imu_turn + 4] = quaternion_from_rpy(np.radians(imu.rpy_deg))
     board[CALIBRATION.mag_turn : CALIBRATION.mag_turn + 4] = quaternion_from_rpy(np.radians(mag.rpy_deg))
     compass = sensor_set.has_compass(drone.sensors.mag, field)
-    board[CALIBRATION.mag_bearing] = math.atan2(field[1], field[0]) if compass else math.nan
+    board[CALIBRATION.mag_bearing] = el.atan2(field[1], field[0]) if compass else math.nan
     board[CALIBRATION.sonar_min] = drone.sensors.sonar.min_m
     return board

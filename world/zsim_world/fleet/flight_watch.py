@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.math import elementary as el
 from zsim.math.compiled import Field, columns, inlined
 from zsim.math.rotation import add, rotate
 from zsim.schema.quantities import G_M_S2
@@ -91,7 +92,7 @@ class FlightWatch:
     def _own_mode(self, i: int, name: str) -> Incident:
         """Return the mode that the firmware of a drone has entered by itself, with the reason."""
         if self._boards.memory[i, MEMORY.mode] == EMERGENCY:
-            tilt_deg = math.degrees(math.acos(self._boards.setting[i, SETTING.tilt_cut]))
+            tilt_deg = math.degrees(el.acos(self._boards.setting[i, SETTING.tilt_cut]))
             text = f"{name} stops its rotors: it finds itself tilted by more than {tilt_deg:.0f} deg"
             return Incident(i, "emergency", text, {"cause": "tilt"})
         charge = 100.0 * float(self._bodies.energy[i] / self._bodies.vehicle[i, VEHICLE.capacity])

@@ -5,6 +5,7 @@ from msgspec import UNSET
 from numpy.typing import NDArray
 
 from zsim.contract.run_messages import RadioLinks
+from zsim.math import elementary as el
 from zsim.math.compiled import kernel
 from zsim.scenario.scenario import RECEPTION_MIN, Radio, Scenario, Topology
 from zsim_world.physics.surfaces import nearest, obstacle_rows
@@ -51,7 +52,7 @@ class RadioChannel:
             hears[:n, :n] &= distance_m[:n, :n] <= topology.within_m
         if radio.range_m is not None and radio.spread_m:
             exponent = np.minimum((distance_m - radio.range_m) / radio.spread_m, 700.0)  # exp(700) is finite
-            reception = 1.0 / (1.0 + np.exp(exponent))
+            reception = 1.0 / (1.0 + el.elementwise(el.exp)(exponent))
             hears &= reception >= RECEPTION_MIN
         elif radio.range_m is not None:
             hears &= distance_m <= radio.range_m

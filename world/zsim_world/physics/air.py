@@ -4,6 +4,7 @@ import math
 
 from numpy.typing import NDArray
 
+from zsim.math import elementary as el
 from zsim.math.compiled import Field, columns, inlined
 from zsim.math.rotation import Vector
 from zsim_world.physics.fleet_arrays import Row
@@ -28,7 +29,7 @@ def gust_decay(length_m: float, airspeed_m_s: float, speed_min_m_s: float, dt: f
 
     MIL-HDBK-1797, longitudinal: S(w) = 2 sigma^2 tau / (1 + (tau w)^2), the spectrum of a first-order filter.
     """
-    return math.exp(-dt * max(airspeed_m_s, speed_min_m_s) / length_m)
+    return el.exp(-dt * max(airspeed_m_s, speed_min_m_s) / length_m)
 
 
 @inlined
@@ -80,4 +81,4 @@ def downwash(thrust_n: float, density: float, start_m: float, below_m: float, as
     disc = math.pi * start_m * start_m
     core = 2.0 * math.sqrt(thrust_n / (2.0 * density * disc)) * start_m / width
     ratio = aside_m / width
-    return core * math.exp(-ratio * ratio)
+    return core * el.exp(-ratio * ratio)

@@ -15,6 +15,7 @@ import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
 
+from zsim.math import elementary as el
 from zsim.math.compiled import Field, columns, inlined
 from zsim.scenario.scenario import Drone, Environment
 from zsim.schema.quantities import COULOMB_PER_MAH, SEA_LEVEL_KG_M3
@@ -282,7 +283,7 @@ def vehicle_row(vehicle: Vehicle, drone: Drone, environment: Environment) -> NDA
     row[VEHICLE.rotor_min], row[VEHICLE.rotor_max] = drone.rotor_min_rad_s, drone.rotor_max_rad_s
     row[VEHICLE.drag] = drone.drag_n_s_m * density
     row[VEHICLE.gravity], row[VEHICLE.air_density] = environment.gravity_m_s2, environment.air_density_kg_m3
-    row[VEHICLE.rotor_radius] = vehicle.rotor_radius_m * (drone.thrust_n_s2 / vehicle.thrust_n_s2) ** 0.25
+    row[VEHICLE.rotor_radius] = vehicle.rotor_radius_m * math.sqrt(math.sqrt(drone.thrust_n_s2 / vehicle.thrust_n_s2))
     row[VEHICLE.rotor_inertia] = vehicle.rotor_inertia_kg_m2 * drone.torque_nm_s2 / vehicle.torque_nm_s2
     row[VEHICLE.rotor_share] = 1.0 / len(vehicle.rotors)
     row[VEHICLE.jet_start] = math.sqrt(len(vehicle.rotors)) * row[VEHICLE.rotor_radius]
@@ -296,7 +297,7 @@ def vehicle_row(vehicle: Vehicle, drone: Drone, environment: Environment) -> NDA
     row[VEHICLE.friction] = frame.friction
     reduced = drone.mass_kg / 2.0
     row[VEHICLE.hull_radius] = size * frame.hull_radius_m
-    row[VEHICLE.hull_stiffness] = reduced * frame.hull_frequency_rad_s**2
+    row[VEHICLE.hull_stiffness] = reduced * el.square(frame.hull_frequency_rad_s)
     row[VEHICLE.hull_damping] = 2.0 * frame.hull_damping_ratio * reduced * frame.hull_frequency_rad_s
     row[VEHICLE.capacity] = drone.battery_mah * COULOMB_PER_MAH * vehicle.battery.voltage_v
     row[VEHICLE.efficiency], row[VEHICLE.electronics] = vehicle.battery.efficiency, vehicle.battery.electronics_w

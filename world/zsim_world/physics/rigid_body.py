@@ -9,6 +9,7 @@ import math
 
 from numpy.typing import NDArray
 
+from zsim.math import elementary as el
 from zsim.math import rotation as rot
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, add, axpy, rotate
@@ -194,7 +195,7 @@ def lag(speeds: PerRotor, commands: PerRotor, decay: float) -> None:
 @inlined
 def half_decay(lag_s: float, dt: float) -> float:
     """Return the fraction of a rotor's distance to its commanded speed that is left after half a step."""
-    return math.exp(-0.5 * dt / lag_s)
+    return el.exp(-0.5 * dt / lag_s)
 
 
 @inlined

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.math import elementary as el
 from zsim.math.compiled import inlined, noinline
 from zsim.math.rotation import Quaternion, Vector, add, axpy, cross, dot, norm, rotate, rotate_back, scaled, subtract
 from zsim.scenario import obstacle
@@ -105,8 +106,8 @@ FEET = 4  # the first of the contact points
 SLOTS_MAX = 8  # solids in reach of one drone at a time, chosen: as many boxes as meet in a corner
 LOOK_S = 0.01  # s, two of the longest steps: what a drone reaches within it is in its reach
 _ANGLES = [2.0 * math.pi * (k + 0.5) / HULL_BALLS for k in range(HULL_BALLS)]
-_COSINES = (*(math.cos(angle) for angle in _ANGLES), 0.0)  # of the hull balls, in units of the hull's middle line
-_SINES = (*(math.sin(angle) for angle in _ANGLES), 0.0)
+_COSINES = (*(el.cos(angle) for angle in _ANGLES), 0.0)  # of the hull balls, in units of the hull's middle line
+_SINES = (*(el.sin(angle) for angle in _ANGLES), 0.0)
 
 nearest: Any = inlined(obstacle.nearest)
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from numpy.typing import NDArray
 
+from zsim.math import elementary as el
 from zsim.math.compiled import inlined, kernel
 from zsim.math.rotation import Quaternion, Vector, add, cross, heading, rotate, rotate_back, z_axis
 from zsim_world.sensors.sensor_set import ARMED, CHANNELS_MAX, CONFIG, FAULT, HOLDING
@@ -97,7 +98,7 @@ def pressure(altitude_m: float) -> float:
     The law holds to 11 km, the limit of scenarios; a drone carried beyond by the wind gets the same law, and a vacuum
     where that ends, at 44 km.
     """
-    return SEA_LEVEL_PA * math.pow(max(1.0 - LAPSE_1_M * altitude_m, 0.0), PRESSURE_EXPONENT)
+    return SEA_LEVEL_PA * el.power(max(1.0 - LAPSE_1_M * altitude_m, 0.0), PRESSURE_EXPONENT)
 
 
 @inlined
@@ -122,7 +123,7 @@ def flow(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
     """
     v = sensor_velocity(x, s)
     psi = heading(x.q_WB)
-    cos, sin = math.cos(psi), math.sin(psi)
+    cos, sin = el.cos(psi), el.sin(psi)
     quality = max(z_axis(x.q_WB)[2], 0.0)
     return (cos * v[0] + sin * v[1], cos * v[1] - sin * v[0], v[2]), (quality, 0.0, 0.0)
 

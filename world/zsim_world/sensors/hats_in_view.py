@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.math import elementary as el
 from zsim.math.compiled import Field, columns, inlined, kernel
 from zsim.math.rotation import (
     Quaternion,
@@ -54,7 +55,7 @@ CAMERA = columns(  # as mounted on a drone
 AHEAD_MIN = 0.05  # cosine to the axis; flatter rays never fall on a picture of 150 deg
 RIM_WIDE, RIM_HIGH = 1.15, 0.14  # radius and height of the rotors' rim, in radii of a hull; fitted to pictures
 POINTS = 32  # of its edge, that are looked at
-COSINES, SINES = (np.array([f(2.0 * math.pi * k / POINTS) for k in range(POINTS)]) for f in (math.cos, math.sin))
+COSINES, SINES = (np.array([f(2.0 * math.pi * k / POINTS) for k in range(POINTS)]) for f in (el.cos, el.sin))
 LEVEL_COSINE = 0.9  # of a ray that is not nearly upright
 SHARE_MIN = 0.3  # of its edge; of a ball with less in view a detector does not know the circle
 SURFACE_M = 0.01  # m, nearer than which a ray has met an obstacle
@@ -288,7 +289,7 @@ def hats_in_view(
         to_K = rotate_back(camera.q_BK, rotate_back(q_WB, to_W))
         if away <= diameter:
             continue
-        angle = 2.0 * math.asin(0.5 * diameter / away)
+        angle = 2.0 * el.asin(0.5 * diameter / away)
         if not _in_picture(camera.lens, to_K, angle):
             continue
         ray = scaled(to_W, 1.0 / away)

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.math import elementary as el
 from zsim.math.compiled import Field, columns, inlined, kernel
 from zsim.math.random_streams import stream
 from zsim.scenario.scenario import Scenario
@@ -136,7 +137,7 @@ def _read_tables() -> Ziggurat:
         near = round(width[layer - 1] / width[layer] * _SIZES)
         sizes = range(near - _ROUNDING, near + _ROUNDING)
         inside[layer] = sizes[bisect_left(sizes, True, key=lambda size, at=layer: not _drawn(rng, at, size)[1])]
-    height = np.array([1.0, *(math.exp(-0.5 * (x * _SIZES) ** 2) for x in width[1:].tolist())])
+    height = np.array([1.0, *(el.exp(-0.5 * el.square(x * _SIZES)) for x in width[1:].tolist())])
     return Ziggurat(width, inside, height)
 
 
@@ -194,7 +195,7 @@ def fill(out: NDArray, stream: NDArray) -> None:
         elif not kept:
             state = _advanced(state, step)
             above, here = _HEIGHT[layer - _ONE], _HEIGHT[layer]
-            kept = (above - here) * _unit(state) + here < math.exp(-0.5 * x * x)
+            kept = (above - here) * _unit(state) + here < el.exp(-0.5 * x * x)
         if kept:
             out[drawn] = x
             drawn += 1
@@ -237,8 +238,8 @@ def _tail(state: _Words, step: _Words, negative: bool) -> tuple[float, _Words]:
     """Return a number beyond the lowest layer, and the state after it."""
     while True:
         state = _advanced(state, step)
-        across = -_TAIL_INVERSE * math.log1p(-_unit(state))
+        across = -_TAIL_INVERSE * el.log1p(-_unit(state))
         state = _advanced(state, step)
-        up = -math.log1p(-_unit(state))
+        up = -el.log1p(-_unit(state))
         if up + up > across * across:
             return (-(_TAIL + across) if negative else _TAIL + across), state

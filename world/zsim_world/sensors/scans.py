@@ -11,10 +11,11 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from zsim.contract.messages import Depth, Lidar, Range
+from zsim.math import elementary as el
 from zsim.math.compiled import Field, Held, columns, hold, inlined, kernel
+from zsim.math.distributions import normal_quantile
 from zsim.math.frames import quaternion_from_rpy, rotation_matrix
 from zsim.math.random_streams import stream
 from zsim.math.rotation import add, dot, matrix, product, subtract
@@ -191,10 +192,7 @@ def _rays(directions_B: Array, share: Array | float = 1.0) -> Array:
 
 def _beams(i: int, name: str, settings: RangeConfig, p_BS: Array, R_BS: Array) -> Mounted:
     half, turn = math.radians(0.5 * settings.cone_deg), 2.0 * math.pi / CONE_RAYS
-    rim = [
-        (math.cos(half), math.sin(half) * math.cos(k * turn), math.sin(half) * math.sin(k * turn))
-        for k in range(CONE_RAYS)
-    ]
+    rim = [(el.cos(half), el.sin(half) * el.cos(k * turn), el.sin(half) * el.sin(k * turn)) for k in range(CONE_RAYS)]
     cone = np.array([(1.0, 0.0, 0.0), *(rim if half else ())])
     names = sorted(settings.beams)  # the resolved text is sorted too
     poses = [_pose(settings.beams[beam]) for beam in names]
@@ -240,7 +238,7 @@ def _fill_row(row: Array, mounted: Mounted, first: int, origin: int, rng: np.ran
     row[SCANNER.min], row[SCANNER.max], row[SCANNER.quantum] = own.min_m, own.max_m, own.quantum_m
     row[SCANNER.noise], row[SCANNER.share], row[SCANNER.square] = own.noise_m, own.noise_share, own.noise_1_m
     row[SCANNER.bias] = own.bias_m * rng.standard_normal()
-    row[SCANNER.miss], row[SCANNER.drop] = ndtri(own.miss), ndtri(own.dropout)
+    row[SCANNER.miss], row[SCANNER.drop] = normal_quantile(own.miss), normal_quantile(own.dropout)
 
 
 @kernel()

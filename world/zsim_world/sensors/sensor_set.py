@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
+from zsim.math import elementary as el
 from zsim.math.compiled import Field, columns
+from zsim.math.distributions import normal_quantile
 from zsim.math.frames import quaternion_from_rpy
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor import VALUES_MAX, ErrorModel, Sensor, SensorType, noise_sigma
@@ -102,12 +103,12 @@ def config(sensors: FleetSensors) -> NDArray[np.float64]:
                 row[CONFIG.walk + k] = model.bias_walk / math.sqrt(rate)
                 row[CONFIG.quantum + k] = model.quantum
                 if sigma := model.correlated_sigma:  # exact: Brown and Hwang, "Random signals", section 5.3
-                    decay = math.exp(-1.0 / (rate * model.correlation_time_s))
+                    decay = el.exp(-1.0 / (rate * model.correlation_time_s))
                     row[CONFIG.correlated], row[CONFIG.decay + k] = 1.0, decay
                     row[CONFIG.kick + k] = sigma * math.sqrt(1.0 - decay * decay)
             row[CONFIG.p_BS : CONFIG.p_BS + 3] = settings.mount.position_m
             row[CONFIG.q_BS : CONFIG.q_BS + 4] = quaternion_from_rpy(np.radians(settings.mount.rpy_deg))
-            row[CONFIG.drop] = ndtri(settings.dropout)
+            row[CONFIG.drop] = normal_quantile(settings.dropout)
             if isinstance(settings, SonarConfig):
                 row[CONFIG.limit_min], row[CONFIG.limit_max] = settings.min_m, settings.max_m
     return table
@@ -153,11 +154,11 @@ def samples_per_gate(sensors: FleetSensors, gate_ms: float) -> int:
 def heading_sigma(mag: MagConfig, horizontal_ut: float) -> float:
     """Return the standard deviation [rad] of a heading from one magnetometer sample, from the sideways field."""
     model = mag.field_ut
-    sideways_ut = math.hypot(noise_sigma(model, mag.rate_hz), model.quantum / math.sqrt(12.0))
+    sideways_ut = el.hypot(noise_sigma(model, mag.rate_hz), model.quantum / math.sqrt(12.0))
     return sideways_ut / max(horizontal_ut, FIELD_MIN_UT)
 
 
 def has_compass(mag: MagConfig, field_ut: Sequence[float]) -> bool:
     """Return whether a magnetometer gives a heading in the magnetic field of the place [uT; W]."""
-    horizontal_ut = math.hypot(*field_ut[:2])
+    horizontal_ut = el.length(field_ut[:2])
     return horizontal_ut >= FIELD_MIN_UT and heading_sigma(mag, horizontal_ut) <= HEADING_SIGMA_MAX_RAD

@@ -16,7 +16,11 @@ from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import Seen, Sightings
 from zsim.contract.keys import SIGHTINGS
+from zsim.math import elementary as el
+from zsim.math import linear
+from zsim.math import rotation as rot
 from zsim.math.compiled import Field, Held, columns, compiled, hold, inlined, kernel
+from zsim.math.distributions import normal_probability
 from zsim.math.random_streams import stream
 from zsim.math.rotation import Vector
 from zsim.scenario.obstacle import COLUMNS, row_of
@@ -149,23 +153,16 @@ def _detector(camera: Camera, model: SightingModel, hats: Hats, light: float, rn
     """Return the row of a detector; its camera's misalignment is drawn first from its stream."""
     row = np.zeros(DETECTOR.size)
     misaligned_rad = math.radians(model.misalignment_deg)
-    R_BK = camera_pose(camera).R_BK @ _turned(misaligned_rad * rng.standard_normal(3))
+    turn = rot.matrix(rot.from_rotation_vector(tuple((misaligned_rad * rng.standard_normal(3)).tolist())))
+    R_BK = linear.product(camera_pose(camera).R_BK, turn)
     row[DETECTOR.R_BK : DETECTOR.R_BK + 9] = R_BK.ravel()
     row[DETECTOR.misaligned], row[DETECTOR.radius] = misaligned_rad, 0.5 * hats.diameter_m
     row[DETECTOR.exposure] = camera.exposure_ms * 1e-3
     row[DETECTOR.centre], row[DETECTOR.diameter] = model.centre_px, model.diameter_px
-    row[DETECTOR.noise] = model.noise_px2 * math.hypot(1.0, NOISY_LIGHT / light) / math.hypot(1.0, NOISY_LIGHT)
+    row[DETECTOR.noise] = model.noise_px2 * el.hypot(1.0, NOISY_LIGHT / light) / el.hypot(1.0, NOISY_LIGHT)
     row[DETECTOR.blur_share], row[DETECTOR.diameter_min] = model.blur_share, model.diameter_min_px
     row[DETECTOR.miss], row[DETECTOR.false] = model.miss, model.false_hz / camera.rate_hz
     return row
-
-
-def _turned(r: Array) -> Array:
-    """Return the rotation matrix of a small rotation vector [rad], to second order."""
-    x, y, z = r.tolist()
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    U, _, Vt = np.linalg.svd(np.eye(3) + K)
-    return U @ Vt
 
 
 @kernel()
@@ -238,7 +235,7 @@ SMALLEST = 0.1  # of a hat's apparent diameter, the least that is measured
 @inlined
 def _unit(normal: float) -> float:
     """Return a uniform number between 0 and 1 from a standard normal one."""
-    return 0.5 * math.erfc(normal / math.sqrt(2.0))
+    return normal_probability(-normal)
 
 
 @inlined
@@ -247,10 +244,10 @@ def _sigmas_px(model: NDArray, row: NDArray) -> tuple[float, float]:
     scale = row[VIEW.scale]
     noise = model[DETECTOR.noise] / (row[VIEW.angle] * scale)
     blur = model[DETECTOR.blur_share] * row[VIEW.rate] * model[DETECTOR.exposure] * scale
-    centre = row[VIEW.centre] * math.hypot(noise, blur)
+    centre = row[VIEW.centre] * el.hypot(noise, blur)
     hidden = 0.5 * (row[VIEW.radius] - 1.0)
-    diameter = math.hypot(row[VIEW.radius] * DIAMETER_NOISE * noise, (1.0 + hidden) * DIAMETER_BLUR * blur)
-    return math.hypot(model[DETECTOR.centre], centre), math.hypot(model[DETECTOR.diameter], diameter)
+    diameter = el.hypot(row[VIEW.radius] * DIAMETER_NOISE * noise, (1.0 + hidden) * DIAMETER_BLUR * blur)
+    return el.hypot(model[DETECTOR.centre], centre), el.hypot(model[DETECTOR.diameter], diameter)
 
 
 @inlined
@@ -266,7 +263,7 @@ def _put(model: NDArray, to_K: Vector, range_m: float, sigma: float, sigma_m: fl
 
 @inlined
 def _range_m(model: NDArray, angle: float) -> float:
-    return model[DETECTOR.radius] / math.sin(0.5 * min(angle, ANGLE_MAX))
+    return model[DETECTOR.radius] / el.sin(0.5 * min(angle, ANGLE_MAX))
 
 
 @inlined
@@ -279,11 +276,11 @@ def _see(model: NDArray, row: NDArray, noise: NDArray, out: NDArray) -> bool:
         return False
     measured = max(measured, SMALLEST * angle)
     x, y, z = row[VIEW.direction_K], row[VIEW.direction_K + 1], row[VIEW.direction_K + 2]
-    across = math.hypot(x, z)
+    across = el.hypot(x, z)
     a, b = centre_px / scale * noise[0], centre_px / scale * noise[1]
     to_K = (x + a * z / across - b * x * y / across, y + b * across, z - a * x / across - b * y * z / across)
     range_m = _range_m(model, measured)
-    sigma = math.hypot(centre_px / scale, model[DETECTOR.misaligned])
+    sigma = el.hypot(centre_px / scale, model[DETECTOR.misaligned])
     sigma_m = range_m * diameter_px / (scale * measured)
     _put(model, to_K, range_m, sigma, sigma_m, out)
     return True
@@ -297,7 +294,7 @@ def _see_nothing(model: NDArray, lens: Lens, noise: NDArray, out: NDArray) -> bo
     x, y = undistorted(lens, _unit(noise[1]) * lens.width - 0.5, _unit(noise[2]) * lens.height - 0.5)
     size_px = model[DETECTOR.diameter_min] * (1.0 + 2.0 * _unit(noise[3]))
     range_m = _range_m(model, size_px / lens.fx)
-    sigma = math.hypot(model[DETECTOR.centre] / lens.fx, model[DETECTOR.misaligned])
+    sigma = el.hypot(model[DETECTOR.centre] / lens.fx, model[DETECTOR.misaligned])
     _put(model, (x, y, 1.0), range_m, sigma, range_m * model[DETECTOR.diameter] / size_px, out)
     return True
 
@@ -308,7 +305,7 @@ def _sort(out: NDArray, first: int, end: int) -> None:
     for m in range(first + 1, end):
         for k in range(m, first, -1):
             a, b = out[k - 1], out[k]
-            if math.atan2(a[SEEN.direction_B + 1], a[SEEN.direction_B]) >= math.atan2(
+            if el.atan2(a[SEEN.direction_B + 1], a[SEEN.direction_B]) >= el.atan2(
                 b[SEEN.direction_B + 1], b[SEEN.direction_B]
             ):
                 break

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import DroneState
+from zsim.math import elementary as el
 from zsim.math import rotation as rot
 from zsim.math.compiled import Field, columns, inlined
 from zsim.math.rotation import Quaternion, Vector, axpy
@@ -43,13 +44,13 @@ Gains = tuple[float, float, float, float, float, float]
 def loop_gains(design: Firmware, rotor_lag_s: float) -> tuple[float, float, float]:
     """Return the gains of rate, tilt and velocity loop [1/s] for a lag of the rotors."""
     rate = design.rate_per_lag / max(design.lag_lead * rotor_lag_s, design.lag_min_s)
-    return rate, rate / design.loop_ratio, rate / design.loop_ratio**2
+    return rate, rate / design.loop_ratio, rate / el.square(design.loop_ratio)
 
 
 def lag_shares(design: Firmware, rotor_lag_s: float) -> tuple[float, float]:
     """Return the fraction of a rotor's lag left after a step, and the overdrive that shortens that lag."""
-    decay = math.exp(-STEP_S / rotor_lag_s)
-    return decay, (1.0 - math.exp(-STEP_S / (design.lag_lead * rotor_lag_s))) / (1.0 - decay)
+    decay = el.exp(-STEP_S / rotor_lag_s)
+    return decay, (1.0 - el.exp(-STEP_S / (design.lag_lead * rotor_lag_s))) / (1.0 - decay)
 
 
 @inlined
@@ -148,7 +149,7 @@ def settings(vehicle: Vehicle, drone: Drone) -> NDArray[np.float64]:
     limits, design, row = drone.limits, vehicle.firmware, np.empty(SETTING.size)
     k_rate, k_tilt, row[SETTING.k_velocity] = loop_gains(design, drone.rotor_time_constant_s)
     row[SETTING.rotor_decay], overdrive = lag_shares(design, drone.rotor_time_constant_s)
-    slope = math.tan(math.radians(limits.tilt_deg))
+    slope = el.tan(math.radians(limits.tilt_deg))
     drive = (k_rate, k_tilt, overdrive, slope, design.yaw_share, design.body_rate_max_rad_s)
     row[SETTING.drive : SETTING.drive + DRIVE.size] = drive
     row[SETTING.k_climb] = design.climb_share * k_rate

@@ -19,8 +19,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
+from zsim.math import elementary as el
+from zsim.math import linear
 from zsim.math import rotation as rot
 from zsim.math.compiled import Field, columns, inlined
 from zsim.math.rotation import Quaternion, Vector, axpy
@@ -299,7 +300,7 @@ def _see_mag(belief: NDArray, gain: NDArray, own: Quaternion, field_B: Vector, b
         return own
     n = belief[BELIEF.mag_samples] + 1.0
     belief[BELIEF.mag_samples] = n
-    e = rot.wrapped(bearing - math.atan2(field_H[1], field_H[0]) - belief[BELIEF.heading])
+    e = rot.wrapped(bearing - el.atan2(field_H[1], field_H[0]) - belief[BELIEF.heading])
     own = _turn_by(belief, own, (0.0, 0.0, max(1.0 / n, gain[GAIN.mag_psi]) * e))
     if 1.0 / n < gain[GAIN.mag_psi]:
         _take_bias(belief, own, (0.0, 0.0, gain[GAIN.mag_rate] * e))
@@ -373,14 +374,14 @@ class ObserverDesign(NamedTuple):
 
 def gain_row(vehicle: Vehicle, drone: Drone, environment: Environment) -> Array:
     s, walks = drone.sensors, vehicle.firmware
-    field = math.hypot(*environment.magnetic_field_ut[:2])
+    field = el.length(environment.magnetic_field_ut[:2])
     gyro = _sigma(scaled(s.imu.gyro_deg_s, DEG), s.imu.rate_hz, "gyro")
     design = ObserverDesign(
         drag_1_s=drone.drag_n_s_m * environment.air_density_kg_m3 / REFERENCE_DENSITY_KG_M3 / drone.mass_kg,
         gravity_m_s2=environment.gravity_m_s2,
         accel=(_sigma(s.imu.accel_m_s2, s.imu.rate_hz, "accel"), BOARD_RATE_HZ),
         accel_walk=max(s.imu.accel_m_s2.bias_walk, walks.lift_bias_walk),
-        tilt_walk=math.hypot(gyro / math.sqrt(BOARD_RATE_HZ), walks.tilt_walk),
+        tilt_walk=el.hypot(gyro / math.sqrt(BOARD_RATE_HZ), walks.tilt_walk),
         gyro_walk=max(scaled(s.imu.gyro_deg_s, DEG).bias_walk, walks.bias_walk),
         flow=(_sigma(s.flow.velocity_m_s, s.flow.rate_hz, "flow"), sample_rate(s.flow)),
         baro=(_sigma(s.baro.altitude_m, s.baro.rate_hz, "baro"), sample_rate(s.baro)),
@@ -398,7 +399,7 @@ def sample_rate(sensor: Sensor) -> float:
 
 
 def _sigma(model: ErrorModel, rate_hz: float, name: str) -> float:
-    return _within(math.hypot(noise_sigma(model, rate_hz), model.quantum / math.sqrt(12.0)), name)
+    return _within(el.hypot(noise_sigma(model, rate_hz), model.quantum / math.sqrt(12.0)), name)
 
 
 def _within(sigma: float, name: str) -> float:
@@ -444,7 +445,10 @@ def steady_gains(a: Array, walks: Array, meters: list[tuple[list[float], float, 
         meters: (row of H, standard deviation of a sample, samples per second).
     """
     p = covariance(a, walks, meters)
-    gains = [p @ np.array(h) / (np.array(h) @ p @ np.array(h) + sigma**2) for h, sigma, _ in meters]
+    gains = []
+    for h, sigma, _ in meters:
+        ph = linear.product(p, h)
+        gains.append(ph / (float((h * ph).sum()) + sigma * sigma))
     return np.array(gains)
 
 
@@ -452,12 +456,17 @@ def covariance(a: Array, walks: Array, meters: list[tuple[list[float], float, fl
     """Return the steady covariance before an update, for the meters of `steady_gains`."""
     dt = 1.0 / BOARD_RATE_HZ
     h = np.array([row for row, _, _ in meters], dtype=float)
-    r = np.diag([sigma**2 * BOARD_RATE_HZ / rate for _, sigma, rate in meters])
+    r = np.diag([sigma * sigma * BOARD_RATE_HZ / rate for _, sigma, rate in meters])
     # process noise over one step by Simpson's rule: exact to dt^5 for these chains
-    q = np.diag(walks**2)
-    half, full = (np.asarray(expm(a * s), dtype=np.float64) for s in (dt / 2, dt))
-    noise = dt / 6.0 * (q + 4.0 * half @ q @ half.T + full @ q @ full.T)
-    return _riccati(full, h.T @ np.linalg.solve(r, h), noise)
+    q = np.diag(walks * walks)
+    half, full = (linear.exponential(a * s) for s in (dt / 2, dt))
+    noise = dt / 6.0 * (q + 4.0 * _carried(half, q) + _carried(full, q))
+    return _riccati(full, linear.product(h.T, linear.solve(r, h)), noise)
+
+
+def _carried(f: Array, p: Array) -> Array:
+    """Return F P F^T."""
+    return linear.product(linear.product(f, p), f.T)
 
 
 def _riccati(f: Array, information: Array, noise: Array) -> Array:
@@ -468,7 +477,8 @@ def _riccati(f: Array, information: Array, noise: Array) -> Array:
     """
     a, g, p = f.T, information, noise
     for _ in range(DOUBLINGS):
-        back = np.linalg.solve(np.eye(len(a)) + g @ p, np.hstack([a, g]))
+        back = linear.solve(np.eye(len(a)) + linear.product(g, p), np.hstack([a, g]))
         turned, spread = back[:, : len(a)], back[:, len(a) :]
-        g, p, a = g + a @ spread @ a.T, p + a.T @ p @ turned, a @ turned
+        g, p = g + _carried(a, spread), p + linear.product(linear.product(a.T, p), turned)
+        a = linear.product(a, turned)
     return 0.5 * (p + p.T)

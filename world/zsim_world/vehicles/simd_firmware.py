@@ -3,11 +3,10 @@
 How blocks of eight work is in physics/simd.py.
 """
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.math import elementary as el
 from zsim.math import rotation as rot
 from zsim.math.compiled import Field, columns, inlined, noinline
 from zsim_world.physics.fleet_arrays import (
@@ -130,7 +129,7 @@ def _turn(lanes: NDArray, count: int) -> None:
         lanes[LANES * BOARD_LANES.angle + k] = rot.norm(observer.step_turn(w))
     for k in range(count):
         half = 0.5 * lanes[LANES * BOARD_LANES.angle + k]
-        lanes[LANES * BOARD_LANES.sine + k], lanes[LANES * BOARD_LANES.cosine + k] = math.sin(half), math.cos(half)
+        lanes[LANES * BOARD_LANES.sine + k], lanes[LANES * BOARD_LANES.cosine + k] = el.sin(half), el.cos(half)
     for k in range(LANES):
         r, angle = observer.step_turn(lane_vector(lanes, BOARD_LANES.w_WB_B, k)), lanes[LANES * BOARD_LANES.angle + k]
         turn = rot.turn_about(r, angle, lanes[LANES * BOARD_LANES.sine + k], lanes[LANES * BOARD_LANES.cosine + k])
@@ -138,7 +137,7 @@ def _turn(lanes: NDArray, count: int) -> None:
         put_lane_four(lanes, BOARD_LANES.q_WB, k, q)
         lanes[LANES * BOARD_LANES.north + k], lanes[LANES * BOARD_LANES.east + k] = rot.forwards(q)
     for k in range(count):
-        heading = math.atan2(lanes[LANES * BOARD_LANES.north + k], lanes[LANES * BOARD_LANES.east + k])
+        heading = el.atan2(lanes[LANES * BOARD_LANES.north + k], lanes[LANES * BOARD_LANES.east + k])
         lanes[LANES * BOARD_LANES.heading + k] = heading
         put_lane_four(lanes, BOARD_LANES.own, k, rot.about_z(heading))
 

@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.errors import UserCodeError
+from zsim.math import elementary as el
+from zsim.math import linear
 from zsim.math.compiled import portable
 from zsim.math.rotation import Matrix, Vector
 from zsim.schema import plugin
@@ -122,13 +124,14 @@ class ClusterSpace(ABC):
 
     def motion(self, c: Array, c_dot: Array) -> Array:
         """Return r_dot (4n,) = J^-1 c_dot; spaces with a large J^-1 have a shorter way than through the matrix."""
-        return self.inverse_jacobian(c).dot(c_dot)  # the same bits as @, in half the time at this size
+        return linear.product(self.inverse_jacobian(c), c_dot)
 
     def specimen(self, apart_m: float) -> Array:
         """Return c (4n,) of some level formation with robots at least so far apart, for rehearsals."""
         radius_m = self.n * apart_m
         turns = np.arange(self.n) * (TAU / self.n)
-        p_W = radius_m * np.column_stack((np.cos(turns), np.sin(turns), np.ones(self.n)))
+        x, y = (el.elementwise(of)(turns) for of in (el.cos, el.sin))
+        p_W = radius_m * np.column_stack((x, y, np.ones(self.n)))
         return self.forward(p_W, np.zeros(self.n))
 
     def margin(self, c: Array) -> float:
@@ -142,7 +145,7 @@ class ClusterSpace(ABC):
     def measures(self, c: Array) -> tuple[float, float]:
         """Return spread(c) and margin(c) [m], with one computation of the spread."""
         spread = self.spread(c)
-        return spread, spread * math.cos(c[self._pitch])
+        return spread, spread * el.cos(c[self._pitch])
 
     def condition(self, c: Array) -> float:
         """Return the condition number of J^-1 (2-norm, metres and radians as they are).
@@ -153,7 +156,8 @@ class ClusterSpace(ABC):
         lengths = np.abs(c[self._lengths])
         scaled = c.copy()
         scaled[self._lengths] *= min(1.0, CONDITION_LENGTH_M / max(float(lengths.max()), CONDITION_LENGTH_M))
-        return float(np.linalg.cond(self.inverse_jacobian(scaled)))
+        values = linear.singular_values(self.inverse_jacobian(scaled))
+        return float(values[0] / values[-1]) if values[-1] > 0.0 else math.inf
 
     def difference(self, c_to: Array, c_from: Array) -> Array:
         """Return c_to - c_from (4n,), angles that wrap by the shorter way."""
@@ -300,21 +304,21 @@ def centroid(p_W: Array) -> Vector:
 def pitch_yaw(x_W: Vector) -> tuple[float, float]:
     """Return pitch and yaw of a frame from its x axis in W."""
     flat = math.sqrt(x_W[0] * x_W[0] + x_W[1] * x_W[1])
-    return math.atan2(-x_W[2], flat), math.atan2(x_W[1], x_W[0])
+    return el.atan2(-x_W[2], flat), el.atan2(x_W[1], x_W[0])
 
 
 @portable
 def euler_axes_C(roll: float, pitch: float) -> Matrix:
     """Return w_WC_C of a unit rate of roll, of pitch and of yaw."""
-    sr, cr = math.sin(roll), math.cos(roll)
-    sp, cp = math.sin(pitch), math.cos(pitch)
+    sr, cr = el.sin(roll), el.cos(roll)
+    sp, cp = el.sin(pitch), el.cos(pitch)
     return (1.0, 0.0, 0.0), (0.0, cr, -sr), (-sp, sr * cp, cr * cp)
 
 
 def euler_rates(roll: float, pitch: float) -> Array:
     """Return T (3, 3) with (roll', pitch', yaw') = T w_WC_C; SingularClusterError: pitch is at 90 degrees."""
-    sr, cr = math.sin(roll), math.cos(roll)
-    sp, cp = math.sin(pitch), math.cos(pitch)
+    sr, cr = el.sin(roll), el.cos(roll)
+    sp, cp = el.sin(pitch), el.cos(pitch)
     if cp < LENGTH_MIN_M:
         raise SingularClusterError("pitch is 90 deg: roll and yaw of the formation are one rotation there")
     return np.array([(1.0, sr * sp / cp, cr * sp / cp), (0.0, cr, -sr), (0.0, sr / cp, cr / cp)])

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.errors import UserCodeError
+from zsim.math import elementary as el
+from zsim.math.linear import product
 from zsim.scenario.scenario import ROBOTS_MAX, Cluster, ClusterGroup, Scenario, space_name
 from zsim.schema import parameters, plugin
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, checked
@@ -62,8 +64,8 @@ def _starts(scenario: Scenario, drones: Sequence[str]) -> Array:
     """Return where drones start (n, 3) [m]: x ahead and y left of the first of them, z up."""
     by_name = {drone.name: drone for drone in scenario.drones}
     yaw = math.radians(by_name[drones[0]].yaw_deg)
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.array([by_name[name].position_m for name in drones]) @ np.array([(c, -s, 0), (s, c, 0), (0, 0, 1)])
+    c, s = el.cos(yaw), el.sin(yaw)
+    return product([by_name[name].position_m for name in drones], [(c, -s, 0), (s, c, 0), (0, 0, 1)])
 
 
 def cluster_space(n: int) -> ClusterSpace:
@@ -144,7 +146,7 @@ class NestedCluster(ClusterSpace):
             own = group.space.jacobian(p_W[group.robots], yaw[group.robots])
             bodies[k] = group.space.forward(p_W[group.robots], yaw[group.robots])[group.body]
             J[group.own, group.rows], body[group.at, group.rows] = own[group.rest], own[group.body]
-        J[: self.parent.size] = self.parent.jacobian(bodies[:, :3].copy(), bodies[:, 3].copy()) @ body
+        J[: self.parent.size] = product(self.parent.jacobian(bodies[:, :3].copy(), bodies[:, 3].copy()), body)
         return J
 
     def inverse_jacobian(self, c: Array) -> Array:
@@ -153,7 +155,7 @@ class NestedCluster(ClusterSpace):
         moved = self.parent.inverse_jacobian(parent)
         for group, own in zip(self._groups, parts, strict=True):
             of_own = group.space.inverse_jacobian(own)
-            J_inv[group.rows, : self.parent.size] = of_own[:, group.body] @ moved[group.at]
+            J_inv[group.rows, : self.parent.size] = product(of_own[:, group.body], moved[group.at])
             J_inv[group.rows, group.own] = of_own[:, group.rest]
         return J_inv
 

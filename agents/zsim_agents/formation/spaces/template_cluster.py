@@ -18,7 +18,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from zsim.math import elementary as el
 from zsim.math.compiled import portable
+from zsim.math.linear import eigen, product, solve
 from zsim.math.rotation import Matrix, matrix, matrix_from_rpy
 from zsim_agents.formation.spaces.cluster_space import (
     CONDITION_LENGTH_M,
@@ -62,8 +64,8 @@ class TemplateCluster(ClusterSpace):
         self.modes_C = shape_modes(self.t_C)
         self._modes = self.modes_C.reshape(3 * n, 3 * n - 6)
         self._gathered = np.ascontiguousarray(self._modes.T) / n  # N^T / n, the inverse of N on its span
-        self._inertia = inertia(self.t_C.T @ self.t_C)
-        self._reach_m = math.sqrt(n * float(np.linalg.eigvalsh(self._inertia)[0]))
+        self._inertia = inertia(product(self.t_C.T, self.t_C))
+        self._reach_m = math.sqrt(n * float(eigen(self._inertia)[0][0]))
         names = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", *numbered("phi", range(1, n + 1))]
         spread_text = "root mean square distance of the robots from the line through them"
         super().__init__(n, [*names, *numbered("w", range(1, 3 * n - 5))], spread_text)
@@ -80,12 +82,12 @@ class TemplateCluster(ClusterSpace):
         c[3:6] = euler_angles(R_WC)
         c[6 : self._shape] = yaw - c[5]
         c[6 : self._shape] -= TAU * np.rint(c[6 : self._shape] / TAU)
-        c[self._shape :] = self._gathered.dot((b_C - self.t_C).ravel())
+        c[self._shape :] = product(self._gathered, (b_C - self.t_C).ravel())
         return c
 
     def inverse(self, c: Array) -> tuple[Array, Array]:
         yaw = c[5] + c[6 : self._shape]
-        return c[:3] + self._places_C(c).dot(rotation_of(c).T), yaw - TAU * np.rint(yaw / TAU)
+        return c[:3] + product(self._places_C(c), rotation_of(c).T), yaw - TAU * np.rint(yaw / TAU)
 
     def jacobian(self, p_W: Array, yaw: Array) -> Array:
         """Return J; with b_C = R^T (P - C): w_WC_C = M^-1 sum of t_i x R^T v_i, M = tr(S) I - S, S = sum of b_i t_i^T.
@@ -94,18 +96,19 @@ class TemplateCluster(ClusterSpace):
         """
         _, b_C, R_WC = self._fitted(p_W)
         n = self.n
-        arms = np.array([skew(t) @ R_WC.T for t in self.t_C]).transpose(1, 0, 2)  # of t_i x R^T v_i: (3, n, 3)
-        turn = np.linalg.solve(inertia(b_C.T @ self.t_C), arms.reshape(3, 3 * n)).reshape(3, n, 3)
+        arms = np.array([product(skew(t), R_WC.T) for t in self.t_C]).transpose(1, 0, 2)  # of t_i x R^T v_i: (3, n, 3)
+        turn = solve(inertia(product(b_C.T, self.t_C)), arms.reshape(3, 3 * n)).reshape(3, n, 3)
         roll, pitch, _ = euler_angles(R_WC)
-        moved_C = np.einsum("iab,bjk->iajk", np.array([skew(b) for b in b_C]), turn)  # b_i' = R^T v_i - w_WC_C x b_i
+        cross_C = np.array([skew(b) for b in b_C]).reshape(3 * n, 3)
+        moved_C = product(cross_C, turn.reshape(3, 3 * n)).reshape(n, 3, n, 3)  # b_i' = R^T v_i - w_WC_C x b_i
         moved_C[range(n), :, range(n)] += R_WC.T  # less that of the centroid, which N^T ignores
 
         J = np.zeros((self.size, n, 4))
         J[:3, :, :3] = np.eye(3)[:, None] / n
-        J[3:6, :, :3] = np.tensordot(euler_rates(roll, pitch), turn, 1)
+        J[3:6, :, :3] = product(euler_rates(roll, pitch), turn.reshape(3, 3 * n)).reshape(3, n, 3)
         J[6 : self._shape, :, 3] = np.eye(n)
         J[6 : self._shape] -= J[5]
-        J[self._shape :, :, :3] = (self._gathered @ moved_C.reshape(3 * n, 3 * n)).reshape(-1, n, 3)
+        J[self._shape :, :, :3] = product(self._gathered, moved_C.reshape(3 * n, 3 * n)).reshape(-1, n, 3)
         return J.reshape(self.size, self.size)
 
     def inverse_jacobian(self, c: Array) -> Array:
@@ -113,17 +116,18 @@ class TemplateCluster(ClusterSpace):
         J_inv = np.zeros((self.n, 4, self.size))
         J_inv[:, :3, :3] = np.eye(3)
         for k, axis_C in enumerate(euler_axes_of(c), start=3):
-            J_inv[:, :3, k] = place_C @ skew(axis_C).T @ R_WC.T
-        J_inv[:, :3, self._shape :] = R_WC @ self.modes_C
+            J_inv[:, :3, k] = product(product(place_C, skew(axis_C).T), R_WC.T)
+        modes_W = [product(R_WC, mode_C) for mode_C in self.modes_C]
+        J_inv[:, :3, self._shape :] = modes_W
         J_inv[:, 3, 5] = 1.0
         J_inv[:, 3, 6 : self._shape] = np.eye(self.n)
         return J_inv.reshape(self.size, self.size)
 
     def motion(self, c: Array, c_dot: Array) -> Array:
-        w_WC_C = c_dot[3:6].dot(euler_axes_of(c))
-        v_C = self._places_C(c).dot(skew(w_WC_C).T) + self._modes.dot(c_dot[self._shape :]).reshape(self.n, 3)
+        w_WC_C = product(euler_axes_of(c).T, c_dot[3:6])
+        v_C = product(self._places_C(c), skew(w_WC_C).T) + product(self._modes, c_dot[self._shape :]).reshape(self.n, 3)
         r_dot = np.empty((self.n, 4))
-        r_dot[:, :3] = c_dot[:3] + v_C.dot(rotation_of(c).T)
+        r_dot[:, :3] = c_dot[:3] + product(v_C, rotation_of(c).T)
         r_dot[:, 3] = c_dot[5] + c_dot[6 : self._shape]
         return r_dot.ravel()
 
@@ -141,8 +145,8 @@ class TemplateCluster(ClusterSpace):
         It is the least eigenvalue of M (see `jacobian`) over sqrt(n times that of the template): exact for a template
         of any size, and zero where another rotation would fit as well.
         """
-        S = self._places_C(c).T.dot(self.t_C)
-        return float(np.linalg.eigvalsh(inertia((S + S.T) / 2))[0]) / self._reach_m
+        S = product(self._places_C(c).T, self.t_C)
+        return float(eigen(inertia((S + S.T) / 2))[0][0]) / self._reach_m
 
     def condition(self, c: Array) -> float:
         """Return the condition number of J^-1, the robots' velocities, headings and phi weighted by their rms.
@@ -154,35 +158,36 @@ class TemplateCluster(ClusterSpace):
         place_C = self._places_C(c)
         scale = min(1.0, CONDITION_LENGTH_M / max(float(np.linalg.norm(place_C, axis=1).max()), LENGTH_MIN_M))
         axes = euler_axes_of(c).T
-        M = scale**2 * axes.T @ inertia(place_C.T @ self.t_C).T  # the template scaled alike
-        stiff = np.linalg.solve(scale**2 * self._inertia, M.T)
-        whole = scale**2 * axes.T @ inertia(place_C.T @ place_C) @ axes
+        squared = scale * scale
+        M = squared * product(axes.T, inertia(product(place_C.T, self.t_C)).T)  # the template scaled alike
+        stiff = solve(squared * self._inertia, M.T)
+        whole = squared * product(product(axes.T, inertia(product(place_C.T, place_C))), axes)
         G = np.eye(7)
         G[TURN, TURN] = whole / self.n
         G[2, 2] += 1.0  # a turn in yaw turns every heading
-        G[TURN, BEND] = _root(whole - M @ stiff, self.n)
+        G[TURN, BEND] = _root(whole - product(M, stiff), self.n)
         G[BEND, TURN] = G[TURN, BEND].T
         G[HEADING, 2] = G[2, HEADING] = 1.0
-        values = np.linalg.eigvalsh(G)
+        values = eigen(G)[0]
         return math.sqrt(values[-1] / values[0]) if values[0] > 0.0 else math.inf
 
     def _places_C(self, c: Array) -> Array:  # (n, 3) [m], from the centroid
-        return self.t_C + self._modes.dot(c[self._shape :]).reshape(self.n, 3)
+        return self.t_C + product(self._modes, c[self._shape :]).reshape(self.n, 3)
 
     def _fitted(self, p_W: Array) -> tuple[Array, Array, Array]:
         """Return the centroid (3,), the places from it in C (n, 3), and R_WC (3, 3)."""
         centre_W = np.add.reduce(p_W, axis=0) / self.n
         b_W = p_W - centre_W
-        gap, R_WC = fitted_rotation(self.t_C.T.dot(b_W))
+        gap, R_WC = fitted_rotation(product(self.t_C.T, b_W))
         if not gap > LENGTH_MIN_M * self._reach_m:  # also true for NaN
             raise SingularClusterError(NO_FRAME)
-        return centre_W, b_W.dot(R_WC), R_WC
+        return centre_W, product(b_W, R_WC), R_WC
 
 
 def _root(E: Array, n: int) -> Array:
     """Return the symmetric root of E / n (3, 3), E without negative eigenvalues but for rounding."""
-    values, vectors = np.linalg.eigh((E + E.T) / 2)
-    return (vectors * np.sqrt(np.maximum(values, 0.0) / n)) @ vectors.T
+    values, vectors = eigen((E + E.T) / 2)
+    return product(vectors * np.sqrt(np.maximum(values, 0.0) / n), vectors.T)
 
 
 def fitted_rotation(H: Array) -> tuple[float, Array]:
@@ -195,7 +200,7 @@ def fitted_rotation(H: Array) -> tuple[float, Array]:
     K = np.empty((4, 4))
     if not put_horn_matrix(H, K):
         return 0.0, np.eye(3)
-    values, vectors = np.linalg.eigh(K)
+    values, vectors = eigen(K)
     return float(values[3] - values[2]) / 2.0, rotation_of_quaternion(vectors[:, 3])
 
 
@@ -256,12 +261,13 @@ def _orthonormal(directions: list[Array], done: list[Array]) -> list[Array]:
     basis: list[Array] = []
     for direction in directions:
         v = direction.ravel()
-        size = np.linalg.norm(v)
+        size = el.length(v.tolist())
         for _ in range(2):  # the second pass removes what rounding left of the first
             earlier = np.array([*done, *basis])
-            v = v - earlier.T @ (earlier @ v) if len(earlier) else v
-        if size > 0.0 and np.linalg.norm(v) > INDEPENDENT_MIN * size:
-            basis.append(v / np.linalg.norm(v))
+            v = v - product(earlier.T, product(earlier, v)) if len(earlier) else v
+        left = el.length(v.tolist())
+        if size > 0.0 and left > INDEPENDENT_MIN * size:
+            basis.append(v / left)
     return basis
 
 
@@ -289,7 +295,7 @@ def skew(a: Array) -> Array:
 def euler_angles(R_WC: Array) -> tuple[float, float, float]:
     """Return roll, pitch and yaw of R_WC = Rz(yaw) Ry(pitch) Rx(roll)."""
     pitch, yaw = pitch_yaw((R_WC[0, 0], R_WC[1, 0], R_WC[2, 0]))
-    return math.atan2(R_WC[2, 1], R_WC[2, 2]), pitch, yaw
+    return el.atan2(R_WC[2, 1], R_WC[2, 2]), pitch, yaw
 
 
 @portable

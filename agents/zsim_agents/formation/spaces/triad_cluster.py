@@ -11,6 +11,8 @@ import math
 
 import numpy as np
 
+from zsim.math import elementary as el
+from zsim.math import linear
 from zsim.math.compiled import portable
 from zsim.math.rotation import (
     Matrix,
@@ -74,16 +76,16 @@ class TriadCluster(ClusterSpace):
         if h == 0.0:
             raise SingularClusterError(NO_FRAME)
         R_WC = np.array([x, y, z]).T
-        d_C = d_W @ R_WC
+        d_C = linear.product(d_W, R_WC)
         rate = np.zeros((3, self.n, 3))  # w_WC_C = sum over robots of rate[:, i] v_i
         rate[0, :3] = np.outer((d_C[2, 0] - d_C[1, 0], -d_C[2, 0], d_C[1, 0]), z) / area
         rate[1, :3] = np.outer((-2.0, 1.0, 1.0), z) / h
         rate[2, :3] = np.outer((2.0, -1.0, -1.0), y) / h
-        roll, pitch = math.atan2(y[2], z[2]), pitch_yaw(x)[0]
+        roll, pitch = el.atan2(y[2], z[2]), pitch_yaw(x)[0]
 
         J = np.zeros((self.size, self.n, 4))
         J[:3, :, :3] = np.eye(3)[:, None] / self.n
-        J[3:6, :, :3] = np.tensordot(euler_rates(roll, pitch), rate, 1)
+        J[3:6, :, :3] = linear.product(euler_rates(roll, pitch), rate.reshape(3, -1)).reshape(rate.shape)
         J[6 : 6 + self.n, :, 3] = np.eye(self.n)
         J[6 : 6 + self.n] -= J[5]
         J[self._shape : self._shape + 3, :3, :3] = _triangle_rows(d_W[1], d_W[2], np.array(z))
@@ -117,11 +119,11 @@ def triad_forward(p_W: Array, yaw: Array, c: Array) -> bool:
     if h == 0.0:
         return False
     c[0], c[1], c[2] = centroid(p_W)
-    c[3] = math.atan2(y[2], z[2])
+    c[3] = el.atan2(y[2], z[2])
     c[4], c[5] = pitch_yaw(x)
     for i in range(n):
         c[6 + i] = wrap_angle(yaw[i] - c[5])
-    c[at], c[at + 1], c[at + 2] = norm(d2), norm(d3), math.atan2(area, dot(d2, d3))
+    c[at], c[at + 1], c[at + 2] = norm(d2), norm(d3), el.atan2(area, dot(d2, d3))
     for k in range(3, n):
         first = at + 3 * (k - 2)
         c[first], c[first + 1], c[first + 2] = spherical(product((x, y, z), subtract(row(p_W, k), p_1)))
@@ -193,9 +195,9 @@ def add_rate(J_inv: Array, robot: int, column: int, rate_W: Vector) -> None:
 @portable
 def triad_spread(c: Array) -> float:
     at = 6 + c.size // 4
-    least = math.sin(c[at + 2]) * min(c[at], c[at + 1])
+    least = el.sin(c[at + 2]) * min(c[at], c[at + 1])
     for first in range(at + 3, c.size, 3):
-        least = min(least, c[first] * math.cos(c[first + 2]))
+        least = min(least, c[first] * el.cos(c[first + 2]))
     return least
 
 
@@ -249,11 +251,11 @@ def split_beta(p: float, q: float, beta: float) -> tuple[float, float, float, fl
 
     All is zero where there is no such axis.
     """
-    along2, along3 = p + q * math.cos(beta), q + p * math.cos(beta)
+    along2, along3 = p + q * el.cos(beta), q + p * el.cos(beta)
     h = math.sqrt(max(p * along2 + q * along3, 0.0))
     if not h > LENGTH_MIN_M:  # also true for NaN
         return 0.0, 0.0, 0.0, 0.0, 0.0
-    return along2 / h, q * math.sin(beta) / h, along3 / h, p * math.sin(beta) / h, h
+    return along2 / h, q * el.sin(beta) / h, along3 / h, p * el.sin(beta) / h, h
 
 
 @portable
@@ -277,19 +279,19 @@ def triangle_rates(p: float, q: float, beta: float) -> tuple[Matrix, Matrix]:
 @portable
 def spherical(d_C: Vector) -> Vector:
     flat = math.sqrt(d_C[0] * d_C[0] + d_C[1] * d_C[1])
-    return norm(d_C), math.atan2(d_C[1], d_C[0]), math.atan2(d_C[2], flat)
+    return norm(d_C), el.atan2(d_C[1], d_C[0]), el.atan2(d_C[2], flat)
 
 
 @portable
 def spherical_place(rho: float, azimuth: float, elevation: float) -> Vector:
-    flat = rho * math.cos(elevation)
-    return flat * math.cos(azimuth), flat * math.sin(azimuth), rho * math.sin(elevation)
+    flat = rho * el.cos(elevation)
+    return flat * el.cos(azimuth), flat * el.sin(azimuth), rho * el.sin(elevation)
 
 
 @portable
 def spherical_rates(rho: float, azimuth: float, elevation: float) -> Matrix:
     """Return the derivatives of (x, y, z) by distance, by azimuth and by elevation."""
-    sa, ca, se, ce = math.sin(azimuth), math.cos(azimuth), math.sin(elevation), math.cos(elevation)
+    sa, ca, se, ce = el.sin(azimuth), el.cos(azimuth), el.sin(elevation), el.cos(elevation)
     return (
         (ce * ca, ce * sa, se),
         (-rho * ce * sa, rho * ce * ca, 0.0),
@@ -299,7 +301,7 @@ def spherical_rates(rho: float, azimuth: float, elevation: float) -> Matrix:
 
 def _triangle_rows(d2_W: Array, d3_W: Array, z_W: Array) -> Array:
     """Return the rows of J for p, q, beta on robots 1, 2, 3: (3, 3 robots, 3)."""
-    p, q = math.hypot(*d2_W), math.hypot(*d3_W)
+    p, q = el.length(d2_W), el.length(d3_W)
     u2, u3 = d2_W / p, d3_W / q
     t2, t3 = np.cross(z_W, u2) / p, np.cross(z_W, u3) / q
     none = np.zeros(3)
@@ -312,15 +314,15 @@ def _spherical_rows(k: int, d_C: Array, R_WC: Array, rate: Array) -> Array:
     In C the robot moves from robot 1 at R_WC^T (v_k - v_1) - w_WC_C x d_C.
     """
     x, y, z = d_C.tolist()
-    flat, rho = math.hypot(x, y), math.hypot(x, y, z)
+    flat, rho = el.hypot(x, y), el.hypot(x, y, z)
     if not flat > LENGTH_MIN_M:
         raise SingularClusterError(f"robot {k + 1} is on the z axis through robot 1: it has no azimuth")
     rates_C = np.array(spherical_rates(*spherical((x, y, z))))  # its rows are orthogonal, of lengths 1, flat and rho
-    gradient = rates_C / np.array([(1.0,), (flat**2,), (rho**2,)])
-    motion_C = np.tensordot(np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)]), rate, 1)
+    gradient = rates_C / np.array([(1.0,), (flat * flat,), (rho * rho,)])
+    motion_C = linear.product([(0, -z, y), (z, 0, -x), (-y, x, 0)], rate.reshape(3, -1)).reshape(rate.shape)
     motion_C[:, k] += R_WC.T
     motion_C[:, 0] -= R_WC.T
-    return np.tensordot(gradient, motion_C, 1)
+    return linear.product(gradient, motion_C.reshape(3, -1)).reshape(rate.shape)
 
 
 class PairCluster(ClusterSpace):
@@ -343,12 +345,12 @@ class PairCluster(ClusterSpace):
 
     def jacobian(self, p_W: Array, yaw: Array) -> Array:
         _, _, _, pitch, psi, _, _, p = self.forward(p_W, yaw).tolist()
-        if math.cos(pitch) < LENGTH_MIN_M:
+        if el.cos(pitch) < LENGTH_MIN_M:
             raise SingularClusterError("the two robots are above each other: the formation has no yaw")
         x, y, z = np.array(matrix_from_rpy(0.0, pitch, psi)).T
         J = np.zeros((8, 2, 4))
         J[:3, :, :3] = np.eye(3)[:, None] / 2
-        for k, axis in ((3, -z / p), (4, y / (p * math.cos(pitch))), (7, x)):
+        for k, axis in ((3, -z / p), (4, y / (p * el.cos(pitch))), (7, x)):
             J[k, 0, :3], J[k, 1, :3] = axis, -axis
         J[5:7, :, 3] = np.eye(2)
         J[5:7] -= J[4]
@@ -391,6 +393,6 @@ def pair_inverse_jacobian(c: Array, J_inv: Array) -> None:
         for k in range(3):
             J_inv[first + k, k] = 1.0
         put(J_inv, first, 3, scaled(z, -half))
-        put(J_inv, first, 4, scaled(y, half * math.cos(c[3])))
+        put(J_inv, first, 4, scaled(y, half * el.cos(c[3])))
         put(J_inv, first, 7, scaled(x, 0.5 - robot))
         J_inv[first + 3, 4] = J_inv[first + 3, 5 + robot] = 1.0

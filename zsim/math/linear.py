@@ -1,0 +1,189 @@
+"""Linear algebra of small matrices with the same bits everywhere: every sum runs in the order of its index.
+
+BLAS and LAPACK, with which numpy and scipy compute, order and fuse their sums by the processor. Whatever decides about
+the flight of a drone or the output of an agent uses these instead; for tens of rows they are as fast. Matrices are
+arrays of float64; a singular system gives results that are not finite.
+
+    product     A B of (m, k) and (k, n), or of (m, k) and (k,)
+    solve       A^-1 B by elimination with partial pivoting
+    eigen       eigenvalues, ascending, and eigenvectors of a symmetric matrix (Jacobi)
+    singular_values     descending, by rotations of columns (Hestenes, J. SIAM 6 (1958) 51-90)
+    pseudo_inverse      of a matrix with independent rows
+    exponential         e^A by Taylor's series, scaled and squared
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zsim.math.compiled import kernel
+
+Array = NDArray[np.float64]
+
+SWEEPS_MAX = 60  # of rotations over all pairs; ten suffice for the largest matrices here
+TERMS = 20  # of the series of e^A for |A| <= 1/2: the next is below 1e-25
+ORTHOGONAL = 1e-16  # cosine of two columns that need no rotation
+
+
+def product(A: ArrayLike, B: ArrayLike) -> Array:
+    a, b = _own(A), _own(B)
+    return product_with(a, b) if b.ndim == 2 else product_with(a, b.reshape(-1, 1)).ravel()
+
+
+def solve(A: ArrayLike, B: ArrayLike) -> Array:
+    """Return A^-1 B of (n, n) and (n, m) or (n,)."""
+    a, b = _own(A), _own(B)
+    return _solved(a.copy(), b.reshape(len(a), -1).copy()).reshape(b.shape)
+
+
+def inverse(A: ArrayLike) -> Array:
+    return solve(A, np.eye(len(np.asarray(A))))
+
+
+def eigen(A: ArrayLike) -> tuple[Array, Array]:
+    """Return eigenvalues (n,), ascending, and unit eigenvectors as columns (n, n)."""
+    values, vectors = _diagonalised(_own(A).copy())
+    order = np.argsort(values, kind="stable")
+    return values[order], vectors[:, order]
+
+
+def singular_values(A: ArrayLike) -> Array:
+    a = _own(A)
+    return -np.sort(-_column_lengths((a if a.shape[0] >= a.shape[1] else _own(a.T)).copy()))
+
+
+def pseudo_inverse(A: ArrayLike) -> Array:
+    """Return A^T (A A^T)^-1, (n, m), of m independent rows (m, n)."""
+    a = _own(A)
+    return solve(product(a, a.T), a).T
+
+
+def exponential(A: ArrayLike) -> Array:
+    a = _own(A)
+    size = float(np.abs(a).sum(axis=1).max())
+    halvings = max(0, math.frexp(size)[1] + 1)
+    a = a * 2.0**-halvings
+    term = total = np.eye(len(a))
+    for k in range(1, TERMS + 1):
+        term = product(term, a) / k
+        total = total + term
+    for _ in range(halvings):
+        total = product(total, total)
+    return total
+
+
+def _own(A: ArrayLike) -> Array:
+    return np.ascontiguousarray(A, dtype=np.float64)
+
+
+@kernel()
+def product_with(A: Array, B: Array) -> Array:
+    """Return A B of contiguous arrays (m, k) and (k, n); for compiled code."""
+    m, n = A.shape[0], B.shape[1]
+    C = np.zeros((m, n))
+    for i in range(m):
+        for k in range(A.shape[1]):
+            a = A[i, k]
+            for j in range(n):
+                C[i, j] += a * B[k, j]
+    return C
+
+
+@kernel()
+def _solved(A: Array, B: Array) -> Array:
+    """Return A^-1 B; both are overwritten."""
+    n, m = B.shape
+    for k in range(n):
+        best = k
+        for i in range(k + 1, n):
+            if abs(A[i, k]) > abs(A[best, k]):
+                best = i
+        if best != k:
+            for j in range(n):
+                A[k, j], A[best, j] = A[best, j], A[k, j]
+            for j in range(m):
+                B[k, j], B[best, j] = B[best, j], B[k, j]
+        for i in range(k + 1, n):
+            factor = A[i, k] / A[k, k]
+            if factor != 0.0:
+                for j in range(k + 1, n):
+                    A[i, j] -= factor * A[k, j]
+                for j in range(m):
+                    B[i, j] -= factor * B[k, j]
+    for k in range(n - 1, -1, -1):
+        for j in range(m):
+            rest = B[k, j]
+            for i in range(k + 1, n):
+                rest -= A[k, i] * B[i, j]
+            B[k, j] = rest / A[k, k]
+    return B
+
+
+@kernel()
+def _diagonalised(A: Array) -> tuple[Array, Array]:
+    """Return diagonal and accumulated rotations of a symmetric matrix, which is overwritten."""
+    n = A.shape[0]
+    V = np.eye(n)
+    for _ in range(SWEEPS_MAX):
+        largest = 0.0
+        for p in range(n - 1):
+            for q in range(p + 1, n):
+                apq = A[p, q]
+                if abs(apq) <= ORTHOGONAL * math.sqrt(abs(A[p, p] * A[q, q])) or apq == 0.0:
+                    continue
+                largest = max(largest, abs(apq))
+                theta = 0.5 * (A[q, q] - A[p, p]) / apq
+                t = math.copysign(1.0, theta) / (abs(theta) + math.sqrt(theta * theta + 1.0))
+                c = 1.0 / math.sqrt(t * t + 1.0)
+                s = t * c
+                for k in range(n):
+                    a, b = A[k, p], A[k, q]
+                    A[k, p], A[k, q] = c * a - s * b, s * a + c * b
+                for k in range(n):
+                    a, b = A[p, k], A[q, k]
+                    A[p, k], A[q, k] = c * a - s * b, s * a + c * b
+                A[p, q] = A[q, p] = 0.0
+                for k in range(n):
+                    a, b = V[k, p], V[k, q]
+                    V[k, p], V[k, q] = c * a - s * b, s * a + c * b
+        if largest == 0.0:
+            break
+    values = np.empty(n)
+    for i in range(n):
+        values[i] = A[i, i]
+    return values, V
+
+
+@kernel()
+def _column_lengths(A: Array) -> Array:
+    """Return the lengths of the columns once all are orthogonal; A (m, n), m >= n, is overwritten."""
+    m, n = A.shape
+    for _ in range(SWEEPS_MAX):
+        rotated = False
+        for p in range(n - 1):
+            for q in range(p + 1, n):
+                pp, qq, pq = 0.0, 0.0, 0.0
+                for k in range(m):
+                    pp += A[k, p] * A[k, p]
+                    qq += A[k, q] * A[k, q]
+                    pq += A[k, p] * A[k, q]
+                if not abs(pq) > 1e-15 * math.sqrt(pp * qq):
+                    continue
+                rotated = True
+                theta = 0.5 * (qq - pp) / pq
+                t = math.copysign(1.0, theta) / (abs(theta) + math.sqrt(theta * theta + 1.0))
+                c = 1.0 / math.sqrt(t * t + 1.0)
+                s = t * c
+                for k in range(m):
+                    a, b = A[k, p], A[k, q]
+                    A[k, p], A[k, q] = c * a - s * b, s * a + c * b
+        if not rotated:
+            break
+    lengths = np.empty(n)
+    for j in range(n):
+        total = 0.0
+        for k in range(m):
+            total += A[k, j] * A[k, j]
+        lengths[j] = math.sqrt(total)
+    return lengths
