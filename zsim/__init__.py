@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-RELEASE = "0.1.0"  # as in pyproject.toml
+RELEASE = "0.2.0"  # as in pyproject.toml
 CONTRACT = 1
 COMMIT_FILE = "commit.txt"  # of an archive that git has made, of an sdist and of a wheel
 DIGITS = 8  # of a commit in a version: none of two in a repository of this size are alike

@@ -72,7 +72,7 @@ def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> str:
         here, recorded_by = fingerprint(), record.info.version
         if others := {record.info.fingerprint, *agents.fingerprints} - {here}:
             of = f"{', '.join(sorted(others))}; here {here}"
-            note(f"recorded with another numeric fingerprint ({of}): the same bits are not promised")
+            note(f"recorded with other code (fingerprint {of}): the same bits are not promised")
         if recorded_by != __version__:
             note(f"recorded by zsim {recorded_by}, flown again by {__version__}: the same bits are not promised")
         if commands_only or agents.why_not:

@@ -60,7 +60,7 @@ def systemd(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ())
     """Return `HOST/zsim-PROCESS.service`, `HOST/zsim.target`, and the scenario for the world's host.
 
     The options are those of systemd.exec(5) and systemd.service(5). Left out are MemoryDenyWriteExecute (numba
-    compiles) and ProcSubset (the fingerprint reads /proc/cpuinfo). `pace`: options of the world. InventoryError if a
+    compiles) and ProcSubset (libraries read /proc/cpuinfo). `pace`: options of the world. InventoryError if a
     process has no place, or a host has no user or no absolute path to its interpreter.
     """
     planned, hosts = inv.processes(placed, scenario, pace), placed.inventory.hosts

@@ -1,11 +1,14 @@
-"""Same bits: the fingerprint of what a process computes with, which its join states; the hash of a flight's truth.
+"""Same bits: the fingerprint of the code with which a process computes, stated in its join; the hash of a flight.
 
-A fingerprint covers what the last bit of a number depends on: CPU feature level, libm, versions of the numeric
-packages, and for which processor BLAS computes: its own, unless OPENBLAS_CORETYPE or the like chooses another.
+What a flight depends on is computed with zsim.math.elementary, distributions and linear, the same on every processor
+and with every version of Python and of the numeric packages. So a fingerprint covers code and contract alone. What else
+differs between two machines is `machine`, for those who look for the cause of a difference: only classes of users, and
+cameras' pictures, may depend on it.
 """
 
 import hashlib
 import importlib.metadata
+import importlib.util
 import platform
 from collections.abc import Callable, Iterable
 from functools import cache
@@ -16,18 +19,32 @@ import numpy as np
 import threadpoolctl
 from numpy.typing import ArrayLike, NDArray
 
-from zsim import __version__
+from zsim import CONTRACT, __version__
 
-PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "filterpy")
+PACKAGES = ("numpy", "scipy", "numba", "llvmlite")  # with which is computed
+CODE = ("zsim", "zsim_world", "zsim_agents")  # packages whose sources decide about a flight
 COLUMNS = 13  # position, velocity, orientation, angular velocity of a drone
 HELD_BYTES = 16_384  # hashed in one go, which takes as long as a few instants
 
 
 @cache
 def parts() -> dict[str, str]:
+    """Return what the bits of a flight depend on: zsim's version, the contract's, and a hash of the sources."""
+    return {"zsim": __version__, "contract": str(CONTRACT), "code": _code()}
+
+
+@cache
+def fingerprint() -> str:
+    """Return 16 hex digits: equal fingerprints promise equal bits."""
+    text = ";".join(f"{name}={value}" for name, value in sorted(parts().items()) if name != "zsim")
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+@cache
+def machine() -> dict[str, str]:
+    """Return what may differ between machines that compute the same: processor, libraries, versions."""
     versions = {package: _version(package) for package in PACKAGES}
     return {
-        "zsim": __version__,
         "python": platform.python_version(),
         "machine": platform.machine(),
         "cpu": _cpu_features(),
@@ -37,11 +54,18 @@ def parts() -> dict[str, str]:
     }
 
 
-@cache
-def fingerprint() -> str:
-    """Return 16 hex digits: equal fingerprints promise equal bits."""
-    text = ";".join(f"{name}={value}" for name, value in sorted(parts().items()))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+def _code() -> str:
+    """Return a hash of the sources of the packages in CODE, whatever their line ends and folder."""
+    found = hashlib.sha256()
+    for package in CODE:
+        spec = importlib.util.find_spec(package)
+        if spec is None or spec.origin is None:
+            continue
+        folder = Path(spec.origin).parent
+        for name in sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.py")):
+            found.update(f"{package}/{name}\0".encode())
+            found.update((folder / name).read_bytes().replace(b"\r\n", b"\n"))
+    return found.hexdigest()[:16]
 
 
 def _version(package: str) -> str:

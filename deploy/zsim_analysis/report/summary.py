@@ -296,7 +296,7 @@ def _notes(
         yield "The scenario has no cluster: there is no table of errors."
     own = flight.info.fingerprint if flight.info else ""
     if others := [p.name for p in flight.processes if own and p.fingerprint and p.fingerprint != own]:
-        text = "computed with another numeric fingerprint than the world; the same bits are not promised."
+        text = "computed with other code than the world (fingerprint); the same bits are not promised."
         yield f"{', '.join(others)} {text}"
 
 

@@ -193,7 +193,7 @@ def notes(summary: SweepSummary) -> list[str]:
         )
     lines += [f"{count} of {summary.finished} runs have no {OWN}: {why}" for why, count in summary.unmeasured.items()]
     if len(summary.fingerprints) > 1:
-        lines.append("The hosts compute with different numeric fingerprints; the same bits are not promised.")
+        lines.append("The hosts have different code (fingerprints); the same bits are not promised.")
     return lines
 
 

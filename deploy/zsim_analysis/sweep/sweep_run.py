@@ -98,7 +98,7 @@ class RunResult(Struct, frozen=True, kw_only=True):
     window_note: str | None = None  # why it is not that of the scenario, empty if it is
     date: str | None = None  # when it was flown (ISO 8601, UTC)
     host: str = ""  # where it was flown
-    fingerprint: str = ""  # numeric; equal ones promise equal bits
+    fingerprint: str = ""  # equal ones promise equal bits
 
 
 # columns with the value of the same name in the run's summary

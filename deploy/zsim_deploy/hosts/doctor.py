@@ -1,7 +1,6 @@
 """`zsim doctor`: whether the hosts of an inventory can fly together; nothing is started on them."""
 
 import asyncio
-import platform
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
@@ -145,14 +144,10 @@ def _probe(link: HostLink, python: str, *words: str) -> AbstractAsyncContextMana
 def compare_reports(reports: dict[str, HostReport]) -> tuple[list[str], list[str]]:
     """Return faults that keep the hosts from flying together, and warnings, a line each."""
     faults, warnings = [], []
-    ours = platform.python_version_tuple()[:2]
     for name, report in reports.items():
         facts = report.facts
         if facts["zsim"] != __version__:
             faults.append(f"{name}: zsim is {facts['zsim']}; must be {__version__} as here; {report.remedy}")
-        if tuple(facts["python"].split(".")[:2]) != ours:
-            wanted = f"must be {'.'.join(ours)} as here, for the same bits"
-            faults.append(f"{name}: Python is {facts['python']}; {wanted}")
         if why := facts["unwritable"]:
             remedy = f"correct hosts.{name}.folder, or make it there"
             faults.append(f"{name}: its folder cannot be used ({why}); {remedy}")
@@ -167,12 +162,12 @@ def compare_reports(reports: dict[str, HostReport]) -> tuple[list[str], list[str
         if facts["free_bytes"] < FREE_MIN_BYTES:
             free = f"{facts['free_bytes'] / 1e9:.1f} GB are free on its disk"
             warnings.append(f"{name}: {free}; a record of an hour takes about 1 GB")
-    computing = {name: report for name, report in reports.items() if NEEDED_TO_COMPUTE in report.facts["parts"]}
-    return faults, [*warnings, *_different_fingerprints(computing)]
+    computing = {name: report for name, report in reports.items() if NEEDED_TO_COMPUTE in report.facts["machine"]}
+    return faults, [*warnings, *_different_fingerprints(computing), *_lacking(computing)]
 
 
 def _different_fingerprints(reports: dict[str, HostReport]) -> Iterator[str]:
-    """Yield a warning of different numeric fingerprints with the parts that differ, and one per missing package."""
+    """Yield a warning of different fingerprints, with the parts that differ."""
     prints = {name: report.facts["fingerprint"] for name, report in reports.items()}
     if len(set(prints.values())) < 2:
         return
@@ -182,9 +177,14 @@ def _different_fingerprints(reports: dict[str, HostReport]) -> Iterator[str]:
     differing = [part for part in names if len({each.get(part) for each in parts.values()}) > 1]
     values = {part: [f"{name} {each.get(part, 'none')}" for name, each in parts.items()] for part in differing}
     causes = "; ".join(f"{part}: {', '.join(found)}" for part, found in values.items())
-    yield f"the hosts compute with different numeric fingerprints ({shown}); same bits are not promised; {causes}"
+    yield f"the hosts have different code, so the same bits are not promised (fingerprints {shown}); {causes}"
+
+
+def _lacking(reports: dict[str, HostReport]) -> Iterator[str]:
+    """Yield a warning for each host without a package with which others compute: it is slower, with the same bits."""
     for name, report in reports.items():
-        if lacking := " and ".join(part for part in differing if part not in parts[name]):
+        others = {part for each in reports.values() for part in each.facts["machine"]}
+        if lacking := " and ".join(sorted(others - set(report.facts["machine"]))):
             yield f"{name}: has no {lacking}, with which others compute; {report.remedy}"
 
 

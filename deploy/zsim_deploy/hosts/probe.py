@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from zsim import __version__
-from zsim.contract.fingerprint import fingerprint, parts
+from zsim.contract.fingerprint import fingerprint, machine, parts
 
 GOVERNORS = "/sys/devices/system/cpu"  # Linux, cpufreq
 PINGS = 9
@@ -42,6 +42,7 @@ def about(folder: Path) -> dict[str, Any]:
         "zsim": __version__,
         "fingerprint": fingerprint(),
         "parts": parts(),
+        "machine": machine(),
         "cores": os.cpu_count() or 1,
         "load": os.getloadavg()[0],
         "governors": governors(Path(GOVERNORS)),

@@ -198,7 +198,7 @@ class Coordinator(ABC):
         found, own = joined.join.fingerprint, fingerprint()
         if found and found != own:
             who = f"{name} on {joined.join.host}"
-            text = f"{who} computes with another numeric fingerprint; the same bits are not promised"
+            text = f"{who} computes with other code (fingerprint); the same bits are not promised"
             outbox.event("fingerprint", name, text, {"found": found, "expected": own})
         for other, both in barrier.duplicates(name).items():
             text = f"{name} and {other} both do the work of {', '.join(sorted(both))}; end one of them"
