@@ -120,7 +120,7 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-OURS = ("eclipse-zenoh", "filterpy", "llvmlite", "msgspec", "numba", "numpy", "scipy")
+OURS = ("eclipse-zenoh", "llvmlite", "msgspec", "numba", "numpy", "scipy")
 
 
 def describe() -> dict[str, Any]:

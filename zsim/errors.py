@@ -174,7 +174,6 @@ EXTRA_OF = {
     "cryptography": "hosts",
     "cv2": "cameras",
     "distributed": "dask",
-    "filterpy": "agents",
     "fmpy": "fmu",
     "foxglove": "export",
     "gymnasium": "env",

@@ -35,7 +35,7 @@ WATCH, TRANSLATE, POKE = "Watch and steer", "Bridges and gateways", "Inspect and
 # Modules that a command needs, by the extra that brings them
 CAMERA_NEEDS = {"cameras": ("cv2",)}
 CONSOLE_NEEDS = {"console": ("aiohttp", "viser")}
-FLIGHT_NEEDS = {"record": ("mcap", "zstandard"), "world": ("numba",), "agents": ("scipy", "filterpy")}
+FLIGHT_NEEDS = {"record": ("mcap", "zstandard"), "world": ("numba",), "agents": ("scipy",)}
 REPORT_NEEDS = {"report": ("matplotlib", "jinja2", "mcap", "zstandard")}
 
 

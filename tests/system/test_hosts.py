@@ -111,10 +111,9 @@ def test_in_realtime_drones_land_while_their_controller_is_cut_off(deployment: D
 
 @pytest.mark.soak
 def test_a_host_that_computes_otherwise_is_warned_of_and_shown(lab: Lab, tmp_path: Path) -> None:
-    """To the processes of one host another version of a numeric package seems to be installed."""
-    other = tmp_path / "filterpy-99.dist-info"
-    other.mkdir()
-    (other / "METADATA").write_text("Metadata-Version: 2.1\nName: filterpy\nVersion: 99\n")
+    """The processes of one host find only a part of the code."""
+    less = "from zsim.contract import fingerprint\nfingerprint.CODE = fingerprint.CODE[:1]\n"
+    (tmp_path / "sitecustomize.py").write_text(less)
     lab.environment("h3", PYTHONPATH=str(tmp_path))
     with closing(Deployment(lab, ROLES)) as deployment:
         run = deployment.up("--duration", "4")

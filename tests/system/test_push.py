@@ -29,7 +29,7 @@ CACHE = Path(tempfile.gettempdir()) / "zsim-tests-cache"  # kept between runs, a
 PUSH_S = 180.0  # wall time for two installations on a loaded machine
 PUSH = (*ZSIM, "push")
 WHERE = "import zsim_deploy; print(zsim_deploy.__file__)"
-HAS = "from importlib.util import find_spec; print([n for n in ('filterpy', 'numba', 'mcap', 'scipy') if find_spec(n)])"
+HAS = "from importlib.util import find_spec; print([n for n in ('cloudpickle', 'numba', 'mcap', 'scipy') if find_spec(n)])"
 ROLES: dict[str, str | list[str]] = {"estimator.*": "h1", "world": "h3"}
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("push")]
@@ -103,7 +103,7 @@ def test_hosts_without_internet_get_what_their_roles_need_once(lab: Lab, hosts: 
         assert over_ssh(lab, hosts, name, python, "-P", "-m", "zsim_deploy.cli", "--version") == f"zsim {__version__}\n"
         assert "zsim_deploy/__init__.py" in over_ssh(lab, hosts, name, python, "-P", "-c", WHERE)
     assert {name: over_ssh(lab, hosts, name, python, "-P", "-c", HAS) for name, python in pythons.items()} == {
-        "h1": "['filterpy', 'numba', 'scipy']\n",
+        "h1": "['cloudpickle', 'numba', 'scipy']\n",
         "h2": "[]\n",
     }
     notes = [lab.host_folder(name) / "venv" / on_host.NOTE for name in pythons]

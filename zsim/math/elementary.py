@@ -89,6 +89,8 @@ def sin_cos(x: float) -> tuple[float, float]:
     """Return sine and cosine of an angle [rad]."""
     if not abs(x) < math.inf:
         return math.nan, math.nan
+    if x == 0.0:
+        return x, 1.0  # with the sign of the zero
     if abs(x) > _ACCURATE_RAD:
         x = x % (2.0 * math.pi)
     turns = math.floor(x * (2.0 / math.pi) + 0.5)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from typer import Argument, Option
+from typer import Argument, BadParameter, Option
 
 from zsim.errors import HostsError, RunError, printable
 from zsim.scenario.roles import ROUTER, WORLD
@@ -69,10 +69,24 @@ def push(
 
 @app.command(rich_help_panel=opt.HOSTS)
 def doctor(
-    hosts: Hosts,
-    scenario: Annotated[Path | None, Argument(help="Scenario whose roles are to be placed.")] = None,
+    scenario: Annotated[
+        Path | None, Argument(help="Scenario whose roles are to be placed, or that is to be flown.")
+    ] = None,
+    hosts: Annotated[Path | None, Option("--hosts", help="Inventory (YAML): which hosts, which role where.")] = None,
+    duration: Annotated[float, Option(callback=opt.between(0.1, 1e6), help="Simulated seconds to fly.")] = 20.0,
 ) -> None:
-    """Check every host: ssh, versions, clock, load, and how the hosts reach each other."""
+    """Check every host: ssh, versions, clock, load, and how the hosts reach each other.
+
+    Without --hosts, fly the scenario twice, as two processors compute, and tell whether the flights are the same.
+    """
+    if hosts is None:
+        from zsim_deploy.hosts.processor_check import check_processor
+
+        if scenario is None:
+            raise BadParameter("zsim doctor needs a scenario to fly, or --hosts with an inventory")
+        require("doctor", opt.FLIGHT_NEEDS)
+        check_processor(scenario, duration, say)
+        return
     from zsim.runtime.progress import PipedConsole
     from zsim.scenario import scenario_file
     from zsim_deploy import inventory

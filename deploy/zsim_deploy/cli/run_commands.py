@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from zsim_analysis.reading.shortfall import Shortfall
 
 
-SWEEP_NEEDS = {"sweep": ("pyarrow", "numba", "filterpy", "mcap", "matplotlib", "jinja2")}
+SWEEP_NEEDS = {"sweep": ("pyarrow", "numba", "scipy", "mcap", "matplotlib", "jinja2")}
 DASK_NEEDS = {**SWEEP_NEEDS, "dask": ("distributed",)}
 REPLAY_NEEDS = {"record": ("mcap", "zstandard")}
 WRITERS = {Format.CSV: "pyarrow", Format.PARQUET: "pyarrow", Format.MAT: "scipy", Format.FOXGLOVE: "foxglove"}

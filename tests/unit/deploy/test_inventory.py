@@ -290,7 +290,7 @@ def test_a_router_needs_none_and_extras_can_be_added() -> None:
 
 @pytest.mark.parametrize("extra", [AGENTS, WORLD])
 def test_who_calculates_has_all_that_its_bits_depend_on(extra: str) -> None:
-    """Else a host that `zsim push` has installed on would compute with another fingerprint."""
+    """Else a host that `zsim push` has installed on could not compute, or would be slower."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
     def distributions(lines: list[str]) -> set[str]:

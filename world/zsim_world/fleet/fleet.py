@@ -9,7 +9,7 @@ and pressure_pa is that of the standard atmosphere at `environment.height_m` + a
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal, NamedTuple, cast
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from msgspec import UNSET
@@ -409,7 +409,8 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
     external = np.array([i for i, drone in enumerate(drones) if drone.is_external], dtype=np.int64)
     pairs = np.zeros((n * (n - 1) // 2, 2), dtype=np.int32)  # yet to be found, since no drone is at its origin
     near = NearPairs(pair=pairs, number=np.zeros(1, dtype=np.int64), origin=np.full((n, 3), np.inf))
-    half_decay = cast(Any, rigid_body.half_decay).py_func  # as Python: compiling it for a few numbers takes longer
+    own = rigid_body.half_decay
+    half_decay = getattr(own, "py_func", own)  # as Python: compiling it for a few numbers takes longer
     return Bodies(
         each=tuple(range(each)),
         vehicle=row,

@@ -145,7 +145,7 @@ class ClusterSpace(ABC):
     def measures(self, c: Array) -> tuple[float, float]:
         """Return spread(c) and margin(c) [m], with one computation of the spread."""
         spread = self.spread(c)
-        return spread, spread * el.cos(c[self._pitch])
+        return spread, spread * float(el.cos(c[self._pitch]))
 
     def condition(self, c: Array) -> float:
         """Return the condition number of J^-1 (2-norm, metres and radians as they are).

@@ -40,7 +40,8 @@ SOUND = {
     "python": platform.python_version(),
     "zsim": __version__,
     "fingerprint": "a" * 16,
-    "parts": {"libc": "glibc-2.36", "numba": "0.68.1", "scipy": "1.17.1"},
+    "parts": {"zsim": __version__, "code": "c0de"},
+    "machine": {"libc": "glibc-2.36", "numba": "0.68.1", "scipy": "1.17.1"},
     "cores": 2,
     "load": 0.1,
     "governors": ["performance"],
@@ -55,7 +56,7 @@ def report(offset_s: float = 0.0, **changes) -> HostReport:
 
 def test_hosts_without_a_difference_that_matters_raise_nothing():
     """A host that computes nothing has no fingerprint to compare."""
-    router = report(fingerprint="b" * 16, parts={"libc": "glibc-2.31"})
+    router = report(fingerprint="b" * 16, machine={"libc": "glibc-2.31"})
     for other in (report(), router):
         assert compare_reports({"h1": other, "h2": report()}) == ([], [])
 
@@ -64,7 +65,6 @@ def test_hosts_without_a_difference_that_matters_raise_nothing():
     ("found", "fault", "warning"),
     [
         (report(zsim="0.0.1"), ("h1", "zsim", "0.0.1", __version__, "zsim push --hosts"), ()),
-        (report(python="3.9.2"), ("h1", "Python", "3.9.2"), ()),
         (report(unwritable="/opt"), ("h1", "folder", "/opt", "hosts.h1.folder"), ()),
         (report(offset_s=3600.0), (), ("h1", "clock", "+3600.0 s")),
         (report(load=1.9), (), ("h1", "load", "1.9", "2 cores")),
@@ -79,15 +79,23 @@ def test_what_keeps_a_host_from_flying_is_a_fault_and_what_slows_or_differs_a_wa
     assert [has_terms(line, *warning) for line in warnings] == [True] * bool(warning)
 
 
-def test_a_package_that_one_host_lacks_is_named_as_the_cause_of_another_fingerprint():
-    parts = {"libc": "glibc-2.31", "scipy": "1.17.1"}
-    faults, (different, lacking) = compare_reports({"h1": report(fingerprint="b" * 16, parts=parts), "h2": report()})
+def test_processors_python_and_libraries_may_differ():
+    other = report(python="3.14.1", machine={"libc": "musl", "numba": "0.70.0", "scipy": "1.18.0"})
+    assert compare_reports({"h1": other, "h2": report()}) == ([], [])
+
+
+def test_other_code_is_named_part_by_part():
+    other = report(fingerprint="b" * 16, parts={"zsim": __version__, "code": "d1ff"})
+    faults, (different,) = compare_reports({"h1": other, "h2": report()})
     assert faults == []
-    assert has_terms(
-        different, "h1 bbbbbbbb", "libc", "h1 glibc-2.31", "h2 glibc-2.36", "numba", "h1 none", "h2 0.68.1"
-    )
+    assert has_terms(different, "h1 bbbbbbbb", "code", "h1 d1ff", "h2 c0de")
+    assert "zsim:" not in different
+
+
+def test_a_package_that_one_host_lacks_is_named():
+    faults, (lacking,) = compare_reports({"h1": report(machine={"libc": "musl", "scipy": "1.17.1"}), "h2": report()})
+    assert faults == []
     assert has_terms(lacking, "h1", "numba", "zsim push --hosts")
-    assert "libc" not in lacking
 
 
 def test_a_path_that_is_not_there_is_a_fault_and_a_slow_one_a_warning():

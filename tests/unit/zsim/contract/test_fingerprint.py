@@ -1,50 +1,61 @@
-"""The numeric fingerprint, the same in every process of a machine; the hash of a flight, written again with `struct`."""
+"""The fingerprint of code and contract, the same on every machine; the hash of a flight, written again with `struct`."""
 
 import hashlib
+import importlib.util
 import os
 import platform
 import re
 import struct
 import subprocess
 import sys
+from importlib.machinery import ModuleSpec
+from pathlib import Path
 
 import numpy as np
 import pytest
 import threadpoolctl
 
 from zsim.contract import fingerprint as module
-from zsim.contract.fingerprint import PACKAGES, TruthHash, fingerprint, parts
+from zsim.contract.fingerprint import CODE, TruthHash, fingerprint, machine, parts
 
 
 @pytest.fixture(autouse=True)
 def _asked_anew():
-    parts.cache_clear()
-    fingerprint.cache_clear()
+    for asked in (parts, fingerprint, machine):
+        asked.cache_clear()
     yield
-    parts.cache_clear()
-    fingerprint.cache_clear()
+    for asked in (parts, fingerprint, machine):
+        asked.cache_clear()
 
 
-def test_another_process_has_the_same():
+def test_another_process_on_another_processor_has_the_same():
     command = [sys.executable, "-c", "from zsim.contract.fingerprint import fingerprint; print(fingerprint())"]
-    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == fingerprint()
-    assert re.fullmatch(r"[0-9a-f]{16}", fingerprint())
+    other = {**os.environ, "OPENBLAS_CORETYPE": "Nehalem", "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA"}
+    found = subprocess.run(command, capture_output=True, text=True, check=True, env=other).stdout.strip()
+    assert found == fingerprint()
+    assert re.fullmatch(r"[0-9a-f]{16}", found)
 
 
-def test_it_is_made_of_what_the_last_bit_depends_on():
-    found = parts()
-    assert {"zsim", "python", "machine", "cpu", "blas", "libc", "numpy"} <= set(found)
-    assert all(found.values())
+def test_the_sources_count_and_their_line_ends_and_folder_do_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def code(folder: str, text: bytes) -> str:
+        place = tmp_path / folder
+        place.mkdir(exist_ok=True)
+        (place / "__init__.py").write_bytes(b"")
+        (place / "drag.py").write_bytes(text)
+        spec = ModuleSpec("any", None, origin=str(place / "__init__.py"))
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name: spec if name == CODE[0] else None)
+        parts.cache_clear()
+        return parts()["code"]
+
+    here = code("a", b"DRAG = 0.3\n")
+    assert code("b", b"DRAG = 0.3\r\n") == here
+    assert code("b", b"DRAG = 0.4\n") != here
 
 
-@pytest.mark.parametrize("package", [*PACKAGES, "processor"])
-def test_another_version_of_a_package_or_processor_is_another_fingerprint(
-    package: str, monkeypatch: pytest.MonkeyPatch
-):
-    here, known, features = fingerprint(), module._version, module._cpu_features()
-    monkeypatch.setattr(module, "_version", lambda name: "0.0.0" if name == package else known(name))
-    monkeypatch.setattr(module, "_cpu_features", lambda: "00000000" if package == "processor" else features)
-    parts.cache_clear()
+@pytest.mark.parametrize("part", ["code", "contract"])
+def test_another_part_is_another_fingerprint(part: str, monkeypatch: pytest.MonkeyPatch):
+    here, known = fingerprint(), parts()
+    monkeypatch.setattr(module, "parts", lambda: {**known, part: "other"})
     fingerprint.cache_clear()
     assert fingerprint() != here
 
@@ -59,19 +70,20 @@ def test_another_version_of_a_package_or_processor_is_another_fingerprint(
         ("x86_64-linux-gnu/libopenblas.so.0", True),
     ],
 )
-def test_a_blas_that_another_package_brings_is_none_of_it(library: str, counts: bool, monkeypatch: pytest.MonkeyPatch):
-    here, known = fingerprint(), threadpoolctl.threadpool_info()
+def test_a_blas_that_another_package_brings_is_none_of_the_machine_s(
+    library: str, counts: bool, monkeypatch: pytest.MonkeyPatch
+):
+    here, known = machine()["blas"], threadpoolctl.threadpool_info()
     other = {"user_api": "blas", "internal_api": "openblas", "architecture": "Other", "filepath": f"/usr/lib/{library}"}
     monkeypatch.setattr(threadpoolctl, "threadpool_info", lambda: [*known, other])
-    parts.cache_clear()
-    fingerprint.cache_clear()
-    assert (fingerprint() != here) == counts
+    machine.cache_clear()
+    assert (machine()["blas"] != here) == counts
 
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="names of cores of x86")
 @pytest.mark.parametrize("core", ["Haswell", "Sandybridge"])
-def test_blas_for_another_processor_is_another_fingerprint(core: str):
-    command = [sys.executable, "-c", "from zsim.contract.fingerprint import parts; print(parts()['blas'])"]
+def test_a_machine_names_the_processor_for_which_blas_computes(core: str):
+    command = [sys.executable, "-c", "from zsim.contract.fingerprint import machine; print(machine()['blas'])"]
     chosen = {**os.environ, "OPENBLAS_CORETYPE": core}
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=chosen)
     assert done.stdout.strip() == f"openblas-{core}"
@@ -81,9 +93,8 @@ def test_what_is_not_there_is_left_out_and_the_system_stands_for_an_unknown_c_li
     monkeypatch.setattr(module.platform, "libc_ver", lambda: ("", ""))
     monkeypatch.setattr(module.platform, "system", lambda: "Darwin")
     monkeypatch.setattr(module, "PACKAGES", ("numpy", "no-such-package"))
-    parts.cache_clear()
-    assert parts()["libc"] == "Darwin"
-    assert "no-such-package" not in parts()
+    assert machine()["libc"] == "Darwin"
+    assert "no-such-package" not in machine()
 
 
 DRONES = 3
