@@ -1,0 +1,78 @@
+"""The same bits on every processor: the golden flights as other processors, C libraries and BLAS compute."""
+
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import golden_flights
+import pytest
+import yaml
+
+from zsim_deploy.hosts.processor_check import older_processor
+
+GOLDEN: dict[str, str] = yaml.safe_load(golden_flights.GOLDEN.read_text())
+OLDER = older_processor()
+GENERIC = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}  # code of a few minutes' compilation
+BLAS = ("Haswell", "Nehalem", "Sandybridge") if platform.machine() == "x86_64" else ("ARMV8", "NEOVERSEN1")
+MIXED = ("swarm", "ring10", "eyes")  # with a radio, a template, sightings
+BY_SETTING = [{name: value} for name, value in OLDER.items() if name != "OPENBLAS_CORETYPE"]
+BY_SETTING += [{"OPENBLAS_CORETYPE": core} for core in BLAS]
+
+LAW = """
+import numpy as np
+import zsim
+
+class Bent(zsim.ControlLaw):
+    def rates(self, c, p_W, v_W, c_des, c_dot_des):
+        pull = np.exp(np.tan(1e-3 * self.space.difference(c_des, c))) - 1.0
+        return self.space.motion(c, c_dot_des + 300.0 * pull)
+"""
+
+
+def flown(settings: dict[str, str], *names: str) -> dict[str, str]:
+    """Return the hashes of golden flights of a process with some variables."""
+    command = [sys.executable, "-P", golden_flights.__file__, *names]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **settings})
+    assert done.returncode == 0, done.stderr
+    return yaml.safe_load(done.stdout)
+
+
+def golden(*names: str) -> dict[str, str]:
+    return {name: GOLDEN[name] for name in names}
+
+
+@pytest.mark.parametrize("name", golden_flights.scenarios())
+def test_every_scenario_of_the_repository_gives_its_golden_hash(name: str) -> None:
+    assert golden_flights.fly(name) == GOLDEN[name]
+
+
+def test_there_is_a_golden_hash_of_every_scenario() -> None:
+    assert list(GOLDEN) == list(golden_flights.scenarios())
+
+
+@pytest.mark.parametrize("settings", BY_SETTING, ids=lambda each: "=".join(*each.items())[:40])
+def test_one_setting_changes_nothing(settings: dict[str, str]) -> None:
+    assert flown(settings, "step") == golden("step")
+
+
+def test_all_settings_together_change_nothing() -> None:
+    assert flown(OLDER, *MIXED) == golden(*MIXED)
+
+
+@pytest.mark.soak
+def test_with_all_settings_and_code_for_any_processor_nothing_changes() -> None:
+    assert flown({**OLDER, **GENERIC}, *GOLDEN) == GOLDEN
+
+
+def test_a_law_that_depends_on_the_processor_is_found(tmp_path: Path) -> None:
+    (tmp_path / "bent.py").write_text(LAW)
+    scenario = yaml.safe_load((golden_flights.ROOT / "scenarios" / "step.yaml").read_text())
+    scenario["clusters"][0]["law"] = "bent:Bent"
+    (tmp_path / "bent.yaml").write_text(yaml.safe_dump(scenario))
+    command = [sys.executable, "-P", "-m", "zsim_deploy", "doctor", str(tmp_path / "bent.yaml"), "--duration", "14"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "command" in done.stderr
+    assert "differs" in done.stderr
