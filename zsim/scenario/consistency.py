@@ -14,7 +14,7 @@ from msgspec import UNSET
 from zsim.contract import messages
 from zsim.scenario.faults import Known, flaws, kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
-from zsim.scenario.own_classes import agent_faults
+from zsim.scenario.own_classes import agent_faults, law_faults
 from zsim.scenario.roles import AGENTS, MAIN, OPERATOR, PILOT, ROLES
 from zsim.scenario.scenario import (
     EXTERNAL,
@@ -77,6 +77,7 @@ def cross_faults(
     yield from _membership_faults(drones, clusters)
     for index, cluster in clusters:
         yield from _under(f"clusters[{index}]", _plan_faults(cluster))
+        yield from _under(f"clusters[{index}]", law_faults(cluster, {drone.name: drone for _, drone in drones}, unread))
     for index, cluster in clusters:
         yield from _under(f"clusters[{index}]", _shape_faults(cluster, drones))
     yield from _reference_faults(scenario, drones, clusters)

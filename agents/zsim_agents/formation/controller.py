@@ -42,7 +42,10 @@ class Controller(Agent):
         self.drones = tuple(spec.drones)
         estimates = tuple(keys.estimate(drone) for drone in spec.drones)
         states = tuple(keys.status(drone) for drone in spec.drones)
-        self.reads = self.gate_keys = states + estimates
+        self._engagement = engagement_of(scenario, spec)
+        self._grants = self._engagement.law.grants
+        self.gate_keys = states + estimates
+        self.reads = self.gate_keys + self._grants.keys
         self._state_key, self._view_key = keys.cluster_state(cluster), keys.cluster_view(cluster)
         self._control_key, self._request_key = keys.cluster_control(cluster), keys.cluster_request(cluster)
         self.writes, self.repeats = (self._state_key,), (self._request_key,)
@@ -55,14 +58,15 @@ class Controller(Agent):
         self._fill = partial(Packing(f"={table.size}d").pack_into, table.data, 0)  # numpy takes three times as long
         self._states: list[str] = ["landed"] * len(spec.drones)
         self._status_ns = [0] * len(spec.drones)
-        self._engagement = engagement_of(scenario, spec)
         self._last_state: flight_messages.ClusterState | None = None
         self._stepped_ns: int | None = None
         self._answered: list[tuple[ControlRequest, ControlAnswer]] = []  # since the last gate
 
     def receive(self, key: str, message: Any) -> None:
-        place = self._place[key]
-        if type(message) is flight_messages.Estimate:
+        place = self._place.get(key)
+        if place is None:
+            self._grants.put(key, message)
+        elif type(message) is flight_messages.Estimate:
             former = self._estimates[place]
             if former is _UNKNOWN or message.t_ns >= former.t_ns:  # in realtime an older one may come later
                 self._estimates[place] = message
@@ -70,7 +74,7 @@ class Controller(Agent):
             self._states[place], self._status_ns[place] = message.state, message.t_ns
 
     def step(self, t_ns: int) -> list[Output]:
-        self._stepped_ns = t_ns
+        self._stepped_ns = self._grants.t_ns = t_ns
         output = self._engagement.step(self._gate(t_ns))
         source, outputs = self.source, []
         answered, self._answered = self._answered, []
@@ -156,6 +160,7 @@ class Controller(Agent):
             "status_ns": self._status_ns,
             "stepped_ns": self._stepped_ns,
             "engagement": engagement,
+            "grants": self._grants.snapshot(),
         }
 
     def restore(self, state: State) -> None:
@@ -163,6 +168,7 @@ class Controller(Agent):
         self._estimates = [messages.decode(key, payload) if payload else _UNKNOWN for key, payload in pairs]
         self._states, self._status_ns = state["states"], state["status_ns"]
         self._stepped_ns = state["stepped_ns"]
+        self._grants.restore(state["grants"])
         gate = None if self._stepped_ns is None else self._gate(self._stepped_ns)
         self._engagement.restore(state["engagement"], gate)
 

@@ -39,6 +39,7 @@ from zsim_agents.formation.flight_check import (
     shape_fault,
 )
 from zsim_agents.formation.flight_plan import REFUSALS, FlightPlan, Follow, MoveTo, PlanError, plan_of
+from zsim_agents.formation.grants import granted, grants_of
 from zsim_agents.formation.guidance import HORIZON_S, LOAD_TOLERANCE, RampPlanner
 from zsim_agents.formation.spaces.cluster_space import (
     Array,
@@ -65,6 +66,8 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
         name = cluster.law or "proportional"
         law = LAWS.get(name) or plugin.load(name, "law", ControlLaw, is_constructed=True)
         law = parameters.bound(law, cluster.law_parameters, "law_parameters")
+        if plugin.is_own(law):
+            law = granted(law, grants_of(cluster, scenario.environment))
         _rehearse(space, cluster.drones, gains, law)
         limits = EngagementLimits()
         if cluster.gains.sigma_max_m is not UNSET:
