@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from zsim.scenario.polynomial_file import pieces_of
-from zsim_agents.references.assignment import assign, first_approach, straight_separation
+from zsim_agents.formation.assignment import assign, straight_separation
+from zsim_agents.references.approach import first_approach
 from zsim_agents.references.cruise import RISE_S, Cruise, cruise, cruise_through
 from zsim_agents.references.generators import Laps, figure_eight
 from zsim_agents.references.path import PathLimits, PiecewisePolynomial, minimum_snap, move, peaks_of

@@ -19,10 +19,11 @@ from zsim.contract.flight_messages import ReferencePhase
 from zsim.errors import DocumentError, NotTrustedError, RunError
 from zsim.scenario.scenario import STAGES_MAX, Drone, DroneReference, Exchange, PathPoint, Piloted, Scenario
 from zsim.vehicles.vehicle_catalogue import vehicle_of
+from zsim_agents.formation.assignment import assign
 from zsim_agents.formation.expression import ExpressionError
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.formation.trajectory import ExpressionTrajectory, Reference, TrajectoryError, WaypointTrajectory
-from zsim_agents.references.assignment import assign, first_approach
+from zsim_agents.references.approach import first_approach
 from zsim_agents.references.generators import Laps, circle, figure_eight
 from zsim_agents.references.path import (
     SHARE,

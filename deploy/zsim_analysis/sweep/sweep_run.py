@@ -44,7 +44,7 @@ from zsim_analysis.in_process import InProcessFlight
 from zsim_analysis.reading.formation import Formation, formations_of
 from zsim_analysis.reading.recorded_flight import FlightReader, RecordedFlight
 from zsim_analysis.reading.shortfall import CRASHES
-from zsim_analysis.report.summary import summarise
+from zsim_analysis.report.summary import RunSummary, summarise
 from zsim_analysis.sweep.design import METRICS
 
 METRIC = "metrics."  # prefix of the columns of the user's metrics
@@ -67,6 +67,7 @@ class Task(Struct, frozen=True):
     record: str | None = None  # folder for the record, None to keep none
     open_run: Callable[[Path], Any] | None = None  # makes a `zsim.Run` of a record, for metrics
     more: Callable[[RecordedFlight], Mapping[str, Any]] | None = None  # returns further columns, of values as in JSON
+    judge: Callable[[RunSummary, Row], Mapping[str, Any]] | None = None  # more, of its summary
 
 
 class RunResult(Struct, frozen=True, kw_only=True):
@@ -180,7 +181,8 @@ def fly(task: Task) -> Row:
         for statistic, value in msgspec.structs.asdict(tracking).items():
             columns[f"tracking.{name}.{statistic}"] = value if summary.as_planned else None
     more = task.more(flight) if task.more and not diverged else {}
-    return make_row(result, task.varied, {**columns, **metrics, **more})
+    row = make_row(result, task.varied, {**columns, **metrics, **more})
+    return {**row, **task.judge(summary, row)} if task.judge and not diverged else row
 
 
 def fly_scenario(

@@ -314,12 +314,19 @@ class Supervisor:
     def _finish(self) -> None:
         """Let all processes leave; the recorder leaves last, by itself."""
         members = [child for child in self.members if child is not self.lasting]
+        programs = [child for child in members if child.is_program and child.name not in self._dead]
+        for program in programs:  # one may have died after the last look at it
+            if program.code and self._deaths.decide(program.name, program.code, self._flies).action == "end":
+                self._fail(f"{program.name} ended: {program.outcome()}", after_end=True)
         for child in members:
             if self._failed or self._interrupted or child.role != "recorder":
                 child.request_stop(self._reason)
         for child in members:
             while not child.wait(min(POLL_S, self._left_s())) and self._left_s() > 0:
                 continue
+        for program in programs:
+            if program.code:
+                self._show.say(f"{program.name} ended: {program.outcome()}")
         recorder = next(child for child in members if child.role == "recorder")
         if recorder.code not in (0, None) and recorder.name not in self._dead:
             self._fail(f"the recorder ended: {recorder.outcome()}", after_end=True)
