@@ -430,6 +430,9 @@ def _in_line(places: list[Any]) -> bool:
 
 
 def _plan_faults(cluster: Any) -> Iterator[Fault]:
+    for (_, before), (index, after) in pairwise(_entries((cluster.plan and cluster.plan.assemblies) or [])):
+        if _known(before.at_s, after.at_s) and after.at_s <= before.at_s:
+            yield f"plan.assemblies[{index}].at_s", f"is {after.at_s:g}; must be > {before.at_s:g}, the one before"
     trajectory = cluster.plan and cluster.plan.trajectory
     if not trajectory:
         return

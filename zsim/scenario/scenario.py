@@ -32,7 +32,7 @@ CONSTANTS_MAX = 100  # of a user, for the expressions of a trajectory
 ROBOTS_MAX = 64  # drones of a cluster; beyond it a dense Jacobian of 4n x 4n no longer fits a control gate of 20 ms
 POINTS_MAX = 1000  # of a path of one drone
 PIECES_MAX = 5000  # polynomials of one path
-STAGES_MAX = 100  # of drones that change places
+STAGES_MAX = 100  # of drones that change places, or become another formation
 METRICS_MAX = 20  # functions
 ROLES_MAX = 20  # of users' agents; each is a process for every drone
 PROGRAMS_MAX = 100  # of users, beside agents
@@ -328,10 +328,19 @@ class Trajectory(Spec, frozen=True, kw_only=True):
     waypoints: Annotated[list[Waypoint], Meta(max_length=WAYPOINTS_MAX)] = []
 
 
+class AssemblyPoint(Spec, frozen=True, kw_only=True):
+    """A formation to whose places its drones fly, each to one that is assigned to it."""
+
+    at_s: NonNegative = 0.0
+    values: Values = {}
+
+
 class ClusterPlan(Spec, frozen=True, kw_only=True):
     """What the controller does without being asked."""
 
     takeoff_s: NonNegative | None = None
+    assemblies: Annotated[list[AssemblyPoint], Meta(min_length=1, max_length=STAGES_MAX)] | UnsetType = UNSET
+    """Unset: the drones form the cluster as they stand at the start; left out of the resolved text."""
     target: Values = {}
     target_over_s: Positive | None = None
     trajectory: Trajectory | None = None

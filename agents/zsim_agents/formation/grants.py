@@ -40,8 +40,21 @@ class Grants:
         self._cluster, self._map = cluster, its_map
         self._newest: dict[str, list[Sample | None]] = {name: [None] * len(drones) for name in sensors}
         self._received: dict[str, Any] = {name: type_of(keys.sensor(drones[0], name)) for name in sensors}
-        self._places = {keys.sensor(drone, name): (name, i) for name in sensors for i, drone in enumerate(drones)}
+        self._drones: Sequence[str] = drones
+        self._places = self._numbered()
         self.keys = tuple(self._places)
+
+    def _numbered(self) -> dict[str, tuple[str, int]]:
+        return {keys.sensor(drone, name): (name, i) for name in self._newest for i, drone in enumerate(self._drones)}
+
+    def seat(self, drones: Sequence[str]) -> None:
+        """Take the drones in another order, of the robots."""
+        if not self.keys:
+            return
+        order = [self._drones.index(drone) for drone in drones]
+        self._newest = {name: [newest[k] for k in order] for name, newest in self._newest.items()}
+        self._drones = drones
+        self._places = self._numbered()
 
     def put(self, key: str, sample: Sample) -> None:
         name, place = self._places[key]
