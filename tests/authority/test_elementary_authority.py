@@ -138,6 +138,17 @@ def test_linear_algebra_is_that_of_lapack(n: int) -> None:
     np.testing.assert_allclose(linear.exponential(A), scipy.linalg.expm(A), rtol=1e-9, atol=1e-9)
 
 
+def test_banded_systems_are_solved_as_full_ones() -> None:
+    rng = np.random.default_rng(3)
+    n, below, above = 40, 5, 2
+    A = np.triu(np.tril(rng.normal(size=(n, n)), above), -below)
+    diagonals = np.zeros((n, below + 1 + above))
+    for i, j in zip(*np.nonzero(A), strict=True):
+        diagonals[i, j - i + below] = A[i, j]
+    B = rng.normal(size=(n, 3))
+    np.testing.assert_allclose(linear.solve_banded(diagonals, below, B), np.linalg.solve(A, B), rtol=1e-8, atol=1e-9)
+
+
 def test_singular_matrices_have_their_zero_and_no_solution() -> None:
     A = np.array([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0], [0.0, 1.0, 1.0]])
     assert linear.singular_values(A)[-1] == pytest.approx(0.0, abs=1e-15)

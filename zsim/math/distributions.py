@@ -1,6 +1,7 @@
 """Normal and chi-square distributions with the same bits everywhere; see `zsim.math.elementary`."""
 
 import math
+from collections.abc import Callable
 
 from zsim.math import elementary as el
 from zsim.math.compiled import kernel
@@ -50,7 +51,7 @@ def chi_square_probability(x: float, dof: int) -> float:
         n += 1
         term *= half / (a + n)
         total += term
-    power = el.power(half, dof // 2) * (math.sqrt(half) if dof % 2 else 1.0)
+    power = el.power(half, float(dof // 2)) * (math.sqrt(half) if dof % 2 else 1.0)
     return min(power * el.exp(-half) / gamma * total, 1.0)
 
 
@@ -59,7 +60,7 @@ def chi_square_quantile(probability: float, dof: int) -> float:
     return _bisected(lambda x: chi_square_probability(x, dof), probability, 0.0, 700.0)
 
 
-def _bisected(function, value: float, low: float, high: float) -> float:  # type: ignore[no-untyped-def]
+def _bisected(function: Callable[[float], float], value: float, low: float, high: float) -> float:
     """Return where an increasing function has a value, to the last bit that halving gives."""
     while True:
         middle = 0.5 * (low + high)

@@ -6,6 +6,7 @@ arrays of float64; a singular system gives results that are not finite.
 
     product     A B of (m, k) and (k, n), or of (m, k) and (k,)
     solve       A^-1 B by elimination with partial pivoting
+    solve_banded        the same, of a matrix with few diagonals
     eigen       eigenvalues, ascending, and eigenvectors of a symmetric matrix (Jacobi)
     singular_values     descending, by rotations of columns (Hestenes, J. SIAM 6 (1958) 51-90)
     pseudo_inverse      of a matrix with independent rows
@@ -35,6 +36,17 @@ def solve(A: ArrayLike, B: ArrayLike) -> Array:
     """Return A^-1 B of (n, n) and (n, m) or (n,)."""
     a, b = _own(A), _own(B)
     return _solved(a.copy(), b.reshape(len(a), -1).copy()).reshape(b.shape)
+
+
+def solve_banded(diagonals: Array, below: int, B: Array) -> Array:
+    """Return A^-1 B (n, m) of a banded matrix.
+
+    Args:
+        diagonals: (n, below + 1 + above): element j - i + below of row i is A[i, j].
+        below: diagonals below the main one.
+    """
+    room = np.zeros((len(diagonals), below))  # which rows fill when they are exchanged
+    return _banded_solved(_own(np.hstack([diagonals, room])), below, _own(B).copy())
 
 
 def inverse(A: ArrayLike) -> Array:
@@ -117,6 +129,38 @@ def _solved(A: Array, B: Array) -> Array:
             for i in range(k + 1, n):
                 rest -= A[k, i] * B[i, j]
             B[k, j] = rest / A[k, k]
+    return B
+
+
+@kernel()
+def _banded_solved(A: Array, below: int, B: Array) -> Array:
+    """Return A^-1 B; both are overwritten."""
+    n, m = B.shape
+    right = A.shape[1] - below  # columns of a row from the diagonal on
+    for k in range(n):
+        best = k
+        for i in range(k + 1, min(n, k + below + 1)):
+            if abs(A[i, k - i + below]) > abs(A[best, k - best + below]):
+                best = i
+        if best != k:
+            for j in range(k, min(n, k + right)):
+                a, b = A[k, j - k + below], A[best, j - best + below]
+                A[k, j - k + below], A[best, j - best + below] = b, a
+            for j in range(m):
+                B[k, j], B[best, j] = B[best, j], B[k, j]
+        for i in range(k + 1, min(n, k + below + 1)):
+            factor = A[i, k - i + below] / A[k, below]
+            if factor != 0.0:
+                for j in range(k + 1, min(n, k + right)):
+                    A[i, j - i + below] -= factor * A[k, j - k + below]
+                for j in range(m):
+                    B[i, j] -= factor * B[k, j]
+    for k in range(n - 1, -1, -1):
+        for j in range(m):
+            rest = B[k, j]
+            for i in range(k + 1, min(n, k + right)):
+                rest -= A[k, i - k + below] * B[i, j]
+            B[k, j] = rest / A[k, below]
     return B
 
 

@@ -216,9 +216,9 @@ class DroneSetup:
             if late_s <= self._gate_s or not is_used:
                 continue
             if channel.field == "velocity_m_s":
-                gained = white * late_s + walk * el.power(late_s, 3) / 3.0  # m^2/s^2
+                gained = white * late_s + walk * el.power(late_s, 3.0) / 3.0  # m^2/s^2
             else:
-                gained = white * el.power(late_s, 3) / 3.0 + walk * el.power(late_s, 5) / 20.0  # m^2
+                gained = white * el.power(late_s, 3.0) / 3.0 + walk * el.power(late_s, 5.0) / 20.0  # m^2
             if gained > CLONED_FROM * el.square(channel.sigma(sensors)):
                 longest_s = max(longest_s, late_s + self._gate_s)
         return math.ceil(longest_s / CLONE_EVERY_S) + 1 if longest_s else 0

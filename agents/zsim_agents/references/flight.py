@@ -20,12 +20,14 @@ from zsim.errors import DocumentError, NotTrustedError, RunError
 from zsim.math import elementary as el
 from zsim.scenario.scenario import STAGES_MAX, Drone, DroneReference, Exchange, PathPoint, Piloted, Scenario
 from zsim.vehicles.vehicle_catalogue import vehicle_of
+from zsim_agents.formation.assignment import assign
 from zsim_agents.formation.expression import ExpressionError
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.formation.trajectory import ExpressionTrajectory, Reference, TrajectoryError, WaypointTrajectory
-from zsim_agents.references.assignment import assign, first_approach
+from zsim_agents.references.approach import first_approach
 from zsim_agents.references.generators import Laps, circle, figure_eight
 from zsim_agents.references.path import (
+    SHARE,
     EndMotion,
     PathLimits,
     Peaks,
@@ -38,7 +40,6 @@ from zsim_agents.references.path import (
 )
 
 READY_S = 4.0  # least from the order to take off to the first way: an AR.Drone takes 4 s or more
-SHARE = 0.8  # of the drone's limits, as in formations: the rest is for the feedback
 WAY_SHARE = 0.5  # of them, for the way to a path, which nobody wants to be fast; chosen
 ROUNDING = 1.0 + 1e-9  # of a factor that just fits
 HEIGHT_MIN_M = 0.2  # over the ground, chosen: above most of the ground effect of the smallest
@@ -304,7 +305,7 @@ def exchange_flights(scenario: Scenario, exchange: Exchange) -> dict[str, Flight
         goals = places.copy()
         goals[:, :3] = np.array(stage.places_m)[_assigned(places[:, :3].tobytes(), tuple(stage.places_m))]
         ways = goals - places
-        aside_m, up_m = np.hypot(ways[:, 0], ways[:, 1]), np.abs(ways[:, 2])
+        aside_m, up_m = np.sqrt(np.square(ways[:, :2]).sum(axis=1)), np.abs(ways[:, 2])
         speeds = peaks.speed_m_s * np.maximum(aside_m / limits[:, 0], up_m / limits[:, 1])
         least_s = float(np.maximum(speeds, np.sqrt(peaks.accel_m_s2 * aside_m / limits[:, 3])).max())
         over_s = stage.over_s
@@ -313,7 +314,7 @@ def exchange_flights(scenario: Scenario, exchange: Exchange) -> dict[str, Flight
                 needed = f"must be >= {round_up(least_s):g} for the longest way, or set fit: true"
                 raise FlightError(f"{at}.over_s", f"is {over_s:g}; {needed}")
             over_s = round_up(least_s)
-        coefficients = (rise / over_s ** np.arange(len(rise)))[:, None] * ways[:, None, :]
+        coefficients = (rise / [el.power(over_s, float(k)) for k in range(len(rise))])[:, None] * ways[:, None, :]
         coefficients[:, 0] += places
         stages.append((stage.start_s, over_s, coefficients))
         places, free_s = goals, stage.start_s + over_s

@@ -16,17 +16,22 @@ import numpy as np
 from numpy.polynomial import polynomial
 
 from zsim.math import elementary as el
+from zsim.math import linear
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.formation.trajectory import Reference, TrajectoryError
 
 DEGREE = 7  # of a piece, as in the files of uav_trajectories: the least in which place, velocity, acceleration and jerk
 # of both ends can be given
 ENDS = 3  # derivatives that are given at both ends of a path
-ROUNDED = 9  # decimals of a coefficient: a nanometre, below which processors differ in the last bits of a solution
+BELOW, ABOVE = 11, 3  # diagonals of the equations of a minimum-snap path, ordered from piece to piece
+PEAK_SAMPLES = 64  # of a piece, where its greatest speed is looked for
+GOLDEN = 0.6180339887498949  # (sqrt(5) - 1) / 2
+GOLDEN_STEPS = 40  # each leaves 0.62 of the interval: 1e-10 of a piece in all
 SAMPLE_S, SAMPLES_MIN, SAMPLES_MAX = 0.05, 65, 4001  # of a path that is no polynomial, between which peaks are refined
 HORIZON_S = 600.0  # of an endless path that is looked at
 DIFFERENCE_S = 1e-4  # of rates, for an acceleration: exact to 1e-7 of it in motions of a second
-FACTOR_DIGITS = 3  # of the factor of a fit, rounded up, see ROUNDED
+FACTOR_DIGITS = 3  # of the factor of a fit, rounded up
+SHARE = 0.8  # of the drone's limits, as in formations: the rest is for the feedback
 LEAST_S, MOVE_MAX_S, GROWTH = 0.5, 3600.0, 1.1  # of a move: 25 gates, however short; an hour; step of the search
 STILL = 1e-9  # m, m/s or rad/s, below which nothing moves
 
@@ -87,30 +92,60 @@ class PiecewisePolynomial:
             rate.append(slope)
         return np.array(place), np.array(rate) if clamped == t_s else np.zeros(4)
 
+    def until(self, end_s: float) -> PiecewisePolynomial:
+        """Return the part before end_s, which is after the beginning."""
+        count = bisect.bisect_left(self._begins, end_s)
+        durations = self.durations_s[:count].copy()
+        durations[-1] = min(durations[-1], end_s - self._begins[count - 1])
+        return PiecewisePolynomial(durations, self.coefficients[:count])
+
     def peaks(self) -> Peaks:
-        """Return the peaks, by the roots of the derivative of each squared quantity."""
+        """Return the peaks of each piece, to 1e-10 of it."""
         greatest = [(0.0, 0.0)] * 4
         for begin_s, duration_s, own in zip(self.begins_s, self.durations_s, self.coefficients, strict=False):
-            unit = own * duration_s ** np.arange(len(own))[:, None]  # of a local time from 0 to 1, which is well scaled
+            unit = own * _powers(duration_s, len(own))[:, None]  # of a local time from 0 to 1, which is well scaled
             v = polynomial.polyder(unit) / duration_s
             a = polynomial.polyder(v) / duration_s
             for k, columns in enumerate((v[:, :2], v[:, 2:3], v[:, 3:], a[:, :2])):
-                square = np.sum([np.convolve(column, column) for column in columns.T], axis=0)
-                most, at = _greatest(square)
+                most, at = _greatest(columns)
                 greatest[k] = max(greatest[k], (math.sqrt(most), float(begin_s + at * duration_s)))
         values, times = zip(*greatest, strict=True)
         return Peaks(*values, at_s=times)
 
 
-def _greatest(coefficients: Array) -> tuple[float, float]:
-    """Return the greatest value of a polynomial in [0, 1], and where."""
-    slope = polynomial.polytrim(polynomial.polyder(coefficients), 1e-12 * max(1e-300, np.abs(coefficients).max()))
-    roots = polynomial.polyroots(slope) if len(slope) > 1 else np.zeros(0)
-    inside = roots.real[(np.abs(roots.imag) < 1e-3) & (roots.real > 0.0) & (roots.real < 1.0)]
-    at = np.concatenate(([0.0, 1.0], inside))
-    values = polynomial.polyval(at, coefficients)
-    best = int(np.argmax(values))
-    return max(0.0, float(values[best])), float(at[best])
+def _powers(x: float, count: int) -> Array:
+    """Return x^0, x^1, ..., (count,)."""
+    return np.array([el.power(x, float(k)) for k in range(count)])
+
+
+def _greatest(columns: Array) -> tuple[float, float]:
+    """Return the greatest sum of squares of polynomials (n, k) in [0, 1], and where: by samples and golden section.
+
+    The derivative of such a sum has at most twelve roots, so samples show all maxima wider than their distance.
+    """
+    falling = columns[::-1].T.tolist()
+
+    def value(t: float) -> float:
+        total = 0.0
+        for column in falling:
+            own = 0.0
+            for coefficient in column:
+                own = own * t + coefficient
+            total += own * own
+        return total
+
+    samples = np.square(polynomial.polyval(np.linspace(0.0, 1.0, PEAK_SAMPLES + 1), columns)).sum(axis=0)
+    best = int(np.argmax(samples))
+    low, high = max(best - 1, 0) / PEAK_SAMPLES, min(best + 1, PEAK_SAMPLES) / PEAK_SAMPLES
+    at = best / PEAK_SAMPLES
+    most = value(at)
+    for _ in range(GOLDEN_STEPS):
+        left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+        a, b = value(left), value(right)
+        low, high = (low, right) if a > b else (left, high)
+        if max(a, b) > most:
+            most, at = (a, left) if a > b else (b, right)
+    return most, at
 
 
 class EndMotion(NamedTuple):
@@ -137,17 +172,43 @@ def minimum_snap(
     Args:
         times_s: (m,), rising; the first is the start of the path.
     """
-    from scipy.interpolate import PPoly, make_interp_spline  # here, as in `WaypointTrajectory`
-
     ends = begin or at_rest(), end or at_rest()
-    given = [[(k + 1, motion[k]) for k in range(ENDS)] for motion in ends]
-    spline = make_interp_spline(np.asarray(times_s), places, k=DEGREE, bc_type=given)
-    pieces = [PPoly.from_spline((spline.t, spline.c[:, k], DEGREE)) for k in range(4)]
-    inner = slice(DEGREE, -DEGREE)  # the knots at both ends are repeated
-    rising = np.stack([each.c[::-1, inner] for each in pieces], axis=-1).swapaxes(0, 1)  # (m - 1, 8, 4)
     spans = np.diff(np.asarray(times_s, float))
-    scale = spans[:, None, None] ** np.arange(DEGREE + 1)[:, None]  # to a local time from 0 to 1
-    return PiecewisePolynomial(spans, np.asarray(np.round(rising * scale, ROUNDED), float) / scale)
+    m, size = len(spans), DEGREE + 1
+    slopes = np.ones((size, size))  # of t^k at 1, row by row for each derivative
+    for d in range(1, size):
+        slopes[d] = slopes[d - 1] * np.maximum(np.arange(size) - (d - 1.0), 0.0)
+    diagonals, b = np.zeros((m * size, BELOW + 1 + ABOVE)), np.zeros((m * size, 4))
+
+    def put(row: int, piece: int, values: Array, first: int = 0) -> None:
+        """Write what a row takes of a piece's coefficients from t^first on."""
+        at = piece * size + first - row + BELOW
+        diagonals[row, at : at + len(values)] = values
+
+    row = 0
+    for p in range(m):
+        put(row, p, np.ones(1))
+        b[row] = places[p]
+        if p == 0:
+            for d in range(1, ENDS + 1):
+                put(row + d, 0, slopes[d, d : d + 1], d)
+                b[row + d] = ends[0][d - 1] * el.power(spans[0], float(d))
+            row += 1 + ENDS
+        else:
+            ratio = spans[p - 1] / spans[p]
+            for d in range(1, DEGREE):
+                put(row + d, p - 1, slopes[d])
+                put(row + d, p, -slopes[d, d : d + 1] * el.power(ratio, float(d)), d)
+            row += DEGREE
+        put(row, p, slopes[0])
+        b[row] = places[p + 1]
+        row += 1
+    for d in range(1, ENDS + 1):
+        put(row + d - 1, m - 1, slopes[d])
+        b[row + d - 1] = ends[1][d - 1] * el.power(spans[-1], float(d))
+    unit = linear.solve_banded(diagonals, BELOW, b).reshape(m, size, 4)  # of a local time from 0 to 1, well scaled
+    scale = np.array([_powers(span, size) for span in spans.tolist()])
+    return PiecewisePolynomial(spans, unit / scale[:, :, None])
 
 
 def move(
@@ -206,7 +267,7 @@ class Scaled:
         own, f = peaks_of(self.of), self.factor
         w, x, y, z = own.at_s
         speed, climb, turn = (each / f for each in own[:3])
-        return Peaks(speed, climb, turn, own.accel_m_s2 / f**2, (w * f, x * f, y * f, z * f))
+        return Peaks(speed, climb, turn, own.accel_m_s2 / (f * f), (w * f, x * f, y * f, z * f))
 
 
 def peaks_of(path: Reference) -> Peaks:

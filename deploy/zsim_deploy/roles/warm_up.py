@@ -13,9 +13,14 @@ import time
 from collections.abc import Collection
 from typing import Any
 
+import numpy as np
+
 from zsim import CONTRACT, __version__
 from zsim.contract.messages import ClusterInfo, DroneInfo, Info, Origin
 from zsim.errors import printable
+from zsim.math import elementary as el
+from zsim.math import linear
+from zsim.math.distributions import normal_quantile
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 
@@ -37,6 +42,7 @@ def main(extras: Collection[str]) -> None:
 
         World(scenario_file.resolve(ALONE), "lockstep", 0.0, time.monotonic_ns, None)
     if WITH_AGENTS & {*extras}:
+        _compile_mathematics()
         from zsim_agents.hosting import hosted
 
         scenario = scenario_file.resolve(formations())
@@ -45,6 +51,20 @@ def main(extras: Collection[str]) -> None:
         from zsim_agents.cameras import detector
 
         detector.rehearse()
+
+
+def _compile_mathematics() -> None:
+    """Call what scenarios, laws and references may call besides what the formations below do."""
+    for function in (el.sin, el.cos, el.tan, el.asin, el.acos, el.atan, el.exp, el.log, el.log1p, el.square):
+        function(0.5)
+    for function in (el.atan2, el.power, el.hypot):
+        function(0.5, 0.5)
+    square = np.eye(4)
+    linear.solve(square, square)
+    linear.eigen(square)
+    linear.singular_values(square)
+    linear.solve_banded(np.ones((4, 1)), 0, square)
+    normal_quantile(0.5)
 
 
 def _info(scenario: Scenario) -> Info:
