@@ -25,6 +25,7 @@ from zsim_deploy.arguments import HOSTS, POKE, TRANSLATE, endpoint_origin, note,
 from zsim_deploy.cli import (
     board_command,
     bridge_commands,
+    bundle_commands,
     federation_commands,
     fmu_command,
     hosts_commands,
@@ -52,7 +53,15 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-_FAMILIES = (run_commands, board_command, role_commands, hosts_commands, federation_commands, bridge_commands)
+_FAMILIES = (
+    run_commands,
+    bundle_commands,
+    board_command,
+    role_commands,
+    hosts_commands,
+    federation_commands,
+    bridge_commands,
+)
 for _family in (*_FAMILIES, fmu_command):
     app.add_typer(_family.app)
 for _panel, _group in (
