@@ -102,8 +102,8 @@ def rerun_record(
             say(f"the world alone, with all recorded commands, differs too: first {alone.compared.first}")
         else:
             say("the world alone, with all recorded commands, gives the recorded truth: the agents answer differently")
-            if again.first_output:
-                say(f"the first answer that differs is {again.first_output}")
+        if again.first_output:
+            say(f"the first answer that differs is {again.first_output}")
         return fault
 
 

@@ -44,8 +44,6 @@ def rerun_bundle(path: Path, commands_only: bool, say: Say, note: Say) -> str:
     """
     with opened(path) as (manifest, folder):
         scenario = check_content(path, manifest, folder)
-        if manifest.zsim != __version__:
-            note(f"flown by zsim {manifest.zsim}, flown again by {__version__}: the same bits are not promised")
         lock = pins_of((folder / names.LOCK).read_text("utf-8"), f"{path}: {names.LOCK}")
         if others := other_versions([*lock, *manifest.needs]):
             note(f"packages differ: {_shown(others)}; --install makes an environment with those of the bundle")
@@ -55,6 +53,8 @@ def rerun_bundle(path: Path, commands_only: bool, say: Say, note: Say) -> str:
         elif commands_only:
             raise RunError(f"{path}: has no {names.RECORD}, whose commands would be read; leave --commands-only out")
         else:
+            if manifest.zsim != __version__:
+                note(f"flown by zsim {manifest.zsim}, flown again by {__version__}: the same bits are not promised")
             fault = _fly_again(manifest, folder, scenario, say)
         if fault:
             _tell_machines(manifest, note)

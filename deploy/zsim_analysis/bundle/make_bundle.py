@@ -191,7 +191,8 @@ class _Expected:
                 self.digests.add(keys.truth(drone), gate.t_ns, payload)
         if scenario.own_programs or scenario.gates("camera"):
             senders.add("what programs or cameras did")
-        if (ended_ns := until_ns + info.command_delay_ns + info.gate_ns) <= scenario.duration_s * 1e9:
+        ended_ns = until_ns + info.gate_ns + info.command_delay_ns
+        if ended_ns + info.gate_ns <= scenario.duration_s * 1e9:
             senders.add(f"an end before its time, after {ended_ns / 1e9:g} of {scenario.duration_s:g} s")
         self.others = f"the flight had {', '.join(sorted(senders))}" if senders else ""
 
@@ -237,7 +238,7 @@ def _copy_record(
             kind, _, what = keys.parts(key)
             if key == keys.INFO:
                 payload = _without_folders(payload, has_modules)
-            elif (kind in ("clock", "world") and key != keys.FAULTS) or (kind == "process" and what != "done"):
+            elif kind in ("clock", "world", "process") and key != keys.FAULTS and what not in ("done", "snapshot"):
                 try:
                     content = msgpack.unpackb(payload)
                 except (ValueError, msgpack.UnpackException):

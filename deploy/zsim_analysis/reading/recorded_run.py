@@ -80,7 +80,7 @@ def is_answer(key: str) -> bool:
 
 
 def answered_until_ns(reader: RecordReader, info: messages.Info) -> int:
-    """Return the last gate whose answers are all on record: that before the last one, by the delay of commands [ns].
+    """Return the last gate whose answers are all on record: without them the last gate had not been flown [ns].
 
     Raises:
         RecordError: there is no gate on record.
@@ -88,7 +88,7 @@ def answered_until_ns(reader: RecordReader, info: messages.Info) -> int:
     clock = reader.last(keys.CLOCK)
     if clock is None:
         raise RecordError(f"{reader.path}: holds no gate")
-    return clock.t_ns - info.command_delay_ns
+    return clock.t_ns - info.gate_ns - info.command_delay_ns
 
 
 def sender_of(key: str, message: Any) -> str:
