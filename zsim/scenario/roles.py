@@ -199,7 +199,10 @@ def rights_for(process: str, scenario: Scenario) -> Rights:
                 sensed += [keys.sensors(mate), keys.gate(mate), keys.detections(mate)]
         granted += [_granted("estimator", drone=[thing], estimates=[process]), Rights(reads=tuple(sensed))]
     if about != "drone" and thing in [cluster.name for cluster in scenario.clusters]:
-        granted.append(_granted("controller", drone=scenario.cluster(thing).drones, cluster=[thing]))
+        cluster = scenario.cluster(thing)
+        sensed = tuple(keys.sensor(drone, name) for drone in cluster.drones for name in cluster.law_sensors or ())
+        granted.append(_granted("controller", drone=cluster.drones, cluster=[thing]))
+        granted.append(Rights(reads=sensed))
         granted.append(Rights(answers=(keys.cluster_control(thing),)))
     return combined(granted)
 

@@ -57,6 +57,7 @@ from zsim_world.physics.simd import body_blocks
 from zsim_world.physics.surfaces import BALLS, POINTS, SLOTS_MAX, contact_points, obstacle_rows
 from zsim_world.run_state import IN_PLACE, PART, Saved
 from zsim_world.sensors import sensor_set
+from zsim_world.sensors.equations import SONAR_COSINE_MIN
 from zsim_world.sensors.noise import NoiseTable
 from zsim_world.sensors.sampler import Sampled, Sampler, with_more
 from zsim_world.sensors.scans import Scan, ScanSampler
@@ -406,7 +407,9 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
     aero = np.array([aero_row(drone, scenario.environment) for drone in drones])
     external = np.array([i for i, drone in enumerate(drones) if drone.is_external], dtype=np.int64)
     pairs = np.zeros((n * (n - 1) // 2, 2), dtype=np.int32)  # yet to be found, since no drone is at its origin
-    near = NearPairs(pair=pairs, number=np.zeros(1, dtype=np.int64), origin=np.full((n, 3), np.inf))
+    eye = np.array([_look(drone) for drone in drones])
+    number, above = np.zeros(1, dtype=np.int64), np.zeros(n, dtype=np.int8)
+    near = NearPairs(pair=pairs, number=number, origin=np.full((n, 3), np.inf), above=above, eye=eye)
     half_decay = cast(Any, rigid_body.half_decay).py_func  # as Python: compiling it for a few numbers takes longer
     return Bodies(
         each=tuple(range(each)),
@@ -435,6 +438,13 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
         external=external,
         pose=state[external],
     )
+
+
+def _look(drone: Drone) -> tuple[float, float, float]:
+    """Return how a drone's sonar and flow look down, the row of `NearPairs.eye`."""
+    sonar, flow = drone.sensors.sonar, drone.sensors.flow
+    away_m = max(math.hypot(*sensor.mount.position_m) for sensor in (sonar, flow))
+    return away_m, sonar.max_m, SONAR_COSINE_MIN
 
 
 def _boards(scenario: Scenario, vehicles: Sequence[Vehicle], row: np.ndarray, rotors: np.ndarray) -> Boards:

@@ -34,6 +34,7 @@ from zsim_world.physics.rigid_body import drained, four, put, put_four, vector
 from zsim_world.physics.simd import accelerate, lead, line_up, move
 from zsim_world.physics.surfaces import meet_obstacles
 from zsim_world.sensors import sensor_set as ss
+from zsim_world.sensors.downward import flow_over, sonar_over
 from zsim_world.sensors.equations import (
     BodyTruth,
     MountedSensor,
@@ -50,7 +51,6 @@ from zsim_world.sensors.equations import (
     pressure,
     sonar,
 )
-from zsim_world.sensors.over_obstacles import flow_over, sonar_over
 from zsim_world.sensors.sensor_set import CONFIG, NEVER, SCHEDULE
 from zsim_world.vehicles import firmware
 from zsim_world.vehicles.observer import DEVICE, STEP_S
@@ -130,13 +130,13 @@ def _sample(s: int, i: int, bodies: Bodies, noise: NoiseRows, senses: Senses, sc
     mounted = MountedSensor(vector(config, CONFIG.p_BS), four(config, CONFIG.q_BS), config[CONFIG.limit_max])
     site = Site(bodies.vehicle[i, VEHICLE.gravity], vector(senses.place, PLACE.field_W))
     first, second = _ideal(s, x, mounted, site)
-    if scene.part.shape[0] > 0:
+    if scene.part.shape[0] > 0 or bodies.near.above[i] != 0:
         if s == ss.SONAR:
-            first = sonar_over(x, mounted, first, scene)
+            first = sonar_over(x, mounted, first, scene, bodies.state, bodies.vehicle, i)
         elif s == ss.FLOW:
             beam = senses.config[i, ss.SONAR]
             ranging = MountedSensor(vector(beam, CONFIG.p_BS), four(beam, CONFIG.q_BS), beam[CONFIG.limit_max])
-            first = flow_over(x, mounted, ranging, first, scene)
+            first = flow_over(x, mounted, ranging, first, scene, bodies.state, bodies.vehicle, i)
     put(value, 0, first)
     put(value, 3, second)
     at = noise.at[s] + noise.cursor[i, s] * noise.width[i, s]

@@ -5,10 +5,10 @@ import math
 from numpy.typing import NDArray
 
 from zsim.math.compiled import inlined, noinline
-from zsim.math.rotation import Vector, add, axpy, cross, dot, norm, rotate, scaled, subtract, z_axis
+from zsim.math.rotation import Vector, axpy, cross, dot, norm, scaled, subtract, z_axis
 from zsim_world.physics.air import downwash, jet_reach
 from zsim_world.physics.fleet_arrays import STATE, VEHICLE, Bodies, NearPairs, PerRotor
-from zsim_world.physics.rigid_body import four, free_thrust, vector
+from zsim_world.physics.rigid_body import four, free_thrust, velocity_at
 from zsim_world.physics.surfaces import brace
 
 DISTANCE_MIN_M = 1e-9  # m, so that two drones in one place have a direction
@@ -51,7 +51,7 @@ def _touch(bodies: Bodies, i: int, j: int, d: Vector, distance: float) -> None:
     one, other = bodies.vehicle[i], bodies.vehicle[j]
     share = distance / (one[VEHICLE.hull_radius] + other[VEHICLE.hull_radius])
     arms = scaled(n, share * one[VEHICLE.hull_radius]), scaled(n, -share * other[VEHICLE.hull_radius])
-    v = subtract(_velocity_at(bodies.state[j], arms[1]), _velocity_at(bodies.state[i], arms[0]))
+    v = subtract(velocity_at(bodies.state[j], arms[1]), velocity_at(bodies.state[i], arms[0]))
     # the softer of the two, so that a light drone stays within what its step can follow
     stiffness = min(one[VEHICLE.hull_stiffness], other[VEHICLE.hull_stiffness])
     damping = min(one[VEHICLE.hull_damping], other[VEHICLE.hull_damping])
@@ -76,11 +76,6 @@ def _touch(bodies: Bodies, i: int, j: int, d: Vector, distance: float) -> None:
         bodies.push[j, k] += f_W[k]
         bodies.twist[i, k] -= twists[0][k]
         bodies.twist[j, k] += twists[1][k]
-
-
-@inlined
-def _velocity_at(state: NDArray, r_W: Vector) -> Vector:
-    return add(vector(state, STATE.v_WB), cross(rotate(four(state, STATE.q_WB), vector(state, STATE.w_WB_B)), r_W))
 
 
 @inlined
@@ -124,12 +119,25 @@ def _strayed(state: NDArray, origin: NDArray) -> bool:
 
 
 @inlined
+def _may_see(radius: float, eye: NDArray, aside: float, dz: float, distance: float) -> bool:
+    """Return whether a hull dz higher may come into the view down of a drone until one strays: within a cone, a range.
+
+    Args:
+        eye: the row of `NearPairs.eye` of the drone that looks.
+    """
+    room, cosine = radius + eye[0] + APPROACH_M, eye[2]
+    return cosine * aside + math.sqrt(1.0 - cosine * cosine) * dz < room and distance < eye[1] + room
+
+
+@inlined
 def _find_near(vehicle: NDArray, state: NDArray, touching: NDArray, near: NearPairs) -> None:
-    """Note all pairs that can touch, blow on each other or be the closest until a drone strays."""
+    """Note all pairs that can touch, blow on each other or be the closest until a drone strays, and who is above."""
     count, least = 0, math.inf
     for i in range(state.shape[0]):
+        near.above[i] = 0
         for k in range(3):
             near.origin[i, k] = state[i, STATE.p_WB + k]
+    for i in range(state.shape[0]):
         for j in range(i + 1, state.shape[0]):
             dx, dy, dz = _apart(state, i, j)
             aside = math.sqrt(dx * dx + dy * dy)
@@ -137,6 +145,10 @@ def _find_near(vehicle: NDArray, state: NDArray, touching: NDArray, near: NearPa
             least = min(least, distance)
             hulls = vehicle[i, VEHICLE.hull_radius] + vehicle[j, VEHICLE.hull_radius]
             closest = max(least + APPROACH_M, hulls) + APPROACH_M
+            if _may_see(vehicle[j, VEHICLE.hull_radius], near.eye[i], aside, dz, distance):
+                near.above[i] = 1
+            if _may_see(vehicle[i, VEHICLE.hull_radius], near.eye[j], aside, -dz, distance):
+                near.above[j] = 1
             start = max(vehicle[i, VEHICLE.jet_start], vehicle[j, VEHICLE.jet_start])
             jet = jet_reach(start, abs(dz) + APPROACH_M) + APPROACH_M
             if distance > closest and aside > jet:

@@ -112,6 +112,8 @@ class NearPairs(NamedTuple):
     pair: NDArray  # int32 (N (N - 1) / 2, 2), i < j, ascending
     number: NDArray  # int64 (1,), how many pairs
     origin: NDArray  # (N, 3), m
+    above: NDArray  # int8 (N,), 1 where sonar or flow of a drone may see another
+    eye: NDArray  # (N, 3), how it looks down: from how far off its centre [m], how far [m], cosine of most of the tilt
 
 
 class Bodies(NamedTuple):

@@ -58,6 +58,13 @@ def pose(state: NDArray) -> tuple[Vector, Vector, Quaternion, Vector]:
 
 
 @inlined
+def velocity_at(state: NDArray, r_W: Vector) -> Vector:
+    """Return the velocity in W [m/s] of the point of a drone that is r_W from its centre of mass."""
+    turn_W = rot.rotate(four(state, STATE.q_WB), vector(state, STATE.w_WB_B))
+    return add(vector(state, STATE.v_WB), rot.cross(turn_W, r_W))
+
+
+@inlined
 def accelerations(
     grounded: bool,
     row: Row,

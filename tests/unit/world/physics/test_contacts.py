@@ -107,7 +107,8 @@ def all_pairs(state):
     """Return every pair as near, wherever the drones go next."""
     n = len(state)
     pairs = np.array([(i, j) for i in range(n) for j in range(i + 1, n)], dtype=np.int32)
-    return NearPairs(pair=pairs, number=np.array([len(pairs)]), origin=state[:, :3].copy())
+    above, eye = np.zeros(len(state), dtype=np.int8), np.zeros((len(state), 3))
+    return NearPairs(pairs, np.array([len(pairs)]), state[:, :3].copy(), above, eye)
 
 
 @pytest.mark.parametrize(
