@@ -185,7 +185,8 @@ def test_all_faults_are_told_at_once_before_anything_flies() -> None:
     with pytest.raises(ScenarioError) as raised:
         make_plan("t.yaml", {"name": "t", "duration_s": 1, **body}, ["seed"], 2)
     gating, programs = raised.value.faults
-    assert has_terms(gating, "processes.gating") and has_terms(programs, "programs", "my.look")
+    assert has_terms(gating, "processes.gating")
+    assert has_terms(programs, "programs", "my.look")
 
 
 def test_a_fault_of_the_file_is_told_once() -> None:
