@@ -50,6 +50,7 @@ def test_what_breaks_is_left_as_a_flight_that_repeats_to_the_bit(tmp_path: Path)
         "--no-report",
     )
     assert (typed.code, zsim.load(tmp_path / "typed").truth_sha256) == (1, found["truth_sha256"])
+    assert run_here("rerun", str(out / "violation.zsim")).code == 0
     page = (out / "report.html").read_text()
     assert shlex.join(found["options"][:2]) in page
     assert (out / "violation" / "report.html").exists()

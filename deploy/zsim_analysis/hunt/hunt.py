@@ -7,6 +7,7 @@ The folder of a hunt:
     summary.json, report.html, figures/
     violation.yaml       the scenario with the causes that are left
     violation/           its flight: record, report, figures
+    violation.zsim       the same as one file
 """
 
 import csv
@@ -17,6 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import lru_cache, partial
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 import msgspec
@@ -41,7 +43,8 @@ from zsim_analysis.sweep.sweep import SweepScreen, span
 from zsim_analysis.sweep.sweep_run import FIXED, METRIC, Row, Task, fly_scenario
 
 PLAN, TABLE, SCENARIO, VIOLATION = "hunt.json", "flights.csv", "violation.yaml", "violation"
-OWN_FILES = (PLAN, TABLE, SCENARIO, VIOLATION, "summary.json", "report.html", "figures", ".lock")
+BUNDLE = "violation.zsim"
+OWN_FILES = (PLAN, TABLE, SCENARIO, VIOLATION, BUNDLE, "summary.json", "report.html", "figures", ".lock")
 SEARCH, CAUSE, RECORD = "search", "each cause", "record"  # stages, beside those of `shrink`
 SAME_BITS = "same_bits"  # figure: truth is the same to the bit as in the flight in which no process dies
 DECIMALS = 6  # of margins in the table
@@ -178,10 +181,18 @@ def hunt(request: HuntRequest) -> Hunted:
     with lock:
         if not take_lock(lock):
             raise RunError(f"{request.out}: another hunt is at work there; give --out another folder")
+        _forget(request.out)
         under_way = _Hunt(request, space, texts, requirements)
         hunted = Hunted(request, space, under_way.run(), under_way.flown)
         write(hunted)
     return hunted
+
+
+def _forget(folder: Path) -> None:
+    """Remove what an earlier hunt has found."""
+    rmtree(folder / VIOLATION, ignore_errors=True)
+    for name in (SCENARIO, BUNDLE):
+        (folder / name).unlink(missing_ok=True)
 
 
 def _with_functions(given: Sequence[str], document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, Any]]:
@@ -487,8 +498,6 @@ def write(hunted: Hunted) -> None:
         if summary.violation:
             text = yaml_file.dump(hunted.space.changed(summary.violation.shrunk))
             (request.out / SCENARIO).write_text(text, encoding="utf-8")
-        else:
-            (request.out / SCENARIO).unlink(missing_ok=True)
     except OSError as error:
         raise ReportError(f"{request.out}: cannot be written ({error.strerror})") from error
 
