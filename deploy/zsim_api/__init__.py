@@ -14,9 +14,9 @@ if TYPE_CHECKING:  # for editors, which do not read _WHERE
     from zsim.schema.parameters import Parameters as Parameters
     from zsim_agents.estimation.drone_estimator import DroneEstimator as DroneEstimator
     from zsim_agents.estimation.drone_estimator import StateEstimate as StateEstimate
+    from zsim_agents.formation.assignment import assign as assign
     from zsim_agents.formation.control_law import ControlLaw as ControlLaw
     from zsim_agents.formation.spaces.cluster_space import ClusterSpace as ClusterSpace
-    from zsim_agents.references.assignment import assign as assign
     from zsim_api.commands import Command as Command
     from zsim_api.commands import ardrone as ardrone
     from zsim_api.commands import attitude as attitude
@@ -52,7 +52,7 @@ _WHERE = {
     "zsim_agents.estimation.drone_estimator": ("DroneEstimator", "StateEstimate"),
     "zsim_agents.formation.control_law": ("ControlLaw",),
     "zsim_agents.formation.spaces.cluster_space": ("ClusterSpace",),
-    "zsim_agents.references.assignment": ("assign",),
+    "zsim_agents.formation.assignment": ("assign",),
     "zsim_api.commands": ("Command", "ardrone", "attitude", "emergency", "land", "rotors", "takeoff", "velocity"),
     "zsim_api.drone_requests": ("PilotedDrone",),
     "zsim_api.environments": (

@@ -26,18 +26,29 @@ class PilotedDrone:
         self._ask, self._key = ask, keys.drone_control(name)
 
     def goto(
-        self, position_m: Sequence[float] | np.ndarray, yaw_deg: float | None = None, over_s: float | None = None
+        self,
+        position_m: Sequence[float] | Sequence[Sequence[float]] | np.ndarray,
+        yaw_deg: float | None = None,
+        over_s: float | None = None,
+        *,
+        speed_m_s: float | None = None,
+        radius_m: float | None = None,
     ) -> float:
-        """Fly to a place in W, to rest there; return the simulated time [s] of arrival.
+        """Fly to a place in W, or through several, to rest at the last one; return the simulated time [s] of arrival.
 
         Args:
+            position_m: (3,), or (n, 3) of places one after the other.
             yaw_deg: heading there; None for the present one.
-            over_s: how long; None, or less than the drone's limits need, for as fast as these let it.
+            over_s: how long, to one place; less than the drone's limits need is lengthened. With the same one, all
+                drones fly by one function of time.
+            speed_m_s: cruise speed; None, or more than the drone's limits allow, for as fast as these let it.
+            radius_m: from within which of a place it turns towards the next one; None or 0: it rests at each.
         """
-        given = {"yaw_deg": yaw_deg, "over_s": over_s}
-        place = [float(each) for each in position_m]
-        result = self._ask(self._key, "goto", position_m=place, **{k: v for k, v in given.items() if v is not None})
-        return float(result["until_s"])
+        places = np.asarray(position_m, float)
+        where = "places_m" if places.ndim == 2 else "position_m"
+        given = {"yaw_deg": yaw_deg, "over_s": over_s, "speed_m_s": speed_m_s, "radius_m": radius_m}
+        asked = {where: places.tolist(), **{name: value for name, value in given.items() if value is not None}}
+        return float(self._ask(self._key, "goto", **asked)["until_s"])
 
     def follow(self, **path: Any) -> float | None:
         """Fly to the beginning of a path, then the path; return the simulated time [s] of its end, None if it has none.

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from zsim.scenario.polynomial_file import pieces_of
-from zsim_agents.references.assignment import assign, first_approach, straight_separation
+from zsim_agents.formation.assignment import assign, straight_separation
+from zsim_agents.references.approach import first_approach
+from zsim_agents.references.cruise import RISE_S, Cruise, cruise, cruise_through
 from zsim_agents.references.generators import Laps, figure_eight
 from zsim_agents.references.path import PathLimits, PiecewisePolynomial, minimum_snap, move, peaks_of
 
@@ -104,6 +106,67 @@ def test_a_move_uses_its_limits() -> None:
         peaks = move(np.zeros(4), np.array(goal, float), limits).peaks()
         assert peaks[quantity] == pytest.approx(limits[quantity], rel=2e-3)
         assert peaks.factor(limits) <= 1.0 + 1e-9
+
+
+LIMITS = PathLimits(5.0, 1.0, 1.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("goal", "rate", "took_s"),
+    [
+        ([20, 0, 0, 0], [0, 0, 0, 0], 20 / 5 + 5 / 2),  # d / v + v / a: a trapezoid
+        ([3, 4, 0, 0], [0, 0, 0, 0], 2 * math.sqrt(5 / 2)),  # 2 sqrt(d / a): a triangle
+        ([0, 0, 6, 0], [0, 0, 0, 0], 6 / 1 + RISE_S),
+        ([0, 0, 0, 2], [0, 0, 0, 0], 2 / 1 + RISE_S),
+        ([20, 0, 0, 0], [3, 0, 0, 0], (5 - 3) / 2 + (20 - 4 - 25 / 4) / 5 + 5 / 2),  # it accelerates over 4 m
+        # it cannot stop in 1 m: it brakes over 4 m and comes back over 3 m, as the time-optimal double integrator does
+        ([1, 0, 0, 0], [4, 0, 0, 0], 4 / 2 + 2 * math.sqrt(3 / 2)),
+        ([4, 0, 0, 0], [4, 0, 0, 0], 4 / 2),
+        ([20, 0, 20, 0], [0, 0, 0, 0], 20 / 1 + 1 / 2),  # straight: the climb's 1 m/s is that aside, which takes longer
+    ],
+)
+def test_a_cruise_takes_the_time_of_the_closed_form(goal: list[float], rate: list[float], took_s: float) -> None:
+    way = cruise(np.zeros(4), np.array(goal, float), LIMITS, np.array(rate, float))
+    assert way.duration_s == pytest.approx(took_s, abs=1e-6)
+    assert way.value(took_s)[0] == pytest.approx(goal, abs=1e-9)
+
+
+def test_a_cruise_from_any_motion_keeps_its_limits_and_what_is_left_of_it_is_the_cruise_from_there() -> None:
+    random = np.random.default_rng(8)
+    for _ in range(300):
+        far = 10.0 ** random.uniform(-2, 2)
+        goal = random.normal(size=4) * [far, far, far / 3, 1]
+        rate = random.uniform(-1, 1, 4) * [3.5, 3.5, 1, 1] * random.choice([0, 0.1, 1])
+        way = cruise(np.zeros(4), goal, LIMITS, rate)
+        end_s = way.duration_s or 0.0
+        assert way.value(0.0)[1] == pytest.approx(rate, abs=1e-9)
+        away = way.value(end_s)[0] - goal
+        assert away[:3] == pytest.approx(np.zeros(3), abs=1e-9)
+        assert math.remainder(away[3], math.tau) == pytest.approx(0.0, abs=1e-9)
+        assert way.peaks().factor(LIMITS) <= 1.0 + 1e-9
+        for before, after in zip(way.begins_s[1:-1] - 1e-9, way.begins_s[1:-1], strict=True):
+            for one, other in zip(way.value(before), way.value(after), strict=True):
+                assert one == pytest.approx(other, abs=1e-7)  # neither place nor velocity jumps
+        at_s = random.uniform(0.0, 0.9) * end_s
+        rest = cruise(way.value(at_s)[0], goal, LIMITS, way.value(at_s)[1])
+        for t in np.linspace(at_s, end_s, 7).tolist():
+            assert rest.value(t - at_s)[0][:3] == pytest.approx(way.value(t)[0][:3], abs=1e-6)
+
+
+def test_a_cruise_through_places_passes_each_by_its_radius_and_keeps_its_speed() -> None:
+    places = [np.array(place, float) for place in ([30, 0, 0, 0], [30, 30, 0, 0], [0, 30, 0, 0])]
+    rests = cruise_through(np.zeros(4), places, LIMITS, speeds=Cruise(2.0))
+    assert rests.duration_s == pytest.approx(3 * (30 / 2 + 2 / 2), abs=1e-6)
+    passes = cruise_through(np.zeros(4), places, LIMITS, speeds=Cruise(2.0), radius_m=1.0)
+    times = np.linspace(0.0, passes.duration_s or 0.0, 5001).tolist()
+    track = np.array([passes.value(t)[0] for t in times])
+    nearest = [float(np.linalg.norm((track - place)[:, :3], axis=1).min()) for place in places]
+    assert all(distance <= 1.0 for distance in nearest)
+    assert nearest[-1] == pytest.approx(0.0, abs=1e-9)
+    assert (passes.duration_s or 0.0) < (rests.duration_s or 0.0) - 1.5
+    assert passes.peaks().speed_m_s == pytest.approx(2.0, abs=1e-9)
+    cruising = [np.hypot(*passes.value(t)[1][:2]) for t in times]
+    assert np.mean(np.array(cruising) > 1.999) > 0.8
 
 
 def test_laps_are_the_curve_and_rest_at_both_ends() -> None:

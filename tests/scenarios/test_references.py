@@ -48,16 +48,29 @@ def test_six_drones_fly_the_public_swap(tmp_path: Path) -> None:
         assert np.linalg.norm((drone[-1] - other[0])[:2]) < 0.3
 
 
-def test_as_processes_after_a_death_and_flown_again_they_have_the_same_bits(tmp_path: Path, compiled: None) -> None:
+def test_as_processes_after_deaths_and_flown_again_they_have_the_same_bits(tmp_path: Path, compiled: None) -> None:
+    """One follows its path, the other one a mission that it is asked for in flight; both of their pilots are killed."""
     (tmp_path / "short.yaml").write_text(SHORT)
-    alone = zsim.run(tmp_path / "short.yaml", out=tmp_path / "alone", progress=False)
-    assert off(alone, "d1").max() < 0.3
+    places, how = [[3, 1, 1], [4, 1, 1.2]], {"speed_m_s": 0.6, "radius_m": 0.3, "yaw_deg": 90}
     with zsim.Federation(tmp_path / "short.yaml", out=tmp_path / "many") as flight:
+        flight.wait_until(6.0)
+        asked = flight.ask("drone/d2/control", "goto", places_m=places, **how)
         flight.wait_until(7.0)
         flight.kill("reference.d1")
+        flight.kill("reference.d2")
         run = flight.run()
+    assert off(run, "d1").max() < 0.3
+    assert {"reference.d1", "reference.d2"} <= {*run.events[run.events.kind == "restart"].subject}
+    alone = zsim.Simulation(tmp_path / "short.yaml")
+    alone.run(until_s=asked["from_s"])
+    assert alone.drone("d2").goto(places, **how) == asked["until_s"] < 12
+    alone.run()
     assert run.truth_sha256 == alone.truth_sha256
-    assert "reference.d1" in [*run.events[run.events.kind == "restart"].subject]
+    assert alone.truth.position_m[1] == pytest.approx(places[-1], abs=0.15)
+    truth = run.truth("d2")
+    way = truth.loc[asked["from_s"] :, AXES].to_numpy()
+    assert np.linalg.norm(way - places[0], axis=1).min() < 0.45  # past the first place, within its radius
+    assert np.hypot(truth.velocity_m_s_x, truth.velocity_m_s_y).max() < 0.75
     said: list[str] = []
     assert rerun_record(tmp_path / "many", False, said.append, said.append) == ""
 

@@ -170,10 +170,11 @@ class Estimate(Message, frozen=True):
 class ClusterState(Message, frozen=True):
     """Where a formation is, by the estimates, and where it is to be.
 
-    `names` are the 4n cluster variables of n drones, in the order of `value`, `desired` [m, rad] and `desired_rate`
-    [m/s, rad/s]. `trajectory_t_s` is the trajectory's own time, None where none runs; `margin` is the distance to a
-    singularity in the measure of the cluster space; `reason` is why it waits or is held. `plan_step` is how many steps
-    of the scenario's plan a restarted controller leaves out.
+    `drones` are in the order of the robots, which an assembly changes. `names` are the 4n cluster variables of n
+    drones, in the order of `value`, `desired` [m, rad] and `desired_rate` [m/s, rad/s]. `trajectory_t_s` is the
+    trajectory's own time, None where none runs; `margin` is the distance to a singularity in the measure of the cluster
+    space; `reason` is why it waits or is held. `plan_step` is how many steps of the scenario's plan a restarted
+    controller leaves out.
     """
 
     phase: Phase

@@ -16,7 +16,7 @@ from zsim.contract import messages
 from zsim.math.compiled import hold
 from zsim.scenario.faults import Known, flaws, kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
-from zsim.scenario.own_classes import agent_faults
+from zsim.scenario.own_classes import agent_faults, law_faults
 from zsim.scenario.roles import AGENTS, MAIN, OPERATOR, PILOT, ROLES
 from zsim.scenario.scenario import (
     EXTERNAL,
@@ -81,6 +81,7 @@ def cross_faults(
     yield from _membership_faults(drones, clusters)
     for index, cluster in clusters:
         yield from _under(f"clusters[{index}]", _plan_faults(cluster))
+        yield from _under(f"clusters[{index}]", law_faults(cluster, {drone.name: drone for _, drone in drones}, unread))
     for index, cluster in clusters:
         yield from _under(f"clusters[{index}]", _shape_faults(cluster, drones))
     yield from _reference_faults(scenario, drones, clusters)
@@ -462,6 +463,9 @@ def _in_line(places: list[Any]) -> bool:
 
 
 def _plan_faults(cluster: Any) -> Iterator[Fault]:
+    for (_, before), (index, after) in pairwise(_entries((cluster.plan and cluster.plan.assemblies) or [])):
+        if _known(before.at_s, after.at_s) and after.at_s <= before.at_s:
+            yield f"plan.assemblies[{index}].at_s", f"is {after.at_s:g}; must be > {before.at_s:g}, the one before"
     trajectory = cluster.plan and cluster.plan.trajectory
     if not trajectory:
         return

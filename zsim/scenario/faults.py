@@ -46,6 +46,7 @@ class FaultParameter(NamedTuple):
     choices: tuple[str, ...] = ()  # of a word
     default: Any = None  # its value where it is left out
     required: bool = True  # whether it must not be left out
+    mildest: float = 0.0  # number at which the fault has no effect
 
 
 class FaultKind(NamedTuple):
@@ -67,12 +68,12 @@ def _number(
 
 
 _PROBABILITY = FaultParameter("probability", "number", "of each sample", "", 0.0, 1.0, default=1.0, required=False)
-_FACTOR = _number("factor", "by which the standard deviation grows", "", 1.0, 1e6, above=True)
+_FACTOR = _number("factor", "by which the standard deviation grows", "", 1.0, 1e6, above=True, mildest=1.0)
 ROTOR = FaultParameter("rotor", "choice", "which", choices=(*ROTORS, "all"))  # of a vehicle: its own names, and all
 _ONE_WAY = FaultParameter("one_way", "flag", "from the first to the second only", default=False, required=False)
 
 _RADIO = (
-    _number("range_m", "distance at which every second message is lost", "m", 0.0, 1e6, above=True),
+    _number("range_m", "distance at which every second message is lost", "m", 0.0, 1e6, above=True, mildest=1e6),
     _number("spread_m", "over which the loss grows", "m", 0.0, 1e6, above=True, default=5.0, required=False),
     FaultParameter(
         "place", "places", "of processes: a drone, or [x, y, z]; else the origin", "m", default={}, required=False
@@ -124,7 +125,9 @@ def _sensor_kinds(sensors: Mapping[str, SensorType | Declaration]) -> dict[str, 
 KINDS: dict[str, FaultKind] = {
     **_sensor_kinds(STOCK),
     "rotor_efficiency": FaultKind(
-        "drone", "a rotor has lost thrust", (ROTOR, _number("value", "share of the thrust that is left", "", 0.0, 1.0))
+        "drone",
+        "a rotor has lost thrust",
+        (ROTOR, _number("value", "share of the thrust that is left", "", 0.0, 1.0, mildest=1.0)),
     ),
     "rotor_stuck": FaultKind(
         "drone",

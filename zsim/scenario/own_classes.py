@@ -4,16 +4,18 @@ Whoever reads `world/info` finds all parameters and messages there, and imports 
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 import msgspec
+from msgspec import UNSET
 
 from zsim.contract.agent_messages import AgentMessage, about, message_info
 from zsim.errors import DocumentError, NotTrustedError
 from zsim.scenario.scenario import LAWS, OwnAgent
 from zsim.schema import parameters, plugin
-from zsim.schema.checker import Fault, faults
+from zsim.schema.checker import Fault, faults, listed
+from zsim.sensors.sensor_catalogue import sensor_names
 
 OF_THE_RUN = ("info", "scenario", "drone", "cluster")  # arguments of an agent's constructor that are no parameters
 
@@ -93,6 +95,30 @@ def with_parameters(document: dict[str, Any]) -> list[Fault]:
         except DocumentError as error:
             wrong += [(path, text) for path, _, text in (line.partition(" ") for line in error.faults)]
     return wrong
+
+
+def law_faults(cluster: Any, drones: Mapping[str, Any], unread: Collection[str]) -> Iterator[Fault]:
+    """Yield what a cluster grants its law that nobody reads, or none of its drones has.
+
+    Args:
+        drones: by name, as far as they are sound.
+        unread: names of sensors that these lack, since their modules could not be read.
+    """
+    given = [name for name in ("law_sensors", "law_map") if getattr(cluster, name)]
+    if given and cluster.law in (UNSET, "proportional"):
+        yield from ((name, "is given, and the stock law reads none; must be left out") for name in given)
+        return
+    has = [drones[name].sensors for name in cluster.drones or () if name in drones]
+    if not has or None in has:
+        return
+    names = list(dict.fromkeys(name for sensors in has for name in sensor_names(sensors)))
+    first: dict[str, int] = {}
+    for place, name in enumerate(cluster.law_sensors or ()):
+        where = f"law_sensors[{place}]"
+        if name is not None and first.setdefault(name, place) != place:
+            yield where, f"is {name!r}, as law_sensors[{first[name]}]; must be unique"
+        elif name is not None and name not in (*names, *unread):
+            yield where, f"is {name!r}, which none of its drones has; must be one of {listed(names)}"
 
 
 def messages_of(kind: Any, where: str) -> tuple[type[AgentMessage], ...]:

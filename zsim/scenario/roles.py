@@ -122,6 +122,23 @@ def check_pace(scenario: Scenario, mode: str) -> None:
         raise ScenarioError([f"{scenario.name}: body of {who}, and the run is in {mode}; {needed}"])
 
 
+def check_alone(scenario: Scenario) -> None:
+    """Raise ScenarioError for what a run in one process cannot have: every field, a line each."""
+    lines = []
+    if scenario.gates("camera"):
+        lines.append(
+            "processes.gating is [camera]; must be left out in one process, which has no cameras: "
+            "fly it as processes, or with --set processes.gating=[]"
+        )
+    if scenario.own_programs:
+        lines.append(
+            f"programs has {', '.join(scenario.own_programs)}; must be left out in one process, which starts no "
+            "programs: fly it as processes, or with --set programs={}"
+        )
+    if lines:
+        raise ScenarioError([f"{scenario.name}: {line}" for line in lines])
+
+
 def drivers_of(scenario: Scenario) -> list[str]:
     return [f"{DRIVER}.{drone}" for drone in scenario.external()]
 
@@ -199,7 +216,10 @@ def rights_for(process: str, scenario: Scenario) -> Rights:
                 sensed += [keys.sensors(mate), keys.gate(mate), keys.detections(mate)]
         granted += [_granted("estimator", drone=[thing], estimates=[process]), Rights(reads=tuple(sensed))]
     if about != "drone" and thing in [cluster.name for cluster in scenario.clusters]:
-        granted.append(_granted("controller", drone=scenario.cluster(thing).drones, cluster=[thing]))
+        cluster = scenario.cluster(thing)
+        sensed = tuple(keys.sensor(drone, name) for drone in cluster.drones for name in cluster.law_sensors or ())
+        granted.append(_granted("controller", drone=cluster.drones, cluster=[thing]))
+        granted.append(Rights(reads=sensed))
         granted.append(Rights(answers=(keys.cluster_control(thing),)))
     return combined(granted)
 

@@ -14,6 +14,7 @@ from zsim.schema.parameters import Given
 from zsim.schema.plugin import CLASS_NAME
 from zsim.schema.quantities import G_M_S2, SEA_LEVEL_KG_M3, Fraction, NonNegative, Positive, Real, Vector3
 from zsim.sensors.camera import Hats
+from zsim.sensors.sensor_catalogue import NAME as SENSOR_NAME
 from zsim.sensors.sensor_catalogue import Sensors
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.vehicle import Aerodynamics, Arm, Limits, Mass, RotorLag, TakeoffHeight, Vehicle
@@ -31,11 +32,12 @@ CONSTANTS_MAX = 100  # of a user, for the expressions of a trajectory
 ROBOTS_MAX = 64  # drones of a cluster; beyond it a dense Jacobian of 4n x 4n no longer fits a control gate of 20 ms
 POINTS_MAX = 1000  # of a path of one drone
 PIECES_MAX = 5000  # polynomials of one path
-STAGES_MAX = 100  # of drones that change places
+STAGES_MAX = 100  # of drones that change places, or become another formation
 METRICS_MAX = 20  # functions
 ROLES_MAX = 20  # of users' agents; each is a process for every drone
 PROGRAMS_MAX = 100  # of users, beside agents
 WORDS_MAX = 1000  # of a command line
+LAW_SENSORS_MAX = 100  # that a law reads
 MESSAGES_MAX = 20  # classes of messages that a class of agents publishes
 VARIABLES_MAX = 4 * ROBOTS_MAX  # of a formation: four a robot
 SEA_HEIGHT_MAX_M = 11_000  # m above the sea: end of the layer whose pressure the barometer follows (ISO 2533)
@@ -326,10 +328,19 @@ class Trajectory(Spec, frozen=True, kw_only=True):
     waypoints: Annotated[list[Waypoint], Meta(max_length=WAYPOINTS_MAX)] = []
 
 
+class AssemblyPoint(Spec, frozen=True, kw_only=True):
+    """A formation to whose places its drones fly, each to one that is assigned to it."""
+
+    at_s: NonNegative = 0.0
+    values: Values = {}
+
+
 class ClusterPlan(Spec, frozen=True, kw_only=True):
     """What the controller does without being asked."""
 
     takeoff_s: NonNegative | None = None
+    assemblies: Annotated[list[AssemblyPoint], Meta(min_length=1, max_length=STAGES_MAX)] | UnsetType = UNSET
+    """Unset: the drones form the cluster as they stand at the start; left out of the resolved text."""
     target: Values = {}
     target_over_s: Positive | None = None
     trajectory: Trajectory | None = None
@@ -342,6 +353,7 @@ SpaceName = Annotated[
 ]
 """How the variables of a formation follow from its robots; a robot is a drone, or a group of them."""
 Template = Annotated[list[Vector3], Meta(max_length=ROBOTS_MAX)]
+SensorName = Annotated[str, Meta(pattern=rf"^{SENSOR_NAME}\Z", description="name of a sensor")]
 LawName = Annotated[
     str, Meta(pattern=rf"^proportional\Z|{CLASS_NAME}", description="one of proportional, or package.module:Class")
 ]
@@ -370,6 +382,10 @@ class Cluster(Spec, frozen=True, kw_only=True):
     space_parameters: Given | UnsetType = UNSET
     law_parameters: Given | UnsetType = UNSET
     """Of a user's class; unset: none, or its defaults."""
+    law_sensors: Annotated[list[SensorName], Meta(max_length=LAW_SENSORS_MAX)] | UnsetType = UNSET
+    """Of its drones, which a user's law may read beside their estimates; unset: none."""
+    law_map: bool | UnsetType = UNSET
+    """Whether it is given the obstacles and surfaces of the scenario; unset: it is not."""
     gains: Gains = Gains()
     plan: ClusterPlan = ClusterPlan()
 

@@ -13,7 +13,7 @@ from zsim.schema import plugin
 from zsim.schema.checker import Fault, faults, field_path, show, suggestion
 from zsim.sensors import stock_sensors
 from zsim.sensors.camera import CAMERAS, BottomCamera, Camera, FrontCamera, SightingModel
-from zsim.sensors.scanner import DepthConfig, LidarConfig, RangeConfig
+from zsim.sensors.scanner import SCANNERS, DepthConfig, LidarConfig, RangeConfig
 from zsim.sensors.sensor import VALUES_MAX, Declaration, Sample, Sensor, SensorType, as_fields
 from zsim.sensors.stock_sensors import BaroConfig, FlowConfig, GpsConfig, ImuConfig, MagConfig, SonarConfig
 
@@ -181,6 +181,12 @@ def own_sections(drone: Any) -> dict[str, dict[str, Any]]:
     """Return the sections of the users' sensors of a drone, as far as they are sound."""
     own = drone.sensors.own if drone.sensors is not None else None
     return own if isinstance(own, dict) else {}
+
+
+def sensor_names(sensors: Any) -> list[str]:
+    """Return the names under which a drone with this section publishes measurements, as far as it is sound."""
+    optional = [name for name in ("sightings", *SCANNERS) if getattr(sensors, name)]
+    return [*STOCK, *optional, *(sensors.own or ())]
 
 
 def own_rates(drone: Any) -> dict[str, float]:

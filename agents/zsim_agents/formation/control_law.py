@@ -23,6 +23,7 @@ from zsim.math.compiled import portable
 from zsim.math.rotation import Vector, dot, norm, subtract
 from zsim.schema import plugin
 from zsim.schema.checker import show
+from zsim_agents.formation.grants import Grants, Kind, Map
 from zsim_agents.formation.spaces.cluster_space import TAU, Array, ClusterSpace, row
 
 Pairs = tuple[tuple[int, int], ...]
@@ -92,11 +93,15 @@ class ControlLaw(ABC):
 
     Attributes:
         robots: their names in messages, in order.
+        grants: what it may read beside the estimates, by `samples`, `map` and `now_ns`.
     """
+
+    _granted: Grants | None = None
 
     def __init__(self, space: ClusterSpace, gains: FormationGains | None = None) -> None:
         self.space = space
         self.gains = gains or FormationGains()
+        self.grants = self._granted or Grants()
         self.robots: Sequence[str] = [f"robot {i + 1}" for i in range(space.n)]
         self._order = np.empty((space.n, space.n), np.int64)
         self._is_own = plugin.is_own(type(self))
@@ -109,6 +114,30 @@ class ControlLaw(ABC):
             c: (4n,) cluster of the estimates; p_W, v_W: the estimates, (n, 3) [m, m/s; W].
             c_des, c_dot_des: (4n,) reference and its rate.
         """
+
+    def samples(self, sensor: str, kind: type[Kind]) -> tuple[Kind | None, ...]:
+        """Return the newest sample of a sensor of each robot, in their order; None before its first.
+
+        `t_ns` of a sample is the gate at which it was published, `t_sample_ns` the instant that was measured.
+
+        Args:
+            sensor: by its name, one of `law_sensors` of the cluster.
+            kind: class of its messages, e.g. zsim.sensors.scanner.Range for "range".
+
+        Raises:
+            UserCodeError: the scenario does not grant it, or its samples are of another class.
+        """
+        return self.grants.samples(type(self), sensor, kind)
+
+    @property
+    def map(self) -> Map:
+        """The obstacles and surfaces of the scenario; UserCodeError unless `law_map` of the cluster is true."""
+        return self.grants.map_for(type(self))
+
+    @property
+    def now_ns(self) -> int:
+        """The gate of the estimates, simulated time [ns]."""
+        return self.grants.t_ns
 
     def reset(self) -> None:  # noqa: B027 - a law may have no state
         """Forget all state: the formation is engaged, or goes on after it was held."""

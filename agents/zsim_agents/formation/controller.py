@@ -1,6 +1,7 @@
 """The cluster controller as an agent: estimates and states in, velocity commands and cluster state out."""
 
 import math
+from collections.abc import Sequence
 from functools import partial
 from operator import itemgetter
 from struct import Struct as Packing
@@ -42,11 +43,14 @@ class Controller(Agent):
         self.drones = tuple(spec.drones)
         estimates = tuple(keys.estimate(drone) for drone in spec.drones)
         states = tuple(keys.status(drone) for drone in spec.drones)
-        self.reads = self.gate_keys = states + estimates
+        self._engagement = engagement_of(scenario, spec)
+        self._grants = self._engagement.law.grants
+        self.gate_keys = states + estimates
+        self.reads = self.gate_keys + self._grants.keys
         self._state_key, self._view_key = keys.cluster_state(cluster), keys.cluster_view(cluster)
         self._control_key, self._request_key = keys.cluster_control(cluster), keys.cluster_request(cluster)
         self.writes, self.repeats = (self._state_key,), (self._request_key,)
-        self._place = {key: i for of_drones in (states, estimates) for i, key in enumerate(of_drones)}
+        self._place = {key(drone): i for i, drone in enumerate(spec.drones) for key in (keys.status, keys.estimate)}
         self._velocity_keys = [keys.command(drone, "velocity") for drone in spec.drones]
         self._estimates = [_UNKNOWN] * len(spec.drones)
         table = np.empty((12, len(spec.drones)))  # the numbers of a GateInput, valid until the next gate
@@ -55,14 +59,15 @@ class Controller(Agent):
         self._fill = partial(Packing(f"={table.size}d").pack_into, table.data, 0)  # numpy takes three times as long
         self._states: list[str] = ["landed"] * len(spec.drones)
         self._status_ns = [0] * len(spec.drones)
-        self._engagement = engagement_of(scenario, spec)
         self._last_state: flight_messages.ClusterState | None = None
         self._stepped_ns: int | None = None
         self._answered: list[tuple[ControlRequest, ControlAnswer]] = []  # since the last gate
 
     def receive(self, key: str, message: Any) -> None:
-        place = self._place[key]
-        if type(message) is flight_messages.Estimate:
+        place = self._place.get(key)
+        if place is None:
+            self._grants.put(key, message)
+        elif type(message) is flight_messages.Estimate:
             former = self._estimates[place]
             if former is _UNKNOWN or message.t_ns >= former.t_ns:  # in realtime an older one may come later
                 self._estimates[place] = message
@@ -70,8 +75,9 @@ class Controller(Agent):
             self._states[place], self._status_ns[place] = message.state, message.t_ns
 
     def step(self, t_ns: int) -> list[Output]:
-        self._stepped_ns = t_ns
+        self._stepped_ns = self._grants.t_ns = t_ns
         output = self._engagement.step(self._gate(t_ns))
+        self._seat(self._engagement.drones)
         source, outputs = self.source, []
         answered, self._answered = self._answered, []
         for request, answer in answered:  # since the last gate; a re-run of the record makes them before this one
@@ -107,6 +113,19 @@ class Controller(Agent):
         outputs.append(Output(self._state_key, state))
         return outputs
 
+    def _seat(self, drones: Sequence[str]) -> None:
+        """Take the drones in the order of the robots, which an assembly changes."""
+        if drones == self.drones:
+            return
+        places = [self.drones.index(drone) for drone in drones]
+        self._estimates = [self._estimates[k] for k in places]
+        self._states = [self._states[k] for k in places]
+        self._status_ns = [self._status_ns[k] for k in places]
+        self.drones = tuple(drones)
+        self._velocity_keys = [keys.command(drone, "velocity") for drone in drones]
+        self._place = {key(drone): i for i, drone in enumerate(drones) for key in (keys.status, keys.estimate)}
+        self._grants.seat(drones)
+
     def _gate(self, t_ns: int) -> GateInput:
         positions, velocities, variances, yaws, yaw_sigmas, ages_s = [], [], [], [], [], []
         for e in self._estimates:
@@ -137,6 +156,7 @@ class Controller(Agent):
             return ControlAnswer(ok=False, error=f"{key}: {REQUESTS_MAX} requests wait for the next gate; ask after it")
         try:
             refusal = self._engagement.request(read_request(request.op, request.args))
+            self._seat(self._engagement.drones)
         except RequestError as error:
             refusal = str(error)
         answer = ControlAnswer(ok=refusal is None, error=refusal or "")
@@ -156,13 +176,16 @@ class Controller(Agent):
             "status_ns": self._status_ns,
             "stepped_ns": self._stepped_ns,
             "engagement": engagement,
+            "grants": self._grants.snapshot(),
         }
 
     def restore(self, state: State) -> None:
-        pairs = zip(self.gate_keys[len(self.drones) :], state["estimates"], strict=True)
+        self._seat(state["engagement"]["drones"])
+        pairs = zip(map(keys.estimate, self.drones), state["estimates"], strict=True)
         self._estimates = [messages.decode(key, payload) if payload else _UNKNOWN for key, payload in pairs]
         self._states, self._status_ns = state["states"], state["status_ns"]
         self._stepped_ns = state["stepped_ns"]
+        self._grants.restore(state["grants"])
         gate = None if self._stepped_ns is None else self._gate(self._stepped_ns)
         self._engagement.restore(state["engagement"], gate)
 
@@ -170,7 +193,9 @@ class Controller(Agent):
         return (self._state_key,)
 
     def warm_start(self, key: str, message: flight_messages.ClusterState) -> None:
-        self._engagement.warm_start(message.phase, np.array(message.desired), message.plan_step)
+        drones = message.drones if sorted(message.drones) == sorted(self.drones) else self.drones
+        self._engagement.warm_start(message.phase, np.array(message.desired), message.plan_step, drones)
+        self._seat(self._engagement.drones)
 
 
 _UNKNOWN = flight_messages.Estimate(

@@ -11,7 +11,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from zsim.contract.snapshot import State
+from zsim.contract.snapshot import State, checked
+from zsim.schema import plugin
+from zsim_agents.formation.assembly import Assembly, assembly_goal, planned_assembly
 from zsim_agents.formation.control_law import (
     ControlLaw,
     FormationCommand,
@@ -46,6 +48,7 @@ from zsim_agents.formation.flight_check import (
 )
 from zsim_agents.formation.flight_plan import (
     REFUSALS,
+    Assemble,
     FlightPlan,
     FlightRequest,
     MoveTo,
@@ -99,6 +102,7 @@ class Engagement:
         self._landing_s = -math.inf
         self._fault = ""  # why an engaged formation does not close its loop
         self._well_since_s = math.inf
+        self._assembly: Assembly | None = None  # while the drones fly to assigned places, or wait there
         self._places: Places | None = None  # while the drones of a held formation are led back to them
         self._checked = np.empty(0)  # the last reference without a fault; one at rest stays the same array
         self._wrapped = self._checked, self._checked  # the last reference, and the same with wrapped angles
@@ -114,11 +118,14 @@ class Engagement:
         self._gate = gate
         self.check.observe(gate)
         self.plan.run(gate.t_s, self._try)
+        gate = self._gate  # with the drones in the order of the robots, which an assembly changes
         if self._phase in ("assembling", "engaged") and gate.down:
-            self._phase, self._places = "idle", None
+            self._phase, self._places, self._assembly = "idle", None, None
         if self._phase == "engaged":
             self._judge(gate)
             return self._hold(gate) if self._fault else self._fly(gate)
+        if self._assembly is not None:
+            return self._assemble(gate, self._assembly)
         if self._phase in ("taking_off", "assembling"):
             return self._climb(gate)
         if self._phase != "landing":
@@ -138,23 +145,30 @@ class Engagement:
             self.plan.overrule()
         return refusal
 
-    def warm_start(self, phase: str, desired: Array, plan_step: int = 0) -> None:
+    def warm_start(self, phase: str, desired: Array, plan_step: int = 0, drones: Sequence[str] = ()) -> None:
         """Continue in the phase and at the reference (4n,) of a former process of this formation.
+
+        `drones`: in the order of its robots, where that is not the scenario's.
 
         Its plan continues after the completed steps, as in the former `GateOutput.plan_step`; what it flew by the plan
         (a target, a trajectory) is requested again, from that reference.
         """
         self._phase = "engaged" if phase == "held" else phase
+        self._name(drones or self.drones)
         if self._phase == "engaged":
             self.guidance.engage(desired)
         self.plan.start_at(plan_step)
 
     def snapshot(self) -> State | None:
         law = self.law.snapshot()
+        if plugin.is_own(type(self.law)):
+            law = checked(law, type(self.law))
         if law is None:
             return None
         return {
             "phase": self._phase,
+            "drones": list(self.drones),
+            "assembly": self._assembly and self._assembly.snapshot(),
             "landing_s": self._landing_s,
             "fault": self._fault,
             "well_since_s": self._well_since_s,
@@ -170,6 +184,8 @@ class Engagement:
     def restore(self, state: State, gate: GateInput | None) -> None:
         """Take over the snapshot of another process, and the gate that it stepped last."""
         self._phase, self._landing_s = state["phase"], state["landing_s"]
+        self._name(state["drones"])
+        self._assembly = state["assembly"] and Assembly.restored(state["assembly"], self.gains)
         self._fault, self._well_since_s = state["fault"], state["well_since_s"]
         self._modes, self._checked = state["modes"], state["checked"]
         self.check.value = state["value"]
@@ -194,7 +210,7 @@ class Engagement:
         if request is Order.TAKE_OFF:
             if self._phase != "idle":
                 raise RefusalError(f"phase is {self.phase}; take-off is possible when idle")
-            if fault := self.check.take_off_fault(gate):
+            if fault := self.check.take_off_fault(gate, self.plan.assembles):
                 raise RefusalError(fault)
             self._phase = "taking_off"
             self._modes.clear()
@@ -203,7 +219,7 @@ class Engagement:
         elif request is Order.LAND:
             if self._phase == "idle" and gate.down:
                 raise RefusalError("all drones are on the ground")
-            self._phase, self._landing_s, self._places = "landing", gate.t_s, None
+            self._phase, self._landing_s, self._places, self._assembly = "landing", gate.t_s, None, None
             self._modes.clear()
         elif request is Order.REJOIN:
             if self._phase != "engaged" or not self._fault:
@@ -216,6 +232,8 @@ class Engagement:
             self._places = self._places_at(self.space.inverse(c)[0])
         elif request is Order.PAUSE and self._places is not None:
             self._places = None
+        elif isinstance(request, Assemble):
+            self._grant_assembly(request, gate)
         elif self._phase != "engaged":
             raise RefusalError(f"phase is {self.phase}; possible when engaged")
         elif self._fault:
@@ -233,13 +251,44 @@ class Engagement:
             return
         if self._phase != "assembling":
             raise RefusalError(f"phase is {self.phase}; possible when assembling, or when held on request")
-        if fault := self.check.engagement_fault(gate):
+        if fault := self._way_left(gate) or self.check.engagement_fault(gate):
             raise RefusalError(fault)
-        self.guidance.engage(self.check.value)
+        if self._assembly is None:
+            self.guidance.engage(self.check.value)
+        else:
+            self.guidance.engage_at(self.check.value, self._assembly.c, gate.t_s)
         self.plan.overrule()
         self.law.reset()
-        self._fault = ""
+        self._fault, self._assembly = "", None
         self._phase = "engaged"
+
+    def _grant_assembly(self, request: Assemble, gate: GateInput) -> None:
+        """Assign the drones to the places of a formation, and let them fly there."""
+        if self._phase not in ("assembling", "engaged") or self._fault:
+            raise RefusalError(self._fault or f"phase is {self.phase}; possible when assembling or engaged")
+        if fault := self._way_left(gate) or self.check.assembly_fault(gate):
+            raise RefusalError(fault)
+        if self._phase == "engaged":
+            base = self.guidance.base(gate.t_s)
+        elif (base := self.check.formation()) is not None:
+            base = np.where(self.space.neutral, 0.0, base)
+        c = assembly_goal(self.space, request.values, base, gate.p_W, gate.yaw)
+        self._assembly, order = planned_assembly(self.space, c, gate.p_W, self.gains)
+        self._phase = "assembling"
+        self._name([self.drones[k] for k in order.tolist()])
+        self._gate = gate.of(order)
+        self.check.observe(self._gate)
+
+    def _name(self, drones: Sequence[str]) -> None:
+        """Take the drones in the order of the robots."""
+        self.drones = self.law.robots = self.check.drones = tuple(drones)
+
+    def _way_left(self, gate: GateInput) -> str | None:
+        """Return what is left of the drones' ways to their places."""
+        if self._assembly is None or self._assembly.arrived(gate.p_W):
+            return None
+        i, away_m = self._assembly.farthest(gate.p_W)
+        return f"{self.drones[i]} is {away_m:.1f} m from its place, {self._assembly.left_s:.1f} s of the ways are left"
 
     def _places_at(self, p_W: Array) -> Places:
         return Places(p_W, self.gains, self._held_limits, SHAPE.share)
@@ -269,6 +318,16 @@ class Engagement:
         below_m = ASSEMBLY_HEIGHT_M - gate.p_W[:, 2]
         climb_m_s = np.minimum(np.maximum(CLIMB_GAIN_1_S * below_m, 0.0), ASSEMBLY_CLIMB_M_S)
         return self._output(gate, reason, modes=modes, command=self._upright(gate, climb_m_s, self.gains.limits))
+
+    def _assemble(self, gate: GateInput, assembly: Assembly) -> GateOutput:
+        """Lead the drones on their ways, without turning; they stand where one cannot be flown."""
+        if fault := self._unflyable(gate):
+            return self._output(gate, fault, command=self._upright(gate, 0.0, self.gains.limits))
+        assembly.advance(gate.p_W, self._dt_s)
+        v_W, guarded, alarmed = guard(gate.p_W, gate.v_W, assembly.velocities(gate.p_W), self.gains.limits)
+        command = FormationCommand(v_W, np.zeros(self.space.n), 1.0, guarded, alarmed)
+        reason = self._way_left(gate) or self.check.engagement_fault(gate) or READY_TO_ENGAGE
+        return self._output(gate, reason, command=command)
 
     def _judge(self, gate: GateInput) -> None:
         """Set the fault of an engaged formation, or clear it when all has been well for a while."""
@@ -362,8 +421,12 @@ class Engagement:
             margin=self.check.margin,
             reason=reason,
             factor=command.factor if command else 1.0,
-            plan_step=self.plan.resume_at(engaged=self._phase == "engaged" and not self.guidance.paused),
+            plan_step=self.plan.resume_at(self._is_led()),
         )
+
+    def _is_led(self) -> bool:
+        """Tell whether the drones fly what a step of the plan has begun."""
+        return self._assembly is not None or (self._phase == "engaged" and not self.guidance.paused)
 
     def _pairs(self, pairs: Pairs) -> str:
         return ", ".join(f"{self.drones[i]} and {self.drones[j]}" for i, j in pairs)

@@ -19,6 +19,7 @@ from msgspec import UNSET
 from zsim.errors import DocumentError, NotTrustedError, RunError
 from zsim.scenario.scenario import Cluster, Gains, Scenario
 from zsim.schema import parameters, plugin
+from zsim_agents.formation.assembly import assembly_goal, planned_assembly
 from zsim_agents.formation.control_law import (
     LAWS,
     ControlLaw,
@@ -38,7 +39,8 @@ from zsim_agents.formation.flight_check import (
     formation_fault,
     shape_fault,
 )
-from zsim_agents.formation.flight_plan import REFUSALS, FlightPlan, Follow, MoveTo, PlanError, plan_of
+from zsim_agents.formation.flight_plan import REFUSALS, Assemble, FlightPlan, Follow, MoveTo, PlanError, plan_of
+from zsim_agents.formation.grants import granted, grants_of
 from zsim_agents.formation.guidance import HORIZON_S, LOAD_TOLERANCE, RampPlanner
 from zsim_agents.formation.spaces.cluster_space import (
     Array,
@@ -65,6 +67,8 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
         name = cluster.law or "proportional"
         law = LAWS.get(name) or plugin.load(name, "law", ControlLaw, is_constructed=True)
         law = parameters.bound(law, cluster.law_parameters, "law_parameters")
+        if plugin.is_own(law):
+            law = granted(law, grants_of(cluster, scenario.environment))
         _rehearse(space, cluster.drones, gains, law)
         limits = EngagementLimits()
         if cluster.gains.sigma_max_m is not UNSET:
@@ -138,7 +142,8 @@ def gains_of(gains: Gains) -> FormationGains:
 def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, gains: FormationGains) -> None:
     """Raise PlanError for a plan that these drones cannot fly; from no valid formation, it is not judged."""
     plan = cluster.plan
-    if plan.takeoff_s is None or not (plan.target or plan.trajectory):
+    assembles = plan.assemblies is not UNSET
+    if plan.takeoff_s is None or not (plan.target or plan.trajectory or assembles):
         return
     ready_s = plan.takeoff_s + READY_S
     begins_s = max(ready_s, plan.trajectory.start_s) if plan.trajectory else ready_s
@@ -149,19 +154,23 @@ def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, ga
     drones = [scenario.drone(name) for name in cluster.drones]
     p_W = np.array([drone.position_m for drone in drones], float)
     p_W[:, 2] += ASSEMBLY_HEIGHT_M  # above their starting places
-    try:
-        start = space.forward(p_W, np.radians([drone.yaw_deg for drone in drones]))
-        if shape_fault(space, start, SHAPE):
-            return
-    except SingularClusterError:
+    yaw = np.radians([drone.yaw_deg for drone in drones])
+    start = _formation_at(space, p_W, yaw)
+    if start is None and not assembles:
         return
     rehearsal = _Rehearsal(scenario, cluster, space, gains)
-    goal = start.copy()
-    goal[space.neutral] = 0.0
+    goal = np.zeros(space.size) if start is None else np.where(space.neutral, 0.0, start)
     for step in plan_of(cluster):
         request = step.request
         try:
-            if isinstance(request, MoveTo):
+            if isinstance(request, Assemble):
+                base = None if start is None else goal
+                start = goal = assembly_goal(space, request.values, base, p_W, yaw)
+                planned_assembly(space, goal, p_W, gains, NEAR_ROOM)
+                p_W, yaw = space.inverse(goal)
+            elif start is None:
+                continue  # of the orders before the first assembly
+            elif isinstance(request, MoveTo):
                 goal = request.goal(space, goal)
                 rehearsal.check_target(start, goal, None if plan.trajectory else request.over_s)
             elif isinstance(request, Follow):
@@ -169,6 +178,15 @@ def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, ga
                 rehearsal.check_trajectory(start, request.trajectory(space, goal), begin_s, ready_s)
         except REFUSALS as error:
             raise PlanError(f"{step.path}: {error}") from None
+
+
+def _formation_at(space: ClusterSpace, p_W: Array, yaw: Array) -> Array | None:
+    """Return the formation (4n,) of robots, None where they are none to be engaged in."""
+    try:
+        c = space.forward(p_W, yaw)
+        return None if shape_fault(space, c, SHAPE) else c
+    except SingularClusterError:
+        return None
 
 
 class _Rehearsal:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from zsim.math.compiled import portable
 from zsim_agents.formation.control_law import FormationGains
@@ -93,6 +94,12 @@ class GateInput(Struct, eq=False):
     yaw_sigma: Array
     age_s: Array
     states: tuple[str, ...]
+
+    def of(self, order: NDArray[np.intp]) -> GateInput:
+        """Return the gate with the robots in another order, (n,) of their present numbers."""
+        motion = self.p_W[order], self.yaw[order], self.v_W[order]
+        known = self.sigma_m[order], self.yaw_sigma[order], self.age_s[order]
+        return GateInput(self.t_s, *motion, *known, tuple(self.states[k] for k in order.tolist()))
 
     @property
     def down(self) -> bool:  # no drone is in the air
@@ -176,19 +183,28 @@ class FlightCheck:
         except SingularClusterError as error:
             self._no_frame = str(error)
 
-    def take_off_fault(self, gate: GateInput) -> str | None:
-        """Return why the drones may not take off; drones that fly already need not stand well."""
+    def take_off_fault(self, gate: GateInput, assembles: bool = False) -> str | None:
+        """Return why the drones may not take off; drones that fly already need not stand well.
+
+        `assembles`: whether they are led to places of a formation, so that they may stand in any other.
+        """
         fault = self._start_fault(gate, AIRBORNE | {"landed"})
-        return fault or (self.formation_fault(gate) if "landed" in gate.states else None)
+        if fault or "landed" not in gate.states:
+            return fault
+        return self.distance_fault(gate) if assembles else self.formation_fault(gate)
 
     def engagement_fault(self, gate: GateInput) -> str | None:
+        return self.assembly_fault(gate) or self.formation_fault(gate)
+
+    def assembly_fault(self, gate: GateInput) -> str | None:
+        """Return why the drones cannot be led one by one after their climb."""
         if fault := self._start_fault(gate, AIRBORNE):
             return fault
         low = int(np.argmin(gate.p_W[:, 2]))
         least_m = ASSEMBLY_HEIGHT_M - ASSEMBLY_WITHIN_M
         if gate.p_W[low, 2] < least_m:
             return f"{self.drones[low]} is at z = {gate.p_W[low, 2]:.2f} m; allowed: {least_m:.2f} m or more"
-        return self.formation_fault(gate)
+        return None
 
     def flight_fault(self, gate: GateInput) -> str | None:
         """Return why the loop of an engaged formation cannot be closed."""
@@ -201,13 +217,19 @@ class FlightCheck:
     def formation_fault(self, gate: GateInput) -> str | None:
         """Return why the robots, where they are, are no formation to start from."""
         fault = self._no_frame or shape_fault(self.space, self.value, SHAPE, self._spread)
-        if fault:
-            return fault
+        return fault or self.distance_fault(gate)
+
+    def distance_fault(self, gate: GateInput) -> str | None:
         distance, i, j = closest_pair(gate.p_W)
         if distance >= self.gains.separation_min_m:
             return None
         pair = f"{self.drones[i]} and {self.drones[j]}"
         return f"{pair} are {distance:.2f} m apart; allowed: {self.gains.separation_min_m:g} m or more"
+
+    def formation(self) -> Array | None:
+        """Return the cluster (4n,) of the observed gate, None where the robots are in no formation to be flown."""
+        is_one = self._no_frame is None and shape_fault(self.space, self.value, SHAPE_IN_FLIGHT, self._spread) is None
+        return self.value if is_one else None
 
     def estimate_fault(self, gate: GateInput) -> str | None:
         """Return why the estimates of drones in flight, at the observed gate, cannot be flown on."""

@@ -9,6 +9,7 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
+from msgspec import UNSET
 
 from zsim.contract.snapshot import State
 from zsim.scenario.scenario import Cluster
@@ -94,7 +95,17 @@ class Follow:
         return ExpressionTrajectory(space, self.expressions, base, self.constants, self.duration_s)
 
 
-FlightRequest = Order | MoveTo | Follow
+@dataclass(frozen=True)
+class Assemble:
+    """Let each drone fly to a place of a formation that is assigned to it; `assemble` on the wire.
+
+    The formation has values by name; what is not named stays, as of `MoveTo`. It is engaged by a further request.
+    """
+
+    values: Mapping[str, str | float] = field(default_factory=dict)
+
+
+FlightRequest = Order | MoveTo | Follow | Assemble
 
 
 @dataclass(frozen=True)
@@ -130,6 +141,8 @@ class FlightPlan:
             try:
                 if isinstance(step.request, MoveTo):
                     step.request.goal(space, base)
+                elif isinstance(step.request, Assemble):
+                    named_values(space, step.request.values, "assemble", base, ".values")
                 elif isinstance(step.request, Follow):
                     step.request.trajectory(space, base).value(0.0)
             except REFUSALS as error:
@@ -139,7 +152,9 @@ class FlightPlan:
                     path = f"{step.path}{error.at}{' ' if text.startswith('is ') else ': '}"
                 elif isinstance(error, ExpressionError) and error.name:
                     text = error.finding
-                    path = f"{step.path}{'.expressions' if step.path.endswith('trajectory') else ''}.{error.name}: "
+                    part = ".values" if isinstance(step.request, Assemble) else ""
+                    part = ".expressions" if step.path.endswith("trajectory") else part
+                    path = f"{step.path}{part}.{error.name}: "
                 raise PlanError(f"{path}{text}") from None
         self._steps = tuple(steps)
         self._next = 0  # first step that is not completed
@@ -158,15 +173,20 @@ class FlightPlan:
             due = self._steps[self._next].request
             if refusal := request(due):
                 self._try_s = t_s + RETRY_S
-                op = due.value if isinstance(due, Order) else "target" if isinstance(due, MoveTo) else "trajectory"
+                op = due.value if isinstance(due, Order) else _OPERATION_OF[type(due)]
                 self.note = f"{op}{WAITS}{refusal}"
                 return
             flown = self._next + 1 if isinstance(due, Order) else self._flown
             self._go_to(self._next + 1, flown)
 
-    def resume_at(self, engaged: bool) -> int:
+    @property
+    def assembles(self) -> bool:
+        """Tell whether drones are still to be assigned to places, so that they may start anywhere."""
+        return any(isinstance(step.request, Assemble) for step in self._steps[self._next :])
+
+    def resume_at(self, flying: bool) -> int:
         """Return how many steps a restart skips: all completed ones, but in flight those flown now."""
-        return self._flown if engaged else self._next
+        return self._flown if flying else self._next
 
     def start_at(self, step: int) -> None:
         """Skip so many steps: they were completed before a restart."""
@@ -203,12 +223,19 @@ def plan_of(cluster: Cluster) -> list[Scheduled]:
     plan, steps = cluster.plan, []
     if plan.takeoff_s is not None:
         steps += [Scheduled(plan.takeoff_s, each, "plan.takeoff_s") for each in (Order.TAKE_OFF, Order.ENGAGE)]
+        from_s = plan.takeoff_s
+        if plan.assemblies is not UNSET:
+            steps.pop()
+            for index, each in enumerate(plan.assemblies):
+                from_s, path = max(each.at_s, plan.takeoff_s), f"plan.assemblies[{index}]"
+                steps.append(Scheduled(from_s, Assemble(each.values), path))
+                steps.append(Scheduled(from_s, Order.ENGAGE, path))
         if plan.target:
-            steps.append(Scheduled(plan.takeoff_s, MoveTo(plan.target, plan.target_over_s), "plan.target"))
+            steps.append(Scheduled(from_s, MoveTo(plan.target, plan.target_over_s), "plan.target"))
         if trajectory := plan.trajectory:
             waypoints = [{"at_s": w.at_s, "values": w.values} for w in trajectory.waypoints]
             follow = Follow(trajectory.expressions, trajectory.constants, None, waypoints, trajectory.start_s)
-            steps.append(Scheduled(plan.takeoff_s, follow, "plan.trajectory"))
+            steps.append(Scheduled(from_s, follow, "plan.trajectory"))
     if plan.land_s is not None:
         steps.append(Scheduled(plan.land_s, Order.LAND, "plan.land_s"))
     return steps
@@ -223,7 +250,12 @@ _FIELDS = {  # of the requests with parameters, by their operation on the wire
         "waypoints": "a list of waypoints",
         "start_s": "a number of seconds",
     },
+    "assemble": {"values": "a map of numbers by variable"},
 }
+_KINDS: dict[str, Callable[..., MoveTo | Follow | Assemble]] = {
+    "target": MoveTo, "trajectory": Follow, "assemble": Assemble,
+}  # fmt: skip
+_OPERATION_OF = {kind: op for op, kind in _KINDS.items()}
 OPERATIONS = (*(order.value for order in Order), *_FIELDS)
 
 
@@ -251,4 +283,4 @@ def read_request(op: object, args: object = None) -> FlightRequest:
         if not fits:
             raise RequestError(f"{op}: {name} is {str(value)[:40]!r}; allowed: {fields[name]}")
     given: dict[str, Any] = {name: value for name, value in arguments.items() if value is not None}
-    return MoveTo(**given) if op == "target" else Follow(**given) if op == "trajectory" else Order(op)
+    return _KINDS[op](**given) if op in _KINDS else Order(op)

@@ -74,14 +74,20 @@ class Guidance:
         self._home = self._flown = Hold(c)
         self.paused = False
 
+    def engage_at(self, c: Array, goal: Array, t_s: float) -> None:
+        """Start at the estimate c (4n,), at rest, and go to the goal (4n,) near it, where it was to be."""
+        home = Hold(goal)
+        self._flown = self._planner.ramp((c, np.zeros_like(c)), home, t_s)
+        self._home, self._goal, self.paused = home, goal.copy(), False
+
     def target(self, request: MoveTo, t_s: float) -> None:
-        goal = request.goal(self.space, self._base(t_s))
+        goal = request.goal(self.space, self.base(t_s))
         home = Hold(goal)
         self._flown = self._planner.ramp(self.value(t_s), home, t_s, request.over_s)
         self._home, self._goal, self.paused = home, goal, False
 
     def follow(self, request: Follow, t_s: float) -> None:
-        trajectory = request.trajectory(self.space, self._base(t_s))
+        trajectory = request.trajectory(self.space, self.base(t_s))
         start_s = request.start_s
         if start_s is None:
             begin = Hold(trajectory.value(0.0)[0])
@@ -126,7 +132,8 @@ class Guidance:
         self._home, self._flown = reference_of(self.space, state["home"]), reference_of(self.space, state["flown"])
         self._goal, self.paused = state["goal"], state["paused"]
 
-    def _base(self, t_s: float) -> Array:
+    def base(self, t_s: float) -> Array:
+        """Return what variables (4n,) keep that a request does not name."""
         return self._home.value(t_s)[0] if isinstance(self._home, Shifted) else self._goal
 
 

@@ -19,12 +19,14 @@ from zsim.contract.flight_messages import ReferencePhase
 from zsim.errors import DocumentError, NotTrustedError, RunError
 from zsim.scenario.scenario import STAGES_MAX, Drone, DroneReference, Exchange, PathPoint, Piloted, Scenario
 from zsim.vehicles.vehicle_catalogue import vehicle_of
+from zsim_agents.formation.assignment import assign
 from zsim_agents.formation.expression import ExpressionError
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.formation.trajectory import ExpressionTrajectory, Reference, TrajectoryError, WaypointTrajectory
-from zsim_agents.references.assignment import assign, first_approach
+from zsim_agents.references.approach import first_approach
 from zsim_agents.references.generators import Laps, circle, figure_eight
 from zsim_agents.references.path import (
+    SHARE,
     EndMotion,
     PathLimits,
     Peaks,
@@ -37,7 +39,6 @@ from zsim_agents.references.path import (
 )
 
 READY_S = 4.0  # least from the order to take off to the first way: an AR.Drone takes 4 s or more
-SHARE = 0.8  # of the drone's limits, as in formations: the rest is for the feedback
 WAY_SHARE = 0.5  # of them, for the way to a path, which nobody wants to be fast; chosen
 ROUNDING = 1.0 + 1e-9  # of a factor that just fits
 HEIGHT_MIN_M = 0.2  # over the ground, chosen: above most of the ground effect of the smallest

@@ -26,6 +26,7 @@ SAMPLE_S, SAMPLES_MIN, SAMPLES_MAX = 0.05, 65, 4001  # of a path that is no poly
 HORIZON_S = 600.0  # of an endless path that is looked at
 DIFFERENCE_S = 1e-4  # of rates, for an acceleration: exact to 1e-7 of it in motions of a second
 FACTOR_DIGITS = 3  # of the factor of a fit, rounded up, see ROUNDED
+SHARE = 0.8  # of the drone's limits, as in formations: the rest is for the feedback
 LEAST_S, MOVE_MAX_S, GROWTH = 0.5, 3600.0, 1.1  # of a move: 25 gates, however short; an hour; step of the search
 STILL = 1e-9  # m, m/s or rad/s, below which nothing moves
 
@@ -85,6 +86,13 @@ class PiecewisePolynomial:
             place.append(value)
             rate.append(slope)
         return np.array(place), np.array(rate) if clamped == t_s else np.zeros(4)
+
+    def until(self, end_s: float) -> PiecewisePolynomial:
+        """Return the part before end_s, which is after the beginning."""
+        count = bisect.bisect_left(self._begins, end_s)
+        durations = self.durations_s[:count].copy()
+        durations[-1] = min(durations[-1], end_s - self._begins[count - 1])
+        return PiecewisePolynomial(durations, self.coefficients[:count])
 
     def peaks(self) -> Peaks:
         """Return the peaks, by the roots of the derivative of each squared quantity."""

@@ -1,7 +1,6 @@
 """The pilot of one drone that has a reference of its own: takes off, follows it by velocities, lands; takes requests.
 
-The velocity that it commands is the reference's own, as early as the drone's velocity loop is late, and a share of the
-distance by which the estimate is off. What is flown is a function of simulated time and of the newest request.
+What is flown is a function of simulated time and of the newest request.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ from zsim_agents.references.flight import (
     limits_of,
 )
 from zsim_agents.references.requests import DroneRequestError, read_request, requested_flight
+from zsim_agents.references.tracking import velocity_towards
 
-K_YAW_1_S = 1.0  # of the heading; chosen: below the yaw loop's bandwidth by a decade
 REQUESTS_MAX = 1000  # between two gates, as of a controller
 
 
@@ -117,17 +116,9 @@ class ReferencePilot(Agent):
         """Return the velocity [m/s, W] and yaw rate [rad/s] that lead to the reference, within the drone's limits."""
         place, _ = self._flight.value(t_s)
         _, ahead = self._flight.value(t_s + self._settings.lead_s)
-        gain, own = self._settings.gain_1_s, self._limits
-        here = zip(estimate.position_m, estimate.velocity_m_s, strict=True)
-        x, y, z = (
-            v + gain * (p - (at + moving * age_s))
-            for v, p, (at, moving) in zip(ahead[:3].tolist(), place[:3].tolist(), here, strict=True)
-        )
-        speed = math.hypot(x, y)
-        share = min(1.0, own.speed_m_s / speed) if speed else 1.0
-        turn = float(ahead[3]) + K_YAW_1_S * math.remainder(float(place[3]) - estimate.yaw_rad, math.tau)
-        most = own.yaw_rate_rad_s
-        return (x * share, y * share, min(max(z, -own.climb_m_s), own.climb_m_s)), min(max(turn, -most), most)
+        x, y, z = (at + moving * age_s for at, moving in zip(estimate.position_m, estimate.velocity_m_s, strict=True))
+        here = x, y, z, estimate.yaw_rad
+        return velocity_towards(place.tolist(), ahead.tolist(), here, self._limits, self._settings)
 
     def _mode(self, t_ns: int, mode: Any) -> list[Output]:
         """Return a mode command, repeated only after a while without effect."""

@@ -1,24 +1,22 @@
-"""From what a vehicle is to hold to the commands of its drone: targets, position loop, climbs, the firmware's modes.
+"""From what a vehicle is to hold to the commands of its drone: targets, the course to places, climbs, firmware modes.
 
-The position loop is proportional: the firmware holds velocities itself, with loops three times as fast.
+Places are flown to as references of drones are: `zsim_agents.references.tracking`.
 """
 
 import math
 from typing import Literal, NamedTuple
 
 from zsim.math.rotation import Quaternion, Vector
-from zsim_bridges.mavlink.dialect import wrapped
-from zsim_bridges.mavlink.personality import Parameters, SpeedLimits
+from zsim_agents.references.cruise import Cruise
+from zsim_agents.references.tracking import Course
+from zsim_bridges.mavlink.personality import Parameters
 from zsim_bridges.mavlink.vehicle_state import VehicleState
 from zsim_bridges.vehicle_links.drone_link import CommandSender, ModeName
 
-K_POSITION_1_S = 0.8  # 1/s; that of the firmware's own hold
-K_YAW_1_S = 1.5  # 1/s, chosen: a turn of 90 deg in 2 s
-YAW_RATE_MAX_RAD_S = 1.0  # rad/s, chosen: half of MC_YAWRAUTO_MAX's 60 deg/s would be slow at this gain
 PLACE_MAX_M = 1e6  # m; positions farther away are refused
 ANSWER_NS = 1_000_000_000  # ns within which the drone is to begin a take-off or a landing
 ARRIVED_M = 0.3  # m of the height at which a climb is over
-STEP_NS = 40_000_000  # ns; the position loop is closed 25 times a second
+STEP_NS = 40_000_000  # ns; the law is evaluated 25 times a second
 BURST = 500  # commands at once: half of what the world records of a source that is not in the lockstep
 REPEAT_NS = 100_000_000  # ns; the firmware takes a commander that is silent for 0.5 s for dead
 
@@ -58,22 +56,6 @@ class TiltTarget(NamedTuple):
     yaw_rate_rad_s: float
 
 
-def steer(target: Target, position_m: Vector, yaw_rad: float, limits: SpeedLimits) -> tuple[Vector, float]:
-    """Return the velocity [m/s] in the axes of the target's own, and the yaw rate [rad/s], that lead to a target."""
-    x, y, z = (
-        v + (0.0 if p is None else K_POSITION_1_S * (p - own))
-        for v, p, own in zip(target.velocity_m_s, target.position_m, position_m, strict=True)
-    )
-    most = limits.horizontal_m_s if target.speed_m_s is None else min(target.speed_m_s, limits.horizontal_m_s)
-    speed = math.hypot(x, y)
-    share = most / speed if speed > most else 1.0
-    velocity = share * x, share * y, max(-limits.down_m_s, min(limits.up_m_s, z))
-    if target.yaw_rad is None:
-        return velocity, target.yaw_rate_rad_s
-    rate = K_YAW_1_S * wrapped(target.yaw_rad - yaw_rad)
-    return velocity, max(-YAW_RATE_MAX_RAD_S, min(YAW_RATE_MAX_RAD_S, rate))
-
-
 def is_place(position_m: Axes) -> bool:
     return all(p is None or (math.isfinite(p) and abs(p) < PLACE_MAX_M) for p in position_m)
 
@@ -90,10 +72,12 @@ class FlightControl:
         asked: the mode that the firmware has yet to enter, and since when it is wanted.
     """
 
-    def __init__(self, parameters: Parameters, state: VehicleState, sender: CommandSender) -> None:
+    def __init__(self, parameters: Parameters, state: VehicleState, sender: CommandSender, course: Course) -> None:
         self._parameters = parameters
         self._state = state
         self._sender = sender
+        self._course = course
+        self._asked: tuple[Target, Cruise] | None = None  # of the course
         self.target: Target | TiltTarget | None = None
         self.climb_to_m: float | None = None
         self.asked: tuple[Literal["takeoff", "land"], int] | None = None
@@ -123,10 +107,10 @@ class FlightControl:
                 self._send()
 
     def hold_here(self) -> None:
-        """Hold where the vehicle is, whatever was under way."""
+        """Come to rest, whatever was under way."""
         self.climb_to_m = None
         if self._state.is_steerable:
-            self.hold(Target(self._state.position_m))
+            self.hold(Target(self._course.stop(*self._motion())))
 
     def climb(self, z_m: float) -> None:
         """Climb, or take off, to z in W above where the vehicle is."""
@@ -152,7 +136,7 @@ class FlightControl:
         if self.asked is None or self.asked[0] != mode or self._state.t_ns - self.asked[1] > ANSWER_NS:
             self.asked = mode, self._state.t_ns
             if mode == "land":
-                self.target = self.climb_to_m = None
+                self._let_go()
             self.send_mode(mode)
 
     def send_mode(self, mode: ModeName) -> None:
@@ -166,7 +150,12 @@ class FlightControl:
         return self._state.t_ns - self.asked[1] > ANSWER_NS
 
     def release(self) -> None:
-        self.target = self.climb_to_m = self.asked = None
+        self.asked = None
+        self._let_go()
+
+    def _let_go(self) -> None:
+        self.target = self.climb_to_m = self._asked = None
+        self._course.leave()
 
     def has_arrived(self) -> bool:
         position_m, radius_m = self._state.position_m, self._parameters["acceptance_m"]
@@ -185,8 +174,25 @@ class FlightControl:
         self._sent_ns = self._now_ns
         self._allowed -= 1
         if isinstance(target, Target):
-            velocity, yaw_rate = steer(target, state.position_m, state.yaw_rad, self._parameters.speeds)
             frame = "heading" if target.along_heading else "world"
-            self._sender.velocity(self._now_ns, velocity, yaw_rate, frame)
+            self._sender.velocity(self._now_ns, *self._velocity(target), frame)
         elif target is not None:
+            self._asked = None
+            self._course.leave()
             self._sender.attitude(self._now_ns, target.q_WB, target.thrust_n, target.yaw_rate_rad_s)
+
+    def _velocity(self, target: Target) -> tuple[Vector, float]:
+        """Return the velocity [m/s] in the axes of the target's own, and the yaw rate [rad/s], that lead to it."""
+        speeds, (t_s, here, moving) = self._parameters.speeds, self._motion()
+        level = min(target.speed_m_s or math.inf, speeds.horizontal_m_s)
+        asked = target, Cruise(level, speeds.up_m_s, speeds.down_m_s)
+        if asked != self._asked:
+            goal, rate = (*target.position_m, target.yaw_rad), (*target.velocity_m_s, target.yaw_rate_rad_s)
+            self._course.send(goal, t_s, here, moving, rate, asked[1])
+            self._asked = asked
+        return self._course.velocity(t_s, here, moving)
+
+    def _motion(self) -> tuple[float, tuple[float, ...], tuple[float, ...]]:
+        """Return simulated time [s], place and heading, and their rates."""
+        state = self._state
+        return state.t_ns * 1e-9, (*state.position_m, state.yaw_rad), (*state.velocity_m_s, 0.0)

@@ -11,8 +11,10 @@ from zsim.contract.messages import Origin
 from zsim.errors import without_figures
 from zsim.math.frames import turned_about_up
 from zsim.math.rotation import Vector
-from zsim.scenario.scenario import Drone
+from zsim.scenario.scenario import Drone, Piloted
 from zsim.schema.quantities import G_M_S2
+from zsim_agents.references.flight import limits_of
+from zsim_agents.references.tracking import Course
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import (
     DEGREES,
@@ -50,6 +52,7 @@ from zsim_bridges.vehicle_links.drone_link import CommandSender
 ALONG_HEADING = (MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED, MavFrame.BODY_FRD)
 FROM_HERE = (MavFrame.LOCAL_OFFSET_NED, *ALONG_HEADING)
 HOVER_THRUST = 0.5  # of the thrust of a setpoint; MPC_THR_HOVER
+YAW_RATE_MAX_RAD_S = math.radians(60.0)  # MPC_YAWRAUTO_MAX
 SPEED_MAX_M_S = 1e3  # m/s; no vehicle here flies faster
 Setpoint = Target | TiltTarget
 TEXT_MAX = 50  # characters of a STATUSTEXT
@@ -114,7 +117,10 @@ class MavlinkVehicle:
         self.outbox: list[WireMessage] = []
         self.state = VehicleState(drone, origin)
         self._parameters = Parameters(person, drone, options.system_id)
-        self.flight = Flight(source, person, self._parameters, self.state, sender, self.report)
+        limits = limits_of(drone, G_M_S2)
+        limits = limits._replace(yaw_rate_rad_s=min(limits.yaw_rate_rad_s, YAW_RATE_MAX_RAD_S))
+        course = Course(limits, drone.reference or Piloted())
+        self.flight = Flight(source, person, self._parameters, self.state, sender, course, self.report)
         self._source = TelemetrySource(drone, self.state, self.flight, person)
         self.watch = DroneWatch(drone.name, source, self._source, self._parameters, self.report)
         self._telemetry = Telemetry(self._source, options.level)

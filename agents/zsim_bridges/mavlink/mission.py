@@ -119,6 +119,7 @@ class Mission:
         self._reported: int | None = None  # items flown at the last report; None while it is not flown
         self._index = 0
         self._since_ns: int | None = None  # at this item
+        self._waits_at: Vector = (0.0, 0.0, 0.0)  # during a delay [m; W]
         self._speed_m_s: float | None = None
         self._jumps: dict[int, int] = {}  # left, by item
         self.has_climbed = False
@@ -219,7 +220,9 @@ class Mission:
             case Cmd.NAV_LAND:
                 return self._land(item, state, parameters)
             case Cmd.NAV_DELAY:
-                return self._wait(Target(state.position_m), item.params[0], state)
+                if self._since_ns is None:
+                    self._waits_at = state.position_m
+                return self._wait(Target(self._waits_at), item.params[0], state)
             case _:
                 return self._visit(item, state, parameters)
         self._enter(self._index + 1)

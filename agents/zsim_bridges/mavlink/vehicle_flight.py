@@ -5,6 +5,7 @@ A landed drone of zsim has no state of its own for armed: armed means that it ta
 
 from collections.abc import Callable
 
+from zsim_agents.references.tracking import Course
 from zsim_bridges.mavlink.dialect import Severity
 from zsim_bridges.mavlink.flight_control import ARRIVED_M, FlightControl, Target, TiltTarget
 from zsim_bridges.mavlink.mission import Mission
@@ -30,6 +31,7 @@ class Flight:
         parameters: Parameters,
         state: VehicleState,
         sender: CommandSender,
+        course: Course,
         report: Report,
     ) -> None:
         self._name = name
@@ -37,7 +39,7 @@ class Flight:
         self._parameters = parameters
         self._state = state
         self._report = report
-        self._control = FlightControl(parameters, state, sender)
+        self._control = FlightControl(parameters, state, sender, course)
         self._is_armed = self._was_airborne = False
         self._armed_ns = 0
         self._setpoint_ns: int | None = None  # simulated time of a client's newest setpoint

@@ -125,7 +125,13 @@ def formation(states: ClusterStates, tracks: list[Track], scenario: Scenario | N
         np.where(rows.any(axis=1, keepdims=True), rows, np.nan) for rows in (states.value, states.desired)
     )
     by_name = {track.name: track for track in tracks}
-    true = _true(space, [by_name[name] for name in states.drones if name in by_name], states.t_ns)
+    members = [by_name[name] for name in states.drones if name in by_name]
+    true = np.full((len(states.t_ns), space.size), np.nan)
+    orders = np.array(states.orders or [" ".join(states.drones)] * len(true))
+    for order in dict.fromkeys(orders.tolist()):  # one, unless the drones were assigned to other places
+        rows = np.flatnonzero(orders == order)
+        seated = [by_name[name] for name in order.split() if name in by_name]
+        true[rows] = _true(space, seated if len(seated) == len(members) else members, states.t_ns[rows])
     est_error, true_error = (
         np.array([space.difference(*pair) for pair in zip(to, desired, strict=True)]) for to in (value, true)
     )

@@ -109,6 +109,12 @@ class ClusterStates:
     phases: list[str]
     reasons: list[str]  # (K,) why it waits or is held
     requests: list[ClusterRequest]  # accepted and refused, from sources other than its plan
+    orders: list[str] = field(default_factory=list)  # (K,) its drones in the order of the robots, between spaces
+
+    def robot_of(self, row: int, drone: str) -> int:
+        """Return which robot a drone is at an instant; as in `drones` where no order is on record."""
+        order = self.orders[row].split() if self.orders else []
+        return order.index(drone) if drone in order else self.drones.index(drone)
 
 
 @dataclass
@@ -388,7 +394,7 @@ class FlightReader:
         rows.t_ns.append(state.t_ns)
         rows.values.extend(state.value)
         rows.values.extend(state.desired)
-        rows.texts.append((intern(state.phase), intern(state.reason)))
+        rows.texts.append((intern(state.phase), intern(state.reason), intern(" ".join(state.drones))))
 
     def _add_process(self, name: str, message: Join | Bye) -> None:
         process = self._processes.setdefault(name, RecordedProcess(name))
@@ -416,8 +422,8 @@ class FlightReader:
             t_ns, values, texts = self._states.get(name, _Rows(0, "d")).by_time(last=True)
             names, known_drones = self._members.get(name, ((), ()))
             value, desired = np.split(values, 2, axis=1)
-            phases, reasons = [phase for phase, _ in texts], [reason for _, reason in texts]
-            about = (phases, reasons, self._requests[name])
+            phases, reasons = [phase for phase, _, _ in texts], [reason for _, reason, _ in texts]
+            about = (phases, reasons, self._requests[name], [order for _, _, order in texts])
             clusters.append(ClusterStates(name, drones or known_drones, names, t_ns, value, desired, *about))
         estimates = {}
         for drone, rows in self._estimates.items():

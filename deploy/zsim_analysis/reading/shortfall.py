@@ -41,7 +41,7 @@ INCIDENTS = ("emergency", "flip", "impact", "touchdown", "battery", "landing")  
 CRASHES = ("emergency", "flip", "impact", "touchdown")  # incidents by which a drone comes down
 ONE_HIT_NS = 500_000_000  # chosen: a touchdown within this time of an impact is part of it
 REFUSED_NS = 5_000_000_000  # chosen: a command refused within this time before a landing explains it
-LEADS = ("hold", "land", "target", "trajectory")  # requests by which a formation leaves its plan
+LEADS = ("hold", "land", "target", "trajectory", "assemble")  # requests by which a formation leaves its plan
 
 
 class Shortfall(Struct, frozen=True):
@@ -383,16 +383,19 @@ def _line(states: ClusterStates, kind: str, t_s: float, text: str, fails: bool =
 def _refused(states: ClusterStates) -> Iterator[Shortfall]:
     """Yield the steps of the plan that were refused until the end, or until the landing that dropped them."""
     begun: tuple[str, float] | None = None
+    was_engaged = False
     for place, note in enumerate(states.reasons):
         step = waiting_step(note)
+        engaged = states.phases[place] in ("engaged", "held")
+        was_engaged = was_engaged or engaged
         if step is None:
             begun = None
             continue
         op, why = step
         begun = begun if begun and begun[0] == op else (op, float(states.t_ns[place]) / 1e9)
         last = place + 1 == len(states.reasons)
-        engaged = states.phases[place] in ("engaged", "held")
-        if engaged and (last or states.phases[place + 1] == "landing"):
+        flown = engaged or (was_engaged and states.phases[place] == "assembling")  # from one formation to another
+        if flown and (last or states.phases[place + 1] == "landing"):
             yield _line(states, "plan", begun[1], f"the {op} of the plan was refused to the end: {why}", True)
 
 
@@ -412,11 +415,12 @@ def _strayed(
     except (*REFUSALS, ValueError):
         return
     tracks = {track.name: track for track in flight.tracks if not track.external}
-    for i, drone in enumerate(states.drones if len(places_W) else ()):
+    for drone in states.drones if len(places_W) else ():
         if (track := tracks.get(drone)) is None:
             continue
         t_ns, at, mine = np.intersect1d(states.t_ns[rows], track.t_ns, assume_unique=True, return_indices=True)
-        away_m = np.linalg.norm(track.p_W[mine] - places_W[at, i], axis=1)
+        robots = np.array([states.robot_of(row, drone) for row in rows[at].tolist()], np.intp)
+        away_m = np.linalg.norm(track.p_W[mine] - places_W[at, robots], axis=1)
         for act in _interventions(drone, flight):
             away_m[act.covers(t_ns)] = 0.0
         yield from _far(drone, t_ns, away_m, "its place in the formation", flight)

@@ -26,7 +26,7 @@ from zsim.transport.zenoh_settings import SESSION_FILES, WORKER_FILES, require_f
 if TYPE_CHECKING:
     from zsim_analysis.sweep.sweep_run import Row, Task
 
-READY = "ready"
+READY, _END = "ready", "end"
 SAFE_PATH = "PYTHONSAFEPATH"  # environment variable of Python
 DEATHS_MAX = 3  # of workers in one run, or consecutively before they are ready
 EXIT_S = 5.0  # wall time within which an idle worker exits by itself
@@ -134,8 +134,10 @@ class ProcessPool:
         self._deaths: Counter[int] = Counter()
         self._deaths_at_start = 0
 
-    def rows(self, tasks: Iterator[Task]) -> Generator[Row]:
+    def rows(self, tasks: Iterator[Task | None]) -> Generator[Row]:
         """Yield the rows of tasks as they are finished; when exhausted or closed, all workers have ended.
+
+        A task that depends on rows which are not finished yet is None: it is asked for again after the next row.
 
         Raises:
             RunError: workers cannot start, or rows cannot be recorded.
@@ -146,7 +148,9 @@ class ProcessPool:
                 self._start()
             while self._workers:
                 for link in wait(list(self._workers)):
-                    yield from self._on_message(self._workers[link], tasks)  # type: ignore[index]
+                    if worker := self._workers.get(link):  # type: ignore[call-overload]
+                        yield from self._on_message(worker)
+                        self._hand_out(tasks)
         finally:
             for worker in self._workers.values():
                 worker.stop()
@@ -156,7 +160,17 @@ class ProcessPool:
         worker = WorkerProcess()
         self._workers[worker.link] = worker
 
-    def _on_message(self, worker: WorkerProcess, tasks: Iterator[Task]) -> Iterator[Row]:
+    def _hand_out(self, tasks: Iterator[Task | None]) -> None:
+        """Give each idle worker a task; one for which there is none any more ends."""
+        for worker in [each for each in self._workers.values() if each.ready and each.task is None]:
+            task = self._again.popleft() if self._again else next(tasks, _END)
+            if isinstance(task, str):
+                del self._workers[worker.link]
+                worker.stop()
+            elif task is not None:
+                worker.send(task)
+
+    def _on_message(self, worker: WorkerProcess) -> Iterator[Row]:
         message = worker.receive()
         if isinstance(message, RuntimeError):
             raise RunError(str(message))
@@ -168,12 +182,6 @@ class ProcessPool:
         else:
             worker.task = None
             yield message  # type: ignore[misc]
-        task = self._again.popleft() if self._again else next(tasks, None)
-        if task is not None:
-            worker.send(task)
-        else:
-            del self._workers[worker.link]
-            worker.stop()
 
     def _on_death(self, worker: WorkerProcess) -> Iterator[Row]:
         """Replace a dead worker; a run in which DEATHS_MAX workers died gets a failed row."""

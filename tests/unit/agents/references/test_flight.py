@@ -115,7 +115,12 @@ def test_a_stage_that_is_too_fast_is_refused_with_its_time_or_fitted() -> None:
     [
         ("jump", {}, ("goto", "follow")),
         ("hold", {"for_s": 3}, ("for_s",)),
-        ("goto", {}, ("position_m", "missing")),
+        ("goto", {}, ("position_m", "missing", "places_m")),
+        ("goto", {"position_m": [1, 2, 3], "places_m": [[1, 2, 3]]}, ("position_m", "places_m")),
+        ("goto", {"position_m": [1, 2, 3], "speed_m_s": 0}, ("speed_m_s", "0")),
+        ("goto", {"places_m": [[1, 2, 3]], "radius_m": -1}, ("radius_m", "-1", "0")),
+        ("goto", {"places_m": [[1, 2, 3]], "over_s": 5}, ("over_s", "5", "places_m")),
+        ("goto", {"position_m": [1, 2, 3], "over_s": 5, "speed_m_s": 1}, ("over_s", "5", "speed_m_s")),
         ("goto", {"position_m": [1, 2]}, ("position_m", "[1, 2]", "3")),
         ("goto", {"position_m": [1, 2, 3], "over_s": -1}, ("over_s", "-1", "0")),
         ("follow", {}, ("none", "minimum_snap")),

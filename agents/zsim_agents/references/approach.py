@@ -1,10 +1,4 @@
-"""Goals of interchangeable drones: which drone flies to which, all at once, and how near paths come. Pure.
-
-CAPT: Turpin, Michael and Kumar, Int. J. Robotics Research 33 (2014) 98-112. Drones fly straight from start to goal with
-one function of time b for all, p_i = s_i + b (g_i - s_i). The assignment of least sum of squared distances has
-(s_i - s_j).(g_i - g_j) >= 0 for every pair; with starts a and goals b apart, no pair then comes nearer than
-a b / sqrt(a^2 + b^2), which is at least the smaller of them over sqrt 2. A sum of distances has no such bound.
-"""
+"""How near paths of drones come to each other. Pure."""
 
 from __future__ import annotations
 
@@ -13,7 +7,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.formation.trajectory import Reference
@@ -22,34 +15,6 @@ from zsim_agents.references.path import peaks_of
 TOLERANCE_M = 1e-3  # of the least distance of two paths
 STEP_S = 0.05  # between the instants at which all paths are looked at
 LEAST_STEP_S = 1e-4  # to which the time between two instants is halved
-
-
-def assign(starts_m: Array, goals_m: Array) -> NDArray[np.intp]:
-    """Return the goal (n,) of each of n starts (n, 3): that of the least sum of squared distances.
-
-    Raises:
-        ValueError: there are not as many goals as starts, or they are not places.
-    """
-    from scipy.optimize import linear_sum_assignment  # here, because scipy takes longer to load than all else
-
-    starts, goals = np.asarray(starts_m, float), np.asarray(goals_m, float)
-    if starts.ndim != 2 or starts.shape != goals.shape or starts.shape[1] not in (2, 3):
-        raise ValueError(f"found starts {starts.shape} and goals {goals.shape}; must both be (n, 3)")
-    if not (np.isfinite(starts).all() and np.isfinite(goals).all()):
-        raise ValueError("a place is not finite; must be")
-    return linear_sum_assignment(((starts[:, None] - goals[None]) ** 2).sum(axis=2))[1]
-
-
-def straight_separation(starts_m: Array, goals_m: Array) -> float:
-    """Return the least distance [m] of drones that fly straight from starts to goals (n, 3) with one b for all."""
-    i, j = np.triu_indices(len(starts_m), 1)
-    if not len(i):
-        return math.inf
-    from_, to = starts_m[i] - starts_m[j], goals_m[i] - goals_m[j]
-    change = to - from_
-    squared = np.maximum((change**2).sum(axis=1), 1e-300)
-    b = np.clip(-(from_ * change).sum(axis=1) / squared, 0.0, 1.0)
-    return float(np.sqrt(((from_ + b[:, None] * change) ** 2).sum(axis=1)).min())
 
 
 class Approach(NamedTuple):

@@ -1,0 +1,140 @@
+"""How robots that stand anywhere become a formation: each flies to a place of it that is assigned to it, all at once.
+
+They fly straight, with one function of time for all, so that how near any two come is known before (see
+`assignment`). The time stands still while one of them is far behind its way.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim.contract.snapshot import State
+from zsim_agents.formation.assignment import assign, straight_separation
+from zsim_agents.formation.control_law import FormationGains
+from zsim_agents.formation.flight_check import ROUNDING_M, SHAPE, formation_fault
+from zsim_agents.formation.flight_plan import RefusalError
+from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
+from zsim_agents.formation.trajectory import named_values, variable_of
+
+PEAK_RATE = 1.875  # of the minimum-jerk function of time, over its mean
+LEAST_S = 2.0  # as of a ramp of the reference
+BEHIND_M = 0.7  # from its way, at which the others wait for a robot; chosen: a third of the least separation
+IN_PLACE_M = 0.5  # chosen: two sigma of a side's estimate
+PLACE = ("x_c", "y_c", "z_c", "yaw")  # variables that any robots have, whatever their shape
+
+
+class Assembly:
+    """Robots on straight ways from start_W to goal_W (n, 3) [m], the places of the formation c (4n,), over over_s."""
+
+    def __init__(self, start_W: Array, goal_W: Array, c: Array, over_s: float, gains: FormationGains) -> None:
+        self.c, self.over_s = c, over_s
+        self._start_W, self._goal_W, self._gains = start_W, goal_W, gains
+        self._flown_s = 0.0
+
+    @property
+    def left_s(self) -> float:
+        return self.over_s - self._flown_s
+
+    def advance(self, p_W: Array, dt_s: float) -> None:
+        """Go on by dt_s, unless a robot at p_W (n, 3) is far behind."""
+        if float(np.linalg.norm(self._way()[0] - p_W, axis=1).max()) <= BEHIND_M:
+            self._flown_s = min(self._flown_s + dt_s, self.over_s)
+
+    def velocities(self, p_W: Array) -> Array:
+        """Return the velocities (n, 3) [m/s, W] of robots at p_W (n, 3) [m], before the guard."""
+        place_W, rate_W = self._way()
+        v_W = rate_W + self._gains.k_1_s * (place_W - p_W)
+        speed = np.sqrt(v_W[:, 0] ** 2 + v_W[:, 1] ** 2)
+        v_W[:, :2] *= np.minimum(1.0, self._gains.speed_max_m_s / np.maximum(speed, 1e-9))[:, None]
+        v_W[:, 2] = np.clip(v_W[:, 2], -self._gains.climb_max_m_s, self._gains.climb_max_m_s)
+        return v_W
+
+    def farthest(self, p_W: Array) -> tuple[int, float]:
+        """Return which robot is farthest from its place, and how far [m]."""
+        away_m = np.linalg.norm(self._goal_W - p_W, axis=1)
+        return int(np.argmax(away_m)), float(away_m.max())
+
+    def arrived(self, p_W: Array) -> bool:
+        return self.left_s <= 0.0 and self.farthest(p_W)[1] <= IN_PLACE_M
+
+    def _way(self) -> tuple[Array, Array]:
+        """Return where the robots are to be, and their velocities, each (n, 3)."""
+        s = self._flown_s / self.over_s
+        ways_W = self._goal_W - self._start_W
+        share, rate = s * s * s * (10.0 - s * (15.0 - 6.0 * s)), 30.0 * s * s * (1.0 - s) * (1.0 - s) / self.over_s
+        return self._start_W + share * ways_W, rate * ways_W
+
+    def snapshot(self) -> State:
+        places = {"start_W": self._start_W, "goal_W": self._goal_W, "c": self.c}
+        return {**places, "over_s": self.over_s, "flown_s": self._flown_s}
+
+    @classmethod
+    def restored(cls, state: State, gains: FormationGains) -> Assembly:
+        assembly = cls(state["start_W"], state["goal_W"], state["c"], state["over_s"], gains)
+        assembly._flown_s = state["flown_s"]
+        return assembly
+
+
+def assembly_goal(
+    space: ClusterSpace, values: Mapping[str, str | float], base: Array | None, p_W: Array, yaw: Array
+) -> Array:
+    """Return the formation (4n,) to fly to: the base with values by name.
+
+    Args:
+        base: (4n,) of robots that are a formation. None: their centre and mean heading, in which nothing departs from a
+            template; all else must be named.
+        p_W, yaw: of the robots, (n, 3) [m] and (n,) [rad].
+
+    Raises:
+        RefusalError: a variable lacks that has no value without a formation.
+        TrajectoryError, ExpressionError: a value is not allowed.
+    """
+    if base is None:
+        base = np.zeros(space.size)
+        heading = math.atan2(math.fsum(np.sin(yaw).tolist()), math.fsum(np.cos(yaw).tolist()))
+        for name, value in zip(PLACE, (*p_W.mean(axis=0).tolist(), heading), strict=True):
+            if name in space.names:
+                base[space.index(name)] = value
+        given = {variable_of(space, name, "assemble", ".values").entry for name in values}
+        known = (name in PLACE or space.neutral[i] or i in given for i, name in enumerate(space.names))
+        if lacking := [name for name, is_known in zip(space.names, known, strict=True) if not is_known]:
+            raise RefusalError(f"the drones are no formation yet; values must name {', '.join(lacking)} as well")
+    return named_values(space, values, "assemble", base, ".values")
+
+
+def planned_assembly(
+    space: ClusterSpace, c: Array, p_W: Array, gains: FormationGains, apart: float = 1.0
+) -> tuple[Assembly, NDArray[np.intp]]:
+    """Return the ways of robots at p_W (n, 3) [m] to the places of c (4n,), and the new order of the robots.
+
+    Entry k of the order is the former number of robot k: of the one that flies to its place.
+
+    Args:
+        apart: share of the least separation that the ways must keep.
+
+    Raises:
+        RefusalError: c is no formation to be engaged in, or two robots would come too near to each other.
+    """
+    if fault := formation_fault(space, c, gains, SHAPE):
+        raise RefusalError(fault)
+    goal_W = space.inverse(c)[0]
+    order = np.argsort(assign(p_W, goal_W))
+    start_W = p_W[order]
+    least_m, distance = apart * gains.separation_min_m, straight_separation(start_W, goal_W)
+    if distance < least_m - ROUNDING_M:
+        near = f"on the ways to their places two drones come within {distance:.2f} m"
+        sure = f"sure where starts, and places, are {math.sqrt(2.0) * gains.separation_min_m:.2f} m apart"
+        raise RefusalError(f"{near}; allowed: {least_m:g} m or more, {sure}")
+    return Assembly(start_W, goal_W, c, _least_s(start_W, goal_W, gains), gains), order
+
+
+def _least_s(start_W: Array, goal_W: Array, gains: FormationGains) -> float:
+    """Return how long the longest way takes at the share of the robots' limits that a reference may use."""
+    ways = np.abs(goal_W - start_W)
+    aside_m, up_m = float(np.sqrt(ways[:, 0] ** 2 + ways[:, 1] ** 2).max()), float(ways[:, 2].max())
+    slowest = max(aside_m / gains.speed_max_m_s, up_m / gains.climb_max_m_s)
+    return max(LEAST_S, PEAK_RATE * slowest / SHAPE.share)

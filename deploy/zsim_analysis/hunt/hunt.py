@@ -1,0 +1,533 @@
+"""Flies a hunt into its folder: what is drawn and what must hold in; the first violation, as small as it gets, out.
+
+The folder of a hunt:
+
+    hunt.json            what was hunted, and with which seed
+    flights.csv          a row for each flight, in order: faults, values, margins
+    summary.json, report.html, figures/
+    violation.yaml       the scenario with the causes that are left
+    violation/           its flight: record, report, figures
+"""
+
+import csv
+import io
+import time
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+from msgspec.structs import replace
+from rich.console import Console
+
+from zsim import __version__
+from zsim.errors import ReportError, RunError, ScenarioError
+from zsim.output_folder import refuse_others, take_lock
+from zsim.scenario.faults import PROCESS_KILL
+from zsim.scenario.scenario import Scenario
+from zsim.schema import yaml_file
+from zsim_analysis.hunt.requirements import BROKEN, Margin, Requirement, figures_of, worst
+from zsim_analysis.hunt.shrink import Shrinker, causes_of, only
+from zsim_analysis.hunt.space import WIND, Case, HuntSpace
+from zsim_analysis.hunt.strategy import LAG, Strategy
+from zsim_analysis.report.summary import RunSummary, summarise
+from zsim_analysis.sweep.design import METRICS, text_of
+from zsim_analysis.sweep.process_pool import ProcessPool, cores
+from zsim_analysis.sweep.sweep import SweepScreen, span
+from zsim_analysis.sweep.sweep_run import FIXED, METRIC, Row, Task, fly_scenario
+
+PLAN, TABLE, SCENARIO, VIOLATION = "hunt.json", "flights.csv", "violation.yaml", "violation"
+OWN_FILES = (PLAN, TABLE, SCENARIO, VIOLATION, "summary.json", "report.html", "figures", ".lock")
+SEARCH, CAUSE, RECORD = "search", "each cause", "record"  # stages, beside those of `shrink`
+SAME_BITS = "same_bits"  # figure: truth is the same to the bit as in the flight in which no process dies
+DECIMALS = 6  # of margins in the table
+
+
+class HuntRequest(Struct, frozen=True):
+    """What to hunt, where to, and how long.
+
+    `flights` and `budget_s` bound the search; what is found is then shrunk, in some hundred flights.
+    """
+
+    document: dict[str, Any]  # of the scenario, with the overrides of the command line
+    source: str  # name of its file, for messages
+    requirements: tuple[str, ...]  # comparisons, or `module:function` of a user's own
+    out: Path
+    seed: int = 1  # of what is drawn
+    flights: int | None = None
+    budget_s: float | None = None
+    faults: tuple[str, ...] = ()  # texts of `--fault`; none: all kinds
+    without: tuple[str, ...] = ()  # kinds that are not drawn
+    vary: tuple[str, ...] = (WIND,)
+    changed: tuple[str, ...] = ()  # texts `a.b.c=value` by which the document differs from its file
+    most: int = 3  # faults of one flight
+    workers: int | None = None  # None: one per core
+    force: bool = False  # whether the folder may hold other files
+    console: Console | None = None  # where progress is shown, None: stderr
+    open_run: Callable[[Path], Any] | None = None  # as of a task
+    processes: Callable[[Scenario, Path], None] | None = None  # as of a task: flies what processes die in
+
+
+class Flown(Struct, frozen=True):
+    """A flight of a hunt."""
+
+    number: int
+    stage: str
+    case: Case
+    margins: list[Margin]  # of the requirements
+    failure: str | None = None
+    truth_sha256: str | None = None
+    shortfall: str | None = None
+
+    @property
+    def worst(self) -> Margin:
+        return worst(self.margins)
+
+    @property
+    def holds(self) -> bool:
+        return all(margin.holds for margin in self.margins)
+
+
+class Stage(Struct, frozen=True):
+    """What a part of a hunt cost."""
+
+    name: str
+    flights: int
+    wall_s: float
+
+
+class CauseFound(Struct, frozen=True):
+    """One cause of a violation, with the margins of the requirement in flights without it, and with it alone."""
+
+    text: str
+    without: float | None
+    alone: float | None
+
+
+class Violation(Struct, frozen=True):
+    """What broke a requirement."""
+
+    requirement: str
+    number: int  # of the flight in which it was found
+    found: Case
+    shrunk: Case
+    margin: float | None  # of the shrunk flight; None where a figure is unknown
+    unknown: str  # that figure, or why the flight failed
+    causes: list[CauseFound]
+    options: list[str]  # of `zsim run` with the scenario: the shrunk flight
+    truth_sha256: str | None
+
+
+class Tried(Struct, frozen=True):
+    """How many combinations of so many kinds of faults were flown together."""
+
+    together: int
+    tried: int
+    possible: int
+
+
+class HuntSummary(Struct, frozen=True, kw_only=True):
+    """The content of summary.json."""
+
+    scenario: str
+    requirements: tuple[str, ...]
+    seed: int
+    version: str = __version__
+    verdict: str  # "violated", "not violated" or, where neither is known, "interrupted"
+    interrupted: bool = False  # by Ctrl-C
+    flights: int
+    wall_s: float
+    stages: list[Stage]
+    coverage: list[Tried]
+    least: list[float | None]  # margin of each requirement over the search
+    violation: Violation | None = None
+
+
+class Hunted(Struct, frozen=True):
+    """A hunt that is over."""
+
+    request: HuntRequest
+    space: HuntSpace
+    summary: HuntSummary
+    flown: list[Flown]
+
+
+def hunt(request: HuntRequest) -> Hunted:
+    """Hunt until a requirement is broken or the budget is spent; return what was found, also after Ctrl-C.
+
+    Raises:
+        ScenarioError: a requirement, a fault, a field or the scenario is wrong; a line each.
+        RunError: the folder holds something else, or cannot be written; workers cannot start.
+    """
+    texts, document = _with_functions(request.requirements, request.document)
+    requirements = _requirements(texts)
+    space = HuntSpace(document, request.source, request.faults, request.without, request.vary, request.most)
+    try:
+        request.out.mkdir(parents=True, exist_ok=True)
+        if not (request.out / PLAN).exists():
+            refuse_others(request.out, OWN_FILES, request.force, "hunt into")
+        elif not request.force:
+            raise RunError(f"{request.out}: holds a hunt already; --force replaces it, or give --out another folder")
+        lock = (request.out / ".lock").open("w")
+    except OSError as error:
+        raise RunError(f"{request.out}: cannot be made ({error.strerror}); give --out another folder") from error
+    with lock:
+        if not take_lock(lock):
+            raise RunError(f"{request.out}: another hunt is at work there; give --out another folder")
+        under_way = _Hunt(request, space, texts, requirements)
+        hunted = Hunted(request, space, under_way.run(), under_way.flown)
+        write(hunted)
+    return hunted
+
+
+def _with_functions(given: Sequence[str], document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """Return requirements as comparisons, and the document with the functions among them as metrics."""
+    texts, report = [], dict(document.get("report") or {})
+    metrics = report.get("metrics") or []
+    names = [metrics] if isinstance(metrics, str) else list(metrics)
+    for text in given:
+        module, colon, function = text.partition(":")
+        if colon and function.isidentifier() and all(part.isidentifier() for part in module.strip().split(".")):
+            names += [] if text.strip() in names else [text.strip()]
+            text = f"{METRIC}{function} > 0"
+        texts.append(text)
+    if not names:
+        return tuple(texts), dict(document)
+    return tuple(texts), {**document, METRICS.partition(".")[0]: {**report, METRICS.partition(".")[2]: names}}
+
+
+def _requirements(texts: Sequence[str]) -> list[Requirement]:
+    made, faults = [], []
+    for text in texts:
+        try:
+            made.append(Requirement(text))
+        except ScenarioError as error:
+            faults += error.faults
+    if faults or not made:
+        raise ScenarioError(faults or ["--require is missing; must be what has to hold, as 'min_separation_m > 1.5'"])
+    return made
+
+
+@lru_cache(maxsize=64)
+def _requirement(text: str) -> Requirement:
+    return Requirement(text)
+
+
+def judged(requirements: Sequence[str], twin: Scenario | None, summary: RunSummary, row: Row) -> dict[str, Any]:
+    """Return the margins of a flight, in the process that flew it; or why they cannot be had.
+
+    `twin` is the same flight without the death of processes, with which its bits are compared; None: it has none.
+    """
+    columns = {
+        name: value
+        for name, value in row.items()
+        if name in FIXED or name.startswith((METRIC, "clusters."))
+    }  # fmt: skip
+    figures = {**columns, **dict(figures_of(msgspec.to_builtins(summary)))}
+    made = [_requirement(text) for text in requirements]
+    if any(SAME_BITS in each.names for each in made):
+        figures[SAME_BITS] = twin is None or _truth_sha256(twin) == summary.truth_sha256
+    faults = [fault for each in made for fault in each.faults(_known(each, figures, row))]
+    try:
+        return {"faults": faults, "margins": [] if faults else [tuple(each.margin(figures)) for each in made]}
+    except ScenarioError as error:
+        return {"faults": error.faults, "margins": []}
+
+
+def _truth_sha256(scenario: Scenario) -> str | None:
+    flown, diverged = fly_scenario(scenario)
+    return None if diverged else summarise(flown, [], Path()).truth_sha256
+
+
+def _known(requirement: Requirement, figures: dict[str, Any], row: Row) -> dict[str, Any]:
+    """Return the figures, in which metrics that a flight does not have are unknown instead of wrong."""
+    for name in requirement.names:
+        if name.startswith(METRIC) and row.get("metrics_failure"):
+            figures.setdefault(name, None)
+    return figures
+
+
+class _Hunt:
+    """One hunt under way."""
+
+    def __init__(
+        self, request: HuntRequest, space: HuntSpace, texts: Sequence[str], requirements: Sequence[Requirement]
+    ) -> None:
+        self._request, self._space = request, space
+        self._texts, self._requirements = tuple(texts), requirements
+        self._strategy = Strategy(space, request.seed)
+        self._screen = HuntScreen(request, self._strategy)
+        self.flown: list[Flown] = []
+        self._scales: list[float] = []  # by requirement: margin of the flight without faults
+        self._stages: Counter[str] = Counter()
+        self._spent_s: defaultdict[str, float] = defaultdict(float)
+        self._waiting: deque[Task] = deque()
+        self._cases: list[tuple[Case, str]] = []  # by number
+        self._rows: dict[int, Row] = {}
+        self._done = False
+
+    def run(self) -> HuntSummary:
+        began_s, verdict = time.monotonic(), "not violated"
+        violation: Violation | None = None
+        interrupted = False
+        with self._screen as screen:
+            kinds = f"{len(self._space.kinds)} kinds of faults, {self._space.most} in a flight"
+            screen.say(f"{self._request.source}: {kinds}, into {self._request.out}")
+            pool = ProcessPool(self._request.workers or cores(), screen.say)
+            try:
+                with closing(pool.rows(self._tasks())) as self._flying:
+                    found = self._timed(SEARCH, self._search)
+                    if found:
+                        verdict = "violated"
+                        least = found.case
+                        violation = self._violation(found, least, [])
+                        for least in self._shrunk(found):
+                            violation = self._violation(found, least, [])
+                        violation = self._timed(RECORD, partial(self._recorded, found, least))
+                    self._done = True
+            except KeyboardInterrupt:
+                interrupted, verdict = True, verdict if violation else "interrupted"
+                screen.say("interrupted; what was found so far is kept")
+        stages = [Stage(name, self._stages[name], round(self._spent_s[name], 2)) for name in self._spent_s]
+        coverage = self._strategy.coverage
+        tried = [Tried(size, coverage.tried(size), len(sets)) for size, sets in coverage.possible.items()]
+        searched = [each for each in self.flown if each.stage == SEARCH]
+        values = [[each.margins[i].value for each in searched] for i in range(len(self._requirements))]
+        return HuntSummary(
+            scenario=self._request.source,
+            requirements=tuple(each.text for each in self._requirements),
+            seed=self._request.seed,
+            verdict=verdict,
+            interrupted=interrupted,
+            flights=len(self.flown),
+            wall_s=round(time.monotonic() - began_s, 2),
+            stages=stages,
+            coverage=tried,
+            least=[min((x for x in each if x is not None), default=None) for each in values],
+            violation=violation,
+        )
+
+    def _timed(self, stage: str, call: Callable[[], Any]) -> Any:
+        began_s = time.monotonic()
+        try:
+            return call()
+        finally:
+            self._spent_s[stage] += time.monotonic() - began_s
+
+    # Flights
+
+    def _tasks(self) -> Iterator[Task | None]:
+        while not self._done:
+            yield self._waiting.popleft() if self._waiting else None
+
+    def _submit(self, case: Case, stage: str, record: Path | None = None) -> int:
+        """Let a case be flown; return its number. ScenarioError if it cannot be flown."""
+        scenario, number = self._space.scenario(case), len(self._cases)
+        self._cases.append((case, stage))
+        deadly = [fault for fault in case.faults if fault["kind"] == PROCESS_KILL]
+        twin = replace(case, faults=tuple(fault for fault in case.faults if fault not in deadly))
+        self._waiting.append(
+            Task(
+                run=number,
+                point=0,
+                varied={},
+                scenario=scenario,
+                record=str(record.absolute()) if record else None,
+                open_run=self._request.open_run,
+                processes=self._request.processes if deadly else None,
+                judge=partial(judged, self._texts, self._space.scenario(twin) if deadly else None),
+            )
+        )
+        return number
+
+    def _result(self, number: int) -> Flown:
+        """Wait for a flight, and take it into the table."""
+        while number not in self._rows:
+            row = next(self._flying)
+            self._rows[row["run"]] = row
+            self._screen.finished(row["failure"] is not None)
+        row, (case, stage) = self._rows.pop(number), self._cases[number]
+        if row.get("faults"):
+            raise ScenarioError(row["faults"])
+        failure = row["failure"]
+        lost = Margin(False, BROKEN, None, failure or "")
+        margins = [Margin(*each) for each in row["margins"]] if not failure else [lost for _ in self._requirements]
+        if not self._scales:
+            self._scales = [abs(each.value) if each.value else 1.0 for each in margins]
+        margins = [
+            each if each.value is None else each._replace(share=each.value / scale)
+            for each, scale in zip(margins, self._scales, strict=True)
+        ]
+        flown = Flown(len(self.flown), stage, case, margins, failure, row["truth_sha256"], row["shortfall"])
+        self._stages[stage] += 1
+        self.flown.append(flown)
+        return flown
+
+    def _fly(self, cases: Sequence[Case], stage: str) -> list[Flown | None]:
+        """Fly cases together; None for one that cannot be flown."""
+        numbers: list[int | None] = []
+        for case in cases:
+            try:
+                numbers.append(self._submit(case, stage))
+            except ScenarioError:
+                numbers.append(None)
+        return [None if number is None else self._result(number) for number in numbers]
+
+    # Stages
+
+    def _search(self) -> Flown | None:
+        """Return the first flight, in their order, that breaks a requirement; None within the budget."""
+        flights, budget_s = self._request.flights, self._request.budget_s
+        until_s = None if budget_s is None else time.monotonic() + budget_s
+        pending: deque[int] = deque()
+        drawn = 0
+        try:
+            while True:
+                while len(pending) < LAG and (flights is None or drawn < flights) and (drawn == 0 or self.flown):
+                    pending.append(self._submit(self._strategy.draw(), SEARCH))
+                    drawn += 1
+                    if drawn == 1:
+                        break  # the flight without faults shows whether the figures are there
+                if not pending or (until_s is not None and time.monotonic() >= until_s):
+                    return None
+                flown = self._result(pending.popleft())
+                self._strategy.learn(flown.case, flown.worst)
+                self._screen.margin = min(self._screen.margin, flown.worst.share)
+                if not flown.holds:
+                    return flown
+        finally:
+            self._waiting.clear()
+
+    def _shrunk(self, found: Flown) -> Iterator[Case]:
+        which = found.margins.index(found.worst)
+        is_unknown, failed = bool(found.worst.unknown), found.failure is not None
+
+        def breaks(cases: Sequence[Case], stage: str) -> list[bool]:
+            self._screen.stage = stage
+
+            def alike(flown: Flown | None) -> bool:
+                if flown is None or (flown.failure is not None) != failed:
+                    return False
+                margin = flown.margins[which]
+                return not margin.holds and bool(margin.unknown) == is_unknown
+
+            return [alike(each) for each in self._timed(stage, lambda: self._fly(cases, stage))]
+
+        what = found.worst.unknown or f"margin {found.worst.value:.3g}"
+        self._screen.say(f"flight {found.number} breaks {self._requirements[which].text} ({what}); shrinking it")
+        yield from Shrinker(self._space, breaks).shrink(found.case)
+
+    def _violation(self, found: Flown, case: Case, causes: list[CauseFound], flown: Flown | None = None) -> Violation:
+        which, last = found.margins.index(found.worst), flown or found
+        return Violation(
+            requirement=self._requirements[which].text,
+            number=found.number,
+            found=found.case,
+            shrunk=case,
+            margin=last.margins[which].value,
+            unknown=last.margins[which].unknown,
+            causes=causes,
+            options=self._space.options(case),
+            truth_sha256=flown.truth_sha256 if flown else None,
+        )
+
+    def _recorded(self, found: Flown, case: Case) -> Violation:
+        """Fly the shrunk flight for its record, and others that show what each cause does."""
+        which, causes = found.margins.index(found.worst), causes_of(case)
+        self._screen.stage = RECORD
+        place = self._request.out / VIOLATION
+        number = self._submit(case, RECORD, place)
+        without = self._fly([only(case, [other for other in causes if other != each]) for each in causes], CAUSE)
+        alone = self._fly([only(case, [each]) for each in causes], CAUSE)
+        table = [
+            CauseFound(cause_text(case, each), *(one and one.margins[which].value for one in two))
+            for each, *two in zip(causes, without, alone, strict=True)
+        ]
+        return self._violation(found, case, table, self._result(number))
+
+
+def cause_text(case: Case, cause: tuple[str, int | str]) -> str:
+    """Return a cause as it is typed in a terminal."""
+    kind, which = cause
+    return f"{which}={text_of(case.values[str(which)])}" if kind == "value" else fault_text(case.faults[int(which)])
+
+
+def fault_text(fault: Mapping[str, Any]) -> str:
+    """Return a fault as `zsim fault add` takes it."""
+    words = [str(fault["target"]), str(fault["kind"])]
+    words += [f"{name}={text_of(v)}" for name, v in fault.items() if name not in ("kind", "target", "at_s", "for_s")]
+    words += [f"--for {fault['for_s']:g}s"] if "for_s" in fault else []
+    return " ".join([*words, *([f"--at {fault['at_s']:g}s"] if "at_s" in fault else [])])
+
+
+# The folder
+
+
+def write(hunted: Hunted) -> None:
+    """Write hunt.json, flights.csv and violation.yaml. ReportError: the folder cannot be written."""
+    request, summary = hunted.request, hunted.summary
+    plan = {
+        "scenario": request.source, "requirements": request.requirements, "seed": request.seed,
+        "flights": request.flights, "budget_s": request.budget_s, "faults": request.faults,
+        "without": request.without, "vary": request.vary, "most": request.most, "version": __version__,
+        "document": request.document,
+    }  # fmt: skip
+    try:
+        (request.out / PLAN).write_bytes(msgspec.json.format(msgspec.json.encode(plan), indent=2) + b"\n")
+        (request.out / TABLE).write_text(table(hunted), encoding="utf-8")
+        if summary.violation:
+            text = yaml_file.dump(hunted.space.changed(summary.violation.shrunk))
+            (request.out / SCENARIO).write_text(text, encoding="utf-8")
+        else:
+            (request.out / SCENARIO).unlink(missing_ok=True)
+    except OSError as error:
+        raise ReportError(f"{request.out}: cannot be written ({error.strerror})") from error
+
+
+def table(hunted: Hunted) -> str:
+    """Return flights.csv: faults as they are typed, and a margin for each requirement."""
+    text, paths = io.StringIO(), list(hunted.space.fields)
+    writer = csv.writer(text, lineterminator="\n")
+    margins = [f"margin of {each}" for each in hunted.summary.requirements]
+    head = ["flight", "stage", "holds", *margins, "unknown", "seed", "duration_s", *paths, "faults", "failure"]
+    writer.writerow([*head, "shortfall", "truth_sha256"])
+    for each in hunted.flown:
+        values = [None if m.value is None else round(m.value, DECIMALS) for m in each.margins]
+        fields = [each.case.values.get(path) for path in paths]
+        faults = "; ".join(map(fault_text, each.case.faults))
+        duration_s = each.case.duration_s or hunted.space.base.duration_s
+        unknown = next((m.unknown for m in each.margins if m.unknown), None)
+        row = [each.number, each.stage, each.holds, *values, unknown, each.case.seed, duration_s, *fields, faults]
+        writer.writerow([*row, each.failure, each.shortfall, each.truth_sha256])
+    return text.getvalue()
+
+
+class HuntScreen(SweepScreen):
+    """Shows the progress of a hunt: flights, combinations tried, the least margin, the budget that is left."""
+
+    def __enter__(self) -> "HuntScreen":
+        super().__enter__()
+        return self
+
+    def __init__(self, request: HuntRequest, strategy: Strategy) -> None:
+        self._request, self._coverage = request, strategy.coverage
+        self.stage, self.margin = SEARCH, float("inf")
+        super().__init__(2**62, 0, request.console)
+
+    def line(self) -> str:
+        elapsed_s = self._now_s() - self._start_s
+        text = f"{self.stage}: {self._done:,} flights"
+        if self._done and elapsed_s > 0:
+            text += f", {60 * self._done / elapsed_s:,.0f} a minute"
+        names = {1: "kinds", 2: "pairs", 3: "triples"}
+        for size, sets in self._coverage.possible.items():
+            text += f"  {self._coverage.tried(size):,}/{len(sets):,} {names[size]}"
+        if self.margin < float("inf"):
+            text += f"  least margin {self.margin:.0%}"
+        if self.stage == SEARCH and self._request.budget_s is not None:
+            text += f"  {span(max(0.0, self._request.budget_s - elapsed_s))} to go"
+        return text

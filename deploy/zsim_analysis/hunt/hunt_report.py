@@ -1,0 +1,185 @@
+"""Makes the page of a hunt: the violation with its causes, margins over flights, what was tried; and its figures."""
+
+import shlex
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import combinations
+
+import msgspec
+import numpy as np
+from rich.console import Group
+from rich.text import Text
+
+from zsim.errors import printable
+from zsim.output_folder import RECORD
+from zsim.presentation import Column, FittedTable
+from zsim_analysis.hunt.hunt import SEARCH, VIOLATION, Flown, Hunted, HuntRequest, HuntSummary, cause_text, fault_text
+from zsim_analysis.hunt.shrink import causes_of
+from zsim_analysis.hunt.space import KindSpace
+from zsim_analysis.report.figure_style import (
+    BLUE,
+    DARK,
+    GREY,
+    PAGE_IN,
+    PAPER_PT,
+    VERMILION,
+    ReportFigure,
+    dress,
+    new_figure,
+)
+from zsim_analysis.report.make_report import Picture, make_report, sources, template, write_report
+
+QUARTERS = 4  # parts of a range of which it is told how often each was tried
+KINDS_DRAWN = 24  # of the matrix of pairs
+
+
+def make_hunt_report(
+    hunted: Hunted, progress: Callable[[str], None] = lambda _: None, formats: Sequence[str] = ()
+) -> None:
+    """Write summary.json, figures and report.html of a hunt, and the report of the flight that broke a requirement.
+
+    Raises:
+        ReportError: the folder cannot be written.
+    """
+    out, summary = hunted.request.out, hunted.summary
+    if (out / VIOLATION / RECORD).exists():
+        make_report(out / VIOLATION, progress, formats)
+    content = msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n"
+    searched = [each for each in hunted.flown if each.stage == SEARCH]
+    write_report(out, content, figures(summary, searched), partial(page, hunted, searched), progress, formats)
+
+
+def figures(summary: HuntSummary, searched: Sequence[Flown]) -> Iterator[ReportFigure]:
+    yield _margins(summary, searched)
+    kinds = sorted({kind for each in searched for kind in each.case.kinds})
+    if 1 < len(kinds) <= KINDS_DRAWN:
+        yield _pairs(kinds, searched)
+
+
+def _margins(summary: HuntSummary, searched: Sequence[Flown]) -> ReportFigure:
+    figure = new_figure(PAGE_IN, 1.6 * len(summary.requirements) + 0.4)
+    panels = figure.subplots(len(summary.requirements), 1, sharex=True, squeeze=False)[:, 0]
+    for i, (axes, text) in enumerate(zip(panels, summary.requirements, strict=True)):
+        known = [(each.number, each.margins[i].value, each.margins[i].holds) for each in searched]
+        points = np.array([(number, value) for number, value, _ in known if value is not None], float).reshape(-1, 2)
+        broken = np.array([not holds for _, value, holds in known if value is not None], bool)
+        axes.plot(*points[~broken].T, ".", color=BLUE, ms=2.5)
+        axes.plot(*points[broken].T, "x", color=VERMILION, ms=5)
+        if len(points):
+            axes.plot(points[:, 0], np.minimum.accumulate(points[:, 1]), color=DARK, lw=0.8)
+        for number in (number for number, value, _ in known if value is None):
+            axes.axvline(number, color=VERMILION, lw=0.6)
+        axes.axhline(0.0, color=GREY, lw=0.8)
+        dress(axes, "margin")
+        axes.set_title(text, fontsize=PAPER_PT, color=DARK, loc="left")
+    panels[-1].set_xlabel("flight", fontsize=PAPER_PT)
+    caption = (
+        "How far each flight of the search was from breaking a requirement, in the unit of its figures; below 0, and "
+        "crossed, it is broken. Line: the least so far. Vertical: a figure is unknown."
+    )
+    return ReportFigure("margins.png", "Margins over the flights", caption, figure)
+
+
+def _pairs(kinds: Sequence[str], searched: Sequence[Flown]) -> ReportFigure:
+    least = np.full((len(kinds), len(kinds)), np.nan)
+    counts = np.zeros_like(least)
+    for each in searched:
+        places = [kinds.index(kind) for kind in each.case.kinds]
+        for a, b in (*combinations(places, 2), *((place, place) for place in places)):
+            row, column = max(a, b), min(a, b)
+            least[row, column] = np.nanmin([least[row, column], each.worst.share])
+            counts[row, column] += 1
+    side = min(PAGE_IN, 1.6 + 0.33 * len(kinds))
+    figure = new_figure(side + 0.6, side)
+    axes = figure.subplots()
+    image = axes.imshow(100 * least, cmap="viridis", vmin=-100, vmax=100)
+    axes.set_xticks(range(len(kinds)), [kind.replace("_", " ") for kind in kinds], rotation=90, fontsize=PAPER_PT - 1)
+    axes.set_yticks(range(len(kinds)), [kind.replace("_", " ") for kind in kinds], fontsize=PAPER_PT - 1)
+    for row, column in zip(*np.nonzero(counts), strict=True):
+        colour = "black" if least[row, column] > 0 else "white"
+        text = f"{counts[row, column]:.0f}"
+        axes.text(column, row, text, ha="center", va="center", fontsize=PAPER_PT - 2, color=colour)
+    bar = figure.colorbar(image, shrink=0.7)
+    bar.set_label("least margin (%)", fontsize=PAPER_PT)
+    bar.ax.tick_params(labelsize=PAPER_PT - 1)
+    caption = (
+        "Least margin of the flights with both kinds, as a share of that of the flight without faults, and their "
+        "number; on the diagonal of all flights with a kind. Empty: not tried."
+    )
+    return ReportFigure("pairs.png", "Kinds of faults flown together", caption, figure)
+
+
+# Page
+
+
+def page(hunted: Hunted, searched: Sequence[Flown], pictures: Sequence[Picture]) -> str:
+    summary, space = hunted.summary, hunted.space
+    found = summary.violation
+    return template("hunt.html.j2", "zsim_analysis.hunt").render(
+        summary=summary,
+        facts=facts(hunted.request, summary),
+        found=[cause_text(found.found, each) for each in causes_of(found.found)] if found else [],
+        faults=[fault_text(fault) for fault in found.shrunk.faults] if found else [],
+        command=command(hunted),
+        record=f"{VIOLATION}/report.html",
+        number=number,
+        kinds=[kind_row(space.kinds[name], searched) for name in space.kinds],
+        figures=sources(pictures),
+    )
+
+
+def facts(request: HuntRequest, summary: HuntSummary) -> list[tuple[str, str]]:
+    budget = [f"{request.flights} flights"] if request.flights is not None else []
+    budget += [f"{request.budget_s:g} s"] if request.budget_s is not None else []
+    return [
+        ("Scenario", summary.scenario),
+        ("Required", "; ".join(summary.requirements)),
+        ("Verdict", summary.verdict),
+        ("Drawn with seed", f"{summary.seed}, within {' and '.join(budget) or 'no limit'}"),
+        ("Flights", f"{summary.flights} in {summary.wall_s:.0f} s"),
+        ("Version", summary.version),
+    ]
+
+
+def kind_row(space: KindSpace, searched: Sequence[Flown]) -> list[str]:
+    """Return how often a kind was flown, its least margin, and in which quarters of the ranges of its numbers."""
+    flown = [(each, fault) for each in searched for fault in each.case.faults if fault["kind"] == space.name]
+    least = min((each.worst.share for each, _ in flown), default=None)
+    targets = {fault["target"] for _, fault in flown}
+    parts = [f"{len(targets)} of {len(space.knobs['target'].choices)} targets"] if flown else []
+    for name, knob in space.knobs.items():
+        if flown and knob.shape != "choice":
+            places = [knob.place(fault[name]) for _, fault in flown if fault.get(name) is not None]
+            quarters = np.histogram(places, QUARTERS, (0.0, 1.0))[0]
+            parts.append(f"{name} {'/'.join(map(str, quarters))}")
+    return [space.name, str(len(flown)), "–" if least is None else f"{least:.0%}", ", ".join(parts)]
+
+
+def number(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.3g}"
+
+
+def command(hunted: Hunted) -> str:
+    """Return the command that flies the violation again; empty if there is none."""
+    request, found = hunted.request, hunted.summary.violation
+    sets = [word for change in request.changed for word in ("--set", change)]
+    return shlex.join(["zsim", "run", request.source, *sets, *found.options, "--in-process"]) if found else ""
+
+
+def terminal_text(hunted: Hunted) -> Group:
+    """Return the violation with its causes, and what was tried, for the terminal."""
+    summary = hunted.summary
+    names = {1: "kinds", 2: "pairs", 3: "triples"}
+    tried = ", ".join(f"{each.tried} of {each.possible} {names[each.together]}" for each in summary.coverage)
+    lines: list[Text | FittedTable] = [
+        Text(printable(f"{summary.flights} flights in {summary.wall_s:.0f} s; tried: {tried}"))
+    ]
+    stages = [[each.name, str(each.flights), f"{each.wall_s:.1f} s"] for each in summary.stages]
+    lines.append(FittedTable([Column("stage", "name"), Column("flights"), Column("time")], stages, "What it took"))
+    if found := summary.violation:
+        columns = [Column("cause", "text"), Column("without it"), Column("with it alone")]
+        rows = [[each.text, number(each.without), number(each.alone)] for each in found.causes]
+        title = f"{found.requirement}: broken in flight {found.number}, margin {found.unknown or number(found.margin)}"
+        lines.append(FittedTable(columns, rows, title, "margins; < 0: broken"))
+        lines.append(Text(printable(f"again: {command(hunted)}")))
+    return Group(*lines)

@@ -1,0 +1,366 @@
+"""What a hunt draws from: kinds of faults with their targets, times and magnitudes, fields of the scenario, and seeds.
+
+Ranges follow from the declarations of the kinds (`zsim.scenario.faults`). Limits there are of what can be simulated,
+far beyond what is flown: of a limit above LARGE, magnitudes are drawn from SMALL_SHARE to LARGE_SHARE of it (GPS bias:
+1 to 1000 m; link delay: 0.6 to 600 ms), of a lower one above 1 from its hundredth part on (gust: 1 to 100 m/s), each
+decade equally often; of a share or probability all, evenly. Rules narrow that: `gust velocity_m_s=1..6 for_s=2..8`.
+"""
+
+import copy
+import math
+import re
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from msgspec import Struct
+from numpy.random import Generator
+
+from zsim.errors import ScenarioError
+from zsim.scenario import scenario_file
+from zsim.scenario.faults import COMMON, FaultKind, FaultParameter, kinds_of
+from zsim.scenario.roles import PILOT, WORLD, agent_names
+from zsim.scenario.scenario import Scenario
+from zsim.schema import yaml_file
+from zsim.schema.checker import show, suggestion
+from zsim.sensors.sensor_catalogue import declarations
+from zsim_agents.hosting import check_classes
+from zsim_analysis.sweep.design import SEED, SEEDS, Draw, Grid, Seeds, parse, text_of
+
+OPTION = "--fault"
+SYNTAX = "a kind and NAME=LOW..HIGH or NAME=VALUE, as in 'gust velocity_m_s=1..6 for_s=2..8'"
+WIND = "environment.wind.gust_m_s=uniform(0, 2)"  # what varies besides, where nothing is said; chosen
+LARGE, SMALL_SHARE, LARGE_SHARE = 1000.0, 1e-5, 1e-2  # see above, chosen
+LEAST_S = 0.5  # of a fault, chosen: shorter ones are a few samples
+DECADES = 30.0  # ratio of the ends of a range from which on every decade is drawn equally often
+ONE_WAY_SHARE = 1 / 3  # chosen
+DIGITS = 4  # significant ones of what is drawn, so that a text repeats it
+_RANGE = re.compile(r"\s*([-+0-9.eE]+?)\.\.([-+0-9.eE]+)\s*")
+
+
+class Case(Struct, frozen=True):
+    """What one flight is flown with."""
+
+    seed: int
+    values: dict[str, Any] = {}  # of fields of the scenario, by path
+    faults: tuple[dict[str, Any], ...] = ()  # as in a scenario
+    duration_s: float | None = None  # None: the scenario's
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Its kinds of faults, each once, sorted."""
+        return tuple(sorted({fault["kind"] for fault in self.faults}))
+
+
+class Knob(Struct, frozen=True):
+    """One number of a fault, or one of several values, and where it is drawn from."""
+
+    name: str
+    low: float = 0.0  # of the number, or of the magnitude of a vector or of a number of either sign
+    high: float = 0.0
+    shape: str = "number"  # "number", "signed", "vector", or "choice" of the values
+    choices: tuple[Any, ...] = ()
+    weights: tuple[float, ...] = ()  # of the choices; none: all alike
+
+    @property
+    def by_decades(self) -> bool:
+        return self.low > 0 and self.high / self.low >= DECADES
+
+    def draw(self, rng: Generator) -> Any:
+        if self.shape == "choice":
+            return self.choices[int(rng.choice(len(self.choices), p=self.weights or None))]
+        return self._of(self._magnitude(rng.uniform()), _direction(rng, self.shape))
+
+    def near(self, value: Any, rng: Generator, step: float) -> Any:
+        """Return another value at a normal distance of `step` of the range; of choices, any."""
+        if self.shape == "choice" or value is None:
+            return self.draw(rng)
+        place = self.place(value) + step * rng.normal()
+        place = abs(place) if place < 1 else 2 - place  # thrown back at the ends
+        size = float(np.linalg.norm(value))
+        direction = np.asarray(value, float) / size if size > 0 else _direction(rng, self.shape)
+        if self.shape == "vector":
+            direction = direction + step * rng.normal(size=3)
+            direction = direction / np.linalg.norm(direction)
+        elif self.shape == "signed" and rng.uniform() < step:
+            direction = -direction
+        return self._of(self._magnitude(float(np.clip(place, 0.0, 1.0))), direction)
+
+    def place(self, value: Any) -> float:
+        """Return where in its range a value is, from 0 to 1."""
+        size = float(np.linalg.norm(value)) if self.shape != "number" else float(value)
+        if self.high <= self.low:
+            return 0.0
+        share = (
+            math.log(max(size, self.low) / self.low) / math.log(self.high / self.low)
+            if self.by_decades
+            else (size - self.low) / (self.high - self.low)
+        )
+        return min(max(share, 0.0), 1.0)
+
+    def _magnitude(self, share: float) -> float:
+        if self.by_decades:
+            return self.low * (self.high / self.low) ** share
+        return self.low + share * (self.high - self.low)
+
+    def _of(self, size: float, direction: Any) -> Any:
+        low, high = _rounded(self.low), _rounded(self.high)
+        size = min(max(_rounded(size), low), high) if self.shape != "vector" else size
+        if self.shape == "vector":
+            return [_rounded(float(x)) for x in size * direction]
+        return _rounded(float(size * direction)) if self.shape == "signed" else size
+
+
+def _direction(rng: Generator, shape: str) -> Any:
+    if shape == "vector":
+        direction = rng.normal(size=3)
+        return direction / np.linalg.norm(direction)
+    return rng.choice([-1.0, 1.0]) if shape == "signed" else 1.0
+
+
+def _rounded(x: float, digits: int = DIGITS) -> float:
+    return float(f"{x:.{digits}g}")
+
+
+class KindSpace(Struct, frozen=True):
+    """Faults of one kind."""
+
+    name: str
+    kind: FaultKind
+    knobs: dict[str, Knob]  # of its target, times and parameters
+
+    def draw(self, rng: Generator) -> dict[str, Any]:
+        return _clean({"kind": self.name, **{name: knob.draw(rng) for name, knob in self.knobs.items()}})
+
+    def near(self, fault: Mapping[str, Any], rng: Generator, step: float) -> dict[str, Any]:
+        """Return a fault of which one or two numbers are others."""
+        count = min(len(self.knobs), 1 + int(rng.integers(2)))
+        moved = {str(each) for each in rng.choice(list(self.knobs), count, replace=False)}
+        values = {
+            name: knob.near(fault.get(name), rng, step) if name in moved else fault.get(name)
+            for name, knob in self.knobs.items()
+        }
+        return _clean({"kind": self.name, **values})
+
+
+def _clean(fault: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in fault.items() if value is not None and value is not False}
+
+
+class HuntSpace:
+    """What is drawn for a scenario, whose raw document is given.
+
+    Args:
+        rules: texts of `--fault`, each a kind with what narrows it; none: all kinds but the death of processes.
+        without: kinds that are not drawn.
+        vary: texts of `--vary`; seeds are always drawn.
+        most: of faults in one flight.
+
+    Raises:
+        ScenarioError: with every fault of these and of the scenario, a line each.
+    """
+
+    def __init__(
+        self,
+        document: Mapping[str, Any],
+        source: str,
+        rules: Sequence[str] = (),
+        without: Sequence[str] = (),
+        vary: Sequence[str] = (WIND,),
+        most: int = 3,
+    ) -> None:
+        self.document, self.source = dict(document), source
+        self.base = scenario_file.resolve(copy.deepcopy(self.document), source)
+        check_classes(self.base, source)
+        faults: list[str] = []
+        self.fields = dict(self._fields(vary, faults))
+        self.kinds = self._kinds(rules, without, faults)
+        if faults:
+            raise ScenarioError(faults)
+        self._check_ends(rules)
+        self.most = min(most, len(self.kinds))
+
+    def scenario(self, case: Case) -> Scenario:
+        """Return the resolved scenario of a flight; ScenarioError if it cannot be flown."""
+        return scenario_file.resolve(self.changed(case), self.source)
+
+    def changed(self, case: Case) -> dict[str, Any]:
+        """Return the raw document of a flight."""
+        document = copy.deepcopy(self.document)
+        faults = []
+        for path, value in case.values.items():
+            taken = lambda _, value=value: copy.deepcopy(value)  # noqa: E731 - of apply_override
+            faults.append(scenario_file.apply_override(document, f"{path}={text_of(value)}", taken))
+        if lines := [f"--vary {fault.removeprefix('--set ')}" for fault in faults if fault]:
+            raise ScenarioError(lines)
+        document[SEED] = case.seed
+        document["faults"] = [*(document.get("faults") or []), *copy.deepcopy(list(case.faults))]
+        if case.duration_s is not None:
+            document["duration_s"] = case.duration_s
+        return document
+
+    def options(self, case: Case) -> list[str]:
+        """Return how a flight differs from the scenario, as options of `zsim run`."""
+        words = ["--seed", str(case.seed)]
+        if case.duration_s is not None:
+            words += ["--duration", f"{case.duration_s:g}"]
+        for path, value in case.values.items():
+            words += ["--set", f"{path}={text_of(value)}"]
+        if case.faults:
+            words += ["--set", f"faults={text_of([*(self.document.get('faults') or []), *case.faults])}"]
+        return words
+
+    # What is drawn
+
+    def _fields(self, vary: Sequence[str], faults: list[str]) -> Iterator[tuple[str, Draw | Grid]]:
+        for text in vary:
+            try:
+                axis = parse(text, self.document)
+            except ValueError as error:
+                faults.append(f"--vary {show(text)}: {error}")
+                continue
+            if isinstance(axis, Seeds):
+                faults.append(f"--vary {show(text)}: seeds are drawn for every flight; must be left out")
+            else:
+                yield axis.path, axis
+
+    def draw_value(self, path: str, rng: Generator) -> Any:
+        axis = self.fields[path]
+        if isinstance(axis, Grid):
+            return axis.values[int(rng.integers(len(axis.values)))]
+        drawn = rng.uniform(axis.first, axis.second) if axis.kind == "uniform" else rng.normal(axis.first, axis.second)
+        return _rounded(float(drawn))
+
+    def draw_seed(self, rng: Generator) -> int:
+        return int(rng.integers(SEEDS))
+
+    @cached_property
+    def targets(self) -> dict[str, tuple[str, ...]]:
+        """What faults may strike, by `FaultKind.strikes`."""
+        scenario = self.base
+        drones = [drone.name for drone in scenario.drones if not drone.is_external]
+        agents = agent_names(scenario)
+        return {
+            "drone": tuple(drones),
+            "world": (WORLD,),
+            "link": tuple(links_of(scenario)),
+            "radio": (WORLD, *(cluster.name for cluster in scenario.clusters)),
+            "process": tuple(agents),
+        }
+
+    def _kinds(self, rules: Sequence[str], without: Sequence[str], faults: list[str]) -> dict[str, KindSpace]:
+        known = kinds_of(declarations(self.base.drones))
+        given: dict[str, dict[str, Any]] = {}
+        for text in rules:
+            try:
+                kind, *words = shlex.split(text) or [""]
+            except ValueError as error:
+                faults.append(f"{OPTION} {show(text)}: {error}; must be {SYNTAX}")
+                continue
+            if kind not in known:
+                faults.append(f"{OPTION} {show(text)}: {unknown_kind(kind, known)}")
+                continue
+            knobs = given.setdefault(kind, {})
+            for word in words:
+                name, equals, value = word.partition("=")
+                if not equals or name == "kind":
+                    faults.append(f"{OPTION} {show(text)}: has {show(word)}; must be {SYNTAX}")
+                    continue
+                try:
+                    knobs[name] = _given(name, value, known[kind])
+                except ValueError as error:
+                    faults.append(f"{OPTION} {show(text)}: {name} {error}")
+        faults += [f"--without {show(each)}: {unknown_kind(each, known)}" for each in without if each not in known]
+        names = given or {name: {} for name, kind in known.items() if kind.strikes != "process"}
+        kinds = {}
+        for name, knobs in names.items():
+            kind = known[name]
+            if name not in without and ("target" in knobs or self.targets[kind.strikes]):
+                kinds[name] = KindSpace(name, kind, self._knobs(kind) | knobs)
+        return kinds
+
+    def _knobs(self, kind: FaultKind) -> dict[str, Knob]:
+        length_s = self.base.duration_s
+        knobs = [Knob("target", shape="choice", choices=self.targets[kind.strikes])]
+        knobs.append(Knob("at_s", 0.0, _rounded(length_s * (1 - 1e-3))))
+        if kind.lasts != "once":
+            knobs.append(Knob("for_s", min(LEAST_S, length_s / 2), length_s / 2))
+        knobs += [knob for p in kind.parameters if (knob := _knob_of(p))]
+        return {knob.name: knob for knob in knobs}
+
+    def _check_ends(self, rules: Sequence[str]) -> None:
+        """Refuse what no scenario may have: both ends of every range, and each of several values."""
+        owners, ends = [], []
+        for name, space in self.kinds.items():
+            for end in (0, -1):
+                fault: dict[str, Any] = {"kind": name}
+                for knob in space.knobs.values():
+                    size = (knob.low, knob.high)[end]
+                    value = knob.choices[end] if knob.shape == "choice" else [size, 0.0, 0.0]
+                    fault[knob.name] = value if knob.shape in ("choice", "vector") else size
+                ends.append(_clean(fault))
+                owners.append(name)
+        for start in range(0, len(ends), 2):
+            try:
+                self.scenario(Case(self.base.seed, faults=tuple(ends[start : start + 2])))
+            except ScenarioError as error:
+                text = next((rule for rule in rules if rule.split()[:1] == [owners[start]]), owners[start])
+                own = len(self.document.get("faults") or [])
+                place = re.compile(rf"^.*?faults\[(?:{own}|{own + 1})\]\.?")
+                lines = dict.fromkeys(place.sub("", fault) for fault in error.faults)
+                raise ScenarioError([f"{OPTION} {show(text)}: {line}" for line in lines]) from error
+
+
+def unknown_kind(kind: str, known: Mapping[str, FaultKind]) -> str:
+    return f"{show(kind)} is no kind of fault; {suggestion(kind, known)}must be one of {', '.join(known)}"
+
+
+def _given(name: str, text: str, kind: FaultKind) -> Knob:
+    """Return what a rule says of a parameter; ValueError if it cannot be read."""
+    parameter = next((p for p in kind.parameters if p.name == name), None)
+    if (ends := _RANGE.fullmatch(text)) is None:
+        return Knob(name, shape="choice", choices=(yaml_file.value(text),))
+    try:
+        low, high = float(ends[1]), float(ends[2])
+    except ValueError:
+        raise ValueError(f"is {show(text)}; must be {SYNTAX}") from None
+    if not (math.isfinite(high - low) and low <= high):
+        raise ValueError(f"is {show(text)}; must be LOW..HIGH, finite numbers with LOW <= HIGH")
+    is_number = name in COMMON[2:] or (parameter is not None and parameter.shape in ("number", "vector"))
+    if parameter is not None and not is_number:
+        raise ValueError(f"is {show(text)}; must be a value, as of a {parameter.shape}")
+    if parameter is not None and parameter.shape == "vector":
+        if low < 0:
+            raise ValueError(f"is {show(text)}; must be a range of the magnitude, from 0 on, or [x, y, z]")
+        return Knob(name, low, high, "vector")
+    return Knob(name, low, high)
+
+
+def _knob_of(p: FaultParameter) -> Knob | None:
+    """Return where a parameter is drawn from, None if it is left out."""
+    if p.shape == "choice":
+        return Knob(p.name, shape="choice", choices=p.choices)
+    if p.shape == "flag":
+        return Knob(p.name, shape="choice", choices=(False, True), weights=(1 - ONE_WAY_SHARE, ONE_WAY_SHARE))
+    if p.shape not in ("number", "vector") or not (p.required or p.default is not None):
+        return None
+    shape = "vector" if p.shape == "vector" else "signed" if p.least < 0 else "number"
+    if p.most <= 1:
+        return Knob(p.name, p.least, p.most, shape)
+    low, high = (SMALL_SHARE, LARGE_SHARE) if p.most >= LARGE else (0.01, 1.0)
+    return Knob(p.name, max(low * p.most, p.least), high * p.most, shape)
+
+
+def links_of(scenario: Scenario) -> list[str]:
+    """Return the links over which the agents of a scenario exchange messages, as targets of faults."""
+    agents = agent_names(scenario)
+    links = [f"{name}/{WORLD}" for name in agents]
+    for cluster in scenario.clusters:
+        links += [f"estimator.{drone}/controller.{cluster.name}" for drone in cluster.drones]
+    links += [f"estimator.{drone}/{PILOT}.{drone}" for drone in scenario.piloted()]
+    for role, own in scenario.own_agents.items():
+        if own.per == "drone":
+            links += [f"estimator.{drone.name}/{role}.{drone.name}" for drone in scenario.drones]
+    return [link for link in links if set(link.split("/")) <= {*agents, WORLD}]

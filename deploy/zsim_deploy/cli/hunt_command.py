@@ -1,0 +1,102 @@
+"""`zsim hunt`: searches for the flight that breaks a requirement, and leaves the least of it."""
+
+import signal
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from typer import BadParameter, Option
+
+from zsim_deploy import INTERRUPTED
+from zsim_deploy import arguments as opt
+from zsim_deploy.arguments import failed, note, require, say
+from zsim_deploy.cli.run_commands import SWEEP_NEEDS
+
+BUDGET_S = 600.0  # where neither it nor flights are given
+MOST = 3  # faults of one flight, chosen: failures of software seldom need more conditions
+
+app = typer.Typer()
+
+
+@app.command(rich_help_panel=opt.RUN)
+def hunt(
+    scenario: opt.ScenarioPath,
+    require_: Annotated[
+        list[str] | None,
+        Option("--require", help="What must hold: 'min_separation_m > 1.5', or module:function. Repeatable."),
+    ] = None,
+    budget: Annotated[str | None, Option(help="Wall time of the search, as 90s or 10min (default 10min).")] = None,
+    flights: Annotated[int | None, Option(min=1, max=10**9, help="Flights of the search.", show_default=False)] = None,
+    fault: Annotated[
+        list[str] | None,
+        Option(help="A kind that is drawn, and within what: 'gust velocity_m_s=1..6' (default all). Repeatable."),
+    ] = None,
+    without: Annotated[list[str] | None, Option(help="A kind that is not drawn. Repeatable.")] = None,
+    most: Annotated[int, Option(min=0, max=6, help="Faults in one flight.")] = MOST,
+    vary: Annotated[
+        list[str] | None,
+        Option(help="a.b.c=uniform(low,high), … as of a sweep (default wind.gust_m_s=uniform(0,2)). Repeatable."),
+    ] = None,
+    draws: Annotated[int, Option("--draws", min=0, max=2**62, help="Seed of what is drawn.")] = 1,
+    set_: opt.Set = None,
+    seed: opt.Seed = None,
+    duration: opt.Duration = None,
+    out: Annotated[Path | None, Option(help="Folder (default runs/NAME-hunt-TIME).", show_default=False)] = None,
+    workers: Annotated[int | None, Option(min=1, max=1024, help="Processes (default: one per core).")] = None,
+    force: Annotated[bool, Option("--force", help="Replace an earlier hunt; take a folder with other files.")] = False,
+) -> None:
+    """Search for faults, wind and delays that break a requirement, and shrink them; exit code 1 where one is found."""
+    require("hunt", SWEEP_NEEDS)
+    from rich.console import Console
+
+    from zsim.errors import ScenarioError
+    from zsim.runtime.progress import PipedConsole, cell
+    from zsim.scenario.faults import typed_duration_s
+    from zsim_analysis.hunt.hunt import HuntRequest, hunt
+    from zsim_analysis.hunt.hunt_report import make_hunt_report, terminal_text
+    from zsim_analysis.hunt.space import WIND
+    from zsim_analysis.sweep.design import read_document
+    from zsim_api.hunting import fly_as_processes
+    from zsim_api.recorded import load
+
+    try:
+        budget_s = None if budget is None else typed_duration_s(budget)
+    except ValueError as error:
+        raise BadParameter(f"--budget {error}") from None
+    document, faults = read_document(scenario, set_ or [], seed=seed, duration_s=duration)
+    if faults:
+        raise ScenarioError(faults)
+    name = str(document.get("name", scenario.stem))
+    request = HuntRequest(
+        document=document,
+        source=str(scenario),
+        requirements=tuple(require_ or ()),
+        out=out or Path("runs") / f"{name}-hunt-{time.strftime('%Y%m%d-%H%M%S')}",
+        seed=draws,
+        flights=flights,
+        budget_s=BUDGET_S if budget_s is None and flights is None else budget_s,
+        faults=tuple(fault or ()),
+        without=tuple(without or ()),
+        vary=tuple(vary or (WIND,)),
+        changed=tuple(opt.changed_fields(set_, seed, duration)),
+        most=most,
+        workers=workers,
+        force=force,
+        open_run=partial(load, trust=True),
+        processes=fly_as_processes,
+    )
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    hunted = hunt(request)
+    summary = hunted.summary
+    with Console(stderr=True).status("drawing …") as status:
+        make_hunt_report(hunted, lambda text: status.update(cell(text)))
+    PipedConsole().print(terminal_text(hunted))
+    say(f"report: {request.out / 'report.html'}")
+    if summary.interrupted:
+        note(f"interrupted; what was found so far is in {request.out}")
+        sys.exit(INTERRUPTED)
+    if summary.violation:
+        raise failed(f"{summary.violation.requirement}: broken; the flight is {request.out / 'violation'}")

@@ -1,0 +1,230 @@
+"""Hunts over flights that are computed, not flown: what is drawn, found and shrunk, whoever is finished first."""
+
+import csv
+import random
+from collections.abc import Callable, Iterator
+from itertools import combinations
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from refused import has_terms
+from rich.console import Console
+
+from zsim.errors import RunError, ScenarioError
+from zsim.math.random_streams import stream
+from zsim.scenario.scenario import Scenario
+from zsim.schema import yaml_file
+from zsim_analysis.hunt import hunt as hunting
+from zsim_analysis.hunt.hunt import SEARCH, TABLE, Hunted, HuntRequest, hunt
+from zsim_analysis.hunt.requirements import Requirement
+from zsim_analysis.hunt.space import HuntSpace
+from zsim_analysis.sweep.sweep_run import Row, Task
+
+DOCUMENT = yaml_file.parse(
+    """
+name: pair
+seed: 7
+duration_s: 40
+drones: [{name: d1, position_m: [0, 0, 0]}, {name: d2, position_m: [3, 0, 0]}]
+clusters: [{name: main, drones: [d1, d2], plan: {takeoff_s: 1}}]
+""",
+    "pair.yaml",
+    "",
+    ScenarioError,
+)
+KINDS = (
+    "gps_dropout target=d1",
+    "gust velocity_m_s=0..8 for_s=1..10",
+    "link_delay delay_ms=20..200",
+    "gps_bias value_m=0..3",
+    "mag_noise",
+    "sonar_stuck",
+)
+STRONG = 2.8  # of 3
+DEFECT = {"gps_dropout", "gust", "link_delay"}
+
+
+def gust_m_s(fault: dict[str, Any]) -> float:
+    return sum(x * x for x in fault["velocity_m_s"]) ** 0.5
+
+
+def separation_m(scenario: Scenario) -> float:
+    """Return a separation that each cause makes smaller, below 1 m for three strong ones together only."""
+    faults = {fault["kind"]: fault for fault in scenario.faults}
+    strong = 0.0
+    if "gust" in faults:
+        strong += min(gust_m_s(faults["gust"]) / 6, 1.0)
+    if "gps_dropout" in faults:
+        strong += min(faults["gps_dropout"]["for_s"] / 12, 1.0)
+    if "link_delay" in faults:
+        strong += min(faults["link_delay"]["delay_ms"] / 150, 1.0)
+    return 4.0 - strong - (0.5 if strong >= STRONG else 0.0)
+
+
+def rows_of(hunted: Hunted) -> list[dict[str, str]]:
+    return list(csv.DictReader((hunted.request.out / TABLE).read_text().splitlines()))
+
+
+class FakePool:
+    """A pool in which several flights are under way, and any of them is finished first."""
+
+    separation: Callable[[Scenario], float] = staticmethod(separation_m)
+    stops_after: int | None = None  # flights after which Ctrl-C is pressed
+    order = random.Random(1)
+
+    def __init__(self, count: int, say: Callable[[str], None]) -> None:
+        self._count = count
+
+    def rows(self, tasks: Iterator[Task | None]) -> Iterator[Row]:
+        held: list[Task] = []
+        flown = 0
+        while True:
+            while len(held) < self._count and (task := next(tasks, None)) is not None:
+                held.append(task)
+            if not held:
+                return
+            task = held.pop(self.order.randrange(len(held)))
+            if flown == self.stops_after:
+                raise KeyboardInterrupt
+            flown += 1
+            yield self.row(task)
+
+    def row(self, task: Task) -> Row:
+        figures = {"min_separation_m": type(self).separation(task.scenario)}
+        texts = task.judge.args[0]  # type: ignore[union-attr]
+        made = [Requirement(text) for text in texts]
+        faults = [fault for each in made for fault in each.faults(figures)]
+        margins = [] if faults else [tuple(each.margin(figures)) for each in made]
+        known = {"run": task.run, "failure": None, "truth_sha256": "", "shortfall": None}
+        return {**known, "faults": faults, "margins": margins}
+
+
+@pytest.fixture
+def fly(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Hunted]:
+    """Hunt for a separation of 1 m, with other arguments of HuntRequest if given."""
+    monkeypatch.setattr(hunting, "ProcessPool", FakePool)
+    monkeypatch.setattr(FakePool, "separation", staticmethod(separation_m))
+    monkeypatch.setattr(FakePool, "stops_after", None)
+    count = iter(range(100))
+
+    def made(**more: Any) -> Hunted:
+        request: dict[str, Any] = {
+            "document": DOCUMENT, "source": "pair.yaml", "requirements": ("min_separation_m > 1",), "faults": KINDS,
+            "out": tmp_path / str(next(count)), "flights": 3000, "workers": 2, "console": Console(quiet=True),
+        }  # fmt: skip
+        return hunt(HuntRequest(**{**request, **more}))
+
+    return made
+
+
+def test_three_causes_are_found_and_nothing_else_is_left_of_the_flight(fly: Callable[..., Hunted]) -> None:
+    found = fly().summary.violation
+    assert found is not None
+    faults = {fault["kind"]: fault for fault in found.shrunk.faults}
+    assert set(faults) == DEFECT
+    assert found.shrunk.values == {}
+    strong = [gust_m_s(faults["gust"]) / 6, faults["gps_dropout"]["for_s"] / 12, faults["link_delay"]["delay_ms"] / 150]
+    assert STRONG <= sum(strong) < STRONG + 0.1
+    assert found.shrunk.duration_s is not None
+    assert found.shrunk.duration_s < DOCUMENT["duration_s"]
+    assert [each.without is not None and each.without > 0 for each in found.causes] == [True] * 3
+    assert [each.alone is not None and each.alone > 0 for each in found.causes] == [True] * 3
+    assert found.margin is not None
+    assert found.margin < 0
+
+
+def test_the_same_seed_gives_the_same_flights_and_verdict_whoever_is_finished_first(fly: Callable[..., Hunted]) -> None:
+    one, other, third = fly(workers=1), fly(workers=7), fly(workers=7, seed=2)
+    assert one.summary.verdict == "violated"
+    assert [(each.stage, each.case) for each in one.flown] == [(each.stage, each.case) for each in other.flown]
+    assert one.summary.violation == other.summary.violation
+    assert one.flown[1].case != third.flown[1].case
+    longer = fly(flights=4000)  # begins with the same
+    assert [each.case for each in longer.flown[:20]] == [each.case for each in one.flown[:20]]
+
+
+def test_search_near_low_margins_needs_fewer_flights_than_drawing_alone(fly: Callable[..., Hunted]) -> None:
+    counts = [sum(each.stage == SEARCH for each in fly(seed=seed).flown) for seed in range(3)]
+    space, drawn = HuntSpace(DOCUMENT, "pair.yaml", KINDS), 2000
+    hits = 0
+    for number in range(drawn):
+        rng = stream(3, f"alone/{number}")
+        kinds = rng.choice(sorted(space.kinds), 3, replace=False)
+        faults = [space.kinds[str(kind)].draw(rng) for kind in kinds]
+        hits += separation_m(SimpleNamespace(faults=faults)) <= 1  # type: ignore[arg-type]
+    assert sum(counts) / len(counts) < drawn / max(hits, 1) / 3
+
+
+def test_what_holds_is_flown_to_the_end_and_every_pair_and_triple_of_kinds_is_tried(
+    fly: Callable[..., Hunted], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FakePool, "separation", staticmethod(lambda _: 3.0))
+    hunted = fly(flights=60)
+    assert (hunted.summary.verdict, hunted.summary.flights) == ("not violated", 60)
+    assert [(each.together, each.tried, each.possible) for each in hunted.summary.coverage] == [
+        (1, 6, 6),
+        (2, 15, 15),
+        (3, 20, 20),
+    ]
+    flown = {tuple(sorted(three)) for each in hunted.flown for three in combinations(each.case.kinds, 3)}
+    assert len(flown) == 20
+    assert hunted.summary.least == [2.0]
+    rows = rows_of(hunted)
+    assert [int(row["flight"]) for row in rows] == list(range(60))
+    assert rows[0]["faults"] == ""
+
+
+def test_a_flight_without_faults_that_breaks_it_already_needs_none(
+    fly: Callable[..., Hunted], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FakePool, "separation", staticmethod(lambda _: 0.5))
+    found = fly().summary.violation
+    assert found is not None
+    assert (found.number, found.shrunk.faults, found.shrunk.values, found.causes) == (0, (), {}, [])
+
+
+@pytest.mark.parametrize(("stops_after", "verdict"), [(5, "interrupted"), (None, "violated")])
+def test_ctrl_c_leaves_what_was_found(
+    fly: Callable[..., Hunted], monkeypatch: pytest.MonkeyPatch, stops_after: int | None, verdict: str
+) -> None:
+    if stops_after is None:
+        stops_after = sum(each.stage == SEARCH for each in fly().flown) + 10  # while it shrinks
+    monkeypatch.setattr(FakePool, "stops_after", stops_after)
+    hunted = fly(workers=1)
+    assert (hunted.summary.verdict, hunted.summary.interrupted) == (verdict, True)
+    assert len(rows_of(hunted)) == len(hunted.flown) <= stops_after
+
+
+def test_the_folder_of_a_hunt_is_not_hunted_into_again(fly: Callable[..., Hunted], tmp_path: Path) -> None:
+    fly(flights=3, out=tmp_path / "a")
+    with pytest.raises(RunError) as error:
+        fly(flights=3, out=tmp_path / "a")
+    assert has_terms(str(error.value), str(tmp_path / "a"), "--force")
+    assert fly(flights=4, out=tmp_path / "a", force=True).summary.flights == 4
+
+
+@pytest.mark.parametrize(
+    ("more", "terms"),
+    [
+        ({"requirements": ()}, ("--require", "missing")),
+        ({"requirements": ("min_separation > 1",)}, ("--require", "min_separation", "min_separation_m?")),
+        ({"faults": ("gps_dropuot",)}, ("--fault", "'gps_dropuot'", "gps_dropout?")),
+        ({"without": ("gusts",)}, ("--without", "'gusts'", "gust?")),
+        ({"faults": ("gust velocity_m_s=0..900",)}, ("--fault", "velocity_m_s", "[900.0, 0.0, 0.0]", "100")),
+        ({"faults": ("gust velocity_m_s=3..1",)}, ("--fault", "velocity_m_s", "'3..1'", "LOW", "HIGH")),
+        ({"faults": ("gust speed=3..4",)}, ("--fault", "speed", "velocity_m_s")),
+        ({"faults": ("gps_dropout target=d9",)}, ("--fault", "target", "'d9'", "d1", "d2")),
+        ({"faults": ("rotor_stuck rotor=1..2",)}, ("--fault", "rotor", "'1..2'", "choice")),
+        ({"faults": ("gust velocity",)}, ("--fault", "'gust velocity'", "NAME=VALUE")),
+        ({"vary": ("seed=1,2",)}, ("--vary", "'seed=1,2'")),
+        ({"vary": ("wind.gust_m_s=uniform(2)",)}, ("--vary", "uniform(2)")),
+    ],
+)
+def test_what_cannot_be_hunted_is_refused(
+    fly: Callable[..., Hunted], more: dict[str, Any], terms: tuple[str, ...]
+) -> None:
+    with pytest.raises(ScenarioError) as error:
+        fly(**more)
+    assert any(has_terms(fault, *terms) for fault in error.value.faults), error.value.faults
