@@ -1,12 +1,28 @@
-"""Every process of a run dies, stops, moves or loses its link, again and again: no bit and no gate is lost. `make soak`."""
+"""A hunt for an event that costs a bit: processes die, stop, move and lose their link, by budget. `make soak`.
 
+Each flight has rounds in which everybody dies once and is stopped once and, on three hosts, processes move and hosts are
+cut off, in an order and at times that are drawn from its number: one event comes while others are on their way back. The
+order is drawn so that every event follows every other one in the end. What must hold of a flight is that it has the bits
+of the same one in which nothing happens, and that no gate or message is missing from its record.
+
+    ZSIM_SOAK_BUDGET_S=28800 make soak         a night, each of the two tests half of it
+    ZSIM_SOAK_DRAWS=7                          further draws
+
+The figure reached is printed at the end.
+"""
+
+import os
 import random
 import re
 import signal
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import msgspec
 import pytest
@@ -23,43 +39,106 @@ from zsim_deploy.launch.supervisor import RESTART_WINDOW_S, RESTARTS_MAX
 
 pytestmark = pytest.mark.soak
 
-ROUNDS = 15  # in each, everybody dies once and is stopped once
+BUDGET_S = float(os.environ.get("ZSIM_SOAK_BUDGET_S", "240")) / 2  # wall time of each test
+DRAWS = int(os.environ.get("ZSIM_SOAK_DRAWS", "1"))
+EVENTS = 10_000  # of both tests; more are not needed
+ROUNDS = 15  # of a flight at most
 STOPPED_S, CUT_S = 0.3, 3.0  # wall time; the second is long enough to be noticed
 PAUSE_S = 0.5  # wall time between two at most: most come while others are on their way back
 ROUND_S = 1.2 * RESTART_WINDOW_S / RESTARTS_MAX  # wall time of a round at least: a launcher takes more for a fault
+TRIES = 20  # orders of a round of which the one with the most untried successions is taken
 ESTIMATORS = ("estimator.drone1", "estimator.drone2", "estimator.drone3")
 LAB_ROLES = (*ESTIMATORS, "controller.main", "recorder", "world")
+HOSTS, FAR_HOSTS = ("h1", "h2", "h3"), ("h2", "h3")  # the second: without the world
 BACK = {"world": "world: goes on at t = "}
-Act = Callable[[], object]
+
+
+class Event(NamedTuple):
+    """Something that happens to a process or a host."""
+
+    name: str  # kind and whom it strikes
+    act: Callable[[], object]  # returns False where it is refused
+    back: str = ""  # pattern of the line that shows that it is over; empty for what nobody notices
+
+
+class Tally:
+    """What happened in all flights, and what followed what."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self.flights = 0
+        self.successions: set[tuple[str, str]] = set()
+        self.possible = 0
+
+    @property
+    def events(self) -> int:
+        return sum(self.counts.values())
+
+    def lines(self) -> Iterator[str]:
+        kinds: Counter[str] = Counter(dict.fromkeys(("kill", "stop", "move", "cut"), 0))
+        for name, count in self.counts.items():
+            kinds[name.partition(" ")[0]] += count
+        parts = ", ".join(f"{count} {kind}s" for kind, count in kinds.items())
+        yield f"{self.events} events ({parts}) in {self.flights} flights, all with the same bits"
+        yield f"{len(self.successions)} of {self.possible} successions of two events"
+
+
+@pytest.fixture(scope="module")
+def tally(request: pytest.FixtureRequest) -> Iterator[Tally]:
+    made = Tally()
+    yield made
+    plugins = request.config.pluginmanager
+    terminal: Any = plugins.getplugin("terminalreporter")
+    capture: Any = plugins.getplugin("capturemanager")
+    with capture.global_and_fixture_disabled():
+        terminal.ensure_newline()
+        for line in made.lines():
+            terminal.write_line(line)
 
 
 class Deaths:
-    """Lets them happen in rounds, each before the last one is over.
+    """Lets events happen in rounds, each before the last one is over.
 
     Args:
         run: the launcher.
-        seed: of their order and times.
+        tally: of all flights.
+        number: of the flight, from which orders and times are drawn.
     """
 
-    def __init__(self, run: Role, seed: int) -> None:
-        self._run = run
-        self._chance = random.Random(seed)
-        self.count = 0
+    def __init__(self, run: Role, tally: Tally, number: int) -> None:
+        self._run, self._tally = run, tally
+        self._chance = random.Random(f"{DRAWS} {number}")
+        self._last = ""
+        self.history: list[str] = []
 
-    def round(self, acts: Sequence[tuple[Act, str]]) -> None:
-        """Do all of these in a random order, then wait until all are over.
-
-        Each has the pattern of the line that shows that it is over, none for what nobody notices.
-        """
+    def round(self, events: Sequence[Event]) -> None:
+        """Let all of these happen in a drawn order, then wait until all are over."""
         until_s = time.monotonic() + ROUND_S
-        expected = {back: len(re.findall(back, self._run.text())) + 1 for _, back in acts if back}
-        for act, _ in self._chance.sample(acts, len(acts)):
-            act()
-            self.count += 1
+        expected = {event.back: len(re.findall(event.back, self._run.text())) + 1 for event in events if event.back}
+        for event in self._order(events):
+            if event.act() is False:
+                continue
+            self._tally.counts[event.name] += 1
+            self.history.append(event.name)
+            if self._last:
+                self._tally.successions.add((self._last, event.name))
+            self._last = event.name
             threading.Event().wait(self._chance.uniform(0, PAUSE_S))
         for pattern, number in expected.items():
             self._run.line(pattern, START_S, number)
         threading.Event().wait(max(0.0, until_s - time.monotonic()))
+
+    def _order(self, events: Sequence[Event]) -> list[Event]:
+        orders = [self._chance.sample(events, len(events)) for _ in range(TRIES)]
+
+        def untried(order: Sequence[Event]) -> int:
+            names = [self._last, *(event.name for event in order)]
+            return len({*pairwise(names)} - self._tally.successions)
+
+        return max(orders, key=untried)
+
+    def choice(self, of: Sequence[str]) -> str:
+        return self._chance.choice(of)
 
 
 def back(role: str) -> str:
@@ -74,6 +153,11 @@ def pause(kill: Callable[[int], object]) -> None:
     kill(signal.SIGCONT)
 
 
+def kills_and_stops(kill: Callable[..., object], roles: Sequence[str]) -> list[Event]:
+    events = [Event(f"kill {role}", lambda role=role: kill(role), back(role)) for role in roles]
+    return [*events, *(Event(f"stop {role}", lambda r=role: pause(lambda n: kill(r, n))) for role in roles)]
+
+
 def sha256_in_process(scenario: Scenario, record: Record, folder: Path) -> str:
     """Return the hash of the same flight when nothing happens to anybody."""
     path = folder / "undisturbed.mcap"
@@ -82,48 +166,80 @@ def sha256_in_process(scenario: Scenario, record: Record, folder: Path) -> str:
         return Record(reader).sha256()
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_on_one_host(federation: Federation, tmp_path: Path, seed: int) -> None:
-    flight = Flight(federation)
-    deaths = Deaths(flight.run, seed)
-    for _ in range(ROUNDS):
-        names = (*PAIR_ROLES, "recorder", "world")
-        deaths.round([(lambda name=name: federation.kill(name), back(name)) for name in names])
-        deaths.round([(lambda name=name: pause(lambda n: federation.kill(name, n)), "") for name in names])
-    flight.finish()
-    record = check_end(federation, whole=True)
-    check_whole(record)
-    drones = ["drone1", "drone2"]
-    wanted = sha256_in_process(scenario_file.from_text(PAIR), record, tmp_path)
-    assert (record.sha256(), record.recomputed_sha256(drones)) == (wanted, wanted)
-    assert deaths.count == 2 * 5 * ROUNDS
+def flights(tally: Tally, share: int) -> Iterator[tuple[int, Callable[[], bool]]]:
+    """Yield the numbers of flights until the budget, or a share of the events, is spent; and whether it is."""
+    until_s, most = time.monotonic() + BUDGET_S, tally.events + share
+
+    def is_spent() -> bool:
+        return time.monotonic() >= until_s or tally.events >= most
+
+    number = 0
+    while number == 0 or not is_spent():
+        yield number, is_spent
+        number, tally.flights = number + 1, tally.flights + 1
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_on_three_hosts(lab: Lab, tmp_path: Path, seed: int) -> None:
-    with closing(Deployment(lab, ROLES)) as deployment:
-        run = deployment.up("--rate", "4", "--duration", "100000")
-        in_flight(run)
-        deaths = Deaths(run, seed)
-        for number in range(ROUNDS):
-            deaths.round([(lambda role=role: deployment.kill(role), back(role)) for role in LAB_ROLES])
-            deaths.round([(lambda r=role: pause(lambda n: deployment.kill(r, n)), "") for role in LAB_ROLES])
-            host = ("h1", "h2", "h3")[number % 3]
-            deaths.round([(lambda to=host: move(deployment, "estimator.drone3", to), "")])
-            deaths.round([(lambda: cut(deployment, "h3"), "")])
-        deployment.zsim("down").ends(with_code=0)
-        run.ends(with_code=130, within_s=START_S)
-        record = deployment.record()
-        wanted = sha256_in_process(scenario_file.load(STEP), record, tmp_path)
-        drones = ["drone1", "drone2", "drone3"]
-        assert (record.sha256(), record.recomputed_sha256(drones)) == (wanted, wanted)
-        check_whole(record)
-        assert deaths.count == 14 * ROUNDS
+def test_on_one_host(tmp_path: Path, tally: Tally, compiled: None) -> None:
+    names = (*PAIR_ROLES, "recorder", "world")
+    tally.possible += (2 * len(names)) ** 2
+    for number, is_spent in flights(tally, EVENTS // 2):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        with Federation(folder) as federation:
+            flight = Flight(federation)
+            deaths = Deaths(flight.run, tally, number)
+            for _ in range(ROUNDS):
+                deaths.round(kills_and_stops(partial(kill_there, federation), names))
+                if is_spent():
+                    break
+            flight.finish()
+            record = check_end(federation, whole=True)
+            check_whole(record)
+            drones = ["drone1", "drone2"]
+            wanted = sha256_in_process(scenario_file.from_text(PAIR), record, folder)
+            assert (record.sha256(), record.recomputed_sha256(drones)) == (wanted, wanted), deaths.history
 
 
-def move(deployment: Deployment, role: str, host: str) -> None:
-    """Move a role, unless it is there, or is on its way to somewhere: then that is refused."""
-    deployment.zsim("move", role, host).process.wait(START_S)
+def test_on_three_hosts(lab: Lab, tmp_path: Path, tally: Tally) -> None:
+    moves = [f"move {role} to {host}" for role in ESTIMATORS for host in HOSTS]
+    tally.possible += (2 * len(LAB_ROLES) + len(moves) + len(FAR_HOSTS)) ** 2
+    for number, is_spent in flights(tally, EVENTS // 2):
+        with closing(Deployment(lab, ROLES)) as deployment:
+            run = deployment.up("--rate", "4", "--duration", "100000", *(["--force"] if number else []))
+            in_flight(run)
+            deaths = Deaths(run, tally, number)
+            for _ in range(ROUNDS):
+                deaths.round(kills_and_stops(deployment.kill, LAB_ROLES))
+                role, to, far = deaths.choice(ESTIMATORS), deaths.choice(HOSTS), deaths.choice(FAR_HOSTS)
+                deaths.round([Event(f"move {role} to {to}", lambda r=role, to=to: move(deployment, r, to))])
+                deaths.round([Event(f"cut {far}", lambda far=far: cut(deployment, far))])
+                if is_spent():
+                    break
+            deployment.zsim("down").ends(with_code=0)
+            run.ends(with_code=130, within_s=START_S)
+            record = deployment.record()
+            wanted = sha256_in_process(scenario_file.load(STEP), record, tmp_path)
+            drones = ["drone1", "drone2", "drone3"]
+            assert (record.sha256(), record.recomputed_sha256(drones)) == (wanted, wanted), deaths.history
+            check_whole(record)
+
+
+def kill_there(federation: Federation, role: str, number: int = signal.SIGKILL) -> None:
+    """Send a role a signal, once it runs."""
+    until_s = time.monotonic() + START_S
+    while True:
+        try:
+            federation.kill(role, number)
+            return
+        except (pytest.fail.Exception, ProcessLookupError):
+            if time.monotonic() > until_s:
+                raise
+        threading.Event().wait(0.05)  # nothing tells of the start of another's process
+
+
+def move(deployment: Deployment, role: str, host: str) -> bool:
+    """Move a role; tell whether it did: it is refused where it is there, or on its way to somewhere."""
+    return deployment.zsim("move", role, host).process.wait(START_S) == 0
 
 
 def cut(deployment: Deployment, host: str) -> None:

@@ -21,25 +21,29 @@ from typing import Any
 
 import msgspec
 from msgspec import Struct
+from msgspec.structs import replace
 from rich.console import Console
 
 from zsim import __version__
 from zsim.errors import ReportError, RunError, ScenarioError
 from zsim.output_folder import refuse_others, take_lock
+from zsim.scenario.faults import PROCESS_KILL
+from zsim.scenario.scenario import Scenario
 from zsim.schema import yaml_file
 from zsim_analysis.hunt.requirements import BROKEN, Margin, Requirement, figures_of, worst
 from zsim_analysis.hunt.shrink import Shrinker, causes_of, only
 from zsim_analysis.hunt.space import WIND, Case, HuntSpace
 from zsim_analysis.hunt.strategy import LAG, Strategy
-from zsim_analysis.report.summary import RunSummary
+from zsim_analysis.report.summary import RunSummary, summarise
 from zsim_analysis.sweep.design import METRICS, text_of
 from zsim_analysis.sweep.process_pool import ProcessPool, cores
 from zsim_analysis.sweep.sweep import SweepScreen, span
-from zsim_analysis.sweep.sweep_run import FIXED, METRIC, Row, Task
+from zsim_analysis.sweep.sweep_run import FIXED, METRIC, Row, Task, fly_scenario
 
 PLAN, TABLE, SCENARIO, VIOLATION = "hunt.json", "flights.csv", "violation.yaml", "violation"
 OWN_FILES = (PLAN, TABLE, SCENARIO, VIOLATION, "summary.json", "report.html", "figures", ".lock")
 SEARCH, CAUSE, RECORD = "search", "each cause", "record"  # stages, beside those of `shrink`
+SAME_BITS = "same_bits"  # figure: truth is the same to the bit as in the flight in which no process dies
 DECIMALS = 6  # of margins in the table
 
 
@@ -65,6 +69,7 @@ class HuntRequest(Struct, frozen=True):
     force: bool = False  # whether the folder may hold other files
     console: Console | None = None  # where progress is shown, None: stderr
     open_run: Callable[[Path], Any] | None = None  # as of a task
+    processes: Callable[[Scenario, Path], None] | None = None  # as of a task: flies what processes die in
 
 
 class Flown(Struct, frozen=True):
@@ -212,8 +217,11 @@ def _requirement(text: str) -> Requirement:
     return Requirement(text)
 
 
-def judged(requirements: Sequence[str], summary: RunSummary, row: Row) -> dict[str, Any]:
-    """Return the margins of a flight, in the process that flew it; or why they cannot be had."""
+def judged(requirements: Sequence[str], twin: Scenario | None, summary: RunSummary, row: Row) -> dict[str, Any]:
+    """Return the margins of a flight, in the process that flew it; or why they cannot be had.
+
+    `twin` is the same flight without the death of processes, with which its bits are compared; None: it has none.
+    """
     columns = {
         name: value
         for name, value in row.items()
@@ -221,11 +229,18 @@ def judged(requirements: Sequence[str], summary: RunSummary, row: Row) -> dict[s
     }  # fmt: skip
     figures = {**columns, **dict(figures_of(msgspec.to_builtins(summary)))}
     made = [_requirement(text) for text in requirements]
+    if any(SAME_BITS in each.names for each in made):
+        figures[SAME_BITS] = twin is None or _truth_sha256(twin) == summary.truth_sha256
     faults = [fault for each in made for fault in each.faults(_known(each, figures, row))]
     try:
         return {"faults": faults, "margins": [] if faults else [tuple(each.margin(figures)) for each in made]}
     except ScenarioError as error:
         return {"faults": error.faults, "margins": []}
+
+
+def _truth_sha256(scenario: Scenario) -> str | None:
+    flown, diverged = fly_scenario(scenario)
+    return None if diverged else summarise(flown, [], Path()).truth_sha256
 
 
 def _known(requirement: Requirement, figures: dict[str, Any], row: Row) -> dict[str, Any]:
@@ -247,6 +262,7 @@ class _Hunt:
         self._strategy = Strategy(space, request.seed)
         self._screen = HuntScreen(request, self._strategy)
         self.flown: list[Flown] = []
+        self._scales: list[float] = []  # by requirement: margin of the flight without faults
         self._stages: Counter[str] = Counter()
         self._spent_s: defaultdict[str, float] = defaultdict(float)
         self._waiting: deque[Task] = deque()
@@ -312,6 +328,8 @@ class _Hunt:
         """Let a case be flown; return its number. ScenarioError if it cannot be flown."""
         scenario, number = self._space.scenario(case), len(self._cases)
         self._cases.append((case, stage))
+        deadly = [fault for fault in case.faults if fault["kind"] == PROCESS_KILL]
+        twin = replace(case, faults=tuple(fault for fault in case.faults if fault not in deadly))
         self._waiting.append(
             Task(
                 run=number,
@@ -320,7 +338,8 @@ class _Hunt:
                 scenario=scenario,
                 record=str(record.absolute()) if record else None,
                 open_run=self._request.open_run,
-                judge=partial(judged, self._texts),
+                processes=self._request.processes if deadly else None,
+                judge=partial(judged, self._texts, self._space.scenario(twin) if deadly else None),
             )
         )
         return number
@@ -337,6 +356,12 @@ class _Hunt:
         failure = row["failure"]
         lost = Margin(False, BROKEN, None, failure or "")
         margins = [Margin(*each) for each in row["margins"]] if not failure else [lost for _ in self._requirements]
+        if not self._scales:
+            self._scales = [abs(each.value) if each.value else 1.0 for each in margins]
+        margins = [
+            each if each.value is None else each._replace(share=each.value / scale)
+            for each, scale in zip(margins, self._scales, strict=True)
+        ]
         flown = Flown(len(self.flown), stage, case, margins, failure, row["truth_sha256"], row["shortfall"])
         self._stages[stage] += 1
         self.flown.append(flown)

@@ -103,7 +103,7 @@ def _pairs(kinds: Sequence[str], searched: Sequence[Flown]) -> ReportFigure:
     bar.set_label("least margin (%)", fontsize=PAPER_PT)
     bar.ax.tick_params(labelsize=PAPER_PT - 1)
     caption = (
-        "Least margin of the flights with both kinds, as a share of the larger side of the comparison, and their "
+        "Least margin of the flights with both kinds, as a share of that of the flight without faults, and their "
         "number; on the diagonal of all flights with a kind. Empty: not tried."
     )
     return ReportFigure("pairs.png", "Kinds of faults flown together", caption, figure)

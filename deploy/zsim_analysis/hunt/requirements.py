@@ -5,8 +5,8 @@ A requirement has numbers, texts, names, comparisons, `and`, `or`, `not`, + - * 
 `metrics.NAME`. Nothing else is read, and nothing is executed.
 
 Its margin is how far it is from being broken: the difference of the two sides of a comparison, the least of an `and`,
-the greatest of an `or`; the robustness of Fainekos and Pappas (Theoretical Computer Science 410, 2009) without time. A
-search compares margins of different units, so that each is also given as a share of the larger side.
+the greatest of an `or`; the robustness of Fainekos and Pappas (Theoretical Computer Science 410, 2009) without time. To
+compare margins of different units, each is also given as a share of the larger side.
 """
 
 import ast
@@ -36,7 +36,8 @@ class Margin(NamedTuple):
     """How a requirement stands in a flight."""
 
     holds: bool
-    share: float  # the margin over the larger side of its comparison, from -2 to 2; < 0 where it is broken
+    # the margin over the larger side of its comparison, from -2 to 2; in a hunt over that of the flight without faults
+    share: float
     value: float | None  # the margin in the unit of its figures; None where a figure is unknown
     unknown: str = ""  # the first figure that the flight does not have
 

@@ -34,7 +34,7 @@ from msgspec.structs import replace
 from zsim.contract.fingerprint import fingerprint
 from zsim.contract.framing import GateMessages
 from zsim.errors import DocumentError, RecordError, ReportError, reason_of
-from zsim.output_folder import temporary_folder
+from zsim.output_folder import RECORD, temporary_folder
 from zsim.record import RecordWriter
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
@@ -42,7 +42,7 @@ from zsim.schema import plugin
 from zsim.schema.checker import show
 from zsim_analysis.in_process import InProcessFlight
 from zsim_analysis.reading.formation import Formation, formations_of
-from zsim_analysis.reading.recorded_flight import FlightReader, RecordedFlight
+from zsim_analysis.reading.recorded_flight import FlightReader, RecordedFlight, read_flight
 from zsim_analysis.reading.shortfall import CRASHES
 from zsim_analysis.report.summary import RunSummary, summarise
 from zsim_analysis.sweep.design import METRICS
@@ -67,6 +67,7 @@ class Task(Struct, frozen=True):
     record: str | None = None  # folder for the record, None to keep none
     open_run: Callable[[Path], Any] | None = None  # makes a `zsim.Run` of a record, for metrics
     more: Callable[[RecordedFlight], Mapping[str, Any]] | None = None  # returns further columns, of values as in JSON
+    processes: Callable[[Scenario, Path], None] | None = None  # flies it as processes, into a folder; None: here
     judge: Callable[[RunSummary, Row], Mapping[str, Any]] | None = None  # more, of its summary
 
 
@@ -131,7 +132,8 @@ def fly(task: Task) -> Row:
     Raises:
         RecordError, OSError: its record cannot be written, nor could that of any other run.
     """
-    if task.record is None and task.open_run and any(map(_takes_run, task.scenario.report.metric_names)):
+    needs_run = task.open_run and any(map(_takes_run, task.scenario.report.metric_names))
+    if task.record is None and (needs_run or task.processes):
         folder = temporary_folder("run-")
         try:
             return fly(replace(task, record=str(folder / "run")))
@@ -139,10 +141,13 @@ def fly(task: Task) -> Row:
             rmtree(folder, ignore_errors=True)
     where: Row = {"host": socket.gethostname(), "fingerprint": fingerprint()}
     try:
-        with _record(task) as writer:
-            flight, diverged = fly_scenario(task.scenario, writer, answers=task.more is not None)
+        if task.processes:
+            flight, diverged = _fly_as_processes(task, task.processes), None
+        else:
+            with _record(task) as writer:
+                flight, diverged = fly_scenario(task.scenario, writer, answers=task.more is not None)
         formations = formations_of(flight)
-        summary = summarise(flight, formations, Path())  # the end event makes the record unnecessary
+        summary = summarise(flight, formations, Path(task.record or "") / RECORD)
     except (RecordError, OSError):
         raise
     except Exception as error:  # of any type: the scenario caused it
@@ -183,6 +188,14 @@ def fly(task: Task) -> Row:
     more = task.more(flight) if task.more and not diverged else {}
     row = make_row(result, task.varied, {**columns, **metrics, **more})
     return {**row, **task.judge(summary, row)} if task.judge and not diverged else row
+
+
+def _fly_as_processes(task: Task, fly_into: Callable[[Scenario, Path], None]) -> RecordedFlight:
+    folder = Path(task.record or "")
+    rmtree(folder, ignore_errors=True)
+    fly_into(task.scenario, folder)
+    answers = task.more is not None or bool(task.scenario.report.metric_names)
+    return read_flight(folder / RECORD, answers)
 
 
 def fly_scenario(

@@ -59,6 +59,7 @@ def hunt(
     from zsim_analysis.hunt.hunt_report import make_hunt_report, terminal_text
     from zsim_analysis.hunt.space import WIND
     from zsim_analysis.sweep.design import read_document
+    from zsim_api.hunting import fly_as_processes
     from zsim_api.recorded import load
 
     try:
@@ -85,6 +86,7 @@ def hunt(
         workers=workers,
         force=force,
         open_run=partial(load, trust=True),
+        processes=fly_as_processes,
     )
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     hunted = hunt(request)
