@@ -20,7 +20,7 @@ from zsim.runtime.bus import Bus
 from zsim.runtime.health import rare_collections
 from zsim.runtime.progress import PERIOD_S, HoldReasons, ProgressSink, SlowStart
 from zsim.runtime.rate_limit import RateLimit
-from zsim.scenario.roles import agent_names, expected_processes, lets_drop
+from zsim.scenario.roles import agent_names, check_alone, expected_processes, lets_drop
 from zsim.scenario.scenario import Scenario
 from zsim.schema.checker import show
 from zsim_agents.hosting import hosted, own_agent, with_own_agents
@@ -122,16 +122,7 @@ class InProcessFlight:
         stock: bool = True,
         steered: bool = False,
     ) -> None:
-        if scenario.gates("camera"):
-            raise RunError(
-                "processes.gating is [camera]; must be left out in one process, which has no cameras: "
-                "fly it as processes, or with --set processes.gating=[]"
-            )
-        if scenario.own_programs:
-            raise RunError(
-                f"programs has {', '.join(scenario.own_programs)}; must be left out in one process, which starts no "
-                "programs: fly it as processes, or with --set programs={}"
-            )
+        check_alone(scenario)
         if not stock:
             scenario = replace(scenario, processes=replace(scenario.processes, expect=[]))
         self.world = World(scenario, "lockstep", 0.0, time.monotonic_ns, run_id, changed)

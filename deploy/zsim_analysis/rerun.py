@@ -28,9 +28,11 @@ from zsim.runtime.rate_limit import RateLimit
 from zsim.scenario.faults import listed
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
+from zsim.schema.checker import show
 from zsim.schema.message import Message
 from zsim_agents.hosting import hosted
 from zsim_analysis.reading import recorded_run
+from zsim_analysis.reading.output_hashes import OutputHashes, content_of
 from zsim_world.run.coordinator import FLIGHT_REQUESTS
 from zsim_world.run.world import World
 
@@ -46,14 +48,18 @@ class RerunResult(NamedTuple):
     sha256: str  # of the truth
     until: str  # why the comparison ended before the record, empty if it did not
     refused: list[str]  # requests that were carried out on record and are refused now
-    first_output: str  # the first output of an agent that differs, empty if none does
+    first_output: str  # the first output of an agent that differs, with its field; empty if none does
+    outputs: dict[str, str]  # SHA-256 of the agents' by key, as OutputHashes
     failure: str  # of a user's code, empty if none failed
 
 
-def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> str:
+def rerun_record(
+    place: Path, commands_only: bool, say: Say, note: Say, outputs: Mapping[str, str] | None = None
+) -> str:
     """Fly the run of a record again; return how truth differs from the record, empty if it is the same to the bit.
 
-    With `commands_only` no agents are run. `say` receives each line of the results, `note` each warning.
+    With `commands_only` no agents are run. `say` receives each line of the results, `note` each warning. `outputs` has
+    the SHA-256 of the agents' outputs by key, as OutputHashes, where they must be the same, too.
 
     Raises:
         RunError, RecordError: there is no record, or it is not one from the start of a flight.
@@ -87,6 +93,8 @@ def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> str:
             fault = f"flown again, {again.failure or 'it does not fail'}"
         elif not fault and again.failure:
             say(f"ended as on record: {again.failure}")
+        if outputs is not None and not fault:
+            fault = _compare_outputs(outputs, again, say)
         if again.compared.first is None:
             return fault
         alone = _fly(record, nobody)
@@ -94,16 +102,27 @@ def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> str:
             say(f"the world alone, with all recorded commands, differs too: first {alone.compared.first}")
         else:
             say("the world alone, with all recorded commands, gives the recorded truth: the agents answer differently")
-            if again.first_output:
-                say(f"the first answer that differs is {again.first_output}")
+        if again.first_output:
+            say(f"the first answer that differs is {again.first_output}")
         return fault
+
+
+def _compare_outputs(expected: Mapping[str, str], again: RerunResult, say: Say) -> str:
+    """Print how the agents' outputs compare; return how they differ, empty if they do not."""
+    keys_of_both = sorted({*expected, *again.outputs})
+    differing = [key for key in keys_of_both if expected.get(key) != again.outputs.get(key)]
+    if not differing:
+        say(f"the agents' outputs are the same, on {len(expected)} keys")
+        return ""
+    say(f"the agents' outputs differ on {len(differing)} of {len(keys_of_both)} keys: {listed(differing)}")
+    return f"outputs differ, first {again.first_output or differing[0]}"
 
 
 def _fly(record: recorded_run.RecordedRun, agents: recorded_run.RecordedAgents) -> RerunResult:
     """Fly from gate to gate of a record, as far as it is whole."""
     reader, info, scenario = record
     world = World(scenario, info.mode, 0.0, time.monotonic_ns, info.run_id)
-    bus = RerunBus(world, agents, info, scenario)
+    bus = RerunBus(world, agents, info, scenario, OutputHashes(recorded_run.answered_until_ns(reader, info)))
     compared = TruthComparison(world.names)
     bus.join()
     until, due_ns, throttle, start_s = "", 0, RateLimit(PERIOD_S), time.monotonic()
@@ -125,7 +144,8 @@ def _fly(record: recorded_run.RecordedRun, agents: recorded_run.RecordedAgents) 
         bus.answer_all()
     if not compared.instants:
         raise RecordError(f"{reader.path}: {until or 'holds no truth'}; a run is flown again from its start")
-    return RerunResult(compared, world.result()["truth_sha256"], until, bus.refused, bus.outputs.first, bus.failure)
+    first, hashes = bus.outputs.first, bus.hashes.hexdigests()
+    return RerunResult(compared, world.result()["truth_sha256"], until, bus.refused, first, hashes, bus.failure)
 
 
 def _judge(reader: RecordReader, recorded: str | None, result: RerunResult, say: Say) -> str:
@@ -161,11 +181,13 @@ class Difference(NamedTuple):
     velocity_m_s: float
     angle_rad: float
     rate_rad_s: float
+    field: str = ""  # the first that differs, with both values
 
     def __str__(self) -> str:
         angle_deg, rate_deg_s = math.degrees(self.angle_rad), math.degrees(self.rate_rad_s)
         by = f"{self.position_m:.3g} m, {self.velocity_m_s:.3g} m/s, {angle_deg:.3g} deg, {rate_deg_s:.3g} deg/s"
-        return f"{self.drone} at {self.t_ns / 1e9:.3f} s by {by}"
+        of = f": {self.field} in {keys.truth(self.drone)}" if self.field else ""
+        return f"{self.drone} at {self.t_ns / 1e9:.3f} s by {by}{of}"
 
 
 def difference(t_ns: int, drone: str, recorded: bytes, flown: bytes) -> Difference | None:
@@ -186,7 +208,21 @@ def difference(t_ns: int, drone: str, recorded: bytes, flown: bytes) -> Differen
         math.dist(a.velocity_m_s, b.velocity_m_s),
         2 * math.acos(min(1.0, cosine)),
         math.dist(a.angular_velocity_rad_s, b.angular_velocity_rad_s),
+        differing_field(a, b, COUNTED),
     )
+
+
+def differing_field(recorded: Any, flown: Any, fields: Sequence[str]) -> str:
+    """Return the first of some fields, and which number of it, that differs in two messages, with both values."""
+    for name in fields:
+        a, b = getattr(recorded, name), getattr(flown, name)
+        if a == b:
+            continue
+        if isinstance(a, tuple) and isinstance(b, tuple) and len(a) == len(b):
+            index = next(i for i, (one, other) in enumerate(zip(a, b, strict=True)) if one != other)
+            name, a, b = f"{name}[{index}]", a[index], b[index]
+        return f"{name} is {show(a)} on record, {show(b)} flown again"
+    return ""
 
 
 class TruthComparison:
@@ -215,21 +251,27 @@ class OutputComparison:
     def __init__(self, match_within_ns: int) -> None:
         self._match_within_ns = match_within_ns
         self._unmatched: dict[tuple[str, int, int], Message] = {}
-        self._first: tuple[int, str] | None = None
+        self._first: tuple[int, bool, str, str] | None = (
+            None  # of one instant estimates come first, the cause of others
+        )
 
     @property
     def first(self) -> str:
-        """The first output that differs, or that only one of the two has, and when; empty if there is none."""
-        return f"{self._first[1]} at {self._first[0] / 1e9:.2f} s" if self._first else ""
+        """The first output that differs, or that only one of the two has, when, and in which field; empty if none."""
+        if not self._first:
+            return ""
+        t_ns, _, key, field = self._first
+        return f"{key} at {t_ns / 1e9:.2f} s" + (f": {field}" if field else "")
 
-    def add(self, key: str, output: Any) -> None:
+    def add(self, key: str, output: Any, recorded: bool = False) -> None:
         """Add an output of either."""
         identity = (key, output.seq, output.t_ns)
         other = self._unmatched.pop(identity, None)
         if other is None:
             self._unmatched[identity] = output
         elif other != output:
-            self._note(output.t_ns, key)
+            pair = (output, other) if recorded else (other, output)
+            self._note(output.t_ns, key, differing_field(*pair, output.__struct_fields__))
 
     def expire(self, t_ns: int) -> None:
         """Count outputs as different whose counterpart has not come in time before t_ns."""
@@ -237,8 +279,9 @@ class OutputComparison:
             del self._unmatched[identity]
             self._note(identity[2], identity[0])
 
-    def _note(self, t_ns: int, key: str) -> None:
-        self._first = min((t_ns, key), self._first or (t_ns, key))
+    def _note(self, t_ns: int, key: str, field: str = "") -> None:
+        found = (t_ns, keys.leaf(key) != "estimate", key, field)
+        self._first = min(found, self._first or found)
 
 
 # Flight
@@ -265,7 +308,12 @@ class RerunBus(Bus):
     """Flies a run again in a new world, with the given agents; without any, all commands come from the record."""
 
     def __init__(
-        self, world: World, agents: recorded_run.RecordedAgents, info: messages.Info, scenario: Scenario
+        self,
+        world: World,
+        agents: recorded_run.RecordedAgents,
+        info: messages.Info,
+        scenario: Scenario,
+        hashes: OutputHashes | None = None,
     ) -> None:
         requests: defaultdict[int, list[tuple[str, ControlRequest]]] = defaultdict(list)
         for key, request in agents.requests:
@@ -280,12 +328,15 @@ class RerunBus(Bus):
         def compare_output(key: str, message: Any) -> None:
             if isinstance(message, (*messages.RELAYED, flight_messages.Command)):
                 self.outputs.add(key, message)
+            if recorded_run.is_answer(key) and recorded_run.sender_of(key, message) in agents.names:
+                self.hashes.add(key, message.t_ns, content_of(message))
 
         def keep_truth(gate: GateMessages) -> None:
             self.truth = {keys.thing(key): payload for key, payload in gate.pairs if keys.leaf(key) == "truth"}
 
         super().__init__(world, groups, lambda: 0, compare_output, keep_truth)
         self._world = world
+        self.hashes = hashes or OutputHashes(-1)  # of the agents that are run again
         self._rerun = agents.names
         self.truth: dict[str, bytes] = {}  # payloads at the newest gate, by drone
         self.refused: list[str] = []  # requests that were carried out on record and are refused now
@@ -345,18 +396,16 @@ class RerunBus(Bus):
         if key == keys.EVENT:
             self._feed_event(message)
         elif isinstance(message, messages.RELAYED):  # estimates, references, and outputs about clusters
-            role = "estimator" if isinstance(message, flight_messages.Estimate) else "controller"
-            is_request = isinstance(message, run_messages.ClusterRequest)
-            source = (message.controller if is_request else message.source) or f"{role}.{keys.thing(key)}"
+            source = recorded_run.sender_of(key, message)
             if source in self._rerun:
-                self.outputs.add(key, message)
+                self.outputs.add(key, message, recorded=True)
             else:
                 self._hand_over(key, message, source)
         elif isinstance(message, Sightings):  # no detector is run again: it would need the pictures
             self._hand_over(key, message, message.source)
         elif isinstance(message, flight_messages.Command):
             if message.source in self._rerun:
-                self.outputs.add(key, message)
+                self.outputs.add(key, message, recorded=True)
             else:
                 self._world.handle(key, message, 0)
         elif keys.thing(key) not in self._rerun:  # a join, done or bye; a join when it was admitted, as its event says

@@ -258,7 +258,10 @@ class Run:
             raise RunError(f"{self.record}: has no world/info, so that its scenario is unknown")
         made = Scenario(**yaml_file.value(self._info.scenario))
         modules = () if self._info.module_folders is UNSET else self._info.module_folders
-        made.source, made.folders = str(self.record), (*map(Path, modules), self.folder, Path.cwd())
+        made.source, made.folders = (
+            str(self.record),
+            (*(self.folder / each for each in modules), self.folder, Path.cwd()),
+        )
         return made
 
     @property

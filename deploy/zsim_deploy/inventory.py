@@ -19,6 +19,7 @@ from zsim.scenario.roles import AGENTS, RECORDER, ROLES, ROUTER, WORLD, agent_na
 from zsim.scenario.scenario import DRONES_MAX, PROCESSES_MAX, Name, OnDeath, Scenario, Spec
 from zsim.schema import yaml_file
 from zsim.schema.checker import Fault, faults, first_lines
+from zsim_api.programs import filled
 from zsim_deploy import SAFE_PATH
 from zsim_deploy.arguments import REALTIME
 
@@ -330,13 +331,31 @@ def processes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (
 
 
 def own_programs(placed: InventoryFile, scenario: Scenario, host: str | None = None) -> list[str]:
-    """Return a remark on each expected process that is a program of the user's own, on one host or on all."""
+    """Return a remark on each program of the user's own, with its command: those of one host, or all.
+
+    One for which the run does not wait has no host, and is among all only.
+    """
     places = placement(placed, scenario)
-    return [
-        f"{name} on {at} is a program of your own: start it yourself, it connects to {endpoint(placed, places, at)}"
-        for name, at in places.items()
-        if not _is_known(name, scenario) and host in (None, at)
-    ]
+    remarks = []
+    for name, at in places.items():
+        if not _is_known(name, scenario) and host in (None, at):
+            where = endpoint(placed, places, at)
+            what = f"{name} on {at} is a program of your own: start it yourself, it connects to {where}"
+            remarks.append(what + _command_text(name, scenario, where))
+    for name, program in scenario.own_programs.items() if host is None else ():
+        if not program.joins and name not in places:
+            where = endpoint(placed, places, places[WORLD])
+            what = f"{name} is a program of your own, for which the run does not wait: start it yourself"
+            remarks.append(what + _command_text(name, scenario, where))
+    return remarks
+
+
+def _command_text(name: str, scenario: Scenario, endpoint: str) -> str:
+    """Return the command line of a program of the scenario; `{folder}`, that of the run, is the user's to choose."""
+    if name not in scenario.own_programs:
+        return ""
+    values = {"endpoint": endpoint, "federation": scenario.federation, "name": name, "folder": "{folder}"}
+    return f": {shlex.join(filled(scenario.own_programs[name].command, values))}"
 
 
 def _is_known(name: str, scenario: Scenario) -> bool:

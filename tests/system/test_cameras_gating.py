@@ -4,7 +4,7 @@ import pytest
 from federation import Federation
 from test_cameras import PAIR, PICTURES, SEEN_DEAD
 
-from zsim.errors import RunError
+from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim_analysis.in_process import InProcessFlight
 
@@ -48,5 +48,5 @@ def test_a_camera_that_is_killed_holds_time_until_it_is_back(
 def test_one_process_has_no_cameras_to_wait_for(tmp_path_factory: pytest.TempPathFactory) -> None:
     place = tmp_path_factory.mktemp("one") / "pair.yaml"
     place.write_text(PAIR)
-    with pytest.raises(RunError, match=r"processes\.gating"):
+    with pytest.raises(ScenarioError, match=r"processes\.gating"):
         InProcessFlight(scenario_file.load(place, ["processes.gating=[camera]"]))

@@ -1,5 +1,6 @@
 """The state of an agent as bytes: maps, lists, texts, numbers and plain arrays; reading it runs no code of its own."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import msgspec
@@ -7,7 +8,9 @@ import numpy as np
 from msgspec.msgpack import Ext
 
 from zsim.contract.messages import REFUSALS
-from zsim.errors import DecodeError
+from zsim.errors import DecodeError, UserCodeError
+from zsim.schema import plugin
+from zsim.schema.checker import show
 
 VERSION = 1  # of what `pack` writes, the field `version` of the message
 ARRAY = 1  # code of a msgpack extension: (type, shape, numbers) of an array
@@ -33,6 +36,44 @@ def unpack(payload: bytes) -> State:
         return _DECODER.decode(payload)
     except REFUSALS as error:
         raise DecodeError(f"state: {error}; must be as this version of zsim packs it") from error
+
+
+def checked(state: Any, owner: type) -> State | None:
+    """Return what the `snapshot` of a user's class returned, a state or None.
+
+    Raises:
+        UserCodeError: it is none; the line names the class, the first value that is not plain, and where it is.
+    """
+    if state is None:
+        return None
+    what = f"{plugin.full_name(owner)}.snapshot returns"
+    if not isinstance(state, dict) or not all(isinstance(name, str) for name in state):
+        raise UserCodeError(
+            f"{what} {show(state)}; must be a map of plain values by name, {{}} where there is no state"
+        )
+    try:
+        pack(state)
+    except (TypeError, *REFUSALS) as error:
+        path, found = next(_flaws(state), ("a value", str(error)))
+        allowed = "must be numbers, texts, bytes, lists, maps by name, or arrays of numbers"
+        raise UserCodeError(f"{what} {path} = {found}; {allowed}") from error
+    return state
+
+
+def _flaws(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
+    """Yield path and text of what cannot be packed in a state."""
+    if isinstance(value, dict):
+        for name, each in value.items():
+            yield from _flaws(each, f"{path}.{name}" if path else str(name))
+    elif isinstance(value, list | tuple):
+        for place, each in enumerate(value):
+            yield from _flaws(each, f"{path}[{place}]")
+    else:
+        try:
+            _ENCODER.encode(value)
+        except (TypeError, *REFUSALS):
+            kind = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
+            yield path, kind
 
 
 def _packed(value: Any) -> Any:

@@ -24,7 +24,7 @@ from zsim.contract.agent_messages import AgentMessage
 from zsim.contract.framing import GateMessages
 from zsim.contract.messages import Info, decode, encode
 from zsim.contract.run_messages import ClusterRequest, ControlAnswer, ControlRequest, Faults
-from zsim.contract.snapshot import State
+from zsim.contract.snapshot import State, checked
 from zsim.errors import DecodeError, RunError, UserCodeError
 from zsim.runtime.agent_radio import Transmitter
 from zsim.runtime.inbox import GateRouter, Input, RoutingTable, canonical, is_held
@@ -64,6 +64,7 @@ class Agent(ABC):
     thing = ""  # name of the drone or cluster that it is of: the second part of its own name
     _links: Links | None = None
     _transmitter: Transmitter | None = None
+    _answered_ns = 0  # the gate whose inputs it took last
 
     def __init__(self) -> None:
         self._seq: defaultdict[str, int] = defaultdict(int)
@@ -142,6 +143,7 @@ class Agent(ABC):
             UserCodeError: a user's class raised, or returned what cannot be used.
         """
         try:
+            self._answered_ns = t_ns
             self.deliver(t_ns, inputs)
             if t_ns % self.period_ns:
                 return None
@@ -270,6 +272,11 @@ class Agent(ABC):
     def checkpoint(self) -> State | None:
         """Return the snapshot with what every agent has beside it: sequence numbers, and what its links hold back."""
         own = self.snapshot()
+        if self._is_own:
+            try:
+                own = checked(own, type(self))
+            except UserCodeError as error:
+                raise UserCodeError(error.text, f"{self.name} at {self._answered_ns / 1e9:.2f} s") from error
         if own is None:
             return None
         return {

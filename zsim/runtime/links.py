@@ -10,7 +10,7 @@ of arrival nor a restart of the receiver changes a draw.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from typing import Any
 
 from zsim.contract import keys, messages
@@ -24,6 +24,7 @@ from zsim.math.random_streams import uniform
 from zsim.runtime.agent_radio import NEVER, Receiver
 from zsim.runtime.inbox import Input, canonical
 from zsim.scenario import faults as fault_kinds
+from zsim.scenario.roles import ROLES
 from zsim.scenario.scenario import Radio
 
 WORLD, RADIO = "world", "radio"
@@ -65,15 +66,21 @@ def joins(fault: Fault, froms: Sequence[str], to: str) -> bool:
     return first == to and second in froms and not fault.parameters["one_way"]
 
 
-def place_of(process: str, places: Mapping[str, Any], where: Callable[[str], Point | None]) -> Point | None:
+def drone_of(process: str, drones: Container[str]) -> str | None:
+    """Return the drone on whose board a process is: one of a role that has one for each drone, also of a user's."""
+    role, _, thing = process.partition(".")
+    about = ROLES[role].about if role in ROLES else "drone"
+    return thing if about == "drone" and thing in drones else None
+
+
+def place_of(
+    process: str, places: Mapping[str, Any], drones: Container[str], where: Callable[[str], Point | None]
+) -> Point | None:
     """Return where a process is [m; W]: where `places` has it, on its drone, or at the origin.
 
     `where`: returns where a drone is in W [m], None where that is not known.
     """
-    place = places.get(process)
-    if place is None:
-        role, _, thing = process.partition(".")
-        place = thing if role == "estimator" else fault_kinds.ORIGIN
+    place = places.get(process, drone_of(process, drones) or fault_kinds.ORIGIN)
     return where(place) if isinstance(place, str) else place
 
 
@@ -129,6 +136,7 @@ class Links:
         self._radio = radio and Receiver(info, radio, self._names[0])
         self._seed, self._gate_ns = info.seed, info.gate_ns
         self._roles = {each.key: each.role for each in info.own_messages}
+        self._drones = frozenset(drone.name for drone in info.drones)
         self._clusters = {cluster.name: cluster.drones for cluster in info.clusters}
         self._list: Faults | None = None  # the newest
         self._faults: list[Fault] = []
@@ -185,14 +193,16 @@ class Links:
         froms, (kind, thing, _) = senders(key, message, self._roles), keys.parts(key)
         to = stock if keys.is_sensor(key) and (stock := f"estimator.{thing}") in self._names else self._names[0]
 
+        aboard = drone_of(to, self._drones)
+
         def acts(fault: Fault) -> bool:
             if fault.kind != RADIO:
                 return joins(fault, froms, to)
             drones = self._clusters.get(fault.target)
-            return kind == "drone" and to != f"estimator.{thing}" and (drones is None or thing in drones)
+            return kind == "drone" and aboard != thing and (drones is None or thing in drones)
 
         def distance_m(fault: Fault) -> float | None:
-            place = place_of(to, fault.parameters["place"], self._positions.get)
+            place = place_of(to, fault.parameters["place"], self._drones, self._positions.get)
             return distance_between(self._positions.get(thing), place)
 
         of_faults_ns = total_delay_ns(filter(acts, acting), self._seed, to, key, message, distance_m)

@@ -217,7 +217,6 @@ class AgentParticipant(Participant):
         ahead = info.command_delay_ns // info.gate_ns
         self._kept: deque[tuple[int, Sequence[Output]]] = deque(maxlen=GATES_KEPT + ahead)
         self._unsent: Pairs = []
-        self._packs = True
         self._resumed = False
         self._unproved = 0  # rejoins left to publish until the world is seen to go on with this process …
         self._proof_ns = 0  # … by coming to a gate beyond this one
@@ -317,17 +316,14 @@ class AgentParticipant(Participant):
         self._unsent.append((self._done_key, messages.encode(done)))
 
     def publish_snapshot(self, t_ns: int) -> None:
-        """Encode the whole state of the agent after a gate, for `send`, if it offers one of plain values."""
+        """Encode the whole state of the agent after a gate, for `send`, if it offers one.
+
+        UserCodeError: a user's class returned one that is not of plain values.
+        """
         state = self._agent.checkpoint()
-        if state is None or not self._packs:
+        if state is None:
             return
-        try:
-            packed = pack(state)
-        except TypeError as error:
-            self._packs = False
-            self._say(f"{self.name}: {error}; no snapshots are published, and a death costs what it has come to know")
-            return
-        snapshot = run_messages.Snapshot(t_ns, self.next_seq("snapshot"), self.name, VERSION, packed)
+        snapshot = run_messages.Snapshot(t_ns, self.next_seq("snapshot"), self.name, VERSION, pack(state))
         self._unsent.append((keys.process(self.name, "snapshot"), messages.encode(snapshot)))
 
     def send(self) -> None:

@@ -122,6 +122,23 @@ def check_pace(scenario: Scenario, mode: str) -> None:
         raise ScenarioError([f"{scenario.name}: body of {who}, and the run is in {mode}; {needed}"])
 
 
+def check_alone(scenario: Scenario) -> None:
+    """Raise ScenarioError for what a run in one process cannot have: every field, a line each."""
+    lines = []
+    if scenario.gates("camera"):
+        lines.append(
+            "processes.gating is [camera]; must be left out in one process, which has no cameras: "
+            "fly it as processes, or with --set processes.gating=[]"
+        )
+    if scenario.own_programs:
+        lines.append(
+            f"programs has {', '.join(scenario.own_programs)}; must be left out in one process, which starts no "
+            "programs: fly it as processes, or with --set programs={}"
+        )
+    if lines:
+        raise ScenarioError([f"{scenario.name}: {line}" for line in lines])
+
+
 def drivers_of(scenario: Scenario) -> list[str]:
     return [f"{DRIVER}.{drone}" for drone in scenario.external()]
 

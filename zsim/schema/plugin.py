@@ -272,8 +272,8 @@ def _imported(name: str, what: str, attribute: str = "") -> ModuleType:
         raise DocumentError([f"{what}, which cannot be imported ({reason_of(error)})"]) from error
 
 
-def _find(name: str, what: str, attribute: str) -> None:
-    """Find a module without running any of it; DocumentError if there is none, or its text does not bind the name."""
+def located(name: str, what: str) -> ModuleSpec:
+    """Return where a module is, without running any of it; DocumentError, beginning with `what`, if it is nowhere."""
     spec: ModuleSpec | None = None
     for part in accumulate(name.split("."), "{}.{}".format):
         where = spec.submodule_search_locations if spec else None
@@ -287,7 +287,14 @@ def _find(name: str, what: str, attribute: str) -> None:
         if spec is None:
             reason = f"ModuleNotFoundError: No module named {part!r}"
             raise DocumentError([f"{what}, which cannot be imported ({reason}); {WHERE}"])
-    if not attribute or spec is None or not (spec.origin or "").endswith(".py"):
+    assert spec is not None  # a name has a part
+    return spec
+
+
+def _find(name: str, what: str, attribute: str) -> None:
+    """Find a module without running any of it; DocumentError if there is none, or its text does not bind the name."""
+    spec = located(name, what)
+    if not attribute or not (spec.origin or "").endswith(".py"):
         return
     try:
         tree = ast.parse(Path(spec.origin or "").read_bytes())

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, NoReturn, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.contract.snapshot import State
+from zsim.contract.snapshot import State, checked
 from zsim.errors import UserCodeError
 from zsim.math import elementary as el
 from zsim.scenario.scenario import ESTIMATORS, Drone, Environment, Estimation
@@ -128,7 +128,13 @@ class EstimatorSet:
         """Return the states of all estimators, None if their class has no `snapshot`."""
         if not all(hasattr(each, "snapshot") for each in self._estimators):
             return None
-        return {"estimators": [each.snapshot() for each in cast("list[Any]", self._estimators)]}
+        states = []
+        for i, each in enumerate(cast("list[Any]", self._estimators)):
+            try:
+                states.append(checked(each.snapshot(), type(each)))
+            except plugin.RAISED as error:
+                self._raise(error, i)
+        return None if None in states else {"estimators": states}
 
     def restore(self, state: State) -> None:
         for each, own in zip(cast("list[Any]", self._estimators), state["estimators"], strict=True):

@@ -11,7 +11,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from zsim.contract.snapshot import State
+from zsim.contract.snapshot import State, checked
+from zsim.schema import plugin
 from zsim_agents.formation.assembly import Assembly, assembly_goal, planned_assembly
 from zsim_agents.formation.control_law import (
     ControlLaw,
@@ -160,6 +161,8 @@ class Engagement:
 
     def snapshot(self) -> State | None:
         law = self.law.snapshot()
+        if plugin.is_own(type(self.law)):
+            law = checked(law, type(self.law))
         if law is None:
             return None
         return {

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from msgspec import UNSET, Struct
 
-from zsim.contract import keys, messages, run_messages
+from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.flight_messages import LinkState
 from zsim.errors import DecodeError, RecordError, ZsimError
 from zsim.output_folder import record_at
@@ -63,7 +63,7 @@ def open_run(place: Path) -> Iterator[RecordedRun]:
 def search_modules(record: Path, info: messages.Info | None) -> None:
     """Search modules named by a run's scenario where the run found them, beside its record, and in this folder."""
     recorded = info.module_folders if info and info.module_folders is not UNSET else ()
-    plugin.search(*map(Path, recorded), record.parent, Path.cwd())
+    plugin.search(*(record.parent / each for each in recorded), record.parent, Path.cwd())
 
 
 def scenario_of(info: messages.Info | None) -> Scenario | None:
@@ -72,6 +72,30 @@ def scenario_of(info: messages.Info | None) -> Scenario | None:
         return scenario_file.from_text(info.scenario) if info else None
     except ZsimError:
         return None
+
+
+def is_answer(key: str) -> bool:
+    """Tell whether agents publish on a key: commands, or what they tell each other."""
+    return keys.is_command(key) or messages.is_relayed(messages.type_of(key))
+
+
+def answered_until_ns(reader: RecordReader, info: messages.Info) -> int:
+    """Return the last gate whose answers are all on record: without them the last gate had not been flown [ns].
+
+    Raises:
+        RecordError: there is no gate on record.
+    """
+    clock = reader.last(keys.CLOCK)
+    if clock is None:
+        raise RecordError(f"{reader.path}: holds no gate")
+    return clock.t_ns - info.gate_ns - info.command_delay_ns
+
+
+def sender_of(key: str, message: Any) -> str:
+    """Return the name of the process that published an output: a command, or what agents publish for each other."""
+    stated = message.controller if isinstance(message, run_messages.ClusterRequest) else message.source
+    role = "estimator" if isinstance(message, flight_messages.Estimate) else "controller"
+    return stated or f"{role}.{keys.thing(key)}"
 
 
 def decode_or_none(recorded: Recorded) -> Any:
@@ -270,7 +294,7 @@ def gates(reader: RecordReader, drones: list[str]) -> Iterator[GateInputs]:
             is_input = what in ("join", "done", "bye")
         else:
             is_detection = kind == "drone" and what == keys.SIGHTINGS
-            is_input = is_detection or keys.is_command(key) or messages.is_relayed(messages.type_of(key))
+            is_input = is_detection or is_answer(key)
         if is_input:
             wanted.add(key)
     wanted &= reader.topics().keys()

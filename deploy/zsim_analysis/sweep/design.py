@@ -22,7 +22,7 @@ from zsim import __version__
 from zsim.errors import DocumentError, ScenarioError
 from zsim.math.random_streams import stream
 from zsim.scenario import scenario_file
-from zsim.scenario.roles import check_pace
+from zsim.scenario.roles import check_alone, check_pace
 from zsim.scenario.scenario import Scenario
 from zsim.scenario.scenario_file import EXAMPLE, NOTHING, steps_of, whole_path
 from zsim.schema import plugin, yaml_file
@@ -340,6 +340,7 @@ class SweepDesign:
             except DocumentError as error:
                 raise ScenarioError(error.faults) from error
         check_pace(scenario, "lockstep")
+        check_alone(scenario)
         return scenario
 
     def faults(self, progress: Callable[[int, int], None] = lambda run, of: None) -> list[str]:

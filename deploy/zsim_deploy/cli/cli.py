@@ -25,6 +25,7 @@ from zsim_deploy.arguments import HOSTS, POKE, TRANSLATE, endpoint_origin, note,
 from zsim_deploy.cli import (
     board_command,
     bridge_commands,
+    bundle_commands,
     federation_commands,
     fmu_command,
     hosts_commands,
@@ -53,7 +54,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-_FAMILIES = (run_commands, hunt_command, board_command, role_commands, hosts_commands)
+_FAMILIES = (run_commands, bundle_commands, hunt_command, board_command, role_commands, hosts_commands)
 for _family in (*_FAMILIES, federation_commands, bridge_commands, fmu_command):
     app.add_typer(_family.app)
 for _panel, _group in (

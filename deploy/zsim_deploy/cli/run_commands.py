@@ -379,25 +379,6 @@ def export(
 
 
 @app.command(rich_help_panel=opt.RUN)
-def rerun(
-    directory: opt.Recorded,
-    commands_only: Annotated[
-        bool, Option("--commands-only", help="Feed the world all recorded commands; run no agents.")
-    ] = False,
-    trust: opt.Trust = False,
-) -> None:
-    """Fly the run of a record again, from its own inputs, and print whether truth is the same; exit code 0 or 1."""
-    require("rerun", opt.FLIGHT_NEEDS)
-    from zsim.schema import plugin
-    from zsim_analysis.rerun import rerun_record
-
-    with plugin.names_only(not trust):
-        fault = rerun_record(directory, commands_only, say, note)
-    if fault:
-        raise failed(fault)
-
-
-@app.command(rich_help_panel=opt.RUN)
 @opt.listener_options
 def replay(
     who: "Identity",

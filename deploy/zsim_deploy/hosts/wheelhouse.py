@@ -152,9 +152,9 @@ class Wheelhouse:
 
         What builds it is kept, so that the next time no index is asked.
         """
-        checkout = _checkout()
-        source = str(checkout) if checkout else requirement(importlib.metadata.distribution(PROJECT))
-        folder = self._folder / PROJECT / _key([zsim.__version__, _sources(checkout)] if checkout else source)
+        root = checkout()
+        source = str(root) if root else requirement(importlib.metadata.distribution(PROJECT))
+        folder = self._folder / PROJECT / _key([zsim.__version__, _sources(root)] if root else source)
         if not folder.is_dir():
             self._progress(f"building the wheel of {PROJECT}")
             with tempfile.TemporaryDirectory(dir=self._folder) as temporary:
@@ -162,7 +162,7 @@ class Wheelhouse:
                 build = ("wheel", "--no-deps", "--wheel-dir", str(built), source)
                 try:
                     if not await is_kept(self._builders, build, self._progress):
-                        if needs := _description(checkout)["build-system"]["requires"] if checkout else []:
+                        if needs := _description(root)["build-system"]["requires"] if root else []:
                             await pip("download", "--dest", str(self._builders), *needs, progress=self._progress)
                         await pip(*build, "--find-links", str(self._builders), progress=self._progress)
                 except PipError as error:
@@ -230,7 +230,7 @@ def constraints() -> list[str]:
     return sorted(versions)
 
 
-def _checkout() -> Path | None:
+def checkout() -> Path | None:
     """Return the folder from which this very code is imported, if it is a checkout of the project."""
     root = Path(zsim.__file__).resolve().parents[1]
     is_checkout = (root / "pyproject.toml").exists() and _description(root).get("project", {}).get("name") == PROJECT

@@ -21,7 +21,7 @@ from zsim.scenario.scenario import Scenario
 from zsim_deploy import inventory, render
 from zsim_deploy.cli import hosts_commands
 from zsim_deploy.cli.cli import app
-from zsim_deploy.inventory import InventoryFile
+from zsim_deploy.inventory import InventoryFile, own_programs
 from zsim_deploy.render import compose, kubernetes, systemd, write
 
 ROOT = Path(__file__).parents[3]
@@ -226,6 +226,20 @@ def test_a_program_of_the_user_s_own_is_told_of_and_not_started(target: str, tmp
     remarked = [path for path, text in texts.items() if remark in text.splitlines()]
     where = {"systemd": "two/zsim.target", "compose": "two/compose.yaml", "kubernetes": "zsim.yaml"}
     assert remarked == [where[target]]
+
+
+def test_a_program_of_the_scenario_is_told_of_with_its_command(tmp_path: Path) -> None:
+    programs = (
+        "{my.drone1: {command: [fly, '{endpoint}', '{name}']}, watch: {command: [look, '{folder}'], joins: false}}"
+    )
+    own = scenario_file.load(STEP, ["processes.expect=[my.drone1, controller.main]", f"programs={programs}"])
+    there = placed(tmp_path, HOSTS.replace('"estimator.*": [one, two]', '"my.*": two'))
+    joining, watching = own_programs(there, own)
+    assert joining.endswith(": fly tls/192.168.1.21:7448 my.drone1")
+    assert watching.startswith("watch ")
+    assert watching.endswith(": look '{folder}'")
+    assert own_programs(there, own, "two") == [joining]
+    assert own_programs(there, own, "one") == []
 
 
 @ALL

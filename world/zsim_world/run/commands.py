@@ -15,7 +15,7 @@ import msgspec
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Ardrone
 from zsim.contract.run_messages import PRIORITY_MAX, ControlRequest, Fault
-from zsim.runtime.links import NEVER, RADIO, WORLD, distance_between, joins, place_of, total_delay_ns
+from zsim.runtime.links import NEVER, RADIO, WORLD, distance_between, drone_of, joins, place_of, total_delay_ns
 from zsim_world.fleet.external_drones import ExternalDrones
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.run.coordinator import Coordinator
@@ -51,6 +51,7 @@ class CommandIntake:
         self._faults_at = faults_at
         self.queue = CommandQueue(fleet.names)
         self._index = {name: i for i, name in enumerate(fleet.names)}
+        self._drones = frozenset(drone.name for drone in run.scenario.drones)
         self._cluster_of = {drone: cluster.name for cluster in run.scenario.clusters for drone in cluster.drones}
 
     def accept(self, drone: str, kind: str, message: Any) -> bool:
@@ -123,9 +124,11 @@ class CommandIntake:
         if not radios:
             return False
         key, sender = keys.command(drone, command.kind), self._sender(drone, command.source)
+        if drone_of(sender, self._drones) == drone:
+            return False
 
         def distance_m(fault: Fault) -> float | None:
-            place = place_of(sender, fault.parameters["place"], self._position_m)
+            place = place_of(sender, fault.parameters["place"], self._drones, self._position_m)
             return distance_between(self._position_m(drone), place)
 
         return total_delay_ns(radios, self._scenario.seed, WORLD, key, command.message, distance_m) is NEVER

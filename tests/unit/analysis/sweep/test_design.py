@@ -180,6 +180,13 @@ def test_all_faults_are_told_at_once_before_anything_flies() -> None:
     body = {"drones": [{"name": "d1", "position_m": [0, 0, 0], "body": "external"}]}
     with refused(ScenarioError, "d1", "external", "lockstep"):
         make_plan("t.yaml", {"name": "t", "duration_s": 1, **body}, ["seed"], 2)
+    body = {"drones": [{"name": "d1", "position_m": [0, 0, 0]}], "programs": {"my.look": {"command": ["look"]}}}
+    body |= {"processes": {"gating": ["camera"]}}
+    with pytest.raises(ScenarioError) as raised:
+        make_plan("t.yaml", {"name": "t", "duration_s": 1, **body}, ["seed"], 2)
+    gating, programs = raised.value.faults
+    assert has_terms(gating, "processes.gating")
+    assert has_terms(programs, "programs", "my.look")
 
 
 def test_a_fault_of_the_file_is_told_once() -> None:

@@ -85,7 +85,7 @@ def checkout(index: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     """A checkout of a project that needs gadget with its extra agents; there is a wheel of gadget."""
     write_wheel(index, "gadget")
     folder = write_project(tmp_path / "checkout", "zsim", NEEDS)
-    monkeypatch.setattr(wheelhouse, "_checkout", lambda: folder)
+    monkeypatch.setattr(wheelhouse, "checkout", lambda: folder)
     return folder
 
 

@@ -11,7 +11,7 @@ from zsim.contract import keys
 from zsim.contract.agent_messages import AgentMessage
 from zsim.contract.flight_messages import Estimate, Mode, Status
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.messages import ClusterInfo, Imu, Info, Origin, encode
+from zsim.contract.messages import ClusterInfo, DroneInfo, Imu, Info, Origin, encode
 from zsim.contract.run_messages import ControlRequest, Fault, Faults
 from zsim.contract.snapshot import pack, unpack
 from zsim.runtime.agent import Agent, Output
@@ -26,7 +26,8 @@ ME, OTHER = "controller.main", "estimator.d1"
 ESTIMATE, STATUS = keys.estimate("d1"), keys.status("d1")
 ZEROS = (0.0, 0.0, 0.0)
 RUN = Info(
-    0, 0, 1, "r", "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, Origin(*ZEROS), (),
+    0, 0, 1, "r", "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, Origin(*ZEROS),
+    (DroneInfo("d1", "ardrone2"), DroneInfo("d2", "ardrone2")),
     (ClusterInfo("main", ("d1", "d2")),), "", "", "", "",
 )  # fmt: skip
 Given = tuple[str, Any]
@@ -223,7 +224,27 @@ def test_a_radio_is_not_between_a_drone_and_its_own_estimator():
 
 def test_an_unknown_place_loses_nothing():
     assert len(gates(links(radio()), 5, status)) == 5  # no estimate has come yet
-    assert place_of("controller.main", {"controller.main": "d9"}, {}.get) is None
+    assert place_of("controller.main", {"controller.main": "d9"}, ("d1",), {}.get) is None
+
+
+@pytest.mark.parametrize("process", ["estimator.d2", "reference.d2", "pilot.d2"])
+def test_a_radio_is_on_the_drone_after_which_a_process_is_named(process: str) -> None:
+    """d1 is 1000 m from the origin and beside d2; d2 hears itself wherever it is."""
+    far, place = (1000.0, 0.0, 0.0), {"d2": (1000.0, 1.0, 0.0)}.get
+    assert place_of(process, {}, ("d1", "d2"), place) == (1000.0, 1.0, 0.0)
+    assert place_of(process, {process: [5, 0, 0]}, ("d1", "d2"), place) == [5, 0, 0]
+    made = links(fault("radio", "world", range_m=50, spread_m=5), names=(process,))
+    for gate in (1, 2, 3):
+        handed = made.delivered(gate * GATE_NS, [estimate(gate, far), estimate(gate, far, drone="d2")])
+        assert len(handed) == 2
+    assert made.delivered(4 * GATE_NS, [estimate(4, drone="d1"), estimate(4, far, drone="d2")]) == [
+        estimate(4, far, drone="d2")
+    ]
+
+
+@pytest.mark.parametrize("process", ["controller.d2", "camera.d2", "console.1", "pilot.nobody"])
+def test_what_is_on_no_board_is_at_the_origin(process: str) -> None:
+    assert place_of(process, {}, ("d1", "d2"), {"d2": (1000.0, 1.0, 0.0)}.get) == ZEROS
 
 
 def world() -> World:

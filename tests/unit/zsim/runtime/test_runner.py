@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 from fake_link import UNANSWERED, FakeLink
 from msgspec.structs import replace
@@ -528,17 +529,33 @@ def test_it_publishes_a_snapshot_after_a_gate_at_intervals():
 class Opaque(Counter):
     """A counter of which the state is none of plain values."""
 
-    def snapshot(self) -> State:
-        return {"count": object()}
+    def __init__(self, state: Any) -> None:
+        super().__init__()
+        self.state = state
+
+    def snapshot(self) -> Any:
+        return self.state
 
 
-def test_one_whose_state_cannot_be_packed_says_so_once_and_goes_on():
+@pytest.mark.parametrize(
+    ("state", "terms"),
+    [
+        ({"count": object()}, ("count", "object")),
+        ({"a": {"b": [1, {"c": 1j}]}}, ("a.b[1].c", "complex")),
+        ({3: 1}, ("map", "name")),
+        ({"seen": np.array(["x"])}, ("seen", "<U1")),
+        ({"big": 1 << 70}, ("big", "int")),
+        ([1, 2], ("[1, 2]",)),
+    ],
+)
+def test_a_state_of_a_user_s_that_is_not_plain_ends_it_with_class_field_and_gate(state: Any, terms: Any) -> None:
     world = World(estimates(range(END + 1)))
-    said: list[str] = []
-    Runner(world, info(), Opaque(), say=said.append, snapshot_ns=GATE_NS).run()  # type: ignore[arg-type]
-    assert world.published_on(keys.process(ME, "snapshot")) == []
-    assert world.gates_done()[-1] == END
-    assert len([line for line in said if has_terms(line, ME, "object", "snapshots")]) == 1
+    with pytest.raises(UserCodeError) as raised:
+        Runner(world, info(), Opaque(state), snapshot_ns=3 * GATE_NS).run()  # type: ignore[arg-type]
+    line = str(raised.value)
+    assert has_terms(line, ME, "0.00", f"{Opaque.__module__}:Opaque.snapshot", *terms), line
+    (bye,) = world.published_on(keys.process(ME, "bye"))
+    assert (bye.reason, bye.failed) == (line, True)
 
 
 class Failing(Judge):

@@ -1,0 +1,230 @@
+"""The file of a bundle: a zip archive, the same bytes for the same content, and checked whole before any of it is used.
+
+Members are stored, not compressed: what zlib makes of them depends on its version, and a stored member cannot be larger
+than the file that holds it. What a bundle holds is in `bundle.json`, with the hash of each member and, as `seal`, of
+itself. That finds what was changed, by accident or by hand; it is no signature.
+"""
+
+import hashlib
+import re
+import shutil
+import stat
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import msgspec
+from msgspec import Struct
+
+from zsim.errors import OTHER_OUT, RunError, file_fault
+from zsim.output_folder import temporary_folder
+
+SUFFIX = ".zsim"
+MANIFEST, README, SCENARIO, LOCK = "bundle.json", "README.md", "scenario.yaml", "lock.txt"
+RECORD, GATES, RESULTS = "run.mcap", "gates.csv", "results.json"
+MODULES, FIGURES = "modules", "figures"  # folders
+FORMAT = 1
+MEMBERS_MAX = 5000
+MANIFEST_BYTES_MAX = 4 << 20
+NAME_MAX = 200  # characters of a member's name
+PIECE_BYTES = 1 << 20
+DATE = (1980, 1, 1, 0, 0, 0)  # of every member: the first that a zip archive can state
+MODE = (stat.S_IFREG | 0o644) << 16
+UNIX = 3  # as the system that made it, wherever that was
+PART = re.compile(r"\w[\w.+@ -]*(?<![ .])")  # of a member's path: no `..`, no drive, nothing hidden
+
+
+class File(Struct, frozen=True, forbid_unknown_fields=True):
+    """A member of a bundle."""
+
+    sha256: str
+    bytes: int
+
+
+class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What a bundle holds and expects, `bundle.json`."""
+
+    format: int
+    zsim: str  # version that flew it
+    commit: str  # of zsim when it was bundled, empty if that is not known
+    name: str  # of the scenario
+    seed: int
+    duration_s: float
+    scenario_sha256: str
+    truth_sha256: str
+    outputs: dict[str, str]  # SHA-256 of what the agents published, by key, as OutputHashes; empty: none are run again
+    until_ns: int  # last gate whose outputs are compared: what is answered to later ones may not be on record
+    own_code: list[str]  # classes, functions and modules of users that the scenario names
+    needs: list[str]  # NAME==VERSION of packages that these import beside those of zsim
+    not_run_again: str  # why agents are not run again but commands are read from the record; empty if they are
+    fingerprints: list[str]  # of the world and its agents
+    machine: dict[str, str]  # on which it was flown; empty where it was bundled on another
+    files: dict[str, File]  # all other members, by path
+    seal: str = ""  # SHA-256 of the manifest as text with this field empty
+
+    def sealed(self) -> "Manifest":
+        blank = msgspec.structs.replace(self, seal="")
+        return msgspec.structs.replace(self, seal=hashlib.sha256(blank.text()).hexdigest())
+
+    def text(self) -> bytes:
+        return msgspec.json.format(msgspec.json.encode(self, order="sorted"), indent=2) + b"\n"
+
+
+class WrittenBundle(NamedTuple):
+    path: Path
+    size_bytes: int
+    sha256: str
+    manifest: Manifest
+
+
+def write_bundle(out: Path, manifest: Manifest, members: Mapping[str, Path | bytes], force: bool) -> WrittenBundle:
+    """Write a bundle.
+
+    Args:
+        manifest: without `files`.
+        members: content, or the file that has it, by path in the bundle.
+        force: whether a file that is there is replaced.
+
+    Raises:
+        RunError: it is there, or cannot be written.
+    """
+    if out.exists() and not force:
+        raise RunError(f"{out}: is there already; --force replaces it, or {OTHER_OUT}")
+    files = {name: File(*_hashed(content)) for name, content in sorted(members.items())}
+    sealed = msgspec.structs.replace(manifest, files=files).sealed()
+    part = out.with_name(f".{out.name}.part")
+    with file_fault(out, "cannot be written", OTHER_OUT):
+        try:
+            with zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as archive:
+                ordered = {README: members[README], MANIFEST: sealed.text(), **dict(sorted(members.items()))}
+                for name, content in ordered.items():
+                    entry = zipfile.ZipInfo(name, DATE)
+                    entry.create_system, entry.external_attr = UNIX, MODE
+                    entry.file_size = len(content) if isinstance(content, bytes) else content.stat().st_size
+                    with archive.open(entry, "w") as target:
+                        for piece in _pieces(content):
+                            target.write(piece)
+            part.replace(out)
+        finally:
+            part.unlink(missing_ok=True)
+    sha256, size_bytes = _hashed(out)
+    return WrittenBundle(out, size_bytes, sha256, sealed)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[tuple[Manifest, Path]]:
+    """Check a bundle and yield its manifest and a folder with its members, which is removed afterwards.
+
+    Raises:
+        RunError: it is no bundle, or was changed: the member, what was found, what must be there.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            manifest = _manifest(path, archive)
+            folder = temporary_folder("bundle-")
+            for name, expected in manifest.files.items():
+                _extract(path, archive, name, expected, folder)
+    except (zipfile.BadZipFile, NotImplementedError, EOFError, UnicodeError) as error:
+        raise RunError(
+            f"{path}: is no bundle or was damaged ({error}); must be a file that `zsim bundle` made"
+        ) from error
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read ({error.strerror})") from error
+    try:
+        yield manifest, folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def is_bundle(path: Path) -> bool:
+    return path.is_file() and (path.suffix == SUFFIX or zipfile.is_zipfile(path))
+
+
+def _manifest(path: Path, archive: zipfile.ZipFile) -> Manifest:
+    """Return the manifest of an archive whose members are all in it, plain files, and as large as it says."""
+    entries = archive.infolist()
+    if len(entries) > MEMBERS_MAX:
+        raise RunError(f"{path}: has {len(entries)} members; must have <= {MEMBERS_MAX}")
+    names: set[str] = set()
+    for entry in entries:
+        if fault := _fault_of(entry, names):
+            raise RunError(f"{path}: member {entry.filename[:NAME_MAX]!r} {fault}")
+        names.add(entry.filename.casefold())
+    size, stated = path.stat().st_size, sum(entry.file_size for entry in entries)
+    if stated > size:
+        raise RunError(f"{path}: its members have {stated} bytes, and the file {size}; must not overlap")
+    if MANIFEST.casefold() not in names:
+        raise RunError(f"{path}: holds no {MANIFEST}; must be a file that `zsim bundle` made")
+    head = archive.getinfo(MANIFEST)
+    if head.file_size > MANIFEST_BYTES_MAX:
+        raise RunError(f"{path}: {MANIFEST} has {head.file_size} bytes; must have <= {MANIFEST_BYTES_MAX}")
+    text = archive.read(head)
+    try:
+        version: Any = msgspec.json.decode(text)
+        if isinstance(version, dict) and version.get("format", FORMAT) != FORMAT:
+            found = version["format"]
+            raise RunError(f"{path}: {MANIFEST} is of format {found!r:.40}; must be {FORMAT}, or take a newer zsim")
+        manifest = msgspec.json.decode(text, type=Manifest)
+    except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
+        raise RunError(f"{path}: {MANIFEST} cannot be read ({error}); must be as `zsim bundle` wrote it") from error
+    if manifest.sealed().seal != manifest.seal:
+        raise RunError(f"{path}: was changed: {MANIFEST} has another content than its seal says")
+    held = {entry.filename for entry in entries} - {MANIFEST}
+    if others := sorted(held ^ set(manifest.files)):
+        fault = f"is not in {MANIFEST}" if others[0] in held else f"is missing, and in {MANIFEST}"
+        raise RunError(f"{path}: was changed: {others[0]} {fault}")
+    for name in (README, SCENARIO, LOCK):
+        if name not in held:
+            raise RunError(f"{path}: holds no {name}; must be a file that `zsim bundle` made")
+    return manifest
+
+
+def _fault_of(entry: zipfile.ZipInfo, names: set[str]) -> str:
+    """Return what is wrong with a member; empty if nothing is."""
+    name, kind = entry.filename, stat.S_IFMT(entry.external_attr >> 16)
+    parts = name.split("/")
+    if len(name) > NAME_MAX or not all(PART.fullmatch(part) for part in parts) or name != entry.orig_filename:
+        return "has a name that a bundle has not; must be a relative path below it"
+    if name.casefold() in names:
+        return "is there twice; must be there once"
+    if kind not in (0, stat.S_IFREG) or entry.is_dir():
+        return "is no plain file; must be one"
+    if entry.flag_bits & 1:
+        return "is encrypted; must be plain"
+    if entry.compress_type != zipfile.ZIP_STORED or entry.compress_size != entry.file_size:
+        return "is compressed; must be stored, as `zsim bundle` wrote it"
+    return ""
+
+
+def _extract(path: Path, archive: zipfile.ZipFile, name: str, expected: File, folder: Path) -> None:
+    target = folder / name
+    target.parent.mkdir(parents=True, exist_ok=True)
+    digest, size = hashlib.sha256(), 0
+    with archive.open(name) as source, target.open("xb") as file:
+        while piece := source.read(PIECE_BYTES):
+            digest.update(piece)
+            file.write(piece)
+            size += len(piece)
+    if (digest.hexdigest(), size) != (expected.sha256, expected.bytes):
+        raise RunError(f"{path}: was changed: {name} has another content than {MANIFEST} says")
+
+
+def _hashed(content: Path | bytes) -> tuple[str, int]:
+    """Return the SHA-256 and the size of a content."""
+    digest, size = hashlib.sha256(), 0
+    for piece in _pieces(content):
+        digest.update(piece)
+        size += len(piece)
+    return digest.hexdigest(), size
+
+
+def _pieces(content: Path | bytes) -> Iterator[bytes]:
+    if isinstance(content, bytes):
+        yield content
+        return
+    file: IO[bytes]
+    with content.open("rb") as file:
+        while piece := file.read(PIECE_BYTES):
+            yield piece

@@ -1,0 +1,161 @@
+"""Flies a bundle again, and compares what comes out with what it says."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from zsim import __version__
+from zsim.contract import keys
+from zsim.contract.fingerprint import fingerprint
+from zsim.contract.framing import GateMessages
+from zsim.errors import RunError
+from zsim.record import RecordReader
+from zsim.runtime.progress import PERIOD_S, Screen
+from zsim.runtime.rate_limit import RateLimit
+from zsim.scenario import scenario_file
+from zsim.scenario.faults import listed
+from zsim.scenario.scenario import Scenario
+from zsim.schema import plugin
+from zsim_agents.hosting import agents_of
+from zsim_analysis.bundle import bundle_file as names
+from zsim_analysis.bundle.bundle_file import Manifest, opened
+from zsim_analysis.bundle.gate_digests import GateDigests, first_difference
+from zsim_analysis.bundle.make_bundle import machine
+from zsim_analysis.bundle.own_code import other_versions, pins_of
+from zsim_analysis.in_process import InProcessFlight
+from zsim_analysis.reading import recorded_run
+from zsim_analysis.reading.output_hashes import OutputHashes, content_of
+from zsim_analysis.rerun import rerun_record
+
+Say = Callable[[str], None]
+SHOWN = 8  # differences of two machines, in a line
+
+
+def rerun_bundle(path: Path, commands_only: bool, say: Say, note: Say) -> str:
+    """Fly a bundle again; return how truth or an agent's outputs differ, empty if all is the same to the bit.
+
+    Args:
+        commands_only, say, note: as of `rerun_record`.
+
+    Raises:
+        RunError: it is no bundle, was changed, or names code of its own, which may not be run.
+        ScenarioError, RecordError: this version cannot read its scenario or its record.
+    """
+    with opened(path) as (manifest, folder):
+        scenario = check_content(path, manifest, folder)
+        lock = pins_of((folder / names.LOCK).read_text("utf-8"), f"{path}: {names.LOCK}")
+        if others := other_versions([*lock, *manifest.needs]):
+            note(f"packages differ: {_shown(others)}; --install makes an environment with those of the bundle")
+        if (folder / names.RECORD).exists():
+            outputs = None if commands_only or manifest.not_run_again else manifest.outputs
+            fault = rerun_record(folder / names.RECORD, commands_only, say, note, outputs)
+        elif commands_only:
+            raise RunError(f"{path}: has no {names.RECORD}, whose commands would be read; leave --commands-only out")
+        else:
+            if manifest.zsim != __version__:
+                note(f"flown by zsim {manifest.zsim}, flown again by {__version__}: the same bits are not promised")
+            fault = _fly_again(manifest, folder, scenario, say)
+        if fault:
+            _tell_machines(manifest, note)
+        else:
+            say(f"the same to the bit: {manifest.name}, {manifest.duration_s:g} s, {len(scenario.drones)} drones")
+        return fault
+
+
+def check_content(path: Path, manifest: Manifest, folder: Path) -> Scenario:
+    """Return the scenario of a bundle, which is also that of its record, and may be flown here.
+
+    Raises:
+        RunError: it is another than the manifest says, or names code that may not be run.
+    """
+    try:
+        text = (folder / names.SCENARIO).read_text("utf-8")
+    except UnicodeDecodeError as error:
+        raise RunError(f"{path}: {names.SCENARIO} is no text in UTF-8 ({error.reason})") from error
+    if scenario_file.sha256(text) != manifest.scenario_sha256:
+        raise RunError(f"{path}: was changed: {names.SCENARIO} has another hash than {names.MANIFEST} says")
+    record = folder / names.RECORD
+    if record.exists():
+        with RecordReader(record) as reader:
+            found = reader.last(keys.INFO)
+        info = recorded_run.decode_or_none(found) if found else None
+        if info is None or info.scenario != text:
+            raise RunError(f"{path}: was changed: {names.RECORD} is not of its {names.SCENARIO}")
+    elif not (folder / names.GATES).exists():
+        raise RunError(f"{path}: holds neither {names.RECORD} nor {names.GATES}; must hold one of them")
+    scenario = scenario_file.from_text(text)
+    if (own := scenario.own_code()) and not plugin.may_import():
+        raise RunError(f"{path}: its scenario names {listed(own)}: code that a rerun runs, and only with --trust")
+    return scenario
+
+
+def _fly_again(manifest: Manifest, folder: Path, scenario: Scenario, say: Say) -> str:
+    """Fly the scenario of a bundle without a record; return how it differs."""
+    plugin.search(folder / names.MODULES)
+    flight = InProcessFlight(scenario)
+    say(f"run again: world, {', '.join(agents_of(scenario))}")
+    with Screen(scenario.duration_s) as screen:
+        watch = _Watch(flight, manifest, screen)
+        flight.run([watch])
+    sha256, outputs = flight.world.result()["truth_sha256"], watch.hashes.hexdigests()
+    differing = [key for key in sorted({*manifest.outputs, *outputs}) if manifest.outputs.get(key) != outputs.get(key)]
+    if sha256 == manifest.truth_sha256 and not differing:
+        say(f"truth_sha256 is the same: {sha256}")
+        say(f"the agents' outputs are the same, on {len(outputs)} keys")
+        return ""
+    what = "truth differs" if sha256 != manifest.truth_sha256 else f"outputs differ on {listed(differing)}"
+    try:
+        first = first_difference((folder / names.GATES).read_bytes(), watch.digests.csv())
+    except (ValueError, UnicodeError) as error:
+        raise RunError(f"{names.GATES} cannot be read ({error}); must be as `zsim bundle` wrote it") from error
+    if first is None:
+        return f"{what}, in the last gates, which are not in {names.GATES}"
+    t_ns, key = first
+    gate = f"gate {t_ns // flight.info.gate_ns} at {t_ns / 1e9:.2f} s"
+    return f"{what}, first {key} at {gate}; which field is not known without a record"
+
+
+class _Watch:
+    """Hashes what a flight publishes, as `make_bundle` does with what is on record."""
+
+    def __init__(self, flight: InProcessFlight, manifest: Manifest, screen: Screen) -> None:
+        self.hashes, self.digests = OutputHashes(manifest.until_ns), GateDigests(manifest.until_ns)
+        self._truth = {keys.truth(drone.name) for drone in flight.info.drones}
+        self._screen, self._throttle, self._start_s = screen, RateLimit(PERIOD_S), time.monotonic()
+
+    def add_message(self, key: str, message: Any, wall_ns: int) -> None:
+        """Take a message of anybody."""
+        if recorded_run.is_answer(key):
+            self.hashes.add(key, message.t_ns, content := content_of(message))
+            self.digests.add(key, message.t_ns, content)
+
+    def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
+        """Take the truth of a gate."""
+        if self._throttle.spend():
+            rate = gate.t_ns / 1e9 / max(1e-9, time.monotonic() - self._start_s)
+            self._screen.clock({"t_s": gate.t_ns / 1e9, "rate": rate, "state": "again", "phase": "", "waiting_for": []})
+        for (key, payload), t_ns in zip(gate.pairs, gate.stamps.tolist(), strict=True):
+            if key in self._truth:
+                self.digests.add(key, t_ns, payload)
+
+
+def _tell_machines(manifest: Manifest, note: Say) -> None:
+    """Say what differs in the machine on which it was flown and this one."""
+    here = machine()
+    if not manifest.machine:
+        prints = f"of numeric fingerprint {', '.join(manifest.fingerprints)}, here {fingerprint()}"
+        note(f"the machines: it is not known on which it was flown, {prints}")
+    elif differing := [
+        f"{name} {manifest.machine.get(name, 'none')}, here {here.get(name, 'none')}"
+        for name in sorted({*manifest.machine, *here})
+        if manifest.machine.get(name) != here.get(name)
+    ]:
+        note(f"the machines differ: {_shown(differing)}")
+    else:
+        note("the machines do not differ in anything that is known of them")
+
+
+def _shown(differing: list[str]) -> str:
+    more = len(differing) - SHOWN
+    return "; ".join(differing[:SHOWN]) + (f"; and {more} more" if more > 0 else "")

@@ -1,0 +1,349 @@
+"""Makes the bundle of a run from its record: no absolute path and no name of a host is in it."""
+
+import csv
+import io
+import platform
+import re
+import socket
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import msgspec
+from msgspec import UNSET
+
+import zsim
+from zsim import __version__
+from zsim.contract import flight_messages, keys, messages
+from zsim.contract.fingerprint import fingerprint, parts
+from zsim.errors import RunError
+from zsim.output_folder import record_at, temporary_folder
+from zsim.record import RecordReader, RecordWriter
+from zsim.record.completeness import record_completeness
+from zsim.scenario import scenario_file
+from zsim.scenario.faults import listed
+from zsim.schema import plugin, yaml_file
+from zsim_analysis.bundle import bundle_file as names
+from zsim_analysis.bundle.bundle_file import Manifest, WrittenBundle, write_bundle
+from zsim_analysis.bundle.gate_digests import GateDigests
+from zsim_analysis.bundle.own_code import locked, own_modules
+from zsim_analysis.reading import recorded_run
+from zsim_analysis.reading.output_hashes import OutputHashes, content_of
+from zsim_analysis.reading.recorded_run import RecordedAgents, RecordedRun
+from zsim_analysis.report.make_report import figures
+from zsim_analysis.report.summary import RunSummary, judge
+from zsim_world.run.coordinator import FLIGHT_REQUESTS
+
+PATH = re.compile(r"(?<![\w./~-])(?:[A-Za-z]:)?[/\\](?:[^\s/\\:;,'\"()]+[/\\])+")  # the folders of an absolute path
+FREE_TEXT = ("text", "reason", "error", "failure")  # fields in which a message says anything
+OF_THE_WALL_CLOCK = (
+    *("run_id", "date", "changed", "versions", "fingerprint", "mode", "real_time_factor", "wall_s", "command_age_ms"),
+    *("deadlines", "deadline_misses", "deadline_misses_by", "links", "participants", "events", "events_left_out"),
+    *("record", "notes"),
+)  # fields of a summary that say how it was flown, not what
+
+
+def make_bundle(
+    place: Path, out: Path | None, with_record: bool, force: bool, note: Callable[[str], None]
+) -> WrittenBundle:
+    """Write the bundle of the run in a folder, or of a record.
+
+    Args:
+        out: the file; None for the scenario's name in the working folder.
+        with_record: whether the record is in it; without, it must be known that the scenario alone gives the flight.
+        note: takes lines on what it lacks.
+
+    Raises:
+        RunError: the record is not that of a whole flight that can be flown again, or the scenario names what a bundle
+            cannot hold; or the file cannot be written.
+    """
+    record = record_at(place)
+    whole = record_completeness(record)
+    if not whole.complete:
+        raise RunError(f"{place}: the record is {whole}; must be that of a whole flight")
+    with recorded_run.open_run(record) as run:
+        _check(place, run)
+        agents = recorded_run.recorded_agents(run.reader, run.info, run.scenario)
+        expected = _Expected(run, agents)
+        if not with_record and (reason := agents.why_not or expected.others):
+            raise RunError(f"{place}: {reason}: only the record has that; leave --no-record out")
+        own = run.scenario.own_code()
+        modules = own_modules(own)
+        lock, needs = locked(modules.packages)
+        if lacking := sorted(modules.packages - {each.partition("==")[0].replace("-", "_") for each in needs}):
+            note(f"{', '.join(lacking)}: not from an index, or named otherwise there; whoever flies it must have it")
+        hosts = _Hosts(run.reader)
+        folder = temporary_folder("bundle-")
+        members: dict[str, Path | bytes] = {names.SCENARIO: run.info.scenario.encode(), **modules.files}
+        members[names.LOCK] = "".join(f"{line}\n" for line in lock).encode()
+        copied = folder / names.RECORD
+        _copy_record(run.reader, copied, hosts, bool(modules.files), note)
+        if with_record:
+            members[names.RECORD] = copied
+        else:
+            members[names.GATES] = expected.digests.csv()
+        flown_here = fingerprint() == run.info.fingerprint and hosts.are_only(socket.gethostname())
+        if not flown_here:
+            note("flown on another machine, or by another version, than it is bundled: it is not said on which")
+        _add_figures(members, copied)
+        manifest = Manifest(
+            format=names.FORMAT,
+            zsim=run.info.version,
+            commit=zsim.commit() if run.info.version == __version__ else "",
+            name=run.scenario.name,
+            seed=run.scenario.seed,
+            duration_s=run.scenario.duration_s,
+            scenario_sha256=run.info.scenario_sha256,
+            truth_sha256=agents.truth_sha256 or "",
+            outputs=expected.hashes.hexdigests(),
+            until_ns=recorded_run.answered_until_ns(run.reader, run.info),
+            own_code=own,
+            needs=needs,
+            not_run_again=agents.why_not,
+            fingerprints=sorted({run.info.fingerprint, *agents.fingerprints}),
+            machine=machine() if flown_here else {},
+            files={},
+        )
+        members[names.README] = _readme(manifest, members).encode()
+        return write_bundle(out or Path(f"{run.scenario.name}{names.SUFFIX}"), manifest, members, force)
+
+
+def machine() -> dict[str, str]:
+    """Return what tells this machine from others, without its name: that of the fingerprint, and more."""
+    libc = "-".join(filter(None, platform.libc_ver()))
+    more = {
+        "system": platform.system(),
+        "machine": platform.machine(),
+        "python": platform.python_version(),
+        "libc": libc,
+    }
+    return {**more, "processor": _processor(), **parts()}
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text("ascii", "replace").splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
+
+
+def _check(place: Path, run: RecordedRun) -> None:
+    """Refuse what cannot be flown again elsewhere."""
+    reader, info, scenario = run
+    if reader.damaged:
+        raise RunError(f"{place}: the record is damaged: {reader.damaged[0]}; must be whole")
+    if info.replay_of:
+        raise RunError(f"{place}: is the record of a replay; give that of run {info.replay_of}")
+    if external := scenario.external():
+        raise RunError(
+            f"{place}: has drones whose bodies are external ({listed(external)}); they cannot be flown again"
+        )
+    if scenario_file.sha256(info.scenario) != info.scenario_sha256:
+        raise RunError(f"{place}: its scenario is not the one whose hash it has; must be as the world recorded it")
+    for path, value in _texts(yaml_file.value(info.scenario)):
+        if PATH.match(value):
+            raise RunError(
+                f"{place}: {path} is {value!r}, an absolute path, which no other machine has; must be relative"
+            )
+
+
+def _texts(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the texts in a document, with their paths."""
+    if isinstance(value, str):
+        yield path, value
+    elif isinstance(value, dict):
+        for name, each in value.items():
+            yield from _texts(each, f"{path}.{name}".lstrip("."))
+    elif isinstance(value, list):
+        for index, each in enumerate(value):
+            yield from _texts(each, f"{path}[{index}]")
+
+
+class _Expected:
+    """What flying a record again must give: `hashes` of the agents' outputs, and `digests` of all keys, gate by gate.
+
+    `others` says which inputs of the flight were none of the scenario's; empty if there were none.
+    """
+
+    def __init__(self, run: RecordedRun, agents: RecordedAgents) -> None:
+        reader, info, scenario = run
+        until_ns = recorded_run.answered_until_ns(reader, info)
+        self.hashes, self.digests = OutputHashes(until_ns), GateDigests(until_ns)
+        senders: set[str] = {"a request to a controller"} if agents.requests else set()
+        for gate in recorded_run.gates(reader, [drone.name for drone in scenario.drones]):
+            for recorded in gate.inputs:
+                message = recorded_run.decode_or_none(recorded)
+                if recorded.key == keys.EVENT:
+                    if message is not None and message.kind == "control" and message.subject in FLIGHT_REQUESTS:
+                        senders.add(f"{message.subject} by {message.source}")
+                elif message is not None and recorded_run.is_answer(recorded.key):
+                    sender = recorded_run.sender_of(recorded.key, message)
+                    if sender in agents.names:
+                        self.hashes.add(recorded.key, recorded.t_ns, content := content_of(message))
+                        self.digests.add(recorded.key, recorded.t_ns, content)
+                    else:
+                        senders.add(f"outputs of {sender}")
+                elif isinstance(message, flight_messages.Sightings):
+                    senders.add(f"sightings of {message.source}")
+            for drone, payload in gate.truth.items():
+                self.digests.add(keys.truth(drone), gate.t_ns, payload)
+        if scenario.own_programs or scenario.gates("camera"):
+            senders.add("what programs or cameras did")
+        ended_ns = until_ns + info.gate_ns + info.command_delay_ns
+        if ended_ns + info.gate_ns <= scenario.duration_s * 1e9:
+            senders.add(f"an end before its time, after {ended_ns / 1e9:g} of {scenario.duration_s:g} s")
+        self.others = f"the flight had {', '.join(sorted(senders))}" if senders else ""
+
+
+class _Hosts:
+    """The hosts of a run, and what stands in a bundle for their names."""
+
+    def __init__(self, reader: RecordReader) -> None:
+        joins = (key for key in reader.topics() if keys.matches("process/*/join", key))
+        found = (recorded_run.decode_or_none(each) for each in reader.messages(set(joins), by_time=False))
+        self._names = dict.fromkeys(join.host for join in found if join is not None)
+        self._stands_for = {name: f"host{count}" for count, name in enumerate(self._names, start=1)}
+        spelled = "|".join(re.escape(name) for name in sorted(self._names, key=len, reverse=True) if name)
+        self._pattern = re.compile(rf"(?<![\w.-])({spelled})(?![\w-])") if spelled else None
+
+    def are_only(self, name: str) -> bool:
+        return set(self._names) == {name}
+
+    def removed(self, value: Any, field: str = "") -> Any:
+        """Return a part of a message without names of hosts and without folders."""
+        if isinstance(value, dict):
+            return {name: self.removed(each, str(name)) for name, each in value.items()}
+        if isinstance(value, list):
+            return [self.removed(each, field) for each in value]
+        if not isinstance(value, str):
+            return value
+        if field == "host":
+            return self._stands_for.setdefault(value, f"host{len(self._stands_for) + 1}")
+        if field in FREE_TEXT:
+            text = PATH.sub("", value)
+            return self._pattern.sub(lambda found: self._stands_for[found[0]], text) if self._pattern else text
+        return value
+
+
+def _copy_record(
+    reader: RecordReader, into: Path, hosts: _Hosts, has_modules: bool, note: Callable[[str], None]
+) -> None:
+    """Copy a record without names of hosts and folders; what drones and agents have published stays as it is."""
+    own_host = socket.gethostname().encode()
+    told: set[str] = set()
+    with RecordWriter(into) as writer:
+        for key, payload, t_ns, wall_ns in reader.messages(by_time=False):
+            kind, _, what = keys.parts(key)
+            if key == keys.INFO:
+                payload = _without_folders(payload, has_modules)
+            elif kind in ("clock", "world", "process") and key != keys.FAULTS and what not in ("done", "snapshot"):
+                try:
+                    content = msgpack.unpackb(payload)
+                except (ValueError, msgpack.UnpackException):
+                    content = None
+                cleaned = hosts.removed(content)
+                payload = payload if cleaned == content else msgpack.packb(cleaned) or b""
+            elif len(own_host) > 3 and key not in told and own_host in payload:
+                told.add(key)
+                note(f"{key}: has the name of this machine, and is in the bundle as it is")
+            writer.add(key, payload, messages.encoding(key), t_ns, wall_ns)
+
+
+def _without_folders(payload: bytes, has_modules: bool) -> bytes:
+    info = messages.decode(keys.INFO, payload)
+    changed = info.changed if info.changed is UNSET else tuple(PATH.sub("", each) for each in info.changed)
+    folders = (names.MODULES,) if has_modules else UNSET
+    return messages.encode(msgspec.structs.replace(info, module_folders=folders, changed=changed))
+
+
+# Figures, results, README
+
+
+def _add_figures(members: dict[str, Path | bytes], record: Path) -> None:
+    """Add the figures of the report, what is drawn in each as a table, and the numbers of the summary."""
+    flight, formations, summary = judge(record, answers=True)
+    for figure in figures(flight, formations, summary):
+        members[f"{names.FIGURES}/{figure.name}"] = figure.png()
+        members[f"{names.FIGURES}/{Path(figure.name).stem}.csv"] = _drawn(figure.drawing)
+    members[names.RESULTS] = _results(summary)
+
+
+def _drawn(drawing: Any) -> bytes:
+    """Return the curves of a figure as a table: panel, curve, x, y."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(["panel", "curve", "x", "y"])
+    for number, axes in enumerate(drawing.axes):
+        panel = axes.get_ylabel() or number
+        for count, curve in enumerate(axes.lines):
+            label = curve.get_label()
+            name = str(count) if label.startswith("_") else label
+            writer.writerows([panel, name, f"{x:.9g}", f"{y:.9g}"] for x, y in zip(*curve.get_data(), strict=True))
+    return file.getvalue().encode()
+
+
+def _results(summary: RunSummary) -> bytes:
+    kept = {name: value for name, value in msgspec.to_builtins(summary).items() if name not in OF_THE_WALL_CLOCK}
+    return msgspec.json.format(msgspec.json.encode(kept, order="sorted"), indent=2) + b"\n"
+
+
+README = """# {name}
+
+A flight of zsim, a co-simulator of drone formations, in one file: a zip archive, which any tool opens.
+
+To fly it again, and to be told whether every bit is the same, with zsim {zsim}{commit}:
+
+    zsim rerun FILE{trust}
+
+`--install` makes an environment with the versions of packages in `{lock}` first. A file that was changed is refused.
+
+| | |
+|---|---|
+| scenario | `{scenario}`, as it was flown: {duration_s:g} s, seed {seed} |
+| SHA-256 of the truth of all drones | `{truth_sha256}` |
+| SHA-256 of the agents' outputs, by key | in `{manifest}` |
+| flown on | {machine} |
+
+| file | |
+|---|---|
+{files}
+
+{code}
+"""
+WHAT = {
+    names.SCENARIO: "the scenario, with all defaults and the seed",
+    names.LOCK: "versions of the packages with which it was bundled",
+    names.RECORD: "every message of the flight: MCAP, opened by `zsim report`, Foxglove, or any MCAP library",
+    names.GATES: "in place of the record: a check sum of each key at each gate, by which a difference is found",
+    names.RESULTS: "errors of the formation, separations, and how the flight fell short of its plan",
+    names.FIGURES: "the figures of the report, each with the curves that are drawn in it as a table",
+    names.MODULES: "the scenario's own Python modules: code that flying it again runs",
+    names.MANIFEST: "what is in this file, with the SHA-256 of each part, and what flying it again must give",
+}
+
+
+def _readme(manifest: Manifest, members: Mapping[str, Any]) -> str:
+    there = dict.fromkeys(name.partition("/")[0] for name in sorted([*members, names.MANIFEST]))
+    own = f"It names code of its own ({', '.join(manifest.own_code)}), which is run only with `--trust`: read it first."
+    made_for = [name for name in members if Path(name).name.startswith(plugin.MADE)]
+    if made_for:
+        own += " Classes of a notebook are in it as Python pickled them: only that version of Python reads them."
+    if manifest.not_run_again:
+        own += f"\n\nIts agents are not run again but their commands are read: {manifest.not_run_again}."
+    return README.format(
+        name=manifest.name,
+        zsim=manifest.zsim,
+        commit=f" (commit {manifest.commit})" if manifest.commit else "",
+        trust=" --trust" if manifest.own_code else "",
+        lock=names.LOCK,
+        scenario=names.SCENARIO,
+        duration_s=manifest.duration_s,
+        seed=manifest.seed,
+        truth_sha256=manifest.truth_sha256,
+        manifest=names.MANIFEST,
+        machine=", ".join(f"{name} {value}" for name, value in manifest.machine.items()) or "another machine",
+        files="\n".join(f"| `{name}` | {WHAT[name]} |" for name in there),
+        code=own if manifest.own_code or manifest.not_run_again else "It names no code of its own.",
+    )

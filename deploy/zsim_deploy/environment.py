@@ -1,0 +1,118 @@
+"""`zsim rerun --install`: an environment with the packages of a bundle, in which it is flown again.
+
+CACHE/environments/KEY    one for each Python, lock and version of zsim; KEY is a hash of these
+
+zsim itself is the one that is here: a bundle brings none.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from importlib.metadata import distribution
+from pathlib import Path
+
+from zsim import __version__
+from zsim.errors import RunError, file_fault
+from zsim.output_folder import take_lock
+from zsim_analysis.bundle import bundle_file as names
+from zsim_analysis.bundle.bundle_file import opened
+from zsim_analysis.bundle.bundle_rerun import check_content
+from zsim_analysis.bundle.own_code import EXTRAS, pins_of
+from zsim_deploy import SAFE_PATH
+from zsim_deploy.hosts.push import default_cache
+from zsim_deploy.hosts.wheelhouse import PROJECT, checkout, requirement
+
+KEY_DIGITS = 16
+READY = "ready"  # in an environment that is whole
+LEFT_OUT = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
+
+
+def rerun_in_environment(
+    bundle: Path, python: Path | None, commands_only: bool, trust: bool, note: Callable[[str], None]
+) -> int:
+    """Make the environment of a bundle if it is not there, and fly it again in there; return the exit code of that.
+
+    Args:
+        python: of the environment; None for this one.
+        trust: whether its own code may be run, and the packages that this needs be installed.
+        note: takes a line on what is done.
+
+    Raises:
+        RunError: the bundle is refused, or the environment cannot be made.
+    """
+    with opened(bundle) as (manifest, folder):
+        check_content(bundle, manifest, folder)
+        lock = pins_of((folder / names.LOCK).read_text("utf-8"), f"{bundle}: {names.LOCK}")
+        needs = pins_of("\n".join(manifest.needs), f"{bundle}: {names.MANIFEST}: needs") if trust else []
+    executable = str(python or sys.executable)
+    environment = _environment(executable, lock, needs, note)
+    options = [*(["--commands-only"] if commands_only else []), *(["--trust"] if trust else [])]
+    words = [str(_python_of(environment)), SAFE_PATH, "-m", "zsim_deploy", "rerun", str(bundle.resolve()), *options]
+    note(f"flying it again in {environment}")
+    return subprocess.run(words, env=_clean(), check=False).returncode
+
+
+def _environment(python: str, lock: Sequence[str], needs: Sequence[str], note: Callable[[str], None]) -> Path:
+    """Return the folder of an environment with the packages of a lock."""
+    version = _output([python, "-c", "import sys; print(sys.version)"], f"{python}: is no Python")
+    source = checkout()
+    wanted = [f"{source}[{','.join(EXTRAS)}]" if source else _with_extras(), *needs]
+    key = hashlib.sha256(json.dumps([python, version, __version__, wanted, list(lock)]).encode()).hexdigest()
+    folder = default_cache() / "environments" / key[:KEY_DIGITS]
+    with file_fault(folder, "cannot be made", "set XDG_CACHE_HOME to a folder that can be written"):
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / "lock").open("a") as held:
+            if not take_lock(held):
+                raise RunError(f"{folder}: another command makes this environment now; wait for it to end")
+            if not (folder / READY).exists():
+                note(f"making an environment with {len(lock)} packages in {folder}")
+                shutil.rmtree(folder / "venv", ignore_errors=True)
+                _output([python, "-m", "venv", str(folder / "venv")], f"{folder}: no environment can be made")
+                (folder / names.LOCK).write_text("".join(f"{line}\n" for line in lock), "utf-8")
+                pip = [
+                    str(_python_of(folder)),
+                    "-m",
+                    "pip",
+                    "install",
+                    "--disable-pip-version-check",
+                    "--no-input",
+                    "-q",
+                ]
+                what = "the packages of the bundle cannot be installed with this Python"
+                _output([*pip, "--constraint", str(folder / names.LOCK), *wanted], f"{folder}: {what}")
+                (folder / READY).touch()
+    return folder
+
+
+def _with_extras() -> str:
+    """Return the requirement by which pip gets the zsim that is installed here again."""
+    name, separator, rest = requirement(distribution(PROJECT)).partition(" @ ")
+    if separator:
+        return f"{PROJECT}[{','.join(EXTRAS)}] @ {rest}"
+    return name.replace(PROJECT, f"{PROJECT}[{','.join(EXTRAS)}]", 1)
+
+
+def _python_of(environment: Path) -> Path:
+    return environment / "venv" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+def _clean() -> dict[str, str]:
+    """Return the environment variables without those by which a Python takes modules of another one."""
+    return {name: value for name, value in os.environ.items() if name not in LEFT_OUT}
+
+
+def _output(words: Sequence[str], fault: str) -> str:
+    """Run a program and return what it prints; RunError with its last line of error if it fails."""
+    try:
+        done = subprocess.run(words, env=_clean(), capture_output=True, text=True, errors="replace", check=False)
+    except OSError as error:
+        raise RunError(f"{fault} ({error.strerror})") from error
+    if done.returncode:
+        lines = [line.strip() for line in done.stderr.splitlines() if line.strip()] or ["it printed nothing"]
+        errors = [line for line in lines if line.startswith("ERROR: ")]
+        raise RunError(f"{fault} ({(errors or lines[-1:])[0].removeprefix('ERROR: ')})")
+    return done.stdout
