@@ -46,8 +46,9 @@ def machine() -> dict[str, str]:
     versions = {package: _version(package) for package in PACKAGES}
     return {
         "python": platform.python_version(),
+        "system": platform.system(),
         "machine": platform.machine(),
-        "cpu": _cpu_features(),
+        "cpu": _cpu(),
         "blas": _blas(),
         "libc": "-".join(filter(None, platform.libc_ver())) or platform.system(),
         **{package: version for package, version in versions.items() if version},
@@ -75,14 +76,19 @@ def _version(package: str) -> str:
         return ""
 
 
-def _cpu_features() -> str:
-    """Return a hash of the CPU's feature flags, which decide what libm, BLAS and the compiled kernel use."""
+def _cpu() -> str:
+    """Return the processor's model and a hash of its feature flags, which libraries and compilers go by."""
+    found: dict[str, str] = {}
     try:
         with open("/proc/cpuinfo", encoding="ascii", errors="replace") as lines:
-            flags = next((line for line in lines if line.startswith(("flags", "Features"))), "")
+            for line in lines:
+                name, _, value = line.partition(":")
+                found.setdefault(name.strip(), value.strip())
     except OSError:
-        flags = platform.processor()
-    return hashlib.sha256(" ".join(sorted(flags.split())).encode()).hexdigest()[:8]
+        return platform.processor()
+    flags = found.get("flags", found.get("Features", ""))
+    digest = hashlib.sha256(" ".join(sorted(flags.split())).encode()).hexdigest()[:8]
+    return " ".join(filter(None, (found.get("model name", ""), digest)))
 
 
 def _blas() -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 from zsim import __version__
 from zsim.contract import keys
-from zsim.contract.fingerprint import fingerprint
+from zsim.contract.fingerprint import fingerprint, machine, parts
 from zsim.contract.framing import GateMessages
 from zsim.errors import RunError
 from zsim.record import RecordReader
@@ -21,7 +21,6 @@ from zsim_agents.hosting import agents_of
 from zsim_analysis.bundle import bundle_file as names
 from zsim_analysis.bundle.bundle_file import Manifest, opened
 from zsim_analysis.bundle.gate_digests import GateDigests, first_difference
-from zsim_analysis.bundle.make_bundle import machine
 from zsim_analysis.bundle.own_code import other_versions, pins_of
 from zsim_analysis.in_process import InProcessFlight
 from zsim_analysis.reading import recorded_run
@@ -142,9 +141,9 @@ class _Watch:
 
 def _tell_machines(manifest: Manifest, note: Say) -> None:
     """Say what differs in the machine on which it was flown and this one."""
-    here = machine()
+    here = {**machine(), **parts()}
     if not manifest.machine:
-        prints = f"of numeric fingerprint {', '.join(manifest.fingerprints)}, here {fingerprint()}"
+        prints = f"of fingerprint {', '.join(manifest.fingerprints)}, here {fingerprint()}"
         note(f"the machines: it is not known on which it was flown, {prints}")
     elif differing := [
         f"{name} {manifest.machine.get(name, 'none')}, here {here.get(name, 'none')}"

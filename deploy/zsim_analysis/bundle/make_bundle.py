@@ -2,7 +2,6 @@
 
 import csv
 import io
-import platform
 import re
 import socket
 from collections.abc import Callable, Iterator, Mapping
@@ -16,7 +15,7 @@ from msgspec import UNSET
 import zsim
 from zsim import __version__
 from zsim.contract import flight_messages, keys, messages
-from zsim.contract.fingerprint import fingerprint, parts
+from zsim.contract.fingerprint import fingerprint, machine, parts
 from zsim.errors import RunError
 from zsim.output_folder import record_at, temporary_folder
 from zsim.record import RecordReader, RecordWriter
@@ -102,31 +101,11 @@ def make_bundle(
             needs=needs,
             not_run_again=agents.why_not,
             fingerprints=sorted({run.info.fingerprint, *agents.fingerprints}),
-            machine=machine() if flown_here else {},
+            machine={**machine(), **parts()} if flown_here else {},
             files={},
         )
         members[names.README] = _readme(manifest, members).encode()
         return write_bundle(out or Path(f"{run.scenario.name}{names.SUFFIX}"), manifest, members, force)
-
-
-def machine() -> dict[str, str]:
-    """Return what tells this machine from others, without its name: that of the fingerprint, and more."""
-    libc = "-".join(filter(None, platform.libc_ver()))
-    more = {
-        "system": platform.system(),
-        "machine": platform.machine(),
-        "python": platform.python_version(),
-        "libc": libc,
-    }
-    return {**more, "processor": _processor(), **parts()}
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text("ascii", "replace").splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
 
 
 def _check(place: Path, run: RecordedRun) -> None:
