@@ -6,12 +6,14 @@ They work on the sound parts of a document (`checker.sound`): a check whose fiel
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from msgspec import UNSET
 
 from zsim.contract import messages
+from zsim.math.compiled import hold
 from zsim.scenario.faults import Known, flaws, kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
 from zsim.scenario.own_classes import agent_faults, law_faults
@@ -25,6 +27,7 @@ from zsim.scenario.scenario import (
     Scenario,
     space_name,
 )
+from zsim.scenario.triangles import nearest_points, sheet_of
 from zsim.schema.checker import Fault, listed, show, suggestion
 from zsim.schema.quantities import COULOMB_PER_MAH, G_M_S2, SEA_LEVEL_KG_M3
 from zsim.sensors.camera_model import folds, lens_of
@@ -39,6 +42,7 @@ TEMPLATE_WIDTH_MIN_M = 0.1  # m, chosen: anything is; where a formation may fly,
 WORLD_DEATHS = ("restart", "end")  # of `on_death`: nobody else keeps the run
 LIFT_SHARE_MAX = 0.9  # of what the rotors lift; the rest is left for control
 TOP_COSINE, TOP_DEPTH_M = 0.999, 0.001  # of a roof's normal to the vertical; how deep a drone on it may be
+UPON_COSINE = 0.5  # of the same of a surface, which is no wall up to 60 deg; chosen
 THRUST_SHARE_MIN = 0.005  # of the rotors' lift, in a hover, chosen: racers that lift fifteen times themselves have .07
 TILT_FREE_DEG = 30.0  # deg, allowed to whatever is light enough to fly
 # Chosen, a decade or more beyond what flies: 60 to 400 W/kg from racers' hover to large rotors; 3 min to 2 h
@@ -68,8 +72,8 @@ def cross_faults(
     yield from _start_faults(drones, vehicles)
     obstacles = _entries(scenario.environment and scenario.environment.obstacles)
     yield from _obstacle_faults(obstacles, drones, vehicles)
-    surfaces = scenario.environment and scenario.environment.surfaces
-    yield from _name_faults("environment.surfaces", _entries(surfaces or []))
+    surfaces = _entries((scenario.environment and scenario.environment.surfaces) or [])
+    yield from _surface_faults(surfaces, {each.name for _, each in obstacles}, drones, vehicles)
     for index, drone in drones:
         yield from _under(f"drones[{index}]", _drone_faults(drone, scenario, vehicles))
     yield from _own_sensor_faults(drones)
@@ -217,6 +221,35 @@ def _obstacle_faults(obstacles: _Entries, drones: _Entries, vehicles: Mapping[st
             if distance < least and not is_on_top:
                 place = f"is {distance:.2f} m from {obstacle.name or 'an obstacle'!r}"
                 yield f"drones[{drone}].position_m", f"{place}; must be >= {least:g} m"
+
+
+def _surface_faults(
+    surfaces: _Entries, obstacles: Collection[str], drones: _Entries, vehicles: Mapping[str, Vehicle]
+) -> Iterator[Fault]:
+    """Yield what is wrong with surfaces: names, and drones that start too near to one, not on top of it."""
+    yield from _name_faults("environment.surfaces", surfaces)
+    names = _names(drones)
+    for index, surface in surfaces:
+        if surface.name in names or surface.name in obstacles:
+            other = "a drone" if surface.name in names else "an obstacle"
+            yield f"environment.surfaces[{index}].name", f"is {surface.name!r}, as {other}; must be another"
+    placed = [(index, drone) for index, drone in drones if drone.position_m is not None]
+    for _, surface in surfaces:
+        is_read = isinstance(surface.triangles, str) and _known(surface.position_m, surface.yaw_deg, surface.scale)
+        if not placed or not is_read:
+            continue
+        try:
+            sheet = hold(sheet_of(SimpleNamespace(surfaces=[surface])))
+        except ValueError:  # its triangles are no such text, which is a fault of its own
+            continue
+        least = np.array([_clearance_m(drone, vehicles) for _, drone in placed])
+        places = np.array([drone.position_m for _, drone in placed])
+        distance, nearest_W = nearest_points(sheet, places, least)
+        up = places[:, 2] - nearest_W[:, 2]
+        is_on_top = (distance <= TOP_DEPTH_M) | (up > UPON_COSINE * distance)
+        for k in np.flatnonzero((distance < least) & ~is_on_top).tolist():
+            place = f"is {distance[k]:.2f} m from {surface.name or 'a surface'!r}"
+            yield f"drones[{placed[k][0]}].position_m", f"{place}; must be >= {least[k]:g} m"
 
 
 def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:

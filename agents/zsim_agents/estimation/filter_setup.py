@@ -15,8 +15,8 @@ from scipy.special import chdtri
 
 from zsim.contract.keys import SENSORS
 from zsim.math.rotation import LEVEL, matrix_from_rpy
-from zsim.scenario.obstacle import nearest, row_of
 from zsim.scenario.scenario import Drone, Environment, Estimation
+from zsim.scenario.triangles import Surroundings
 from zsim.sensors.sensor import ErrorModel, Sensor, scaled
 from zsim.sensors.sensor_catalogue import Sensors
 from zsim.sensors.stock_sensors import ImuConfig
@@ -221,8 +221,8 @@ class DroneSetup:
         obstacles the sonar is as wrong, and its readings are refused as outliers.
         """
         x, y, z = self._drone.position_m
-        on_roof = any(abs(nearest(row_of(each), x, y, z)[0]) < ON_ROOF_M for each in self._environment.obstacles)
-        return z if on_roof else 0.0
+        away_m = float(Surroundings(self._environment).distances_m((x, y, z))[0])
+        return z if abs(away_m) < ON_ROOF_M else 0.0
 
     def setting(self) -> list[float]:
         """Return the columns SETTING."""

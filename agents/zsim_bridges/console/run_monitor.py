@@ -2,15 +2,15 @@
 
 import math
 from collections import defaultdict, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from zsim.contract.flight_messages import DroneView, ViewCluster, ViewDrones
 from zsim.math import frames
-from zsim.scenario.obstacle import least_distances
-from zsim.scenario.scenario import Obstacle
+from zsim.scenario.scenario import Environment
+from zsim.scenario.triangles import Surroundings
 from zsim_bridges.console import alarms
 from zsim_bridges.console.alarms import AlarmBoard, DroneCondition, FaultWatch
 from zsim_bridges.console.orders import PendingRequest, PendingRequests
@@ -43,7 +43,7 @@ class RunMonitor:
         self._t_ns = 0
         self.condition = RunCondition(replayed=run.is_replay)
         self.board = AlarmBoard()
-        self.flight = FlightMeter(run.scenario.environment.obstacles)
+        self.flight = FlightMeter(run.scenario.environment)
         self.fault_watch = FaultWatch()
         self.pending = PendingRequests()
         self.record_s: tuple[float, float] | None = None
@@ -136,14 +136,14 @@ class FlightFigures(NamedTuple):
     pitch_deg: float
     heading_deg: float  # 0 to 360
     battery_left_s: float | None  # at the present drain; None while unknown
-    obstacle_m: float | None = None  # from its centre to the nearest surface of an obstacle; None without any
+    obstacle_m: float | None = None  # from its centre to what is nearest of obstacles and surfaces; None without any
 
 
 class FlightMeter:
-    """Derives figures of each drone's flight from views of the true states, and the run's obstacles."""
+    """Derives figures of each drone's flight from views of the true states, and of what is around."""
 
-    def __init__(self, obstacles: Sequence[Obstacle] = ()) -> None:
-        self._obstacles = obstacles
+    def __init__(self, environment: Environment) -> None:
+        self._around = Surroundings(environment)
         # of each drone [m; W] and [%], with their simulated times [s]
         self._places: defaultdict[str, deque[tuple[float, tuple[float, float, float]]]]
         self._charges: defaultdict[str, deque[tuple[float, float]]]
@@ -171,7 +171,7 @@ class FlightMeter:
     @property
     def figures(self) -> dict[str, FlightFigures]:
         found = {}
-        away_m = least_distances(self._obstacles, [drone.position_m for drone in self._drones]).tolist()
+        away_m = self._around.distances_m([drone.position_m for drone in self._drones]).tolist()
         for drone, obstacle_m in zip(self._drones, away_m, strict=True):
             (first_s, first), (last_s, last) = self._places[drone.name][0], self._places[drone.name][-1]
             span_s = max(last_s - first_s, 1e-9)  # of one view: at rest
@@ -187,6 +187,6 @@ class FlightMeter:
                 pitch,
                 yaw % 360.0,
                 drone.battery_percent * lasted_s / used if lasted_s >= BATTERY_S and used > 0.0 else None,
-                obstacle_m if self._obstacles else None,
+                None if self._around.is_empty else obstacle_m,
             )
         return found

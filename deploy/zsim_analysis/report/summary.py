@@ -17,7 +17,7 @@ from zsim import __version__
 from zsim.contract.fingerprint import TruthHash
 from zsim.errors import RecordError, printable
 from zsim.presentation import Column, FittedTable
-from zsim.scenario.obstacle import least_distances
+from zsim.scenario.triangles import Surroundings
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.drone_errors import Tracking, reference_errors, tracking_of
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of, min_separation_m
@@ -114,7 +114,7 @@ class RunSummary(Struct, frozen=True):
     errors: dict[str, ParameterErrors]
     clusters: dict[str, ClusterErrors]
     min_separation_m: float | None
-    obstacle_distance_m: dict[str, float]  # least, from each drone's centre to a surface; empty without obstacles
+    obstacle_distance_m: dict[str, float]  # least, from each drone's centre to obstacles and surfaces; empty without
     tracking: dict[str, Tracking]  # against the references of single drones, of the window
     radio: RadioSummary | None  # of the window; None where the scenario has none
     paper_table_1: dict[str, float]
@@ -224,10 +224,12 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
 
 
 def obstacle_distances_m(flight: RecordedFlight) -> dict[str, float]:
-    """Return by drone the least true distance [m] of its centre from an obstacle, below 0 inside of one."""
-    obstacles = flight.scenario.environment.obstacles if flight.scenario else []
-    tracks = [track for track in flight.tracks if obstacles and len(track.t_ns)]
-    return {track.name: float(least_distances(obstacles, track.p_W).min()) for track in tracks}
+    """Return by drone the least true distance [m] of its centre from obstacles and surfaces, below 0 in an obstacle."""
+    if flight.scenario is None:
+        return {}
+    around = Surroundings(flight.scenario.environment)
+    tracks = [track for track in flight.tracks if not around.is_empty and len(track.t_ns)]
+    return {track.name: float(around.distances_m(track.p_W).min()) for track in tracks}
 
 
 def _record_facts(flight: RecordedFlight, last_ns: int) -> RecordFacts:

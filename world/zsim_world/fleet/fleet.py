@@ -22,7 +22,7 @@ from zsim.errors import RunError
 from zsim.math.compiled import hold
 from zsim.math.frames import quaternion_from_heading, quaternion_from_rpy
 from zsim.scenario.scenario import Drone, Scenario
-from zsim.scenario.surface_file import placed
+from zsim.scenario.triangles import sheet_of
 from zsim.sensors.scanner import SCANNERS
 from zsim.sensors.sensor import noise_sigma
 from zsim.vehicles.vehicle import Vehicle
@@ -52,9 +52,9 @@ from zsim_world.physics.fleet_arrays import (
     state_arrays,
     vehicle_row,
 )
-from zsim_world.physics.rays import TRIANGLE, scene
+from zsim_world.physics.rays import scene
 from zsim_world.physics.simd import body_blocks
-from zsim_world.physics.surfaces import BALLS, POINTS, SLOTS_MAX, contact_points, obstacle_rows
+from zsim_world.physics.surfaces import BALLS, PLANE, POINTS, SLOTS_MAX, contact_points, obstacle_rows
 from zsim_world.run_state import IN_PLACE, PART, Saved
 from zsim_world.sensors import sensor_set
 from zsim_world.sensors.equations import SONAR_COSINE_MIN
@@ -110,6 +110,7 @@ class Fleet:
         gps_sigma_m: of each drone's fixes.
         impairment: what faults do to it.
         bodies, boards: the arrays that the kernel works on; to be read only.
+        things: names of the obstacles, then of the surfaces.
         beside: the sensors that see other drones and obstacles, behind all of `sensors`: sightings and scanners.
         sampled: what fell due for publication in the last gate.
         seen: what those sensors saw among it, by the row of `sampled`.
@@ -173,7 +174,9 @@ class Fleet:
         self.touching = np.zeros(self.count, dtype=bool)
         self._hull_m = float(hulls.max())
         self._integrate(0)
-        self._watch = FlightWatch(self._w, self.names, [each.name for each in scenario.environment.obstacles])
+        place = scenario.environment
+        self.things = [each.name for each in (*place.obstacles, *(place.surfaces or ()))]
+        self._watch = FlightWatch(self._w, self.names, self.things)
         # loads or compiles what the first command needs: in realtime no gate may wait for it
         kernel.enter(self.boards.memory[0].copy(), self.boards.belief[0].copy(), firmware.LANDED)
 
@@ -205,7 +208,7 @@ class Fleet:
         self._tick += ticks
         self.collisions = []
         self.touching.fill(False)
-        if self.bodies.obstacle.size:
+        if self.bodies.bumping.size:
             self.touching[:] = self.bodies.bumping.any(axis=1)
         if self.closest_m < 2.0 * self._hull_m:
             self.collisions = [(int(i), int(j)) for i, j in np.argwhere(self.bodies.touched)]
@@ -256,8 +259,8 @@ class Fleet:
         return firmware.MODES[self._mode(i)], charge, bool(self.touching[i])
 
     def bumps(self) -> list[tuple[int, int]]:
-        """Return the pairs of drone and obstacle that began to touch in the last gate."""
-        if not self.bodies.obstacle.size:
+        """Return the pairs of drone and thing, by its place in `things`, that began to touch in the last gate."""
+        if not self.bodies.bumped.size:
             return []
         return [(int(i), int(m)) for i, m in np.argwhere(self.bodies.bumped)]
 
@@ -388,13 +391,14 @@ def _initial_arrays(
     air[WIND.steady : WIND.steady + 3] = wind.steady_m_s
     air[WIND.gust], air[WIND.correlation] = wind.gust_m_s, wind.gust_correlation
     air[WIND.length], air[WIND.speed_min] = wind.gust_length_m, wind.gust_speed_min_m_s
-    surfaces = () if place.surfaces is UNSET else place.surfaces
-    seen = scene(bodies.obstacle, np.concatenate([np.empty((0, TRIANGLE)), *map(placed, surfaces)]))
-    return Arrays(time, bodies, boards, numbers, senses, air, noise.gust, watched, seen)
+    sheet = sheet_of(place)
+    seen = scene(bodies.obstacle, sheet.triangle)
+    return Arrays(time, bodies, boards, numbers, senses, air, noise.gust, watched, seen, sheet)
 
 
 def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) -> Bodies:
     drones, n, obstacles = scenario.drones, len(scenario.drones), obstacle_rows(scenario.environment)
+    surfaces = len(scenario.environment.surfaces or ())
     each, slots = rotors.shape[1] // ROTOR.size, min(len(obstacles), SLOTS_MAX)
     state, anchor = np.zeros((n, STATE.size + each)), np.zeros((n, POINTS, 2))
     for i, drone in enumerate(drones):  # its feet carry its weight; from a position above the ground it falls
@@ -426,10 +430,11 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
         touched=np.zeros((n, n), dtype=np.int8),
         near=near,
         obstacle=obstacles,
-        bumping=np.zeros((n, len(obstacles)), dtype=np.int8),
-        bumped=np.zeros((n, len(obstacles)), dtype=np.int8),
+        bumping=np.zeros((n, len(obstacles) + surfaces), dtype=np.int8),
+        bumped=np.zeros((n, len(obstacles) + surfaces), dtype=np.int8),
         solid=np.full((n, slots), -1, dtype=np.int32),
         held=np.zeros((n, slots, BALLS, 3)),
+        plane=np.zeros((n, BALLS if surfaces else 0, PLANE.size)),
         braced=np.zeros(n, dtype=np.int8),
         twist=np.zeros((n, 3)),
         aero_parts=(0, 1) if aero.any() else (0,),

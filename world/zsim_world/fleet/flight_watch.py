@@ -16,7 +16,7 @@ from zsim.math.rotation import add, rotate
 from zsim.schema.quantities import G_M_S2
 from zsim_world.physics.fleet_arrays import STATE, VEHICLE, Arrays, Bodies, Watched
 from zsim_world.physics.rigid_body import four, vector
-from zsim_world.physics.surfaces import FEET, POINTS, contact_point, nearest
+from zsim_world.physics.surfaces import FEET, PLANE, POINTS, contact_point, nearest, plane_depth
 from zsim_world.vehicles.firmware import EMERGENCY, FLYING, HOVERING, LANDING, MEMORY, SETTING, TAKING_OFF
 from zsim_world.vehicles.observer import STEP_S
 
@@ -26,7 +26,7 @@ IMPACT_M_S = IMPACT_G * G_M_S2 * IMPACT_STEPS * STEP_S  # m/s, greatest change o
 UPRIGHT_AGAIN = 0.5  # chosen: cosine of the tilt below which one that was upside down may flip again
 QUIET_STEPS = round(1.0 / STEP_S)  # chosen: contacts that follow an impact within 1 s are its bounces
 MODE, FLIP, IMPACT, EMPTY, TOUCHDOWN = 1, 2, 4, 8, 16  # bits of the incidents of a drone
-NOTHING, GROUND, FIRST_OBSTACLE = 0, 1, 2  # what a drone touches; then the obstacles, then the drones
+NOTHING, GROUND, FIRST_OBSTACLE = 0, 1, 2  # what a drone touches; then obstacles, surfaces, drones
 
 SEEN = columns(
     "SeenColumns",
@@ -56,13 +56,13 @@ class Incident(NamedTuple):
 
 
 class FlightWatch:
-    """Describes the incidents of a fleet's drones; `drones` and `obstacles` are names."""
+    """Describes the incidents of a fleet's drones; `drones` and `things` are names."""
 
-    def __init__(self, arrays: Arrays, drones: Sequence[str], obstacles: Sequence[str]) -> None:
+    def __init__(self, arrays: Arrays, drones: Sequence[str], things: Sequence[str]) -> None:
         self._bodies, self._boards = arrays.bodies, arrays.boards
         self._seen, self._found = arrays.watched
         self._names = drones
-        self._others = ("", "the ground", *obstacles, *drones)  # by what `SEEN.touched` holds
+        self._others = ("", "the ground", *things, *drones)  # by what `SEEN.touched` holds
 
     def note_command(self, i: int, mode: int) -> None:
         """Note a mode that was commanded: entering it is no incident."""
@@ -147,14 +147,14 @@ def _touchdown(bodies: Bodies, seen: NDArray, i: int, mode: float) -> int:
         seen[i, SEEN.airborne], seen[i, SEEN.grounded] = 1.0, 0.0
         return 0
     surface = _surface(bodies, i)
-    touched, obstacles = surface, bodies.obstacle.shape[0]
+    touched, things = surface, bodies.bumping.shape[1]
     if bodies.braced[i] != 0:
-        for m in range(obstacles):
+        for m in range(things):
             if bodies.bumping[i, m] != 0:
                 touched = FIRST_OBSTACLE + m
         for j in range(bodies.state.shape[0]):
             if bodies.touching[min(i, j), max(i, j)] != 0:
-                touched = FIRST_OBSTACLE + obstacles + j
+                touched = FIRST_OBSTACLE + things + j
     if touched != NOTHING:
         seen[i, SEEN.touched] = touched
     if surface == NOTHING:
@@ -183,4 +183,8 @@ def _surface(bodies: Bodies, i: int) -> int:
                 x = add(p_WB, rotate(q_WB, contact_point(row, k)))
                 if nearest(bodies.obstacle[m], x[0], x[1], x[2])[0] < 0.0:
                     return FIRST_OBSTACLE + m
+    if bodies.plane.shape[1] > 0:
+        for k in range(FEET):
+            if plane_depth(bodies.plane[i, k], 0.0) > 0.0:
+                return FIRST_OBSTACLE + bodies.obstacle.shape[0] + int(bodies.plane[i, k, PLANE.surface])
     return NOTHING

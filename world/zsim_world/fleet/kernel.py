@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from zsim.math.compiled import Held, inlined, kernel, noinline
 from zsim.math.rotation import norm
+from zsim.scenario.triangles import Sheet
 from zsim_world.fleet.flight_watch import watch
 from zsim_world.physics import rigid_body as body
 from zsim_world.physics.air import WIND, blow
@@ -32,6 +33,7 @@ from zsim_world.physics.fleet_arrays import (
 from zsim_world.physics.rays import Scene
 from zsim_world.physics.rigid_body import drained, four, put, put_four, vector
 from zsim_world.physics.simd import accelerate, lead, line_up, move
+from zsim_world.physics.surface_contact import meet_surfaces
 from zsim_world.physics.surfaces import meet_obstacles
 from zsim_world.sensors import sensor_set as ss
 from zsim_world.sensors.downward import flow_over, sonar_over
@@ -78,7 +80,7 @@ def _gusts(wind: NDArray, gust: NDArray, state: NDArray, noise: NoiseRows) -> No
 
 
 @inlined
-def _meet(wind: NDArray, gust: NDArray, bodies: Bodies) -> float:
+def _meet(wind: NDArray, gust: NDArray, bodies: Bodies, sheet: Sheet) -> float:
     """Set air and pushes for the next tick; return the least distance of two drones [m]."""
     for i in range(gust.shape[0]):
         bodies.braced[i] = 0
@@ -87,6 +89,8 @@ def _meet(wind: NDArray, gust: NDArray, bodies: Bodies) -> float:
             bodies.push[i, k] = 0.0
     if bodies.obstacle.shape[0] > 0:
         meet_obstacles(bodies)
+    if bodies.plane.shape[1] > 0:
+        meet_surfaces(bodies, sheet)
     return meet_drones(bodies)
 
 
@@ -130,7 +134,7 @@ def _sample(s: int, i: int, bodies: Bodies, noise: NoiseRows, senses: Senses, sc
     mounted = MountedSensor(vector(config, CONFIG.p_BS), four(config, CONFIG.q_BS), config[CONFIG.limit_max])
     site = Site(bodies.vehicle[i, VEHICLE.gravity], vector(senses.place, PLACE.field_W))
     first, second = _ideal(s, x, mounted, site)
-    if scene.part.shape[0] > 0 or bodies.near.above[i] != 0:
+    if scene.tree.part.shape[0] > 0 or bodies.near.above[i] != 0:
         if s == ss.SONAR:
             first = sonar_over(x, mounted, first, scene, bodies.state, bodies.vehicle, i)
         elif s == ss.FLOW:
@@ -289,7 +293,7 @@ def advance(held: Held, ticks: int) -> tuple[int, float, int, bool]:
 
 @inlined
 def _advance(w: Arrays, ticks: int) -> tuple[int, float, int, bool]:
-    time, bodies, boards, noise, senses, wind, gust, watched, scene = w
+    time, bodies, boards, noise, senses, wind, gust, watched, scene, sheet = w
     clock, device = time.clock, boards.device
     logged, least = 0, math.inf
     bodies.touched.fill(0)
@@ -308,7 +312,7 @@ def _advance(w: Arrays, ticks: int) -> tuple[int, float, int, bool]:
         if step and ticks > 0:
             _gusts(wind, gust, bodies.state, noise)
             _drain(bodies)
-        least = min(least, _meet(wind, gust, bodies))
+        least = min(least, _meet(wind, gust, bodies, sheet))
         if step:
             accelerate(bodies)
             if ticks > 0:

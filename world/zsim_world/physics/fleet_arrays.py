@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from zsim.math.compiled import Field, columns, inlined
 from zsim.scenario.scenario import Drone, Environment
+from zsim.scenario.triangles import Sheet
 from zsim.schema.quantities import COULOMB_PER_MAH, SEA_LEVEL_KG_M3
 from zsim.vehicles.vehicle import Aerodynamics, Vehicle, allocation, lift_shares, mixing
 from zsim_world.physics.rays import Scene
@@ -131,11 +132,12 @@ class Bodies(NamedTuple):
     touched: NDArray  # int8 (N, N), contacts that began in this gate
     near: NearPairs
     obstacle: NDArray  # (M, obstacle.COLUMNS)
-    bumping: NDArray  # int8 (N, M), who touches which obstacle with more than its feet
-    bumped: NDArray  # int8 (N, M), contacts that began in this gate
+    bumping: NDArray  # int8 (N, M + surfaces), who touches which obstacle or surface with more than its feet
+    bumped: NDArray  # int8 (N, M + surfaces), contacts that began in this gate
     solid: NDArray  # int32 (N, K), the obstacles in reach of each, see physics/surfaces.py
     held: NDArray  # (N, K, BALLS, 3), m, anchors on them
-    braced: NDArray  # int8 (N,), 1 where an obstacle is in reach or a hull touches another
+    plane: NDArray  # (N, BALLS, PLANE.size), where each is nearest to a surface, see physics/surfaces.py; none: no rows
+    braced: NDArray  # int8 (N,), 1 where obstacle or surface is in reach or a hull touches another
     twist: NDArray  # (N, 3), N m in W, of other drones' hulls; of those that are braced
     lanes: NDArray  # (blocks, columns of a block), see physics/simd.py
     aero_parts: tuple[int, ...]  # one number; two where any drone has aerodynamics, which are left out else
@@ -199,14 +201,15 @@ class Arrays(NamedTuple):
     gust: NDArray  # (N, 3), m/s
     watched: Watched
     scene: Scene
+    sheet: Sheet
 
 
 def state_arrays(group: tuple[object, ...]) -> Iterator[NDArray]:
-    """Yield the arrays that make up the state of a fleet: not near pairs, found anew, nor the scene, which stays."""
+    """Yield the arrays that make up the state of a fleet: not near pairs (found anew), scene and sheet."""
     for member in group:
         if isinstance(member, np.ndarray):
             yield member
-        elif isinstance(member, tuple) and not isinstance(member, NearPairs | Scene):
+        elif isinstance(member, tuple) and not isinstance(member, NearPairs | Scene | Sheet):
             yield from state_arrays(member)
 
 

@@ -16,39 +16,30 @@ from numpy.typing import NDArray
 from zsim.math.compiled import inlined, noinline
 from zsim.math.rotation import Quaternion, Vector, dot, rotate_back, subtract
 from zsim.scenario.obstacle import BOX, CENTRE, COLUMNS, COSINE, CYLINDER, HALF, SHAPE, SINE, SPHERE
+from zsim.scenario.triangles import TRIANGLE, Tree, corners_of, tree_over
 
-LEAF = 4  # parts of a leaf at most, chosen: a box costs about as much as a cylinder
-DEPTH = 64  # boxes that may wait while a ray is followed; each step down halves the parts
-MARGIN_M = 1e-6  # m, by which boxes are larger than what is in them, against rounding
 HUGE = 1e300  # in place of 1 / 0: a product with it is never 0 times infinity
 HULL_FLATNESS = 0.25  # height over width of a hull, the AR.Drone's rounded: 0.13 m of 0.52 m
-TRIANGLE = 9  # numbers of a triangle: a corner and the two edges from it
 
 Array = NDArray[np.float64]
 
 
 class Scene(NamedTuple):
-    """What does not move: M obstacles, T triangles, and the tree of K boxes over both, in which the first is on top."""
+    """What does not move: M obstacles, T triangles, and the tree over both."""
 
     solid: NDArray  # (M, COLUMNS), rows of zsim.scenario.obstacle
     triangle: NDArray  # (T, TRIANGLE), m, in W
-    bounds: NDArray  # (K, 6), least and greatest x, y, z [m]
-    link: NDArray  # int32 (K, 2): the second child (the first follows) and 0; of a leaf its first part and their count
-    part: NDArray  # int32 (M + T,), obstacles by their number, triangles by M plus theirs
-    waiting: NDArray  # int32 (DEPTH,), boxes that wait while a ray is followed
-    entered: NDArray  # (DEPTH,), m, where the ray enters them
+    tree: Tree  # its parts are obstacles by their number, triangles by M plus theirs
 
 
 def scene(solid: Array, triangle: Array) -> Scene:
     """Return the scene of some obstacles, (M, COLUMNS), and triangles, (T, TRIANGLE)."""
     solid, triangle = solid.reshape(-1, COLUMNS), triangle.reshape(-1, TRIANGLE)
-    corners = np.concatenate([triangle[:, :3], triangle[:, :3] + triangle[:, 3:6], triangle[:, :3] + triangle[:, 6:]])
-    corners = corners.reshape(3, -1, 3)
+    corners = corners_of(triangle)
     boxes = [_bounds_of(row) for row in solid.tolist()]
-    low = np.concatenate([np.array([low for low, _ in boxes]).reshape(-1, 3), corners.min(axis=0)])
-    high = np.concatenate([np.array([high for _, high in boxes]).reshape(-1, 3), corners.max(axis=0)])
-    bounds, link, part = _tree(low - MARGIN_M, high + MARGIN_M)
-    return Scene(solid, triangle, bounds, link, part, np.empty(DEPTH, dtype=np.int32), np.empty(DEPTH))
+    low = np.concatenate([np.array([low for low, _ in boxes]).reshape(-1, 3), corners.min(axis=1)])
+    high = np.concatenate([np.array([high for _, high in boxes]).reshape(-1, 3), corners.max(axis=1)])
+    return Scene(solid, triangle, tree_over(low, high))
 
 
 def _bounds_of(row: Sequence[float]) -> tuple[list[float], list[float]]:
@@ -60,30 +51,6 @@ def _bounds_of(row: Sequence[float]) -> tuple[list[float], list[float]]:
         half = [half[0], half[0], half[0] if row[SHAPE] == SPHERE else half[2]]
     centre = row[CENTRE : CENTRE + 3]
     return [x - h for x, h in zip(centre, half, strict=True)], [x + h for x, h in zip(centre, half, strict=True)]
-
-
-def _tree(low: Array, high: Array) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:
-    """Return bounds, links and parts of the tree over P boxes, (P, 3) each: halves along the longest side."""
-    part, middle = np.arange(len(low), dtype=np.int32), 0.5 * (low + high)
-    bounds: list[Array] = []
-    link: list[tuple[int, int]] = []
-    waiting = [(0, len(part), -1)] if len(part) else []
-    while waiting:
-        first, end, parent = waiting.pop()
-        if parent >= 0:
-            link[parent] = (len(link), 0)
-        own = part[first:end]
-        bounds.append(np.concatenate([low[own].min(axis=0), high[own].max(axis=0)]))
-        if end - first <= LEAF:
-            link.append((first, end - first))
-            continue
-        axis = int(np.ptp(middle[own], axis=0).argmax())
-        part[first:end] = own[np.argsort(middle[own, axis], kind="stable")]
-        half = (first + end) // 2
-        waiting += [(half, end, len(link)), (first, half, -1)]
-        link.append((0, 0))
-    links = np.array(link, dtype=np.int32).reshape(-1, 2)
-    return np.array(bounds).reshape(-1, 6), links, part
 
 
 @inlined
@@ -201,24 +168,25 @@ def _box(bounds: NDArray, o: Vector, per: Vector, far: float) -> float:
 @noinline
 def cast_parts(scene: Scene, o: Vector, d: Vector, far: float) -> float:
     """Return the distance [m] at which a ray meets obstacle or triangle; arguments as of `cast`."""
-    best, count, waiting, entered = far, scene.solid.shape[0], scene.waiting, scene.entered
-    if scene.bounds.shape[0] == 0:
+    best, count, tree = far, scene.solid.shape[0], scene.tree
+    waiting, entered = tree.waiting, tree.away  # boxes, and where the ray enters them [m]
+    if tree.bounds.shape[0] == 0:
         return best
     per = (inverse(d[0]), inverse(d[1]), inverse(d[2]))
-    node, at, depth = 0, _box(scene.bounds[0], o, per, best), 0
+    node, at, depth = 0, _box(tree.bounds[0], o, per, best), 0
     while True:
         while at < best:
-            first, parts = scene.link[node, 0], scene.link[node, 1]
+            first, parts = tree.link[node, 0], tree.link[node, 1]
             if parts > 0:
                 for n in range(first, first + parts):
-                    m = scene.part[n]
+                    m = tree.part[n]
                     if m < count:
                         best = cast_solid(scene.solid[m], o, d, best)
                     else:
                         best = cast_triangle(scene.triangle[m - count], o, d, best)
                 break
             near, other = node + 1, first
-            at, away = _box(scene.bounds[near], o, per, best), _box(scene.bounds[other], o, per, best)
+            at, away = _box(tree.bounds[near], o, per, best), _box(tree.bounds[other], o, per, best)
             if away < at:
                 near, other, at, away = other, near, away, at
             if away < best:

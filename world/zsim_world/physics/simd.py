@@ -259,7 +259,7 @@ def _accelerate_braced(bodies: Bodies, i: int) -> None:
 
 @inlined
 def _touch(bodies: Bodies, i: int) -> Touch:
-    return Touch(bodies.obstacle, bodies.solid[i], bodies.held[i], vector(bodies.twist[i], 0))
+    return Touch(bodies.obstacle, bodies.solid[i], bodies.held[i], bodies.plane[i], vector(bodies.twist[i], 0))
 
 
 @noinline

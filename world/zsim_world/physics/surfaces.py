@@ -1,4 +1,4 @@
-"""Contact with the ground z = 0 and with obstacles: spring and damper under every contact point, with dry friction.
+"""Contact with ground (z = 0), obstacles and surfaces: spring and damper under every contact point, with dry friction.
 
 Friction is a spring to an anchor on the surface; where it would exceed the friction cone, the anchor is dragged along.
 The anchor is fixed within a step and moves after it, so that a step is a smooth function of the state.
@@ -7,7 +7,8 @@ At obstacles a drone is a rigid set of balls: the contact points of the ground, 
 hull and one in its middle, so that neither a post nor an edge fits between the points. A ball is pushed along the
 surface normal by the same law. The distance to a convex solid is the depth of a potential, so springs and anchors
 return no more energy than they were given. A drone has slots for the solids within its reach, each with an anchor for
-every ball; they are updated after every step and do not change within one.
+every ball; they are updated after every step and do not change within one. On surfaces each ball has a plane, likewise
+(surface_contact.py).
 """
 
 import math
@@ -16,7 +17,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.math.compiled import inlined, noinline
+from zsim.math.compiled import Field, columns, inlined, noinline
 from zsim.math.rotation import Quaternion, Vector, add, axpy, cross, dot, norm, rotate, rotate_back, scaled, subtract
 from zsim.scenario import obstacle
 from zsim.scenario.scenario import Environment
@@ -111,12 +112,26 @@ _SINES = (*(math.sin(angle) for angle in _ANGLES), 0.0)
 nearest: Any = inlined(obstacle.nearest)
 
 
+PLANE = columns(  # of a ball: where it is nearest to a surface
+    "PlaneColumns",
+    (
+        Field("side", "1"),  # 1 in front of it, -1 behind, where it is driven back; 0: none is in reach
+        Field("normal_W", "1", 3),  # from it, towards where the ball is free
+        Field("distance", "m"),  # of the ball's centre, below 0 behind it
+        Field("surface", "1"),
+        Field("centre_W", "m", 3),  # of the ball, when this was found
+        Field("anchor_W", "m", 3),
+    ),
+)
+
+
 class Touch(NamedTuple):
     """What acts on one drone besides air and ground."""
 
     obstacle: NDArray  # (M, obstacle.COLUMNS)
     solid: NDArray  # int32 (K,), those in its reach by their places in `obstacle`; -1: none
     anchor: NDArray  # (K, BALLS, 3), m, in W
+    plane: NDArray  # (BALLS, PLANE.size); (0, PLANE.size) where there are no surfaces
     twist_W: Vector  # N m, of other drones' hulls
 
 
@@ -167,18 +182,46 @@ def touched(
             distance, nx, ny, nz = nearest(touch.obstacle[touch.solid[s]], x[0], x[1], x[2])
             depth, n = radius - distance, (nx, ny, nz)
             if depth > 0.0:
-                hull = k >= POINTS
-                stiffness = row[VEHICLE.hull_stiffness] if hull else row[VEHICLE.foot_stiffness]
-                damping = row[VEHICLE.hull_damping] if hull else row[VEHICLE.foot_damping]
                 v = add(v_WB, rotate(q_WB, cross(w_WB_B, r_B)))
-                normal = max(stiffness * depth - damping * dot(v, n), 0.0)
-                gap = _across(subtract(x, _vector(touch.anchor[s, k])), n)
-                held = axpy(scaled(gap, -stiffness), -damping, _across(v, n))
-                size, limit = norm(held), row[VEHICLE.friction] * normal
-                f_W = axpy(scaled(n, normal), 1.0 if size <= limit else limit / size, held)
+                f_W = _pushed(row, k, depth, n, subtract(x, _vector(touch.anchor[s, k])), v)
+                force = add(force, f_W)
+                moment = add(moment, cross(r_B, rotate_back(q_WB, f_W)))
+    for k in range(touch.plane.shape[0]):
+        plane = touch.plane[k]
+        if plane[PLANE.side] != 0.0:
+            r_B, radius = ball(row, k)
+            x, n = add(p_WB, rotate(q_WB, r_B)), _vector(plane[PLANE.normal_W : PLANE.normal_W + 3])
+            moved = subtract(x, _vector(plane[PLANE.centre_W : PLANE.centre_W + 3]))
+            depth = radius - (plane[PLANE.distance] + dot(n, moved))
+            if depth > 0.0:
+                v = add(v_WB, rotate(q_WB, cross(w_WB_B, r_B)))
+                gap = subtract(x, _vector(plane[PLANE.anchor_W : PLANE.anchor_W + 3]))
+                f_W = _pushed(row, k, depth, n, gap, v)
                 force = add(force, f_W)
                 moment = add(moment, cross(r_B, rotate_back(q_WB, f_W)))
     return force, moment
+
+
+@inlined
+def _pushed(row: Row, k: int, depth: float, n: Vector, gap: Vector, v: Vector) -> Vector:
+    """Return the force in W [N] on ball k that is `depth` [m] in something whose normal is n.
+
+    Args:
+        gap: from its anchor to its centre [m; W]; v: its velocity [m/s; W].
+    """
+    hull = k >= POINTS
+    stiffness = row[VEHICLE.hull_stiffness] if hull else row[VEHICLE.foot_stiffness]
+    damping = row[VEHICLE.hull_damping] if hull else row[VEHICLE.foot_damping]
+    normal = max(stiffness * depth - damping * dot(v, n), 0.0)
+    held = axpy(scaled(_across(gap, n), -stiffness), -damping, _across(v, n))
+    size, limit = norm(held), row[VEHICLE.friction] * normal
+    return axpy(scaled(n, normal), 1.0 if size <= limit else limit / size, held)
+
+
+@inlined
+def plane_depth(plane: NDArray, radius: float) -> float:
+    """Return how deep [m] a ball was in a surface when its plane was found; not above 0 if none is in its reach."""
+    return radius - plane[PLANE.distance] if plane[PLANE.side] != 0.0 else 0.0
 
 
 @noinline
@@ -191,8 +234,7 @@ def meet_obstacles(bodies: Bodies) -> None:
     p, v = STATE.p_WB, STATE.v_WB
     for i in range(bodies.state.shape[0]):
         row, state = bodies.vehicle[i], bodies.state[i]
-        reach = max(row[VEHICLE.contact_reach], row[VEHICLE.hull_radius]) + ball(row, POINTS)[1]
-        reach += LOOK_S * norm(_vector(state[v : v + 3]))
+        reach = reach_of(row, _vector(state[v : v + 3]))
         for m in range(bodies.obstacle.shape[0]):
             distance = nearest(bodies.obstacle[m], state[p], state[p + 1], state[p + 2])[0]
             hit = False
@@ -207,9 +249,21 @@ def meet_obstacles(bodies: Bodies) -> None:
                 for s in range(bodies.solid.shape[1]):
                     if bodies.solid[i, s] == m:
                         bodies.solid[i, s] = -1
-            if hit and bodies.bumping[i, m] == 0:
-                bodies.bumped[i, m] = 1
-            bodies.bumping[i, m] = 1 if hit else 0
+            note_bump(bodies, i, m, hit)
+
+
+@inlined
+def reach_of(row: NDArray, v_WB: Vector) -> float:
+    """Return the distance [m] from a drone's centre within which something can touch it in the next steps."""
+    reach = max(row[VEHICLE.contact_reach], row[VEHICLE.hull_radius]) + ball(row, POINTS)[1]
+    return reach + LOOK_S * norm(v_WB)
+
+
+@inlined
+def note_bump(bodies: Bodies, i: int, thing: int, hit: bool) -> None:
+    if hit and bodies.bumping[i, thing] == 0:
+        bodies.bumped[i, thing] = 1
+    bodies.bumping[i, thing] = 1 if hit else 0
 
 
 @inlined
@@ -250,13 +304,19 @@ def _drag_anchors(row: NDArray, solid: NDArray, anchor: NDArray, state: NDArray,
         r_B, radius = ball(row, k)
         x = add(p_WB, rotate(q_WB, r_B))
         distance, nx, ny, nz = nearest(solid, x[0], x[1], x[2])
-        keep, gap = 0.0, (0.0, 0.0, 0.0)
-        if distance < radius:
-            hit |= k >= FEET
-            if not is_new:
-                gap = _across(subtract(x, _vector(anchor[k])), (nx, ny, nz))
-            size, limit = norm(gap), row[VEHICLE.friction] * (radius - distance)
-            keep = 1.0 if size <= limit else limit / size
-        for axis in range(3):
-            anchor[k, axis] = x[axis] - keep * gap[axis]
+        hit |= distance < radius and k >= FEET
+        drag(row, radius - distance, x, (nx, ny, nz), anchor[k], is_new)
     return hit
+
+
+@inlined
+def drag(row: Row, depth: float, x: Vector, n: Vector, anchor: NDArray, is_new: bool) -> None:
+    """Move the anchor (3,) [m; W] of a ball at x that is `depth` [m] in something whose normal is n."""
+    keep, gap = 0.0, (0.0, 0.0, 0.0)
+    if depth > 0.0:
+        if not is_new:
+            gap = _across(subtract(x, _vector(anchor)), n)
+        size, limit = norm(gap), row[VEHICLE.friction] * depth
+        keep = 1.0 if size <= limit else limit / size
+    for axis in range(3):
+        anchor[axis] = x[axis] - keep * gap[axis]

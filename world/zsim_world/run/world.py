@@ -214,7 +214,7 @@ class World(Coordinator):
             name, other = self.names[i], self.names[j]
             self.outbox.notice("collision", name, f"{name} and {other} collide", {"other": other})
         for i, m in self.fleet.bumps():
-            name, other = self.names[i], self.scenario.environment.obstacles[m].name
+            name, other = self.names[i], self.fleet.things[m]
             self.outbox.notice("collision", name, f"{name} runs into {other}", {"other": other})
         for each in self.fleet.incidents():
             data = {**each.data, "commander": self.queue.commanders()[each.drone]}

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from refused import has_terms, without_tags
 
@@ -14,7 +15,8 @@ from zsim.contract.messages import DroneInfo
 from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health, Waiting
 from zsim.math import frames
 from zsim.runtime.participant import Participant
-from zsim.scenario.scenario import Obstacle
+from zsim.scenario.scenario import Environment, Obstacle, Surface
+from zsim.scenario.surface_file import packed
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.console_server import console_state
 from zsim_bridges.console.console_tables import TableRows
@@ -348,13 +350,16 @@ def test_a_drone_s_distance_is_that_to_the_nearest_obstacle():
     poles = [
         Obstacle(name=f"p{x}", shape="cylinder", position_m=(x, 0, 0), radius_m=0.5, height_m=9) for x in (3.0, 9.0)
     ]
-    meter = FlightMeter(poles)
+    wall = Surface(name="wall", triangles=packed(np.array([[4.4, -9, 0, 4.4, 9, 0, 4.4, 0, 19]], dtype=float)))
+    meter = FlightMeter(Environment(obstacles=poles, surfaces=[wall]))
     meter.update(view(0.0, 5.0))
-    assert meter.figures["drone1"].obstacle_m == pytest.approx(1.5)
+    assert meter.figures["drone1"].obstacle_m == pytest.approx(0.6, abs=1e-6)
+    meter.update(view(0.1, 5.6))
+    assert meter.figures["drone1"].obstacle_m == pytest.approx(1.2, abs=1e-6)
 
 
 def test_figures_of_flight_come_from_where_a_drone_was():
-    meter = FlightMeter()
+    meter = FlightMeter(Environment())
     for step in range(10):
         meter.update(view(0.1 * step, 0.2 * step))
     figures = meter.figures["drone1"]

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from falling import energy, fly, tilt_deg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -42,27 +43,6 @@ def put(fleet: Fleet, p: Any, q: Any = (1, 0, 0, 0), v: Any = (0, 0, 0), w: Any 
     fleet.bodies.held[i] = np.nan  # what is left of the place before must not matter
     fleet.bodies.solid[i] = -1
     fleet.bodies.braced[i], fleet.bodies.twist[i] = 1, 0.0
-
-
-def fly(fleet: Fleet, seconds: float) -> np.ndarray:
-    """Advance, and return the state of all drones at every gate, (gates, N, STATE.size)."""
-    track = []
-    for _ in range(round(seconds / 0.02)):
-        fleet.advance()
-        track.append(fleet.bodies.state[:, : STATE.size].copy())
-    return np.array(track)
-
-
-def energy(fleet: Fleet, state: np.ndarray) -> np.ndarray:
-    """Return kinetic and potential energy of each drone [J], without that of springs; state (..., N, STATE.size)."""
-    row = fleet.bodies.vehicle
-    inertia = row[:, VEHICLE.inertia : VEHICLE.inertia + 3]
-    kinetic = row[:, VEHICLE.mass] * (state[..., 3:6] ** 2).sum(-1) + (inertia * state[..., 10:13] ** 2).sum(-1)
-    return 0.5 * kinetic + row[:, VEHICLE.mass] * row[:, VEHICLE.gravity] * state[..., 2]
-
-
-def tilt_deg(state: np.ndarray) -> float:
-    return math.degrees(math.acos(np.clip(1 - 2 * (state[7] ** 2 + state[8] ** 2), -1, 1)))
 
 
 @pytest.mark.parametrize("solid", [BOX, PILLAR], ids=["box", "cylinder"])
@@ -160,7 +140,7 @@ def test_a_force_beside_the_centre_turns() -> None:
     p = (-3.01 + 0.02 - corner[0], -3.01 + 0.02 - corner[1], ROOF_M - corner[2] - 0.001)  # the others are over the edge
     held = np.zeros((1, *fleet.bodies.held.shape[2:]))
     held[0, 0] = np.array(p) + corner
-    touch = Touch(fleet.bodies.obstacle, np.zeros(1, dtype=np.int32), held, (0.0, 0.0, 0.0))
+    touch = Touch(fleet.bodies.obstacle, np.zeros(1, dtype=np.int32), held, fleet.bodies.plane[0], (0.0, 0.0, 0.0))
     force, moment = touched(row, touch, p, (0.0, 0.0, 0.0), (q[0], q[1], q[2], q[3]), (0.0, 0.0, 0.0))
     normal = row[VEHICLE.foot_stiffness] * 0.001
     np.testing.assert_allclose(force, (0.0, 0.0, normal), atol=1e-9)

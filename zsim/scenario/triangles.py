@@ -1,0 +1,281 @@
+"""The triangles of a scenario's surfaces: the nearest point of them, whether a way crosses one, and a tree over them.
+
+A surface is a sheet without thickness: a distance from it has no sign. An edge that one triangle has alone is its rim.
+All is exact, in a fixed order of plain operations, compiled where numba is installed.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zsim.math.compiled import Held, hold, inlined, kernel, noinline
+from zsim.math.rotation import Vector, add, axpy, cross, dot, scaled, subtract
+from zsim.scenario.obstacle import least_distances
+from zsim.scenario.surface_file import placed
+
+TRIANGLE = 9  # numbers of a triangle: a corner and the two edges from it [m; W]
+LEAF = 4  # parts of a leaf at most, chosen: a box costs about as much as a cylinder
+DEPTH = 64  # boxes that may wait while the tree is walked; each step down halves the parts
+MARGIN_M = 1e-6  # m, by which boxes are larger than what is in them, against rounding
+AREA_MIN_M2 = 1e-12  # m^2, twice the area; a smaller triangle has no direction and is left out
+WELD_M = 1e-6  # m, chosen: so near to each other two corners are one; a resolved scenario has single precision
+EDGE = 1e-9  # by which a triangle is wider for what crosses it, of its sides, so that nothing slips between two
+FIRST_EDGE, FIRST_CORNER, FACE = 0, 3, 6  # features of a triangle: edges ab, bc, ca; corners a, b, c; what is within
+
+Array = NDArray[np.float64]
+
+
+class Tree(NamedTuple):
+    """Boxes over P parts; the first is on top."""
+
+    bounds: NDArray  # (K, 6), least and greatest x, y, z [m]
+    link: NDArray  # int32 (K, 2): the second child (the first follows) and 0; of a leaf its first part and their count
+    part: NDArray  # int32 (P,)
+    waiting: NDArray  # int32 (DEPTH,), boxes that wait while it is walked
+    away: NDArray  # (DEPTH,), what is known of them
+
+
+class Sheet(NamedTuple):
+    """The triangles of all surfaces."""
+
+    triangle: NDArray  # (T, TRIANGLE)
+    rim: NDArray  # int8 (T, 6), 1 where an edge or corner is on the rim
+    surface: NDArray  # int32 (T,), whose it is
+    tree: Tree
+
+
+class Nearest(NamedTuple):
+    """The nearest point of some triangles."""
+
+    distance: float  # m
+    triangle: int  # -1: none is so near
+    feature: int  # of it
+    point: Vector
+
+
+def sheet_of(environment: Any) -> Sheet:
+    """Return the triangles of the surfaces of a scenario's environment."""
+    each = [placed(surface) for surface in environment.surfaces or ()]
+    triangle = np.concatenate([np.empty((0, TRIANGLE)), *each])
+    whose = np.repeat(np.arange(len(each), dtype=np.int32), [len(part) for part in each])
+    normal = np.stack([triangle[:, 4] * triangle[:, 8] - triangle[:, 5] * triangle[:, 7],
+                       triangle[:, 5] * triangle[:, 6] - triangle[:, 3] * triangle[:, 8],
+                       triangle[:, 3] * triangle[:, 7] - triangle[:, 4] * triangle[:, 6]], axis=1)  # fmt: skip
+    sound = np.sqrt((normal * normal).sum(axis=1)) > AREA_MIN_M2
+    triangle, whose = triangle[sound], whose[sound]
+    corners = corners_of(triangle)
+    tree = tree_over(corners.min(axis=1), corners.max(axis=1))
+    return Sheet(triangle, _rim(corners), whose, tree)
+
+
+def corners_of(triangle: Array) -> Array:
+    """Return the three corners of each triangle, (T, 3, 3) [m; W]."""
+    first = triangle[:, :3]
+    return np.stack([first, first + triangle[:, 3:6], first + triangle[:, 6:]], axis=1)
+
+
+def _rim(corners: Array) -> NDArray[np.int8]:
+    """Return which edges and corners of triangles are on the rim, (T, 6)."""
+    count = len(corners)
+    if not count:
+        return np.zeros((0, 6), dtype=np.int8)
+    _, number = np.unique(np.rint(corners.reshape(-1, 3) / WELD_M), axis=0, return_inverse=True)
+    number = number.reshape(count, 3)
+    edges = np.sort(np.stack([number, np.roll(number, -1, axis=1)], axis=2), axis=2).reshape(-1, 2)
+    _, which, uses = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
+    alone = uses[which.ravel()] == 1
+    on_rim = np.zeros(number.max() + 1, dtype=bool)
+    on_rim[edges[alone].ravel()] = True
+    return np.concatenate([alone.reshape(count, 3), on_rim[number]], axis=1).astype(np.int8)
+
+
+def tree_over(low: Array, high: Array) -> Tree:
+    """Return the tree over P boxes, given their least and greatest corners (P, 3): halves along the longest side."""
+    low, high = low - MARGIN_M, high + MARGIN_M
+    part, middle = np.arange(len(low), dtype=np.int32), 0.5 * (low + high)
+    bounds: list[Array] = []
+    link: list[tuple[int, int]] = []
+    waiting = [(0, len(part), -1)] if len(part) else []
+    while waiting:
+        first, end, parent = waiting.pop()
+        if parent >= 0:
+            link[parent] = (len(link), 0)
+        own = part[first:end]
+        bounds.append(np.concatenate([low[own].min(axis=0), high[own].max(axis=0)]))
+        if end - first <= LEAF:
+            link.append((first, end - first))
+            continue
+        axis = int(np.ptp(middle[own], axis=0).argmax())
+        part[first:end] = own[np.argsort(middle[own, axis], kind="stable")]
+        half = (first + end) // 2
+        waiting += [(half, end, len(link)), (first, half, -1)]
+        link.append((0, 0))
+    links = np.array(link, dtype=np.int32).reshape(-1, 2)
+    return Tree(np.array(bounds).reshape(-1, 6), links, part, np.empty(DEPTH, dtype=np.int32), np.empty(DEPTH))
+
+
+@inlined
+def _square(bounds: NDArray, x: Vector) -> float:
+    """Return the square of a point's distance from a box [m^2]."""
+    square = 0.0
+    for k in range(3):
+        over = max(bounds[k] - x[k], x[k] - bounds[k + 3], 0.0)
+        square += over * over
+    return square
+
+
+@inlined
+def nearest_on(row: NDArray, x: Vector) -> tuple[Vector, int]:
+    """Return the point of a triangle that is nearest to x, and the feature that it is on.
+
+    By the regions of Voronoi (C. Ericson, "Real-Time Collision Detection", 2005, section 5.1.5).
+    """
+    a, ab, ac = (row[0], row[1], row[2]), (row[3], row[4], row[5]), (row[6], row[7], row[8])
+    ax = subtract(x, a)
+    a1, a2 = dot(ab, ax), dot(ac, ax)
+    if a1 <= 0.0 and a2 <= 0.0:
+        return a, FIRST_CORNER
+    bx = subtract(ax, ab)
+    b1, b2 = dot(ab, bx), dot(ac, bx)
+    if b1 >= 0.0 and b2 <= b1:
+        return add(a, ab), FIRST_CORNER + 1
+    beside_ab = a1 * b2 - b1 * a2
+    if beside_ab <= 0.0 and a1 >= 0.0 and b1 <= 0.0:
+        return axpy(a, a1 / (a1 - b1), ab), FIRST_EDGE
+    cx = subtract(ax, ac)
+    c1, c2 = dot(ab, cx), dot(ac, cx)
+    if c2 >= 0.0 and c1 <= c2:
+        return add(a, ac), FIRST_CORNER + 2
+    beside_ca = c1 * a2 - a1 * c2
+    if beside_ca <= 0.0 and a2 >= 0.0 and c2 <= 0.0:
+        return axpy(a, a2 / (a2 - c2), ac), FIRST_EDGE + 2
+    beside_bc = b1 * c2 - c1 * b2
+    if beside_bc <= 0.0 and b2 - b1 >= 0.0 and c1 - c2 >= 0.0:
+        along = (b2 - b1) / ((b2 - b1) + (c1 - c2))
+        return axpy(add(a, ab), along, subtract(ac, ab)), FIRST_EDGE + 1
+    per = 1.0 / (beside_ab + beside_bc + beside_ca)
+    return add(a, axpy(scaled(ab, beside_ca * per), beside_ab * per, ac)), FACE
+
+
+@noinline
+def nearest_point(sheet: Sheet, x: Vector, far: float) -> Nearest:
+    """Return the nearest point that is nearer than `far` [m]; of those equally near, the first that is found."""
+    tree = sheet.tree
+    best, which, feature, point = far * far, -1, FACE, x
+    if tree.bounds.shape[0] > 0 and _square(tree.bounds[0], x) < best:
+        tree.waiting[0], tree.away[0], depth = 0, 0.0, 1
+        while depth > 0:
+            depth -= 1
+            node = tree.waiting[depth]
+            if not tree.away[depth] < best:
+                continue
+            first, parts = tree.link[node, 0], tree.link[node, 1]
+            if parts == 0:
+                near, other = node + 1, first
+                at, beyond = _square(tree.bounds[near], x), _square(tree.bounds[other], x)
+                if beyond < at:
+                    near, other, at, beyond = other, near, beyond, at
+                if beyond < best:
+                    tree.waiting[depth], tree.away[depth] = other, beyond
+                    depth += 1
+                if at < best:
+                    tree.waiting[depth], tree.away[depth] = near, at
+                    depth += 1
+                continue
+            for n in range(first, first + parts):
+                t = tree.part[n]
+                found, of = nearest_on(sheet.triangle[t], x)
+                away = subtract(x, found)
+                square = dot(away, away)
+                if square < best:
+                    best, which, feature, point = square, t, of, found
+    return Nearest(math.sqrt(best) if which >= 0 else far, which, feature, point)
+
+
+@inlined
+def side_of(row: NDArray, x: Vector) -> tuple[float, Vector]:
+    """Return the volume that x spans with a triangle, above 0 in front of it, and its normal; neither of unit size."""
+    normal = cross((row[3], row[4], row[5]), (row[6], row[7], row[8]))
+    return dot(normal, subtract(x, (row[0], row[1], row[2]))), normal
+
+
+@noinline
+def crosses(sheet: Sheet, start: Vector, end: Vector) -> bool:
+    """Tell whether a way from one point to another crosses a triangle; a point in its plane is in front of it."""
+    tree = sheet.tree
+    if tree.bounds.shape[0] == 0:
+        return False
+    tree.waiting[0], depth = 0, 1
+    while depth > 0:
+        depth -= 1
+        node = tree.waiting[depth]
+        apart = False
+        for k in range(3):
+            low, high = min(start[k], end[k]), max(start[k], end[k])
+            apart |= high < tree.bounds[node, k] or low > tree.bounds[node, k + 3]
+        if apart:
+            continue
+        first, parts = tree.link[node, 0], tree.link[node, 1]
+        if parts == 0:
+            tree.waiting[depth], tree.waiting[depth + 1] = first, node + 1
+            depth += 2
+            continue
+        for n in range(first, first + parts):
+            if _crosses_one(sheet.triangle[tree.part[n]], start, end):
+                return True
+    return False
+
+
+@inlined
+def _crosses_one(row: NDArray, start: Vector, end: Vector) -> bool:
+    (was, normal), (now, _) = side_of(row, start), side_of(row, end)
+    if (was >= 0.0) == (now >= 0.0):
+        return False
+    ab, ac = (row[3], row[4], row[5]), (row[6], row[7], row[8])
+    at = subtract(axpy(start, was / (was - now), subtract(end, start)), (row[0], row[1], row[2]))
+    square = dot(normal, normal)
+    u, v = dot(cross(at, ac), normal) / square, dot(cross(ab, at), normal) / square
+    return u >= -EDGE and v >= -EDGE and u + v <= 1.0 + EDGE
+
+
+@kernel()
+def _find_nearest(held: Held, points: NDArray, least: NDArray, found: NDArray) -> None:
+    """Set the nearest point (P, 3) to each point (P, 3), and the distance (P,), where this is less than it was."""
+    for k in range(points.shape[0]):
+        nearest = nearest_point(held.content, (points[k, 0], points[k, 1], points[k, 2]), least[k])
+        least[k] = nearest.distance
+        for axis in range(3):
+            found[k, axis] = nearest.point[axis]
+
+
+def nearest_points(sheet: Held, p_W: ArrayLike, far_m: ArrayLike) -> tuple[Array, Array]:
+    """Return distances (P,) [m] and places (P, 3) of what of a sheet, by `hold`, is nearest to points (P, 3).
+
+    `far_m` and the point itself where it is not nearer than that.
+    """
+    points = np.ascontiguousarray(p_W, dtype=float).reshape(-1, 3)
+    least, found = np.array(np.broadcast_to(far_m, len(points)), dtype=float), np.empty_like(points)
+    _find_nearest(sheet, points, least, found)
+    return least, found
+
+
+class Surroundings:
+    """What a drone may come near to: the obstacles and surfaces of a scenario's environment.
+
+    Attributes:
+        is_empty: whether there are none.
+    """
+
+    def __init__(self, environment: Any) -> None:
+        self._obstacles, sheet = environment.obstacles, sheet_of(environment)
+        self._sheet = hold(sheet) if len(sheet.triangle) else None
+        self.is_empty = not self._obstacles and self._sheet is None
+
+    def distances_m(self, p_W: ArrayLike) -> Array:
+        """Return the distance [m] of each point (P, 3) from what is nearest, below 0 in an obstacle; inf if none is."""
+        least = least_distances(self._obstacles, p_W)
+        if self._sheet is not None:
+            least = np.minimum(least, nearest_points(self._sheet, p_W, np.maximum(least, 0.0))[0])
+        return least
