@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from zsim.contract.flight_messages import Status
+from zsim.math import elementary as el
 from zsim.vehicles.vehicle import Limits
 from zsim_bridges.ardrone import at_commands
 from zsim_bridges.ardrone.at_commands import Pcmd, PcmdMag, Ref
@@ -248,7 +249,7 @@ class SetpointSender:
     def __init__(self, sender: CommandSender, limits: Limits, configuration: Configuration) -> None:
         self._sender = sender
         self._configuration = configuration
-        self._tilt_slope = math.tan(math.radians(limits.tilt_deg))
+        self._tilt_slope = el.tan(math.radians(limits.tilt_deg))
         self._climb_m_s, self._yaw_rad_s = limits.vertical_speed_m_s, math.radians(limits.yaw_rate_deg_s)
         self._turn_rad_s = min(CALIBRATION_YAW_RAD_S, self._yaw_rad_s)
         self.turn_ns = round(2e9 * math.pi / self._turn_rad_s)
@@ -270,10 +271,10 @@ class SetpointSender:
         right, back = setpoint.right, setpoint.back
         if setpoint.pilot_heading_rad is not None:
             turn = setpoint.pilot_heading_rad - self.heading_rad
-            sine, cosine = math.sin(turn), math.cos(turn)
+            sine, cosine = el.sin(turn), el.cos(turn)
             right, back = cosine * right - sine * back, sine * right + cosine * back
         tilt_rad = number("control:euler_angle_max")
-        right, back = (share(math.tan(part * tilt_rad) / self._tilt_slope) for part in (right, back))
+        right, back = (share(el.tan(part * tilt_rad) / self._tilt_slope) for part in (right, back))
         climb_m_s = min(setpoint.up * number("control:control_vz_max") / 1e3, self._climb_left_m_s())
         yaw_left = share(-setpoint.clockwise * number("control:control_yaw") / self._yaw_rad_s)
         self._sender.tilt(t_ns, -back, -right, share(climb_m_s / self._climb_m_s), yaw_left, hover=False)

@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from zsim.contract.flight_messages import state_refusal
+from zsim.math import elementary as el
 from zsim.math.frames import turned_about_up
 from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Scenario
@@ -131,7 +132,7 @@ def geofence_of(scenario: Scenario) -> Geofence:
 def stick_velocity(stick: Stick, pose: DronePose, limits: Limits, fence: Geofence) -> FlownVelocity:
     """Return the velocity that a stick demands, within the drone's limits and the fence."""
     speed = min(max(stick.speed_m_s, 0.0), limits.horizontal_speed_m_s)
-    deflection = max(1.0, math.hypot(stick.forward, stick.left))
+    deflection = max(1.0, el.hypot(stick.forward, stick.left))
     climb = stick.up * min(CLIMB_SHARE * speed, limits.vertical_speed_m_s)
     wanted = (stick.forward / deflection * speed, stick.left / deflection * speed, climb)
     yaw_rate = stick.turn * min(YAW_RATE_RAD_S, math.radians(limits.yaw_rate_deg_s))
@@ -422,7 +423,7 @@ class ManualFlight:
         """Return the place to which a drone flies, past those that it has come near to."""
         with self._lock:
             places = flight.places_W
-            if pose is not None and len(places) > 1 and math.dist(pose.p_W, places[0]) <= NEAR_M:
+            if pose is not None and len(places) > 1 and el.distance(pose.p_W, places[0]) <= NEAR_M:
                 places = flight.places_W = places[1:]
             return next(iter(places), None)
 

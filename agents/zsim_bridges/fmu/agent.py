@@ -17,6 +17,7 @@ from zsim.contract.flight_messages import Estimate, Mode, Status, state_refusal
 from zsim.contract.messages import Info
 from zsim.contract.snapshot import State
 from zsim.errors import RunError, UserCodeError, printable
+from zsim.math import elementary as el
 from zsim.runtime.agent import Agent, Output
 from zsim.scenario.scenario import Scenario
 from zsim_bridges.fmu.formation import Formation
@@ -297,10 +298,10 @@ class _Writer:
         """Set the heading of an estimate where the FMU gives the attitude only, or the attitude by the heading."""
         if self._level_from and not self._yaw_from:
             half = fields["yaw_rad"] / 2
-            fields["orientation_wxyz"] = (math.cos(half), 0.0, 0.0, math.sin(half))
+            fields["orientation_wxyz"] = (el.cos(half), 0.0, 0.0, el.sin(half))
         elif self._yaw_from and not self._level_from:
             w, x, y, z = fields["orientation_wxyz"]
-            fields["yaw_rad"] = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+            fields["yaw_rad"] = el.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 class _FormationWriter:

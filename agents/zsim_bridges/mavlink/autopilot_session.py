@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from zsim.contract.flight_messages import DroneState
 from zsim.contract.messages import Info
+from zsim.math import elementary as el
 from zsim.math.frames import geodetic_to_enu, heading
 from zsim.math.rotation import LEVEL, Vector
 from zsim.scenario.scenario import Scenario
@@ -434,7 +435,7 @@ class TelemetryReadings(AircraftReadings):
         match m:
             case dialect.AttitudeQuaternion():
                 q = dialect.attitude_ned((m.q1, m.q2, m.q3, m.q4))
-                length = math.hypot(*q)
+                length = el.length(q)
                 if length > 0.5:  # else it is no attitude at all
                     w, x, y, z = (part / length for part in q)
                     self._q_WB, self._w_WB_B = (w, x, y, z), frd((m.rollspeed, m.pitchspeed, m.yawspeed))
@@ -487,7 +488,7 @@ class TelemetryReadings(AircraftReadings):
         if taken_ns - max(self._measured_flow_ns + FLOW_LOST_NS, self._flow_ns + FLOW_NS) >= 0:
             self._flow_ns = taken_ns
             yaw = float(heading(self._q_WB))
-            forward, left = vx * math.cos(yaw) + vy * math.sin(yaw), vy * math.cos(yaw) - vx * math.sin(yaw)
+            forward, left = vx * el.cos(yaw) + vy * el.sin(yaw), vy * el.cos(yaw) - vx * el.sin(yaw)
             self.read("flow", taken_ns, (forward, left, vz), 1.0)
 
     def _read_field(self, taken_ns: int, unit_ut: float, m: Any) -> None:

@@ -6,6 +6,7 @@ Places are flown to as references of drones are: `zsim_agents.references.trackin
 import math
 from typing import Literal, NamedTuple
 
+from zsim.math import elementary as el
 from zsim.math.rotation import Quaternion, Vector
 from zsim_agents.references.cruise import Cruise
 from zsim_agents.references.tracking import Course
@@ -45,7 +46,7 @@ class Target(NamedTuple):
 
     def distance_m(self, position_m: Vector) -> float:
         pairs = zip(self.position_m, position_m, strict=True)
-        return math.hypot(*(0.0 if p is None else p - own for p, own in pairs))
+        return el.length((0.0 if p is None else p - own for p, own in pairs))
 
 
 class TiltTarget(NamedTuple):

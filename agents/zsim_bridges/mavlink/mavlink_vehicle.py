@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from zsim.contract.messages import Origin
 from zsim.errors import without_figures
+from zsim.math import elementary as el
 from zsim.math.frames import turned_about_up
 from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Drone, Piloted
@@ -408,7 +409,7 @@ def from_local(message: dialect.SetPositionTargetLocalNed, state: VehicleState) 
     along_heading = frame in ALONG_HEADING
     x, y, z = dialect.frd(place) if along_heading else ned(place)
     if along_heading:
-        c, s = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
+        c, s = el.cos(state.yaw_rad), el.sin(state.yaw_rad)
         x, y = c * x - s * y, s * x + c * y
     own_x, own_y, own_z = state.position_m
     return _target(message, (own_x + x, own_y + y, own_z + z), along_heading, state)
@@ -473,7 +474,7 @@ def from_attitude(message: dialect.SetAttitudeTarget, weight_n: float) -> Setpoi
     values = (*message.q, message.thrust, message.body_yaw_rate)
     if mask & AttitudeMask.ATTITUDE:
         return "body rates alone are not flown; give an attitude"
-    length = math.hypot(*message.q)
+    length = el.length(message.q)
     if not all(map(math.isfinite, values)) or not 0.5 < length < 2.0:
         return "the attitude of a setpoint is no quaternion"
     w, x, y, z = dialect.attitude_ned((message.q[0], message.q[1], message.q[2], message.q[3]))

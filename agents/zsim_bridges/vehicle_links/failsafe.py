@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 from zsim.contract import flight_messages
+from zsim.math import elementary as el
 from zsim.math.frames import heading, turned_about_up
 from zsim.scenario.scenario import Silence
 from zsim_bridges.vehicle_links.vehicle_session import AIRBORNE, STANDING, AircraftState, Demand
@@ -49,12 +50,12 @@ class FlightLimits(NamedTuple):
     def limited(self, velocity_m_s: Sequence[float], position_m: Sequence[float] | None) -> tuple[float, float, float]:
         """Return a velocity [m/s; W] within the limits that does not lead through the fence, if a position is known."""
         x, y, z = velocity_m_s
-        speed = math.hypot(x, y)
+        speed = el.hypot(x, y)
         share = min(1.0, self.speed_m_s / speed) if speed else 1.0
         x, y, z = x * share, y * share, max(-self.climb_m_s, min(self.climb_m_s, z))
         if position_m is None:
             return x, y, z
-        distance = math.hypot(position_m[0], position_m[1])
+        distance = el.hypot(position_m[0], position_m[1])
         if distance > 0.0 and not math.isinf(self.radius_m):
             out_x, out_y = position_m[0] / distance, position_m[1] / distance
             excess = x * out_x + y * out_y - _approach(self.radius_m - distance)
@@ -67,7 +68,7 @@ class FlightLimits(NamedTuple):
 
     def is_breached(self, position_m: Sequence[float]) -> bool:
         """Return whether an aircraft at a position [m; W] is so far outside that it must land."""
-        distance = math.hypot(position_m[0], position_m[1])
+        distance = el.hypot(position_m[0], position_m[1])
         return distance > self.radius_m + BREACH_M or position_m[2] > self.ceiling_m + BREACH_M
 
 
