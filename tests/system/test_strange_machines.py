@@ -58,6 +58,7 @@ STREAMED = (  # command, its exit code whatever becomes of its output, and what 
     ("nonsense", USER_FAULT, (FULL,)),
     ("keys --connect tcp/127.0.0.1:9 --wait 0.1", USER_FAULT, (CLOSED,)),
     ("export {run} --format csv --out {out}/csv", 0, (CLOSED,)),
+    ("bundle {run} --no-record -o {out}/closed.zsim", 0, (CLOSED,)),
     ("replay {run} --rate 0 --listen tcp/127.0.0.1:{port}", 0, (CLOSED,)),
     ("run {scenario} --duration 1 --no-report --out {out}/run", 0, (CLOSED, FULL)),
 )
@@ -103,6 +104,7 @@ def test_any_path_will_do(tmp_path: Path, flown: Path, several: bool) -> None:
         outside = ("run", scenario, *SHORT, "--out", run)
         here = [("export", run, "--format", form) for form in ("csv", "parquet", "mat", "foxglove")]
         here += [("report", run, "--format", "svg"), ("rerun", run)]
+        here += [("bundle", run, "-o", folder / f"{ODD}.zsim"), ("rerun", folder / f"{ODD}.zsim")]
     done = zsim(*map(str, outside))  # with processes that are given these paths
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
