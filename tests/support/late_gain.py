@@ -85,5 +85,5 @@ SPACE = (  # what is drawn for it, each of which the stock law stands
     "link_delay target=controller.main/world delay_ms=10..60 for_s=1..8 at_s=5..12",
     "mag_noise factor=2..5",
     "baro_bias value_m=-1..1",
-    "sonar_stuck",
+    "baro_noise factor=2..3",
 )
