@@ -80,10 +80,10 @@ SCENARIO: dict[str, Any] = {
 }
 WIND = "wind.gust_m_s=uniform(0, 0.3)"
 SPACE = (  # what is drawn for it, each of which the stock law stands
-    "gust velocity_m_s=0..6 for_s=1..5",
-    "gps_dropout probability=1 for_s=1..8",
-    "link_delay delay_ms=10..60 for_s=1..8",
+    "gust velocity_m_s=0..6 for_s=1..5 at_s=5..12",
+    "gps_dropout target=drone2 probability=1 for_s=1..8 at_s=5..12",
+    "link_delay target=controller.main/world delay_ms=10..60 for_s=1..8 at_s=5..12",
     "mag_noise factor=2..5",
     "baro_bias value_m=-1..1",
-    "sonar_stuck",
+    "baro_noise factor=2..3",
 )
