@@ -32,6 +32,8 @@ RATE_MAX = 5.0  # × real time; chosen: faster, manual flight is hopeless, and t
 CLIMB_SHARE = 0.5  # of the horizontal speed, up and down; chosen: height is harder to see on a page
 YAW_RATE_RAD_S = math.radians(45.0)  # chosen: a full turn in 8 s
 SPEED_M_S = 1.5  # towards a place; chosen: as the paper's formations
+NEAR_M = 0.5  # of a place, from which a drone turns to the one after it; chosen
+PLACES_MAX = 50  # of one drone, chosen: more are no longer an operator's
 BRAKE_S = 1.0  # in which a drone comes to rest before the fence; chosen: three times the lag of its velocity loop
 
 
@@ -91,6 +93,7 @@ class FlightAnswer(NamedTuple):
     commander: str = ""
     id: str = ""  # of the page's request to take it
     goal: Vector | None = None  # the place to which it flies [m; W]
+    then: tuple[Vector, ...] = ()  # and those after it
 
 
 class Geofence(NamedTuple):
@@ -156,8 +159,8 @@ class _Flight:
     id: str = ""  # of the page's request
     owned_s: float | None = None  # since when it is commanded; None before
     sent_s: float = 0.0  # when it was last commanded
-    stick: Stick | None = None  # that is held; None: hover, or on the way to `place_W`
-    place_W: Vector | None = None
+    stick: Stick | None = None  # that is held; None: hover, or on the way to `places_W`
+    places_W: tuple[Vector, ...] = ()  # to which it flies, one after the other
     sent_W: Vector | None = None  # the place to which its course leads; None: to none
     lost: bool = False  # whether the page's connection is gone
     asked_s: float = 0.0  # when the world was last asked for the drone
@@ -261,14 +264,18 @@ class ManualFlight:
             flight = self._flights.get(page)
             if flight is not None:
                 if stick is not None:
-                    flight.place_W = None  # the stick overrides the place
+                    flight.places_W = ()  # the stick overrides the place
                 elif flight.stick is not None:
                     self._send_soon(flight)
                 flight.stick, flight.seen_s = stick, self._wall_s()
         return self.answer(page)
 
-    def go(self, page: Any, x_m: float, y_m: float, z_m: float | None = None) -> FlightAnswer:
-        """Fly the page's drone to a place, at its present height unless another one is given."""
+    def go(self, page: Any, x_m: float, y_m: float, z_m: float | None = None, then: bool = False) -> FlightAnswer:
+        """Fly the page's drone to a place, at its present height unless another one is given.
+
+        Args:
+            then: after the places to which it flies already, rather than instead of them.
+        """
         with self._lock:
             flight = self._flights.get(page)
             if flight is None:
@@ -276,14 +283,17 @@ class ManualFlight:
             pose, refusal = self._sight_of(flight.drone).pose, self._fence.refusal(x_m, y_m)
             if refusal or pose is None:
                 return self.answer(page)._replace(text=refusal or f"no estimate of {flight.drone}")
-            height_m = pose.p_W[2] if z_m is None else z_m
-            flight.stick, flight.place_W, flight.seen_s = None, (x_m, y_m, height_m), self._wall_s()
+            place = x_m, y_m, pose.p_W[2] if z_m is None else z_m
+            before = flight.places_W if then else ()
+            flight.stick, flight.seen_s = None, self._wall_s()
+            if before[-1:] != (place,):  # a page repeats what is not confirmed yet
+                flight.places_W = (*before[: PLACES_MAX - 1], place)
         return self.answer(page)
 
     def is_on_way(self, page: Any) -> bool:
         with self._lock:
             flight = self._flights.get(page)
-            return flight is not None and flight.place_W is not None
+            return flight is not None and bool(flight.places_W)
 
     def leave(self, page: Any, text: str = "") -> FlightAnswer:
         """Let the page's drone hover, and give it back; `text` says why."""
@@ -302,7 +312,7 @@ class ManualFlight:
             flight = self._flights.get(page)
             self._texts.pop(page, None)
             if flight is not None:
-                flight.stick, flight.place_W, flight.lost = None, None, True
+                flight.stick, flight.places_W, flight.lost = None, (), True
                 self._send_soon(flight)
 
     def answer(self, page: Any) -> FlightAnswer:
@@ -316,11 +326,12 @@ class ManualFlight:
                 return FlightAnswer(flight.drone, "taking", f"{text}: {silence}" if silence else text, id=flight.id)
             if self._sight_of(flight.drone).pose is None:
                 text = f"hovers: no estimate of {flight.drone}"
-            elif flight.place_W is not None:
-                text = "goes to {:.1f}, {:.1f} m at z = {:.1f} m".format(*flight.place_W)
+            elif flight.places_W:
+                text = "goes to {:.1f}, {:.1f} m at z = {:.1f} m".format(*flight.places_W[0])
             else:
                 text = "flown by hand" if flight.stick is not None else "hovers"
-            return FlightAnswer(flight.drone, "flying", text, id=flight.id, goal=flight.place_W)
+            goal, then = next(iter(flight.places_W), None), flight.places_W[1:]
+            return FlightAnswer(flight.drone, "flying", text, id=flight.id, goal=goal, then=then)
 
     def tick(self) -> None:
         """Command every drone that is due; give back those that may not be flown any more.
@@ -392,7 +403,7 @@ class ManualFlight:
 
     def _velocity(self, flight: _Flight, wall_s: float) -> FlownVelocity:
         pose, limits, stick = self._sight_of(flight.drone).pose, self._limits[flight.drone], flight.stick
-        place = flight.place_W if stick is None else None
+        place = self._next_place(flight, pose) if stick is None else None
         if wall_s - flight.seen_s > STALE_S or pose is None:
             place = stick = None
         before, flight.sent_W = flight.sent_W, place
@@ -406,6 +417,14 @@ class ManualFlight:
             course.send((*place, None), pose.t_s, here, moving, speeds=Cruise(SPEED_M_S, climb_m_s, climb_m_s))
         velocity_W, turn = course.velocity(pose.t_s, here, moving)
         return FlownVelocity(_fenced(velocity_W, pose, self._fence), turn)
+
+    def _next_place(self, flight: _Flight, pose: DronePose | None) -> Vector | None:
+        """Return the place to which a drone flies, past those that it has come near to."""
+        with self._lock:
+            places = flight.places_W
+            if pose is not None and len(places) > 1 and math.dist(pose.p_W, places[0]) <= NEAR_M:
+                places = flight.places_W = places[1:]
+            return next(iter(places), None)
 
     def _send_soon(self, flight: _Flight) -> None:
         """Let a command be sent at once, not a period after the last one."""

@@ -311,6 +311,23 @@ def test_a_drone_is_sent_to_a_place_at_its_height_and_the_stick_ends_that(flown:
     assert set(flown.after(0.2)) == {STILL}
 
 
+def test_places_are_flown_to_one_after_the_other_and_one_that_is_repeated_is_one(flown: Cockpit):
+    flown.control.go(PAGE, 10.0, 0.0, 5.0)
+    flown.control.go(PAGE, 10.0, 10.0, 5.0, then=True)
+    answer = flown.control.go(PAGE, 10.0, 10.0, 5.0, then=True)
+    assert (answer.goal, answer.then) == ((10.0, 0.0, 5.0), ((10.0, 10.0, 5.0),))
+    assert flown.after(PERIOD_S)[0][1] == pytest.approx(0.0, abs=1e-9)
+    flown.see("drone2", pose=DronePose((9.7, 0.0, 5.0), 0.0))
+    assert flown.after(2 * PERIOD_S)[-1][1] > 0.5
+    answer = flown.control.answer(PAGE)
+    assert (answer.goal, answer.then) == ((10.0, 10.0, 5.0), ())
+    flown.see("drone2", pose=DronePose((10.0, 10.0, 5.0), 0.0))
+    flown.after(PERIOD_S)
+    assert flown.control.answer(PAGE).goal == (10.0, 10.0, 5.0)  # where it stays
+    flown.control.steer(PAGE, FORWARD)
+    assert flown.control.answer(PAGE).goal is None
+
+
 def test_a_place_outside_of_the_fence_or_without_an_estimate_is_refused(flown: Cockpit):
     assert has_terms(flown.control.go(PAGE, 80.0, 0.0).text, "x", "80.0", "50")
     flown.see("drone2", pose=None)
