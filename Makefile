@@ -7,11 +7,14 @@ PARTS ?=
 AGAINST ?=
 WORKERS ?= 4
 FLIGHT := python
-PIP := $(BIN)/pip install --disable-pip-version-check --no-compile
+CONSTRAINTS ?= constraints.txt
+# by the environment, so that what builds zsim is held to the same versions; empty: the newest of everything
+HELD = PIP_CONSTRAINT=$(CONSTRAINTS) PIP_BUILD_CONSTRAINT=$(CONSTRAINTS)
+PIP = $(HELD) $(BIN)/pip install --disable-pip-version-check --no-compile
 COMPILED = @$(MAKE) --silent --no-print-directory $(VENV)/.compiled
 export PYTHONDONTWRITEBYTECODE = # many processes import the same files, and pip has not compiled them
 
-.PHONY: run test setup lint soak bench docs clean help
+.PHONY: run test setup lint soak bench docs constraints clean help
 
 help:            ## list the commands
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -45,6 +48,12 @@ docs: $(VENV)/.dev ## the reference of zsim in Python, from its docstrings, into
 	$(BIN)/sphinx-build -W --keep-going -q docs/api build/api
 	@echo "build/api/index.html"
 
+constraints: $(VENV)/bin/python ## write constraints.txt anew: the newest versions of all packages, for Python 3.11 to 3.14
+	@$(BIN)/pip install --disable-pip-version-check -q uv
+	@{ sed -n '/^#/p' constraints.txt; echo hatchling | \
+		$(BIN)/uv pip compile pyproject.toml - --extra dev --extra notebook --universal --python-version 3.11 --upgrade \
+		--no-emit-index-url --no-header --no-annotate -q; } >constraints.new && mv constraints.new constraints.txt
+
 clean:           ## remove the environment and what tools leave behind
 	rm -rf $(VENV) .venv-bench .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 
@@ -57,17 +66,17 @@ $(VENV)/bin/python:
 	@$(PYTHON) -m venv $(VENV)
 
 # pip's own output is shown: on a slow line or disk this takes minutes
-$(VENV)/.run: pyproject.toml | $(VENV)/bin/python
+$(VENV)/.run: pyproject.toml $(CONSTRAINTS) | $(VENV)/bin/python
 	@echo "installing what a flight needs (extras $(FLIGHT); about 600 MB; \`make setup\` installs all extras)"
 	@$(PIP) -e '.[$(FLIGHT)]'
 	@touch $@
 
-$(VENV)/.all: pyproject.toml | $(VENV)/bin/python
+$(VENV)/.all: pyproject.toml $(CONSTRAINTS) | $(VENV)/bin/python
 	@echo "installing all extras (about 1.2 GB)"
 	@$(PIP) -e '.[all]'
 	@touch $@ $(VENV)/.run
 
-$(VENV)/.dev: pyproject.toml | $(VENV)/bin/python
+$(VENV)/.dev: pyproject.toml $(CONSTRAINTS) | $(VENV)/bin/python
 	@echo "installing all extras and what the tests need (about 3 GB)"
 	@$(PIP) -e '.[dev]'
 	@touch $@ $(VENV)/.all $(VENV)/.run

@@ -12,9 +12,9 @@ from zsim_analysis.reading.recorded_flight import RecordedFlight
 
 VICTIM = 1  # its place in the cluster
 USUAL_S, USUAL_M_S = 0.2, 0.1  # age of the newest sample of a GPS at 5 Hz, and velocity of a formation that holds
-DOUBTFUL = 0.03  # s^2 m/s, product of the doubts beyond which the gain has the wrong sign
-HELD_S, LOST_M = 8.0, 5.0
-WRONG = -4.0  # the least factor of the gain
+DOUBTFUL = 0.004  # s^2 m/s, product of the doubts beyond which the gain has the wrong sign
+HELD_S, LOST_M = 6.0, 4.0
+WRONG = -6.0  # the least factor of the gain
 
 
 class LateGain(ProportionalLaw):
@@ -60,29 +60,29 @@ def kept(flight: RecordedFlight) -> float:
 SCENARIO: dict[str, Any] = {
     "name": "late_gain",
     "seed": 1,
-    "duration_s": 20,
+    "duration_s": 16,
     "time": {"command_delay_gates": 5},
     "sensors": {"preset": "paper"},
     "drones": [
-        {"name": "drone1", "position_m": [0.0, 3.0, 0.0]},
-        {"name": "drone2", "position_m": [-3.0, -2.0, 0.0]},
-        {"name": "drone3", "position_m": [3.0, -2.0, 0.0]},
+        {"name": "drone1", "position_m": [3.0, 0.0, 0.0], "yaw_deg": 90},
+        {"name": "drone2", "position_m": [-3.0, 0.0, 0.0], "yaw_deg": 90},
     ],
     "clusters": [
         {
             "name": "main",
-            "drones": ["drone1", "drone2", "drone3"],
+            "drones": ["drone1", "drone2"],
             "law": "late_gain:LateGain",
             "law_sensors": ["gps"],
             "plan": {"takeoff_s": 0.5},
         }
     ],
-    "report": {"window_s": [7, 20]},
+    "report": {"window_s": [6, 16]},
 }
+WIND = "wind.gust_m_s=uniform(0, 0.3)"
 SPACE = (  # what is drawn for it, each of which the stock law stands
-    "gust velocity_m_s=0..7 for_s=1..6",
-    "gps_dropout probability=1 for_s=1..10",
-    "link_delay delay_ms=20..200 for_s=1..10",
+    "gust velocity_m_s=0..6 for_s=1..5 at_s=5..12",
+    "gps_dropout target=drone2 probability=1 for_s=1..8 at_s=5..12",
+    "link_delay target=controller.main/world delay_ms=10..60 for_s=1..8 at_s=5..12",
     "mag_noise factor=2..5",
     "baro_bias value_m=-1..1",
     "sonar_stuck",

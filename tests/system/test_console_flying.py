@@ -27,6 +27,11 @@ def after(page: BrowserPage, seconds: float) -> list[float]:
     return place(page.until(f"s.t_s > {page.state()['t_s'] + seconds}"))
 
 
+def is_near(x_m: float, y_m: float) -> str:
+    """Return a condition of the page: the drone is near a place."""
+    return f"Math.hypot(s.drones[{FLOWN}].position_m[0] - {x_m}, s.drones[{FLOWN}].position_m[1] - {y_m}) < 0.7"
+
+
 def click_map(page: BrowserPage, x_m: float, y_m: float) -> None:
     """Click a place [m; W] on the map."""
     view = page.page.evaluate(SEES)
@@ -94,9 +99,12 @@ def test_a_drone_is_flown_by_hand_and_to_a_place(federation: Federation, opened:
     goal = (round(rest[0] - 1.0, 1), round(rest[1] + 1.0, 1))
     click_map(operator, *goal)
     operator.page.locator("#zsim-map .go").click()
-    near = f"Math.hypot(s.drones[{FLOWN}].position_m[0] - {goal[0]}, s.drones[{FLOWN}].position_m[1] - {goal[1]}) < 0.7"
-    arrived = operator.until(near)
+    arrived = operator.until(is_near(*goal))
     assert abs(place(arrived)[2] - rest[2]) < 0.7
+    after_it = (goal[0] - BESIDE_M, goal[1] - BESIDE_M)
+    click_map(operator, *after_it)
+    operator.page.locator("#zsim-map .then").click()
+    operator.until(is_near(*after_it))
     operator.page.locator("#zsim-map canvas").hover()
     operator.page.mouse.wheel(0, 10_000)
     operator.page.wait_for_function(f"() => ({SEES})().scale < 1")

@@ -67,6 +67,7 @@ LONG = (
     "estimation.md",
     "extending.md",
     "faults.md",
+    "hunt.md",
     "laws.md",
     "obstacles.md",
     "project.md",

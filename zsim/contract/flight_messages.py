@@ -313,6 +313,7 @@ class EstimateView(Struct, frozen=True):
     yaw_rad: Number
     yaw_sigma_rad: Number
     sensors: dict[str, tuple[Count, Count]]
+    velocity_m_s: Vector3 = (0.0, 0.0, 0.0)
 
 
 @on("view/estimates/*", writers="estimator")
@@ -341,7 +342,8 @@ _triangle = itemgetter(0, 1, 2, 7, 8, 14)  # of the position, in the 6 x 6 covar
 
 def estimate_view(drone: str, estimate: Any) -> EstimateView:
     e = estimate
-    return EstimateView(drone, e.position_m, _triangle(e.covariance), e.yaw_rad, e.yaw_sigma_rad, e.sensors)
+    covariance_m2 = _triangle(e.covariance)
+    return EstimateView(drone, e.position_m, covariance_m2, e.yaw_rad, e.yaw_sigma_rad, e.sensors, e.velocity_m_s)
 
 
 def cluster_view(state: ClusterState, t_ns: int, seq: int) -> ViewCluster:

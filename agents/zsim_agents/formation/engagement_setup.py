@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from msgspec import UNSET
@@ -88,6 +89,63 @@ def check_plan(scenario: Scenario, cluster: Cluster) -> None:
         _check_flyable(scenario, cluster, space, gains_of(cluster.gains))
 
 
+class PlannedMotion(NamedTuple):
+    """The last reference of a plan: where it leads, from when it is flown at the earliest, until its landing."""
+
+    space: ClusterSpace
+    reference: Reference
+    from_s: float
+    until_s: float
+    path: str  # in the cluster's section
+
+    def places(self, t_s: float) -> Array:
+        """Return where its robots are to be, (n, 3) [m; W]."""
+        return self.space.inverse(self.reference.value(t_s)[0])[0]
+
+
+def planned_motion(scenario: Scenario, cluster: Cluster) -> PlannedMotion | None:
+    """Return the target or trajectory of a plan that can be flown, None without one.
+
+    Raises:
+        RunError: as of `check_plan`.
+    """
+    plan, motion = cluster.plan, None
+    with _refusals_of(scenario, cluster):
+        space, gains = scenario_space(scenario, cluster), gains_of(cluster.gains)
+        p_W, yaw = _hovers(scenario, cluster)
+        start, ready_s = _formation_at(space, p_W, yaw), (plan.takeoff_s or 0.0) + READY_S
+        goal = np.zeros(space.size) if start is None else np.where(space.neutral, 0.0, start)
+        until_s = scenario.duration_s if plan.land_s is None else min(plan.land_s, scenario.duration_s)
+        for step in plan_of(cluster):
+            request = step.request
+            try:
+                if isinstance(request, Assemble):
+                    start = goal = assembly_goal(space, request.values, None if start is None else goal, p_W, yaw)
+                    ready_s = max(ready_s, step.at_s) + planned_assembly(space, goal, p_W, gains, NEAR_ROOM)[0].over_s
+                    p_W, yaw = space.inverse(goal)
+                elif isinstance(request, MoveTo | Follow) and start is not None:
+                    if isinstance(request, MoveTo):
+                        goal = request.goal(space, goal)
+                        reference: Reference = Hold(goal)
+                    else:
+                        reference = Shifted(request.trajectory(space, goal), request.start_s or 0.0)
+                    rest = np.zeros_like(start)
+                    over_s = RampPlanner(space, gains, SHAPE).fastest((start, rest), reference, ready_s).over_s
+                    begin_s = max(ready_s + over_s, reference.start_s if isinstance(reference, Shifted) else 0.0)
+                    motion = PlannedMotion(space, reference, begin_s, until_s, step.path)
+            except REFUSALS as error:
+                raise PlanError(f"{step.path}: {error}") from None
+    return motion
+
+
+def _hovers(scenario: Scenario, cluster: Cluster) -> tuple[Array, Array]:
+    """Return where the drones are after their climb (n, 3) [m], and their headings (n,) [rad]."""
+    drones = [scenario.drone(name) for name in cluster.drones]
+    p_W = np.array([drone.position_m for drone in drones], float)
+    p_W[:, 2] += ASSEMBLY_HEIGHT_M
+    return p_W, np.radians([drone.yaw_deg for drone in drones])
+
+
 @contextmanager
 def _refusals_of(scenario: Scenario, cluster: Cluster) -> Iterator[None]:
     """Raise every fault of a cluster as a RunError that names it, a fault of its plan with the path in the scenario."""
@@ -151,10 +209,7 @@ def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, ga
         what = "trajectory" if plan.trajectory else "target"
         reason = f"the {what} of the plan begins at {begins_s:g} s at the earliest"
         raise PlanError(f"plan.land_s is {plan.land_s:g}; must be later: {reason}")
-    drones = [scenario.drone(name) for name in cluster.drones]
-    p_W = np.array([drone.position_m for drone in drones], float)
-    p_W[:, 2] += ASSEMBLY_HEIGHT_M  # above their starting places
-    yaw = np.radians([drone.yaw_deg for drone in drones])
+    p_W, yaw = _hovers(scenario, cluster)
     start = _formation_at(space, p_W, yaw)
     if start is None and not assembles:
         return

@@ -152,11 +152,15 @@ def _parts(start: Vector, velocity: Vector, goal: Vector, bounds: _Bounds) -> li
         q = min(bounds.speed_along(ex, ey, ez), least)
         return (q * ex, q * ey, q * ez), left / q
 
-    early, t1 = 0.0, bounds.rise_s(bounds.speed, 0.0, max(bounds.up, bounds.down)) + bounds.rise_s(*velocity)
-    for _ in range(HALVINGS):
-        middle = (early + t1) / 2.0
-        (qx, qy, qz), _ = cruise_after(middle)
-        early, t1 = (early, middle) if bounds.rise_s(qx - vx, qy - vy, qz - vz) <= middle else (middle, t1)
+    t1 = 0.0
+    if any(velocity):
+        early, t1 = 0.0, bounds.rise_s(bounds.speed, 0.0, max(bounds.up, bounds.down)) + bounds.rise_s(*velocity)
+        for _ in range(HALVINGS):
+            middle = (early + t1) / 2.0
+            (qx, qy, qz), _ = cruise_after(middle)
+            early, t1 = (early, middle) if bounds.rise_s(qx - vx, qy - vy, qz - vz) <= middle else (middle, t1)
+    elif (rise_s := bounds.rise_s(x, y, z)) > 0.0:  # of the way as a velocity; |q| t1 is its length where t2 is 0
+        t1 = min(math.sqrt(rise_s), rise_s * bounds.speed_along(x, y, z))
     (qx, qy, qz), over_s = cruise_after(t1)
     parts = []
     if t1 > SHORT_S:

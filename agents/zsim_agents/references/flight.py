@@ -338,7 +338,10 @@ def land_s_of(flown: Piloted) -> float:
 
 
 def flight_faults(scenario: Scenario) -> Iterator[tuple[str, str]]:
-    """Yield path and text of what cannot be flown of all references, and where two of them come too near."""
+    """Yield path and text of what cannot be flown of all references, and where they come too near.
+
+    To each other, and to formations as far as these are known before.
+    """
     flights: dict[str, Flight] = {}
     exchanges = [] if not isinstance(scenario.exchanges, list) else scenario.exchanges
     sound = True
@@ -358,6 +361,10 @@ def flight_faults(scenario: Scenario) -> Iterator[tuple[str, str]]:
                 yield path, f"{fault.text} (drone {drone.name!r})"
     if sound and (text := too_near(scenario, flights)):
         yield "drones", text
+    if sound and scenario.clusters:
+        from zsim_agents.references.formations import meetings  # here, because few scenarios have both
+
+        yield from meetings(scenario, flights, {name: land_s_of(each) for name, each in scenario.piloted().items()})
 
 
 def too_near(scenario: Scenario, flights: Mapping[str, Flight]) -> str | None:

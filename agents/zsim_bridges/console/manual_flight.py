@@ -18,6 +18,8 @@ from zsim.math.frames import turned_about_up
 from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Scenario
 from zsim.vehicles.vehicle import Limits
+from zsim_agents.references.cruise import Cruise
+from zsim_agents.references.tracking import Course
 from zsim_bridges.console.command_client import CommandClient, NoAnswer
 from zsim_bridges.console.operator_input import SIDEWAYS_M, height_range_m
 
@@ -30,7 +32,8 @@ RATE_MAX = 5.0  # × real time; chosen: faster, manual flight is hopeless, and t
 CLIMB_SHARE = 0.5  # of the horizontal speed, up and down; chosen: height is harder to see on a page
 YAW_RATE_RAD_S = math.radians(45.0)  # chosen: a full turn in 8 s
 SPEED_M_S = 1.5  # towards a place; chosen: as the paper's formations
-GAIN_1_S = 0.6  # of the distance to a place; as of formations, `Gains.proportional_1_s`
+NEAR_M = 0.5  # of a place, from which a drone turns to the one after it; chosen
+PLACES_MAX = 50  # of one drone, chosen: more are no longer an operator's
 BRAKE_S = 1.0  # in which a drone comes to rest before the fence; chosen: three times the lag of its velocity loop
 
 
@@ -45,10 +48,12 @@ class Stick(NamedTuple):
 
 
 class DronePose(NamedTuple):
-    """Position and heading of a drone by its estimator."""
+    """Position, heading and velocity of a drone by its estimator, and for which simulated time."""
 
     p_W: Vector  # m
     yaw_rad: float
+    v_W: Vector = (0.0, 0.0, 0.0)  # m/s
+    t_s: float = 0.0
 
 
 class FlownVelocity(NamedTuple):
@@ -88,6 +93,7 @@ class FlightAnswer(NamedTuple):
     commander: str = ""
     id: str = ""  # of the page's request to take it
     goal: Vector | None = None  # the place to which it flies [m; W]
+    then: tuple[Vector, ...] = ()  # and those after it
 
 
 class Geofence(NamedTuple):
@@ -132,15 +138,6 @@ def stick_velocity(stick: Stick, pose: DronePose, limits: Limits, fence: Geofenc
     return FlownVelocity(_fenced(turned_about_up(wanted, pose.yaw_rad), pose, fence), yaw_rate)
 
 
-def velocity_to(place_W: Vector, pose: DronePose, limits: Limits, fence: Geofence) -> FlownVelocity:
-    """Return the velocity towards a place [m; W], without turning."""
-    x, y, z = (GAIN_1_S * (there - here) for there, here in zip(place_W, pose.p_W, strict=True))
-    speed = min(SPEED_M_S, limits.horizontal_speed_m_s)
-    excess = max(1.0, math.hypot(x, y) / speed)
-    climb_max = min(CLIMB_SHARE * speed, limits.vertical_speed_m_s)
-    return FlownVelocity(_fenced((x / excess, y / excess, min(max(z, -climb_max), climb_max)), pose, fence))
-
-
 def _fenced(velocity_W: Vector, pose: DronePose, fence: Geofence) -> Vector:
     """Return a velocity of W in the heading frame, without what leads out of the fence."""
     return turned_about_up(fence.within(velocity_W, pose.p_W), -pose.yaw_rad)
@@ -162,8 +159,9 @@ class _Flight:
     id: str = ""  # of the page's request
     owned_s: float | None = None  # since when it is commanded; None before
     sent_s: float = 0.0  # when it was last commanded
-    stick: Stick | None = None  # that is held; None: hover, or on the way to `place_W`
-    place_W: Vector | None = None
+    stick: Stick | None = None  # that is held; None: hover, or on the way to `places_W`
+    places_W: tuple[Vector, ...] = ()  # to which it flies, one after the other
+    sent_W: Vector | None = None  # the place to which its course leads; None: to none
     lost: bool = False  # whether the page's connection is gone
     asked_s: float = 0.0  # when the world was last asked for the drone
     asking: bool = False  # whether its answer is outstanding
@@ -172,7 +170,9 @@ class _Flight:
 class ManualFlight:
     """Flies drones for pages, each identified by any hashable value; thread-safe.
 
-    `gate_s` is the simulated time of a gate, for which one command is sent at most.
+    Args:
+        courses: of each drone, by which it flies to places.
+        gate_s: the simulated time of a gate, for which one command is sent at most.
     """
 
     def __init__(
@@ -180,6 +180,7 @@ class ManualFlight:
         client: CommandClient,
         name: str,
         limits: Mapping[str, Limits],
+        courses: Mapping[str, Course],
         fence: Geofence,
         gate_s: float,
         sight_of: Callable[[str], DroneSight],
@@ -189,6 +190,7 @@ class ManualFlight:
         self._client = client
         self._name = name
         self._limits = limits
+        self._courses = courses
         self._fence = fence
         self._gate_s = gate_s
         self._sight_of = sight_of
@@ -262,14 +264,18 @@ class ManualFlight:
             flight = self._flights.get(page)
             if flight is not None:
                 if stick is not None:
-                    flight.place_W = None  # the stick overrides the place
+                    flight.places_W = ()  # the stick overrides the place
                 elif flight.stick is not None:
                     self._send_soon(flight)
                 flight.stick, flight.seen_s = stick, self._wall_s()
         return self.answer(page)
 
-    def go(self, page: Any, x_m: float, y_m: float, z_m: float | None = None) -> FlightAnswer:
-        """Fly the page's drone to a place, at its present height unless another one is given."""
+    def go(self, page: Any, x_m: float, y_m: float, z_m: float | None = None, then: bool = False) -> FlightAnswer:
+        """Fly the page's drone to a place, at its present height unless another one is given.
+
+        Args:
+            then: after the places to which it flies already, rather than instead of them.
+        """
         with self._lock:
             flight = self._flights.get(page)
             if flight is None:
@@ -277,14 +283,17 @@ class ManualFlight:
             pose, refusal = self._sight_of(flight.drone).pose, self._fence.refusal(x_m, y_m)
             if refusal or pose is None:
                 return self.answer(page)._replace(text=refusal or f"no estimate of {flight.drone}")
-            height_m = pose.p_W[2] if z_m is None else z_m
-            flight.stick, flight.place_W, flight.seen_s = None, (x_m, y_m, height_m), self._wall_s()
+            place = x_m, y_m, pose.p_W[2] if z_m is None else z_m
+            before = flight.places_W if then else ()
+            flight.stick, flight.seen_s = None, self._wall_s()
+            if before[-1:] != (place,):  # a page repeats what is not confirmed yet
+                flight.places_W = (*before[: PLACES_MAX - 1], place)
         return self.answer(page)
 
     def is_on_way(self, page: Any) -> bool:
         with self._lock:
             flight = self._flights.get(page)
-            return flight is not None and flight.place_W is not None
+            return flight is not None and bool(flight.places_W)
 
     def leave(self, page: Any, text: str = "") -> FlightAnswer:
         """Let the page's drone hover, and give it back; `text` says why."""
@@ -303,7 +312,7 @@ class ManualFlight:
             flight = self._flights.get(page)
             self._texts.pop(page, None)
             if flight is not None:
-                flight.stick, flight.place_W, flight.lost = None, None, True
+                flight.stick, flight.places_W, flight.lost = None, (), True
                 self._send_soon(flight)
 
     def answer(self, page: Any) -> FlightAnswer:
@@ -317,11 +326,12 @@ class ManualFlight:
                 return FlightAnswer(flight.drone, "taking", f"{text}: {silence}" if silence else text, id=flight.id)
             if self._sight_of(flight.drone).pose is None:
                 text = f"hovers: no estimate of {flight.drone}"
-            elif flight.place_W is not None:
-                text = "goes to {:.1f}, {:.1f} m at z = {:.1f} m".format(*flight.place_W)
+            elif flight.places_W:
+                text = "goes to {:.1f}, {:.1f} m at z = {:.1f} m".format(*flight.places_W[0])
             else:
                 text = "flown by hand" if flight.stick is not None else "hovers"
-            return FlightAnswer(flight.drone, "flying", text, id=flight.id, goal=flight.place_W)
+            goal, then = next(iter(flight.places_W), None), flight.places_W[1:]
+            return FlightAnswer(flight.drone, "flying", text, id=flight.id, goal=goal, then=then)
 
     def tick(self) -> None:
         """Command every drone that is due; give back those that may not be flown any more.
@@ -392,12 +402,29 @@ class ManualFlight:
         return off or _too_fast(run.rate / 2.0) or state_refusal(drone, sight.state, "velocity") or ""
 
     def _velocity(self, flight: _Flight, wall_s: float) -> FlownVelocity:
-        pose, limits = self._sight_of(flight.drone).pose, self._limits[flight.drone]
+        pose, limits, stick = self._sight_of(flight.drone).pose, self._limits[flight.drone], flight.stick
+        place = self._next_place(flight, pose) if stick is None else None
         if wall_s - flight.seen_s > STALE_S or pose is None:
-            return HOVER
-        if flight.stick is not None:
-            return stick_velocity(flight.stick, pose, limits, self._fence)
-        return HOVER if flight.place_W is None else velocity_to(flight.place_W, pose, limits, self._fence)
+            place = stick = None
+        before, flight.sent_W = flight.sent_W, place
+        if pose is None or place is None:
+            return HOVER if pose is None or stick is None else stick_velocity(stick, pose, limits, self._fence)
+        course, here, moving = self._courses[flight.drone], (*pose.p_W, pose.yaw_rad), (*pose.v_W, 0.0)
+        if before is None:
+            course.leave()  # it leads from where the drone was flown to a place before
+        if place != before:
+            climb_m_s = CLIMB_SHARE * min(SPEED_M_S, limits.horizontal_speed_m_s)
+            course.send((*place, None), pose.t_s, here, moving, speeds=Cruise(SPEED_M_S, climb_m_s, climb_m_s))
+        velocity_W, turn = course.velocity(pose.t_s, here, moving)
+        return FlownVelocity(_fenced(velocity_W, pose, self._fence), turn)
+
+    def _next_place(self, flight: _Flight, pose: DronePose | None) -> Vector | None:
+        """Return the place to which a drone flies, past those that it has come near to."""
+        with self._lock:
+            places = flight.places_W
+            if pose is not None and len(places) > 1 and math.dist(pose.p_W, places[0]) <= NEAR_M:
+                places = flight.places_W = places[1:]
+            return next(iter(places), None)
 
     def _send_soon(self, flight: _Flight) -> None:
         """Let a command be sent at once, not a period after the last one."""

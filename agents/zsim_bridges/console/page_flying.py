@@ -15,9 +15,11 @@ import numpy as np
 from zsim.contract.flight_messages import ViewCluster
 from zsim.math import frames
 from zsim.presentation import drone_colours
-from zsim.scenario.scenario import Scenario
+from zsim.scenario.scenario import Piloted, Scenario
 from zsim.scenario.triangles import outline_of
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
+from zsim_agents.references.flight import limits_of
+from zsim_agents.references.tracking import Course
 from zsim_bridges.console.command_client import CommandClient
 from zsim_bridges.console.console_page import PageForms
 from zsim_bridges.console.histories import CanvasTrails
@@ -67,8 +69,12 @@ class PageFlying:
         fence = geofence_of(run.scenario)
         self._surroundings = surroundings(run.scenario, fence)
         limits = {drone.name: drone.limits for drone in run.scenario.drones}
-        gate_s = run.info.gate_ns / 1e9
-        self.control = ManualFlight(client, name, limits, fence, gate_s, self._sight, self._run_sight)
+        gravity_m_s2, gate_s = run.scenario.environment.gravity_m_s2, run.info.gate_ns / 1e9
+        courses = {
+            drone.name: Course(limits_of(drone, gravity_m_s2), drone.reference or Piloted())
+            for drone in run.scenario.drones
+        }
+        self.control = ManualFlight(client, name, limits, courses, fence, gate_s, self._sight, self._run_sight)
         self.returns = ReturnFlights(run.scenario, client, self.control, self._sight, lambda: views.clusters, note)
 
     def plan(self, client_id: int | None, whole: bool) -> dict[str, Any]:
@@ -99,7 +105,9 @@ class PageFlying:
         received = self._views.estimates().get(drone)
         pose = None
         if received is not None and received.fresh:
-            pose = DronePose(received.estimate.position_m, received.estimate.yaw_rad)
+            estimate = received.estimate
+            t_s = received.t_ns * 1e-9
+            pose = DronePose(estimate.position_m, estimate.yaw_rad, estimate.velocity_m_s, t_s)
         return DroneSight(seen.state, seen.commander, pose)
 
     def _run_sight(self) -> RunSight:

@@ -97,11 +97,15 @@ class SteerDrone(_Action, frozen=True, tag="steer"):
 
 
 class GoToPlace(_Action, frozen=True, tag="go"):
-    """Send the drone that was taken to a place, at its present height unless `z_m` is given."""
+    """Send the drone that was taken to a place, at its present height unless `z_m` is given.
+
+    `then`: after the places to which it flies already.
+    """
 
     x_m: Metres
     y_m: Metres
     z_m: Metres | None = None
+    then: bool = False
 
 
 class LeaveDrone(_Action, frozen=True, tag="leave"):
@@ -202,7 +206,7 @@ class ActionSockets:
             deflections = action.forward, action.left, action.up, action.turn
             answer = flying.control.steer(page, Stick(*deflections, action.speed_m_s) if action.held else None)
         elif isinstance(action, GoToPlace):
-            answer = flying.control.go(page, action.x_m, action.y_m, action.z_m)
+            answer = flying.control.go(page, action.x_m, action.y_m, action.z_m, action.then)
         else:
             answer = flying.control.leave(page)
         return {"flight": answer._asdict()}

@@ -7,6 +7,7 @@ The folder of a hunt:
     summary.json, report.html, figures/
     violation.yaml       the scenario with the causes that are left
     violation/           its flight: record, report, figures
+    violation.zsim       the same as one file
 """
 
 import csv
@@ -17,6 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import lru_cache, partial
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 import msgspec
@@ -41,7 +43,8 @@ from zsim_analysis.sweep.sweep import SweepScreen, span
 from zsim_analysis.sweep.sweep_run import FIXED, METRIC, Row, Task, fly_scenario
 
 PLAN, TABLE, SCENARIO, VIOLATION = "hunt.json", "flights.csv", "violation.yaml", "violation"
-OWN_FILES = (PLAN, TABLE, SCENARIO, VIOLATION, "summary.json", "report.html", "figures", ".lock")
+BUNDLE = "violation.zsim"
+OWN_FILES = (PLAN, TABLE, SCENARIO, VIOLATION, BUNDLE, "summary.json", "report.html", "figures", ".lock")
 SEARCH, CAUSE, RECORD = "search", "each cause", "record"  # stages, beside those of `shrink`
 SAME_BITS = "same_bits"  # figure: truth is the same to the bit as in the flight in which no process dies
 DECIMALS = 6  # of margins in the table
@@ -178,10 +181,18 @@ def hunt(request: HuntRequest) -> Hunted:
     with lock:
         if not take_lock(lock):
             raise RunError(f"{request.out}: another hunt is at work there; give --out another folder")
+        _forget(request.out)
         under_way = _Hunt(request, space, texts, requirements)
         hunted = Hunted(request, space, under_way.run(), under_way.flown)
         write(hunted)
     return hunted
+
+
+def _forget(folder: Path) -> None:
+    """Remove what an earlier hunt has found."""
+    rmtree(folder / VIOLATION, ignore_errors=True)
+    for name in (SCENARIO, BUNDLE):
+        (folder / name).unlink(missing_ok=True)
 
 
 def _with_functions(given: Sequence[str], document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, Any]]:
@@ -406,16 +417,21 @@ class _Hunt:
         which = found.margins.index(found.worst)
         is_unknown, failed = bool(found.worst.unknown), found.failure is not None
 
+        known: dict[bytes, bool] = {}  # of what was flown already
+
         def breaks(cases: Sequence[Case], stage: str) -> list[bool]:
             self._screen.stage = stage
+            names = [msgspec.json.encode(case) for case in cases]
+            new = {name: case for name, case in zip(names, cases, strict=True) if name not in known}
+            flown = self._timed(stage, lambda: self._fly([*new.values()], stage))
+            known.update({name: alike(each) for name, each in zip(new, flown, strict=True)})
+            return [known[name] for name in names]
 
-            def alike(flown: Flown | None) -> bool:
-                if flown is None or (flown.failure is not None) != failed:
-                    return False
-                margin = flown.margins[which]
-                return not margin.holds and bool(margin.unknown) == is_unknown
-
-            return [alike(each) for each in self._timed(stage, lambda: self._fly(cases, stage))]
+        def alike(flown: Flown | None) -> bool:
+            if flown is None or (flown.failure is not None) != failed:
+                return False
+            margin = flown.margins[which]
+            return not margin.holds and bool(margin.unknown) == is_unknown
 
         what = found.worst.unknown or f"margin {found.worst.value:.3g}"
         self._screen.say(f"flight {found.number} breaks {self._requirements[which].text} ({what}); shrinking it")
@@ -482,8 +498,6 @@ def write(hunted: Hunted) -> None:
         if summary.violation:
             text = yaml_file.dump(hunted.space.changed(summary.violation.shrunk))
             (request.out / SCENARIO).write_text(text, encoding="utf-8")
-        else:
-            (request.out / SCENARIO).unlink(missing_ok=True)
     except OSError as error:
         raise ReportError(f"{request.out}: cannot be written ({error.strerror})") from error
 

@@ -10,10 +10,21 @@ import numpy as np
 from rich.console import Group
 from rich.text import Text
 
-from zsim.errors import printable
+from zsim.errors import ZsimError, printable
 from zsim.output_folder import RECORD
 from zsim.presentation import Column, FittedTable
-from zsim_analysis.hunt.hunt import SEARCH, VIOLATION, Flown, Hunted, HuntRequest, HuntSummary, cause_text, fault_text
+from zsim_analysis.bundle.make_bundle import make_bundle
+from zsim_analysis.hunt.hunt import (
+    BUNDLE,
+    SEARCH,
+    VIOLATION,
+    Flown,
+    Hunted,
+    HuntRequest,
+    HuntSummary,
+    cause_text,
+    fault_text,
+)
 from zsim_analysis.hunt.shrink import causes_of
 from zsim_analysis.hunt.space import KindSpace
 from zsim_analysis.report.figure_style import (
@@ -35,18 +46,27 @@ KINDS_DRAWN = 24  # of the matrix of pairs
 
 def make_hunt_report(
     hunted: Hunted, progress: Callable[[str], None] = lambda _: None, formats: Sequence[str] = ()
-) -> None:
-    """Write summary.json, figures and report.html of a hunt, and the report of the flight that broke a requirement.
+) -> list[str]:
+    """Write summary.json, figures and report.html of a hunt, and report and bundle of the flight that broke it.
+
+    Returns lines on what the bundle lacks, or why there is none.
 
     Raises:
         ReportError: the folder cannot be written.
     """
     out, summary = hunted.request.out, hunted.summary
+    notes: list[str] = []
     if (out / VIOLATION / RECORD).exists():
         make_report(out / VIOLATION, progress, formats)
+        progress("bundling the flight")
+        try:
+            make_bundle(out / VIOLATION, out / BUNDLE, True, True, notes.append)
+        except ZsimError as error:
+            notes.append(f"no bundle: {error}")
     content = msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n"
     searched = [each for each in hunted.flown if each.stage == SEARCH]
     write_report(out, content, figures(summary, searched), partial(page, hunted, searched), progress, formats)
+    return notes
 
 
 def figures(summary: HuntSummary, searched: Sequence[Flown]) -> Iterator[ReportFigure]:

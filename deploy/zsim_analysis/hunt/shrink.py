@@ -171,13 +171,15 @@ class Shrinker:
         for _ in range(ROUNDS):
             lengths = [_round(least + share * (most - least)) for share in SHARES]
             tried = [made(each) for each in lengths]
-            idle = [replace(each, faults=(), values={}) for each in tried]
-            broken = self._breaks([*tried, *idle], DURATION)
-            good = [now and not always for now, always in zip(broken, broken[len(tried) :], strict=False)]
-            first = good.index(True) if any(good) else len(tried)
+            broken = self._breaks(tried, DURATION)
+            good = (place for place, each in enumerate(tried) if broken[place] and self._holds_idle(each))
+            first = next(good, len(tried))
             case = tried[first] if first < len(tried) else case
             least, most = [least, *lengths][first], [*lengths, most][first]
         return case
+
+    def _holds_idle(self, case: Case) -> bool:
+        return not any(self._breaks([replace(case, faults=(), values={})], DURATION))
 
 
 def causes_of(case: Case) -> list[Cause]:

@@ -143,7 +143,8 @@ def _draw_safety(results: SweepResults) -> Figure:
                 x = place.x + 0.5 * side * (place.room[1] - place.room[0])
                 look: dict[str, Any] = {"color": tint, "mfc": "white" if side >= 0 else tint}
                 axes.errorbar([x], [share.value], yerr=ends, fmt=mark, ms=5, lw=1.4, capsize=4, **look)
-        axes.plot([], [], mark, color=own, mfc="white" if side >= 0 else own, ms=5, label=name)
+        shown = style.GREY if axis and len(axis.series) > 1 else own  # the colours are those of the series
+        axes.plot([], [], mark, color=shown, mfc="white" if side >= 0 else shown, ms=5, label=name)
     axes.set_ylim(-0.03, 1.03)
     if axis:
         axis.dress(axes)
@@ -169,7 +170,9 @@ def _name(
 ) -> None:
     """Put the legend of dots, means, boxes, marks and colours above a figure."""
     mean = style.VERMILION if not axis or len(axis.series) == 1 else style.GREY
-    if axis and means:
+    if axis and means and most_runs(results) == 1:
+        axes.plot([], [], "o", color=mean, ms=4, label=ONE_RUN)
+    elif axis and means:
         axes.plot(
             [], [], ".", color=style.BLUE if len(axis.series) == 1 else style.GREY, ms=7, alpha=0.6, label=ONE_RUN
         )
@@ -191,6 +194,11 @@ def _name(
     style.legend_above(figure, axes, LEGEND_COLUMNS)
     if never and not axis:
         style.mark_figure(figure, NEVER_AS_PLANNED, "", MARK)  # none of the runs followed its plan
+
+
+def most_runs(results: SweepResults) -> int:
+    """Return how many runs of one point have ended well, at most."""
+    return max((results.ended_well(point)[0] for point in range(results.design.points)), default=0)
 
 
 def mean_label(results: SweepResults) -> str:
@@ -319,7 +327,7 @@ def _with_printed(low: float, high: float, value: float) -> tuple[float, float]:
 def _draw_point(axes: Axes, samples: Samples, place: "Place", axis: "GridAxis") -> "DrawnMean":
     """Draw the runs of a point and their mean; return the mean."""
     colour = axis.colour(place)
-    if not axis.field:
+    if not axis.field and len(samples) > 1:
         line = {"color": style.BLUE, "lw": 1.0}
         box = {"facecolor": "#0072b226", "edgecolor": style.BLUE, "lw": 1.0}
         look: dict[str, Any] = {"boxprops": box, "medianprops": {"color": style.BLUE, "lw": 1.6}}
@@ -329,8 +337,10 @@ def _draw_point(axes: Axes, samples: Samples, place: "Place", axis: "GridAxis") 
     shares = ((np.arange(len(dots)) + 0.5) * GOLDEN + 0.5 * (1 - GOLDEN)) % 1
     low, high = place.room
     size = 7 if len(dots) < 30 else 4
-    axes.plot(low + shares * (high - low), dots, ".", color=colour, ms=size, alpha=0.45, mew=0, zorder=3, clip_on=False)
-    mean_x = place.x if axis.field else place.x + 0.36  # beside the box
+    if len(samples) > 1:  # else it is the mean, at the middle
+        spread = low + shares * (high - low)
+        axes.plot(spread, dots, ".", color=colour, ms=size, alpha=0.45, mew=0, zorder=3, clip_on=False)
+    mean_x = place.x if axis.field or len(samples) == 1 else place.x + 0.36  # beside the box
     mean = DrawnMean(mean_x, mean_interval(samples), style.VERMILION if len(axis.series) == 1 else colour)
     mean.draw(axes)
     return mean
@@ -378,6 +388,7 @@ DECADES_MIN = 30.0  # ratio of the greatest and the least value from which an ax
 TURNED_FROM = 34  # characters of all labels, with a space each, that fit side by side in a panel
 ABOVE = 1.1  # of the height of axes: clear of runs, and of the marks of intervals that leave the axes
 MARK = style.VERMILION
+GROUP_MAX = 0.3  # of the range of values, that the combinations at one value take: six marks stand beside each other
 TICKS_MAX = 8  # labelled values of an axis; of more, some
 
 
@@ -429,7 +440,7 @@ class GridAxis:
         self.series = list(dict.fromkeys(combinations))
         numbers = self._space(np.array(self._numbers))
         distinct = np.unique(numbers)
-        width = 0.6 * min(float(np.diff(distinct).min()), float(np.ptp(distinct)) / 6)
+        width = min(0.6 * float(np.diff(distinct).min()), GROUP_MAX * float(np.ptp(distinct)))
         each = width / len(self.series)
         for point, (number, combination) in enumerate(zip(numbers, combinations, strict=True)):
             series = self.series.index(combination)

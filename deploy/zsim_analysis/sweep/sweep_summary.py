@@ -353,12 +353,20 @@ UNITS = {  # by the end of a name, longer ones first
 OF_CHANNEL = {  # units relative to that of the channel: zsim.sensors
     "noise": "", "density": "/√Hz", "bias": "", "bias_walk": "/√s", "bias_instability": "", "quantum": "",
 }  # fmt: skip
-SECTIONS = ("environment", "sensors", "drones", "clusters", "metrics")  # left out before the names of their fields
+SECTIONS = (
+    "environment",
+    "sensors",
+    "drones",
+    "clusters",
+    "agents",
+    "metrics",
+)  # left out before the names of their fields
 WORDS = {
     "gps": "GPS", "imu": "IMU", "mag": "magnetometer", "baro": "barometer", "accel": "accelerometer",
     "gyro": "gyroscope", "takeoff": "take-off",
 }  # fmt: skip
 OF_VARIABLES = ("target", "values", "expressions")  # maps of a plan, by the variables of its cluster
+OF_CLASS = ("parameters", "law_parameters", "space_parameters")  # sections whose names say nothing of a field
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # as in zsim.scenario.overrides
 
 
@@ -383,6 +391,7 @@ def field_name(path: str) -> FieldName:
     """
     steps: list[str] = [word or bracket for word, bracket in _STEP.findall(path)] or [path]
     kept = steps[1:] if steps[0] in SECTIONS and len(steps) > (1 if steps[0] == "metrics" else 2) else steps
+    kept = [step for step in kept[:-1] if step not in OF_CLASS] + kept[-1:]
     kept = [f"{steps[0].removesuffix('s')} {kept[0]}", *kept[1:]] if kept[0].isdigit() else kept
     parted: list[tuple[str, str]] = []  # words and unit of each step
     for step in kept:

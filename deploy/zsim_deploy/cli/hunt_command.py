@@ -92,7 +92,9 @@ def hunt(
     hunted = hunt(request)
     summary = hunted.summary
     with Console(stderr=True).status("drawing …") as status:
-        make_hunt_report(hunted, lambda text: status.update(cell(text)))
+        notes = make_hunt_report(hunted, lambda text: status.update(cell(text)))
+    for text in notes:
+        note(f"note: {text}")
     PipedConsole().print(terminal_text(hunted))
     say(f"report: {request.out / 'report.html'}")
     if summary.interrupted:

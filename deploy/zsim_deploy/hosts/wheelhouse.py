@@ -29,6 +29,7 @@ from zsim_deploy import SAFE_PATH
 
 PROJECT = "zsim"
 KEY_DIGITS = 16  # 64 bits of a SHA-256; what one person builds never collides
+LOCK = "constraints.txt"  # in a checkout
 PIP = "pip"  # installs on a host that has none; never held to the version here, which may be too old for a newer Python
 RETRIES = "1"  # of pip, for each page of an index; with its own 5 it takes minutes where there is no network
 LINE_BYTES = 1 << 20  # of the longest line that pip prints
@@ -131,7 +132,7 @@ class Wheelhouse:
             try:
                 project = await self._project()
                 wanted = tuple(sorted(extras))
-                key = _key([requirements(project), wanted, target.options(), constraints()])
+                key = _key([requirements(project), wanted, target.options(), constraints(), lock()])
                 note = self._houses / f"{key}.json"
                 names = json.loads(note.read_text()) if note.exists() else []
                 if not names or not all((self._wheels / name).exists() for name in names):
@@ -184,7 +185,7 @@ class Wheelhouse:
         with tempfile.TemporaryDirectory(dir=self._folder) as temporary:
             try:
                 other_versions = await download_wheels(
-                    [wanted, PIP], target, Path(temporary), constraints(), self._wheels, self._progress
+                    [wanted, PIP], target, Path(temporary), (constraints(), lock()), self._wheels, self._progress
                 )
             except PipError as error:
                 line = f"no wheels for {target}: {error}"
@@ -230,6 +231,13 @@ def constraints() -> list[str]:
     return sorted(versions)
 
 
+def lock() -> list[str]:
+    """Return the versions with which a checkout is tested, as constraints of pip; none without a checkout."""
+    root = checkout()
+    path = root / LOCK if root else None
+    return path.read_text("utf-8").splitlines() if path and path.exists() else []
+
+
 def checkout() -> Path | None:
     """Return the folder from which this very code is imported, if it is a checkout of the project."""
     root = Path(zsim.__file__).resolve().parents[1]
@@ -267,12 +275,18 @@ def _key(content: Any) -> str:
 
 
 async def download_wheels(
-    wanted: Sequence[str], target: WheelTarget, into: Path, held: Sequence[str], kept: Path, progress: Progress
+    wanted: Sequence[str],
+    target: WheelTarget,
+    into: Path,
+    held: Sequence[Sequence[str]],
+    kept: Path,
+    progress: Progress,
 ) -> bool:
     """Collect wheels for a target; where a project has only sources, build them here.
 
-    The versions are those of this machine (`held`, constraints of pip) where there are such wheels for the target,
-    because equal versions are a condition for equal bits; return whether they had to differ. No index is asked where
+    The versions are those of this machine (the first of `held`, constraints of pip) where there are such wheels for the
+    target, because equal versions are a condition for equal bits; else those of the next one that has any; else the
+    newest. Return whether they had to differ. No index is asked where
     all of them are in the folder `kept` already. PipError if there are no wheels for the target, UnreachableError if
     the index does not answer, so that it is unknown whether there are.
     """
@@ -288,18 +302,19 @@ async def download_wheels(
             await pip(*fit, "--find-links", built, *wanted, progress=progress)
 
     with tempfile.TemporaryDirectory() as aside:
-        limits = Path(aside, "constraints.txt")
-        limits.write_text("\n".join(held))
-        same = (*wanted, "--constraint", str(limits))
-        if await is_kept(kept, (*fit, *same), progress):
-            return False
-        try:
-            await download(same, f"{aside}/same")
-            return False
-        except PipError:
-            progress("looking for other versions than those here")
-            await download(wanted, f"{aside}/other")
-            return True
+        for count, versions in enumerate(filter(None, held)):
+            limits = Path(aside, f"constraints{count}.txt")
+            limits.write_text("\n".join(versions))
+            same = (*wanted, "--constraint", str(limits))
+            if await is_kept(kept, (*fit, *same), progress):
+                return count > 0
+            try:
+                await download(same, f"{aside}/{count}")
+                return count > 0
+            except PipError:
+                progress("looking for other versions than those here")
+        await download(wanted, f"{aside}/other")
+        return True
 
 
 async def is_kept(kept: Path, arguments: Sequence[str], progress: Progress) -> bool:

@@ -115,7 +115,7 @@ def test_an_operator_flies_a_drone_and_is_answered():
         assert answer["flight"]["state"] == "flying"
     stick = Stick(1.0, 0.0, 0.0, 0.0, 1.0)
     assert flying.done == [
-        ("take", "here", "drone2", True, "one"), ("steer", "here", stick), ("go", "here", 3.0, -2.0, 4.0), ("leave", "here"),
+        ("take", "here", "drone2", True, "one"), ("steer", "here", stick), ("go", "here", 3.0, -2.0, 4.0, False), ("leave", "here"),
     ]  # fmt: skip
     sockets.lose("here")
     assert flying.done[-1] == ("lose", "here")

@@ -1,5 +1,6 @@
 """A vehicle as its clients see it: arming, modes, setpoints, missions, fence, parameters, what is refused."""
 
+import itertools
 import math
 import struct
 from collections.abc import Callable, Sequence
@@ -12,6 +13,8 @@ from mavlink_drone import FlownDrone
 from zsim.contract.flight_messages import Mode as ModeCommand
 from zsim.contract.flight_messages import Velocity
 from zsim.contract.run_messages import Event
+from zsim.scenario.scenario import Piloted
+from zsim_agents.references.path import SHARE
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import FENCE, FORCE, Cmd, MavFrame, MissionResult, Result, TypeMask
 from zsim_bridges.mavlink.personality import COPTER_MODES, PX4_MODES, FlightMode
@@ -225,6 +228,38 @@ def test_a_mission_takes_off_visits_its_waypoints_and_lands() -> None:
     progress = [(each.state, each.done) for each in drone.vehicle.flight.mission.reports]
     assert (progress[0], progress[-1]) == (("active", 0), ("finished", 5))
     assert {each.items for each in drone.vehicle.flight.mission.reports} == {5}
+
+
+def test_a_mission_is_flown_straight_at_the_speed_of_its_items_and_a_new_place_turns_it_without_a_jump() -> None:
+    """The drone obeys at once: what it flies is what is commanded."""
+    drone = FlownDrone()
+    items = [
+        item(0, Cmd.NAV_TAKEOFF, 0, 3),
+        item(1, Cmd.DO_CHANGE_SPEED, 0, 0, 1, 2.0),
+        item(2, Cmd.NAV_WAYPOINT, 40, 8, 0, 0, 0, NAN),
+    ]
+    assert upload(drone, items) == 0
+    drone.command(Cmd.COMPONENT_ARM_DISARM, 1)
+    assert drone.command(Cmd.MISSION_START, 0, 0) == Result.ACCEPTED
+    drone.until(lambda: drone.vehicle.flight.mission.current == 2)
+    flown = [drone._velocity]
+    for _ in range(600):
+        drone.step()
+        flown.append(drone._velocity)
+        low_m = 0.35 if drone.position[1] < 4.0 else 0.1  # the climb is over within 0.3 m of its height
+        assert drone.position[2] == pytest.approx(3.0 + drone.position[1] / 40.0 * (8.0 - 3.0), abs=low_m)
+        assert abs(drone.position[0]) < 0.1
+    assert flown[300][1] == pytest.approx(2.0, abs=0.03)
+    assert drone.command(Cmd.DO_REPOSITION, -1, 0, 0, NAN, 47.4, 8.5, 405.0) == Result.ACCEPTED
+    for _ in range(1000):
+        drone.step()
+        flown.append(drone._velocity)
+    steps = [math.dist(one[:2], other[:2]) for one, other in itertools.pairwise(flown)]
+    accel_m_s2 = SHARE * 9.80665 * math.tan(math.radians(20.0))
+    lead_s, period_s = Piloted().lead_s, 0.04  # of the law: a new acceleration is seen ahead by its lead
+    assert max(steps[25:]) < accel_m_s2 * (lead_s + period_s)
+    assert drone.position[:2] == pytest.approx([0.0, 0.0], abs=0.6)
+    assert drone.position[2] == pytest.approx(5.0, abs=0.1)
 
 
 def on_mission(*last: dialect.MissionItemInt) -> FlownDrone:

@@ -92,14 +92,16 @@ def checkout(index: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 def test_versions_are_those_of_here_and_others_only_where_there_are_none(index: Path, tmp_path: Path) -> None:
     """A project without wheels is built here, for others, too."""
 
-    def download(held: str) -> bool:
-        into = tmp_path / held
-        others = asyncio.run(download_wheels(["gadget"], ELSEWHERE, into, [held], tmp_path / "kept", print))
+    def download(*held: str) -> bool:
+        into = tmp_path / " ".join(held)
+        limits = [[each] for each in held]
+        others = asyncio.run(download_wheels(["gadget"], ELSEWHERE, into, limits, tmp_path / "kept", print))
         assert [path.name for path in into.glob("*.whl")] == ["gadget-1.0-py3-none-any.whl"]
         return others
 
     assert not download("gadget==1.0")
     assert download("gadget==0.9")
+    assert download("gadget==0.9", "gadget==1.0")
 
 
 def house(folder: Path, extras: list[str], host: str = "h") -> tuple[WheelSet, list[str]]:
