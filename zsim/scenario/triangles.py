@@ -5,6 +5,7 @@ All is exact, in a fixed order of plain operations, compiled where numba is inst
 """
 
 import math
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,6 +75,27 @@ def corners_of(triangle: Array) -> Array:
     """Return the three corners of each triangle, (T, 3, 3) [m; W]."""
     first = triangle[:, :3]
     return np.stack([first, first + triangle[:, 3:6], first + triangle[:, 6:]], axis=1)
+
+
+def outline_of(surface: Any) -> list[list[float]]:
+    """Return the convex outline of a surface from above, counter-clockwise, as [x, y] [m; W].
+
+    By a monotone chain (A. M. Andrew, Information Processing Letters 9, 1979).
+    """
+    points = np.unique(np.round(corners_of(placed(surface))[..., :2].reshape(-1, 2), 2), axis=0).tolist()
+
+    def chain(ordered: Iterable[list[float]]) -> list[list[float]]:
+        kept: list[list[float]] = []
+        for x, y in ordered:
+            while len(kept) > 1:
+                (ax, ay), (bx, by) = kept[-2:]
+                if (bx - ax) * (y - ay) > (by - ay) * (x - ax):
+                    break
+                kept.pop()
+            kept.append([x, y])
+        return kept
+
+    return [*chain(points)[:-1], *chain(reversed(points))[:-1]]
 
 
 def _rim(corners: Array) -> NDArray[np.int8]:

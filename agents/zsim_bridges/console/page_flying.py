@@ -16,6 +16,7 @@ from zsim.contract.flight_messages import ViewCluster
 from zsim.math import frames
 from zsim.presentation import drone_colours
 from zsim.scenario.scenario import Piloted, Scenario
+from zsim.scenario.triangles import outline_of
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.references.flight import limits_of
 from zsim_agents.references.tracking import Course
@@ -120,7 +121,7 @@ class PageFlying:
 
 
 def surroundings(scenario: Scenario, fence: Geofence) -> dict[str, Any]:
-    """Return what does not change: names, labels and colours of the drones, the fence, outlines of obstacles."""
+    """Return what does not change: drones' names, labels and colours, the fence, outlines of what stands around."""
     names = [drone.name for drone in scenario.drones]
     return {
         "names": names,
@@ -137,6 +138,9 @@ def surroundings(scenario: Scenario, fence: Geofence) -> dict[str, Any]:
                 "size_m": list(each.size_m[:2]) if each.size_m is not None else None,
             }
             for each in scenario.environment.obstacles
+        ],
+        "surfaces": [
+            {"name": each.name, "outline_m": outline_of(each)} for each in scenario.environment.surfaces or ()
         ],
     }
 

@@ -16,7 +16,9 @@ from zsim.contract.flight_messages import ViewDrones
 from zsim.contract.messages import DroneInfo
 from zsim.math import frames
 from zsim.presentation import drone_colours, rgb
-from zsim.scenario.scenario import Obstacle
+from zsim.scenario.scenario import Obstacle, Surface
+from zsim.scenario.surface_file import placed
+from zsim.scenario.triangles import corners_of
 from zsim.vehicles.vehicle import cross_layout
 from zsim_bridges.console import airframe
 from zsim_bridges.console.histories import CanvasTrails
@@ -84,6 +86,7 @@ class RunScene:
         arms_m = [drone.arm_m for drone in run.scenario.drones]
         self.nodes = SceneNodes(server, run.info.drones, arms_m, robots, len(run.spaces))
         self.nodes.obstacles(run.scenario.environment.obstacles)
+        self.nodes.surfaces(run.scenario.environment.surfaces or ())
         self.nodes.references(reference_lines(run.scenario))
         cameras.restart()
 
@@ -234,6 +237,13 @@ class SceneNodes:
                 self._scene.add_cylinder(name, radius=each.radius_m or 0.0, height=height_m, position=centre, **look)
             else:
                 self._scene.add_icosphere(name, radius=each.radius_m or 0.0, position=(x, y, z), **look)
+
+    def surfaces(self, surfaces: Sequence[Surface]) -> None:
+        for each in surfaces:
+            corners = corners_of(placed(each)).reshape(-1, 3).astype(np.float32)
+            faces = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
+            look: Any = {"color": SOLID, "flat_shading": True, "side": "double"}
+            self._scene.add_mesh_simple(f"/surfaces/{each.name}", corners, faces, **look)
 
     def references(self, lines: Array) -> None:
         """Draw the paths of drones that fly by themselves, as segments (M, 2, 3) [m; W]."""

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Rectangle
@@ -19,7 +20,9 @@ from scipy.special import chdtri
 
 from zsim.presentation import colours_of, drone_colours
 from zsim.scenario.obstacle import BOX, CENTRE, COSINE, HALF, SHAPE, SINE, row_of
-from zsim.scenario.scenario import Scenario
+from zsim.scenario.scenario import Scenario, Surface
+from zsim.scenario.surface_file import placed
+from zsim.scenario.triangles import corners_of
 from zsim_analysis.reading import drone_errors
 from zsim_analysis.reading.formation import Formation, common_instants
 from zsim_analysis.reading.radio_links import RadioHistory
@@ -67,7 +70,9 @@ def draw_plan(flight: RecordedFlight, formations: Sequence[Formation]) -> Figure
 
 
 def draw_obstacles(axes: Axes, scenario: Scenario | None) -> None:
-    """Draw the outlines of a scenario's obstacles from above; rows as in `zsim.scenario.obstacle`."""
+    """Draw the outlines of a scenario's obstacles from above, rows as in `zsim.scenario.obstacle`, and its surfaces."""
+    for number, surface in enumerate((scenario and scenario.environment.surfaces) or ()):
+        _draw_surface(axes, surface, None if number else "surface, the darker the higher")
     look: dict[str, Any] = {"facecolor": "#8c959f99", "edgecolor": style.DARK, "hatch": "///", "lw": 1.0, "zorder": 1.5}
     for number, obstacle in enumerate(scenario.environment.obstacles if scenario else ()):
         row = row_of(obstacle)
@@ -79,6 +84,20 @@ def draw_obstacles(axes: Axes, scenario: Scenario | None) -> None:
             b, angle = row[HALF + 1], math.degrees(math.atan2(row[SINE], row[COSINE]))
             corner = (x - a, y - b)
             axes.add_patch(Rectangle(corner, 2 * a, 2 * b, angle=angle, rotation_point="center", **named))
+
+
+def _draw_surface(axes: Axes, surface: Surface, label: str | None) -> None:
+    """Draw the triangles of a surface from above, the highest on top."""
+    corners = corners_of(placed(surface))
+    corners = corners[np.argsort(corners[..., 2].max(axis=1), kind="stable")]
+    heights = corners[..., 2].mean(axis=1)
+    look: dict[str, Any] = {"cmap": "Greys", "edgecolors": "face", "lw": 0.3, "zorder": 1.2, "rasterized": True}
+    drawn = PolyCollection(list(corners[..., :2]), array=heights, **look)
+    low, high = corners[..., 2].min(), corners[..., 2].max()
+    drawn.set_clim(low - 0.4 * max(high - low, 0.1), high + 0.8 * max(high - low, 0.1))  # never white, never black
+    axes.add_collection(drawn, autolim=False)
+    if label:
+        axes.add_patch(Rectangle((np.nan, np.nan), 1, 1, facecolor="#8c959f", label=label))
 
 
 def draw_path(axes: Axes, track: Track, colour: str, named: bool) -> None:

@@ -27,6 +27,7 @@ from zsim_analysis.report.summary import PAPER_COLUMN, STATISTICS
 from zsim_analysis.sweep.sweep import load
 from zsim_analysis.sweep.sweep_figures import figures
 from zsim_analysis.sweep.sweep_summary import (
+    OBSTACLE_DISTANCE,
     RUNS_MIN,
     SEPARATION,
     Distribution,
@@ -129,7 +130,7 @@ def differing(summary: SweepSummary) -> dict[str, str]:
     """Return the titles of the columns that have paired differences, the user's own first."""
     errors = {f"{prefix}.true_rms": f"RMS of {each.titled}" for prefix, each in summary.parameters.items()}
     own = {column: str(field_name(column)) for column in summary.metrics}
-    titles = {**own, **errors, SEPARATION: "separation (m)"}
+    titles = {**own, **errors, SEPARATION: "separation (m)", OBSTACLE_DISTANCE: "from obstacles (m)"}
     known = {column for point in summary.points for column in point.differences}
     return {column: title for column, title in titles.items() if column in known}
 

@@ -85,6 +85,7 @@ class RunResult(Struct, frozen=True, kw_only=True):
     real_time_factor: float | None = None
     min_separation_m: float | None = None
     collisions: int | None = None  # contacts between drones, and with obstacles
+    min_obstacle_distance_m: float | None = None  # of any drone's centre from obstacles and surfaces; None without
     # whether a drone was stopped in the air, flipped, hit something hard, or touched the ground in flight
     crashed: bool | None = None
     # whether every cluster was engaged at some instant of the judged window, None without a cluster
@@ -162,6 +163,7 @@ def fly(task: Task) -> Row:
         seed=task.scenario.seed,
         failure=reason_of(diverged) if diverged else None,
         collisions=sum(event.kind == "collision" for event in flight.events),
+        min_obstacle_distance_m=min(summary.obstacle_distance_m.values(), default=None),
         crashed=any(event.kind in CRASHES for event in flight.events),
         engaged=all(engaged.get(name) is not None for name in clusters) if clusters else None,
         engaged_throughout=all(shares.get(name) == 1.0 for name in clusters) if clusters else None,

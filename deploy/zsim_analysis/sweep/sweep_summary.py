@@ -28,6 +28,7 @@ Samples = NDArray[np.float64]
 LEVEL = 0.95  # of all intervals
 RUNS_MIN = 5  # chosen: of two runs Student's interval is nine times as wide as their distance; fewer are listed
 SEPARATION = "min_separation_m"
+OBSTACLE_DISTANCE = "min_obstacle_distance_m"
 _FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")  # in a text, but not in a name such as drone1
 _COLUMN = re.compile(r"(?:clusters\.(.+?)\.)?errors\.(.+)")  # of a parameter: its cluster's name, and its own
 
@@ -319,8 +320,9 @@ class SweepResults:
         well, runs = self.ended_well(point)
         engaged, of = self.count("engaged", point)
         planned, judged = self.count("as_planned", point)
-        columns = (SEPARATION, *self.errors, *self.metrics)
-        compared = (*self.metrics, SEPARATION, *(each for each in self.errors if each.endswith(".true_rms")))
+        columns = (SEPARATION, OBSTACLE_DISTANCE, *self.errors, *self.metrics)
+        rms = (each for each in self.errors if each.endswith(".true_rms"))
+        compared = (*self.metrics, SEPARATION, OBSTACLE_DISTANCE, *rms)
         names = self.design.names(point)
         return GridPoint(
             label=" · ".join(names.values()) or "all runs",

@@ -454,7 +454,7 @@ def draw_obstacle(
     for corners, normal in _faces(row):
         if normal @ (motion.p_WK - corners[0]) > 0:
             shade = brightness * (AMBIENT - 0.15 + (DIFFUSE + 0.15) * max(0.0, float(normal @ SUN_W)))
-            _fill(picture, view, motion.points_K(corners), shade * OBSTACLE)
+            fill_face(picture, view, motion.points_K(corners), shade * OBSTACLE)
 
 
 @lru_cache(maxsize=1000)
@@ -476,7 +476,7 @@ def _faces(row: tuple[float, ...]) -> tuple[tuple[Array, Array], ...]:
     return tuple(faces)
 
 
-def _fill(picture: Picture, view: View, corners_K: Array, colour: Array) -> None:
+def fill_face(picture: Picture, view: View, corners_K: Array, colour: Array) -> None:
     """Fill a convex face, given by its corners (M, 3) [m; K]."""
     seen = _in_front(corners_K)
     if len(seen) < 3:

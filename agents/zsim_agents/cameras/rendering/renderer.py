@@ -23,6 +23,7 @@ from zsim_agents.cameras.rendering.scene import (
     camera_motion,
     motion_blur_kernels,
 )
+from zsim_agents.cameras.rendering.surfaces import SurfaceImager
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -52,6 +53,7 @@ class Renderer:
         self._view = view_of(lens_of(camera))
         self._brightness = scene.light * gain
         self._colours = colour_map(self._brightness)
+        self._surfaces = SurfaceImager(self._view, scene.surfaces, self._brightness)
         self._imager = DroneImager(self._view, scene, carrier, self._exposure_s, self._brightness)
         shape = self._view.lens.height, self._view.lens.width
         self._noise = _Noise(seed, f"{name}/noise", shape, camera.noise * gain) if camera.noise > 0 else None
@@ -85,9 +87,13 @@ class Renderer:
         things = [(distance_m, "drone", i) for i, (distance_m, _) in drones.items()]
         things += [(nearest(row, *p_W)[0], "obstacle", i) for i, row in enumerate(self._scene.obstacles)]
         things += [(math.dist(place, p_W), "hat", i) for i, place in enumerate(self._scene.hats.false_m)]
+        if len(self._scene.surfaces):
+            things += [(distance_m, "surface", i) for distance_m, i in self._surfaces.shown(motion)]
         for _, kind, which in sorted(things, reverse=True):  # the farthest first
             if kind == "obstacle":
                 draw_obstacle(picture, self._view, self._scene.obstacles[which], motion, self._brightness)
+            elif kind == "surface":
+                self._surfaces.draw(picture, which)
             elif kind == "hat":
                 centre_K = motion.points_K(np.array([self._scene.hats.false_m[which]]))
                 if centre_K[0, 2] > 0:

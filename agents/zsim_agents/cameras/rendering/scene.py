@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from zsim.contract.messages import DroneInfo, Info
 from zsim.scenario.obstacle import row_of
 from zsim.scenario.scenario import Scenario
+from zsim.scenario.triangles import TRIANGLE, sheet_of
 from zsim.sensors.camera import Hats
 from zsim.sensors.camera_model import CameraPose, Lens, camera_matrix, undistorted
 from zsim.vehicles.vehicle import cross_layout
@@ -46,13 +47,20 @@ class DroneLook(NamedTuple):
     has_hat: bool
 
 
+NO_TRIANGLE = np.empty((0, TRIANGLE))
+
+
 class Scene(NamedTuple):
-    """What stays the same during a run; obstacles are rows of zsim.scenario.obstacle, light 1 is a clear day."""
+    """What stays the same during a run.
+
+    Obstacles are rows of zsim.scenario.obstacle, surfaces those of zsim.scenario.triangles; light 1 is a clear day.
+    """
 
     drones: tuple[DroneLook, ...]
     obstacles: tuple[tuple[float, ...], ...] = ()
     hats: Hats = Hats()
     light: float = 1.0
+    surfaces: Array = NO_TRIANGLE
 
 
 class DroneStates(NamedTuple):
@@ -74,7 +82,8 @@ def scene_of(info: Info, scenario: Scenario) -> Scene:
     hats = Hats() if environment.hats is UNSET else environment.hats
     light = 1.0 if environment.light is UNSET else environment.light
     looks = tuple(_look(drone, drone.name not in hats.covered) for drone in info.drones)
-    return Scene(looks, tuple(tuple(row_of(obstacle)) for obstacle in environment.obstacles), hats, light)
+    obstacles = tuple(tuple(row_of(obstacle)) for obstacle in environment.obstacles)
+    return Scene(looks, obstacles, hats, light, sheet_of(environment).triangle)
 
 
 def default_look(has_hat: bool = True) -> DroneLook:

@@ -121,6 +121,17 @@ def test_an_obstacle_before_a_hat_hides_it_and_one_behind_does_not(obstacle: Any
     assert has_magenta(draw(of=scene(obstacles=(row,)))) is not hides
 
 
+@pytest.mark.parametrize("lens", [{}, {"distortion": (-0.2, 0.05, 0, 0, 0)}], ids=["flat", "bent"])
+def test_a_surface_before_a_hat_hides_it_from_both_sides_and_one_behind_does_not(lens: dict[str, Any]) -> None:
+    for x, hides in ((2.0, True), (7.0, False)):
+        a, b, c = (x, -9.0, 0.0), (x, 9.0, 0.0), (x, 0.0, 20.0)
+        for corners in ((a, b, c), (a, c, b)):
+            first, *others = np.array(corners)
+            row = np.concatenate([first, *(other - first for other in others)])[None]
+            picture = draw(replace(FRONT, **CLEAN, **lens), of=scene()._replace(surfaces=row))
+            assert has_magenta(picture) is not hides
+
+
 def test_a_nearer_drone_hides_the_hat_of_a_farther_one() -> None:
     far = bodies([(0, 0, 5), (6, 0, 5), (1.2, 0, 5.02)])
     covered = scene(3)._replace(drones=(*scene(2).drones, scene(1).drones[0]._replace(has_hat=False)))

@@ -19,6 +19,8 @@ from synthetic_record import Flown
 from zsim.contract.flight_messages import ClusterState
 from zsim.contract.run_messages import Event, RadioLinks
 from zsim.presentation import drone_colours
+from zsim.scenario.scenario_file import resolve
+from zsim.scenario.surface_file import packed
 from zsim_analysis.reading.drone_errors import Distances, EstimateErrors, Separations, VelocityResponse
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of, goal_errors
 from zsim_analysis.reading.radio_links import RadioHistory
@@ -29,6 +31,7 @@ from zsim_analysis.report.drone_figures import (
     draw_distances,
     draw_drones,
     draw_estimates,
+    draw_obstacles,
     draw_plan,
     draw_radio,
     draw_velocities,
@@ -455,6 +458,18 @@ def test_captions_name_the_paper_beside_its_tests_alone(monkeypatch: pytest.Monk
 
 def bands_of(figure: Figure, place: int) -> list[Any]:
     return [patch for patch in figure.axes[place].patches if patch.get_alpha() == pytest.approx(ALPHA)]
+
+
+def test_surfaces_lie_in_the_plan_view_the_highest_on_top() -> None:
+    low, high = [0, 0, 0, 2, 0, 0, 0, 1, 0], [0, 0, 3, 2, 0, 3, 0, 1, 3]
+    roof = {"name": "roof", "triangles": packed(np.array([high, low], float)), "position_m": [5, 6, 0]}
+    drones = [{"name": "drone1", "position_m": [0, 0, 0]}]
+    document = {"name": "roof", "duration_s": 1, "drones": drones, "environment": {"surfaces": [roof]}}
+    axes = Figure().subplots()
+    draw_obstacles(axes, resolve(document))
+    drawn: Any = axes.collections[0]
+    assert [path.vertices[0].tolist() for path in drawn.get_paths()] == [[5.0, 6.0]] * 2
+    assert drawn.get_array().tolist() == [0.0, 3.0]
 
 
 def test_obstacles_stand_in_the_plan_view(flight: RecordedFlight, formation: Formation) -> None:

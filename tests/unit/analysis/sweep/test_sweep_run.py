@@ -58,6 +58,14 @@ def task(text: str = ONE, run: int = 7, record: Path | None = None, varied: dict
     return Task(run, 1, varied or {}, scenario_file.from_text(text), str(record) if record else None)
 
 
+def test_a_row_has_the_least_distance_of_any_drone_from_obstacles(tmp_path: Path) -> None:
+    ball = "environment: {obstacles: [{name: ball, shape: sphere, position_m: [0, 9, 3], radius_m: 1}]}\n"
+    row = fly(task(ONE + ball, record=tmp_path / "000007"))
+    distances_m = judge(tmp_path / "000007/run.mcap")[2].obstacle_distance_m
+    assert row["min_obstacle_distance_m"] == min(distances_m.values()) > 1.0
+    assert fly(task())["min_obstacle_distance_m"] is None
+
+
 def test_a_row_is_what_the_report_of_a_record_says(tmp_path: Path) -> None:
     """The same numbers as from the record of `zsim run --in-process`, and the same from a record of its own."""
     row = fly(task(PAIR, record=tmp_path / "000007", varied={"environment.wind.gust_m_s": 0.3}))

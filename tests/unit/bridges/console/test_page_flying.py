@@ -12,6 +12,9 @@ import pytest
 
 from zsim.contract.flight_messages import DroneView, ViewCluster, ViewDrones
 from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Surface
+from zsim.scenario.surface_file import packed
+from zsim.scenario.triangles import outline_of
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_bridges.console import page_flying
 from zsim_bridges.console.histories import CanvasTrails
@@ -158,6 +161,11 @@ def test_what_stands_around_the_drones():
     wall, mast = around["obstacles"]
     assert wall == {"name": "wall", "x_m": 5.0, "y_m": 1.0, "yaw_deg": 30.0, "radius_m": None, "size_m": [1.0, 4.0]}
     assert (mast["x_m"], mast["radius_m"], mast["size_m"]) == (9.0, 0.2, None)
+    assert around["surfaces"] == []
+    corners = np.array([[0, 0, 0, 2, 0, 3, 2, 1, 0], [0, 0, 0, 2, 1, 0, 0, 1, 1], [1, 0.5, 9, 0, 0, 0, 1, 0, 0]], float)
+    stone = Surface(name="stone", triangles=packed(corners), position_m=(5, 6, 0), yaw_deg=90)
+    outline = [[4.0, 6.0], [5.0, 6.0], [5.0, 8.0], [4.0, 8.0]]
+    assert outline_of(stone) == outline
 
 
 def test_drones_by_place_heading_and_state_and_none_where_one_is_not_seen():

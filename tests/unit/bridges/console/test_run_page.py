@@ -16,6 +16,8 @@ from zsim.contract.flight_messages import DroneView, EstimateView, ViewCluster, 
 from zsim.contract.messages import DroneInfo, RotorInfo
 from zsim.contract.run_messages import ControlAnswer, Event
 from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Surface
+from zsim.scenario.surface_file import packed
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import console_tables
 from zsim_bridges.console import scene as stages
@@ -402,6 +404,19 @@ def test_obstacles_stand_where_the_scenario_says(viser: PrivateViser):
         "/obstacles/mast": (9.0, 0.0, 3.0),
         "/obstacles/balloon": (9.0, 9.0, 5.0),
     }
+
+
+def test_surfaces_are_drawn_where_the_scenario_puts_them(viser: PrivateViser):
+    ramp = Surface(name="ramp", triangles=packed(np.array([[0, 0, 0, 2, 0, 0, 0, 1, 1]], float)), position_m=(5, 6, 7))
+    added: dict[str, Any] = {}
+    scene: Any = viser.server.scene
+    stage = stages.SceneNodes(viser.server, DRONES, ARMS_M, 3, 1)
+    scene.add_mesh_simple = lambda name, vertices, faces, **_: added.update({name: vertices[faces].tolist()})
+    try:
+        stage.surfaces([ramp])
+    finally:
+        del scene.add_mesh_simple
+    assert added == {"/surfaces/ramp": [[[5, 6, 7], [7, 6, 7], [5, 7, 8]]]}
 
 
 def test_a_run_that_nobody_watched_leaves_its_last_picture_and_sends_what_was_moved_now_or_never(viser: PrivateViser):
