@@ -17,6 +17,7 @@ from zsim.scenario.roles import AGENTS, PILOT
 from zsim.schema import yaml_file
 from zsim.schema.checker import Fault as Flaw
 from zsim.schema.checker import listed, show, suggestion
+from zsim.sensors.scanner import SCANNERS
 from zsim.sensors.sensor import Channel, Declaration, SensorType
 from zsim.sensors.sensor_catalogue import STOCK
 
@@ -122,8 +123,19 @@ def _sensor_kinds(sensors: Mapping[str, SensorType | Declaration]) -> dict[str, 
     return dropouts | stuck | biases | noises
 
 
+def _scanner_kinds() -> dict[str, FaultKind]:
+    """Return the kinds of the sensors that cast rays, which a drone need not have."""
+    off = _number("value_m", "of every distance", "m", -1e4, 1e4)
+    dropouts = {
+        f"{name}_dropout": FaultKind("drone", f"messages of {name} are lost", (_PROBABILITY,)) for name in SCANNERS
+    }
+    text = "has an additional constant error"
+    return dropouts | {f"{name}_bias": FaultKind("drone", f"{name} {text}", (off,)) for name in SCANNERS}
+
+
 KINDS: dict[str, FaultKind] = {
     **_sensor_kinds(STOCK),
+    **_scanner_kinds(),
     "rotor_efficiency": FaultKind(
         "drone",
         "a rotor has lost thrust",

@@ -11,11 +11,13 @@ from zsim.contract.run_messages import Fault
 from zsim.math import elementary as el
 from zsim.math.distributions import normal_probability, normal_quantile
 from zsim.scenario.faults import sensor_parts
+from zsim.sensors.scanner import SCANNERS
 from zsim.vehicles.vehicle import Vehicle
 from zsim_world.physics.air import WIND
 from zsim_world.physics.fleet_arrays import STATE, Arrays
 from zsim_world.run_state import Saved
 from zsim_world.sensors import sensor_set as ss
+from zsim_world.sensors.scans import ScanSampler
 from zsim_world.sensors.sensor_set import CONFIG, FAULT, FleetSensors
 from zsim_world.vehicles.simd_firmware import ACTUATOR, sound_actuators
 
@@ -26,6 +28,7 @@ class Impairment:
     Args:
         arrays: of the fleet, before its first gate.
         drones, vehicles: their names and what they are, in scenario order.
+        scans: of their sensors that cast rays, None if no drone has one.
 
     Attributes:
         rotors: names of the rotors of each drone.
@@ -34,9 +37,14 @@ class Impairment:
     SAVED: ClassVar[Saved] = {"_held": dict[int, tuple[float, ...]], "_gusts": tuple[Fault, ...], "_calm": bool}
 
     def __init__(
-        self, arrays: Arrays, drones: Sequence[str], vehicles: Sequence[Vehicle], sensors: FleetSensors
+        self,
+        arrays: Arrays,
+        drones: Sequence[str],
+        vehicles: Sequence[Vehicle],
+        sensors: FleetSensors,
+        scans: ScanSampler | None = None,
     ) -> None:
-        self._w = arrays
+        self._w, self._scans = arrays, scans
         self._sensor = {name: s for s, name in enumerate(sensors.names)}
         self._parts = sensor_parts(dict(zip(sensors.names, sensors.types, strict=True)))
         self._index = {name: i for i, name in enumerate(drones)}
@@ -52,6 +60,8 @@ class Impairment:
         """Let these faults act from now on, and no others; those that have acted before go on."""
         self._w.senses.config[:] = self._config
         self._w.boards.actuator[:] = self._sound
+        if self._scans:
+            self._scans.recover()
         self._w.senses.fault[:, :, FAULT.offset : FAULT.hold] = 0.0
         stuck: set[tuple[int, int]] = set()
         self._held = {fault.id: self._held[fault.id] for fault in acting if fault.id in self._held}
@@ -79,6 +89,11 @@ class Impairment:
         what, _, how = fault.kind.rpartition("_")
         if what == "rotor":
             self._impair_rotors(fault, i, how)
+            return
+        if what in SCANNERS:
+            share, bias_m = (fault.parameters.get(name, 0.0) for name in ("probability", "value_m"))
+            if self._scans:
+                self._scans.impair(i, what, lambda limit: dropped(limit, share) if share else limit, bias_m)
             return
         if how in ("dropout", "stuck"):
             row = self._w.senses.config[i, self._sensor[what]]

@@ -165,14 +165,16 @@ class Fleet:
         has_sightings = any(each.sightings is not UNSET for each in simulated)
         self.beside = (*([SIGHTINGS] if has_sightings else []), *scanned)
         self._seeing: list[SightingSampler | ScanSampler] = []
+        scans: ScanSampler | None = None
         if has_sightings:
             self._seeing.append(SightingSampler(scenario, hulls.copy()))
         if scanned:
-            self._seeing.append(ScanSampler(scenario, hulls.copy(), self._w.scene))
+            scans = ScanSampler(scenario, hulls.copy(), self._w.scene)
+            self._seeing.append(scans)
         self.seen: dict[int, PictureSightings | Scan] = {}
         self._held = hold(self._w)
         self.bodies, self.boards = self._w.bodies, self._w.boards
-        self.impairment = Impairment(self._w, self.names, vehicles, self.sensors)
+        self.impairment = Impairment(self._w, self.names, vehicles, self.sensors, scans)
         self.touching = np.zeros(self.count, dtype=bool)
         self._hull_m = float(hulls.max())
         self._integrate(0)

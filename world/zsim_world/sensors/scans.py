@@ -6,7 +6,7 @@ the same number of numbers: two for each of its values, one for itself.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -117,7 +117,7 @@ class ScanScene(NamedTuple):
 class ScanSampler:
     """Makes the scans of a fleet, gate by gate; `hulls`: radius of each drone's [m], (N,)."""
 
-    SAVED: ClassVar[Saved] = {"_streams": IN_PLACE, "_exposures": PART, "_later": list[WaitingScan]}
+    SAVED: ClassVar[Saved] = {"_rows": IN_PLACE, "_streams": IN_PLACE, "_exposures": PART, "_later": list[WaitingScan]}
 
     def __init__(self, scenario: Scenario, hulls: Array, scene: Scene) -> None:
         self._mounted = [*_mounted(scenario)]
@@ -129,10 +129,26 @@ class ScanSampler:
             first, origin = first + len(each.rays), origin + len(each.origins)
         self._streams = np.array([words(rng) for rng in generators], dtype=np.uint64).reshape(-1, WORDS.size)
         origins, rays = (np.concatenate([getattr(m, part) for m in self._mounted]) for part in ("origins", "rays"))
+        self._rows, self._sound = rows, rows.copy()
         self._held = hold(ScanScene(scene, hulls, rows, origins, rays))
         gate_ns = round(scenario.time.gate_ms * 1e6)
         self._exposures = Exposures([each.settings.rate_hz for each in self._mounted], gate_ns)
         self._later: list[WaitingScan] = []
+
+    def recover(self) -> None:
+        """Let no fault act on any sensor."""
+        self._rows[:] = self._sound
+
+    def impair(self, drone: int, sensor: str, drop: Callable[[float], float], bias_m: float) -> None:
+        """Let a fault act on a sensor of a drone, beside those that act already; nothing where it has none.
+
+        Args:
+            drop: returns the limit of SCANNER.drop with the fault, given that without.
+        """
+        for row, each in zip(self._rows, self._mounted, strict=True):
+            if (each.drone, each.sensor) == (drone, sensor):
+                row[SCANNER.drop] = drop(row[SCANNER.drop])
+                row[SCANNER.bias] += bias_m
 
     def due(self, state: Array, now_ns: int) -> list[Scan]:
         """Return what is due by a gate, given the state of all drones there, (N, STATE.size or more)."""

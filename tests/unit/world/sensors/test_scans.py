@@ -8,6 +8,7 @@ import pytest
 
 from zsim.contract import messages
 from zsim.contract.messages import Depth, Lidar, Range
+from zsim.contract.run_messages import Fault
 from zsim.contract.snapshot import pack, unpack
 from zsim.math.frames import rotation_matrix
 from zsim.scenario.scenario_file import resolve
@@ -169,3 +170,24 @@ def test_a_first_scan_that_is_larger_than_all_other_messages_is_published_whole(
     sizes = [len(payload) for key, payload in gate.pairs if key.endswith("/lidar")]
     assert len(sizes) == 2
     assert min(sizes) > 64 * 360 * 4
+
+
+def test_faults_lose_messages_and_shift_distances_of_one_sensor_and_end() -> None:
+    made = fleet((0, 0, 0), (0, 3, 0), range={"beams": {"ahead": {}}, "max_m": 8, "rate_hz": 50})
+    made.advance()
+
+    def faults(*kinds: tuple[str, dict[str, float]]) -> list[Fault]:
+        return [Fault(k, kind, "d1", values, 0, None, "test") for k, (kind, values) in enumerate(kinds)]
+
+    def ahead() -> list[float]:
+        made.advance()
+        return [message.ranges_m[0] for message in (taken(made, Range, drone) for drone in (0, 1))]
+
+    for bias_m in (0.5, -0.25):
+        made.impairment.strike(faults(("range_bias", {"value_m": bias_m}), ("lidar_bias", {"value_m": 9.0})))
+        assert ahead() == pytest.approx([5.0, 5.0 + bias_m], abs=1e-3)
+    made.impairment.strike(faults(("range_dropout", {"probability": 1.0})))
+    made.advance()
+    assert {each.drone for each in made.seen.values()} == {0}
+    made.impairment.strike([])
+    assert ahead() == pytest.approx([5.0, 5.0], abs=1e-3)

@@ -31,6 +31,7 @@ SOUND: dict[str, dict[str, Any]] = {
     "baro_bias": {"value_m": -2},
     "sonar_bias": {"value_m": 0.1},
     "flow_bias": {"value_m_s": [0.1, 0, 0]},
+    **{f"{scanner}_bias": {"value_m": 0.1} for scanner in ("range", "lidar", "depth")},
     **{kind: {"factor": 3} for kind in KINDS if kind.endswith("_noise")},
     "rotor_efficiency": {"rotor": "all", "value": 0.8},
     "rotor_stuck": {"rotor": "front_left"},
