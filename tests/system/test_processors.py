@@ -69,9 +69,9 @@ def test_with_all_settings_and_code_for_any_processor_nothing_changes() -> None:
 def test_a_law_that_depends_on_the_processor_is_found(tmp_path: Path) -> None:
     (tmp_path / "bent.py").write_text(LAW)
     scenario = yaml.safe_load((golden_flights.ROOT / "scenarios" / "step.yaml").read_text())
-    scenario["clusters"][0]["law"] = "bent:Bent"
+    scenario["clusters"][0] |= {"law": "bent:Bent", "plan": {**scenario["clusters"][0]["plan"], "takeoff_s": 1}}
     (tmp_path / "bent.yaml").write_text(yaml.safe_dump(scenario))
-    command = [sys.executable, "-P", "-m", "zsim_deploy", "doctor", str(tmp_path / "bent.yaml"), "--duration", "14"]
+    command = [sys.executable, "-P", "-m", "zsim_deploy", "doctor", str(tmp_path / "bent.yaml"), "--duration", "12"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 1
     assert "command" in done.stderr

@@ -16,7 +16,7 @@ from zsim.errors import HostsError, RunError, printable
 from zsim.scenario.roles import ROUTER, WORLD
 from zsim.transport.tls import DAYS
 from zsim_deploy import arguments as opt
-from zsim_deploy.arguments import note, require, say
+from zsim_deploy.arguments import failed, note, require, say
 from zsim_deploy.hosts import control_socket
 
 UP_NEEDS = {"hosts": ("asyncssh", "cryptography"), "record": ("mcap", "zstandard")}
@@ -85,7 +85,8 @@ def doctor(
         if scenario is None:
             raise BadParameter("zsim doctor needs a scenario to fly, or --hosts with an inventory")
         require("doctor", opt.FLIGHT_NEEDS)
-        check_processor(scenario, duration, say)
+        if differs := check_processor(scenario, duration, say):
+            raise failed(differs)
         return
     from zsim.runtime.progress import PipedConsole
     from zsim.scenario import scenario_file
