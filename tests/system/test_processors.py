@@ -74,5 +74,5 @@ def test_a_law_that_depends_on_the_processor_is_found(tmp_path: Path) -> None:
     command = [sys.executable, "-P", "-m", "zsim_deploy", "doctor", str(tmp_path / "bent.yaml"), "--duration", "12"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 1
-    assert "command" in done.stderr
+    assert "cmd/velocity" in done.stderr
     assert "differs" in done.stderr

@@ -58,4 +58,4 @@ def _finished(words: tuple[str, ...], settings: dict[str, str], allowed: tuple[i
     if done.returncode not in allowed:
         last = (done.stderr or done.stdout).strip().splitlines() or ["it printed nothing"]
         raise RunError(f"zsim {words[0]} ended with exit code {done.returncode}: {last[-1]}")
-    return done.returncode, done.stdout + done.stderr
+    return done.returncode, done.stdout
