@@ -89,10 +89,10 @@ def flown_beside(truths: list[Truth]) -> np.ndarray:
 
 
 def test_it_blows_on_who_flies_below_as_the_simulated_one_did_whose_truth_its_driver_publishes():
-    """Between two gates a pose is moved on with its velocity; that is all the difference."""
+    """Between two gates a pose is moved on with its velocity, for the air and for the sonar that sees it from above."""
     path, truths = flown_over()
     far = [msgspec.structs.replace(truth, position_m=(50.0, 0.0, 2.0)) for truth in truths]
     same, alone = flown_beside(truths), flown_beside(far)
     blown_m = np.abs(path - alone)[450:].max()
     assert blown_m > 0.02
-    assert np.abs(path - same).max() < 1e-4
+    assert np.abs(path - same).max() < 0.02 * blown_m

@@ -53,6 +53,8 @@ MATRIX: dict[str, Document] = {
     "link_cut": {"target": "world/estimator.drone1"},
     "radio": {"target": "main", "range_m": 2, "spread_m": 1},
 }
+# Of sensors that no drone has unless it is given them: tests/unit/world/sensors
+SCANNED = {f"{sensor}_{effect}" for sensor in ("range", "lidar", "depth") for effect in ("bias", "dropout")}
 CHANCE = {"noise", "jitter", "loss", "radio"}  # in the names of kinds that draw numbers
 SEVERAL: list[Document] = [
     {"kind": "link_loss", "target": "world/estimator.drone2", "probability": 0.3, "at_s": 4},
@@ -140,7 +142,7 @@ def briefly_undisturbed() -> Flight:
 
 
 def test_every_kind_is_in_the_matrix() -> None:
-    assert {*MATRIX, KILL} == {*KINDS}
+    assert {*MATRIX, *SCANNED, KILL} == {*KINDS}
 
 
 @pytest.mark.parametrize("kind", MATRIX)

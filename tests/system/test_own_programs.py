@@ -8,7 +8,7 @@ import yaml
 from federation import Federation
 
 import zsim
-from zsim.errors import RunError, ScenarioError
+from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim_analysis.in_process import InProcessFlight
 
@@ -75,6 +75,6 @@ def test_a_faulty_entry_is_refused_at_its_place(programs: dict[str, Any], field:
 
 def test_in_one_process_none_is_started() -> None:
     resolved = scenario_file.resolve(yaml.safe_load(scenario(["sleep", "600"])))
-    with pytest.raises(RunError) as raised:
+    with pytest.raises(ScenarioError) as raised:
         InProcessFlight(resolved)
     assert "my.main" in str(raised.value)

@@ -37,6 +37,7 @@ def world(
     launched: opt.Launched = None,
 ) -> None:
     """Run the world: integrates all drones and owns simulated time."""
+    require("world", {"agents": ("numba", "scipy")})
     from zsim.scenario import scenario_file
     from zsim.schema import plugin
     from zsim_deploy.roles import world_role
@@ -58,6 +59,7 @@ def _agent_command(name: str, role: Role) -> Callable[..., None]:
     several_help = f"{about.capitalize()}s, or patterns: '{about}*'."
 
     def start(things: list[str], reach: opt.WorldAccess) -> None:
+        require(name, {"agents": ("scipy",)})
         from zsim_deploy.roles import roles
 
         roles.agent(roles.agent_of(name, things), reach, roles.process_of(name, things))

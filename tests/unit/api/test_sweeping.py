@@ -37,10 +37,12 @@ class NearWorker:
 
     def __init__(self) -> None:
         self.link, self._far = process_pool.multiprocessing.Pipe()
-        self.ready, self.task = False, None
+        self.ready = False
+        self.task: Task | None = None
         self._far.send(READY)
 
     def send(self, task: Task) -> None:
+        self.task = task
         self._far.send(fly(task))
 
     def receive(self) -> Row:

@@ -92,7 +92,7 @@ def test_what_a_launcher_and_hosts_answer_holds_no_codes(
     (tmp_path / "hosts.yaml").write_text("hosts: {h1: {address: 192.0.2.1}}\nroles: {world: h1}\n")
     found = CheckResult([], [], [NASTY])
     monkeypatch.setattr(doctor, "check_hosts", lambda *_: found)
-    hosts_commands.doctor(tmp_path / "hosts.yaml")
+    hosts_commands.doctor(hosts=tmp_path / "hosts.yaml")
     output, errors = capsys.readouterr()
     assert not CODES & set(output + errors)
     assert output.count(printable(NASTY)) == 2
