@@ -23,6 +23,7 @@ def hunted(scenario: Path, out: Path, *options: str, code: int) -> dict[str, Any
     return json.loads((out / "summary.json").read_text())
 
 
+@pytest.mark.soak
 def test_what_breaks_is_left_as_a_flight_that_repeats_to_the_bit(tmp_path: Path) -> None:
     scenario, out = tmp_path / "pair.yaml", tmp_path / "hunt"
     scenario.write_text(PAIR)
