@@ -49,10 +49,6 @@ def solve_banded(diagonals: Array, below: int, B: Array) -> Array:
     return _banded_solved(_own(np.hstack([diagonals, room])), below, _own(B).copy())
 
 
-def inverse(A: ArrayLike) -> Array:
-    return solve(A, np.eye(len(np.asarray(A))))
-
-
 def eigen(A: ArrayLike) -> tuple[Array, Array]:
     """Return eigenvalues (n,), ascending, and unit eigenvectors as columns (n, n)."""
     values, vectors = _diagonalised(_own(A).copy())

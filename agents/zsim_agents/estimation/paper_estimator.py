@@ -132,7 +132,7 @@ class PaperEstimator:
 class DeadReckoningFilter:
     """Position and heading, x = (p_WB, yaw) with covariance P (4, 4), by dead reckoning and fixes.
 
-    The equations, and in the end their numbers to rounding, are those of filterpy's ExtendedKalmanFilter.
+    The equations are those of filterpy's ExtendedKalmanFilter, in Joseph form.
     """
 
     def __init__(self, yaw: float) -> None:

@@ -75,7 +75,7 @@ class HuntRequest(Struct, frozen=True):
     processes: Callable[[Scenario, Path], None] | None = None  # as of a task: flies what processes die in
 
 
-class Flown(Struct, frozen=True):
+class HuntFlight(Struct, frozen=True):
     """A flight of a hunt."""
 
     number: int
@@ -156,7 +156,7 @@ class Hunted(Struct, frozen=True):
     request: HuntRequest
     space: HuntSpace
     summary: HuntSummary
-    flown: list[Flown]
+    flown: list[HuntFlight]
 
 
 def hunt(request: HuntRequest) -> Hunted:
@@ -272,7 +272,7 @@ class _Hunt:
         self._texts, self._requirements = tuple(texts), requirements
         self._strategy = Strategy(space, request.seed)
         self._screen = HuntScreen(request, self._strategy)
-        self.flown: list[Flown] = []
+        self.flown: list[HuntFlight] = []
         self._scales: list[float] = []  # by requirement: margin of the flight without faults
         self._stages: Counter[str] = Counter()
         self._spent_s: defaultdict[str, float] = defaultdict(float)
@@ -355,7 +355,7 @@ class _Hunt:
         )
         return number
 
-    def _result(self, number: int) -> Flown:
+    def _result(self, number: int) -> HuntFlight:
         """Wait for a flight, and take it into the table."""
         while number not in self._rows:
             row = next(self._flying)
@@ -373,12 +373,12 @@ class _Hunt:
             each if each.value is None else each._replace(share=each.value / scale)
             for each, scale in zip(margins, self._scales, strict=True)
         ]
-        flown = Flown(len(self.flown), stage, case, margins, failure, row["truth_sha256"], row["shortfall"])
+        flown = HuntFlight(len(self.flown), stage, case, margins, failure, row["truth_sha256"], row["shortfall"])
         self._stages[stage] += 1
         self.flown.append(flown)
         return flown
 
-    def _fly(self, cases: Sequence[Case], stage: str) -> list[Flown | None]:
+    def _fly(self, cases: Sequence[Case], stage: str) -> list[HuntFlight | None]:
         """Fly cases together; None for one that cannot be flown."""
         numbers: list[int | None] = []
         for case in cases:
@@ -390,7 +390,7 @@ class _Hunt:
 
     # Stages
 
-    def _search(self) -> Flown | None:
+    def _search(self) -> HuntFlight | None:
         """Return the first flight, in their order, that breaks a requirement; None within the budget."""
         flights, budget_s = self._request.flights, self._request.budget_s
         until_s = None if budget_s is None else time.monotonic() + budget_s
@@ -413,7 +413,7 @@ class _Hunt:
         finally:
             self._waiting.clear()
 
-    def _shrunk(self, found: Flown) -> Iterator[Case]:
+    def _shrunk(self, found: HuntFlight) -> Iterator[Case]:
         which = found.margins.index(found.worst)
         is_unknown, failed = bool(found.worst.unknown), found.failure is not None
 
@@ -427,7 +427,7 @@ class _Hunt:
             known.update({name: alike(each) for name, each in zip(new, flown, strict=True)})
             return [known[name] for name in names]
 
-        def alike(flown: Flown | None) -> bool:
+        def alike(flown: HuntFlight | None) -> bool:
             if flown is None or (flown.failure is not None) != failed:
                 return False
             margin = flown.margins[which]
@@ -437,7 +437,9 @@ class _Hunt:
         self._screen.say(f"flight {found.number} breaks {self._requirements[which].text} ({what}); shrinking it")
         yield from Shrinker(self._space, breaks).shrink(found.case)
 
-    def _violation(self, found: Flown, case: Case, causes: list[CauseFound], flown: Flown | None = None) -> Violation:
+    def _violation(
+        self, found: HuntFlight, case: Case, causes: list[CauseFound], flown: HuntFlight | None = None
+    ) -> Violation:
         which, last = found.margins.index(found.worst), flown or found
         return Violation(
             requirement=self._requirements[which].text,
@@ -451,7 +453,7 @@ class _Hunt:
             truth_sha256=flown.truth_sha256 if flown else None,
         )
 
-    def _recorded(self, found: Flown, case: Case) -> Violation:
+    def _recorded(self, found: HuntFlight, case: Case) -> Violation:
         """Fly the shrunk flight for its record, and others that show what each cause does."""
         which, causes = found.margins.index(found.worst), causes_of(case)
         self._screen.stage = RECORD

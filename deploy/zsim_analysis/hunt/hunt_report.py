@@ -18,8 +18,8 @@ from zsim_analysis.hunt.hunt import (
     BUNDLE,
     SEARCH,
     VIOLATION,
-    Flown,
     Hunted,
+    HuntFlight,
     HuntRequest,
     HuntSummary,
     cause_text,
@@ -69,14 +69,14 @@ def make_hunt_report(
     return notes
 
 
-def figures(summary: HuntSummary, searched: Sequence[Flown]) -> Iterator[ReportFigure]:
+def figures(summary: HuntSummary, searched: Sequence[HuntFlight]) -> Iterator[ReportFigure]:
     yield _margins(summary, searched)
     kinds = sorted({kind for each in searched for kind in each.case.kinds})
     if 1 < len(kinds) <= KINDS_DRAWN:
         yield _pairs(kinds, searched)
 
 
-def _margins(summary: HuntSummary, searched: Sequence[Flown]) -> ReportFigure:
+def _margins(summary: HuntSummary, searched: Sequence[HuntFlight]) -> ReportFigure:
     figure = new_figure(PAGE_IN, 1.6 * len(summary.requirements) + 0.4)
     panels = figure.subplots(len(summary.requirements), 1, sharex=True, squeeze=False)[:, 0]
     for i, (axes, text) in enumerate(zip(panels, summary.requirements, strict=True)):
@@ -100,7 +100,7 @@ def _margins(summary: HuntSummary, searched: Sequence[Flown]) -> ReportFigure:
     return ReportFigure("margins.png", "Margins over the flights", caption, figure)
 
 
-def _pairs(kinds: Sequence[str], searched: Sequence[Flown]) -> ReportFigure:
+def _pairs(kinds: Sequence[str], searched: Sequence[HuntFlight]) -> ReportFigure:
     least = np.full((len(kinds), len(kinds)), np.nan)
     counts = np.zeros_like(least)
     for each in searched:
@@ -132,7 +132,7 @@ def _pairs(kinds: Sequence[str], searched: Sequence[Flown]) -> ReportFigure:
 # Page
 
 
-def page(hunted: Hunted, searched: Sequence[Flown], pictures: Sequence[Picture]) -> str:
+def page(hunted: Hunted, searched: Sequence[HuntFlight], pictures: Sequence[Picture]) -> str:
     summary, space = hunted.summary, hunted.space
     found = summary.violation
     return template("hunt.html.j2", "zsim_analysis.hunt").render(
@@ -161,7 +161,7 @@ def facts(request: HuntRequest, summary: HuntSummary) -> list[tuple[str, str]]:
     ]
 
 
-def kind_row(space: KindSpace, searched: Sequence[Flown]) -> list[str]:
+def kind_row(space: KindSpace, searched: Sequence[HuntFlight]) -> list[str]:
     """Return how often a kind was flown, its least margin, and in which quarters of the ranges of its numbers."""
     flown = [(each, fault) for each in searched for fault in each.case.faults if fault["kind"] == space.name]
     least = min((each.worst.share for each, _ in flown), default=None)

@@ -215,7 +215,7 @@ class RecordedAgents(NamedTuple):
 def recorded_agents(reader: RecordReader, info: messages.Info, scenario: Scenario) -> RecordedAgents:
     """Return the agents that took part in the run of a record.
 
-    Processes of others do not announce a numeric fingerprint, or serve names that are no agents of the scenario.
+    Processes of others do not announce a fingerprint, or serve names that are no agents of the scenario.
     """
     known = set(agents_of(scenario)) if scenario.drones else set()
     joins = [(keys.thing(key), join) for key, join in _read(reader, "process/*/join")]
