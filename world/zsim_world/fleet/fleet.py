@@ -21,8 +21,8 @@ from zsim.contract.messages import RotorInfo
 from zsim.errors import RunError
 from zsim.math import elementary as el
 from zsim.math import linear
-from zsim.math.compiled import hold
 from zsim.math.frames import quaternion_from_heading, quaternion_from_rpy
+from zsim.math.held import hold
 from zsim.scenario.scenario import Drone, Scenario
 from zsim.scenario.triangles import sheet_of
 from zsim.sensors.scanner import SCANNERS

@@ -19,8 +19,9 @@ from zsim.contract.keys import SIGHTINGS
 from zsim.math import elementary as el
 from zsim.math import linear
 from zsim.math import rotation as rot
-from zsim.math.compiled import Field, Held, columns, compiled, hold, inlined, kernel
+from zsim.math.compiled import Field, columns, compiled, inlined, kernel
 from zsim.math.distributions import normal_probability
+from zsim.math.held import Held, hold
 from zsim.math.random_streams import stream
 from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Scenario
