@@ -6,7 +6,8 @@ from numpy.typing import NDArray
 
 from zsim.contract.run_messages import RadioLinks
 from zsim.math import elementary as el
-from zsim.math.compiled import Held, hold, kernel
+from zsim.math.compiled import kernel
+from zsim.math.held import Held, hold
 from zsim.math.rotation import norm, scaled, subtract
 from zsim.scenario.scenario import RECEPTION_MIN, Radio, Scenario, Topology
 from zsim_world.physics.rays import Scene, cast_parts
