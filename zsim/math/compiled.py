@@ -7,7 +7,7 @@ No fast-math and no fused operations, so that the same input gives the same bits
     compiled    part of a kernel that may make arrays
     kernel      called from Python and kept on disk; 1 / 0 is inf, as in numpy
     portable    called from Python and kept on disk; 1 / 0 raises ZeroDivisionError, as in Python
-    hold        the arrays of a NamedTuple as one argument: numba unpacks each array of a tuple at every call
+    deferred    a kernel that does not import numba, and runs as Python until something else has
     columns     names of the columns of a row of numbers, which compiled code reads as constants
 
 Numba's own cache on disk looks only at the file of a function, although everything that the function calls is compiled
@@ -25,18 +25,14 @@ import sys
 import tempfile
 from collections import namedtuple
 from collections.abc import Callable, Iterable
-from functools import cache, partial
+from functools import cache, cached_property, partial, update_wrapper
+from importlib.util import find_spec
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
-try:
-    from numba import njit
-except ImportError:
-    njit = None
-
 Function = TypeVar("Function", bound=Callable[..., Any])
-COMPILES = njit is not None  # whether anything is compiled here
+COMPILES = find_spec("numba") is not None  # whether anything is compiled here
 _EXACT: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
 _UNCOUNTED: dict[str, Any] = {"_nrt": False}  # numba's name for doing without its counts; making an array is refused
 _IMPORTS = re.compile(r"^from (zsim[\w.]*) import (\([^)]*\)|.*)$", re.MULTILINE)
@@ -76,14 +72,27 @@ def _is_writable(folder: Path) -> bool:
     return True
 
 
-if njit is not None and hasattr(os, "getuid"):  # not on Windows
+@cache
+def _numba() -> Any:
+    """Return numba, imported where the first function is to be compiled: it takes a third of a second."""
+    if not COMPILES:
+        return None
     import numba
+    from numba.extending import typeof_impl
 
-    numba.config.CACHE_DIR = numba.config.CACHE_DIR or cache_folder()  # type: ignore[attr-defined]
+    if hasattr(os, "getuid"):  # not on Windows
+        numba.config.CACHE_DIR = numba.config.CACHE_DIR or cache_folder()  # type: ignore[attr-defined]
+
+    @typeof_impl.register(Deferred)
+    def _(function: Deferred, _context: Any) -> Any:  # pyright: ignore[reportUnusedFunction]
+        return numba.types.Dispatcher(function.dispatcher)
+
+    return numba
 
 
 def _compile(function: Function, options: dict[str, Any]) -> Function:
-    dispatcher: Any = function if njit is None else njit(**options)(function)
+    numba = _numba()
+    dispatcher: Any = function if numba is None else numba.njit(**options)(function)
     return dispatcher
 
 
@@ -101,7 +110,7 @@ def noinline(function: Function) -> Function:
 
 def _kept(function: Function, options: dict[str, Any]) -> Function:
     """Return a function whose compilation is kept on disk, under a name that changes with any of its sources."""
-    if njit is None:
+    if not COMPILES:
         return function
     version = _digest_of_module(function.__module__)
     function.__qualname__ = f"{function.__qualname__}_{version}"
@@ -145,6 +154,32 @@ def portable(function: Function) -> Function:
     return _kept(function, {})
 
 
+class Deferred:
+    """A kernel that runs as Python, to the same bits, until something has imported numba."""
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        update_wrapper(self, function)
+        self.py_func = function
+        self._options = options
+
+    @cached_property
+    def dispatcher(self) -> Any:
+        return _kept(self.py_func, self._options)
+
+    def __call__(self, *arguments: Any) -> Any:
+        return (self.dispatcher if "numba" in sys.modules else self.py_func)(*arguments)
+
+    def __reduce__(self) -> str:
+        return self.py_func.__name__
+
+
+def deferred(makes_arrays: bool = True) -> Callable[[Function], Function]:
+    """Return the decorator, as of a `kernel`; for mathematics that the setting up of a run uses as well."""
+    options = _EXACT if makes_arrays else {**_EXACT, **_UNCOUNTED}
+    made: Any = lambda function: Deferred(function, options) if COMPILES else function  # noqa: E731
+    return made
+
+
 def is_kept(function: Callable[..., Any]) -> bool:
     """Tell whether a compilation of a kernel, as its sources are now, is on disk; it is then only loaded."""
     stats = getattr(function, "stats", None)  # of numba's dispatcher
@@ -186,54 +221,6 @@ def digest(files: Iterable[Path]) -> str:
 @cache
 def _text(path: Path) -> bytes:
     return path.read_bytes()
-
-
-class Held:
-    """A tuple of arrays as one argument of compiled functions, which read its `content`; made by `hold`."""
-
-    def __init__(self, content: Any) -> None:
-        self.content = content
-
-
-_make_held: Any = Held
-if njit is not None:
-    from numba import types
-    from numba.core import config
-    from numba.experimental import structref
-
-    @structref.register
-    class _HeldType(types.StructRef):
-        def preprocess_fields(self, fields: Iterable[tuple[str, Any]]) -> tuple[tuple[str, Any], ...]:
-            return tuple((name, types.unliteral(kind)) for name, kind in fields)
-
-    class _CompiledHeld(structref.StructRefProxy):
-        """A Held of compiled code, whose type, read twice a call, is the slot behind the property of numba."""
-
-        __slots__ = ()
-        _numba_type_: Any = structref.StructRefProxy.__dict__["_type"]
-
-    structref.define_proxy(_CompiledHeld, _HeldType, ["content"])
-    if not getattr(config, "DISABLE_JIT", False):  # with it compiled functions stay Python's, to be stepped through
-        _make_held = _CompiledHeld
-
-
-def hold(content: Any) -> Held:
-    """Return a tuple of arrays as one argument: the same arrays, whose contents may change.
-
-    With the eleven arrays of an estimator's rows a call takes 2.1 us, and 6.0 us with the tuple itself.
-    """
-    return _holder(type(content).__module__)(content)
-
-
-@cache
-def _holder(module: str) -> Callable[[Any], Held]:
-    """Return `hold` for the tuples of a module, kept by its sources: numba finds kept code by the tuples' classes."""
-
-    def holder(content: Any) -> Held:
-        return _make_held(content)
-
-    holder.__module__ = module
-    return portable(holder)
 
 
 class Field(NamedTuple):

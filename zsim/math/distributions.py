@@ -4,13 +4,13 @@ import math
 from collections.abc import Callable
 
 from zsim.math import elementary as el
-from zsim.math.compiled import kernel
+from zsim.math.compiled import deferred
 
 _ROOT_2_PI = math.sqrt(2.0 * math.pi)
 _FARTHEST = 38.0  # standard deviations; the density beyond is no double
 
 
-@kernel(makes_arrays=False)
+@deferred(makes_arrays=False)
 def normal_probability(x: float) -> float:
     """Return the probability of a standard normal number below x, within 1e-15.
 

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zsim.math.compiled import kernel
+from zsim.math.compiled import deferred
 
 _CELLS = 32  # of the tables of 2^x over [0, 1] and of atan over [0, 1]; a cell's half is small for the series below
 
@@ -78,7 +78,7 @@ _HALF_PI_LOW = float((Decimal(_PI_A) - Decimal(math.pi / 2)) + Decimal(_PI_B) + 
 _LN2_A, _LN2_B = _TABLES.ln2
 _CELLS_PER_E = _CELLS / (_LN2_A + _LN2_B)  # cells of 2^x for each unit of x in e^x
 _EXP2, _ATAN = _TABLES.exp2, _TABLES.atan
-_scalar = kernel(makes_arrays=False)
+_scalar = deferred(makes_arrays=False)
 _LARGEST_EXPONENT = 1100.0  # beyond the powers of two of any double
 _ACCURATE_RAD = 1e6  # up to which products of the quarter turns counted and of the parts of pi / 2 are exact
 _SQRT_HALF = math.sqrt(0.5)

@@ -18,7 +18,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zsim.math.compiled import kernel
+from zsim.math.compiled import deferred
 
 Array = NDArray[np.float64]
 
@@ -85,7 +85,7 @@ def _own(A: ArrayLike) -> Array:
     return np.ascontiguousarray(A, dtype=np.float64)
 
 
-@kernel()
+@deferred()
 def product_with(A: Array, B: Array) -> Array:
     """Return A B of contiguous arrays (m, k) and (k, n); for compiled code."""
     m, n = A.shape[0], B.shape[1]
@@ -98,7 +98,7 @@ def product_with(A: Array, B: Array) -> Array:
     return C
 
 
-@kernel()
+@deferred()
 def _solved(A: Array, B: Array) -> Array:
     """Return A^-1 B; both are overwritten."""
     n, m = B.shape
@@ -128,7 +128,7 @@ def _solved(A: Array, B: Array) -> Array:
     return B
 
 
-@kernel()
+@deferred()
 def _banded_solved(A: Array, below: int, B: Array) -> Array:
     """Return A^-1 B; both are overwritten."""
     n, m = B.shape
@@ -160,7 +160,7 @@ def _banded_solved(A: Array, below: int, B: Array) -> Array:
     return B
 
 
-@kernel()
+@deferred()
 def _diagonalised(A: Array) -> tuple[Array, Array]:
     """Return diagonal and accumulated rotations of a symmetric matrix, which is overwritten."""
     n = A.shape[0]
@@ -195,7 +195,7 @@ def _diagonalised(A: Array) -> tuple[Array, Array]:
     return values, V
 
 
-@kernel()
+@deferred()
 def _column_lengths(A: Array) -> Array:
     """Return the lengths of the columns once all are orthogonal; A (m, n), m >= n, is overwritten."""
     m, n = A.shape

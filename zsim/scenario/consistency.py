@@ -14,7 +14,7 @@ from msgspec import UNSET
 
 from zsim.contract import messages
 from zsim.math import elementary as el
-from zsim.math.compiled import hold
+from zsim.math.held import hold
 from zsim.math.linear import singular_values
 from zsim.scenario.faults import Known, flaws, kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of

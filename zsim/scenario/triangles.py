@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zsim.math.compiled import Held, hold, inlined, kernel, noinline
+from zsim.math.compiled import inlined, kernel, noinline
+from zsim.math.held import Held, hold
 from zsim.math.rotation import Vector, add, axpy, cross, dot, scaled, subtract
 from zsim.scenario.obstacle import least_distances
 from zsim.scenario.surface_file import placed

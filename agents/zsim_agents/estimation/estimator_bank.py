@@ -18,7 +18,8 @@ from zsim.contract.framing import GateMessages
 from zsim.contract.keys import SENSORS
 from zsim.contract.snapshot import State
 from zsim.math import elementary as el
-from zsim.math.compiled import Held, hold, inlined, portable
+from zsim.math.compiled import inlined, portable
+from zsim.math.held import Held, hold
 from zsim.math.rotation import axpy, multiply, normalised, scaled
 from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim_agents.estimation import measurement_update, strapdown

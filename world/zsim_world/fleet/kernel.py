@@ -9,7 +9,8 @@ import math
 
 from numpy.typing import NDArray
 
-from zsim.math.compiled import Held, inlined, kernel, noinline
+from zsim.math.compiled import inlined, kernel, noinline
+from zsim.math.held import Held
 from zsim.math.rotation import norm
 from zsim.scenario.triangles import Sheet
 from zsim_world.fleet.flight_watch import watch

@@ -13,7 +13,8 @@ from zsim.contract import encoding, flight_messages, messages
 from zsim.contract.encoding import GAP, Layouts, Program, TextTable
 from zsim.contract.framing import GateMessages, key_table
 from zsim.errors import UserCodeError, reason_of
-from zsim.math.compiled import Held, compiled, hold, inlined, kernel
+from zsim.math.compiled import compiled, inlined, kernel
+from zsim.math.held import Held, hold
 from zsim.schema import plugin
 from zsim.schema.declared_message import field_types
 from zsim.sensors.sensor import Sample, as_fields, message_type

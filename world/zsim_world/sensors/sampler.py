@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from zsim.errors import UserCodeError, reason_of
 from zsim.math import frames
-from zsim.math.compiled import Field, Held, columns, hold, inlined, kernel
+from zsim.math.compiled import Field, columns, inlined, kernel
 from zsim.math.frames import rotation_matrix
+from zsim.math.held import Held, hold
 from zsim.math.random_streams import stream
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin

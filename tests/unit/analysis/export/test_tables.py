@@ -332,7 +332,9 @@ def test_nothing_to_export_is_one_line(tmp_path: Path) -> None:
 
 
 def test_the_command_line_starts_without_what_exports_need() -> None:
-    loaded = "import sys, zsim_deploy.cli.cli; print({'mcap', 'pyarrow', 'foxglove'} & set(sys.modules))"
+    loaded = (
+        "import sys, zsim_deploy.cli.cli; print({'numba', 'scipy', 'mcap', 'pyarrow', 'foxglove'} & set(sys.modules))"
+    )
     done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.strip() == "set()"
 

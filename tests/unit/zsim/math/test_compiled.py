@@ -130,10 +130,32 @@ def test_processes_that_start_together_compile_a_kernel_once(tmp_path: Path):
     assert not list((tmp_path / "cache").rglob("*.lock"))
 
 
+DEFERRED = """
+import pickle, sys
+from zsim.math.elementary import elementwise, exp, power
+from zsim.math.linear import solve
+
+def computed():
+    return [exp(0.3).hex(), power(-2.0, -3.0).hex(), *map(float.hex, elementwise(exp)([0.1, 0.2])), str(solve([[3.0]], [1.0]))]
+
+before = computed()
+assert "numba" not in sys.modules
+import zsim.math.rotation
+assert "numba" in sys.modules
+assert computed() == before
+assert exp.dispatcher.signatures and pickle.loads(pickle.dumps(exp)) is exp
+"""
+
+
+def test_a_deferred_kernel_runs_as_python_until_numba_is_imported_to_the_same_bits():
+    pytest.importorskip("numba")
+    subprocess.run([sys.executable, "-c", DEFERRED], check=True)
+
+
 HELD = """
 from typing import NamedTuple
 import numpy as np
-from zsim.math.compiled import hold
+from zsim.math.held import hold
 
 class {name}(NamedTuple):
     row: np.ndarray

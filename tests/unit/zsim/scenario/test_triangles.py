@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zsim.math.compiled import hold
+from zsim.math.held import hold
 from zsim.scenario.scenario import Environment, Obstacle, Surface
 from zsim.scenario.surface_file import packed
 from zsim.scenario.triangles import Surroundings, corners_of, crosses, nearest_points, sheet_of
