@@ -9,6 +9,7 @@ import yaml
 from federation import Federation
 
 import zsim
+from zsim.contract.keys import RADIO
 from zsim.contract.messages import decode
 from zsim.errors import UserCodeError
 from zsim.record import RecordReader
@@ -32,8 +33,11 @@ agents: {pilot: {class: 'swarm:Pilot', parameters: {takeoff_s: 0.5}}}
 """
 OVER_RADIO = """
 topology: {nearest: 1, symmetric: true}
-radio: {range_m: 6, spread_m: 0.5, loss: 0.3, delay_ms: 30, jitter_ms: 40, bandwidth_kbit_s: 16}
+radio:
+  {range_m: 6, spread_m: 0.5, loss: 0.3, delay_ms: 30, jitter_ms: 40, bandwidth_kbit_s: 16, line_of_sight: true}
+environment: {surfaces: [{name: ridge, file: ridge.csv, cell_m: 1, position_m: [3, 0, 0]}]}
 """
+RIDGE = "0,9,0\n" * 5  # between d1 and d2, from x = 2 to 4 m and y = -2 to 2 m
 TALKERS = """
 import zsim
 
@@ -221,11 +225,16 @@ def test_over_a_radio_each_hears_whom_it_reaches_and_when_it_does(groups: list[l
 
 
 def test_as_processes_and_flown_again_they_have_the_same_bits(tmp_path: Path, compiled: None) -> None:
-    """Over a radio that loses and delays messages; killed in the middle, a pilot goes on from its snapshot."""
+    """Over a radio that loses and delays messages, with a ridge between two drones; killed in the middle, a pilot goes on
+    from its snapshot."""
+    (tmp_path / "ridge.csv").write_text(RIDGE)
     (tmp_path / "swarm.yaml").write_text(SWARM + OVER_RADIO)
     alone = zsim.run(tmp_path / "swarm.yaml", out=tmp_path / "alone", progress=False)
     messages = alone.messages("swarm/d1/position")
     assert 150 < len(messages) < 301  # as many as the bandwidth lets out
+    with RecordReader(tmp_path / "alone" / "run.mcap") as reader:
+        d1_hears = {decode(each.key, each.payload).hears[0] for each in reader.messages([RADIO])}
+    assert d1_hears == {(2,)}  # d3; d2 is as near
     assert {"position_m_x", "position_m_y", "position_m_z"} <= {*messages.columns}
     with zsim.Federation(tmp_path / "swarm.yaml", out=tmp_path / "many") as flight:
         flight.wait_until(3.0)

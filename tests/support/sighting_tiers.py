@@ -22,6 +22,7 @@ from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera_model import camera_pose, lens_of, undistorted
 from zsim_agents.cameras.detector import HatDetector, decoded
 from zsim_agents.cameras.rendering.scene import DroneStates
+from zsim_world.physics import rays
 from zsim_world.sensors.sightings import SightingSampler
 
 Array = NDArray[np.float64]
@@ -151,7 +152,9 @@ def measured(condition: Condition, pictures: int, seed: int = 3) -> Tiers:
     rng = np.random.default_rng(seed)
     drawn = renderer(FRONT, scene(1 + OTHERS, light=condition.light))
     detector = HatDetector(LENS, POSE, HATS.diameter_m)
-    sampler = SightingSampler(scenario(condition.light), np.full(1 + OTHERS, HULL_M))
+    sampler = SightingSampler(
+        scenario(condition.light), np.full(1 + OTHERS, HULL_M), rays.scene(np.empty(0), np.empty(0))
+    )
     rendered, geometric = _Tally(), _Tally()
     for number in range(pictures):
         hats = looks(condition, rng)

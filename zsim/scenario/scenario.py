@@ -522,7 +522,7 @@ class Radio(Spec, frozen=True, kw_only=True):
     range_m: Positive | None = None  # None: any distance
     spread_m: NonNegative = 0.0  # 0: everything is received up to range_m, and nothing beyond
     loss: Fraction = 0.0
-    line_of_sight: bool = False  # whether obstacles are in the way of it
+    line_of_sight: bool = False  # whether obstacles and surfaces are in the way of it
     delay_ms: LinkTime = 0.0  # a message comes at the first gate after it, at the next one at least
     jitter_ms: LinkTime = 0.0  # most of a further delay, evenly spread from 0
     bandwidth_kbit_s: Positive | None = None  # of each agent's transmitter; None: any

@@ -54,7 +54,7 @@ from zsim_world.physics.fleet_arrays import (
     state_arrays,
     vehicle_row,
 )
-from zsim_world.physics.rays import scene
+from zsim_world.physics.rays import Scene, scene
 from zsim_world.physics.simd import body_blocks
 from zsim_world.physics.surfaces import BALLS, PLANE, POINTS, SLOTS_MAX, contact_points, obstacle_rows
 from zsim_world.run_state import IN_PLACE, PART, Saved
@@ -167,7 +167,7 @@ class Fleet:
         self._seeing: list[SightingSampler | ScanSampler] = []
         scans: ScanSampler | None = None
         if has_sightings:
-            self._seeing.append(SightingSampler(scenario, hulls.copy()))
+            self._seeing.append(SightingSampler(scenario, hulls.copy(), self._w.scene))
         if scanned:
             scans = ScanSampler(scenario, hulls.copy(), self._w.scene)
             self._seeing.append(scans)
@@ -238,6 +238,11 @@ class Fleet:
     @property
     def t_ns(self) -> int:
         return self._tick * self._tick_ns
+
+    @property
+    def scene(self) -> Scene:
+        """Return what does not move: obstacles and surfaces."""
+        return self._w.scene
 
     def rotor_info(self, i: int) -> tuple[RotorInfo, ...]:
         """Return the rotors of a drone as `world/info` names them."""

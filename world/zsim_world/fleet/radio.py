@@ -7,21 +7,26 @@ from numpy.typing import NDArray
 from zsim.contract.run_messages import RadioLinks
 from zsim.math import elementary as el
 from zsim.math.compiled import kernel
+from zsim.math.held import Held, hold
+from zsim.math.rotation import norm, scaled, subtract
 from zsim.scenario.scenario import RECEPTION_MIN, Radio, Scenario, Topology
-from zsim_world.physics.surfaces import nearest, obstacle_rows
+from zsim_world.physics.rays import Scene, cast_parts
+from zsim_world.physics.rigid_body import vector
 
-TOUCH_M = 1e-3  # chosen: so near to an obstacle a line has met it
 Matrix = NDArray[np.bool_]
 
 
 class RadioChannel:
     """The links between N drones, and a ground station where there is one: the place after theirs.
 
+    Args:
+        scene: what blocks lines of sight.
+
     Raises:
         ValueError: the scenario has neither a radio nor a topology.
     """
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, scene: Scene) -> None:
         radio = scenario.radio_of_agents
         if radio is None:
             raise ValueError(f"{scenario.name} has no radio")
@@ -35,7 +40,8 @@ class RadioChannel:
             constant_values=True,
         )
         np.fill_diagonal(self._allowed, False)
-        self._obstacles = obstacle_rows(scenario.environment)
+        self._scene = hold(scene)
+        self._is_open = not len(scene.tree.part)
 
     def links(self, t_ns: int, seq: int, position_m: NDArray[np.float64]) -> RadioLinks:
         """Return the message of a gate.
@@ -56,8 +62,8 @@ class RadioChannel:
             hears &= reception >= RECEPTION_MIN
         elif radio.range_m is not None:
             hears &= distance_m <= radio.range_m
-        if radio.line_of_sight and len(self._obstacles):
-            clear_lines(place_m, self._obstacles, hears)
+        if radio.line_of_sight and not self._is_open:
+            clear_lines(place_m, self._scene, hears)
         if topology.nearest is not None:
             apart_m = np.where(hears, distance_m, np.inf)[:n, :n]
             others = np.argsort(apart_m, axis=1, kind="stable")[:, topology.nearest :]
@@ -86,21 +92,14 @@ def allowed(drones: list[str], topology: Topology) -> Matrix:
 
 
 @kernel()
-def clear_lines(place_m: NDArray, obstacles: NDArray, hears: NDArray) -> None:
-    """Take out of `hears` the pairs whose line meets an obstacle, by sphere tracing: an obstacle is at least so far."""
+def clear_lines(place_m: NDArray, scene: Held, hears: NDArray) -> None:
+    """Take out of `hears` the pairs whose line meets an obstacle or a surface."""
     for i in range(place_m.shape[0]):
         for j in range(i):
             if not (hears[i, j] or hears[j, i]):
                 continue
-            x, y, z = place_m[i, 0], place_m[i, 1], place_m[i, 2]
-            dx, dy, dz = place_m[j, 0] - x, place_m[j, 1] - y, place_m[j, 2] - z
-            length = np.sqrt(dx * dx + dy * dy + dz * dz)
-            for m in range(obstacles.shape[0]):
-                along = 0.0
-                while along < length:
-                    share = along / length
-                    free = nearest(obstacles[m], x + share * dx, y + share * dy, z + share * dz)[0]
-                    if free < TOUCH_M:
-                        hears[i, j] = hears[j, i] = False
-                        break
-                    along += free
+            start = vector(place_m[i], 0)
+            to = subtract(vector(place_m[j], 0), start)
+            length = norm(to)
+            if length > 0.0 and cast_parts(scene.content, start, scaled(to, 1.0 / length), length) < length:
+                hears[i, j] = hears[j, i] = False

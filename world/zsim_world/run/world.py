@@ -92,7 +92,7 @@ class World(Coordinator):
         self.queue = self._intake.queue
         self._operations |= {**self._intake.operations(), **self.faults.operations()}
         self._publication = GatePublication(self.fleet)
-        self._radio = RadioChannel(scenario) if scenario.radio_of_agents else None
+        self._radio = RadioChannel(scenario, self.fleet.scene) if scenario.radio_of_agents else None
         self.truth_hash = TruthHash(len(self._simulated))
         self._last_ns = round(scenario.duration_s * 1e9) // self.clock.gate_ns * self.clock.gate_ns
         self.statistics.closest_m = self.fleet.closest_m

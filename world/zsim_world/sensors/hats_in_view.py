@@ -1,8 +1,8 @@
 """Which hats a camera has in view, and where: of true poses, without pictures. Compiled, without time or chance.
 
 A hat is a ball. It is in view where all of it falls on the picture and enough of its edge is visible: a detector knows
-its circle from that, the better the more it is. What hides are obstacles, hulls, flat bodies of revolution about their
-drones' z axis, and from below the rim of the drone's own rotors.
+its circle from that, the better the more it is. What hides are obstacles, surfaces, hulls, flat bodies of revolution
+about their drones' z axis, and from below the rim of the drone's own rotors.
 """
 
 import math
@@ -31,9 +31,8 @@ from zsim.math.rotation import (
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import Lens, camera_pose, lens_of, pixel, spread
 from zsim_world.physics.fleet_arrays import STATE
-from zsim_world.physics.rays import HULL_FLATNESS
+from zsim_world.physics.rays import HULL_FLATNESS, Scene, cast_parts
 from zsim_world.physics.rigid_body import four, vector
-from zsim_world.physics.surfaces import nearest
 
 VIEW = columns(  # of a hat in a camera
     "ViewColumns",
@@ -58,9 +57,7 @@ POINTS = 32  # of its edge, that are looked at
 COSINES, SINES = (np.array([f(2.0 * math.pi * k / POINTS) for k in range(POINTS)]) for f in (el.cos, el.sin))
 LEVEL_COSINE = 0.9  # of a ray that is not nearly upright
 SHARE_MIN = 0.3  # of its edge; of a ball with less in view a detector does not know the circle
-SURFACE_M = 0.01  # m, nearer than which a ray has met an obstacle
 EDGE_PX = 3.0  # px, nearer than which to the picture's edge a detector takes a hat for cut; the blur of its rim
-STEPS_MAX = 64  # along a ray; each goes as far as the nearest surface
 
 
 class MountedCamera(NamedTuple):
@@ -136,24 +133,6 @@ def _rim_hides(eye: Vector, ray: Vector, p_WB: Vector, q_WB: Quaternion, radius:
 
 
 @inlined
-def _obstacle_hides(eye: Vector, ray: Vector, far: float, clearance: float, row: NDArray, unsure: bool) -> bool:
-    """Tell whether a ray comes nearer to an obstacle than a clearance [m] before `far` [m], by steps that are free.
-
-    `unsure` is the answer where all steps are used up beside it.
-    """
-    at = 0.0
-    for _ in range(STEPS_MAX):
-        p = axpy(eye, at, ray)
-        free = nearest(row, p[0], p[1], p[2])[0] - clearance
-        if free < 0.0:
-            return True
-        at += max(free, SURFACE_M)
-        if at >= far:
-            return False
-    return unsure
-
-
-@inlined
 def _drone_hides(eye: Vector, ray: Vector, away: float, i: int, m: int, pose: NDArray, radius: float) -> bool:
     """Tell whether drone i stands on a ray to a ball, that of drone m or of none."""
     p, q = vector(pose, STATE.p_WB), four(pose, STATE.q_WB)
@@ -188,26 +167,17 @@ def _in_picture(lens: Lens, to_K: Vector, angle: float) -> bool:
 
 @inlined
 def _hidden(
-    eye: Vector,
-    ray: Vector,
-    away: float,
-    ball: float,
-    own: int,
-    m: int,
-    poses: NDArray,
-    hulls: NDArray,
-    obstacles: NDArray,
+    eye: Vector, ray: Vector, away: float, ball: float, own: int, m: int, poses: NDArray, hulls: NDArray, scene: Scene
 ) -> int:
     """Return which points of a ball's edge are hidden, one bit each."""
     e1 = (ray[1], -ray[0], 0.0) if abs(ray[2]) < LEVEL_COSINE else (0.0, ray[2], -ray[1])
     e1 = scaled(e1, 1.0 / norm(e1))
     e2 = cross(ray, e1)
-    hidden = 0
-    for i in range(poses.shape[0] + obstacles.shape[0]):
-        k = i - poses.shape[0]
-        if k < 0 and (i == own or (_passes(eye, ray, away, vector(poses[i], STATE.p_WB), RIM_WIDE * hulls[i] + ball))):
-            continue
-        if k >= 0 and not _obstacle_hides(eye, ray, away, ball, obstacles[k], True):
+    hidden, drones = 0, poses.shape[0]
+    for i in range(drones + 1 if scene.tree.part.shape[0] > 0 else drones):  # the drones, then all that does not move
+        if i < drones and (
+            i == own or _passes(eye, ray, away, vector(poses[i], STATE.p_WB), RIM_WIDE * hulls[i] + ball)
+        ):
             continue
         for point in range(POINTS):
             a, b = ball / away * COSINES[point], ball / away * SINES[point]
@@ -215,8 +185,8 @@ def _hidden(
             to = scaled(to, 1.0 / norm(to))
             if (
                 _drone_hides(eye, to, away, i, m, poses[i], hulls[i])
-                if k < 0
-                else _obstacle_hides(eye, to, away, SURFACE_M, obstacles[k], False)
+                if i < drones
+                else cast_parts(scene, eye, to, away) < away
             ):
                 hidden |= 1 << point
     return hidden
@@ -250,7 +220,7 @@ def hats_in_view(
     diameter: float,
     balls: NDArray,
     bare: NDArray,
-    obstacles: NDArray,
+    scene: Scene,
     view: NDArray,
 ) -> None:
     """Write what a camera has in view.
@@ -264,7 +234,7 @@ def hats_in_view(
         diameter: of a hat [m].
         balls: centres of what only looks like a hat [m; W], (M, 3).
         bare: of each drone, whether its hat can be seen at all, (N,).
-        obstacles: rows of zsim.scenario.obstacle, (O, 9).
+        scene: obstacles and surfaces.
         view: the result, (N + M, VIEW.size): drones, then balls.
     """
     row = poses[own]
@@ -293,7 +263,7 @@ def hats_in_view(
         if not _in_picture(camera.lens, to_K, angle):
             continue
         ray = scaled(to_W, 1.0 / away)
-        _write_outline(_hidden(eye, ray, away, 0.5 * diameter, own, m, poses, hulls, obstacles), view[m])
+        _write_outline(_hidden(eye, ray, away, 0.5 * diameter, own, m, poses, hulls, scene), view[m])
         if view[m, VIEW.share] < SHARE_MIN:
             continue
         across = axpy(subtract(velocity, v_eye), -dot(subtract(velocity, v_eye), ray), ray)

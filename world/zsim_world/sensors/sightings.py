@@ -24,10 +24,10 @@ from zsim.math.distributions import normal_probability
 from zsim.math.held import Held, hold
 from zsim.math.random_streams import stream
 from zsim.math.rotation import Vector
-from zsim.scenario.obstacle import COLUMNS, row_of
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import Camera, Hats, SightingModel
 from zsim.sensors.camera_model import Lens, camera_pose, undistorted
+from zsim_world.physics.rays import Scene
 from zsim_world.run_state import IN_PLACE, PART, Saved
 from zsim_world.sensors.exposures import Between, Exposures
 from zsim_world.sensors.hats_in_view import CAMERA, VIEW, camera_row, hats_in_view, mounted, poses_between
@@ -66,7 +66,7 @@ class Surroundings(NamedTuple):
     diameter: float  # of a hat [m]
     balls: Array  # (M, 3), centres of what only looks like a hat [m; W]
     bare: NDArray[np.bool_]  # (N,), whether a hat can be seen at all
-    obstacles: Array  # (O, COLUMNS)
+    scene: Scene  # obstacles and surfaces
 
 
 class _Pictures(NamedTuple):
@@ -86,7 +86,7 @@ class SightingSampler:
         "_later": list[PictureSightings],
     }
 
-    def __init__(self, scenario: Scenario, hulls: Array) -> None:
+    def __init__(self, scenario: Scenario, hulls: Array, scene: Scene) -> None:
         env = scenario.environment
         hats = Hats() if env.hats is UNSET else env.hats
         light = 1.0 if env.light is UNSET else env.light
@@ -112,7 +112,7 @@ class SightingSampler:
             hats.diameter_m,
             np.array(hats.false_m, dtype=float).reshape(-1, 3),
             np.array([drone.name not in hats.covered for drone in scenario.drones]),
-            np.array([row_of(each) for each in env.obstacles], dtype=float).reshape(-1, COLUMNS),
+            scene,
         )
         self._held = hold(surroundings)
         self._streams = np.array([words(rng) for rng in generators], dtype=np.uint64).reshape(-1, WORDS.size)
@@ -184,18 +184,18 @@ def look(
         held: Surroundings, by `hold`.
         streams: words of the cameras' random streams, (W, WORDS.size); moved on.
     """
-    scene = held.content
-    hats = len(now) + len(scene.balls)
+    own = held.content
+    hats = len(now) + len(own.balls)
     view, out = np.empty((hats, VIEW.size)), np.empty((len(pictures) * (hats + 1), SEEN.size))
     poses, end = now, 0
     for n in range(len(pictures)):
         at_ns, w = pictures[n]
         if n == 0 or at_ns != pictures[n - 1, 0]:
             poses = poses_between(former, former_ns, now, now_ns, at_ns)
-        camera = mounted(scene.cameras[w])
-        fixed = (scene.hulls, scene.hat_B, scene.diameter, scene.balls, scene.bare, scene.obstacles)
-        hats_in_view(camera, int(scene.drones[w]), poses, *fixed, view)
-        first, end = end, detect(scene.detectors[w], camera.lens, view, streams[w], out, end)
+        camera = mounted(own.cameras[w])
+        fixed = (own.hulls, own.hat_B, own.diameter, own.balls, own.bare, own.scene)
+        hats_in_view(camera, int(own.drones[w]), poses, *fixed, view)
+        first, end = end, detect(own.detectors[w], camera.lens, view, streams[w], out, end)
         out[first:end, SEEN.picture] = n
     return out[:end]
 

@@ -1,6 +1,7 @@
 """Who hears whom: graphs, distance, reception, lines of sight, the nearest."""
 
 import math
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,11 @@ from zsim.contract.run_messages import RadioLinks
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import RECEPTION_MIN
+from zsim.scenario.surface_file import packed
+from zsim.scenario.triangles import sheet_of
 from zsim_world.fleet.radio import RadioChannel
+from zsim_world.physics.rays import scene
+from zsim_world.physics.surfaces import obstacle_rows
 
 LINE_M = [[0.0, 0.0, 2.0], [4.0, 0.0, 2.0], [7.0, 0.0, 2.0], [16.0, 0.0, 2.0]]
 WALL = {"name": "wall", "shape": "box", "position_m": [5.5, 0, 0], "size_m": [0.2, 3, 4]}
@@ -22,7 +27,9 @@ def scenario(**sections: Any) -> Any:
 
 
 def links(**sections: Any) -> RadioLinks:
-    return RadioChannel(scenario(**sections)).links(0, 0, np.array(LINE_M))
+    made = scenario(**sections)
+    around = scene(obstacle_rows(made.environment), sheet_of(made.environment).triangle)
+    return RadioChannel(made, around).links(0, 0, np.array(LINE_M))
 
 
 @pytest.mark.parametrize(
@@ -58,6 +65,35 @@ def test_reception_falls_with_distance_until_nobody_is_a_neighbour() -> None:
     at = dict(zip(made.hears[1], made.reception[1], strict=True))
     assert at == pytest.approx({each: 1 / (1 + math.exp(d - 7)) for each, d in ((0, 4.0), (2, 3.0), (3, 12.0))})
     assert min(map(min, made.reception)) > RECEPTION_MIN
+
+
+def hill(crest_m: float) -> dict[str, Any]:
+    """Return a height map that rises from 0 at x = 4.5 m to a crest at x = 5.5 m and falls to 0 at 6.5 m."""
+    corners = [[(x, y, crest_m if x == 5.5 else 0.0) for y in (-3.0, 3.0)] for x in (4.5, 5.5, 6.5)]
+    faces = [face for (a, b), (c, d) in pairwise(corners) for face in ((a, b, c), (b, d, c))]
+    return {"surfaces": [{"name": "hill", "triangles": packed(np.array(faces))}]}
+
+
+@pytest.mark.parametrize(
+    ("environment", "is_between"),
+    [
+        (hill(2.001), True),
+        (hill(1.999), False),
+        (
+            {"surfaces": [{"name": "wall", "triangles": packed(np.array([[[5.5, -9, 0], [5.5, 9, 0], [5.5, 0, 9]]]))}]},
+            True,
+        ),
+        (
+            {"surfaces": [{"name": "wall", "triangles": packed(np.array([[[5.5, 1, 0], [5.5, 9, 0], [5.5, 9, 9]]]))}]},
+            False,
+        ),
+    ],
+    ids=["a hill to the line", "a hill below it", "a wall", "a wall beside it"],
+)
+def test_a_surface_blocks_the_lines_that_cross_it(environment: dict[str, Any], is_between: bool) -> None:
+    """d0 and d1 are on one side, d2 and d3 on the other, all at 2 m; d3 is 9 m from d2 and out of the others' range."""
+    hears = ((1,), (0,), (3,), (2,)) if is_between else ((1, 2), (0, 2), (0, 1, 3), (2,))
+    assert links(radio={"range_m": 9, "line_of_sight": True}, environment=environment).hears == hears
 
 
 def test_an_obstacle_beside_the_line_is_in_nobodys_way() -> None:

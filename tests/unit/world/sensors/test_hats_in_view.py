@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 from zsim.math.frames import quaternion_from_rpy
 from zsim.scenario.obstacle import COLUMNS, row_of
 from zsim.scenario.scenario import Obstacle
+from zsim.scenario.triangles import TRIANGLE
 from zsim.sensors.camera import FrontCamera
 from zsim.sensors.camera_model import camera_pose, lens_of
 from zsim_world.physics.fleet_arrays import STATE
+from zsim_world.physics.rays import scene
 from zsim_world.sensors.hats_in_view import POINTS, VIEW, MountedCamera, hats_in_view
 
 HAT_B, DIAMETER_M, HULL_M = (-0.03, 0.0, 0.11), 0.14, 0.26
@@ -29,6 +31,7 @@ def look(
     balls: list[tuple[float, float, float]] | None = None,
     bare: list[bool] | None = None,
     obstacles: list[Obstacle] | None = None,
+    triangles: list[list[tuple[float, float, float]]] | None = None,
 ) -> NDArray[np.float64]:
     """Return what the front camera of the first drone has in view."""
     at, camera = camera_pose(FrontCamera()), FrontCamera()
@@ -37,9 +40,12 @@ def look(
     mounted = MountedCamera(lens_of(camera), (x, y, z), (w, i, j, k))
     view = np.zeros((len(poses) + len(balls or []), VIEW.size))
     rows = np.array([row_of(each) for each in obstacles or []]).reshape(-1, COLUMNS)
+    corners = np.array(triangles or []).reshape(-1, 3, 3)
+    sheet = np.concatenate([corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=1)
+    around = scene(rows, sheet.reshape(-1, TRIANGLE))
     spheres, seen = np.array(balls or []).reshape(-1, 3), np.array(bare or [True] * len(poses))
     hulls = np.full(len(poses), HULL_M)
-    hats_in_view(mounted, 0, np.array(poses), hulls, HAT_B, DIAMETER_M, spheres, seen, rows, view)
+    hats_in_view(mounted, 0, np.array(poses), hulls, HAT_B, DIAMETER_M, spheres, seen, around, view)
     return view
 
 
@@ -107,7 +113,7 @@ def test_its_own_rotors_hide_a_hat_from_its_lower_edge_on(below_deg: float):
 
 def test_an_edge_that_is_visible_to_a_half_tells_the_circle_as_least_squares_do():
     """A wall hides the right half; of a circle through 15 points of 32 the errors are those of (A^T A)^-1."""
-    wall = Obstacle(name="wall", shape="box", position_m=(2, -1.0101, 0), size_m=(0.01, 2, 20))
+    wall = Obstacle(name="wall", shape="box", position_m=(2, -1.0001, 0), size_m=(0.01, 2, 20))
     view = look([pose(0, 0, 5), pose(4, 0, 5)], obstacles=[wall])[1]
     count = round(view[VIEW.share] * POINTS)
     turns = 2 * math.pi * (np.arange(count) - (count - 1) / 2) / POINTS
@@ -131,6 +137,18 @@ def test_an_obstacle_in_between_hides_it(obstacle: Obstacle, y: float, seen: int
     """The second pair stands beside the obstacle."""
     view = look([pose(0, y, 5), pose(4, y, 5)], obstacles=[obstacle])
     assert view[1, VIEW.seen] == seen
+
+
+@pytest.mark.parametrize(("below_m", "share"), [(-0.06, 1.0), (0.0, 0.5), (0.06, 0.0)])
+def test_a_hill_in_between_hides_the_part_of_a_hat_that_is_below_its_crest(below_m: float, share: float):
+    """A crest in the middle between lens and hat, its height that of their line and so much above it, of a hat of 14 cm."""
+    line_m = 0.5 * (5 + LENS_B[2] + 5 + HAT_B[2])
+    x, z = 0.5 * (LENS_B[0] + 4 + HAT_B[0]), line_m + below_m
+    slopes = [[(x, -9.0, z), (x, 9.0, z), (x + side, 0.0, 0.0)] for side in (-1.0, 1.0)]
+    row = look([pose(0, 0, 5), pose(4, 0, 5)], triangles=slopes)[1]
+    beside = 2 / POINTS if share == 0.5 else 0.0  # the points beside what is hidden are left out
+    assert row[VIEW.share] == pytest.approx(share - beside, abs=1 / POINTS)
+    assert row[VIEW.seen] == (share > 0.0)
 
 
 def test_it_moves_over_the_picture_as_the_drones_move_and_turn():

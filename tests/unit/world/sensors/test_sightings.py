@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
+from zsim_world.physics.rays import scene
 from zsim_world.sensors.sightings import PictureSightings, SightingSampler
 
 GATE_NS = 20_000_000
@@ -48,7 +49,7 @@ def sampled(sampler: SightingSampler, gates: range, state: NDArray[np.float64] |
 
 
 def made(*fields: str) -> SightingSampler:
-    return SightingSampler(scenario(*fields), np.full(3, 0.26))
+    return SightingSampler(scenario(*fields), np.full(3, 0.26), scene(np.empty(0), np.empty(0)))
 
 
 def of(sightings: list[PictureSightings], drone: int) -> list[PictureSightings]:
