@@ -61,7 +61,8 @@ class RunOptions:
         if self.supervisor:
             rows, clock = self.supervisor.rows(), self.supervisor.clock
         else:
-            rows, clock = [status_row("in-process", socket.gethostname(), os.getpid(), "running")], None
+            what, state = ("in-process", "running") if self.launch.in_process else ("run", "starting")
+            rows, clock = [status_row(what, socket.gethostname(), os.getpid(), state)], None
         return {"rows": rows, "clock": clock, "out": str(self.out.absolute()), "roles": [row["role"] for row in rows]}
 
     def agents(self) -> list[AgentSpec]:
