@@ -74,15 +74,18 @@ def run(
     if options and not processes:
         raise RunError(f"options is {list(options)}; must be empty without processes=True, which they are for")
     flown, made = calling(lambda: with_agents(source.resolved, agents))
-    folder = run_folder.make_directory(Path(out) if out is not None else None, flown, force)
-    source.keep_modules(folder)
+    place = Path(out) if out is not None else None
     screen = screen_for(flown.duration_s) if progress else None
     if processes:
+        folder = run_folder.make_directory(place, flown, force)
+        source.keep_modules(folder)
         _fly_as_processes(source, agents, [agent.name for agent in made], options, folder, screen)
     else:
         launch = run_folder.new_launch(in_process=True, changed=source.changes or ())
-        with screen or nullcontext(), _ctrl_c() as stop_reason:
-            calling(lambda: fly_here(flown, folder, launch, made, screen, stop_reason), folder)
+        with run_folder.run_directory(place, flown, force) as folder:
+            source.keep_modules(folder)
+            with screen or nullcontext(), _ctrl_c() as stop_reason:
+                calling(lambda: fly_here(flown, folder, launch, made, screen, stop_reason), folder)
         if reason := stop_reason():
             raise KeyboardInterrupt(f"{reason}; zsim.load({str(folder)!r}) reads the record so far")
     from zsim_api.recorded import load

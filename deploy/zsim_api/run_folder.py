@@ -4,11 +4,13 @@ How the run was launched is kept in it, beside the journal of its world, so that
 """
 
 import json
+import os
 import shutil
 import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ import msgspec
 
 from zsim.contract import keys, messages
 from zsim.errors import OTHER_OUT, DecodeError, RunError, file_fault
-from zsim.output_folder import RECORD, no_locks, refuse_others
+from zsim.output_folder import RECORD, no_locks, refuse_others, take_lock
 from zsim.record.mcap_layout import LIBRARY, OURS, is_ours
 from zsim.record.record_writer import cut_at_last, is_being_written
 from zsim.scenario import scenario_file
@@ -32,22 +34,66 @@ WRITTEN = (RECORD, "summary.json", "report.html", *LEFT)  # of a run that is rep
 WRITTEN_INTO = {LOGS: (".log",), FIGURES: (".png", ".pdf", ".svg")}  # suffixes of a run's files, by folder
 
 
-def make_directory(out: Path | None, scenario: Scenario, force: bool = False) -> Path:
-    """Return the run's folder: `out`, or a new one named after scenario and time.
+@contextmanager
+def run_directory(out: Path | None, scenario: Scenario, force: bool = False) -> Iterator[Path]:
+    """Yield the run's folder, locked against other runs: `out`, or a new one named after scenario and time.
 
     With `force`, one that holds other files, too, which stay as they are; an earlier run of zsim's is removed.
-    RunError if it holds a run, or other files, or cannot be made; with `force`, if the run is under way, or its record
-    is not zsim's.
+    RunError if a run is under way in it, if it holds a run, or other files, or cannot be made; with `force`, if its
+    record is not zsim's.
     """
-    if out is None:  # two runs may start within one second
-        first = Path("runs") / f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}"
-        names = [first, *(first.with_name(f"{first.name}-{i}") for i in range(2, 1000))]
-        out = next(name for name in names if not name.exists())
+    if out is None:
+        out = _new_directory(f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}")
     with file_fault(out, "cannot be made", OTHER_OUT):
-        is_new = not out.exists()
-        out.mkdir(parents=True, exist_ok=True)
-        if is_new:
+        if not out.exists():
+            out.mkdir(parents=True, exist_ok=True)
             _MADE.add(out.resolve())
+    with locked(out):
+        _make_room(out, force)
+        yield out
+
+
+def make_directory(out: Path | None, scenario: Scenario, force: bool = False) -> Path:
+    """Return the folder of `run_directory` for a run that another process flies, which locks it."""
+    with run_directory(out, scenario, force) as folder:
+        return folder
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[Path]:
+    """Yield a run's folder, locked until the block is left, so that no other run is flown into it, of this process too.
+
+    A run has no file from its first moment on, so the folder itself is locked. NFS locks no folders: there the locks of
+    record and journal must do.
+    """
+    with file_fault(folder, "cannot be opened", OTHER_OUT):
+        opened = None if os.name == "nt" else os.open(folder, os.O_RDONLY)
+    try:
+        if opened is not None and not take_lock(opened):
+            raise RunError(f"{folder}: a run is flown into it now; end that one, or give --out another folder")
+        yield folder
+    finally:
+        if opened is not None:
+            os.close(opened)
+
+
+def _new_directory(name: str) -> Path:
+    """Make a folder in `runs` that no other run has made: several may start within one second."""
+    folder = first = Path("runs") / name
+    with file_fault(first, "cannot be made", OTHER_OUT):
+        for number in count(2):
+            try:
+                folder.mkdir(parents=True)
+                break
+            except FileExistsError:
+                folder = first.with_name(f"{name}-{number}")
+    _MADE.add(folder.resolve())
+    return folder
+
+
+def _make_room(out: Path, force: bool) -> None:
+    """Refuse a folder that holds a run, or other files; with `force`, remove the run."""
+    with file_fault(out, "cannot be made", OTHER_OUT):
         if force:
             _remove_run(out)
         elif any((out / JOURNAL).glob("*.entries")):
@@ -56,7 +102,6 @@ def make_directory(out: Path | None, scenario: Scenario, force: bool = False) ->
         elif (out / RECORD).exists() or any(not log.is_file() or log.stat().st_size for log in (out / LOGS).glob("*")):
             raise RunError(f"{out}: holds a run already; --force replaces it, or give --out another folder")
         refuse_others(out, (*LEFT, LOGS, JOURNAL), force, "fly into")
-    return out
 
 
 _MADE: set[Path] = set()  # folders that were not there before

@@ -178,6 +178,23 @@ def test_a_link_between_two_of_them_may_be_cut(groups: list[list[str]]) -> None:
     assert (whole["talk.d1"], whole["talk.d3"]) == (lacking["talk.d1"], lacking["talk.d3"])
 
 
+@pytest.mark.parametrize("groups", [[["talk.d1"], ["talk.d2"], ["talk.d3"]], [[*NAMES]]], ids=["apart", "together"])
+def test_a_fault_of_the_radio_loses_their_messages_with_distance(groups: list[list[str]]) -> None:
+    """From 0.1 s to 0.3 s, where d2 and d3 are 8.5 m apart, of which next to nothing arrives, and d1 is 6 m from both."""
+    fault = {"kind": "radio", "target": "world", "range_m": 6, "spread_m": 0.2, "at_s": 0.1, "for_s": 0.2}
+    whole, lacking = heard(groups, 1), heard(groups, 1, faults=[fault])
+    for name in NAMES:
+        lost = [entry for entry in whole[name] if entry not in lacking[name]]
+        gates = {drone: [sent // 20_000_000 for _, each, sent in lost if each == drone] for drone in ("d1", "d2", "d3")}
+        assert gates.pop(name[-2:]) == []
+        near, far = (
+            (gates["d1"], gates["d3" if name == "talk.d2" else "d2"]) if name != "talk.d1" else (gates["d2"], [])
+        )
+        assert 0 < len(near) < 10
+        assert {*near, *far} <= {*range(6, 16)}
+        assert len(far) == (0 if name == "talk.d1" else 10)
+
+
 @pytest.mark.parametrize(
     ("kind", "terms"),
     [

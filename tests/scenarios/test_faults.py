@@ -18,6 +18,8 @@ from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
 from zsim.scenario import scenario_file
 from zsim.scenario.faults import KINDS
+from zsim.sensors.scanner import SCANNERS
+from zsim.sensors.sensor_catalogue import STOCK
 from zsim_agents.estimation.estimator import Estimator
 from zsim_agents.formation.controller import Controller
 from zsim_agents.hosting import hosted
@@ -43,7 +45,11 @@ MATRIX: dict[str, Document] = {
     "baro_bias": {"target": "drone1", "value_m": 0.2},
     "sonar_bias": {"target": "drone1", "value_m": 0.2},
     "flow_bias": {"target": "drone1", "value_m_s": [0.3, 0, 0]},
-    **{kind: {"target": "drone1", "factor": 3} for kind in KINDS if kind.endswith("_noise")},
+    **{
+        kind: {"target": "drone1", "factor": 3}
+        for kind in KINDS
+        if kind.endswith("_noise") and KINDS[kind].sensor in STOCK
+    },
     "rotor_efficiency": {"target": "drone1", "rotor": "front_left", "value": 0.85},
     "rotor_stuck": {"target": "drone1", "rotor": "all", "for_s": 0.1},
     "gust": {"target": "world", "velocity_m_s": [3, 0, 0]},
@@ -54,7 +60,7 @@ MATRIX: dict[str, Document] = {
     "radio": {"target": "main", "range_m": 2, "spread_m": 1},
 }
 # Of sensors that no drone has unless it is given them: tests/unit/world/sensors
-SCANNED = {f"{sensor}_{effect}" for sensor in ("range", "lidar", "depth") for effect in ("bias", "dropout")}
+SCANNED = {kind for kind in KINDS if KINDS[kind].sensor in SCANNERS}
 CHANCE = {"noise", "jitter", "loss", "radio"}  # in the names of kinds that draw numbers
 SEVERAL: list[Document] = [
     {"kind": "link_loss", "target": "world/estimator.drone2", "probability": 0.3, "at_s": 4},

@@ -34,7 +34,7 @@ from zsim.schema.checker import Fault, listed, show, suggestion
 from zsim.schema.quantities import COULOMB_PER_MAH, G_M_S2, SEA_LEVEL_KG_M3
 from zsim.sensors.camera_model import folds, lens_of
 from zsim.sensors.scanner import RAYS_MAX, SCANNERS
-from zsim.sensors.sensor_catalogue import DECLARED, MODULE, STOCK, declarations, own_sections
+from zsim.sensors.sensor_catalogue import DECLARED, MODULE, STOCK, declarations, own_sections, sensor_names
 from zsim.sensors.stock_sensors import BOARD_RATE_HZ
 from zsim.vehicles.vehicle import Vehicle, lift_shares
 
@@ -615,7 +615,8 @@ def _injected_faults(
     rotors = {drone.name: vehicles[drone.model].rotor_names if drone.model in vehicles else () for _, drone in drones}
     external = tuple(drone.name for _, drone in drones if drone.body == EXTERNAL)
     names = tuple(_names(drones)), tuple(_names(clusters))
-    known = Known(*names, processes, kinds, rotors, external, unread)
+    sensors = {drone.name: sensor_names(drone.sensors) for _, drone in drones if drone.sensors is not None}
+    known = Known(*names, processes, kinds, rotors, external, sensors, unread)
     for index, fault in _entries(scenario.faults):
         for path, text in flaws(fault, known):
             yield f"faults[{index}]{f'.{path}' if path else ''}", text

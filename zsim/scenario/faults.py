@@ -60,6 +60,7 @@ class FaultKind(NamedTuple):
     parameters: tuple[FaultParameter, ...] = ()
     # "ends" needs `for_s`, "once" takes none, "any" takes it or lasts until it is cleared
     lasts: Literal["any", "ends", "once"] = "any"
+    sensor: str = ""  # which it strikes, that a drone need not have
 
 
 def _number(
@@ -110,32 +111,28 @@ def _sensor_kinds(sensors: Mapping[str, SensorType | Declaration]) -> dict[str, 
     dropouts, stuck, biases, noises = {}, {}, {}, {}
     for name, sensor in sensors.items():
         label = sensor.label or name
-        dropouts[f"{name}_dropout"] = FaultKind("drone", f"samples of the {label} are lost", (_PROBABILITY,))
-        stuck[f"{name}_stuck"] = FaultKind("drone", f"the {label} shows one sample again and again")
+        dropouts[f"{name}_dropout"] = FaultKind(
+            "drone", f"samples of the {label} are lost", (_PROBABILITY,), sensor=name
+        )
+        stuck[f"{name}_stuck"] = FaultKind("drone", f"the {label} shows one sample again and again", sensor=name)
     for name, part in sensor_parts(sensors).items():
         channel = part.channel
         unit = "" if channel.unit == "1" else re.sub(r"[^a-z0-9]+", "_", channel.unit.lower().replace("^", ""))
         shape: Shape = "vector" if channel.width == VECTOR_SIZE else "number"
         limits = -channel.bias_max, channel.bias_max
         bias = FaultParameter(f"value_{unit}".strip("_"), shape, channel.axes, channel.unit, *limits)
-        biases[f"{name}_bias"] = FaultKind("drone", f"the {part.label} has an additional constant error", (bias,))
-        noises[f"{name}_noise"] = FaultKind("drone", f"the {part.label} has more white noise", (_FACTOR,))
+        text = f"the {part.label} has an additional constant error"
+        biases[f"{name}_bias"] = FaultKind("drone", text, (bias,), sensor=part.sensor)
+        noises[f"{name}_noise"] = FaultKind(
+            "drone", f"the {part.label} has more white noise", (_FACTOR,), sensor=part.sensor
+        )
     return dropouts | stuck | biases | noises
 
 
-def _scanner_kinds() -> dict[str, FaultKind]:
-    """Return the kinds of the sensors that cast rays, which a drone need not have."""
-    off = _number("value_m", "of every distance", "m", -1e4, 1e4)
-    dropouts = {
-        f"{name}_dropout": FaultKind("drone", f"messages of {name} are lost", (_PROBABILITY,)) for name in SCANNERS
-    }
-    text = "has an additional constant error"
-    return dropouts | {f"{name}_bias": FaultKind("drone", f"{name} {text}", (off,)) for name in SCANNERS}
-
-
+_DISTANCES = (Channel("noise_m", "m", axes="of every distance", bias_max=1e4),)
+_SCANNERS = {name: Declaration(message.__name__, {}, _DISTANCES) for name, message in SCANNERS.items()}
 KINDS: dict[str, FaultKind] = {
-    **_sensor_kinds(STOCK),
-    **_scanner_kinds(),
+    **_sensor_kinds({**STOCK, **_SCANNERS}),
     "rotor_efficiency": FaultKind(
         "drone",
         "a rotor has lost thrust",
@@ -256,6 +253,7 @@ class Known(NamedTuple):
     # of each drone; none of one whose vehicle is a module that is not read here
     rotors: Mapping[str, tuple[str, ...]] = {}
     external: tuple[str, ...] = ()  # drones whose bodies and sensors nobody simulates
+    sensors: Mapping[str, Collection[str]] = {}  # names of those of each drone, where they are known
     unread: Collection[str] = ()  # sensors whose modules are not imported, or faulty: what can fail of them is unknown
 
     def things(self) -> dict[str, tuple[str, ...]]:
@@ -321,6 +319,10 @@ def _target_flaws(fault: Mapping[str, Any], kind: FaultKind, known: Known) -> It
             yield "target", f"{actual}; must be {'one of ' if len(allowed) > 1 else ''}{listed(allowed)}"
         elif kind.strikes == "drone" and target in known.external:
             yield "target", f"{actual}, whose body is external; must be a drone that is simulated"
+        elif kind.sensor and kind.sensor not in known.sensors.get(str(target), (kind.sensor,)):
+            having = [drone for drone in known.drones if kind.sensor in known.sensors.get(drone, ())]
+            allowed = f"a drone with one: {listed(having)}" if having else "left out: no drone has one"
+            yield "target", f"{actual}, which has no sensor {kind.sensor}; must be {allowed}"
 
 
 def _link_flaws(actual: str, target: Any, one_way: bool, known: Known) -> Iterator[Flaw]:

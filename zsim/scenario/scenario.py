@@ -608,7 +608,8 @@ class Scenario(Spec, frozen=True, kw_only=True):
     @property
     def radio_of_agents(self) -> Radio | None:
         """Return the radio over which users' agents exchange messages; None where all of them hear all."""
-        if self.radio is UNSET and self.topology is UNSET:
+        has_fault = bool(self.own_agents) and any(fault.get("kind") == "radio" for fault in self.faults)
+        if self.radio is UNSET and self.topology is UNSET and not has_fault:
             return None
         return Radio() if self.radio is UNSET else self.radio
 

@@ -11,7 +11,6 @@ import math
 import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from zsim.scenario.roles import PILOT, WORLD, agent_names
 from zsim.scenario.scenario import Scenario
 from zsim.schema import yaml_file
 from zsim.schema.checker import show, suggestion
-from zsim.sensors.sensor_catalogue import declarations
+from zsim.sensors.sensor_catalogue import declarations, sensor_names
 from zsim_agents.hosting import check_classes
 from zsim_analysis.sweep.design import SEED, SEEDS, Draw, Grid, Seeds, parse, text_of
 
@@ -236,19 +235,18 @@ class HuntSpace:
     def draw_seed(self, rng: Generator) -> int:
         return int(rng.integers(SEEDS))
 
-    @cached_property
-    def targets(self) -> dict[str, tuple[str, ...]]:
-        """What faults may strike, by `FaultKind.strikes`."""
+    def targets_of(self, kind: FaultKind) -> tuple[str, ...]:
+        """Return what faults of a kind may strike."""
         scenario = self.base
-        drones = [drone.name for drone in scenario.drones if not drone.is_external]
-        agents = agent_names(scenario)
-        return {
-            "drone": tuple(drones),
-            "world": (WORLD,),
-            "link": tuple(links_of(scenario)),
-            "radio": (WORLD, *(cluster.name for cluster in scenario.clusters)),
-            "process": tuple(agents),
-        }
+        if kind.strikes == "drone":
+            simulated = [drone for drone in scenario.drones if not drone.is_external]
+            has = [drone.name for drone in simulated if not kind.sensor or kind.sensor in sensor_names(drone.sensors)]
+            return tuple(has)
+        if kind.strikes == "link":
+            return tuple(links_of(scenario))
+        if kind.strikes == "radio":
+            return (WORLD, *(cluster.name for cluster in scenario.clusters))
+        return (WORLD,) if kind.strikes == "world" else tuple(agent_names(scenario))
 
     def _kinds(self, rules: Sequence[str], without: Sequence[str], faults: list[str]) -> dict[str, KindSpace]:
         known = kinds_of(declarations(self.base.drones))
@@ -277,13 +275,16 @@ class HuntSpace:
         kinds = {}
         for name, knobs in names.items():
             kind = known[name]
-            if name not in without and ("target" in knobs or self.targets[kind.strikes]):
+            has_target = "target" in knobs or self.targets_of(kind)
+            if name in given and not has_target:
+                faults.append(f"{OPTION} {show(name)}: has no target in this scenario; must be a kind with one")
+            if name not in without and has_target:
                 kinds[name] = KindSpace(name, kind, self._knobs(kind) | knobs)
         return kinds
 
     def _knobs(self, kind: FaultKind) -> dict[str, Knob]:
         length_s = self.base.duration_s
-        knobs = [Knob("target", shape="choice", choices=self.targets[kind.strikes])]
+        knobs = [Knob("target", shape="choice", choices=self.targets_of(kind))]
         knobs.append(Knob("at_s", 0.0, _rounded(length_s * (1 - 1e-3))))
         if kind.lasts != "once":
             knobs.append(Knob("for_s", min(LEAST_S, length_s / 2), length_s / 2))

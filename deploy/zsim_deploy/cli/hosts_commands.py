@@ -124,7 +124,7 @@ def up(
     """
     require("up", UP_NEEDS | (opt.REPORT_NEEDS if report else {}))
     from zsim.transport.zenoh_settings import host_launcher_files, require_files
-    from zsim_api.run_folder import make_directory, new_launch
+    from zsim_api.run_folder import new_launch, run_directory
     from zsim_deploy import inventory
     from zsim_deploy.cli.run_commands import conclude
     from zsim_deploy.hosts.host_run import HostRun
@@ -141,16 +141,16 @@ def up(
     count, hosts_count = len(inventory.roles(loaded)), len(placed.inventory.hosts)
     require_files(host_launcher_files(count, hosts_count), f"{count} processes on {hosts_count} hosts")
     was_there = out is not None and out.exists()
-    folder = make_directory(out, loaded, force)
-    try:
-        with StatusTable(loaded.duration_s, choice=choice) as status:
-            launch = new_launch(mode=mode, rate=pace, changed=tuple(flight.changed()))
-            outcome = HostRun(loaded, placed, folder, launch, status).run()
-        conclude(outcome, folder, report)
-    finally:
-        if not was_there:  # and the run was refused: nothing is in it
-            with contextlib.suppress(OSError):
-                folder.rmdir()
+    with run_directory(out, loaded, force) as folder:
+        try:
+            with StatusTable(loaded.duration_s, choice=choice) as status:
+                launch = new_launch(mode=mode, rate=pace, changed=tuple(flight.changed()))
+                outcome = HostRun(loaded, placed, folder, launch, status).run()
+            conclude(outcome, folder, report)
+        finally:
+            if not was_there:  # and the run was refused: nothing is in it
+                with contextlib.suppress(OSError):
+                    folder.rmdir()
 
 
 @app.command(rich_help_panel=opt.HOSTS)

@@ -75,7 +75,7 @@ def run(
     require("run", opt.FLIGHT_NEEDS | (opt.REPORT_NEEDS if report else {}))
     from zsim.schema import plugin
     from zsim_agents.hosting import AgentSpec, check_plans, with_own_agents
-    from zsim_api.run_folder import make_directory, new_launch
+    from zsim_api.run_folder import locked, new_launch, run_directory
     from zsim_deploy.hosts.control_socket import seen_by_ps
     from zsim_deploy.launch.console_process import RunConsole
     from zsim_deploy.launch.run import RunOptions, check_endpoint, check_open_files, fly, options_of, with_cameras
@@ -110,9 +110,8 @@ def run(
         if options.camera_children():
             require("run", opt.CAMERA_NEEDS)
         check_open_files(options)
-    if not continue_:
-        options.out = make_directory(out, options.scenario, force)
-    with shown or nullcontext(), interruptible():
+    place = locked(options.out) if continue_ else run_directory(out, options.scenario, force)
+    with place as options.out, shown or nullcontext(), interruptible():
         with seen_by_ps(options.scenario.federation, options.status):
             outcome = fly(options)
         if shown:

@@ -11,7 +11,7 @@ from synthetic_record import SCENARIOS
 from zsim.errors import RunError
 from zsim.record import RecordWriter
 from zsim.scenario import scenario_file
-from zsim_api.run_folder import make_directory
+from zsim_api.run_folder import make_directory, run_directory
 
 STEP = scenario_file.load(SCENARIOS / "step.yaml")
 
@@ -85,3 +85,20 @@ def test_force_removes_no_record_of_another_tool_and_no_run_under_way(tmp_path: 
         with refused(RunError, str(tmp_path if is_under_way else tmp_path / "run.mcap"), "--out"):
             make_directory(tmp_path, STEP, force=True)
         assert files(tmp_path) == {"run.mcap", "logs/world.log", "scenario.yaml"}
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_folder_is_one_runs_until_it_is_over(tmp_path: Path, force: bool) -> None:
+    with run_directory(tmp_path, STEP) as folder, refused(RunError, str(tmp_path), "--out"):
+        make_directory(folder, STEP, force)
+    assert make_directory(tmp_path, STEP, force) == tmp_path
+
+
+def test_runs_that_start_in_one_second_have_folders_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("zsim_api.run_folder.time.strftime", lambda _: "now")
+    monkeypatch.setattr(Path, "exists", lambda _: False)  # as it was when they looked
+    names = [make_directory(None, STEP).name for _ in range(3)]
+    assert names == ["step-now", "step-now-2", "step-now-3"]

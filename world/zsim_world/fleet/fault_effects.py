@@ -1,7 +1,7 @@
 """The effects of faults on the arrays of a fleet: sensors, rotors and wind. Without faults they are as at the start."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -17,7 +17,7 @@ from zsim_world.physics.air import WIND
 from zsim_world.physics.fleet_arrays import STATE, Arrays
 from zsim_world.run_state import Saved
 from zsim_world.sensors import sensor_set as ss
-from zsim_world.sensors.scans import ScanSampler
+from zsim_world.sensors.scans import SCANNER, ScanSampler
 from zsim_world.sensors.sensor_set import CONFIG, FAULT, FleetSensors
 from zsim_world.vehicles.simd_firmware import ACTUATOR, sound_actuators
 
@@ -91,9 +91,8 @@ class Impairment:
             self._impair_rotors(fault, i, how)
             return
         if what in SCANNERS:
-            share, bias_m = (fault.parameters.get(name, 0.0) for name in ("probability", "value_m"))
-            if self._scans:
-                self._scans.impair(i, what, lambda limit: dropped(limit, share) if share else limit, bias_m)
+            for row in self._scans.rows_of(i, what) if self._scans else ():
+                _impair_scanner(row, how, fault.parameters)
             return
         if how in ("dropout", "stuck"):
             row = self._w.senses.config[i, self._sensor[what]]
@@ -126,6 +125,17 @@ class Impairment:
                         speed, speeds = fault.parameters["speed_rad_s"], self._w.bodies.state[i, STATE.size :].tolist()
                         self._held[fault.id] = tuple(speeds) if speed is None else (speed,) * len(speeds)
                     row[ACTUATOR.size + count + r] = self._held[fault.id][r]
+
+
+def _impair_scanner(row: NDArray[np.float64], how: str, parameters: Mapping[str, float]) -> None:
+    if how == "stuck":
+        row[SCANNER.stuck] = 1.0
+    elif how == "dropout":
+        row[SCANNER.drop] = dropped(row[SCANNER.drop], parameters["probability"])
+    elif how == "noise":
+        row[[SCANNER.noise, SCANNER.share, SCANNER.square]] *= parameters["factor"]
+    else:
+        row[SCANNER.bias] += parameters["value_m"]
 
 
 def dropped(limit: float, probability: float) -> float:

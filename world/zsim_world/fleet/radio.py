@@ -1,10 +1,12 @@
 """Who hears whom at a gate: the topology of a scenario over its radio, by the true places of the drones."""
 
+from collections.abc import Iterable
+
 import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-from zsim.contract.run_messages import RadioLinks
+from zsim.contract.run_messages import Fault, RadioLinks
 from zsim.math import elementary as el
 from zsim.math.compiled import kernel
 from zsim.math.held import Held, hold
@@ -33,6 +35,9 @@ class RadioChannel:
         self._radio: Radio = radio
         self._topology = Topology() if scenario.topology is UNSET else scenario.topology
         self._count = len(scenario.drones)
+        self._clusters = {
+            each.name: np.array([drone.name in each.drones for drone in scenario.drones]) for each in scenario.clusters
+        }
         self._station = np.array([radio.station_m] if radio.station_m is not None else [], dtype=float).reshape(-1, 3)
         self._allowed = np.pad(
             allowed([drone.name for drone in scenario.drones], self._topology),
@@ -43,11 +48,12 @@ class RadioChannel:
         self._scene = hold(scene)
         self._is_open = not len(scene.tree.part)
 
-    def links(self, t_ns: int, seq: int, position_m: NDArray[np.float64]) -> RadioLinks:
+    def links(self, t_ns: int, seq: int, position_m: NDArray[np.float64], faults: Iterable[Fault] = ()) -> RadioLinks:
         """Return the message of a gate.
 
         Args:
             position_m: of the drones in W, (N, 3).
+            faults: that act; those of kind `radio` lower the reception of the drones of their target.
         """
         radio, topology, n = self._radio, self._topology, self._count
         place_m = np.concatenate([position_m, self._station])
@@ -57,11 +63,15 @@ class RadioChannel:
         if topology.within_m is not None:
             hears[:n, :n] &= distance_m[:n, :n] <= topology.within_m
         if radio.range_m is not None and radio.spread_m:
-            exponent = np.minimum((distance_m - radio.range_m) / radio.spread_m, 700.0)  # exp(700) is finite
-            reception = 1.0 / (1.0 + el.elementwise(el.exp)(exponent))
-            hears &= reception >= RECEPTION_MIN
+            reception = _received(distance_m, radio.range_m, radio.spread_m)
         elif radio.range_m is not None:
             hears &= distance_m <= radio.range_m
+        struck = [fault for fault in faults if fault.kind == "radio"]
+        for fault in struck:
+            of_target = self._of_target(fault.target)
+            lowered = reception * _received(distance_m, fault.parameters["range_m"], fault.parameters["spread_m"])
+            reception = np.where(of_target[:, None] | of_target[None, :], lowered, reception)
+        hears &= reception >= RECEPTION_MIN
         if radio.line_of_sight and not self._is_open:
             clear_lines(place_m, self._scene, hears)
         if topology.nearest is not None:
@@ -71,9 +81,20 @@ class RadioChannel:
         if topology.symmetric:
             hears |= hears.T
         heard = [np.flatnonzero(row).tolist() for row in hears]
-        soft = radio.range_m is not None and radio.spread_m > 0.0
+        soft = bool(struck) or (radio.range_m is not None and radio.spread_m > 0.0)
         chances = tuple(tuple(row[of].tolist()) for row, of in zip(reception, heard, strict=True)) if soft else ()
         return RadioLinks(t_ns, seq, tuple(map(tuple, heard)), chances)
+
+    def _of_target(self, target: str) -> Matrix:
+        """Return which places are drones of a cluster, of the world all."""
+        of_target = np.zeros(len(self._allowed), dtype=bool)
+        of_target[: self._count] = self._clusters.get(target, True)
+        return of_target
+
+
+def _received(distance_m: NDArray[np.float64], range_m: float, spread_m: float) -> NDArray[np.float64]:
+    exponent = np.minimum((distance_m - range_m) / spread_m, 700.0)  # exp(700) is finite
+    return 1.0 / (1.0 + el.elementwise(el.exp)(exponent))
 
 
 def allowed(drones: list[str], topology: Topology) -> Matrix:

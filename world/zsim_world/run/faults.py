@@ -14,7 +14,7 @@ from zsim.scenario.faults import PROCESS_KILL, Known, flaws
 from zsim.scenario.roles import WORLD, expected_processes
 from zsim.scenario.scenario import FAULTS_MAX
 from zsim.schema.checker import show
-from zsim.sensors.sensor_catalogue import declarations
+from zsim.sensors.sensor_catalogue import declarations, sensor_names
 from zsim_world.fleet.fault_effects import Impairment
 from zsim_world.run.coordinator import Coordinator
 from zsim_world.run.outbox import Refusal
@@ -154,12 +154,17 @@ class FaultInjector:
         gating = (p.name for p in self._barrier.participants.values() if p.gating)
         processes = (*expected_processes(scenario), *gating)
         external = tuple(scenario.external())
-        known = Known(drones, clusters, processes, self._kinds, self._effects.rotors, external)
+        sensors = {drone.name: sensor_names(drone.sensors) for drone in scenario.drones}
+        known = Known(drones, clusters, processes, self._kinds, self._effects.rotors, external, sensors)
         for path, text in flaws(args, known):
             return f"{path or 'args'} {text}"
         if args["kind"] == PROCESS_KILL and (immune := self._immunity(args["target"])):
             allowed = f"must be a process that a kill ends ({PROCESS_KILL})"
             return Refusal("target", f"{show(args['target'])}, which {immune}", allowed)
+        if args["kind"] == "radio" and scenario.own_messages() and scenario.radio_of_agents is None:
+            return Refusal(
+                "kind", "radio", "must be another: the scenario's agents exchange messages without a `radio`"
+            )
         at_s, now_s, end_s = args.get("at_s"), self._clock.now_ns / 1e9, scenario.duration_s
         if at_s is not None and at_s < now_s:
             return Refusal("at_s", f"{at_s:g}", f"must be >= {now_s:g}, the present, or left out")

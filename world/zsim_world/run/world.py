@@ -200,8 +200,9 @@ class World(Coordinator):
         state = fleet.bodies.state
         self.truth_hash.add(clock.now_ns, state[self._simulated] if self.external else state)
         if self._radio is not None:  # before the gate, which lets agents go on
-            position_m = state[:, STATE.p_WB : STATE.p_WB + 3]
-            self.outbox.put(keys.RADIO, self._radio.links(clock.now_ns, self.outbox.next_seq(keys.RADIO), position_m))
+            position_m, seq = state[:, STATE.p_WB : STATE.p_WB + 3], self.outbox.next_seq(keys.RADIO)
+            acting = self.faults.of_links(clock.now_ns)
+            self.outbox.put(keys.RADIO, self._radio.links(clock.now_ns, seq, position_m, acting))
         if gate is not None:
             self.outbox.put(keys.GATE, gate)
         statistics.gate(clock.now_ns, wall_ns)

@@ -6,7 +6,7 @@ the same number of numbers: two for each of its values, one for itself.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -56,6 +56,7 @@ SCANNER = columns(
         Field("quantum", "m"),
         Field("miss", "1"),  # a ray is missed when its standard normal number is below this
         Field("drop", "1"),  # likewise a message
+        Field("stuck", "1"),  # by a fault: 1 where its first message is given again and again
     ),
 )
 
@@ -118,7 +119,13 @@ class ScanScene(NamedTuple):
 class ScanSampler:
     """Makes the scans of a fleet, gate by gate; `hulls`: radius of each drone's [m], (N,)."""
 
-    SAVED: ClassVar[Saved] = {"_rows": IN_PLACE, "_streams": IN_PLACE, "_exposures": PART, "_later": list[WaitingScan]}
+    SAVED: ClassVar[Saved] = {
+        "_rows": IN_PLACE,
+        "_streams": IN_PLACE,
+        "_exposures": PART,
+        "_later": list[WaitingScan],
+        "_stuck": dict[int, bytes],
+    }
 
     def __init__(self, scenario: Scenario, hulls: Array, scene: Scene) -> None:
         self._mounted = [*_mounted(scenario)]
@@ -135,21 +142,17 @@ class ScanSampler:
         gate_ns = round(scenario.time.gate_ms * 1e6)
         self._exposures = Exposures([each.settings.rate_hz for each in self._mounted], gate_ns)
         self._later: list[WaitingScan] = []
+        self._stuck: dict[int, bytes] = {}  # by place: the message that it gives again and again
 
     def recover(self) -> None:
         """Let no fault act on any sensor."""
         self._rows[:] = self._sound
 
-    def impair(self, drone: int, sensor: str, drop: Callable[[float], float], bias_m: float) -> None:
-        """Let a fault act on a sensor of a drone, beside those that act already; nothing where it has none.
-
-        Args:
-            drop: returns the limit of SCANNER.drop with the fault, given that without.
-        """
+    def rows_of(self, drone: int, sensor: str) -> Iterator[Array]:
+        """Yield the rows of a sensor of a drone, (SCANNER.size,), one for each of its cameras, for faults to change."""
         for row, each in zip(self._rows, self._mounted, strict=True):
             if (each.drone, each.sensor) == (drone, sensor):
-                row[SCANNER.drop] = drop(row[SCANNER.drop])
-                row[SCANNER.bias] += bias_m
+                yield row
 
     def due(self, state: Array, now_ns: int) -> list[Scan]:
         """Return what is due by a gate, given the state of all drones there, (N, STATE.size or more)."""
@@ -168,8 +171,13 @@ class ScanSampler:
         poses = poses_between(*between, at_ns)
         values = scan(self._held, place, poses, self._streams[place])
         if len(values):
+            sent = values.astype(SINGLE).tobytes()
+            if self._rows[place, SCANNER.stuck]:
+                sent = self._stuck.setdefault(place, sent)
+            else:
+                self._stuck.pop(place, None)
             latency_ns = round(self._mounted[place].settings.latency_ms * 1e6)
-            self._later.append(WaitingScan(at_ns + latency_ns, at_ns, place, values.astype(SINGLE).tobytes()))
+            self._later.append(WaitingScan(at_ns + latency_ns, at_ns, place, sent))
 
     def _made(self, waiting: WaitingScan) -> Scan:
         m = self._mounted[waiting.place]

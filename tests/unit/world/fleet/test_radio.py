@@ -1,13 +1,14 @@
 """Who hears whom: graphs, distance, reception, lines of sight, the nearest."""
 
 import math
+from collections.abc import Iterable
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
 
-from zsim.contract.run_messages import RadioLinks
+from zsim.contract.run_messages import Fault, RadioLinks
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import RECEPTION_MIN
@@ -26,10 +27,10 @@ def scenario(**sections: Any) -> Any:
     return scenario_file.resolve({"name": "t", "duration_s": 1, "drones": drones, **sections})
 
 
-def links(**sections: Any) -> RadioLinks:
+def links(faults: Iterable[Fault] = (), **sections: Any) -> RadioLinks:
     made = scenario(**sections)
     around = scene(obstacle_rows(made.environment), sheet_of(made.environment).triangle)
-    return RadioChannel(made, around).links(0, 0, np.array(LINE_M))
+    return RadioChannel(made, around).links(0, 0, np.array(LINE_M), faults)
 
 
 @pytest.mark.parametrize(
@@ -94,6 +95,21 @@ def test_a_surface_blocks_the_lines_that_cross_it(environment: dict[str, Any], i
     """d0 and d1 are on one side, d2 and d3 on the other, all at 2 m; d3 is 9 m from d2 and out of the others' range."""
     hears = ((1,), (0,), (3,), (2,)) if is_between else ((1, 2), (0, 2), (0, 1, 3), (2,))
     assert links(radio={"range_m": 9, "line_of_sight": True}, environment=environment).hears == hears
+
+
+def test_faults_of_kind_radio_lower_the_reception_of_the_drones_of_their_target() -> None:
+    def fault(number: int, target: str, range_m: float, spread_m: float, kind: str = "radio") -> Fault:
+        return Fault(number, kind, target, {"range_m": range_m, "spread_m": spread_m, "place": {}}, 0, None, "test")
+
+    acting = (fault(1, "main", 4, 2), fault(2, "world", 9, 3), fault(3, "world", 1, 1, "link_cut"))
+    clusters = [{"name": "main", "drones": ["d0", "d1"]}]
+    made = links(acting, radio={"range_m": 20}, clusters=clusters)
+    for hearer, (heard, chances) in enumerate(zip(made.hears, made.reception, strict=True)):
+        for sender, chance in zip(heard, chances, strict=True):
+            d = abs(LINE_M[hearer][0] - LINE_M[sender][0])
+            of_main = 1 / (1 + math.exp((d - 4) / 2)) if {0, 1} & {hearer, sender} else 1.0
+            assert chance == pytest.approx(of_main / (1 + math.exp((d - 9) / 3)))
+    assert made.hears == ((1, 2), (0, 2, 3), (0, 1, 3), (1, 2))  # d0 and d3: 16 m, 2.2e-4 < RECEPTION_MIN
 
 
 def test_an_obstacle_beside_the_line_is_in_nobodys_way() -> None:

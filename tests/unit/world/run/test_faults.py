@@ -1,8 +1,10 @@
 """Requested faults: added, begun, ended, cleared, and published before the first gate that they change."""
 
+import json
 from typing import Any
 
 import pytest
+import yaml
 from refused import has_terms, parts
 
 from zsim.contract import keys
@@ -54,6 +56,29 @@ def events(made: World) -> list[tuple[int, str, int]]:
 def listed(made: World) -> list[list[int]]:
     """Return the ids of every list since the last time."""
     return [[fault.id for fault in m.faults] for _, m in made.take_outbox() if isinstance(m, Faults)]
+
+
+def test_where_agents_talk_without_a_radio_a_fault_of_it_is_refused_while_flying():
+    """No gate tells these agents who hears whom; a fault that is planned, or a radio, brings it."""
+    word = {"message": "Word", "key": "talk/*/word", "fields": {"said": "number"}}
+    agents = {"talk": {"class": "talkers:Talker", "declared": [word]}}
+    radio = {"kind": "radio", "target": "main", "range_m": 5}
+    for more, is_taken in (({}, False), ({"radio": {}}, True), ({"faults": [radio]}, True)):
+        made = World(scenario_file.from_text(json.dumps({**yaml.safe_load(SCENARIO), "agents": agents, **more})))
+        answer = ask(made, "fault_add", **radio)
+        assert answer.ok is is_taken, answer.error
+        assert is_taken or has_terms(answer.error, "kind", "radio")
+
+
+def test_a_fault_of_a_sensor_that_the_drone_does_not_have_is_refused():
+    sensors = {"d1": {"range": {}}, "d2": {}}
+    document = yaml.safe_load(SCENARIO)
+    for drone in document["drones"]:
+        drone["sensors"] = sensors[drone["name"]]
+    made = World(scenario_file.resolve(document))
+    assert ask(made, "fault_add", kind="range_stuck", target="d1").ok
+    answer = ask(made, "fault_add", kind="range_stuck", target="d2")
+    assert has_terms(answer.error, "target", "'d2'", "range", "d1", "range_stuck")
 
 
 def test_what_the_scenario_plans_is_published_at_the_start_begun_and_ended():

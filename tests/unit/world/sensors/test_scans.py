@@ -191,3 +191,25 @@ def test_faults_lose_messages_and_shift_distances_of_one_sensor_and_end() -> Non
     assert {each.drone for each in made.seen.values()} == {0}
     made.impairment.strike([])
     assert ahead() == pytest.approx([5.0, 5.0], abs=1e-3)
+
+
+def test_a_fault_multiplies_the_noise_of_one_sensor_or_gives_its_first_message_again_and_again() -> None:
+    noisy = {"beams": {"ahead": {}}, "max_m": 8, "rate_hz": 50, "noise_m": 0.01}
+    readings = {}
+    for kind, values in {"": {}, "range_noise": {"factor": 3.0}, "range_stuck": {}}.items():
+        made = fleet((0, 0, 0), (0, 3, 0), range=noisy)
+        made.advance()
+        made.impairment.strike([Fault(1, kind, "d1", values, 0, None, "test")] if kind else [])
+        kept = []
+        for gate in range(40):
+            if gate == 20:
+                made.impairment.strike([])
+            made.advance()
+            kept.append([taken(made, Range, drone).ranges_m[0] for drone in (0, 1)])
+        readings[kind] = np.array(kept)
+    sound, noise, stuck = readings.values()
+    for struck in (noise, stuck):
+        assert struck[20:].tolist() == sound[20:].tolist()  # the same draws with the fault as without
+        assert struck[:, 0].tolist() == sound[:, 0].tolist()  # the other drone
+    assert noise[:20, 1] - 5.0 == pytest.approx(3.0 * (sound[:20, 1] - 5.0), abs=2e-3)
+    assert stuck[:20, 1].tolist() == [sound[0, 1]] * 20

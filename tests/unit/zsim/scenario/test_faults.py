@@ -13,6 +13,7 @@ from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.faults import KINDS, FaultParameter, Known, acts, expected, flaws, planned
 from zsim.scenario.scenario_file import resolve
+from zsim.sensors.scanner import SCANNERS
 
 GATE_NS = 20_000_000
 KNOWN = Known(("drone1", "drone2"), ("main",), ("my.filter",), rotors={"drone2": ("r1", "r2")})
@@ -31,7 +32,7 @@ SOUND: dict[str, dict[str, Any]] = {
     "baro_bias": {"value_m": -2},
     "sonar_bias": {"value_m": 0.1},
     "flow_bias": {"value_m_s": [0.1, 0, 0]},
-    **{f"{scanner}_bias": {"value_m": 0.1} for scanner in ("range", "lidar", "depth")},
+    **{f"{scanner}_bias": {"value_m": 0.1} for scanner in SCANNERS},
     **{kind: {"factor": 3} for kind in KINDS if kind.endswith("_noise")},
     "rotor_efficiency": {"rotor": "all", "value": 0.8},
     "rotor_stuck": {"rotor": "front_left"},
@@ -115,6 +116,17 @@ def test_a_flaw_is_a_line(given: dict[str, Any], terms: tuple[str, ...]):
     assert has_terms(flaw, *terms)
 
 
+@pytest.mark.parametrize(("others", "allowed"), [((), "out"), (("lidar",), "drone2")])
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if KINDS[kind].sensor in SCANNERS])
+def test_a_sensor_that_the_drone_does_not_have_cannot_fail(kind: str, others: tuple[str, ...], allowed: str):
+    sensor = KINDS[kind].sensor
+    others = (sensor,) if others else ()
+    ((path, text),) = flaws(sound(kind), KNOWN._replace(sensors={"drone1": (), "drone2": others}))
+    assert path == "target"
+    assert has_terms(text, "'drone1'", sensor, allowed, kind)
+    assert list(flaws(sound(kind), KNOWN._replace(sensors={"drone1": (sensor,), "drone2": ()}))) == []
+
+
 def test_an_unknown_kind_names_all_kinds_and_hides_nothing_else():
     ((path, text),) = flaws({"kind": "gremlin"}, KNOWN)
     assert path == "kind"
@@ -194,7 +206,8 @@ def test_a_scenario_tells_every_flaw_at_once():
 
 def test_a_scenario_takes_every_kind_and_comes_back_from_its_text():
     everything = [sound(kind, at_s=1.5) for kind in KINDS]
-    scenario = resolve(document(*everything))
+    seeing = {"range": {}, "lidar": {}, "front_camera": {}, "depth": {}}
+    scenario = resolve({**document(*everything), "sensors": seeing})
     text = scenario_file.to_text(scenario)
     assert scenario_file.from_text(text).faults == scenario.faults == everything
 
