@@ -15,7 +15,17 @@ import msgspec
 from msgspec import Meta
 
 from zsim.errors import InventoryError
-from zsim.scenario.roles import AGENTS, RECORDER, ROLES, ROUTER, WORLD, agent_names, expected_processes, on_death
+from zsim.scenario.roles import (
+    AGENTS,
+    RECORDER,
+    ROLES,
+    ROUTER,
+    WORLD,
+    agent_names,
+    expected_processes,
+    on_death,
+    programs,
+)
 from zsim.scenario.scenario import DRONES_MAX, PROCESSES_MAX, Name, OnDeath, Scenario, Spec
 from zsim.schema import yaml_file
 from zsim.schema.checker import Fault, faults, first_lines
@@ -172,11 +182,18 @@ def roles(scenario: Scenario) -> list[str]:
 
 
 def placement(placed: InventoryFile, scenario: Scenario) -> dict[str, str]:
-    """Return the host of every process, by `spread`; InventoryError if one has none, or a pattern matches nothing."""
+    """Return the host of every process, by `spread`; InventoryError if one has none, or a pattern matches nothing.
+
+    A program of the scenario may have none: it is started where `zsim up` is run.
+    """
     names, inventory = roles(scenario), placed.inventory
     entries = inventory.roles
     places = spread(entries, names)
-    lines = [f"roles has no place for {name}; add {name!r}" for name in names if name not in places]
+    lines = [
+        f"roles has no place for {name}; add {name!r}"
+        for name in names
+        if name not in {**places, **scenario.own_programs}
+    ]
     unused = [key for key in entries if not any(fnmatch.fnmatchcase(name, key) for name in names)]
     lines += [f"roles.{key} matches no process of {scenario.name!r}; it has {', '.join(names)}" for key in unused]
     if WORLD in places:
@@ -331,10 +348,7 @@ def processes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (
 
 
 def own_programs(placed: InventoryFile, scenario: Scenario, host: str | None = None) -> list[str]:
-    """Return a remark on each program of the user's own, with its command: those of one host, or all.
-
-    One for which the run does not wait has no host, and is among all only.
-    """
+    """Return a remark on each program of the user's own, with its command: those placed on one host, or all."""
     places = placement(placed, scenario)
     remarks = []
     for name, at in places.items():
@@ -342,12 +356,17 @@ def own_programs(placed: InventoryFile, scenario: Scenario, host: str | None = N
             where = endpoint(placed, places, at)
             what = f"{name} on {at} is a program of your own: start it yourself, it connects to {where}"
             remarks.append(what + _command_text(name, scenario, where))
-    for name, program in scenario.own_programs.items() if host is None else ():
-        if not program.joins and name not in places:
-            where = endpoint(placed, places, places[WORLD])
-            what = f"{name} is a program of your own, for which the run does not wait: start it yourself"
-            remarks.append(what + _command_text(name, scenario, where))
+    for name in programs_here(placed, scenario) if host is None else ():
+        where = endpoint(placed, places, places[WORLD])
+        what = f"{name} is a program of your own: start it yourself, it connects to {where}"
+        remarks.append(what + _command_text(name, scenario, where))
     return remarks
+
+
+def programs_here(placed: InventoryFile, scenario: Scenario) -> list[str]:
+    """Return the programs of a scenario that have no place: `zsim up` starts them itself."""
+    places = placement(placed, scenario)
+    return [name for name in programs(scenario) if name not in places]
 
 
 def _command_text(name: str, scenario: Scenario, endpoint: str) -> str:

@@ -67,7 +67,7 @@ def test_a_planted_defect_is_found_and_shrunk_to_its_three_causes(
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "support"))
     words = [word for fault in SPACE for word in ("--fault", fault)]
     found = hunted(
-        scenario, tmp_path / "hunt", *words, "--vary", WIND, "--require", "late_gain:kept", "--flights", "3500", code=1
+        scenario, tmp_path / "hunt", *words, "--vary", WIND, "--require", "late_gain:kept", "--flights", "2400", code=1
     )["violation"]
     assert {fault["kind"]: fault["target"] for fault in found["shrunk"]["faults"]} == DEFECT
     assert found["shrunk"]["values"] == {}

@@ -1,5 +1,6 @@
 """A control law with a defect: one of its gains is wrong, in a combination of gust, GPS dropout and late link only."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -12,16 +13,16 @@ from zsim_analysis.reading.recorded_flight import RecordedFlight
 
 VICTIM = 1  # its place in the cluster
 USUAL_S, USUAL_M_S = 0.2, 0.1  # age of the newest sample of a GPS at 5 Hz, and velocity of a formation that holds
-DOUBTFUL = 0.004  # s^2 m/s, product of the doubts beyond which the gain has the wrong sign
 HELD_S, LOST_M = 6.0, 4.0
-WRONG = -6.0  # the least factor of the gain
+GAIN = 6.0  # m/s per root of s^2 m/s; 0 would be right
 
 
 class LateGain(ProportionalLaw):
-    """Weakens the gain of one drone where its position is doubtful: by the product of three doubts, beyond 0.
+    """Sends one drone away where its position is doubtful: by the root of the product of three doubts.
 
     Doubtful is what is pushed (mean velocity of the drones), blind (no GPS) and late (age of the others' samples). The
-    greatest doubt lasts until the drone has GPS again.
+    greatest doubt lasts. One flight in 10 000 that SPACE draws loses it: of 1040 with all three faults, which one in 20
+    has, two did.
     """
 
     def reset(self) -> None:
@@ -43,18 +44,16 @@ class LateGain(ProportionalLaw):
             late_s = max(min(age_s for place, age_s in enumerate(ages_s) if place != VICTIM) - USUAL_S, 0.0)
             blind_s = max(ages_s[VICTIM] - min(ages_s), 0.0)
             pushed_m_s = max(float(np.linalg.norm(np.mean(v_W[:, :2], axis=0))) - USUAL_M_S, 0.0)
-            self.doubt = max(self.doubt, late_s * blind_s * pushed_m_s / DOUBTFUL) if blind_s else 0.0
-            rates[4 * VICTIM : 4 * VICTIM + 3] *= max(1.0 - self.doubt**3, WRONG)
+            self.doubt = max(self.doubt, math.sqrt(late_s * blind_s * pushed_m_s))
+            rates[4 * VICTIM] += GAIN * self.doubt
         return rates
 
 
 def kept(flight: RecordedFlight) -> float:
-    """Return how much farther [m] a drone may still stray, of LOST_M from where it was when the formation held."""
-    strayed_m = []
-    for track in flight.tracks:
-        held = track.t_ns >= HELD_S * 1e9
-        strayed_m.append(float(np.linalg.norm(track.p_W[held] - track.p_W[held][0], axis=1).max()))
-    return LOST_M - max(strayed_m)
+    """Return how much more [m] the drones may move against each other, of LOST_M, from where the formation held."""
+    first, second = flight.tracks
+    apart_W = (second.p_W - first.p_W)[first.t_ns >= HELD_S * 1e9]
+    return LOST_M - float(np.linalg.norm(apart_W - apart_W[0], axis=1).max())
 
 
 SCENARIO: dict[str, Any] = {

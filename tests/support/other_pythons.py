@@ -75,7 +75,7 @@ def other_python(kind: Kind) -> OtherPython:
     """Return a Python, fetched where it has not been yet.
 
     Raises:
-        LackingError: this machine has no apt, no emulator, or another processor than x86-64.
+        LackingError: this machine has no apt, no emulator, another processor than x86-64, or does not reach the packages.
     """
     for tool in ("apt-get", "dpkg-deb", *([kind.emulator] if kind.emulator else [])):
         if shutil.which(tool) is None:
@@ -143,7 +143,10 @@ def _fetch_packages(kind: Kind, folder: Path) -> None:
     (apt / "sources.list").write_text(f"deb [signed-by={keys}] {uri} {kind.suite or release} main\n")
     (apt / "apt.conf").write_text(APT.format(folder=folder, architecture=kind.architecture))
     own = ("apt-get", "-q", "-c", str(apt / "apt.conf"))
-    _output(*own, "update")
+    try:
+        _output(*own, "update")
+    except RuntimeError as error:
+        raise LackingError(f"apt reaches no package of {kind.suite or release}: {error}") from error
     _output(*own, "install", "--download-only", "--no-install-recommends", "-y", kind.package, "libstdc++6")
     for package in sorted((apt / "cache" / "archives").glob("*.deb")):
         _output("dpkg-deb", "-x", str(package), str(folder / "root"))

@@ -74,6 +74,24 @@ def test_drones_that_talk_to_each_other_fly_as_in_one_process(
         assert len(record.all("swarm/drone1/position")) == DURATION_S / 0.02 + 1
 
 
+def test_a_program_without_a_place_is_started_here_and_named_where_it_fails(lab: Lab, tmp_path: Path) -> None:
+    """To the bits that it flies to under `zsim run`."""
+    client, dies = EXAMPLES / "plain_client.yaml", tmp_path / "dies.yaml"
+    dies.write_text(
+        client.read_text().replace("[python, plain_client.py, '{endpoint}']", "[sh, -c, echo lost; exit 3]")
+    )
+    alone = zsim.run(client, duration_s=3, processes=True, out=tmp_path / "alone", progress=False)
+    spread = {"world": "h1", "estimator.*": "h2"}
+    with closing(Deployment(lab, spread, secure=False, scenario=client)) as deployment:
+        deployment.up("--duration", "3").ends(with_code=0, within_s=START_S)
+        assert "flying" in (deployment.out / "logs" / "plain.client.log").read_text()
+        assert deployment.record().sha256() == alone.truth_sha256
+        deployment.scenario, deployment.out = dies, tmp_path / "died"
+        failed = deployment.up()
+        failed.ends(with_code=1, within_s=START_S)
+        assert "exit code 3: lost" in failed.text()
+
+
 POLICY = """
 from pathlib import Path
 

@@ -78,6 +78,12 @@ def expected_processes(scenario: Scenario) -> list[str]:
     return [*agent_names(scenario), *(f"camera.{name}" for name in cameras), *programs]
 
 
+def programs(scenario: Scenario) -> list[str]:
+    """Return the names of the users' programs that are started with a run."""
+    expected = expected_processes(scenario)
+    return [name for name, each in scenario.own_programs.items() if name in expected or not each.joins]
+
+
 def on_death(actions: Mapping[str, OnDeath], name: str, role: str | None = None) -> OnDeath:
     """Return what is to be done when a process dies: what the scenario has for it, else for its role, else the default.
 

@@ -60,7 +60,9 @@ class HostPlan:
         self._pace = pace  # options of the world
         in_order = sorted(inv.processes(placed, scenario, pace), key=lambda process: process.role != ROUTER)
         self.processes = {process.name: process for process in in_order}  # each after the one that it connects to
-        self.remarks = inv.own_programs(placed, scenario)  # on programs of the user's own, which are not started
+        self.programs = inv.programs_here(placed, scenario)  # of the user's own, that are started here
+        # on those that are placed on a host, which are not started: what they need is the user's to bring there
+        self.remarks = [line for host in placed.inventory.hosts for line in inv.own_programs(placed, scenario, host)]
 
     def moved(self, name: str, host: str) -> "HostPlan":
         """Return the same plan but for the host of one process."""
@@ -80,6 +82,10 @@ class HostPlan:
     def keys(self, host: str) -> str:
         """Return the folder in which the keys of this run's processes are on a host."""
         return f"{self.folder(host)}/{FOLDER}"
+
+    def endpoint(self) -> str:
+        """Return where the programs that are started here find the run."""
+        return inv.endpoint(self.placed, inv.placement(self.placed, self._scenario), self.host(WORLD))
 
     def record(self) -> str:
         return f"{self.folder(self.host(RECORDER))}/{RECORD}"

@@ -29,6 +29,7 @@ from zsim_deploy.hosts.host_plan import RECORD, HostPlan, leftovers, port_faults
 from zsim_deploy.hosts.remote_process import ProcessLog, RemoteProcess
 from zsim_deploy.hosts.status_table import StatusTable
 from zsim_deploy.inventory import MODULE, MODULES, InventoryFile, extras
+from zsim_deploy.launch.program_process import programs_of
 from zsim_deploy.launch.supervisor import EndSignals, Outcome, Supervisor
 
 CONNECT_S = 30.0  # how long all hosts together may take to let us in, …
@@ -49,7 +50,7 @@ class HostRun:
     def __init__(
         self, scenario: Scenario, placed: InventoryFile, out: Path, launch: Launch, status: StatusTable
     ) -> None:
-        self._scenario = scenario
+        self._scenario, self._launch = scenario, launch
         self._placed = placed
         self._out = out
         self._status = status
@@ -126,7 +127,8 @@ class HostRun:
             (self._out / "scenario.yaml").write_text(scenario_file.to_text(self._scenario))
         for remark in self._plan.remarks:
             self._status.say(remark)
-        self._supervisor.members = [self._remote(self._plan, name) for name in self._plan.processes]
+        here = programs_of(self._scenario, self._plan.programs, self._plan.endpoint(), self._out, self._launch)
+        self._supervisor.members = [*(self._remote(self._plan, name) for name in self._plan.processes), *here]
         self._status.members, self._status.links = self._supervisor.members, self._links.by_name
         self._links.listen()
         self._record_stays = True

@@ -18,7 +18,6 @@ from zsim_deploy.launch.supervisor import status_row
 
 if TYPE_CHECKING:
     from zsim_deploy.hosts.host_link import HostLink
-    from zsim_deploy.hosts.remote_process import RemoteProcess
 
 FIRST_S = 1.0  # simulated; from then on it flies
 SILENT_S = 1.0  # a host that has not answered for so long is shown as silent; it is asked twice a second …
@@ -108,7 +107,7 @@ class StatusTable(Screen):
     def rows(self) -> list[dict[str, Any]]:
         rows, now_s = [], time.monotonic()
         for member in self.members:
-            link, health = self.links[member.host], self._health.get(member.name)
+            link, health = self.links.get(member.host), self._health.get(member.name)
             last_s = health["wall_s"] if health else None
             if member.name == WORLD and self.clock_now is not None:
                 last_s = max(last_s or 0.0, self.clock_now["wall_s"])
@@ -116,17 +115,17 @@ class StatusTable(Screen):
             row["age_s"] = None if last_s is None else now_s - last_s  # since anything has come of it
             if health and now_s - health["wall_s"] < STALE_S:
                 row |= {"lag_ms": health["lag_ns"] / 1e6, "messages_per_s": health["per_s"]}
-            if link.answered_s and not _is_silent(link):
+            if link and link.answered_s and not _is_silent(link):
                 row["round_trip_ms"] = 1e3 * link.round_trip_s
             rows.append(row)
         return rows
 
-    def _state(self, member: "RemoteProcess", link: "HostLink") -> str:
+    def _state(self, member: Any, link: "HostLink | None") -> str:
         if member.state != "running":
             return f"ended ({member.outcome()})" if member.state == "ended" and member.code else member.state
-        if _is_silent(link):
+        if link and _is_silent(link):
             return f"host silent {link.silent_s():.0f} s"
-        if silent_s := self._no_sign_s(member.name, link):
+        if silent_s := self._no_sign_s(member.name, link.round_trip_s if link else 0.0):
             return f"no sign of life for {silent_s:.0f} s"
         waiting = (self.clock_now or {}).get("waiting_for", ())
         waited = next((each for each in waiting if each["name"] == member.name), None)
@@ -136,12 +135,12 @@ class StatusTable(Screen):
             return f"waited for {waited['since_wall_s']:.0f} s"
         return member.state
 
-    def _no_sign_s(self, name: str, link: "HostLink") -> float:
+    def _no_sign_s(self, name: str, round_trip_s: float) -> float:
         """Return for how long a process has been silent, 0 where that is not long [s, wall].
 
         All that is known of the others comes from the world: while that is silent, only the world is known to be.
         """
-        now_s, patience_s = time.monotonic(), SILENT_PROCESS_S + ROUND_TRIPS * link.round_trip_s
+        now_s, patience_s = time.monotonic(), SILENT_PROCESS_S + ROUND_TRIPS * round_trip_s
         heard_s = self._health[name]["wall_s"] if name in self._health else None
         world_s = max([health["wall_s"] for health in self._health.values()], default=now_s)
         world_s = max(world_s, (self.clock_now or {}).get("wall_s", world_s))

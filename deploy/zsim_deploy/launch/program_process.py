@@ -1,12 +1,15 @@
 """A program of a user's that is started with a run, watched like the run's own processes."""
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from zsim_api.programs import Program
+from zsim.scenario.scenario import Scenario
+from zsim_api.programs import Program, environment_of, filled
+from zsim_api.run_folder import Launch
 from zsim_deploy.launch.supervisor import end_text, last_line
 
+HERE = "here"  # as the host of a program that `zsim up` starts itself
 LEAVES_S = 2.0  # wall time that a program has to see that the run is over, before it is interrupted
 
 
@@ -18,6 +21,7 @@ class ProgramProcess:
     """
 
     is_program = True
+    host = HERE
 
     def __init__(
         self, name: str, words: Sequence[str], logs: Path, environment: Mapping[str, str], folder: Path | None
@@ -34,6 +38,10 @@ class ProgramProcess:
         if self._program is not None:
             self._program.close()
         self._program = Program(self._words, self._environment, self._log, self._folder)
+
+    @property
+    def state(self) -> str:
+        return "ended" if self.code is not None else "running" if self._program else "starting"
 
     @property
     def pid(self) -> int:
@@ -70,3 +78,25 @@ class ProgramProcess:
             self._asked.cancel()
         if self._program is not None:
             self._program.close()
+
+
+def programs_of(
+    scenario: Scenario, names: Iterable[str], endpoint: str, out: Path, launch: Launch
+) -> list[ProgramProcess]:
+    """Return some of the users' programs of a scenario; they run where its modules are, beside its file.
+
+    Args:
+        endpoint: at which they find the run; out: its folder.
+    """
+    folder, environment = next(map(Path, launch.modules), None), environment_of(endpoint, scenario.federation)
+    values = {"endpoint": endpoint, "federation": scenario.federation, "folder": str(out.absolute())}
+    return [
+        ProgramProcess(
+            name,
+            filled(scenario.own_programs[name].command, {**values, "name": name}),
+            out / "logs",
+            environment,
+            folder,
+        )
+        for name in names
+    ]

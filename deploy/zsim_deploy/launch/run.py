@@ -5,7 +5,7 @@ import os
 import re
 import signal
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,19 +16,18 @@ from zsim.errors import RecordError, RunFailedError, SessionError
 from zsim.output_folder import RECORD
 from zsim.record import repair
 from zsim.runtime.progress import JsonProgress, Screen
-from zsim.scenario.roles import driver_lines, expected_processes, watched_drones
+from zsim.scenario.roles import driver_lines, expected_processes, programs, watched_drones
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import BottomCamera, FrontCamera
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import launcher_files, require_files
 from zsim_agents.hosting import AgentSpec, agents_of
 from zsim_api import run_folder
-from zsim_api.programs import environment_of, filled
 from zsim_api.run_folder import JOURNAL, Launch
 from zsim_deploy.arguments import changed_options, load_scenario, pace_options
 from zsim_deploy.inventory import COMMANDS
 from zsim_deploy.launch.console_process import RunConsole
-from zsim_deploy.launch.program_process import ProgramProcess
+from zsim_deploy.launch.program_process import programs_of
 from zsim_deploy.launch.role_launcher import ChildProcess, RoleLauncher
 from zsim_deploy.launch.supervisor import EndSignals, Outcome, RunProcess, Supervisor, status_row
 from zsim_deploy.roles.stop_channel import REASONS, StopChannel, handled_by
@@ -168,7 +167,7 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
         commands[CONSOLE] = ["console", "--name", CONSOLE, "--folder", str(options.out), *reach]
     for role, name, drones in options.camera_children():
         commands[name] = [COMMANDS.get(role, role), "--name", name, *reach, "--", *drones]
-    children: list[RunProcess] = [*_programs(options, endpoint)]
+    children: list[RunProcess] = [*programs_of(scenario, programs(scenario), endpoint, options.out, options.launch)]
     for name, command in commands.items():
         on_line = supervisor.handle_line if name in ("world", CONSOLE) else None
         child = ChildProcess(name, command, logs, launcher, on_line)
@@ -177,18 +176,6 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
             options.console.own(child)
     rank = {name: i for i, name in enumerate(options.order)}
     return sorted(children, key=lambda child: rank.get(child.name, len(rank)))
-
-
-def _programs(options: RunOptions, endpoint: str) -> Iterator[ProgramProcess]:
-    """Yield the users' programs of a scenario; they run where its modules are, beside its file."""
-    scenario, expected = options.scenario, expected_processes(options.scenario)
-    folder = next(map(Path, options.launch.modules), None)
-    for name, program in scenario.own_programs.items():
-        if name in expected or not program.joins:
-            values = {"federation": scenario.federation, "folder": str(options.out.absolute()), "name": name}
-            words = filled(program.command, {"endpoint": endpoint, **values})
-            environment = environment_of(endpoint, scenario.federation)
-            yield ProgramProcess(name, words, options.out / "logs", environment, folder)
 
 
 def run_in_process(options: RunOptions, screen: Shown) -> Outcome:
