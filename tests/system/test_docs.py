@@ -96,7 +96,7 @@ KINDS = (
 ELSEWHERE = ("apt-get install ", "git clone ", "cd ", "python3 -m venv ", ".venv/bin/pip install ", ".venv/bin/jupyter ", "ssh ", "scp ",
              "rsync ", "sudo ", "zenohd ", "ufw ", "chrt ", "kill ", "docker ", "kubectl ", "sh ",
              ".venv/bin/pip wheel ", "export ", "make ", ".venv/bin/pytest ", ".venv/bin/python -m benchmarks",
-             "python examples/", "unzip ")  # fmt: skip
+             "python examples/", "unzip ", "mkdir ")  # fmt: skip
 
 
 class Block(NamedTuple):
