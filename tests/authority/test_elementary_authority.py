@@ -107,6 +107,14 @@ def test_the_source_as_plain_python_gives_the_same_bits(name: str) -> None:
         assert own(*given) == source(*given)
 
 
+@pytest.mark.parametrize("x", [709.0, 709.7, 709.78, 709.782712893384, 709.79, 1000.0, 1099.9])
+def test_where_exp_overflows_it_is_inf_also_as_plain_python(x: float) -> None:
+    with np.errstate(over="ignore"):
+        wanted = float(np.exp(x))
+    source: Callable[..., Any] = getattr(el.exp, "py_func", el.exp)
+    assert el.exp(x) == source(x) == pytest.approx(wanted, rel=4e-16)
+
+
 def test_distributions_are_those_of_scipy() -> None:
     x = np.linspace(-9, 9, 1001)
     found = [distributions.normal_probability(each) for each in x.tolist()]

@@ -182,7 +182,10 @@ def exp(x: float) -> float:
     cell = int(cells - _CELLS * power)
     series = r * r * (0.5 + r * (1.0 / 6.0 + r * (1.0 / 24.0 + r * (1.0 / 120.0 + r * (1.0 / 720.0)))))
     growth = r + (((a - r) - b) + series)  # e^r - 1
-    return math.ldexp(_EXP2[cell, 0] + (_EXP2[cell, 0] * growth + _EXP2[cell, 1]), int(power))
+    significand = _EXP2[cell, 0] + (_EXP2[cell, 0] * growth + _EXP2[cell, 1])
+    if power >= 1024.0:  # where ldexp of Python raises an error, and that of numba does not
+        return math.inf if power > 1024.0 else 2.0 * math.ldexp(significand, 1023)
+    return math.ldexp(significand, int(power))
 
 
 @_scalar

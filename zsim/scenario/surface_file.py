@@ -39,7 +39,7 @@ def triangles_of(path: Path, where: str, cell_m: float | None) -> Array:
     """
     kind = path.suffix.lower()
     if kind in (".csv", ".npy"):
-        heights = _read(path, where, np.load if kind == ".npy" else _text_grid)
+        heights = _read(path, where, _numpy_grid if kind == ".npy" else _text_grid)
         if heights.ndim != 2 or min(heights.shape) < 2 or cell_m is None:
             _refuse(
                 path, where, f"is a height map of {list(heights.shape)} heights", "must be 2 x 2 or more, with cell_m"
@@ -75,6 +75,10 @@ def points_of(path: Path, where: str) -> Array:
     if not len(points):
         _refuse(path, where, "has no point", "must have one or more")
     return points
+
+
+def _numpy_grid(path: Path) -> Array:
+    return np.load(path).astype(float, casting="same_kind")  # no archive, no complex numbers, no texts
 
 
 def _text_grid(path: Path) -> Array:
@@ -122,13 +126,22 @@ def unpacked(text: str) -> Array:
     Raises:
         ValueError: it is none.
     """
+    each = CORNERS * SINGLE.itemsize
+    reader = zlib.decompressobj()
     try:
-        data = zlib.decompress(base64.b64decode(text, validate=True))
+        data = reader.decompress(base64.b64decode(text, validate=True), TRIANGLES_MAX * each + 1)
     except (binascii.Error, zlib.error) as error:
         raise ValueError(f"is no triangles ({error})") from error
-    if not data or len(data) % (CORNERS * SINGLE.itemsize):
-        raise ValueError(f"has {len(data)} bytes; must have {CORNERS * SINGLE.itemsize} for each triangle")
-    return np.frombuffer(data, SINGLE).astype(float).reshape(-1, CORNERS)
+    if len(data) > TRIANGLES_MAX * each:  # a short text may be of any number of bytes
+        raise ValueError(f"has more than {TRIANGLES_MAX} triangles; must have at most {TRIANGLES_MAX}")
+    if not reader.eof:
+        raise ValueError("is no triangles (cut short)")
+    if not data or len(data) % each:
+        raise ValueError(f"has {len(data)} bytes; must have {each} for each triangle")
+    triangles = np.frombuffer(data, SINGLE).astype(float).reshape(-1, CORNERS)
+    if not np.isfinite(triangles).all():
+        raise ValueError("has a number that is not finite; must be finite")
+    return triangles
 
 
 def placed(surface: Any) -> Array:

@@ -22,6 +22,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from zsim.contract import keys
 from zsim.contract.agent_messages import AgentMessage
 from zsim.contract.flight_messages import Estimate, Mode, Status, Velocity
 from zsim.contract.snapshot import State
@@ -120,6 +121,7 @@ class Pilot(Agent):
         self._heard: dict[str, Motion] = {}
         self._state = "landed"
         self._p_W = self._v_W = np.zeros(3)
+        self._estimate_ns = -1  # of these
         self._is_engaged = self._has_flown = False
         self.begin(scenario)
 
@@ -146,12 +148,15 @@ class Pilot(Agent):
 
     def receive(self, key: str, message: Any) -> None:
         if isinstance(message, Estimate):
+            if message.t_ns < self._estimate_ns:
+                return  # a link that delays some more than others lets one overtake another
+            self._estimate_ns = message.t_ns
             self._p_W, self._v_W = np.array(message.position_m), np.array(message.velocity_m_s)
         elif isinstance(message, Status):
             self._state = message.state
         else:
-            drone = key.split("/")[1]
-            if drone != self._drone:
+            drone, former = keys.thing(key), self._heard.get(keys.thing(key))
+            if drone != self._drone and (former is None or message.t_ns >= former.t_ns):
                 self._heard[drone] = message
 
     def step(self, t_ns: int) -> list[Output]:
@@ -212,7 +217,7 @@ class Pilot(Agent):
         heard = {name: [m.t_ns, *m.position_m, *m.velocity_m_s, m.is_engaged] for name, m in self._heard.items()}
         return {
             "heard": heard, "state": self._state, "p_W": self._p_W, "v_W": self._v_W,
-            "is_engaged": self._is_engaged, "has_flown": self._has_flown,
+            "estimate_ns": self._estimate_ns, "is_engaged": self._is_engaged, "has_flown": self._has_flown,
         }  # fmt: skip
 
     def restore(self, state: State) -> None:
@@ -221,6 +226,7 @@ class Pilot(Agent):
             for name, (t_ns, *pv, engaged) in state["heard"].items()
         }
         self._state, self._p_W, self._v_W = state["state"], np.array(state["p_W"]), np.array(state["v_W"])
+        self._estimate_ns = state["estimate_ns"]
         self._is_engaged, self._has_flown = state["is_engaged"], state["has_flown"]
 
 

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -238,6 +239,11 @@ def _through(points: Sequence[PathPoint], yaw: float) -> Reference:
         yaw += math.remainder(wanted - yaw, math.tau)
         row[:] = *point.position_m, yaw
     times = [point.at_s for point in points]
+    if len(times) < 2:
+        raise TrajectoryError("has 1 entry; must have 2 or more")
+    for number, (before_s, after_s) in enumerate(pairwise(times), start=1):
+        if after_s <= before_s:
+            raise TrajectoryError(f"[{number}].at_s is {after_s:g}; must be > {before_s:g}, the one before")
     path = minimum_snap([t - times[0] for t in times], places)
     if not times[0]:
         return path

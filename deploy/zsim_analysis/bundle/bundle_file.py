@@ -155,7 +155,7 @@ def _manifest(path: Path, archive: zipfile.ZipFile) -> Manifest:
     size, stated = path.stat().st_size, sum(entry.file_size for entry in entries)
     if stated > size:
         raise RunError(f"{path}: its members have {stated} bytes, and the file {size}; must not overlap")
-    if MANIFEST.casefold() not in names:
+    if MANIFEST not in archive.namelist():
         raise RunError(f"{path}: holds no {MANIFEST}; must be a file that `zsim bundle` made")
     head = archive.getinfo(MANIFEST)
     if head.file_size > MANIFEST_BYTES_MAX:

@@ -10,9 +10,9 @@ from refused import has_terms
 from zsim.errors import RunError, ScenarioError
 from zsim.scenario import scenario_file
 from zsim_agents.hosting import check_plans
-from zsim_agents.references.flight import SHARE, checked_flight, exchange_flights, flight_of, limits_of
+from zsim_agents.references.flight import SHARE, FlightError, checked_flight, exchange_flights, flight_of, limits_of
 from zsim_agents.references.path import peaks_of
-from zsim_agents.references.requests import DroneRequestError, Goto, read_request
+from zsim_agents.references.requests import DroneRequestError, Goto, read_request, requested_flight
 
 FAST = [{"at_s": 0, "position_m": [0, 0, 2]}, {"at_s": 2, "position_m": [20, 0, 2]}]
 SLOW = [{"at_s": 0, "position_m": [0, 0, 2]}, {"at_s": 30, "position_m": [20, 0, 2], "yaw_deg": 90}]
@@ -133,6 +133,20 @@ def test_requests_that_cannot_be_understood_are_refused(op: str, args: dict[str,
         read_request(op, args)
     assert all(term in str(raised.value) for term in terms), raised.value
     assert isinstance(read_request("goto", {"position_m": [1, 2, 3]}), Goto)
+
+
+@pytest.mark.parametrize("times", [(0,), (1, 1), (2, 1), (0, 3, 3)])
+@pytest.mark.parametrize("kind", ["minimum_snap", "waypoints"])
+def test_a_request_for_points_without_rising_times_is_refused(kind: str, times: tuple[float, ...]) -> None:
+    """In a scenario the file is judged; what is asked for during a flight is judged here."""
+    drone = scenario_of(None).drones[0]
+    points = [{"at_s": at_s, "position_m": [k, 0, 2]} for k, at_s in enumerate(times)]
+    asked = read_request("follow", {kind: points, "fit": True})
+    if (kind, len(times)) == ("waypoints", 1):
+        return  # a place to stand at
+    with pytest.raises(FlightError) as raised:
+        requested_flight(asked, 5.0, np.array([0.0, 0, 2, 0]), np.zeros(4), drone, limits_of(drone, 9.81))
+    assert raised.value.path == kind
 
 
 def test_flights_are_functions_of_time_alone() -> None:

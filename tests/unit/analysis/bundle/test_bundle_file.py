@@ -118,6 +118,16 @@ def test_a_manifest_that_cannot_be_read_is_refused(bundle: Path, field: str) -> 
         pass
 
 
+def test_a_manifest_of_another_spelling_is_none(bundle: Path) -> None:
+    def change(entry: zipfile.ZipInfo, content: bytes) -> tuple[zipfile.ZipInfo, bytes]:
+        if entry.filename == MANIFEST:
+            entry.filename = MANIFEST.upper()
+        return entry, content
+
+    with refused(RunError, "other.zsim", MANIFEST), opened(rewritten(bundle, change)):
+        pass
+
+
 def test_what_is_compressed_or_larger_than_the_file_is_refused(bundle: Path) -> None:
     def squeezed(entry: zipfile.ZipInfo, content: bytes) -> tuple[zipfile.ZipInfo, bytes]:
         entry.compress_type = zipfile.ZIP_DEFLATED

@@ -10,7 +10,7 @@ import pytest
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.obstacle import COLUMNS
-from zsim.scenario.surface_file import placed
+from zsim.scenario.surface_file import packed, placed
 from zsim.schema import plugin
 from zsim_world.physics.rays import cast, scene
 
@@ -20,7 +20,8 @@ CORNERS = np.array([[[0, -1, 0], [0, 1, 0], [0, 0, 2]], [[2, -1, 0], [2, 1, 0], 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Write the same two triangles in every format; height maps and clouds of other shapes."""
-    monkeypatch.setenv(plugin.FOLDERS, str(tmp_path))
+    monkeypatch.setenv(plugin.FOLDERS, "")
+    plugin.search(tmp_path)
     facets = b"".join(struct.pack("<12fH", 0, 0, 0, *each.ravel(), 0) for each in CORNERS)
     (tmp_path / "binary.stl").write_bytes(bytes(80) + struct.pack("<I", len(CORNERS)) + facets)
     loops = "".join(
@@ -35,6 +36,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "mesh.obj").write_text(f"{vertices}f 1 2 3\nf 4 5 6\n")
     (tmp_path / "hill.csv").write_text("0,0,0\n0,3,0\n0,0,0\n")
     np.save(tmp_path / "hill.npy", [[0, 0, 0], [0, 3, 0], [0, 0, 0]])
+    np.save(tmp_path / "complex.npy", np.full((3, 3), 1j))
+    np.savez(tmp_path / "archive.npz", np.zeros((3, 3)))
+    (tmp_path / "archive.npz").rename(tmp_path / "archive.npy")
     (tmp_path / "bad.csv").write_text("0,much\n")
     (tmp_path / "nan.csv").write_text("0,0\n0,nan\n")
     (tmp_path / "torn.stl").write_bytes(bytes(80) + struct.pack("<I", 9) + facets)
@@ -101,7 +105,12 @@ def test_a_cloud_becomes_boxes_of_its_occupied_cells(file: str):
         ({"surfaces": [{"name": "m", "file": "nan.csv", "cell_m": 1}]}, "surfaces[0].file"),
         ({"surfaces": [{"name": "m", "file": "torn.stl"}]}, "surfaces[0].file"),
         ({"surfaces": [{"name": "m", "file": 5}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "file": "complex.npy", "cell_m": 1}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "file": "archive.npy", "cell_m": 1}]}, "surfaces[0].file"),
         ({"surfaces": [{"name": "m", "triangles": "no"}]}, "surfaces[0].triangles"),
+        ({"surfaces": [{"name": "m", "triangles": packed(np.ones((4, 9)))[:-8]}]}, "surfaces[0].triangles"),
+        ({"surfaces": [{"name": "m", "triangles": packed(np.full((1, 9), np.nan))}]}, "surfaces[0].triangles"),
+        ({"surfaces": [{"name": "m", "triangles": packed(np.ones((400_000, 9)))}]}, "surfaces[0].triangles"),
         ({"surfaces": [{"name": "m", "file": "hill.csv", "cell_m": 0}]}, "surfaces[0].file"),
         ({"surfaces": [{"name": "m", "file": "hill.csv", "cell_m": 1, "scale": 0}]}, "surfaces[0].scale"),
         ({"surfaces": [{"name": "m", "file": "hill.csv", "cell_m": 1, "yaw_deg": "n"}]}, "surfaces[0].yaw_deg"),
