@@ -67,6 +67,7 @@ LONG = (
     "estimation.md",
     "extending.md",
     "faults.md",
+    "fmu.md",
     "hunt.md",
     "laws.md",
     "obstacles.md",
