@@ -27,7 +27,8 @@ def hill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Return the document of the flight to a height map from x = 4 to 14 m, in cells of 1 m."""
     rows = [",".join(f"{height_m(x):g}" for x in range(4, 15))] * 9
     (tmp_path / "hill.csv").write_text("\n".join(rows))
-    monkeypatch.setenv(plugin.FOLDERS, str(tmp_path))
+    monkeypatch.setenv(plugin.FOLDERS, "")
+    plugin.search(tmp_path)
     surface = {"name": "hill", "file": "hill.csv", "cell_m": 1, "position_m": [9, 0, 0]}
     plan = {"takeoff_s": 3, "target": {"x_c": 9, "y_c": 0, "z_c": 4, "p": 4}, "land_s": 50}
     drones = [{"name": f"drone{k + 1}", "position_m": [x, 0, 0]} for k, x in enumerate((2, -2))]

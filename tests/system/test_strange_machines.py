@@ -166,6 +166,34 @@ def test_shared_memory_is_not_needed(tmp_path: Path, flown: Path, options: str) 
         assert completeness(record).complete
 
 
+MOUNTED = "mkdir $OUT/small && mount -t tmpfs -o"
+LACKING = {  # what is before the command of a run, in a namespace of mounts; the run's exit code
+    "any variable": ("env -i", 0),
+    "a folder for temporary files": ("TMPDIR=/nowhere", 0),
+    "room for temporary files": (
+        f"{MOUNTED} size=4k tmpfs $OUT/small && ! head -c 9000 /dev/zero >$OUT/small/x && TMPDIR=$OUT/small", 0
+    ),
+    "a folder that can be written": (f"{MOUNTED} ro tmpfs $OUT/small && cd $OUT/small &&", 0),
+    "a folder": ("mkdir $OUT/gone && cd $OUT/gone && rmdir $OUT/gone &&", USER_FAULT),
+}  # fmt: skip
+
+
+@needs_root
+@pytest.mark.parametrize("lacking", LACKING)
+def test_a_run_without(tmp_path: Path, flown: Path, lacking: str) -> None:
+    before, code = LACKING[lacking]
+    words = [*ZSIM, "run", str(flown.parent / "pair.yaml"), *SHORT, "--out", str(tmp_path / "run")]
+    line = f"OUT={shlex.quote(str(tmp_path))}; {before} {shlex.join(words)}"
+    done = subprocess.run(
+        ["unshare", "-m", "sh", "-c", line], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stdout + done.stderr
+    if code == 0:
+        with RecordReader(tmp_path / "run" / "run.mcap") as record:
+            assert completeness(record).complete
+
+
 KERNEL = """
 import os, sys
 from zsim.math.compiled import kernel

@@ -10,6 +10,7 @@ others have written look names up without importing anything (`names_only`).
 
 import ast
 import importlib
+import json
 import os
 import re
 import sys
@@ -52,11 +53,12 @@ def search(*places: Path) -> None:
     Args:
         places: folders, that of the document first; those that are not there are left out.
     """
-    os.environ[FOLDERS] = os.pathsep.join(dict.fromkeys(str(place.resolve()) for place in places if place.is_dir()))
+    found = dict.fromkeys(str(place.resolve()) for place in places if place.is_dir())
+    os.environ[FOLDERS] = json.dumps([*found])  # a name may hold any separator
 
 
 def folders() -> tuple[Path, ...]:
-    return tuple(map(Path, filter(None, os.environ.get(FOLDERS, "").split(os.pathsep))))
+    return tuple(map(Path, json.loads(os.environ.get(FOLDERS) or "[]")))
 
 
 def beside(name: str) -> Path:

@@ -120,6 +120,9 @@ def _run() -> int | str | None:
         note(f"{' '.join(sys.argv[1:2])}: {lacking}")
         return USER_FAULT
     except OSError as error:
+        if isinstance(error, FileNotFoundError) and not _is_in_a_folder():
+            note("the current folder has been removed; change to another one")
+            return USER_FAULT
         if error.errno not in FILE_FAULTS or error.filename is None:
             raise
         path = os.fsdecode(error.filename)
@@ -131,6 +134,13 @@ def _run() -> int | str | None:
     if code == INTERRUPTED:
         note("interrupted")
     return code
+
+
+def _is_in_a_folder() -> bool:
+    try:
+        return bool(os.getcwd())
+    except FileNotFoundError:
+        return False
 
 
 def _show_usage(error: Any) -> None:

@@ -20,7 +20,8 @@ CORNERS = np.array([[[0, -1, 0], [0, 1, 0], [0, 0, 2]], [[2, -1, 0], [2, 1, 0], 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Write the same two triangles in every format; height maps and clouds of other shapes."""
-    monkeypatch.setenv(plugin.FOLDERS, str(tmp_path))
+    monkeypatch.setenv(plugin.FOLDERS, "")
+    plugin.search(tmp_path)
     facets = b"".join(struct.pack("<12fH", 0, 0, 0, *each.ravel(), 0) for each in CORNERS)
     (tmp_path / "binary.stl").write_bytes(bytes(80) + struct.pack("<I", len(CORNERS)) + facets)
     loops = "".join(

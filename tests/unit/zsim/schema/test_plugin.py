@@ -41,14 +41,16 @@ number = 3
 
 @pytest.fixture
 def beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with modules that is searched."""
+    """A folder with modules that is searched; its name holds what separates paths elsewhere."""
     monkeypatch.setenv(plugin.FOLDERS, "")
     monkeypatch.setattr(sys, "path", [*sys.path])
-    (tmp_path / "plugin_meter.py").write_text(SOURCE)
-    (tmp_path / "plugin_broken.py").write_text("1 / 0\n")
-    (tmp_path / "plugin_exits.py").write_text("raise SystemExit\n")
-    plugin.search(tmp_path)
-    return tmp_path
+    folder = tmp_path / "12:30 ü;"  # as of a run that is named after its time
+    folder.mkdir()
+    (folder / "plugin_meter.py").write_text(SOURCE)
+    (folder / "plugin_broken.py").write_text("1 / 0\n")
+    (folder / "plugin_exits.py").write_text("raise SystemExit\n")
+    plugin.search(folder)
+    return folder
 
 
 def test_a_method_may_take_more_than_it_is_given(beside: Path) -> None:
