@@ -47,6 +47,7 @@ BUNDLE = "violation.zsim"
 OWN_FILES = (PLAN, TABLE, SCENARIO, VIOLATION, BUNDLE, "summary.json", "report.html", "figures", ".lock")
 SEARCH, CAUSE, RECORD = "search", "each cause", "record"  # stages, beside those of `shrink`
 SAME_BITS = "same_bits"  # figure: truth is the same to the bit as in the flight in which no process dies
+MISSES_MAX = 100  # draws one after the other that cannot be flown, chosen: then what varies is wrong
 DECIMALS = 6  # of margins in the table
 
 
@@ -386,12 +387,19 @@ class _Hunt:
         flights, budget_s = self._request.flights, self._request.budget_s
         until_s = None if budget_s is None else time.monotonic() + budget_s
         pending: deque[int] = deque()
-        drawn = 0
+        drawn = misses = 0
         try:
             while True:
                 while len(pending) < LAG and (flights is None or drawn < flights) and (drawn == 0 or self.flown):
-                    pending.append(self._submit(self._strategy.draw(), SEARCH))
                     drawn += 1
+                    try:
+                        pending.append(self._submit(self._strategy.draw(), SEARCH))
+                    except ScenarioError:  # as of a normal number that its field does not allow
+                        misses += 1
+                        if misses == MISSES_MAX:
+                            raise
+                        continue
+                    misses = 0
                     if drawn == 1:
                         break  # the flight without faults shows whether the figures are there
                 if not pending or (until_s is not None and time.monotonic() >= until_s):
