@@ -28,7 +28,7 @@ from rich.console import Console
 
 from zsim import __version__
 from zsim.errors import ReportError, RunError, ScenarioError
-from zsim.output_folder import refuse_others, take_lock
+from zsim.output_folder import held_folder
 from zsim.scenario.faults import PROCESS_KILL
 from zsim.scenario.scenario import Scenario
 from zsim.schema import yaml_file
@@ -170,18 +170,9 @@ def hunt(request: HuntRequest) -> Hunted:
     texts, document = _with_functions(request.requirements, request.document)
     requirements = _requirements(texts)
     space = HuntSpace(document, request.source, request.faults, request.without, request.vary, request.most)
-    try:
-        request.out.mkdir(parents=True, exist_ok=True)
-        if not (request.out / PLAN).exists():
-            refuse_others(request.out, OWN_FILES, request.force, "hunt into")
-        elif not request.force:
-            raise RunError(f"{request.out}: holds a hunt already; --force replaces it, or give --out another folder")
-        lock = (request.out / ".lock").open("w")
-    except OSError as error:
-        raise RunError(f"{request.out}: cannot be made ({error.strerror}); give --out another folder") from error
-    with lock:
-        if not take_lock(lock):
-            raise RunError(f"{request.out}: another hunt is at work there; give --out another folder")
+    if (request.out / PLAN).exists() and not request.force:
+        raise RunError(f"{request.out}: holds a hunt already; --force replaces it, or give --out another folder")
+    with held_folder(request.out, PLAN, OWN_FILES, request.force, "hunt into", "another hunt is at work"):
         _forget(request.out)
         under_way = _Hunt(request, space, texts, requirements)
         hunted = Hunted(request, space, under_way.run(), under_way.flown)
