@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from falling import energy, fly, tilt_deg
+from falling import check_slide, energy, fly, tilt_deg
 
 from zsim.contract.snapshot import pack, unpack
 from zsim.math.frames import quaternion_from_rpy
@@ -81,14 +81,7 @@ def test_on_a_slope_it_slides_where_the_tangent_exceeds_the_friction(share: floa
     slope = math.atan(share * FRAME.friction)
     fleet, away = over(plane(slope, cell_m, max(WIDE_M, cell_m / 2))), FRAME.foot_depth_m - FRAME.foot_sag_m
     put(fleet, (away * math.sin(slope), 0.0, FLOOR_M + away * math.cos(slope)), quaternion_from_rpy((0.0, slope, 0.0)))
-    track = fly(fleet, 1.0)[:, 0]
-    speeds = np.linalg.norm(track[:, 3:6], axis=1)
-    if slides:
-        expected = 9.80665 * (math.sin(slope) - FRAME.friction * math.cos(slope))
-        assert (speeds[-1] - speeds[19]) / 0.6 == pytest.approx(expected, rel=0.05)  # once the feet have settled
-    else:
-        assert speeds[-1] < 1e-5
-        assert np.linalg.norm(track[-1, :3] - track[0, :3]) < 0.01  # while the feet settle
+    check_slide(fleet, slope, FRAME.friction if slides else None, rel=0.05)
 
 
 @pytest.mark.parametrize("speed_m_s", [1.0, 6.0, 15.0])
