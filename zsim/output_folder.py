@@ -6,8 +6,8 @@ are kept apart by locks. Some file systems have none (Lustre, some of NFS, FUSE)
 
 import os
 import shutil
-from collections.abc import Collection
-from contextlib import suppress
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryFile, gettempdir, mkdtemp
@@ -56,6 +56,30 @@ def no_locks(folder: Path) -> str | None:
     except OSError as error:
         return f"{folder}: cannot be locked ({error.strerror}); do not let two commands write there at a time"
     return None
+
+
+@contextmanager
+def held_folder(folder: Path, mark: str, own: Collection[str], force: bool, use: str, others: str) -> Iterator[None]:
+    """Make a folder, and hold it as long as the block lasts against others that work there.
+
+    Args:
+        mark: file of a folder in which the command has worked before; another one is taken as by `refuse_others`.
+        others: for the error, where it is held: "another hunt is at work".
+
+    Raises:
+        RunError: it holds something else, is held, or cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not (folder / mark).exists():
+            refuse_others(folder, own, force, use)
+        held = (folder / ".lock").open("w")
+    except OSError as error:
+        raise RunError(f"{folder}: cannot be made ({error.strerror}); give --out another folder") from error
+    with held:
+        if not take_lock(held):
+            raise RunError(f"{folder}: {others} there; give --out another folder")
+        yield
 
 
 def refuse_others(folder: Path, own: Collection[str], force: bool, use: str) -> None:

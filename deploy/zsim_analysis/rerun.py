@@ -22,7 +22,7 @@ from zsim.errors import RecordError, RunError, RunFailedError
 from zsim.record import Recorded, RecordReader
 from zsim.runtime.agent import Agent, AgentGroup, Output
 from zsim.runtime.bus import Bus
-from zsim.runtime.inbox import NEVER_NS, Inbox, output_hold_ns
+from zsim.runtime.inbox import output_hold_ns
 from zsim.runtime.progress import PERIOD_S, Screen
 from zsim.runtime.rate_limit import RateLimit
 from zsim.scenario.faults import listed
@@ -379,10 +379,6 @@ class RerunBus(Bus):
         """Let the agents answer all that they have received."""
         while self._round():
             pass
-
-    def _leave_failed(self, agent: Agent, inbox: Inbox) -> None:
-        """Stop feeding an agent that failed; the world continues as far as it did on record."""
-        inbox.start_after(NEVER_NS)
 
     def _update_faults(self, faults: run_messages.Faults) -> None:
         if self._rerun:  # alone, the world receives the commands that resulted from them

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 import zsim
 from zsim.errors import ScenarioError
@@ -42,8 +43,10 @@ def test_five_drones_fly_among_the_trunks_and_touch_none(tmp_path: Path, compile
 
 
 def test_as_processes_they_have_the_same_bits_though_a_pilot_is_killed(tmp_path: Path, compiled: None) -> None:
-    alone = zsim.run(EXAMPLES / "forest.yaml", duration_s=9, out=tmp_path / "alone", progress=False)
-    with zsim.Federation(EXAMPLES / "forest.yaml", duration=9, out=tmp_path / "many") as flight:
+    document = yaml.safe_load((EXAMPLES / "forest.yaml").read_text())
+    (tmp_path / "forest.yaml").write_text(yaml.safe_dump({**document, "drones": document["drones"][:3]}))
+    alone = zsim.run(tmp_path / "forest.yaml", duration_s=9, out=tmp_path / "alone", progress=False)
+    with zsim.Federation(tmp_path / "forest.yaml", duration=9, out=tmp_path / "many") as flight:
         flight.wait_until(6.0)
         flight.kill("pilot.drone3")
         run = flight.run()

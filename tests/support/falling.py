@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.physics.fleet_arrays import STATE, VEHICLE
@@ -27,3 +28,15 @@ def energy(fleet: Fleet, state: np.ndarray) -> np.ndarray:
 
 def tilt_deg(state: np.ndarray) -> float:
     return math.degrees(math.acos(np.clip(1 - 2 * (state[7] ** 2 + state[8] ** 2), -1, 1)))
+
+
+def check_slide(fleet: Fleet, slope: float, friction: float | None, rel: float) -> None:
+    """Check that the first drone, put on a slope [rad], slides at g (sin s - mu cos s); where mu is None, that it stays."""
+    track = fly(fleet, 1.0)[:, 0]
+    speeds = np.linalg.norm(track[:, 3:6], axis=1)
+    if friction is not None:
+        expected = 9.80665 * (math.sin(slope) - friction * math.cos(slope))
+        assert (speeds[-1] - speeds[19]) / 0.6 == pytest.approx(expected, rel=rel)  # once the feet have settled
+    else:
+        assert speeds[-1] < 1e-5
+        assert np.linalg.norm(track[-1, :3] - track[0, :3]) < 0.01  # while the feet settle

@@ -22,13 +22,14 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import pytest
 from deployment import ROLES, START_S, STEP, Deployment, closing, in_flight
 from federation import PAIR, PAIR_ROLES, Federation, Record, Role
 from lab import Lab
+from said_lines import say
 from test_kill import Flight, check_end, check_whole
 
 from zsim.record import RecordReader
@@ -87,13 +88,7 @@ class Tally:
 def tally(request: pytest.FixtureRequest) -> Iterator[Tally]:
     made = Tally()
     yield made
-    plugins = request.config.pluginmanager
-    terminal: Any = plugins.getplugin("terminalreporter")
-    capture: Any = plugins.getplugin("capturemanager")
-    with capture.global_and_fixture_disabled():
-        terminal.ensure_newline()
-        for line in made.lines():
-            terminal.write_line(line)
+    say(request, made.lines())
 
 
 class Deaths:

@@ -67,6 +67,7 @@ LONG = (
     "estimation.md",
     "extending.md",
     "faults.md",
+    "fmu.md",
     "hunt.md",
     "laws.md",
     "obstacles.md",
@@ -74,6 +75,7 @@ LONG = (
     "records.md",
     "references.md",
     "sweep.md",
+    "testing.md",
 )  # what they show has tests of its own
 PATIENCE_S = 600  # wall seconds for one block on a machine that does other work as well
 PROGRAMS = ("octave-cli", "gcc", "node", "zenoh-ros2", "rostopic")
@@ -166,7 +168,7 @@ def test_python_runs(page: Path, tmp_path: Path) -> None:
         checkout.run(Block("bash run", f"python {script.name}", 1, 0), page)
 
 
-@pytest.mark.parametrize("page", pages_with("python test"))
+@pytest.mark.parametrize("page", pages_with("python test", long=LONG))
 def test_tests_pass(page: Path, tmp_path: Path, compiled: None) -> None:
     with Checkout(tmp_path) as checkout:
         for block in blocks(page):

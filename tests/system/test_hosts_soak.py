@@ -11,12 +11,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 from deployment import DISK_BYTES, NAMED_AFTER_S, ROLES, START_S, Deployment, closing, in_flight, in_process
 from federation import Role
 from lab import Lab
+from said_lines import say
 
 pytestmark = pytest.mark.soak
 
@@ -62,13 +63,7 @@ class Tally:
 def tally(request: pytest.FixtureRequest) -> Iterator[Tally]:
     made = Tally()
     yield made
-    plugins = request.config.pluginmanager
-    terminal: Any = plugins.getplugin("terminalreporter")
-    capture: Any = plugins.getplugin("capturemanager")
-    with capture.global_and_fixture_disabled():
-        terminal.ensure_newline()
-        for line in made.lines():
-            terminal.write_line(line)
+    say(request, made.lines())
 
 
 @functools.cache

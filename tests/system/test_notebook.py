@@ -123,7 +123,7 @@ def test_a_mistake_is_shown_with_the_user_s_own_lines_alone(notebook: Notebook) 
         assert frames.count("----> ") == (2 if code == mistaken else 1)
 
 
-@pytest.mark.parametrize("processes", [False, True])
+@pytest.mark.parametrize("processes", [False, pytest.param(True, marks=pytest.mark.soak)])
 def test_an_interrupt_ends_a_flight_with_its_record_whole(notebook: Notebook, processes: bool) -> None:
     names = []
     shown = 0

@@ -17,7 +17,7 @@ SIZE_MAX = 1_000_000  # bytes of a notebook, with its pictures
 nbformat = pytest.importorskip("nbformat", reason="nbclient is not installed")
 nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed")
 pytest.importorskip("ipykernel", reason="ipykernel is not installed")
-SOAKED = ("2-own-estimator", "3-own-law")  # classes in cells have tests of their own
+SOAKED = ("2-own-estimator", "3-own-law", "4-train-a-policy")  # what they show has tests of its own
 AT_ONCE = [pytest.param(each, marks=[pytest.mark.soak] if each.stem in SOAKED else []) for each in NOTEBOOKS]
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 

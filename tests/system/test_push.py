@@ -145,6 +145,7 @@ def test_a_host_without_sftp_is_a_line(lab: Lab, hosts: Path, monkeypatch: pytes
     assert has_terms(h2, "h2", "SFTP", "sshd_config")
 
 
+@pytest.mark.soak
 def test_a_push_that_is_interrupted_does_not_disturb_the_next_one(lab: Lab, hosts: Path) -> None:
     gather(lab, hosts, "h2")
     command = (*PUSH, "--hosts", str(hosts), "--host", "h2")

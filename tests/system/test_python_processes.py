@@ -93,6 +93,7 @@ class TwoRates(zsim.ControlLaw):
         return c[:2]
 
 
+@pytest.mark.soak  # the next one has the same law and the same error
 def test_a_law_that_fails_before_the_first_gate_is_an_error(tmp_path: Path, compiled: None) -> None:
     (tmp_path / "pair.yaml").write_text(PAIR)
     with pytest.raises(RunFailedError, match=r"TwoRates\.rates .*\(2,\)"):

@@ -2,6 +2,7 @@
 
 import csv
 import errno
+import fcntl
 import io
 import os
 import re
@@ -28,7 +29,7 @@ import errno, fcntl, os
 def flock(*_):
     raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
 fcntl.flock = flock
-"""
+"""  # for what is started; run here, it is undone by monkeypatch
 
 
 def zsim(*arguments: str, **variables: str) -> "subprocess.CompletedProcess[str]":
@@ -250,23 +251,25 @@ def test_a_folder_of_somebody_else_is_not_run(monkeypatch: pytest.MonkeyPatch, t
 
 
 @pytest.fixture
-def lockless(tmp_path: Path) -> dict[str, str]:
-    """Variables by which every Python finds a file system without locks, as some of NFS and Lustre are."""
+def lockless(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let this process, and every Python that it starts, find a file system without locks, as some of NFS and Lustre are."""
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(LOCKLESS)
-    return {"PYTHONPATH": str(tmp_path / "site")}
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
+    monkeypatch.setattr(fcntl, "flock", fcntl.flock)
+    exec(LOCKLESS)
 
 
-@pytest.mark.usefixtures("compiled")
-def test_a_run_and_a_sweep_go_on_without_locks(tmp_path: Path, lockless: dict[str, str]) -> None:
+@pytest.mark.usefixtures("compiled", "lockless")
+def test_a_run_and_a_sweep_go_on_without_locks(tmp_path: Path) -> None:
     scenario = tmp_path / "pair.yaml"
     scenario.write_text(PAIR)
     reason = os.strerror(errno.EOPNOTSUPP)
     run = ("run", "--in-process", *SHORT)
     for command, *options in (run, (*run, "--force"), ("sweep", "--runs", "1", *SHORT)):
         out = tmp_path / f"{command}s"
-        done = zsim(command, str(scenario), *options, "--out", str(out), **lockless)
-        assert done.returncode == 0, done.stderr
+        done = run_here(command, str(scenario), *options, "--out", str(out))
+        assert done.code == 0, done.stderr
         assert [line for line in done.stderr.splitlines() if reason in line] == [
             f"{out}: cannot be locked ({reason}); do not let two commands write there at a time"
         ]

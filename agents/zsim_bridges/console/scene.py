@@ -47,6 +47,7 @@ NAMED_MAX = 60  # drones with their names beside them; more would hide each othe
 LARGE_MAX = 12  # names in full, at full size; of more drones short names, smaller
 SMALL = 0.8  # of the size of a name
 SOLID = (134, 142, 150)
+EDGE = (96, 102, 118)  # of the triangles of a surface, whose slopes differ little in light
 GHOST, ELLIPSOID, WIND, SIDE = (77, 171, 247), (250, 176, 5), (21, 170, 191), (226, 0, 134)
 PREVIEW = (217, 72, 15)
 PREVIEW_PX = 3.0  # of a previewed way
@@ -244,6 +245,7 @@ class SceneNodes:
             faces = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
             look: Any = {"color": SOLID, "flat_shading": True, "side": "double"}
             self._scene.add_mesh_simple(f"/surfaces/{each.name}", corners, faces, **look)
+            self._scene.add_mesh_simple(f"/surfaces/{each.name}/edges", corners, faces, color=EDGE, wireframe=True)
 
     def references(self, lines: Array) -> None:
         """Draw the paths of drones that fly by themselves, as segments (M, 2, 3) [m; W]."""

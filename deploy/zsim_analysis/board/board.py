@@ -24,8 +24,8 @@ from msgspec import Struct
 from rich.console import Console
 
 from zsim import __version__
-from zsim.errors import ReportError, RunError, ScenarioError
-from zsim.output_folder import refuse_others, take_lock
+from zsim.errors import ReportError, ScenarioError
+from zsim.output_folder import held_folder
 from zsim.scenario import scenario_file
 from zsim_agents.hosting import check_classes
 from zsim_agents.laws.reference import FormationReference, polygon
@@ -110,16 +110,7 @@ def fly_board(request: BoardRequest) -> list[Row]:
         KeyboardInterrupt: the finished flights are in the journal.
     """
     tasks = _tasks(request)
-    try:
-        request.out.mkdir(parents=True, exist_ok=True)
-        if not (request.out / JOURNAL).exists():
-            refuse_others(request.out, OWN_FILES, request.force, "write a board into")
-        lock = (request.out / ".lock").open("w")
-    except OSError as error:
-        raise RunError(f"{request.out}: cannot be made ({error.strerror}); give --out another folder") from error
-    with lock:
-        if not take_lock(lock):
-            raise RunError(f"{request.out}: another board is flown there; give --out another folder")
+    with held_folder(request.out, JOURNAL, OWN_FILES, request.force, "write a board into", "another board is flown"):
         known = {row["identity"]: row for row in read_journal(request.out / JOURNAL)}
         missing = [task for task in tasks if task.varied["identity"] not in known]
         with SweepScreen(len(tasks), len(tasks) - len(missing), request.console) as screen:

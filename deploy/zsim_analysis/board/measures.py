@@ -120,7 +120,7 @@ def shape_errors(flown: Flown) -> Array:
             p, c = p - _mean(p)[:, None], c - _mean(c)[:, None]
         product, size = np.nansum(c.conj() * p, axis=1), np.nansum(np.abs(c) ** 2, axis=1)
         turn = product / np.abs(product) if "rotation" in wanted.invariances else np.ones(len(p), complex)
-        growth = (product / turn).real / size if "scale" in wanted.invariances else np.ones(len(p))
+        growth = np.maximum((product / turn).real, 0.0) / size if "scale" in wanted.invariances else np.ones(len(p))
         errors = np.sqrt(_mean(np.abs(p - (growth * turn)[:, None] * c) ** 2).real)
     return np.where((~np.isnan(p)).sum(axis=1) > 1, errors, np.nan)
 

@@ -28,7 +28,7 @@ from rich.console import Console
 
 from zsim import __version__
 from zsim.errors import ReportError, RunError, ScenarioError
-from zsim.output_folder import refuse_others, take_lock
+from zsim.output_folder import held_folder
 from zsim.scenario.faults import PROCESS_KILL
 from zsim.scenario.scenario import Scenario
 from zsim.schema import yaml_file
@@ -47,6 +47,7 @@ BUNDLE = "violation.zsim"
 OWN_FILES = (PLAN, TABLE, SCENARIO, VIOLATION, BUNDLE, "summary.json", "report.html", "figures", ".lock")
 SEARCH, CAUSE, RECORD = "search", "each cause", "record"  # stages, beside those of `shrink`
 SAME_BITS = "same_bits"  # figure: truth is the same to the bit as in the flight in which no process dies
+MISSES_MAX = 100  # draws one after the other that cannot be flown, chosen: then what varies is wrong
 DECIMALS = 6  # of margins in the table
 
 
@@ -169,18 +170,9 @@ def hunt(request: HuntRequest) -> Hunted:
     texts, document = _with_functions(request.requirements, request.document)
     requirements = _requirements(texts)
     space = HuntSpace(document, request.source, request.faults, request.without, request.vary, request.most)
-    try:
-        request.out.mkdir(parents=True, exist_ok=True)
-        if not (request.out / PLAN).exists():
-            refuse_others(request.out, OWN_FILES, request.force, "hunt into")
-        elif not request.force:
-            raise RunError(f"{request.out}: holds a hunt already; --force replaces it, or give --out another folder")
-        lock = (request.out / ".lock").open("w")
-    except OSError as error:
-        raise RunError(f"{request.out}: cannot be made ({error.strerror}); give --out another folder") from error
-    with lock:
-        if not take_lock(lock):
-            raise RunError(f"{request.out}: another hunt is at work there; give --out another folder")
+    if (request.out / PLAN).exists() and not request.force:
+        raise RunError(f"{request.out}: holds a hunt already; --force replaces it, or give --out another folder")
+    with held_folder(request.out, PLAN, OWN_FILES, request.force, "hunt into", "another hunt is at work"):
         _forget(request.out)
         under_way = _Hunt(request, space, texts, requirements)
         hunted = Hunted(request, space, under_way.run(), under_way.flown)
@@ -395,12 +387,19 @@ class _Hunt:
         flights, budget_s = self._request.flights, self._request.budget_s
         until_s = None if budget_s is None else time.monotonic() + budget_s
         pending: deque[int] = deque()
-        drawn = 0
+        drawn = misses = 0
         try:
             while True:
                 while len(pending) < LAG and (flights is None or drawn < flights) and (drawn == 0 or self.flown):
-                    pending.append(self._submit(self._strategy.draw(), SEARCH))
                     drawn += 1
+                    try:
+                        pending.append(self._submit(self._strategy.draw(), SEARCH))
+                    except ScenarioError:  # as of a normal number that its field does not allow
+                        misses += 1
+                        if misses == MISSES_MAX:
+                            raise
+                        continue
+                    misses = 0
                     if drawn == 1:
                         break  # the flight without faults shows whether the figures are there
                 if not pending or (until_s is not None and time.monotonic() >= until_s):

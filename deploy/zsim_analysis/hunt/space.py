@@ -293,6 +293,13 @@ class HuntSpace:
 
     def _check_ends(self, rules: Sequence[str]) -> None:
         """Refuse what no scenario may have: both ends of every range, and each of several values."""
+        for path, axis in self.fields.items():
+            both = (axis.first, axis.second) if isinstance(axis, Draw) else axis.values
+            for value in both if isinstance(axis, Grid) or axis.kind == "uniform" else both[:1]:
+                try:
+                    self.scenario(Case(self.base.seed, {path: value}))
+                except ScenarioError as error:
+                    raise ScenarioError([f"--vary {path}={text_of(value)}: {line}" for line in error.faults]) from error
         owners, ends = [], []
         for name, space in self.kinds.items():
             for end in (0, -1):

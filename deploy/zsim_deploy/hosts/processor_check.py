@@ -46,7 +46,7 @@ def check_processor(scenario: Path, duration_s: float, say: Callable[[str], None
         code, text = _finished(("rerun", out, "--trust"), older_processor(), (0, 1))  # whose code has just flown
     if code:
         named = [line for line in text.splitlines() if "differs" in line]
-        found = "; ".join(dict.fromkeys(named)) or text.strip().splitlines()[-1]
+        found = "; ".join(dict.fromkeys(named)) or (text.strip() or "it printed nothing").splitlines()[-1]
         return f"{scenario}: on another processor, {found}; {ADVICE}"
     say("flown again as an older processor computes: the same to the bit")
     return ""
@@ -58,4 +58,4 @@ def _finished(words: tuple[str, ...], settings: dict[str, str], allowed: tuple[i
     if done.returncode not in allowed:
         last = (done.stderr or done.stdout).strip().splitlines() or ["it printed nothing"]
         raise RunError(f"zsim {words[0]} ended with exit code {done.returncode}: {last[-1]}")
-    return done.returncode, done.stdout
+    return done.returncode, done.stdout or done.stderr

@@ -36,6 +36,7 @@ def error(p: NDArray[Any], *invariances: str) -> float:
         (1.5 * C - 2, ("translation",), 1.5),
         (1.5 * C - 2, ("translation", "rotation"), 1.5),
         (1.5 * C - 2, ("translation", "scale"), 0.0),
+        (-C, ("translation", "scale"), 3.0),  # turned inside out: no growth makes it of that
         (C * [1, -1], ("translation", "rotation"), 3.0 * math.sqrt(2)),  # a mirrored figure is another one
     ],
 )  # fmt: skip

@@ -197,6 +197,15 @@ def test_ctrl_c_leaves_what_was_found(
     assert len(rows_of(hunted)) == len(hunted.flown) <= stops_after
 
 
+def test_a_draw_that_no_scenario_may_have_is_left_out_and_the_hunt_goes_on(fly: Callable[..., Hunted]) -> None:
+    path = "environment.wind.gust_m_s"
+    hunted = fly(vary=(f"{path}=normal(0, 1)",), requirements=("min_separation_m > -9",), flights=60)
+    drawn = [each.case.values[path] for each in hunted.flown[1:]]
+    assert 10 < len(drawn) < 59
+    assert min(drawn) >= 0.0
+    assert hunted.summary.verdict == "not violated"
+
+
 def test_the_folder_of_a_hunt_is_not_hunted_into_again(fly: Callable[..., Hunted], tmp_path: Path) -> None:
     fly(flights=3, out=tmp_path / "a")
     with pytest.raises(RunError) as error:
@@ -220,6 +229,10 @@ def test_the_folder_of_a_hunt_is_not_hunted_into_again(fly: Callable[..., Hunted
         ({"faults": ("gust velocity",)}, ("--fault", "'gust velocity'", "NAME=VALUE")),
         ({"vary": ("seed=1,2",)}, ("--vary", "'seed=1,2'")),
         ({"vary": ("wind.gust_m_s=uniform(2)",)}, ("--vary", "uniform(2)")),
+        ({"vary": ("environment.wind.gust_m_s=0,much",)}, ("--vary", "environment.wind.gust_m_s", "'much'")),
+        ({"vary": ("environment.wind.gust_m_s=uniform(-1, 2)",)}, ("--vary", "environment.wind.gust_m_s", "-1.0")),
+        # hardly any that is drawn is a mass
+        ({"vary": ("drones[0].mass_kg=normal(0.4, 1e7)",), "faults": ()}, ("drones[0].mass_kg", "100")),
     ],
 )
 def test_what_cannot_be_hunted_is_refused(

@@ -416,7 +416,7 @@ def test_surfaces_are_drawn_where_the_scenario_puts_them(viser: PrivateViser):
         stage.surfaces([ramp])
     finally:
         del scene.add_mesh_simple
-    assert added == {"/surfaces/ramp": [[[5, 6, 7], [7, 6, 7], [5, 7, 8]]]}
+    assert added == {name: [[[5, 6, 7], [7, 6, 7], [5, 7, 8]]] for name in ("/surfaces/ramp", "/surfaces/ramp/edges")}
 
 
 def test_a_run_that_nobody_watched_leaves_its_last_picture_and_sends_what_was_moved_now_or_never(viser: PrivateViser):
