@@ -109,6 +109,11 @@ class BySource(Talker):
 class Foreign(Talker):
     def step(self, t_ns):
         return [zsim.Output(Word.of("d2"), Word(t_ns=t_ns, seq=0, said=0.0))] if self.drone == "d1" else []
+
+
+class Pirate(Talker):
+    def step(self, t_ns):
+        return [self.command(t_ns, "d2", zsim.takeoff())] if self.drone == "d1" else []
 """
 TALK = """
 name: talk
@@ -204,6 +209,7 @@ def test_a_fault_of_the_radio_loses_their_messages_with_distance(groups: list[li
         ("Number", ("talk.d1 at 0.00 s", "talkers:Number.step", "0")),
         ("Unlisted", ("talk.d1 at 0.00 s", "talkers:Unlisted.step", "talk/d1/word", "Word", "messages")),
         ("Foreign", ("talk.d1 at 0.00 s", "talkers:Foreign.step", "talk/d2/word", "talk/d1/word")),
+        ("Pirate", ("talk.d1 at 0.00 s", "talkers:Pirate.step", "drone/d2/cmd/mode", "d1")),
     ],
 )
 def test_what_cannot_be_sent_ends_the_run_with_class_key_field_and_gate(

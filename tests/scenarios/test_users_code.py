@@ -1,15 +1,19 @@
 """What a user's class does wrong is told with class, method, gate, and value or line, and its module is found again."""
 
+import re
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from shutil import move
 
 import pytest
+from federation import Federation
 from refused import has_terms
 from typer.testing import CliRunner
 
 from zsim.errors import DocumentError, RunFailedError, UserCodeError
+from zsim.record import RecordReader
 from zsim.scenario import scenario_file
 from zsim.schema import plugin
 from zsim.sensors.sensor_catalogue import sensor_type
@@ -389,3 +393,38 @@ def test_nor_does_what_reads_a_record_and_a_rerun_only_if_told_to(
     with pytest.raises(DocumentError, match="come with all its numbers"):  # a record made to name a module
         scenario_file.from_text("name: a\ndrones: [{name: d1, model: marked, position_m: [0, 0, 0]}]\n")
     assert "marked" in sys.modules  # of the rerun
+
+
+ENDLESS = """
+import time
+import zsim
+
+
+class Endless(zsim.Agent):
+    def __init__(self, drone):
+        super().__init__()
+
+    def receive(self, key, message):
+        pass
+
+    def step(self, t_ns):
+        while t_ns >= 1_000_000_000:
+            print("in the loop", flush=True)
+            time.sleep(60)
+        return []
+"""
+
+
+def test_one_that_never_returns_is_interrupted_and_named_and_the_record_is_left(
+    federation: Federation,
+) -> None:
+    (federation.folder / "endless.py").write_text(ENDLESS)
+    drone, rider = "{name: drone1, position_m: [0, 0, 0]}", "{class: 'endless:Endless', per: drone}"
+    scenario = f"name: endless\nduration_s: 2\ndrones: [{drone}]\nagents: {{rider: {rider}}}\n"
+    run = federation.run(scenario, "--in-process")
+    run.line("in the loop")
+    run.signal(signal.SIGINT)
+    run.ends(with_code=130)
+    assert re.search(r"rider.drone1 .* 1\.00 s \(.*endless\.py:16\)", run.text())
+    with RecordReader(federation.out / "run.mcap") as reader:
+        assert len(list(reader.messages(["drone/drone1/truth"]))) > 40

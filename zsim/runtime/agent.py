@@ -14,6 +14,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
+from types import FrameType
 from typing import Any, NamedTuple
 
 from msgspec import Struct
@@ -62,6 +63,7 @@ class Agent(ABC):
     repeats: tuple[str, ...] = ()  # keys of its outputs that carry the requests that it took, for `repeat`
     messages: tuple[type[AgentMessage], ...] = ()  # classes of messages of a user's that it publishes
     thing = ""  # name of the drone or cluster that it is of: the second part of its own name
+    _flies = ""  # the only drone that it may command, where it is of one
     _links: Links | None = None
     _transmitter: Transmitter | None = None
     _answered_ns = 0  # the gate whose inputs it took last
@@ -94,6 +96,7 @@ class Agent(ABC):
         self._seq.clear()
         drones = [drone.name for drone in info.drones]
         self.thing = (name or getattr(self, "name", default_name(type(self)))).partition(".")[2]
+        self._flies = self.thing if self.thing in drones and self.thing != MAIN else ""
         statuses = [keys.status(drone) for drone in ([self.thing] if self.thing in drones else drones)]
         at_gates = [keys.estimate(drone.name) for drone in info.drones]
         at_gates += [keys.cluster_state(cluster.name) for cluster in info.clusters]
@@ -160,6 +163,17 @@ class Agent(ABC):
                 raise
             raise failure from error
 
+    @staticmethod
+    def held_by(frame: FrameType | None) -> str:
+        """Return which agent has not answered, and at what line it is, of a frame of the thread that waits; or ""."""
+        line = plugin.innermost_line(frame)
+        while frame and frame.f_code is not Agent.answer.__code__:
+            frame = frame.f_back
+        if frame is None:
+            return ""
+        agent = frame.f_locals["self"]
+        return f"; {agent.name} has not returned at {agent._answered_ns / 1e9:.2f} s{line}"
+
     def failure(self, error: BaseException, t_ns: int) -> UserCodeError | None:
         """Return what a user's code raised in this agent with the agent's name and the gate; None for other errors."""
         return plugin.user_code_error(error, f"{self.name} at {t_ns / 1e9:.2f} s")
@@ -185,6 +199,8 @@ class Agent(ABC):
             kind = messages.output_type(key)
             if isinstance(message, AgentMessage) and key != message.of(self.thing):
                 raise DecodeError(f"{key}: is another's; must be {message.of(self.thing)}")
+            if keys.is_command(key) and keys.thing(key) != self._flies and self._flies:
+                raise DecodeError(f"{key}: commands another's drone; {self.name} may command {self._flies} only")
             if isinstance(message, AgentMessage) and message.seq < 0:
                 message = self.message(t_ns, message).message
             if type(message) is not kind:

@@ -183,6 +183,13 @@ def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
     return UserCodeError(f"{method} raised {raised} ({_place(deepest.f_code.co_filename, line)})", where)
 
 
+def innermost_line(frame: FrameType | None) -> str:
+    """Return file and line of a user's code that a frame is in, in parentheses; empty if it is in none."""
+    while frame and not is_user_frame(frame):
+        frame = frame.f_back
+    return f" ({_place(frame.f_code.co_filename, frame.f_lineno)})" if frame else ""
+
+
 def is_user_frame(frame: FrameType) -> bool:
     """Tell whether a frame is of a user's file or notebook, or of an installed package that a document names."""
     package, path = frame.f_globals.get("__name__", "").partition(".")[0], frame.f_code.co_filename

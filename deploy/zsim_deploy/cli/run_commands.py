@@ -168,7 +168,7 @@ def _fault_of(complete: bool, state: str, shortfalls: "Sequence[Shortfall]") -> 
 def note_skipped(names: Sequence[str]) -> None:
     """Print which code that a document names was found, and not imported."""
     for name in names:
-        note(f"note: {name} was found and not imported; --trust imports it")
+        note(f"note: {name} was found and not imported; --trust imports it, and checks its parameters")
 
 
 @app.command(rich_help_panel=opt.RUN)

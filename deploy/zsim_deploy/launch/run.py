@@ -15,6 +15,7 @@ from msgspec.structs import replace
 from zsim.errors import RecordError, RunFailedError, SessionError
 from zsim.output_folder import RECORD
 from zsim.record import repair
+from zsim.runtime.agent import Agent
 from zsim.runtime.progress import JsonProgress, Screen
 from zsim.scenario.roles import driver_lines, expected_processes, programs, watched_drones
 from zsim.scenario.scenario import Scenario
@@ -183,7 +184,7 @@ def run_in_process(options: RunOptions, screen: Shown) -> Outcome:
     from zsim_world.fleet.fleet import DivergedError
 
     with EndSignals(options.out / "run.log", screen.hang_up) as signals:
-        stop = StopChannel()
+        stop = StopChannel(held_by=Agent.held_by)
 
         def reason() -> str | None:
             return signals.look() or stop.reason()

@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from zsim.transport.tls import KEY, Identity
@@ -44,11 +45,20 @@ class StopChannel:
         launched: run that the process is part of. Then standard input is its launcher's pipe, and Ctrl-C is left to
             the launcher. None if it was started by hand.
         identity: its key is removed as soon as the launcher is gone, if it is leased.
+        held_by: of a process that flies a user's code itself: tells, from a frame of the main thread, which code it is
+            in. Where the reason is not asked for within GRACE_S, or the user presses Ctrl-C again, KeyboardInterrupt
+            is raised in that code.
     """
 
-    def __init__(self, launched: str | None = None, identity: Identity | None = None) -> None:
+    def __init__(
+        self,
+        launched: str | None = None,
+        identity: Identity | None = None,
+        held_by: Callable[[FrameType | None], str] | None = None,
+    ) -> None:
         self._lease = key_lease(identity, launched) if identity else None
         self._reason: str | None = None
+        self._held_by, self._is_heeded = held_by, threading.Event()
         self._orphaned = self._terminated = False
         self._last_line_s = time.monotonic()
         self._former = {number: signal.getsignal(number) for number in (*REASONS, *HANGUP)}
@@ -64,6 +74,8 @@ class StopChannel:
             signal.signal(number, handler)
 
     def reason(self) -> str | None:
+        if self._reason is not None:
+            self._is_heeded.set()
         return self._reason
 
     def stopped(self) -> bool:
@@ -80,11 +92,18 @@ class StopChannel:
 
     def restore_signals(self) -> None:
         """Handle no signals any longer: what is left to do may be interrupted like any other work."""
+        self._is_heeded.set()
         for number, handler in self._former.items():
             signal.signal(number, handler)
 
     def _stop(self, reason: str) -> None:
+        if self._held_by and self._reason is None:
+            threading.Thread(target=self._insist, name="stop", daemon=True).start()
         self._reason = self._reason or reason
+
+    def _insist(self) -> None:
+        if not self._is_heeded.wait(GRACE_S):
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
 
     def _on_kill(self, *_: object) -> None:
         if self._reason is None:
@@ -96,7 +115,9 @@ class StopChannel:
         redirect_output(Path(os.devnull))
         self._stop(CLOSED)
 
-    def _on_interrupt(self, *_: object) -> None:
+    def _on_interrupt(self, _: int, frame: FrameType | None) -> None:
+        if self._reason is not None and self._held_by:
+            raise KeyboardInterrupt(f"{self._reason}{self._held_by(frame)}")
         if self._reason is not None:
             write_error(TWICE_INTERRUPTED)
             os._exit(INTERRUPTED)
