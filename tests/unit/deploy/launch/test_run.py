@@ -178,6 +178,8 @@ def test_a_run_in_one_process_says_where_it_is_recorded(monkeypatch: pytest.Monk
 class NoStopChannel:
     """Leaves the signals to pytest."""
 
+    def __init__(self, held_by: object) -> None: ...
+
     def reason(self) -> None:
         return
 
