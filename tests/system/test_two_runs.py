@@ -2,6 +2,7 @@
 
 import json
 import re
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from federation import PAIR, Record, Role
 from forked_commands import USER_FAULT, run_here
 from refused import has_terms
+from wire import PATIENCE_S
 
 from zsim.record import RecordReader
 from zsim.scenario import scenario_file
@@ -43,9 +45,12 @@ def test_two_runs_side_by_side_fly_as_each_would_alone(tmp_path: Path, runs: lis
     for run in runs:
         run.line(r" 0\.0 / 2 s ", STARTS_S)  # its world listens, and its processes are started
     assert len({*out}) == 2
-    rows = status()
-    assert set(rows) == {str(folder) for folder in out}
-    pids = [row["pid"] for folder in rows for row in rows[folder] if row["state"] != "ended"]
+    pids: list[int | None] = [None]
+    until_s = time.monotonic() + PATIENCE_S
+    while None in pids and time.monotonic() < until_s:  # a process has none until it is forked
+        rows = status()
+        assert set(rows) == {str(folder) for folder in out}
+        pids = [row["pid"] for folder in rows for row in rows[folder] if row["state"] != "ended"]
     assert len({*pids}) == len(pids) == 2 * 5  # world, recorder, controller and two estimators
     for options in ((), ("--force",)):
         other = run_here("run", str(tmp_path / "pair.yaml"), "--in-process", "--out", str(out[0]), *options)
