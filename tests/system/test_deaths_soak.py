@@ -156,6 +156,7 @@ def kills_and_stops(kill: Callable[..., object], roles: Sequence[str]) -> list[E
 def sha256_in_process(scenario: Scenario, record: Record, folder: Path) -> str:
     """Return the hash of the same flight when nothing happens to anybody."""
     path = folder / "undisturbed.mcap"
+    path.unlink(missing_ok=True)  # of an earlier flight
     fly(msgspec.structs.replace(scenario, duration_s=record.end()["last_ns"] / 1e9), path)
     with RecordReader(path) as reader:
         return Record(reader).sha256()

@@ -92,7 +92,7 @@ class Controller(Agent):
             outputs.append(Output(key, flight_messages.Mode(t_ns, self.next_seq(key), source, mode)))  # type: ignore[arg-type]
         for key, setpoint, estimate in zip(self._velocity_keys, output.setpoints, self._estimates, strict=True):
             if setpoint is not None and estimate is not _UNKNOWN:
-                (x, y, z), c, s = setpoint.v_W, el.cos(estimate.yaw_rad), el.sin(estimate.yaw_rad)
+                (x, y, z), (s, c) = setpoint.v_W, el.sin_cos(estimate.yaw_rad)
                 velocity = (c * x + s * y, -s * x + c * y, z)  # forward, left, up
                 message = flight_messages.Velocity(t_ns, self.next_seq(key), source, velocity, setpoint.yaw_rate)
                 outputs.append(Output(key, message))
