@@ -160,6 +160,15 @@ def _banded_solved(A: Array, below: int, B: Array) -> Array:
     return B
 
 
+@deferred(makes_arrays=False)
+def _rotation(pp: float, qq: float, pq: float) -> tuple[float, float]:
+    """Return cosine and sine of the rotation (Jacobi's) that makes ((pp, pq), (pq, qq)) diagonal."""
+    theta = 0.5 * (qq - pp) / pq
+    t = math.copysign(1.0, theta) / (abs(theta) + math.sqrt(theta * theta + 1.0))
+    c = 1.0 / math.sqrt(t * t + 1.0)
+    return c, t * c
+
+
 @deferred()
 def _diagonalised(A: Array) -> tuple[Array, Array]:
     """Return diagonal and accumulated rotations of a symmetric matrix, which is overwritten."""
@@ -173,10 +182,7 @@ def _diagonalised(A: Array) -> tuple[Array, Array]:
                 if abs(apq) <= ORTHOGONAL * math.sqrt(abs(A[p, p] * A[q, q])) or apq == 0.0:
                     continue
                 largest = max(largest, abs(apq))
-                theta = 0.5 * (A[q, q] - A[p, p]) / apq
-                t = math.copysign(1.0, theta) / (abs(theta) + math.sqrt(theta * theta + 1.0))
-                c = 1.0 / math.sqrt(t * t + 1.0)
-                s = t * c
+                c, s = _rotation(A[p, p], A[q, q], apq)
                 for k in range(n):
                     a, b = A[k, p], A[k, q]
                     A[k, p], A[k, q] = c * a - s * b, s * a + c * b
@@ -211,10 +217,7 @@ def _column_lengths(A: Array) -> Array:
                 if not abs(pq) > 1e-15 * math.sqrt(pp * qq):
                     continue
                 rotated = True
-                theta = 0.5 * (qq - pp) / pq
-                t = math.copysign(1.0, theta) / (abs(theta) + math.sqrt(theta * theta + 1.0))
-                c = 1.0 / math.sqrt(t * t + 1.0)
-                s = t * c
+                c, s = _rotation(pp, qq, pq)
                 for k in range(m):
                     a, b = A[k, p], A[k, q]
                     A[k, p], A[k, q] = c * a - s * b, s * a + c * b
