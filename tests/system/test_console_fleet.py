@@ -1,13 +1,15 @@
 """Thirty drones on a page: sorted, filtered, selected for one command, on a desk's screen and under a thumb."""
 
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from chromium import needs_browser
-from console_browser import IN_SIGHT, SCREENS, BrowserPage
+from console_browser import IN_SIGHT, POLL_MS, SCREENS, BrowserPage
 from staged_console import StagedRun, staged_console
+from wire import PATIENCE_S
 
 pytestmark = [
     needs_browser,
@@ -55,6 +57,14 @@ DRONES_JS = """() => {
   });
 }"""
 """Corners of the grid, about (5, 0) m, that something lies over on the map."""
+
+
+def until_nothing(page: BrowserPage, faults: str) -> None:
+    """Wait until a function (JavaScript) finds no fault of a page."""
+    until_s = time.monotonic() + PATIENCE_S
+    while found := page.page.evaluate(faults):
+        assert time.monotonic() < until_s, found
+        page.page.wait_for_timeout(POLL_MS)
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +157,7 @@ def test_under_a_thumb_everything_is_large_enough_and_nothing_is_under_a_bar(
     page = opened(address, SCREENS[-1])
     page.wait_for_text("running")
     page.wait_for_notice()
-    page.page.wait_for_function(f"() => ({BARS_JS})().length === 0")
+    until_nothing(page, BARS_JS)
     page.close_notice()
     found: dict[str, Any] = {}
     for tab in ("Fly", "Plots", "Faults", "Run", "Drones", "Events"):
@@ -159,7 +169,7 @@ def test_under_a_thumb_everything_is_large_enough_and_nothing_is_under_a_bar(
     assert found == {}
     for button in (".map", ".fly"):
         page.page.locator(f"#zsim-flight {button}").click()
-    page.page.wait_for_function(f"() => ({BARS_JS})().length === 0")
-    page.page.wait_for_function(f"() => ({DRONES_JS})().length === 0")
+    until_nothing(page, BARS_JS)
+    until_nothing(page, DRONES_JS)
     assert page.page.evaluate(SMALL_JS) == []
     assert page.page.evaluate(IN_SIGHT)

@@ -164,8 +164,9 @@ def gone(head: Head) -> None:
     head.page.route(LOOKED_AT, lambda route: route.abort())
 
 
-def test_when_a_run_is_over_its_report_and_record_are_named(head: Head) -> None:
-    state = ended(Path("/home/somebody/lab/flights/with/a/long/name/runs/step-20261125-065514"))
+@pytest.mark.parametrize("above", ["name", "name-that-no-line-can-hold" * 8])
+def test_when_a_run_is_over_its_report_and_record_are_named(head: Head, above: str) -> None:
+    state = ended(Path(f"/home/somebody/lab/flights/with/a/long/{above}/runs/step-20261125-065514"))
     files = state["files"]
     head.show(files=files)
     shown = head.page.locator(".files")
@@ -177,6 +178,10 @@ def test_when_a_run_is_over_its_report_and_record_are_named(head: Head) -> None:
         assert head.page.evaluate(IN_SIGHT)
     head.show(files={name: {**each, "size_bytes": 7} for name, each in files.items()})
     assert [link.get_attribute("href") for link in shown.locator("a").all()] == ["/report", "/record"]
+    for size in SCREENS:
+        head.page.set_viewport_size(size)
+        for link in shown.locator("a").all():
+            link.click(trial=True)  # it lies under the middle of its own box
     gone(head)
     head.page.locator("[data-level=gone]").wait_for()
     for size in SCREENS:
