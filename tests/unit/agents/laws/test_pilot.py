@@ -5,7 +5,7 @@ from typing import Any
 from zsim.contract.flight_messages import Estimate
 from zsim.scenario import scenario_file
 from zsim_agents.laws.pilot import Motion
-from zsim_agents.laws.virtual_structure import VirtualStructure
+from zsim_agents.laws.shape import VirtualStructure
 
 DRONES = [{"name": name, "position_m": [3 * k, 0, 0]} for k, name in enumerate(("d1", "d2"))]
 
