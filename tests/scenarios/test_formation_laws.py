@@ -3,12 +3,14 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
 import zsim
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
+from zsim.scenario.surface_file import packed
 from zsim_analysis.board.measures import measures
 from zsim_analysis.sweep.sweep_run import fly_scenario
 
@@ -64,17 +66,30 @@ def test_each_law_flies_what_it_promises(
     assert found["effort_m2_s"] is not None
 
 
-def test_as_processes_and_after_a_kill_the_bits_are_the_same(tmp_path: Path, compiled: None) -> None:
-    """The flock's pilot has the state of a double integrator beside what it has heard."""
+def test_a_pilot_keeps_off_a_surface_that_it_knows_as_processes_and_after_a_kill_to_the_same_bits(
+    tmp_path: Path, compiled: None
+) -> None:
+    """A wall of triangles is between d3 and its flock, 2 m from it; without the map d3 flies into it.
+
+    The flock's pilot has the state of a double integrator beside what it has heard.
+    """
+    a, b, c, d = [-3, 0, 0], [-3, 6, 0], [-3, 6, 4], [-3, 0, 4]
+    wall = {"name": "wall", "triangles": packed(np.array([a + b + c, a + c + d]))}
+    flock = {**scenario("olfati_saber"), "duration_s": 9, "report": {}, "environment": {"surfaces": [wall]}}
     file = tmp_path / "flock.yaml"
-    file.write_text(yaml.safe_dump({**scenario("olfati_saber"), "duration_s": 7, "report": {}}))
+    file.write_text(yaml.safe_dump(flock))
     alone = zsim.run(file, out=tmp_path / "alone", progress=False)
     with zsim.Federation(file, out=tmp_path / "many") as flight:
-        flight.wait_until(5.0)
-        flight.kill("pilot.d2")
+        flight.wait_until(7.0)
+        flight.kill("pilot.d3")
         run = flight.run()
     assert run.truth_sha256 == alone.truth_sha256
-    assert "pilot.d2" in [*run.events[run.events.kind == "restart"].subject]
+    assert "pilot.d3" in [*run.events[run.events.kind == "restart"].subject]
+    assert alone.summary.obstacle_distance_m["d3"] > 1.0
+    flock["agents"]["pilot"]["map"] = False
+    file.write_text(yaml.safe_dump(flock))
+    blind = zsim.run(file, out=tmp_path / "blind", progress=False)
+    assert [*blind.events[blind.events.kind == "collision"].subject] == ["d3"]
 
 
 @pytest.mark.parametrize(

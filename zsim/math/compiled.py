@@ -83,8 +83,8 @@ def _numba() -> Any:
     if hasattr(os, "getuid"):  # not on Windows
         numba.config.CACHE_DIR = numba.config.CACHE_DIR or cache_folder()  # type: ignore[attr-defined]
 
-    @typeof_impl.register(Deferred)
-    def _(function: Deferred, _context: Any) -> Any:  # pyright: ignore[reportUnusedFunction]
+    @typeof_impl.register(Part)
+    def _(function: Part, _context: Any) -> Any:  # pyright: ignore[reportUnusedFunction]
         return numba.types.Dispatcher(function.dispatcher)
 
     return numba
@@ -96,16 +96,48 @@ def _compile(function: Function, options: dict[str, Any]) -> Function:
     return dispatcher
 
 
+class Part:
+    """A function of kernels, which call it without the entry for Python: that was a quarter of the time to compile.
+
+    Python calls a compilation of its own, with the entry, which is kept on disk as those of kernels are.
+    """
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        update_wrapper(self, function)
+        self.py_func = function
+        self._options = options
+
+    @cached_property
+    def dispatcher(self) -> Any:
+        """What compiled code calls."""
+        return _compile(self.py_func, {**self._options, "no_cpython_wrapper": True, "no_cfunc_wrapper": True})
+
+    @cached_property
+    def _entered(self) -> Any:
+        return _kept(self.py_func, self._options)
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self._entered(*arguments)
+
+    def __reduce__(self) -> str:
+        return self.py_func.__name__
+
+
+def _part(function: Function, options: dict[str, Any]) -> Function:
+    made: Any = Part(function, options) if COMPILES else function
+    return made
+
+
 def compiled(function: Function) -> Function:
-    return _compile(function, _EXACT)
+    return _part(function, _EXACT)
 
 
 def inlined(function: Function) -> Function:
-    return _compile(function, {**_EXACT, **_UNCOUNTED, "forceinline": True})
+    return _part(function, {**_EXACT, **_UNCOUNTED, "forceinline": True})
 
 
 def noinline(function: Function) -> Function:
-    return _compile(function, {**_EXACT, **_UNCOUNTED})
+    return _part(function, {**_EXACT, **_UNCOUNTED})
 
 
 def _kept(function: Function, options: dict[str, Any]) -> Function:
@@ -154,13 +186,8 @@ def portable(function: Function) -> Function:
     return _kept(function, {})
 
 
-class Deferred:
+class Deferred(Part):
     """A kernel that runs as Python, to the same bits, until something has imported numba."""
-
-    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
-        update_wrapper(self, function)
-        self.py_func = function
-        self._options = options
 
     @cached_property
     def dispatcher(self) -> Any:
@@ -168,9 +195,6 @@ class Deferred:
 
     def __call__(self, *arguments: Any) -> Any:
         return (self.dispatcher if "numba" in sys.modules else self.py_func)(*arguments)
-
-    def __reduce__(self) -> str:
-        return self.py_func.__name__
 
 
 def deferred(makes_arrays: bool = True) -> Callable[[Function], Function]:

@@ -57,7 +57,8 @@ def lens_of(camera: Camera) -> Lens:
     half_px = el.hypot(camera.width_px, camera.height_px) / 2
     focal_px = half_px / el.tan(math.radians(camera.diagonal_deg) / 2)
     centre = (camera.width_px - 1) / 2, (camera.height_px - 1) / 2
-    return Lens(focal_px, focal_px, *centre, *camera.distortion, camera.width_px, camera.height_px)
+    k1, k2, p1, p2, k3 = map(float, camera.distortion)  # what takes a lens is compiled for the types in it
+    return Lens(focal_px, focal_px, *centre, k1, k2, p1, p2, k3, camera.width_px, camera.height_px)
 
 
 def camera_pose(camera: Camera) -> CameraPose:
@@ -111,7 +112,7 @@ def folds(lens: Lens) -> bool:
     with np.errstate(all="ignore"):
         x, y = undistorted(lens, u.ravel(), v.ravel())
         share = np.linspace(0.0, 1.0, FOLD_GRID)[:, None]
-        xx, xy, yy = distortion_slopes(lens, share * x, share * y)
+        xx, xy, yy = distortion_slopes(lens, (share * x).ravel(), (share * y).ravel())
         at_x, at_y = distorted(lens, x, y)
         off_u, off_v = lens.fx * at_x + lens.cx - u.ravel(), lens.fy * at_y + lens.cy - v.ravel()
         off_px = np.sqrt(off_u * off_u + off_v * off_v)

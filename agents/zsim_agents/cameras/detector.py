@@ -218,7 +218,7 @@ def _outlined(level: Levels, noise: float, rays: Levels, focal_px: float) -> tup
     if _roundness(covered) / oblique < ROUND_MIN:
         return None
     scale = focal_px / (cosine * math.sqrt(cosine))  # between those along and across the way to the middle
-    circle = outline(covered, noise / peak, rays, scale)
+    circle = outline(covered, noise / peak, np.ascontiguousarray(rays), scale)  # as rehearsed
     is_known = circle.share >= SHARE_OF_EDGE_MIN and 2 * circle.radius_rad * scale >= DIAMETER_MIN_PX
     return (circle, scale) if is_known else None
 

@@ -123,7 +123,7 @@ class OlfatiSaber(Pilot):
         """c1 of flockmates, obstacles and aim; each c2 is 2 sqrt(c1)."""
         accel_max_m_s2: Positive = 2.0
         avoid_m: NonNegative = 0.0
-        """Nearer than this, drones and obstacles repel beside the law; 0: none does."""
+        """Nearer than this, drones, obstacles and surfaces repel beside the law; 0: none does."""
 
     def begin(self, scenario: Scenario) -> None:
         self._dt = self._gate_ns / 1e9

@@ -15,7 +15,9 @@ They are sorted by name, and all sums run in that order, so that the bits do not
 
 import math
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import lru_cache
+from types import SimpleNamespace
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -28,7 +30,7 @@ from zsim.contract.flight_messages import Estimate, Mode, Status, Velocity
 from zsim.contract.snapshot import State
 from zsim.runtime.agent import Agent, Output
 from zsim.scenario import obstacle
-from zsim.scenario.scenario import Scenario, Value
+from zsim.scenario.scenario import SURFACES_MAX, Scenario, Surface, Value
 from zsim.schema.checker import Fault
 from zsim.schema.parameters import Parameters
 from zsim.schema.quantities import NonNegative
@@ -90,7 +92,7 @@ class PilotParameters(Parameters):
     """Of the formation in W: numbers, or expressions of t, in seconds since `start_s`."""
     start_s: NonNegative = 0.0
     avoid_m: NonNegative = 1.5
-    """Nearer than this, drones and obstacles repel; 0: none does."""
+    """Nearer than this, drones, obstacles and surfaces repel; 0: none does."""
     avoid_m4_s: NonNegative = 1.0
     """Gain of the repulsion."""
 
@@ -117,6 +119,7 @@ class Pilot(Agent):
         self._message_ns = max(self._gate_ns, round(1e9 / own.message_rate_hz))
         self._silence_ns = round(own.silence_s * 1e9)
         self._obstacles = [obstacle.row_of(each) for each in scenario.environment.obstacles]
+        self._surfaces = [_sheet(each) for each in scenario.environment.surfaces or ()]
         self._reference = self.reference_of(own)
         self._heard: dict[str, Motion] = {}
         self._state = "landed"
@@ -192,7 +195,7 @@ class Pilot(Agent):
         return limited(v_W, self.parameters.speed_max_m_s)
 
     def avoidance(self, p_W: Array, heard: Sequence[Heard]) -> Array:
-        """Return the repulsion (2,) from the drones that it hears, and from obstacles [m/s; W]."""
+        """Return the repulsion (2,) from the drones that it hears, from obstacles and surfaces [m/s; W]."""
         reach, gain = self.parameters.avoid_m, self.parameters.avoid_m4_s
         v_W = np.zeros(2)
         for each in heard:
@@ -203,12 +206,21 @@ class Pilot(Agent):
         return v_W
 
     def obstacles_near(self, p_W: Array, reach_m: float) -> list[tuple[float, Array]]:
-        """Return distance [m] and direction away (2,) of the obstacles within reach beside the drone."""
+        """Return distance [m] and direction away (2,) of the obstacles and surfaces within reach beside the drone.
+
+        A surface is at the distance at which a level flight meets its tangent in the nearest point: that of a wall is
+        its distance, a slope is the farther the flatter it is, and level ground is none, however near it is below.
+        """
         found = []
         for row in self._obstacles:
             distance, x, y, _ = obstacle.nearest(row, float(p_W[0]), float(p_W[1]), float(self._p_W[2]))
             if distance < reach_m and (x or y):
                 found.append((distance, unit(np.array([x, y]))))
+        for nearest in self._surfaces:
+            distance, point = nearest((*p_W, self._p_W[2]), reach_m)
+            away = p_W - point[:2]
+            if distance * distance < reach_m * length(away):
+                found.append((distance * distance / length(away), unit(away)))
         return found
 
     # The state that survives a restart
@@ -228,6 +240,23 @@ class Pilot(Agent):
         self._state, self._p_W, self._v_W = state["state"], np.array(state["p_W"]), np.array(state["v_W"])
         self._estimate_ns = state["estimate_ns"]
         self._is_engaged, self._has_flown = state["is_engaged"], state["has_flown"]
+
+
+@lru_cache(maxsize=SURFACES_MAX)  # pilots of one process share it: that of 40 000 triangles is made in a second
+def _sheet(surface: Surface) -> Callable[[Sequence[float], float], tuple[float, Array]]:
+    """Return the function of a point (3,) and a reach [m] that finds the distance of the surface and its nearest point.
+
+    The reach and the point itself where it is not nearer than that.
+    """
+    from zsim.scenario.triangles import hold, nearest_points, sheet_of  # here: who has no surface needs no numba
+
+    sheet = hold(sheet_of(SimpleNamespace(surfaces=[surface])))
+
+    def nearest(point_m: Sequence[float], reach_m: float) -> tuple[float, Array]:
+        distances, points = nearest_points(sheet, point_m, reach_m)
+        return float(distances[0]), points[0]
+
+    return nearest
 
 
 # Vectors, in one order of operations on every processor

@@ -62,7 +62,7 @@ class Vasarhelyi(Pilot):
         arena_m: NonNegative = 8.0
         """Side of the square about the reference; 0: there is none."""
         avoid_m: NonNegative = 0.0
-        """Nearer than this, drones and obstacles repel beside the law; 0: none does."""
+        """Nearer than this, drones, obstacles and surfaces repel beside the law; 0: none does."""
 
     def velocity(self, now: Sight) -> Array:
         own = self.parameters

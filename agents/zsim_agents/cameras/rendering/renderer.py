@@ -161,6 +161,6 @@ def _pinhole(view: View) -> tuple[View, tuple[Picture, Picture]]:
     half = np.abs(view.plane).max(axis=(0, 1)) * (lens.fx, lens.fy)
     most = np.array([lens.width, lens.height]) * WIDER_MAX / 2
     width, height = (int(2 * math.ceil(side + 2)) for side in np.minimum(half, most))
-    flat = Lens(lens.fx, lens.fy, (width - 1) / 2, (height - 1) / 2, 0, 0, 0, 0, 0, width, height)
+    flat = Lens(lens.fx, lens.fy, (width - 1) / 2, (height - 1) / 2, 0.0, 0.0, 0.0, 0.0, 0.0, width, height)
     at = (view.plane * (lens.fx, lens.fy) + (flat.cx, flat.cy)).astype(np.float32)
     return view_of(flat), cv2.convertMaps(at[..., 0], at[..., 1], cv2.CV_16SC2)  # type: ignore[return-value]

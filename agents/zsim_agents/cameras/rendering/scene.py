@@ -142,7 +142,8 @@ class View:
         self.distorts = bool(self._D.any())
         self._K = camera_matrix(lens)
         u, v = np.meshgrid(np.arange(lens.width, dtype=float), np.arange(lens.height, dtype=float))
-        self.plane: Array = np.stack(undistorted(lens, u, v), axis=-1)
+        x, y = undistorted(lens, u.ravel(), v.ravel())
+        self.plane: Array = np.stack([x, y], axis=-1).reshape(lens.height, lens.width, 2)
         norm = np.sqrt(1.0 + (self.plane * self.plane).sum(axis=-1, keepdims=True))
         whole = np.concatenate([self.plane, np.ones_like(norm)], axis=-1) / norm
         self.rays: NDArray[np.float32] = np.ascontiguousarray(whole, np.float32)

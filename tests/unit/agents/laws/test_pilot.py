@@ -1,27 +1,33 @@
-"""What a pilot of a formation law takes of what comes late."""
+"""What a pilot of a formation law takes of what comes late, and of the obstacles and surfaces about it."""
 
+import math
 from typing import Any
+
+import numpy as np
+import pytest
 
 from zsim.contract.flight_messages import Estimate
 from zsim.scenario import scenario_file
+from zsim.scenario.surface_file import packed
 from zsim_agents.laws.pilot import Motion
 from zsim_agents.laws.shape import VirtualStructure
 
 DRONES = [{"name": name, "position_m": [3 * k, 0, 0]} for k, name in enumerate(("d1", "d2"))]
 
 
-def pilot() -> Any:
+def pilot(**environment: Any) -> Any:
     made = type("Own", (VirtualStructure,), {"parameters": VirtualStructure.Parameters()})
-    return made("d1", scenario_file.resolve({"name": "s", "duration_s": 9, "drones": DRONES}))
+    document = {"name": "s", "duration_s": 9, "drones": DRONES, "environment": environment}
+    return made("d1", scenario_file.resolve(document))
 
 
 def motion(t_ns: int) -> Motion:
     return Motion(t_ns=t_ns, position_m=(t_ns, 0.0, 2.0), velocity_m_s=(0.0, 0.0, 0.0), is_engaged=True)
 
 
-def estimate(t_ns: int) -> Estimate:
+def estimate(t_ns: int, y_m: float = 0.0, z_m: float = 2.0) -> Estimate:
     four, three = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    return Estimate(t_ns, 0, (t_ns, 0.0, 2.0), three, four, 0.0, (0.0,) * 36, 0.0, three, {})
+    return Estimate(t_ns, 0, (t_ns, y_m, z_m), three, four, 0.0, (0.0,) * 36, 0.0, three, {})
 
 
 def test_an_older_message_that_comes_later_changes_nothing() -> None:
@@ -38,3 +44,34 @@ def test_an_older_message_that_comes_later_changes_nothing() -> None:
     again.receive("drone/d1/estimate", estimate(2))
     assert again.snapshot()["heard"] == state["heard"]
     assert again.snapshot()["p_W"].tolist() == state["p_W"].tolist()
+
+
+def sheet(name: str, *corners: tuple[float, float, float]) -> dict[str, Any]:
+    """Return the surface of a quadrangle."""
+    a, b, c, d = corners
+    return {"name": name, "triangles": packed(np.array([[*a, *b, *c], [*a, *c, *d]]))}
+
+
+def test_a_wall_of_triangles_is_heeded_as_a_wall_that_is_solid() -> None:
+    """Along y = 5; once as a box 2 m thick, once as the sheet of its face."""
+    solid = pilot(obstacles=[{"name": "wall", "shape": "box", "position_m": [0, 6, 0], "size_m": [40, 2, 8]}])
+    face = pilot(surfaces=[sheet("wall", (-20, 5, 0), (20, 5, 0), (20, 5, 8), (-20, 5, 8))])
+    for x, y in ((0, 4.2), (1, 3.6), (2, 3.4), (21, 4.5)):
+        felt = []
+        for each in (solid, face):
+            each.receive("drone/d1/estimate", estimate(x, y))
+            felt.append(each.avoidance(np.array([x, y], dtype=float), []))
+        assert felt[1] == pytest.approx(felt[0], rel=1e-6), (x, y)
+        assert (felt[1][1] < 0) == (y > 3.5), (x, y)  # within avoid_m
+
+
+def test_a_slope_is_as_far_as_a_level_flight_to_it_and_level_ground_is_not_heeded() -> None:
+    rise = math.tan(math.radians(30))
+    slope = sheet("slope", (4, -30, 0), (34, -30, 30 * rise), (34, 30, 30 * rise), (4, 30, 0))
+    flown = pilot(surfaces=[slope, sheet("floor", (-30, -30, 1), (4, -30, 1), (4, 30, 1), (-30, 30, 1))])
+    flown.receive("drone/d1/estimate", estimate(4, 0.0, 2.0))
+    ahead_m = 2.0 / rise
+    assert flown.obstacles_near(np.array([4.0, 0.0]), 0.95 * ahead_m) == []  # the floor is 1 m below
+    ((distance, away),) = flown.obstacles_near(np.array([4.0, 0.0]), 1.05 * ahead_m)
+    assert distance == pytest.approx(ahead_m, rel=1e-6)
+    assert away == pytest.approx([-1.0, 0.0], abs=1e-6)

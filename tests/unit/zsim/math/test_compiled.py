@@ -152,6 +152,34 @@ def test_a_deferred_kernel_runs_as_python_until_numba_is_imported_to_the_same_bi
     subprocess.run([sys.executable, "-c", DEFERRED], check=True)
 
 
+PART = """
+from numba.core import event
+from zsim.math.compiled import inlined, kernel
+
+@inlined
+def halved(x):
+    return 0.5 * x
+
+@kernel()
+def quarter(x):
+    return halved(halved(x))
+
+compilations = event.RecordingListener()
+event.register("numba:compile", compilations)
+print(quarter(2.0), halved(2.0), len(compilations.buffer) // 2)
+"""
+
+
+def test_kernels_have_their_parts_and_what_python_calls_of_these_is_kept(tmp_path: Path):
+    pytest.importorskip("numba")
+    (tmp_path / "halving.py").write_text(PART)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
+    run = [sys.executable, "-c", "import halving"]
+    for compilations in ("3", "0"):  # the kernel, its part, and that of Python
+        made = subprocess.run(run, env=environment, capture_output=True, text=True, check=True)
+        assert made.stdout.split() == ["0.5", "1.0", compilations]
+
+
 HELD = """
 from typing import NamedTuple
 import numpy as np
