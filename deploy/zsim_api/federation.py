@@ -39,7 +39,7 @@ from zsim.transport.session import RawSample, ReceivedSample, Session, result_of
 from zsim_analysis.in_process import OwnAgent, sequence_of_agents, with_agents
 from zsim_api import run_folder
 from zsim_api.assertions import Assertions
-from zsim_api.drone_requests import PilotedDrone
+from zsim_api.commands import PilotedDrone
 from zsim_api.flight import LAUNCHER, calling, command_of, raise_failure
 from zsim_api.programs import Program, environment_of, filled, search_path
 from zsim_api.scenarios import AnyScenario, scenario_of
