@@ -127,7 +127,8 @@ class PilotedDrone:
         """Fly to the beginning of a path, then the path; return the simulated time [s] of its end, None if it has none.
 
         Args:
-            path: fields of a reference as in a scenario: `minimum_snap=[{"at_s": 0, "position_m": [0, 0, 2]}, …]`,
+            path: fields of a reference as in a scenario, but for its times, gains and file:
+                `minimum_snap=[{"at_s": 0, "position_m": [0, 0, 2]}, …]`,
                 `circle={"radius_m": 2, "period_s": 10}`, `fit=True`, `origin_m=…`.
         """
         return self._ask(self._key, "follow", **path)["until_s"]
