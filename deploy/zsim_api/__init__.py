@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # for editors, which do not read _WHERE
     from zsim_agents.formation.control_law import ControlLaw as ControlLaw
     from zsim_agents.formation.spaces.cluster_space import ClusterSpace as ClusterSpace
     from zsim_api.commands import Command as Command
+    from zsim_api.commands import PilotedDrone as PilotedDrone
     from zsim_api.commands import ardrone as ardrone
     from zsim_api.commands import attitude as attitude
     from zsim_api.commands import emergency as emergency
@@ -25,7 +26,6 @@ if TYPE_CHECKING:  # for editors, which do not read _WHERE
     from zsim_api.commands import rotors as rotors
     from zsim_api.commands import takeoff as takeoff
     from zsim_api.commands import velocity as velocity
-    from zsim_api.drone_requests import PilotedDrone as PilotedDrone
     from zsim_api.environments import any_of as any_of
     from zsim_api.environments import collided as collided
     from zsim_api.environments import far_away as far_away
@@ -53,8 +53,10 @@ _WHERE = {
     "zsim_agents.formation.control_law": ("ControlLaw",),
     "zsim_agents.formation.spaces.cluster_space": ("ClusterSpace",),
     "zsim_agents.formation.assignment": ("assign",),
-    "zsim_api.commands": ("Command", "ardrone", "attitude", "emergency", "land", "rotors", "takeoff", "velocity"),
-    "zsim_api.drone_requests": ("PilotedDrone",),
+    "zsim_api.commands": (
+        *("Command", "ardrone", "attitude", "emergency", "land", "rotors", "takeoff", "velocity"),
+        "PilotedDrone",
+    ),
     "zsim_api.environments": (
         *("any_of", "collided", "far_away", "flipped"),
         *("gym_env", "parallel_env", "vector_env"),

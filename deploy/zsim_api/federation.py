@@ -39,7 +39,7 @@ from zsim.transport.session import RawSample, ReceivedSample, Session, result_of
 from zsim_analysis.in_process import OwnAgent, sequence_of_agents, with_agents
 from zsim_api import run_folder
 from zsim_api.assertions import Assertions
-from zsim_api.drone_requests import PilotedDrone
+from zsim_api.commands import PilotedDrone
 from zsim_api.flight import LAUNCHER, calling, command_of, raise_failure
 from zsim_api.programs import Program, environment_of, filled, search_path
 from zsim_api.scenarios import AnyScenario, scenario_of
@@ -50,7 +50,8 @@ if TYPE_CHECKING:
 PROCESS = "test.federation"
 PATIENCE_S = 300.0  # wall time; the first run on a machine compiles for one to three minutes, more on a busy one
 PROGRAM_END_S = 5.0  # wall time that programs have to see that the run is over
-HARMLESS = (signal.SIGSTOP, signal.SIGCONT)  # signals that end no process
+KILL = getattr(signal, "SIGKILL", signal.SIGTERM)  # Windows has no other
+HARMLESS = {getattr(signal, name, None) for name in ("SIGSTOP", "SIGCONT")}  # signals that end no process
 LAST_LINES = 40  # of a log that tells of a failure
 ENDED = re.compile(r"^(\S+)(?: \(pid \d+\))? ended: ", re.MULTILINE)  # as the launcher says of a process
 
@@ -112,6 +113,8 @@ class Federation(Assertions):
         out: str | Path | None = None,
         modules: Sequence[str | Path] = (),
     ) -> None:
+        if not hasattr(os, "killpg"):
+            raise RunError("Federation: needs signals of POSIX; use Linux, macOS or WSL, or zsim.run in one process")
         self._port = _reserved_port()
         self.endpoint = f"tcp/127.0.0.1:{self._port.getsockname()[1]}"
         self.name = str((set or {}).get("federation", f"test-{os.getpid()}-{self._port.getsockname()[1]}"))
@@ -273,7 +276,7 @@ class Federation(Assertions):
         at = {} if (ahead_s := self._watch.ahead_s) is None else {"at_s": round(self.t_s + ahead_s, 9)}
         return self.ask(keys.CONTROL, "fault_add", **{**at, **fault})
 
-    def kill(self, process: str, number: int = signal.SIGKILL, within_s: float = PATIENCE_S) -> int:
+    def kill(self, process: str, number: int = KILL, within_s: float = PATIENCE_S) -> int:
         """Send a process of the run a signal, kill -9 by default; return its process id.
 
         Args:

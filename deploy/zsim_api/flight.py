@@ -14,6 +14,7 @@ from rich.console import Console
 from zsim.errors import RunError, RunFailedError, UserCodeError, printable
 from zsim.output_folder import RECORD
 from zsim.runtime.progress import JsonProgress, NotebookLine, ProgressSink, Screen, describe
+from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario as Resolved
 from zsim.schema import plugin
 from zsim_analysis.in_process import OwnAgent, fly, with_agents
@@ -265,3 +266,25 @@ class NotebookScreen(Screen):
 
     def clock(self, line: dict[str, Any]) -> None:
         self._line.update(describe(line, self._duration_s))
+
+
+def fly_as_processes(scenario: Resolved, folder: Path) -> None:
+    """Fly a resolved scenario as processes of this machine, into a new folder of a run.
+
+    Raises:
+        RunError: nothing was recorded; with the last line that `zsim run` printed.
+    """
+    log = folder / run_folder.LOGS / f"{LAUNCHER}.log"
+    log.parent.mkdir(parents=True)
+    file = folder / run_folder.SCENARIO
+    file.write_text(scenario_file.to_text(scenario), encoding="utf-8")
+    words = [*COMMAND, "run", str(file), "--out", str(folder), "--force", "--no-report"]
+    program = Program(words, {"PYTHONPATH": search_path(plugin.folders())}, log)
+    try:
+        code = program.wait()
+    finally:
+        program.close()
+    if not (folder / RECORD).exists():
+        said = log.read_text(errors="replace").split("\n")
+        last = next((line for line in reversed(said) if line.strip()), f"`zsim run` ended with code {code}")
+        raise RunError(f"{folder}: nothing was recorded: {last}")

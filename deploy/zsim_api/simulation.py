@@ -31,8 +31,7 @@ from zsim.runtime.agent import Agent
 from zsim.schema.checker import suggestion
 from zsim.sensors.sensor import Sample
 from zsim_analysis.in_process import CALLER, FlightObserver, InProcessFlight, OwnAgent, sequence_of_agents, with_agents
-from zsim_api.commands import Command
-from zsim_api.drone_requests import PilotedDrone
+from zsim_api.commands import Command, PilotedDrone
 from zsim_api.flight import calling
 from zsim_api.scenarios import AnyScenario, scenario_of
 from zsim_world.physics.fleet_arrays import STATE

@@ -23,7 +23,7 @@ import zsim_api
 
 PAGES = {  # last parts of modules by page
     "flights": ("flight", "simulation", "recorded", "sweeping", "scenarios", "errors"),
-    "commands": ("commands", "drone_requests", "assignment"),
+    "commands": ("commands", "assignment"),
     "agents": ("agent", "control_law", "cluster_space", "drone_estimator", "fmu_agent"),
     "testing": ("federation", "programs", "pytest_plugin"),
     "environments": ("environments", "policy"),

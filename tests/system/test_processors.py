@@ -66,6 +66,27 @@ def test_with_all_settings_and_code_for_any_processor_nothing_changes() -> None:
     assert flown({**OLDER, **GENERIC}, *GOLDEN) == GOLDEN
 
 
+SHORT = """
+import sys, zsim
+drone = {"name": "d1", "position_m": [0, 0, 0]}
+agents = {"pilot": {"class": "virtual_structure", "parameters": {"takeoff_s": 0.2}}}
+flown = {"name": "short", "duration_s": 3, "drones": [drone], "agents": agents}
+print(zsim.run(flown, out=sys.argv[1], progress=False).truth_sha256)
+"""
+
+
+def test_without_compiled_code_nothing_changes_and_nothing_is_told(tmp_path: Path) -> None:
+    """As one steps through it: lanes without a drone divide by no 0, and no integer that wraps around is warned of."""
+    hashes = set()
+    for disabled in ("0", "1"):
+        command = [sys.executable, "-P", "-c", SHORT, str(tmp_path / disabled)]
+        environment = {**os.environ, "NUMBA_DISABLE_JIT": disabled}
+        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        assert (done.returncode, done.stderr) == (0, "")
+        hashes.add(done.stdout)
+    assert len(hashes) == 1
+
+
 def test_a_law_that_depends_on_the_processor_is_found(tmp_path: Path) -> None:
     (tmp_path / "bent.py").write_text(LAW)
     scenario = yaml.safe_load((golden_flights.ROOT / "scenarios" / "step.yaml").read_text())

@@ -8,6 +8,7 @@ import os
 import re
 import shlex
 import shutil
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -16,10 +17,13 @@ from typing import Any
 import pytest
 from federation import ONE, PAIR, Federation, compiled, free_port
 from forked_commands import COLUMNS, ROOT, USER_FAULT, ZSIM, refusal, run_here
+from refused import has_terms
 from wire import PATIENCE_S
 
+from zsim.errors import RunError
 from zsim.math import compiled as kernels
 from zsim.record import RecordReader, completeness
+from zsim_api import federation as tested
 
 __all__ = ["compiled"]
 needs_root = pytest.mark.skipif(os.geteuid() != 0 or not shutil.which("unshare"), reason="mounts need root")
@@ -193,6 +197,23 @@ def test_a_run_without(tmp_path: Path, flown: Path, lacking: str) -> None:
     if code == 0:
         with RecordReader(tmp_path / "run" / "run.mcap") as record:
             assert completeness(record).complete
+
+
+@pytest.mark.parametrize("words", ["ps", "logs world", "restart world", "move world h1", "down"])
+def test_where_there_are_no_unix_sockets_launchers_are_not_to_be_reached(
+    words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on Windows."""
+    monkeypatch.delattr(os, "getuid")
+    monkeypatch.delattr(socket, "AF_UNIX")
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    assert has_terms(refusal(*words.split()), "Unix sockets", "WSL")
+
+
+def test_a_flight_under_test_needs_signals_of_posix(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "killpg")
+    with pytest.raises(RunError):
+        tested.Federation(PAIR)
 
 
 KERNEL = """

@@ -14,8 +14,7 @@ from typing import ClassVar
 
 from msgspec import Struct
 
-from zsim.schema.declared_message import FieldType, declared_type, field_types
-from zsim.schema.message import Whole
+from zsim.schema.message import FieldType, Whole, declared_type, field_types
 
 KEY = re.compile(r"([a-z][a-z0-9_]{0,31})/\{(drone|cluster|run)\}/([a-z][a-z0-9_]{0,31})")
 KEY_ALLOWED = "swarm/{drone}/state: a word, {drone}, {cluster} or {run}, and a word, of a-z 0-9 _"

@@ -16,8 +16,7 @@ from zsim.contract import flight_messages, keys, run_messages
 from zsim.contract.agent_messages import AgentMessage, MessageInfo, message_info, type_of_info
 from zsim.errors import DecodeError, RunError
 from zsim.schema.checker import first_fault
-from zsim.schema.declared_message import FieldType
-from zsim.schema.message import Count, Message, Number, Whole
+from zsim.schema.message import Count, FieldType, Message, Number, Whole
 from zsim.sensors.scanner import SCANNERS
 from zsim.sensors.scanner import Depth as Depth
 from zsim.sensors.scanner import Lidar as Lidar

@@ -1,15 +1,45 @@
-"""Types of messages' fields: finite numbers, whole numbers of 64 bits; and the first fields of every message."""
+"""Messages: types of their fields, the first fields of each, and those that users declare.
+
+Users declare them by words that every language can read: number, number[3], whole, flag, text.
+
+    field_types(State, Message)  →  {"position_m": "number[3]", "leader": "flag"}
+    declared_type("State", {"position_m": "number[3]", "leader": "flag"}, Message)
+
+A process that has the user's module has the class; all others make one of the same name and fields from `world/info`.
+"""
 
 import sys
-from typing import Annotated
+from collections.abc import Collection, Mapping
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import msgspec
 from msgspec import Meta, Struct
+from msgspec import inspect as types
 
 # Limits that every finite number keeps and that NaN and infinities break: msgspec compares while it decodes.
 Number = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
 Whole = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Vector3 = tuple[Number, Number, Number]
+COUNT_MAX = 16  # numbers of one field, as of a matrix 4 x 4
+TEXT_MAX = 10_000  # characters of one field
+if TYPE_CHECKING:
+    FieldType = str
+else:
+    SEVERAL = [f"number[{count}]" for count in range(1, COUNT_MAX + 1)]
+    FieldType = Literal["number", "whole", "flag", "text", "number[]", *SEVERAL]
+"""Type of a field: a finite number, a whole number, a flag, text, any number of numbers, or so many."""
+FieldName = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,31}\Z")]
+MessageName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}\Z")]
+_WORDS = {types.FloatType: "number", types.IntType: "whole", types.BoolType: "flag", types.StrType: "text"}
+_TYPES: dict[str, Any] = {
+    "number": Number,
+    "whole": Whole,
+    "flag": bool,
+    "text": Annotated[str, Meta(max_length=TEXT_MAX)],
+    "number[]": Annotated[tuple[Number, ...], Meta(max_length=TEXT_MAX)],
+}
 
 
 class Message(Struct, frozen=True, gc=False):
@@ -20,3 +50,56 @@ class Message(Struct, frozen=True, gc=False):
 
     t_ns: Count
     seq: Count
+
+
+def field_types(message: type[Struct], base: type[Struct], but: Collection[str] = ()) -> dict[FieldName, FieldType]:
+    """Return the types of the fields that a message has beside those of its base.
+
+    Args:
+        but: words of types that are not allowed.
+
+    Raises:
+        TypeError: a field is of a type that no message of a user's has.
+    """
+    info: Any = types.type_info(message)
+    words: dict[str, Any] = {}
+    for field in info.fields:
+        if field.name in base.__struct_fields__:
+            continue
+        word = _word(field.type)
+        if word is None or word in but:
+            words_allowed = ("number", "tuple or list of numbers", "whole number", "bool", "text")
+            allowed = ", ".join(each for each in words_allowed if each not in but)
+            found = getattr(message, "__annotations__", {}).get(field.name, "another type")
+            raise TypeError(f"{message.__name__}.{field.name} is {found!s:.60}; must be a {allowed}")
+        words[field.name] = word
+    return words
+
+
+def _word(kind: Any) -> FieldType | None:
+    if isinstance(kind, types.Metadata):
+        kind = kind.type
+    if isinstance(kind, types.TupleType):
+        numbers = all(isinstance(item, types.FloatType) for item in kind.item_types)
+        return f"number[{len(kind.item_types)}]" if numbers and 1 <= len(kind.item_types) <= COUNT_MAX else None
+    if isinstance(kind, types.VarTupleType | types.ListType):
+        return "number[]" if isinstance(kind.item_type, types.FloatType) else None
+    return _WORDS.get(type(kind))
+
+
+def declared_type(
+    name: str, fields: Mapping[str, str], base: type[Struct], namespace: tuple[tuple[str, Any], ...] = ()
+) -> Any:
+    """Return the message with these fields after those of its base: the same class for the same arguments.
+
+    `namespace`: attributes of the class.
+    """
+    return _declared_type(name, tuple(fields.items()), base, namespace)
+
+
+@cache
+def _declared_type(
+    name: str, fields: tuple[tuple[str, str], ...], base: type[Struct], namespace: tuple[tuple[str, Any], ...]
+) -> Any:
+    own: Any = [(field, _TYPES.get(word) or tuple[(Number,) * int(word[7:-1])]) for field, word in fields]  # type: ignore[misc]
+    return msgspec.defstruct(name, own, bases=(base,), namespace=dict(namespace), frozen=True, gc=False)

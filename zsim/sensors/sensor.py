@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from zsim.math import elementary as el
 from zsim.math.linear import product
-from zsim.schema.declared_message import FieldName, FieldType, MessageName, declared_type, field_types
-from zsim.schema.message import Message, Whole
+from zsim.schema.message import FieldName, FieldType, Message, MessageName, Whole, declared_type, field_types
 from zsim.schema.quantities import Fraction, NonNegative, Vector3
 
 VALUES_MAX = 6  # numbers of one reading

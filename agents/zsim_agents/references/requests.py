@@ -5,20 +5,20 @@ hold: come to rest
 goto {position_m, yaw_deg, speed_m_s}: fly there, at a cruise speed, or as fast as the limits let it, and rest there
 goto {places_m, yaw_deg, speed_m_s, radius_m}: through places, past each by radius_m at most; 0: rest at each
 goto {position_m, yaw_deg, over_s}: from rest to rest in over_s, with one function of time for all ways
-follow {minimum_snap: [...], fit: true, ...}: fly to the beginning of a path, then the path; fields as of a reference
+follow {minimum_snap: [...], fit: true, ...}: fly to the beginning of a path, then the path; FOLLOWED of a reference
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta, Struct, convert
 
 from zsim.scenario.scenario import PATHS, POINTS_MAX, Drone, DroneReference, Position
-from zsim.schema.checker import faults
+from zsim.schema.checker import faults, show
 from zsim.schema.quantities import NonNegative, Positive, Real
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.formation.trajectory import TrajectoryError
@@ -28,6 +28,8 @@ from zsim_agents.references.path import EndMotion, PathLimits, move
 
 PLAIN = ("takeoff", "land", "hold")
 OPERATIONS = (*PLAIN, "goto", "follow")
+OF_EXPRESSIONS = ("constants", "duration_s")
+FOLLOWED = (*PATHS, *OF_EXPRESSIONS, "origin_m", "time_scale", "fit")  # the others are of a whole flight of a scenario
 
 
 class DroneRequestError(ValueError):
@@ -67,6 +69,8 @@ def read_request(op: str, args: Mapping[str, Any]) -> Asked:
     if isinstance(asked, DroneReference) and len(asked.paths()) != 1:
         given = " and ".join(asked.paths()) or "none"
         raise DroneRequestError(f"has {given} of {', '.join(PATHS)}; must have one")
+    if isinstance(asked, DroneReference) and (unused := list(_unused(asked, args))):
+        raise DroneRequestError(f"{'; '.join(unused[:3])}; allowed: {', '.join(FOLLOWED)}")
     if isinstance(asked, Goto):
         if (asked.position_m is None) != bool(asked.places_m):
             found = "is given beside" if asked.places_m else "is missing, and so is"
@@ -75,6 +79,15 @@ def read_request(op: str, args: Mapping[str, Any]) -> Asked:
             other = "places_m" if asked.places_m else "speed_m_s"
             raise DroneRequestError(f"over_s is {asked.over_s:g} beside {other}; must be left out, or {other}")
     return asked
+
+
+def _unused(asked: DroneReference, args: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what is wrong with fields that a request has no use for."""
+    for name, value in args.items():
+        if name not in FOLLOWED:
+            yield f"{name} is {show(value)}; must be left out of a request"
+        elif name in OF_EXPRESSIONS and not asked.expressions:
+            yield f"{name} is {show(value)}; must be left out without expressions"
 
 
 def requested_flight(asked: Any, t_s: float, place: Array, rate: Array, drone: Drone, limits: PathLimits) -> Flight:

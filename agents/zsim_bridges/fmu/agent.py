@@ -20,8 +20,7 @@ from zsim.errors import RunError, UserCodeError, printable
 from zsim.math import elementary as el
 from zsim.runtime.agent import Agent, Output
 from zsim.scenario.scenario import Scenario
-from zsim_bridges.fmu.formation import Formation
-from zsim_bridges.fmu.mapping import FORMATION, MappedVariable, mapping_of
+from zsim_bridges.fmu.mapping import FORMATION, Formation, MappedVariable, mapping_of
 from zsim_bridges.fmu.model import FmuInstance, FmuModel, Inputs, Variable
 
 Frame = Literal["heading", "world"]

@@ -9,16 +9,21 @@ command. `main/c` is c of the cluster `main` by the estimates, and `main/c_dot` 
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 from msgspec import Struct
 
 from zsim.contract import flight_messages, keys, messages
+from zsim.contract.flight_messages import Velocity
 from zsim.contract.messages import Info
-from zsim.errors import DecodeError, RunError
+from zsim.errors import DecodeError, RunError, UserCodeError
+from zsim.scenario.scenario import Scenario
 from zsim.schema.checker import suggestion
+from zsim_agents.formation.spaces.cluster_space import SingularClusterError, robot_rates
+from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.fmu.model import FmuModel, Kind, Unit, Variable
 
 MODES = ("takeoff", "land", "emergency", "reset")
@@ -87,7 +92,7 @@ class MappedVariable(NamedTuple):
         return values
 
 
-class Mapping(NamedTuple):
+class FmuMapping(NamedTuple):
     """What an FMU takes and gives, and lines on units that differ."""
 
     inputs: list[MappedVariable]
@@ -97,7 +102,7 @@ class Mapping(NamedTuple):
 
 def mapping_of(
     model: FmuModel, texts: Sequence[str], info: Info, drone: str | None, cluster_names: Callable[[str], Sequence[str]]
-) -> Mapping:
+) -> FmuMapping:
     """Return what texts `NAME=PLACE` mean.
 
     Args:
@@ -107,7 +112,7 @@ def mapping_of(
     Raises:
         RunError: with the text that cannot be used, what was found, and what is allowed.
     """
-    found = Mapping([], [], [])
+    found = FmuMapping([], [], [])
     places = _Places(info, drone, cluster_names)
     for text in texts:
         name, equals, where = (part.strip() for part in text.partition("="))
@@ -134,7 +139,7 @@ def mapping_of(
     return found
 
 
-def _check_once(found: Mapping) -> None:
+def _check_once(found: FmuMapping) -> None:
     taken: dict[tuple[str, str, int | None], str] = {}
     for variable, place, _ in found.outputs:
         for index in place.indices or (None,):
@@ -300,3 +305,52 @@ def _conversion(variable: Variable, place: Place, is_output: bool) -> tuple[Call
     if is_output:
         return lambda value: (value * factor + offset) / own, f"{found}; converted"
     return lambda value: (value * own - offset) / factor, f"{found}; converted"
+
+
+class Formation:
+    """A formation as an FMU sees it: cluster variables of the estimates, and velocities for rates of these variables.
+
+    So an FMU may be a cluster space controller that knows nothing of kinematics: c in, c_dot out.
+
+    Attributes:
+        drones: in the order of its robots.
+        names: of its variables, in the order of c.
+    """
+
+    def __init__(self, scenario: Scenario, cluster: str) -> None:
+        of = scenario.cluster(cluster)
+        self.cluster, self.drones = cluster, of.drones
+        try:
+            self._space = scenario_space(scenario, of)
+        except ValueError as error:
+            raise RunError(f"cluster {cluster}: {error}") from error
+        self.names: Sequence[str] = self._space.names
+        self._estimates = [keys.estimate(drone) for drone in self.drones]
+
+    def c(self, latest: Mapping[str, Any]) -> list[float] | None:
+        """Return c (4n,) of the newest messages; None before there are all estimates, or where it is singular."""
+        estimates = [latest.get(key) for key in self._estimates]
+        if None in estimates:
+            return None
+        p_W = np.array([estimate.position_m for estimate in estimates])  # type: ignore[union-attr]
+        yaw = np.array([estimate.yaw_rad for estimate in estimates])  # type: ignore[union-attr]
+        try:
+            return self._space.forward(p_W, yaw).tolist()
+        except SingularClusterError:
+            return None
+
+    def velocities(self, latest: Mapping[str, Any], c_dot: Sequence[float]) -> list[Velocity]:
+        """Return the commands of the drones in W [m/s, rad/s] for rates c_dot (4n,); none before there is a c.
+
+        Raises:
+            UserCodeError: the formation has no such motion.
+        """
+        c = self.c(latest)
+        if c is None:
+            return []
+        try:
+            v_W, yaw_rates = robot_rates(self._space, np.array(c), np.array(c_dot))
+        except SingularClusterError as error:
+            raise UserCodeError(f"cluster {self.cluster}: {error}") from error
+        rates = zip(v_W.tolist(), yaw_rates.tolist(), strict=True)
+        return [Velocity(0, 0, "", (x, y, z), yaw_rate, "world") for (x, y, z), yaw_rate in rates]

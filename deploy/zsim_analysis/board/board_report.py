@@ -1,17 +1,45 @@
-"""Makes the page of a board, its tables and figures; and its table for the terminal."""
+"""Makes the page of a board, its tables and figures; and its table for the terminal.
 
-from collections.abc import Callable, Sequence
+Figures: all measures of all laws, the ways of the drones seen from above, and shapes over time.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import Any
 
+import numpy as np
+from matplotlib.patches import Rectangle
 from rich.console import Group
 
-from zsim.presentation import Column, FittedTable
-from zsim_analysis.board.board import Board, board_of, cells, heads, summary_of, write_tables
+from zsim.presentation import Column, FittedTable, drone_colours
+from zsim_analysis.board.board import MEASURES, Board, board_of, cells, heads, planned_figure, summary_of, write_tables
 from zsim_analysis.board.board import BoardRequest as Request
-from zsim_analysis.board.board_figures import board_figures
-from zsim_analysis.board.entries import about
+from zsim_analysis.board.entries import about, document
+from zsim_analysis.report.figure_style import (
+    BLACK,
+    BLUE,
+    DARK,
+    GREEN,
+    GREY,
+    ORANGE,
+    PAGE_IN,
+    PAPER_PT,
+    PURPLE,
+    SKY,
+    VERMILION,
+    ReportFigure,
+    dress,
+    legend_above,
+    letter_panels,
+    new_figure,
+)
 from zsim_analysis.report.make_report import Picture, sources, template, write_report
 from zsim_analysis.sweep.sweep_run import Row
+
+COLOURS = (BLUE, ORANGE, GREEN, VERMILION, SKY, PURPLE, BLACK, GREY)
+MARKS = "osD^vP*X"
+ROW_IN, MARGIN_IN = 0.42, 0.9  # height of a law, and of what stands around the axes
+LEAST_IN = 0.5  # height of a row of ways
 
 
 def make_board_report(
@@ -49,3 +77,128 @@ def terminal_text(board: Board) -> Group:
         rows = [[law, *cells(board.entry(scenario, law))] for law in board.laws]
         tables.append(FittedTable(columns, rows, title=f"\n{scenario}: {about(scenario)}"))
     return Group(*tables)
+
+
+def board_figures(board: Board, rows: Sequence[Row]) -> Iterator[ReportFigure]:
+    """Yield the figures of a board; ways and shapes over time are those of the first seed."""
+    yield _measures(board)
+    first = {(row["scenario"], row["law"]): row for row in rows if row["seed"] == 1 and row["failure"] is None}
+    if first:
+        yield _ways(board, first)
+        yield _shapes(board, first)
+
+
+def _measures(board: Board) -> ReportFigure:
+    shown = [each for each in MEASURES if any(entry.means[each.name] is not None for entry in board.entries)]
+    columns = 4
+    lines = -(-len(shown) // columns)
+    figure = new_figure(PAGE_IN, lines * (MARGIN_IN + ROW_IN * len(board.laws)) * 0.75)
+    panels = figure.subplots(lines, columns, sharey=True, squeeze=False)
+    for axes in panels.flat[len(shown) :]:
+        axes.set_visible(False)
+    for axes, measure in zip(panels.flat, shown, strict=False):
+        for place, scenario in enumerate(board.scenarios):
+            offset = 0.7 * ((place + 0.5) / len(board.scenarios) - 0.5)
+            for row, law in enumerate(board.laws):
+                entry = board.entry(scenario, law)
+                mean = entry.means[measure.name]
+                if mean is None:
+                    continue
+                colour, y = COLOURS[place % len(COLOURS)], row + offset
+                axes.plot([entry.least[measure.name], entry.greatest[measure.name]], [y, y], color=colour, lw=1.0)
+                axes.plot(mean, y, MARKS[place % len(MARKS)], color=colour, ms=3.2, label=scenario.replace("_", " "))
+        dress(axes)
+        axes.margins(x=0.08)
+        axes.set_xlim(0.0, max(axes.get_xlim()[1], 10.0**-measure.digits))
+        unit = f" ({measure.unit})" if measure.unit else ""
+        axes.set_xlabel(f"{measure.title}{unit}", fontsize=PAPER_PT)
+        axes.set_yticks(range(len(board.laws)), [law.replace("_", " ") for law in board.laws])
+        axes.set_ylim(len(board.laws) - 0.5, -0.5)
+    letter_panels(list(panels.flat[: len(shown)]))
+    legend_above(figure, panels[0, 0])
+    spread = f"Means over {board.seeds} seeds; lines from the least to the greatest."
+    caption = f"{spread} A law without a mark has no such measure."
+    return ReportFigure("measures.png", "What the laws achieve", caption, figure)
+
+
+def _ways(board: Board, first: dict[tuple[str, str], Row]) -> ReportFigure:
+    boxes = [_box(board, scenario, first) for scenario in board.scenarios]
+    wide = (PAGE_IN - 0.4) / len(board.laws)
+    heights = [max(wide * (high[1] - low[1]) / (high[0] - low[0]), LEAST_IN) for low, high in boxes]
+    figure = new_figure(PAGE_IN, 0.5 + sum(heights) + 0.08 * len(heights))
+    shape = {"squeeze": False, "height_ratios": heights}
+    panels = figure.subplots(len(board.scenarios), len(board.laws), **shape)
+    for line, (scenario, (low, high)) in enumerate(zip(board.scenarios, boxes, strict=True)):
+        plan, obstacles = planned_figure(scenario), _obstacles(scenario)
+        for axes, law in zip(panels[line], board.laws, strict=True):
+            axes.set_aspect("equal")
+            axes.set_xlim(low[0], high[0])
+            axes.set_ylim(low[1], high[1])
+            axes.set_xticks([])
+            axes.set_yticks([])
+            axes.spines[:].set_color(GREY)
+            for patch in map(_patch, obstacles):
+                axes.add_patch(patch)
+            if line == 0:
+                axes.set_title(law.replace("_", "\n"), fontsize=PAPER_PT - 2)
+            if (row := first.get((scenario, law))) is None:
+                continue
+            t_s, p = np.array(row["track_t_s"]), np.array(row["track_m"], float)
+            centre = np.array([plan.reference.at(float(t)).p_W for t in t_s])
+            axes.plot(*centre.T, color=GREY, lw=0.8, ls=(0, (3, 2)))
+            for drone, colour in enumerate(drone_colours(p.shape[1])):
+                axes.plot(*p[:, drone].T, color=colour, lw=0.6)
+                known = np.flatnonzero(np.isfinite(p[:, drone, 0]))
+                if len(known):
+                    axes.plot(*p[known[-1], drone], "o", color=colour, ms=2.2)
+        panels[line, 0].set_ylabel(scenario.replace("_", " "), fontsize=PAPER_PT)
+    caption = (
+        "Seen from above, x to the right; each drone in its colour, a dot where it was last in the air; dashed, the "
+        "way of the reference's centre. Panels of a row have one scale."
+    )
+    return ReportFigure("ways.png", "The ways of the drones, first seed", caption, figure)
+
+
+def _box(board: Board, scenario: str, first: dict[tuple[str, str], Row]) -> tuple[Any, Any]:
+    """Return the corners of the smallest box, with a metre more, that holds all ways of a scenario [m]."""
+    rows = [first[scenario, law] for law in board.laws if (scenario, law) in first]
+    places = np.concatenate([np.zeros((1, 2)), *(np.array(row["track_m"], float).reshape(-1, 2) for row in rows)])
+    return np.nanmin(places, axis=0) - 1.0, np.nanmax(places, axis=0) + 1.0
+
+
+def _shapes(board: Board, first: dict[tuple[str, str], Row]) -> ReportFigure:
+    columns = min(2, len(board.scenarios))
+    lines = -(-len(board.scenarios) // columns)
+    figure = new_figure(PAGE_IN, 0.4 + 1.7 * lines)
+    panels = figure.subplots(lines, columns, sharex=True, squeeze=False)
+    for axes in panels.flat[len(board.scenarios) :]:
+        axes.set_visible(False)
+    for axes, scenario in zip(panels.flat, board.scenarios, strict=False):
+        for place, law in enumerate(board.laws):
+            row = first.get((scenario, law))
+            errors = np.array(row["track_shape_m"] if row else [], float)
+            if row and np.isfinite(errors).any():
+                name = law.replace("_", " ")
+                axes.plot(row["track_t_s"], errors, color=COLOURS[place % len(COLOURS)], lw=0.8, label=name)
+        dress(axes, "shape error (m)")
+        axes.set_yscale("log")
+        axes.set_title(scenario.replace("_", " "), fontsize=PAPER_PT, color=DARK)
+    for axes in panels[-1]:
+        axes.set_xlabel("simulated time (s)", fontsize=PAPER_PT)
+    legend_above(figure, panels[0, 0])
+    about_all = "; ".join(f"{each.replace('_', ' ')}: {about(each)}" for each in board.scenarios)
+    caption = (
+        "Root mean square distance of the drones from their places, after what the law leaves open; "
+        f"laws without places are not shown. {about_all[0].upper()}{about_all[1:]}."
+    )
+    return ReportFigure("shapes.png", "Shape error over time, first seed", caption, figure)
+
+
+def _obstacles(scenario: str) -> list[dict[str, Any]]:
+    return document("consensus", scenario, 1).get("environment", {}).get("obstacles", [])
+
+
+def _patch(each: dict[str, Any]) -> Rectangle:
+    """Return an obstacle of a shipped scenario: all are boxes along the axes."""
+    (x, y), (wide, deep) = each["position_m"][:2], each["size_m"][:2]
+    return Rectangle((x - wide / 2, y - deep / 2), wide, deep, color=GREY, alpha=0.6, lw=0)

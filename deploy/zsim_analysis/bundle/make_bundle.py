@@ -25,10 +25,9 @@ from zsim.scenario.faults import listed
 from zsim.schema import plugin, yaml_file
 from zsim_analysis.bundle import bundle_file as names
 from zsim_analysis.bundle.bundle_file import Manifest, WrittenBundle, refuse_existing, write_bundle
-from zsim_analysis.bundle.gate_digests import GateDigests
 from zsim_analysis.bundle.own_code import locked, own_modules
 from zsim_analysis.reading import recorded_run
-from zsim_analysis.reading.output_hashes import OutputHashes, content_of
+from zsim_analysis.reading.output_hashes import GateDigests, OutputHashes, content_of
 from zsim_analysis.reading.recorded_run import RecordedAgents, RecordedRun
 from zsim_analysis.report.make_report import figures
 from zsim_analysis.report.summary import RunSummary, judge

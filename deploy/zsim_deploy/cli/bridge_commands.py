@@ -1,4 +1,4 @@
-"""The processes that show a run, and translate it: `console`, `gateway`, `ros1`, `ros2`, `mavlink` and `ardrone`."""
+"""The processes that show or translate a run: `console`, `gateway`, `ros1`, `ros2`, `mavlink`, `ardrone`; `fmu`."""
 
 import math
 import time
@@ -29,6 +29,7 @@ KEY_BYTES = 32
 GCS_PORT, GCS_LOCAL_PORT = 14550, 18570  # PX4's simulation: to the ground station, and the first port here
 API_PORT, API_LOCAL_PORT = 14540, 14580  # likewise for programs
 GATEWAY_NEEDS = {"gateway": ("aiohttp",)}
+FMU_NEEDS = {"fmu": ("fmpy",)}
 ROS1_NEEDS = {"ros1": ("rosbags",)}
 ROS2_NEEDS = {"ros2": ("rosbags", "xxhash")}
 
@@ -44,6 +45,8 @@ PaceAsked = Annotated[
 SigningKey = Annotated[
     Path | None, Option(help="File with the key of MAVLink 2 signatures; unsigned messages are refused.")
 ]
+DroneName = Annotated[str, Argument(help="The drone of the run that it is; `body: external` in the scenario.")]
+Armed = Annotated[bool, Option("--armed", help="Obey from the start; else an operator asks `arm` first.")]
 
 
 @app.command(rich_help_panel=opt.WATCH)
@@ -294,10 +297,6 @@ def serve_ardrone(
     serve_as("ardrone", name, partial(ArdroneServer.serve, options=options), reach)
 
 
-DroneName = Annotated[str, Argument(help="The drone of the run that it is; `body: external` in the scenario.")]
-Armed = Annotated[bool, Option("--armed", help="Obey from the start; else an operator asks `arm` first.")]
-
-
 def _bounds(
     armed: bool, speed: float, climb: float, radius: float | None, ceiling: float | None
 ) -> "tuple[FlightLimits, bool]":
@@ -374,3 +373,61 @@ def drive_ardrone(
     check_host(aircraft_host(address))
     make_session = partial(AircraftSession.of_run, host=address, ultrasound=ultrasound)
     serve_as("driver", "", partial(drive, options=options, make_session=make_session), reach, drone)
+
+
+@app.command(rich_help_panel=opt.TRANSLATE)
+@opt.participant_options
+def fmu(
+    reach: opt.WorldAccess,
+    path: Annotated[
+        Path, Argument(metavar="FILE", help="The FMU: FMI 2 or 3, for co-simulation. Trust it: it is run.")
+    ],
+    drone: Annotated[str | None, Option(help="The drone that places mean that name none.", show_default=False)] = None,
+    map_: Annotated[
+        list[str] | None,
+        Option("--map", metavar="NAME=PLACE", help="vx=velocity_m_s.0, or z=drone2/estimate.position_m.2. Repeatable."),
+    ] = None,
+    param: Annotated[
+        list[str] | None, Option(metavar="NAME=VALUE", help="Start value of a parameter or an input. Repeatable.")
+    ] = None,
+    period: Annotated[
+        float | None,
+        opt.positive_option("Communication step, s (default what the FMU suggests, or the gate).", show_default=False),
+    ] = None,
+    takeoff: Annotated[
+        float | None,
+        Option(
+            callback=opt.not_negative, help="When the drones that it commands take off, s; others' task if not given."
+        ),
+    ] = None,
+    frame: Annotated[Literal["heading", "world"], Option(help="Of velocity commands.")] = "heading",
+    log: Annotated[bool, Option("--log", help="Print all that the FMU logs, not only warnings and errors.")] = False,
+    name: Annotated[
+        str, Option(help="Process name (default fmu.DRONE, or the certificate's); controller.main replaces that one.")
+    ] = "",
+) -> None:
+    """Let an FMU of Simulink, Modelica, Dymola or pythonfmu control drones, or estimate."""
+    require("fmu", FMU_NEEDS)
+    from zsim_bridges.fmu.agent import Fmu
+    from zsim_deploy.roles import roles
+
+    params = {}
+    for text in param or ():
+        variable, equals, value = text.partition("=")
+        if not equals or not variable:
+            raise BadParameter(f"--param is {text!r}; must be NAME=VALUE")
+        params[variable] = value
+    own_name = roles.process_name("fmu", name, reach.who, drone or "main")
+    made = Fmu(
+        path,
+        drone,
+        map_ or (),
+        name=own_name,
+        period_s=period,
+        param=params,
+        takeoff_s=takeoff,
+        frame=frame,
+        log=log,
+        say=roles.log_printer(reach.launched),
+    )
+    roles.agent(made, reach, own_name)

@@ -23,15 +23,12 @@ from zsim.errors import (
 from zsim_deploy import INTERRUPTED, USER_FAULT
 from zsim_deploy.arguments import HOSTS, POKE, TRANSLATE, endpoint_origin, note, say
 from zsim_deploy.cli import (
-    board_command,
     bridge_commands,
-    bundle_commands,
     federation_commands,
-    fmu_command,
     hosts_commands,
-    hunt_command,
     role_commands,
     run_commands,
+    study_commands,
 )
 from zsim_deploy.roles.closed_output import STREAMS, is_unread
 
@@ -54,8 +51,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-_FAMILIES = (run_commands, bundle_commands, hunt_command, board_command, role_commands, hosts_commands)
-for _family in (*_FAMILIES, federation_commands, bridge_commands, fmu_command):
+_FAMILIES = (run_commands, study_commands, role_commands, hosts_commands, federation_commands, bridge_commands)
+for _family in _FAMILIES:
     app.add_typer(_family.app)
 for _panel, _group in (
     (POKE, federation_commands.faults),

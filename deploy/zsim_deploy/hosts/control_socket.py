@@ -29,7 +29,9 @@ Act = Callable[..., Any]
 
 
 def place(federation: str) -> Path:
-    """Return where the launcher of a federation listens; only its user may connect."""
+    """Return where the launcher of a federation listens; only its user may connect. RunError on Windows."""
+    if not hasattr(socket, "AF_UNIX") or not hasattr(os, "getuid"):
+        raise RunError("this system has no Unix sockets with owners, by which launchers are reached; use Linux or WSL")
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     folder = Path(runtime) / "zsim" if runtime else Path(tempfile.gettempdir()) / f"zsim-{os.getuid()}"
     return folder / f"{federation}.sock"
@@ -77,7 +79,7 @@ def ask(federation: str, op: str, **args: Any) -> Any:
 def seen_by_ps(federation: str, status: Callable[[], dict[str, Any]]) -> Iterator[None]:
     """Let `zsim ps` see a run of this process while it lasts; a machine without a place to listen goes without."""
     with contextlib.ExitStack() as stack:
-        with contextlib.suppress(RunError, AttributeError):  # no such sockets on Windows
+        with contextlib.suppress(RunError):
             name = f"{federation}@{os.getpid()}"  # there may be several of a federation
             stack.enter_context(ControlSocket(name, {"ps": status}))
         yield

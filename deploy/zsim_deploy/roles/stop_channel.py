@@ -102,8 +102,12 @@ class StopChannel:
         self._reason = self._reason or reason
 
     def _insist(self) -> None:
-        if not self._is_heeded.wait(GRACE_S):
+        if self._is_heeded.wait(GRACE_S):
+            return
+        if hasattr(signal, "pthread_kill"):  # also wakes the main thread where it sleeps
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+        else:  # Windows, where Python handles a signal of any thread in the main one
+            signal.raise_signal(signal.SIGINT)
 
     def _on_kill(self, *_: object) -> None:
         if self._reason is None:

@@ -16,7 +16,7 @@ from zsim.errors import UserCodeError, reason_of
 from zsim.math.compiled import compiled, inlined, kernel
 from zsim.math.held import Held, hold
 from zsim.schema import plugin
-from zsim.schema.declared_message import field_types
+from zsim.schema.message import field_types
 from zsim.sensors.sensor import Sample, as_fields, message_type
 from zsim.sensors.sensor_catalogue import STOCK
 from zsim.vehicles.vehicle import ROTORS_MAX, ROTORS_MIN

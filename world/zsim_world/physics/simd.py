@@ -24,6 +24,7 @@ from zsim_world.physics.rigid_body import four, put, vector
 from zsim_world.physics.surfaces import Touch, drag_anchors
 
 LANES = 8  # doubles in a register of 512 bit, or in two of 256
+LEVEL = (1.0, 0.0, 0.0, 0.0)  # attitude of a lane without a drone
 
 # Every block begins with the parameters of its drones. This one ends with groups of numbers per rotor.
 BODY_LANES = columns(
@@ -45,11 +46,12 @@ BODY_ROTORS = columns(
 
 
 def blocks(count: int, parts: Iterable[tuple[int, NDArray[np.float64]]]) -> NDArray[np.float64]:
-    """Return the blocks of N drones, (blocks, LANES * count), with the constant columns; all else is 0.
+    """Return the blocks of N drones, (blocks, LANES * count), with some columns; all else is 0.
 
     Args:
         count: of a block's columns.
-        parts: first column, and numbers (N, any) from there on. Lanes without a drone get those of the last one.
+        parts: first column, and numbers (N, any) from there on. Lanes without a drone get those of the last one, and
+            besides these constants an attitude at the start: they are computed too, and Python divides by no 0.
     """
     listed = list(parts)
     drones = len(listed[0][1])
@@ -65,7 +67,8 @@ def body_blocks(row: NDArray, rotors: NDArray, decay: NDArray, aero: NDArray) ->
     """Return the blocks of N bodies: parameters, rotors, the lag of these in half a tick (N, 1), aerodynamics."""
     each = rotors.shape[1] // ROTOR.size
     known = BODY_LANES.size + BODY_ROTORS.known * each
-    parts = ((BODY_LANES.vehicle, row), (BODY_LANES.decay, decay), (BODY_LANES.aero, aero), (known, rotors))
+    level = (BODY_LANES.state + STATE.q_WB, np.tile(LEVEL, (len(row), 1)))
+    parts = ((BODY_LANES.vehicle, row), (BODY_LANES.decay, decay), (BODY_LANES.aero, aero), level, (known, rotors))
     return blocks(BODY_LANES.size + BODY_ROTORS.size * each, parts)
 
 

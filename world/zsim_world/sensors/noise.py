@@ -61,7 +61,8 @@ class NoiseTable:
 
     def refill(self) -> None:
         """Draw as many rows as have been used."""
-        refill(self.table, self.at, self._rows, self.width, self.cursor, self.streams)
+        with np.errstate(over="ignore"):  # words wrap around, of which numpy warns where this is not compiled
+            refill(self.table, self.at, self._rows, self.width, self.cursor, self.streams)
 
     def _draw_start(
         self, scenario: Scenario, streams: list[list[np.random.Generator]], shared: np.random.Generator

@@ -24,6 +24,7 @@ from zsim_world.physics.fleet_arrays import (
 from zsim_world.physics.rigid_body import charge_percent, four, put, put_four, vector
 from zsim_world.physics.simd import (
     LANES,
+    LEVEL,
     blocks,
     lane_four,
     lane_rotors,
@@ -83,8 +84,10 @@ def board_blocks(row: NDArray, rotors: NDArray, setting: NDArray, mounts: NDArra
     each = rotors.shape[1] // ROTOR.size
     drive = setting[:, SETTING.drive : SETTING.drive + DRIVE.size]
     known = BOARD_LANES.size + BOARD_ROTORS.known * each
-    parts = ((BOARD_LANES.vehicle, row), (BOARD_LANES.drive, drive), (BOARD_LANES.mount, mounts), (known, rotors))
-    return blocks(BOARD_LANES.size + BOARD_ROTORS.size * each, parts)
+    constant = ((BOARD_LANES.vehicle, row), (BOARD_LANES.drive, drive), (BOARD_LANES.mount, mounts), (known, rotors))
+    level, unturned = np.tile(LEVEL, (len(row), 1)), np.ones((len(row), 1))
+    start = ((BOARD_LANES.q_WB, level), (BOARD_LANES.cosine, unturned))
+    return blocks(BOARD_LANES.size + BOARD_ROTORS.size * each, (*constant, *start))
 
 
 @inlined

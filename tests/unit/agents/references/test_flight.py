@@ -126,6 +126,11 @@ def test_a_stage_that_is_too_fast_is_refused_with_its_time_or_fitted() -> None:
         ("follow", {}, ("none", "minimum_snap")),
         ("follow", {"minimum_snap": SLOW, "waypoints": SLOW}, ("waypoints", "minimum_snap")),
         ("follow", {"circle": {"radius_m": -1, "period_s": 3}}, ("circle.radius_m", "-1", "0")),
+        ("follow", {"minimum_snap": SLOW, "file": "way.csv"}, ("file", "way.csv", "pieces")),
+        ("follow", {"minimum_snap": SLOW, "start_s": 3}, ("start_s", "3", "time_scale")),
+        ("follow", {"minimum_snap": SLOW, "takeoff_s": 0, "land_s": 40}, ("takeoff_s", "0", "land_s", "40", "fit")),
+        ("follow", {"minimum_snap": SLOW, "gain_1_s": 1.5}, ("gain_1_s", "1.5", "origin_m")),
+        ("follow", {"minimum_snap": SLOW, "duration_s": 9}, ("duration_s", "9", "expressions")),
     ],
 )
 def test_requests_that_cannot_be_understood_are_refused(op: str, args: dict[str, Any], terms: tuple[str, ...]) -> None:

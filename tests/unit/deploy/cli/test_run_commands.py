@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from zsim.contract import keys, run_messages
 from zsim.errors import RecordError
 from zsim.record import RecordWriter
-from zsim_deploy.cli import bundle_commands, run_commands
+from zsim_deploy.cli import run_commands
 from zsim_deploy.cli.cli import app
 from zsim_deploy.launch.supervisor import Outcome
 
@@ -153,7 +153,7 @@ def test_a_rerun_and_a_sweep_that_fail_end_with_why(
 ):
     monkeypatch.setattr("zsim_analysis.rerun.rerun_record", lambda *_: "truth differs")
     with pytest.raises(typer.Exit) as ended:
-        bundle_commands.rerun(tmp_path)
+        run_commands.rerun(tmp_path)
     assert (ended.value.exit_code, capsys.readouterr().err.splitlines()[-1]) == (1, "truth differs")
     with pytest.raises(typer.Exit) as ended:
         run_commands._conclude(tmp_path, ["too heavy", "too heavy"], 2, report=False)

@@ -52,6 +52,28 @@ def test_a_process_that_is_told_to_stop_keeps_its_key_and_a_deserted_one_gives_i
     assert not key.exists()
 
 
+HELD = """
+import signal, sys, time
+from zsim_deploy.roles import stop_channel
+if sys.argv[1] == "windows":
+    del signal.pthread_kill
+stop_channel.GRACE_S = 0.01
+stop = stop_channel.StopChannel(held_by=lambda _: ", in a law")
+signal.raise_signal(signal.SIGTERM)
+try:
+    while True:
+        time.sleep(0.001)
+except KeyboardInterrupt as error:
+    print(stop.reason(), error, sep="|")
+"""
+
+
+@pytest.mark.parametrize("system", ["posix", "windows"])
+def test_code_that_does_not_look_whether_to_stop_is_interrupted(system: str) -> None:
+    done = subprocess.run([sys.executable, "-c", HELD, system], capture_output=True, text=True, timeout=60.0)
+    assert (done.stdout, done.stderr) == ("terminated|terminated, in a law\n", "")
+
+
 def test_a_key_that_was_brought_for_a_successor_stays(key: Path) -> None:
     old = KeyLease(key.parent)
     key.unlink()

@@ -12,7 +12,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.faults import kinds_of
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
-from zsim.schema.declared_message import field_types
+from zsim.schema.message import field_types
 from zsim.sensors import sensor_catalogue
 from zsim.sensors.scanner import SCANNERS
 from zsim.sensors.sensor import Sample, as_fields, message_type
