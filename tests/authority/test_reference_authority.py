@@ -11,8 +11,15 @@ from zsim.scenario.polynomial_file import pieces_of
 from zsim_agents.formation.assignment import assign, straight_separation
 from zsim_agents.references.approach import first_approach
 from zsim_agents.references.cruise import RISE_S, Cruise, cruise, cruise_through
-from zsim_agents.references.generators import Laps, figure_eight
-from zsim_agents.references.path import PathLimits, PiecewisePolynomial, minimum_snap, move, peaks_of
+from zsim_agents.references.path import (
+    Laps,
+    PathLimits,
+    PiecewisePolynomial,
+    figure_eight,
+    minimum_snap,
+    move,
+    peaks_of,
+)
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "trajectories"
 AXES = ("x", "y", "z", "yaw")

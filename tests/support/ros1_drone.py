@@ -8,8 +8,8 @@ from zsim.contract import flight_messages
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_bridges.ros1 import tcpros
-from zsim_bridges.ros1.drone_topics import DroneTopics
 from zsim_bridges.ros1.node import Ros1Node
+from zsim_bridges.ros1.ros1_bridge import DroneTopics
 
 GATE_NS = 20_000_000
 SCENARIO = """

@@ -25,15 +25,17 @@ from zsim_agents.formation.assignment import assign
 from zsim_agents.formation.expression import ExpressionError
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.formation.trajectory import ExpressionTrajectory, Reference, TrajectoryError, WaypointTrajectory
-from zsim_agents.references.approach import first_approach
-from zsim_agents.references.generators import Laps, circle, figure_eight
+from zsim_agents.references.approach import first_approach, meetings
 from zsim_agents.references.path import (
     SHARE,
     EndMotion,
+    Laps,
     PathLimits,
     Peaks,
     PiecewisePolynomial,
     Scaled,
+    circle,
+    figure_eight,
     minimum_snap,
     move,
     peaks_of,
@@ -369,8 +371,6 @@ def flight_faults(scenario: Scenario) -> Iterator[tuple[str, str]]:
     if sound and (text := too_near(scenario, flights)):
         yield "drones", text
     if sound and scenario.clusters:
-        from zsim_agents.references.formations import meetings  # here, because few scenarios have both
-
         yield from meetings(scenario, flights, {name: land_s_of(each) for name, each in scenario.piloted().items()})
 
 

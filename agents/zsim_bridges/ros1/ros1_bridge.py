@@ -1,22 +1,59 @@
-"""The bridge as a process: one run's drones in the graph of a ROS 1 master; it commands, and never gates."""
+"""The bridge as a process: one run's drones in the graph of a ROS 1 master; it commands, and never gates.
+
+Each drone is there as ardrone_autonomy's driver in the namespace of its name: messages, commands, cameras. Units, signs
+and frames are the driver's; its frames are those of a driver whose tf_prefix is the drone's name. Sources:
+ardrone_autonomy 1.4.1, src/ardrone_driver.cpp (PublishNavdata, PublishOdometry), src/teleop_twist.cpp; REP 103 and 105.
+"""
 
 import asyncio
 import contextlib
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
-from zsim.contract import keys
+import numpy as np
+from rosbags.typesys.stores import ros1_noetic as ros1
+
+from zsim.contract import flight_messages, keys, messages
 from zsim.contract.flight_messages import CameraImage, CameraInfo
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
 from zsim.errors import RunError
+from zsim.math import frames as rotations
+from zsim.math.rotation import LEVEL, Quaternion, Vector
 from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Drone
+from zsim.schema.quantities import G_M_S2
+from zsim.sensors.camera import CAMERAS
 from zsim.transport.session import Session
 from zsim_bridges import ros_messages as ros
-from zsim_bridges.ros1.drone_topics import QUEUE, DroneTopics, ros1_name, ros_time
-from zsim_bridges.ros1.node import Ros1Node
+from zsim_bridges.ros1.node import PublishedTopic, Ros1Node
+from zsim_bridges.ros1.tcpros import message_class
 from zsim_bridges.vehicle_links import drone_link
+from zsim_bridges.vehicle_links.drone_link import CommandSender, ModeName, OnboardState
 from zsim_bridges.vehicle_links.server import PictureIntake, Say, TrafficIntake, VehicleServer
+
+WORLD = "world"
+MAG_LSB_PER_UT = 1 / 0.3  # AK8975 datasheet, 0.3 uT per LSB: the AR.Drone 2.0's
+FIX_3D = 3  # a fix with a height, as in NMEA
+NOT_SIMULATED = {  # fields of navdata: numbers, and lists of the tags that its camera recognises
+    **dict.fromkeys(("temp", "wind_speed", "wind_angle", "wind_comp_angle", "tags_count"), 0),
+    **dict.fromkeys(("motor1", "motor2", "motor3", "motor4"), 0),
+    **{f"tags_{what}": np.zeros(0, np.uint32) for what in ("type", "xc", "yc", "width", "height")},
+    **{f"tags_{what}": np.zeros(0, np.float32) for what in ("orientation", "distance")},
+}
+UNKNOWN = np.zeros(9)
+DRIVER_QUEUE = 200  # messages, of the driver's publishers
+CAMERA_QUEUE = 10  # pictures, of the driver's image publishers
+QUEUE = 100  # messages
+NEARLY_ZERO = 1e-6  # of a component of cmd_vel, _EPS of the driver
+REPEAT_NS = 100_000_000  # ns; a commander that is silent for 0.5 s counts as dead, scenario `silence.hover_s`
+AIRBORNE = ("hovering", "flying")
+COMMANDABLE = ("taking_off", *AIRBORNE)
+Part = tuple[str, Vector, Quaternion]  # frame of a part, and its pose in the body
+Navdata = message_class("ardrone_autonomy/Navdata")
 
 
 class NodeShutdownError(RunError):
@@ -115,3 +152,274 @@ class Ros1Bridge(VehicleServer):
         """Print which commands of ROS nodes the world refuses."""
         if (event.kind, event.source) == ("refused", self.observer.name):
             self.say_once(f"{event.subject}: {event.data.get('reason', event.text)}")
+
+
+class DriverFrames:
+    """Names of a drone's frames."""
+
+    def __init__(self, drone: str) -> None:
+        self.base = f"{drone}/ardrone_base_link"
+        self.gps = f"{drone}/ardrone_base_gps"
+        self.odom = f"{drone}/odom"
+
+
+def ros1_name(name: str) -> str:
+    """Return a name of the contract as a name of ROS, which has letters, digits and _ alone."""
+    return name.replace(".", "_").replace("-", "_")
+
+
+def camera_frame(name: str, camera: str) -> str:
+    """Return the driver's name of a camera's frame: x to the right of the picture, y down, z ahead."""
+    return f"{name}/ardrone_base_{camera}cam"
+
+
+class DroneTopics:
+    """Topics and services of a drone; commands are sent under the name of a process, `tf` is of all drones."""
+
+    def __init__(
+        self, node: Ros1Node, drone: Drone, source: str, put: Callable[[str, Any], None], tf: PublishedTopic
+    ) -> None:
+        name = ros1_name(drone.name)
+        self._state, self._frames = OnboardState(drone.sensors.imu.mount, drone.sensors.mag.mount), DriverFrames(name)
+        self._commands = commands = DriverCommands(drone.name, source, put)
+        self.cameras = CameraTopics(node, name)
+
+        self._navdata = node.publish(f"/{name}/ardrone/navdata", "ardrone_autonomy/Navdata", DRIVER_QUEUE)
+        self._imu = node.publish(f"/{name}/ardrone/imu", "sensor_msgs/Imu", DRIVER_QUEUE)
+        self._mag = node.publish(f"/{name}/ardrone/mag", "geometry_msgs/Vector3Stamped", DRIVER_QUEUE)
+        self._odometry = node.publish(f"/{name}/ardrone/odometry", "nav_msgs/Odometry", DRIVER_QUEUE)
+        self._fix = node.publish(f"/{name}/fix", "sensor_msgs/NavSatFix", QUEUE)
+        self._truth = node.publish(f"/{name}/ground_truth/state", "nav_msgs/Odometry", QUEUE)
+        self._tf = tf
+        node.subscribe(f"/{name}/cmd_vel", "geometry_msgs/Twist", commands.on_cmd_vel)
+        node.subscribe(f"/{name}/ardrone/takeoff", "std_msgs/Empty", lambda _: commands.send_mode("takeoff"))
+        node.subscribe(f"/{name}/ardrone/land", "std_msgs/Empty", lambda _: commands.send_mode("land"))
+        node.subscribe(f"/{name}/ardrone/reset", "std_msgs/Empty", lambda _: commands.reset())
+        node.serve(f"/{name}/ardrone/flattrim", commands.trim_refusal)
+
+    def publish(self, message: Any) -> None:
+        """Publish what follows from a message of the drone or of its estimator."""
+        state, frames = self._state, self._frames
+        message = state.update(message)
+        match message:
+            case messages.Imu():
+                self._imu.publish(partial(imu, sample=message, attitude=state.attitude, frames=frames))
+            case messages.Mag():
+                self._mag.publish(partial(mag, sample=message, frames=frames))
+            case messages.Gps():
+                self._fix.publish(partial(fix, sample=message, frames=frames))
+            case flight_messages.Truth():
+                self._truth.publish(partial(ground_truth, truth=message, frames=frames))
+            case flight_messages.Status():
+                self._commands.on_status(message)
+                self._navdata.publish(partial(navdata, state=state, frames=frames))
+                self._odometry.publish(partial(odometry, state=state, frames=frames))
+                self._tf.publish(partial(transforms, state=state, frames=frames, parts=self.cameras.poses()))
+
+
+class TiltCommand(NamedTuple):
+    """A cmd_vel within its limits: shares of the largest tilt, climb and yaw rate."""
+
+    forward: float
+    left: float
+    up: float
+    yaw_left: float
+    hover: bool
+
+
+class DriverCommands:
+    """Commands of ROS nodes to one drone, by the driver's rules. Pure.
+
+    The driver repeats the last cmd_vel until there is another; so does this, until the drone comes down.
+    """
+
+    def __init__(self, drone: str, source: str, put: Callable[[str, Any], None]) -> None:
+        self._sender = CommandSender(drone, source, put)
+        self._tilt: TiltCommand | None = None
+        self._sent_ns: int | None = None
+        self._status: flight_messages.Status | None = None
+
+    def on_cmd_vel(self, twist: Any) -> None:
+        """Fly a geometry_msgs/Twist from the next gate on.
+
+        Raises:
+            ValueError: it is not finite.
+        """
+        tilt = tilt_of(twist)
+        if self._status is not None and self._status.state in COMMANDABLE:
+            self._tilt, self._sent_ns = tilt, None
+
+    def reset(self) -> None:
+        """Stop the rotors at once; in the emergency that this is, leave it: the driver's toggle."""
+        self.send_mode("reset" if self._status is not None and self._status.state == "emergency" else "emergency")
+
+    def trim_refusal(self) -> str | None:
+        """Return why the drone cannot be trimmed now; a landed one stands level, and nothing more is to be done."""
+        state = self._status.state if self._status else "not there yet"
+        return None if state == "landed" else f"the drone is {state}; must be landed"
+
+    def on_status(self, status: flight_messages.Status) -> None:
+        self._status = status
+        if status.state not in COMMANDABLE:
+            self._tilt = None
+        late = self._sent_ns is None or status.t_ns - self._sent_ns >= REPEAT_NS
+        if self._tilt is not None and late and status.state in AIRBORNE:
+            self._sent_ns = status.t_ns
+            self._sender.tilt(status.t_ns, *self._tilt)
+
+    def send_mode(self, mode: ModeName) -> None:
+        self._sender.mode(self._status.t_ns if self._status else 0, mode)
+
+
+def tilt_of(twist: Any) -> TiltCommand:
+    """Return the AR.Drone's command for a geometry_msgs/Twist.
+
+    linear.x and linear.y are shares of the largest tilt, forward and to the left; linear.z of the largest climb;
+    angular.z of the largest yaw rate, counter-clockwise. All six zero is hovering in place.
+
+    Raises:
+        ValueError: it is not finite.
+    """
+    linear, angular = twist.linear, twist.angular
+    values = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
+    if not all(map(math.isfinite, values)):
+        raise ValueError(f"cmd_vel is {values}; must be finite")
+    shares = (min(1.0, max(-1.0, share)) for share in (linear.x, linear.y, linear.z, angular.z))
+    return TiltCommand(*shares, hover=all(abs(value) < NEARLY_ZERO for value in values))
+
+
+class CameraTopics:
+    """Topics of a drone's cameras, as of the driver with image_transport, and the service togglecam.
+
+    There is a topic for each camera, and one for the active camera, which the service changes. Pictures are large: a
+    camera's are read only while a node subscribes to them.
+    """
+
+    def __init__(self, node: Ros1Node, name: str) -> None:
+        def publishers(base: str) -> tuple[PublishedTopic, PublishedTopic]:
+            """Return the topics of pictures, and of how they are to be understood."""
+            return (
+                node.publish(f"{base}/image_raw/compressed", "sensor_msgs/CompressedImage", CAMERA_QUEUE),
+                node.publish(f"{base}/camera_info", "sensor_msgs/CameraInfo", CAMERA_QUEUE),
+            )
+
+        self._name = name
+        self._own = {camera: publishers(f"/{name}/ardrone/{camera}") for camera in CAMERAS}
+        self._of_active = publishers(f"/{name}/ardrone")
+        self._infos: dict[str, CameraInfo] = {}
+        self.active = CAMERAS[0]
+        node.serve(f"/{name}/ardrone/togglecam", self._toggle)
+
+    def _toggle(self) -> None:
+        self.active = CAMERAS[(CAMERAS.index(self.active) + 1) % len(CAMERAS)]
+
+    def _topics(self, camera: str) -> list[tuple[PublishedTopic, PublishedTopic]]:
+        return [self._own[camera], self._of_active] if camera == self.active else [self._own[camera]]
+
+    def wanted(self) -> Iterator[str]:
+        for camera in CAMERAS:
+            if any(image.links or info.links for image, info in self._topics(camera)):
+                yield camera
+
+    def learn(self, camera: str, info: CameraInfo) -> None:
+        self._infos[camera] = info
+
+    def publish(self, camera: str, image: CameraImage) -> None:
+        frame, info = camera_frame(self._name, camera), self._infos.get(camera)
+        for of_images, of_infos in self._topics(camera):
+            of_images.publish(lambda seq: ros.compressed_image(header(seq, image.t_sample_ns, frame), image))
+            if info is not None:
+                of_infos.publish(partial(camera_info, info=info, t_ns=image.t_sample_ns, frame=frame))
+
+    def poses(self) -> list[Part]:
+        """Return frame, position and orientation in the body of the cameras that have said how they see."""
+        return [
+            (camera_frame(self._name, camera), info.position_m, info.orientation_wxyz)
+            for camera, info in self._infos.items()
+        ]
+
+
+def ros_time(t_ns: int) -> Any:
+    """Return simulated time [ns] as ROS writes it: seconds, and nanoseconds; ROS 1 has none before 0."""
+    return ros.Time(*divmod(max(t_ns, 0), ros.NS_PER_S))
+
+
+def header(seq: int, t_ns: int, frame: str) -> Any:
+    return ros1.std_msgs__msg__Header(seq, ros_time(t_ns), frame)
+
+
+def navdata(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
+    """Return what the driver publishes as ardrone/navdata, at the newest status.
+
+    rotX is positive to the right, rotY nose down, rotZ counter-clockwise [deg]; velocities x forward, y left,
+    z up [mm/s]; accelerations [g], az 1 at rest; altd [mm]; tm since the start [us].
+    """
+    assert state.status is not None
+    rpy_deg = np.degrees(rotations.rpy_from_quaternion(state.attitude)).tolist()
+    mag = [round(field * MAG_LSB_PER_UT) for field in state.mag.field_ut] if state.mag else [0, 0, 0]
+    v = [1e3 * speed for speed in state.flow.velocity_m_s] if state.flow else [0.0, 0.0, 0.0]
+    f = [accel / G_M_S2 for accel in state.imu.accel_m_s2] if state.imu else [0.0, 0.0, 0.0]
+    return Navdata(
+        header=header(seq, state.status.t_ns, frames.base),
+        batteryPercent=state.status.battery_percent,
+        state=ros.NAVDATA_STATES[state.status.state],
+        **ros.by_axis("mag{}", "XYZ", mag),
+        pressure=round(state.baro.pressure_pa) if state.baro else 0,
+        **ros.by_axis("rot{}", "XYZ", rpy_deg),
+        altd=round(1e3 * state.altitude_m),
+        **ros.by_axis("v{}", "xyz", v),
+        **ros.by_axis("a{}", "xyz", f),
+        **NOT_SIMULATED,
+        tm=state.status.t_ns / 1e3,
+    )
+
+
+def imu(seq: int, sample: messages.Imu, attitude: Quaternion, frames: DriverFrames) -> Any:
+    """Return ardrone/imu: attitude, rate and specific force in B, (0, 0, 9.8) at rest."""
+    return ros.imu(header(seq, sample.t_sample_ns, frames.base), sample, attitude, (UNKNOWN, UNKNOWN, UNKNOWN))
+
+
+def mag(seq: int, sample: messages.Mag, frames: DriverFrames) -> Any:
+    """Return ardrone/mag: the direction of the Earth's field in B, of length 1."""
+    length = math.hypot(*sample.field_ut) or 1.0
+    direction: Any = ros.Vector3(*(field / length for field in sample.field_ut))
+    return ros1.geometry_msgs__msg__Vector3Stamped(header(seq, sample.t_sample_ns, frames.base), direction)
+
+
+def fix(seq: int, sample: messages.Gps, frames: DriverFrames) -> Any:
+    return ros.fix(header(seq, sample.t_sample_ns, frames.gps), sample, sample.fix >= FIX_3D)
+
+
+def odometry(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
+    """Return ardrone/odometry: what the aircraft's own velocity integrates to since the start.
+
+    The velocity is that of navdata: along the level axes x forward, y left, z up.
+    """
+    assert state.status is not None
+    velocity = state.flow.velocity_m_s if state.flow else (0.0, 0.0, 0.0)
+    rate = state.imu.gyro_rad_s if state.imu else (0.0, 0.0, 0.0)
+    head = header(seq, state.status.t_ns, frames.odom)
+    return ros.odometry(head, frames.base, ros.pose(state.position_m, state.attitude), ros.twist(velocity, rate))
+
+
+def ground_truth(seq: int, truth: flight_messages.Truth, frames: DriverFrames) -> Any:
+    """Return the true state as Gazebo's p3d plugin does, which hector_quadrotor and tum_simulator use: all in W."""
+    q = truth.orientation_wxyz
+    rate = rotations.rotate(q, truth.angular_velocity_rad_s).tolist()
+    head = header(seq, truth.t_ns, WORLD)
+    return ros.odometry(head, frames.base, ros.pose(truth.position_m, q), ros.twist(truth.velocity_m_s, rate))
+
+
+def transforms(seq: int, state: OnboardState, frames: DriverFrames, parts: Sequence[Part] = ()) -> Any:
+    """Return `/tf` of a drone: odom to base as integrated, world to odom as far as it is estimated, and its parts."""
+    assert state.status is not None
+    t_ns = state.status.t_ns
+    poses = [ros.transform(header(seq, t_ns, frames.odom), frames.base, state.position_m, state.attitude)]
+    if state.origin_m is not None:
+        poses.append(ros.transform(header(seq, t_ns, WORLD), frames.odom, state.origin_m, LEVEL))
+    poses += [ros.transform(header(seq, t_ns, frames.base), *part) for part in parts]
+    return ros.TFMessage(poses)
+
+
+def camera_info(seq: int, info: CameraInfo, t_ns: int, frame: str) -> Any:
+    return ros.camera_info(ros1.sensor_msgs__msg__CameraInfo, header(seq, t_ns, frame), info)

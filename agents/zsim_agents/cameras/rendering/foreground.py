@@ -1,4 +1,4 @@
-"""What stands before ground and sky in one camera's picture: drones, hats, and obstacles. Pure.
+"""What stands before ground and sky in one camera's picture: drones, hats, obstacles and surfaces. Pure.
 
 Drones are hulls, arms, motors, rotors as their blades sweep, and hats; they look like the console's
 (zsim_bridges.console.airframe); lengths are the AR.Drone's, scaled by the arms. All of a picture are computed together.
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.scenario.obstacle import BOX, CENTRE, COSINE, HALF, SHAPE, SINE, SPHERE
+from zsim.scenario.triangles import corners_of
 from zsim_agents.cameras.rendering.scene import (
     ARM_M,
     BLUR_MAX_PX,
@@ -68,6 +69,19 @@ SEEN_M = 300.0  # m; farther drones are less than a pixel
 ROOM_M = 0.5  # m; no part is farther from the middle of a drone with arms of 0.18 m
 BLURRED_PX = 2.0  # px of motion from which drones are blurred; hulls need not be as exact as hats
 EDGE_PX = 3.0  # px by which smooth edges and the blur may exceed the lines
+Levels = NDArray[np.float32]
+AMBIENT, DIFFUSE = 0.72, 0.28  # shares of the light from the sky and from the sun; chosen: matt foam outdoors
+STEPS_MAX = 6  # instants of an exposure that are drawn of a moving ball
+STEP_PX = 0.8  # px between two of them
+ROUNDING = np.float32(0.5)
+AXIS = np.array([0.0, 0.0, 1.0])
+NEAR_M = 0.05  # nothing nearer is drawn
+FAR_PX = 16_000.0  # px; coordinates beyond are clipped: they have 32 bits with the fraction, and lines have to end
+SIDES = 24  # of a cylinder
+PIECES = 8  # of an edge that the lens bends
+OBSTACLE = np.array([92.0, 118.0, 146.0])  # B, G, R, chosen: weathered wood; never magenta
+SURFACE = np.array([102.0, 116.0, 124.0])  # B, G, R, chosen: stone; never magenta
+BENT_PX = 24.0  # px, chosen: the lens bends the edges of larger triangles visibly
 
 
 class DroneImager:
@@ -324,19 +338,6 @@ def _fill_hull(picture: Picture, pixels: Fixed, colour: Colour) -> None:
     cv2.fillConvexPoly(picture, cv2.convexHull(pixels), colour, cv2.LINE_AA, SHIFT)
 
 
-Levels = NDArray[np.float32]
-AMBIENT, DIFFUSE = 0.72, 0.28  # shares of the light from the sky and from the sun; chosen: matt foam outdoors
-STEPS_MAX = 6  # instants of an exposure that are drawn of a moving ball
-STEP_PX = 0.8  # px between two of them
-ROUNDING = np.float32(0.5)
-AXIS = np.array([0.0, 0.0, 1.0])
-NEAR_M = 0.05  # nothing nearer is drawn
-FAR_PX = 16_000.0  # px; coordinates beyond are clipped: they have 32 bits with the fraction, and lines have to end
-SIDES = 24  # of a cylinder
-PIECES = 8  # of an edge that the lens bends
-OBSTACLE = np.array([92.0, 118.0, 146.0])  # B, G, R, chosen: weathered wood; never magenta
-
-
 class BallImage(NamedTuple):
     """A ball in a part of the picture.
 
@@ -515,3 +516,49 @@ def bgr(colour: Array) -> tuple[float, float, float]:
     """Return a colour as OpenCV's scalar."""
     b, g, r = colour.tolist()
     return round(b), round(g), round(r)
+
+
+class SurfaceImager:
+    """The surfaces before one camera, (T, 9) as in zsim.scenario.triangles: of one shade, seen from both sides.
+
+    They are drawn from the farthest to the nearest by their middles, among drones and obstacles, without smoothed
+    edges, so that no gap shows between neighbours.
+    """
+
+    def __init__(self, view: View, triangle: Array, brightness: float) -> None:
+        self._view = view
+        self._corners_W = corners_of(triangle)
+        self._middles_W = self._corners_W.mean(axis=1)
+        normals = np.cross(triangle[:, 3:6], triangle[:, 6:])
+        self._normals_W = normals / np.linalg.norm(normals, axis=1)[:, None]
+        self._brightness = brightness
+
+    def shown(self, motion: CameraMotion) -> list[tuple[float, int]]:
+        """Return distance [m] and number of each triangle of which something may be in the picture, and keep them."""
+        self._points_K = motion.points_K(self._corners_W)
+        z = self._points_K[..., 2]
+        ahead = (z > NEAR_M).all(axis=1)
+        self._pixels = np.zeros((len(z), 3, 2))
+        if ahead.any():
+            self._pixels[ahead] = self._view.pixels(self._points_K[ahead])
+        low, high = self._pixels.min(axis=1), self._pixels.max(axis=1)
+        size = self._view.lens.width, self._view.lens.height
+        inside = ahead & (high >= 0.0).all(axis=1) & (low <= size).all(axis=1)
+        bent = self._view.distorts & ((high - low).max(axis=1) > BENT_PX)
+        self._is_plain = inside & ~bent
+        chosen = np.flatnonzero(inside | (~ahead & (z > NEAR_M).any(axis=1)))
+        away = self._middles_W[chosen] - motion.p_WK
+        faces = np.where((self._normals_W[chosen] * away).sum(axis=1) > 0.0, -1.0, 1.0)  # the side that is seen
+        lit = np.maximum(faces * (self._normals_W[chosen] @ SUN_W), 0.0)
+        self._shade = np.zeros(len(z))
+        self._shade[chosen] = self._brightness * (AMBIENT - 0.15 + (DIFFUSE + 0.15) * lit)
+        distance = np.linalg.norm(away, axis=1)
+        return list(zip(distance.tolist(), chosen.tolist(), strict=True))
+
+    def draw(self, picture: NDArray[np.uint8], number: int) -> None:
+        """Draw one of the triangles that are shown."""
+        colour = self._shade[number] * SURFACE
+        if self._is_plain[number]:
+            cv2.fillConvexPoly(picture, fixed(self._pixels[number]), bgr(colour), cv2.LINE_8, SHIFT)
+        else:
+            fill_face(picture, self._view, self._points_K[number], colour)

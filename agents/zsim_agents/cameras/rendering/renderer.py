@@ -14,7 +14,7 @@ from zsim.scenario.obstacle import nearest
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import Lens, camera_pose, lens_of
 from zsim_agents.cameras.rendering.backdrop import Backdrop, Ground, colour_map, meadow
-from zsim_agents.cameras.rendering.foreground import SEEN_M, DroneImager, draw_obstacle
+from zsim_agents.cameras.rendering.foreground import SEEN_M, DroneImager, SurfaceImager, draw_obstacle
 from zsim_agents.cameras.rendering.scene import (
     CameraMotion,
     DroneStates,
@@ -23,7 +23,6 @@ from zsim_agents.cameras.rendering.scene import (
     camera_motion,
     motion_blur_kernels,
 )
-from zsim_agents.cameras.rendering.surfaces import SurfaceImager
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]

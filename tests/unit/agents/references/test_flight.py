@@ -12,7 +12,7 @@ from zsim.scenario import scenario_file
 from zsim_agents.hosting import check_plans
 from zsim_agents.references.flight import SHARE, FlightError, checked_flight, exchange_flights, flight_of, limits_of
 from zsim_agents.references.path import peaks_of
-from zsim_agents.references.requests import DroneRequestError, Goto, read_request, requested_flight
+from zsim_agents.references.pilot import DroneRequestError, Goto, read_request, requested_flight
 
 FAST = [{"at_s": 0, "position_m": [0, 0, 2]}, {"at_s": 2, "position_m": [20, 0, 2]}]
 SLOW = [{"at_s": 0, "position_m": [0, 0, 2]}, {"at_s": 30, "position_m": [20, 0, 2], "yaw_deg": 90}]

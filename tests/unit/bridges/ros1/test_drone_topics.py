@@ -9,8 +9,8 @@ from refused import has_terms
 from scipy.spatial.transform import Rotation
 
 from zsim.contract import flight_messages, messages
-from zsim_bridges.ros1 import drone_topics, tcpros
-from zsim_bridges.ros1.drone_topics import REPEAT_NS, DriverCommands, DriverFrames, TiltCommand, ros1_name, tilt_of
+from zsim_bridges.ros1 import ros1_bridge, tcpros
+from zsim_bridges.ros1.ros1_bridge import REPEAT_NS, DriverCommands, DriverFrames, TiltCommand, ros1_name, tilt_of
 from zsim_bridges.vehicle_links.drone_link import OnboardState
 
 T_NS, GATE_NS = 61_040_000_000, 20_000_000
@@ -59,12 +59,12 @@ def on_wire(kind: str, message: Any) -> Any:
 
 
 def navdata(state: Any = "hovering", **angles: float) -> Any:
-    return on_wire("ardrone_autonomy/Navdata", drone_topics.navdata(3, aircraft(state, **angles), FRAMES))
+    return on_wire("ardrone_autonomy/Navdata", ros1_bridge.navdata(3, aircraft(state, **angles), FRAMES))
 
 
 @pytest.mark.parametrize(("t_ns", "stamp"), [(12_340_000_005, (12, 340_000_005)), (0, (0, 0)), (-5_000_000, (0, 0))])
 def test_a_time_is_seconds_and_nanoseconds_and_none_is_before_the_start(t_ns, stamp):
-    time = drone_topics.ros_time(t_ns)
+    time = ros1_bridge.ros_time(t_ns)
     assert (time.sec, time.nanosec) == stamp
 
 
@@ -101,14 +101,14 @@ def test_states_have_the_numbers_of_the_sdk(state, number):
 
 
 def test_an_aircraft_that_has_said_little_has_navdata_too():
-    message = on_wire("ardrone_autonomy/Navdata", drone_topics.navdata(0, without_sensors(), FRAMES))
+    message = on_wire("ardrone_autonomy/Navdata", ros1_bridge.navdata(0, without_sensors(), FRAMES))
     assert (message.altd, message.vx, message.pressure, message.az) == (0, 0.0, 0, 0.0)
 
 
 def test_an_imu_tells_specific_force_rate_and_attitude():
     own = aircraft(yaw_deg=90.0)
     assert own.imu is not None
-    message = on_wire("sensor_msgs/Imu", drone_topics.imu(0, own.imu, own.attitude, FRAMES))
+    message = on_wire("sensor_msgs/Imu", ros1_bridge.imu(0, own.imu, own.attitude, FRAMES))
     assert message.linear_acceleration.z == pytest.approx(9.80665)
     assert xyz(message.angular_velocity) == (0.1, 0.2, 0.3)
     assert (message.orientation.w, message.orientation.z) == pytest.approx((math.sqrt(0.5), math.sqrt(0.5)))
@@ -116,7 +116,7 @@ def test_an_imu_tells_specific_force_rate_and_attitude():
 
 @pytest.mark.parametrize(("field", "direction"), [((3.0, 0.0, -4.0), (0.6, 0.0, -0.8)), (ZERO, ZERO)])
 def test_the_magnetic_field_is_a_direction(field, direction):
-    message = drone_topics.mag(0, messages.Mag(T_NS, 0, T_NS - 5_000_000, field), FRAMES)
+    message = ros1_bridge.mag(0, messages.Mag(T_NS, 0, T_NS - 5_000_000, field), FRAMES)
     assert xyz(message.vector) == pytest.approx(direction)
     assert message.header.stamp.nanosec == 35_000_000  # of the sample, not of its arrival
 
@@ -124,14 +124,14 @@ def test_the_magnetic_field_is_a_direction(field, direction):
 @pytest.mark.parametrize(("fix", "status"), [(3, 0), (0, -1)])
 def test_a_fix_is_where_and_how_well(fix, status):
     gps = messages.Gps(T_NS, 0, T_NS - 100_000_000, -34.6, -58.4, 31.0, ZERO, ZERO, 2.0, fix, 9)
-    message = on_wire("sensor_msgs/NavSatFix", drone_topics.fix(0, gps, FRAMES))
+    message = on_wire("sensor_msgs/NavSatFix", ros1_bridge.fix(0, gps, FRAMES))
     assert (message.latitude, message.longitude, message.altitude) == (-34.6, -58.4, 31.0)
     assert message.status.status == status
     assert message.position_covariance.tolist() == [4.0, 0, 0, 0, 4.0, 0, 0, 0, 4.0]
 
 
 def test_odometry_is_the_aircraft_s_own():
-    message = on_wire("nav_msgs/Odometry", drone_topics.odometry(0, aircraft(), FRAMES))
+    message = on_wire("nav_msgs/Odometry", ros1_bridge.odometry(0, aircraft(), FRAMES))
     assert (message.header.frame_id, message.child_frame_id) == ("drone1/odom", "drone1/ardrone_base_link")
     assert message.pose.pose.position.z == pytest.approx(1.234)
     assert (message.twist.twist.linear.x, message.twist.twist.linear.y) == (1.0, 0.25)
@@ -141,7 +141,7 @@ def test_ground_truth_is_in_the_world():
     truth = flight_messages.Truth(
         T_NS, 0, (1.0, 2.0, 3.0), (0.0, 4.0, 0.0), attitude(yaw_deg=90.0), (1.0, 0.0, 0.5), ZERO, STILL
     )  # fmt: skip
-    message = drone_topics.ground_truth(0, truth, FRAMES)
+    message = ros1_bridge.ground_truth(0, truth, FRAMES)
     assert message.header.frame_id == "world"
     assert xyz(message.pose.pose.position) == (1.0, 2.0, 3.0)
     assert xyz(message.twist.twist.linear) == (0.0, 4.0, 0.0)
@@ -151,7 +151,7 @@ def test_ground_truth_is_in_the_world():
 def test_transforms_lead_from_the_world_to_where_the_estimator_believes_it_to_be():
     own = aircraft(yaw_deg=30.0)
     own.update(estimate(attitude(yaw_deg=30.0)))
-    to_base, to_odom = on_wire("tf2_msgs/TFMessage", drone_topics.transforms(0, own, FRAMES)).transforms
+    to_base, to_odom = on_wire("tf2_msgs/TFMessage", ros1_bridge.transforms(0, own, FRAMES)).transforms
     assert (to_odom.header.frame_id, to_odom.child_frame_id) == ("world", "drone1/odom")
     assert (to_base.header.frame_id, to_base.child_frame_id) == ("drone1/odom", "drone1/ardrone_base_link")
     place = [xyz(t.transform.translation) for t in (to_odom, to_base)]
@@ -159,7 +159,7 @@ def test_transforms_lead_from_the_world_to_where_the_estimator_believes_it_to_be
 
 
 def test_transforms_without_an_estimator_end_at_odom():
-    (only,) = drone_topics.transforms(0, without_sensors(), FRAMES).transforms
+    (only,) = ros1_bridge.transforms(0, without_sensors(), FRAMES).transforms
     assert only.header.frame_id == "drone1/odom"
 
 

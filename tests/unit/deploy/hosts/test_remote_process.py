@@ -13,7 +13,7 @@ from refused import has_terms
 
 from zsim.errors import HostsError
 from zsim_deploy.hosts.host_link import EventLoopThread
-from zsim_deploy.hosts.remote_process import LOST, ProcessLog, RemoteProcess
+from zsim_deploy.hosts.host_run import LOST, ProcessLog, RemoteProcess
 
 FILES = {"identity/estimator.d1/key.pem": b"secret"}
 PATIENCE_S = 20.0  # after which a test that waits for ever fails
