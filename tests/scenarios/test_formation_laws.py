@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from refused import has_terms
 
 import zsim
-from zsim.errors import ScenarioError
+from zsim.errors import ScenarioError, UserCodeError
 from zsim.scenario import scenario_file
 from zsim.scenario.surface_file import packed
 from zsim_analysis.board.measures import measures
@@ -112,3 +113,13 @@ def test_what_cannot_be_flown_is_refused(
     (line,) = raised.value.faults
     assert f".{path} " in line
     assert all(term in line for term in terms), line
+
+
+def test_a_reference_without_a_value_in_flight_ends_the_run_with_field_and_time(tmp_path: Path) -> None:
+    """A pole that no check at the start sees; the record is readable up to it."""
+    document = {**scenario("virtual_structure", centre_m=["1/(t-0.5)", 0], start_s=8.0), "duration_s": 12}
+    document["report"] = {}
+    with pytest.raises(UserCodeError) as raised:
+        zsim.run(document, out=tmp_path / "run", progress=False)
+    assert has_terms(str(raised.value), "pilot.d1", "8.50", "parameters.centre_m[0]", "0.5")
+    assert zsim.load(tmp_path / "run").truth("d1").index[-1] == pytest.approx(8.5, abs=0.1)

@@ -148,7 +148,9 @@ def test_validate_prints_what_a_scenario_resolves_to(tmp_path: Path) -> None:
     resolved = zsim("validate", str(path), "--set", "seed=77").stdout
     assert "seed: 77" in resolved
     path.write_text(resolved)
-    assert zsim("validate", str(path)).stdout == resolved
+    again = zsim("validate", str(path))
+    assert again.stdout == resolved
+    assert again.stderr.splitlines() == ["one.yaml: no errors found"]
 
 
 def test_report_of_a_run(federation: Federation) -> None:

@@ -279,7 +279,7 @@ def flaws(fault: Any, known: Known) -> Iterator[Flaw]:
         sensor, _, ending = name.rpartition("_") if isinstance(name, str) else ("", "", "")
         if sensor in known.unread and ending in ("dropout", "stuck", "bias", "noise"):
             return
-        yield "kind", f"{_actual(fault, 'kind')}; must be one of {', '.join(known.kinds)}"
+        yield "kind", f"{_actual(fault, 'kind')}; {allowed_kinds(name, known.kinds)}"
         return
     of = {parameter.name: parameter for parameter in kind.parameters}
     for field in fault:
@@ -478,3 +478,8 @@ def _words(text: str) -> list[str]:
             words.append(part)
         depth += sum(part.count(each) for each in "[{") - sum(part.count(each) for each in "]}")
     return words
+
+
+def allowed_kinds(found: Any, known: Collection[str]) -> str:
+    """Return what is allowed in place of an unknown kind of fault; there are some fifty."""
+    return f"{suggestion(found, known)}must be one of the {len(known)} that `zsim fault kinds` lists"

@@ -28,6 +28,7 @@ from zsim.contract import keys
 from zsim.contract.agent_messages import AgentMessage
 from zsim.contract.flight_messages import Estimate, Mode, Status, Velocity
 from zsim.contract.snapshot import State
+from zsim.errors import UserCodeError
 from zsim.runtime.agent import Agent, Output
 from zsim.scenario import obstacle
 from zsim.scenario.scenario import SURFACES_MAX, Scenario, Surface, Value
@@ -190,7 +191,11 @@ class Pilot(Agent):
             for name, m in sorted(self._heard.items())
             if m.is_engaged and t_ns - m.t_ns <= self._silence_ns
         ]
-        now = Sight(t_ns / 1e9, self._p_W[:2], self._v_W[:2], heard, self._reference.at(t_ns / 1e9))
+        try:
+            reference = self._reference.at(t_ns / 1e9)
+        except ExpressionError as error:  # a pole that is not at its start
+            raise UserCodeError(f"{type(self).__name__}: parameters.{error}, since start_s; must be finite") from None
+        now = Sight(t_ns / 1e9, self._p_W[:2], self._v_W[:2], heard, reference)
         v_W = self.velocity(now) + self.avoidance(now.p_W, heard)
         return limited(v_W, self.parameters.speed_max_m_s)
 

@@ -79,6 +79,12 @@ class WrittenBundle(NamedTuple):
     manifest: Manifest
 
 
+def refuse_existing(out: Path, force: bool) -> None:
+    """Raise a RunError where the file of a bundle is there already, and `force` does not say that it is replaced."""
+    if out.exists() and not force:
+        raise RunError(f"{out}: is there already; --force replaces it, or {OTHER_OUT}")
+
+
 def write_bundle(out: Path, manifest: Manifest, members: Mapping[str, Path | bytes], force: bool) -> WrittenBundle:
     """Write a bundle.
 
@@ -90,8 +96,7 @@ def write_bundle(out: Path, manifest: Manifest, members: Mapping[str, Path | byt
     Raises:
         RunError: it is there, or cannot be written.
     """
-    if out.exists() and not force:
-        raise RunError(f"{out}: is there already; --force replaces it, or {OTHER_OUT}")
+    refuse_existing(out, force)
     files = {name: File(*_hashed(content)) for name, content in sorted(members.items())}
     sealed = msgspec.structs.replace(manifest, files=files).sealed()
     part = out.with_name(f".{out.name}.part")

@@ -24,7 +24,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.faults import listed
 from zsim.schema import plugin, yaml_file
 from zsim_analysis.bundle import bundle_file as names
-from zsim_analysis.bundle.bundle_file import Manifest, WrittenBundle, write_bundle
+from zsim_analysis.bundle.bundle_file import Manifest, WrittenBundle, refuse_existing, write_bundle
 from zsim_analysis.bundle.own_code import locked, own_modules
 from zsim_analysis.reading import recorded_run
 from zsim_analysis.reading.output_hashes import GateDigests, OutputHashes, content_of
@@ -61,6 +61,8 @@ def make_bundle(
     if not whole.complete:
         raise RunError(f"{place}: the record is {whole}; must be that of a whole flight")
     with recorded_run.open_run(record) as run:
+        out = out or Path(f"{run.scenario.name}{names.SUFFIX}")
+        refuse_existing(out, force)  # before seconds of drawing
         _check(place, run)
         agents = recorded_run.recorded_agents(run.reader, run.info, run.scenario)
         expected = _Expected(run, agents)
@@ -104,7 +106,7 @@ def make_bundle(
             files={},
         )
         members[names.README] = _readme(manifest, members).encode()
-        return write_bundle(out or Path(f"{run.scenario.name}{names.SUFFIX}"), manifest, members, force)
+        return write_bundle(out, manifest, members, force)
 
 
 def _check(place: Path, run: RecordedRun) -> None:

@@ -30,11 +30,11 @@ from numpy.random import Generator
 from zsim.errors import ScenarioError
 from zsim.math.random_streams import stream
 from zsim.scenario import scenario_file
-from zsim.scenario.faults import COMMON, FaultKind, FaultParameter, kinds_of
+from zsim.scenario.faults import COMMON, FaultKind, FaultParameter, allowed_kinds, kinds_of
 from zsim.scenario.roles import PILOT, WORLD, agent_names
 from zsim.scenario.scenario import Scenario
 from zsim.schema import yaml_file
-from zsim.schema.checker import show, suggestion
+from zsim.schema.checker import show
 from zsim.sensors.sensor_catalogue import declarations, sensor_names
 from zsim_agents.hosting import check_classes
 from zsim_analysis.hunt.requirements import Margin
@@ -338,7 +338,7 @@ class HuntSpace:
 
 
 def unknown_kind(kind: str, known: Mapping[str, FaultKind]) -> str:
-    return f"{show(kind)} is no kind of fault; {suggestion(kind, known)}must be one of {', '.join(known)}"
+    return f"{show(kind)} is no kind of fault; {allowed_kinds(kind, known)}"
 
 
 def _given(name: str, text: str, kind: FaultKind) -> Knob:

@@ -183,13 +183,13 @@ def validate(scenario: opt.ScenarioPath, set_: opt.Set = None, trust: opt.Trust 
         loaded = opt.load_scenario(scenario, set_)
         check_plans(loaded, scenario.name)
     if modules := [name for name in skipped if ":" not in name]:  # of vehicles and sensors: their numbers are in there
-        lacking = f"the resolved scenario is not printed, since it depends on {', '.join(modules)}"
-        note(f"{scenario.name}: no errors found; {lacking}")
+        note(f"{scenario.name}: the resolved scenario is not printed, since it depends on {', '.join(modules)}")
     else:
         print(printable(scenario_file.to_text(loaded)), end="", flush=True)
     for line in unflown_plans(loaded):
         note(f"{scenario.name}: {line}")
     note_skipped(skipped)
+    note(f"{scenario.name}: no errors found")
 
 
 @app.command(rich_help_panel=opt.RUN)
