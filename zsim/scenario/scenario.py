@@ -456,11 +456,11 @@ class OwnProgram(Spec, frozen=True, kw_only=True):
 
 
 LAWS = {
-    "consensus": "zsim_agents.laws.shape:Consensus",
-    "leader_follower": "zsim_agents.laws.shape:LeaderFollower",
-    "virtual_structure": "zsim_agents.laws.shape:VirtualStructure",
-    "distance_based": "zsim_agents.laws.shape:DistanceBased",
-    "bearing_only": "zsim_agents.laws.shape:BearingOnly",
+    "consensus": "zsim_agents.laws.consensus:Consensus",
+    "leader_follower": "zsim_agents.laws.leader_follower:LeaderFollower",
+    "virtual_structure": "zsim_agents.laws.virtual_structure:VirtualStructure",
+    "distance_based": "zsim_agents.laws.distance_based:DistanceBased",
+    "bearing_only": "zsim_agents.laws.bearing_only:BearingOnly",
     "olfati_saber": "zsim_agents.laws.olfati_saber:OlfatiSaber",
     "vasarhelyi": "zsim_agents.laws.vasarhelyi:Vasarhelyi",
 }

@@ -1,1 +1,1 @@
-"""Formation laws of the literature: the equations of a paper, pure, and the agent that flies them."""
+"""Formation laws of the literature, one a file: the equations of its paper, pure, and the agent that flies them."""

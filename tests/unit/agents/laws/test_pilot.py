@@ -10,7 +10,7 @@ from zsim.contract.flight_messages import Estimate
 from zsim.scenario import scenario_file
 from zsim.scenario.surface_file import packed
 from zsim_agents.laws.pilot import Motion
-from zsim_agents.laws.shape import VirtualStructure
+from zsim_agents.laws.virtual_structure import VirtualStructure
 
 DRONES = [{"name": name, "position_m": [3 * k, 0, 0]} for k, name in enumerate(("d1", "d2"))]
 

@@ -6,16 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from zsim_agents.laws.bearing_only import bearing_only, bearing_rigidity_matrix
+from zsim_agents.laws.consensus import consensus
+from zsim_agents.laws.distance_based import distance_based, rigidity_matrix
 from zsim_agents.laws.pilot import repulsion
 from zsim_agents.laws.reference import FormationReference, polygon
-from zsim_agents.laws.shape import (
-    bearing_only,
-    bearing_rigidity_matrix,
-    consensus,
-    distance_based,
-    rigidity_matrix,
-    virtual_structure,
-)
+from zsim_agents.laws.virtual_structure import virtual_structure
 
 Array = NDArray[np.float64]
 Edges = list[tuple[int, int]]

@@ -1,0 +1,63 @@
+"""Bearing-only control: drones measure in which direction the others are, not how far away.
+
+    u_i = -k sum_{j in N_i} P(g_ij) g_ij*,    g_ij = z_ij / |z_ij|,    P(g) = I - g g^T       (1)
+
+Zhao, Zelazo, Bearing rigidity and almost global bearing-only formation stabilization, IEEE Trans. Automatic Control 61
+(2016), arXiv:1408.6552. The centroid and the scale s = sqrt(mean |p_i - centroid|^2) never change, so
+that the figure comes to its shape and attitude, in the size with which it began; V = 1/2 |p - p*|^2 falls. It must be
+infinitesimally bearing rigid: the rank of the bearing rigidity matrix is d n - d - 1. All drones need one compass. The
+figure turned inside out is an equilibrium too, and unstable.
+"""
+
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import ArrayLike
+
+from zsim.math import elementary as el
+from zsim.scenario.scenario import Scenario
+from zsim_agents.laws.pilot import Array, Sight, added, total, unit
+from zsim_agents.laws.shape import ShapeParameters, ShapePilot
+
+
+def bearing_only(relative: list[tuple[Array, Array]], k: float) -> Array:
+    """Return u_i of (1) [m/s].
+
+    Args:
+        relative: of each neighbour the bearing g_ij, and the wanted one (d,).
+        k: gain [m/s].
+    """
+    size = len(relative[0][0]) if relative else 2
+    return k * added([g * total(g * wanted) - wanted for g, wanted in relative], size)
+
+
+def bearing_rigidity_matrix(p: ArrayLike, edges: list[tuple[int, int]]) -> Array:
+    """Return R_B (m d, n d) of places (n, d) and edges (i, j): the derivative of the bearings."""
+    places = np.asarray(p, float)
+    n, d = places.shape
+    R = np.zeros((len(edges), d, n, d))
+    for row, (i, j) in enumerate(edges):
+        z = places[j] - places[i]
+        size = el.length(z.tolist())
+        P = (np.eye(d) - np.outer(z, z) / (size * size)) / size
+        R[row, :, j], R[row, :, i] = P, -P
+    return R.reshape(len(edges) * d, n * d)
+
+
+class BearingOnly(ShapePilot):
+    """Two drones are informed by default, the first ones: pinned to their places they hold the figure's size."""
+
+    class Parameters(ShapeParameters):
+        gain_m_s: Annotated[float, Meta(gt=0, le=20)] = 2.0
+
+    invariances = ("translation", "scale")
+
+    def begin(self, scenario: Scenario) -> None:
+        super().begin(scenario)
+        if self.parameters.informed is None:
+            self._informed = self._drone in [drone.name for drone in scenario.drones[:2]]
+
+    def velocity(self, now: Sight) -> Array:
+        bearings = [(unit(z), unit(c)) for z, c in self.relative(now)]
+        return bearing_only(bearings, self.parameters.gain_m_s) + self.tied(now)

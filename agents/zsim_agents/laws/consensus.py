@@ -1,0 +1,28 @@
+"""Consensus on displacements.
+
+    u_i = k sum_{j in N_i} ((p_j - p_i) - (c_j - c_i))        (1)
+
+Olfati-Saber, Fax, Murray, Consensus and cooperation in networked multi-agent systems, Proc. IEEE 95 (2007), with the
+displacement from one's place as the state on which all agree. On a connected, undirected graph the errors about their
+mean decay at the rate k lambda_2 of its Laplacian, and the mean stays where it is.
+"""
+
+from zsim_agents.laws.pilot import Array, Sight, added
+from zsim_agents.laws.shape import ShapePilot
+
+
+def consensus(relative: list[tuple[Array, Array]], k: float) -> Array:
+    """Return u_i of (1) [m/s].
+
+    Args:
+        relative: of each neighbour p_j - p_i and c_j - c_i (d,) [m].
+        k: gain [1/s].
+    """
+    return k * added([z - c for z, c in relative], len(relative[0][0]) if relative else 2)
+
+
+class Consensus(ShapePilot):
+    invariances = ("translation",)
+
+    def velocity(self, now: Sight) -> Array:
+        return consensus(self.relative(now), self.parameters.gain_1_s) + self.tied(now)

@@ -1,0 +1,55 @@
+"""Distance-based control of a rigid graph: each drone needs no common compass, only where the others are from it.
+
+    u_i = k sum_{j in N_i} (|z_ij|^2 - d_ij^2) z_ij,    z_ij = p_j - p_i       (1)
+
+Krick, Broucke, Francis, Stabilisation of infinitesimally rigid formations of multi-robot networks, Int. J. Control 82
+(2009). It is the descent of V = 1/4 sum e_ij^2, e_ij = |z_ij|^2 - d_ij^2, over the edges: dV/dt = -sum |u_i|^2 / k, and
+the centroid stays. The figure must be infinitesimally rigid: the rank of its rigidity matrix R, a row z_ij, z_ji for
+each edge, is 2 n - 3 in the plane and 3 n - 6 in space. Then errors decay near it at the rate 2 k lambda_min(R R^T),
+for as many edges as that rank. Only near it: drones in one line stay in a line, and a corner with two edges may settle
+on the wrong side of them. Distances that the two ends of an edge know differently make the figure drift.
+"""
+
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import ArrayLike
+
+from zsim_agents.laws.pilot import Array, Sight, added, total
+from zsim_agents.laws.shape import ShapeParameters, ShapePilot
+
+
+def distance_based(relative: list[tuple[Array, float]], k: float) -> Array:
+    """Return u_i of (1) [m/s].
+
+    Args:
+        relative: of each neighbour z_ij (d,) [m] and d_ij^2 [m^2].
+        k: gain [1/(m^2 s)].
+    """
+    size = len(relative[0][0]) if relative else 2
+    return k * added([(total(z * z) - squared) * z for z, squared in relative], size)
+
+
+def rigidity_matrix(p: ArrayLike, edges: list[tuple[int, int]]) -> Array:
+    """Return R (m, n d) of places (n, d) and edges (i, j): half the derivative of the squared lengths."""
+    places = np.asarray(p, float)
+    n, d = places.shape
+    R = np.zeros((len(edges), n, d))
+    for row, (i, j) in enumerate(edges):
+        R[row, i] = places[i] - places[j]
+        R[row, j] = -R[row, i]
+    return R.reshape(len(edges), n * d)
+
+
+class DistanceBased(ShapePilot):
+    class Parameters(ShapeParameters):
+        gain_1_s: Annotated[float, Meta(gt=0, le=5)] = 0.3
+        """Of a distance of the size of the formation: k is this over the mean squared distance of its places."""
+
+    invariances = ("translation", "rotation")
+
+    def velocity(self, now: Sight) -> Array:
+        relative = [(z, total(c * c)) for z, c in self.relative(now)]
+        mean = total(np.array([squared for _, squared in relative])) / max(len(relative), 1)
+        return distance_based(relative, self.parameters.gain_1_s / max(mean, 1e-6)) + self.tied(now)

@@ -1,0 +1,32 @@
+"""Leader and followers on displacements.
+
+    leader      u_l = v_l* + b (p_l* - p_l)
+    follower    u_i = k sum_{j in N_i} ((p_j - p_i) - (c_j - c_i))    (1)
+
+The leader knows the reference and hears nobody; a follower knows neither, and hears the leader only if that is its
+neighbour. With L_ff, the rows and columns of the followers in the Laplacian, their errors decay at the rate
+k lambda_min(L_ff); behind a leader that flies at v they lag by L_ff^-1 1 v / k: without feed-forward a chain is the
+longer behind the farther down it is. Mesbahi, Egerstedt, Graph theoretic methods in multiagent networks (2010), ch. 10.
+"""
+
+import numpy as np
+
+from zsim_agents.laws.consensus import consensus
+from zsim_agents.laws.pilot import Array, Sight
+from zsim_agents.laws.shape import ShapeParameters, ShapePilot
+
+
+class LeaderFollower(ShapePilot):
+    """The informed ones lead, by default the first drone."""
+
+    class Parameters(ShapeParameters):
+        feedforward: bool = False
+        """Whether followers know the reference's motion."""
+
+    invariances = ("translation",)
+
+    def velocity(self, now: Sight) -> Array:
+        if self._informed:
+            return self.tied(now)
+        followed = consensus(self.relative(now), self.parameters.gain_1_s)
+        return followed + (self.own_place(now)[1] if self.parameters.feedforward else np.zeros(2))
