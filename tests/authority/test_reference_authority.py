@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from zsim.scenario.polynomial_file import pieces_of
+from zsim.scenario.scenario_file import pieces_of
 from zsim_agents.formation.assignment import assign, straight_separation
 from zsim_agents.references.approach import first_approach
 from zsim_agents.references.cruise import RISE_S, Cruise, cruise, cruise_through

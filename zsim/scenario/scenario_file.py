@@ -1,7 +1,9 @@
 """Scenario files: read, override, resolve, check, and write out again as the text of `world/info`."""
 
 import copy
+import csv
 import hashlib
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
@@ -16,7 +18,6 @@ from zsim.errors import DocumentError, NotTrustedError, ScenarioError
 from zsim.scenario import own_classes
 from zsim.scenario.consistency import cross_faults
 from zsim.scenario.generated import with_generated
-from zsim.scenario.polynomial_file import pieces_of
 from zsim.scenario.scenario import DRONES_MAX, VEHICLE_NUMBERS, Document, Scenario, SharedVehicle, Topology
 from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import Fault, faults, first_lines, show, sound, suggestion
@@ -27,6 +28,16 @@ from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.vehicle import Aerodynamics, Vehicle
 
 EXAMPLE = "scenarios/step.yaml"  # named to whoever gives no scenario
+SYNTAX = "a.b.c=value, e.g. drones.drone2.mass_kg=0.5 or environment.wind.gust_m_s=0.5"
+PATH_MAX = 1000  # characters; the longest of a scenario has a tenth of that
+NOTHING: Mapping[str, Any] = {}
+_STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # one step of a path: a word, or anything between brackets
+_FIRST = re.compile(r"[^.\[\]]+")
+_PATH = re.compile(r"([^.\[\]]+|\[[^\[\]]+\])(\.[^.\[\]]+|\[[^\[\]]+\])*")
+AXES = ("x", "y", "z", "yaw")
+TERMS = 8
+HEADER = ("duration", *(f"{axis}^{power}" for axis in AXES for power in range(TERMS)))
+BYTES_MAX = 2_000_000  # of a file: five thousand pieces
 
 
 def load(
@@ -260,13 +271,6 @@ def _whose(document: dict[str, Any], path: str) -> str:
 
 # Overrides: `a.b.c=value`, entries of lists by place or by name
 
-SYNTAX = "a.b.c=value, e.g. drones.drone2.mass_kg=0.5 or environment.wind.gust_m_s=0.5"
-PATH_MAX = 1000  # characters; the longest of a scenario has a tenth of that
-NOTHING: Mapping[str, Any] = {}
-_STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # one step of a path: a word, or anything between brackets
-_FIRST = re.compile(r"[^.\[\]]+")
-_PATH = re.compile(r"([^.\[\]]+|\[[^\[\]]+\])(\.[^.\[\]]+|\[[^\[\]]+\])*")
-
 
 def apply_override(document: dict[str, Any], text: str, parse: Callable[[str], Any]) -> str | None:
     """Apply one override to a raw document; return the fault if there is one, and then nothing has changed.
@@ -362,3 +366,55 @@ def _assign(document: dict[str, Any], steps: list[str], value: Any) -> None:
         elif isinstance(place, dict) and place.get(key) is None:
             place[key] = {}
         place = place[key]
+
+
+def pieces_of(path: Path, where: str) -> list[dict[str, Any]]:
+    """Return the polynomial pieces of a file as a scenario has them: `duration_s`, and `x`, `y`, `z`, `yaw` as lists.
+
+    The file is as uav_trajectories and Crazyswarm write and read it: a header line, then a line for each piece of 33
+    numbers: its duration [s], and the coefficients of t^0 to t^7 in x, y, z [m] and yaw [rad], t being the time from
+    the beginning of the piece. https://github.com/whoenig/uav_trajectories
+
+    Args:
+        where: path of the field that names the file.
+
+    Raises:
+        DocumentError: it cannot be read, or a line for each that is not as it must be.
+    """
+    try:
+        if path.stat().st_size > BYTES_MAX:
+            raise DocumentError(
+                [f"{where} is {show(str(path))}, which has more than {BYTES_MAX} bytes; must have less"]
+            )
+        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise DocumentError([f"{where} is {show(str(path))}, which cannot be read ({error})"]) from error
+    rows = [_without_end([cell.strip() for cell in row]) for row in rows]
+    header = tuple(cell.lower().replace(" ", "") for cell in rows[0]) if rows else ()
+    if header != HEADER:
+        needed = f"must begin with the header duration, x^0 to x^7, y^0, …, yaw^7: {len(HEADER)} columns"
+        raise DocumentError([f"{where} is {show(str(path))}, which does not; {needed}"])
+    pieces, wrong = [], []
+    for number, row in enumerate(rows[1:], start=2):
+        if not row:
+            continue
+        try:
+            numbers = [float(cell) for cell in row]
+        except ValueError:
+            numbers = []
+        if len(numbers) != len(HEADER) or not all(map(math.isfinite, numbers)):
+            found = f"has {len(row)} entries: {', '.join(row)[:40]}"
+            wrong.append(f"{where} is {show(str(path))}, whose line {number} {found}; must be {len(HEADER)} numbers")
+            continue
+        axes = {axis: numbers[1 + k * TERMS : 1 + (k + 1) * TERMS] for k, axis in enumerate(AXES)}
+        pieces.append({"duration_s": numbers[0], **axes})
+    if wrong or not pieces:
+        raise DocumentError(wrong or [f"{where} is {show(str(path))}, which has no piece; must have one or more"])
+    return pieces
+
+
+def _without_end(row: list[str]) -> list[str]:
+    """Return a row without empty cells at its end: files of Crazyswarm have a comma there."""
+    while row and not row[-1]:
+        row.pop()
+    return row

@@ -17,7 +17,7 @@ from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.console_tables import DroneRow, drone_table, event_table, figure_lines, preflight_lines
 from zsim_bridges.console.control_desk import EVERY, RUN, ControlDesk, ControlForm
 from zsim_bridges.console.formation_form import FormationForm
-from zsim_bridges.console.histories import TRAIL_S, TRAILS_S
+from zsim_bridges.console.histories import TRAIL_S, TRAILS_S, FlightHistory, VariablePlots
 from zsim_bridges.console.operator_input import slider_ranges
 from zsim_bridges.console.picture import Array, DronePoses, FlightPreview
 from zsim_bridges.console.private_viser import control_id, control_ids
@@ -34,7 +34,6 @@ from zsim_bridges.console.run_forms import (
 )
 from zsim_bridges.console.run_monitor import FlightFigures
 from zsim_bridges.console.scene import ChosenRing, draw_ground
-from zsim_bridges.console.variable_plots import FlightHistory, VariablePlots
 from zsim_bridges.console.view_buffer import ALL, KINDS, EventRow, chosen_rows
 
 PANEL_PX = 350

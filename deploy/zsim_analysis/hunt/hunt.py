@@ -34,8 +34,7 @@ from zsim.scenario.scenario import Scenario
 from zsim.schema import yaml_file
 from zsim_analysis.hunt.requirements import BROKEN, Margin, Requirement, figures_of, worst
 from zsim_analysis.hunt.shrink import Shrinker, causes_of, only
-from zsim_analysis.hunt.space import WIND, Case, HuntSpace
-from zsim_analysis.hunt.strategy import LAG, Strategy
+from zsim_analysis.hunt.space import LAG, WIND, Case, HuntSpace, Strategy
 from zsim_analysis.report.summary import RunSummary, summarise
 from zsim_analysis.sweep.design import METRICS, text_of
 from zsim_analysis.sweep.process_pool import ProcessPool, cores

@@ -6,8 +6,7 @@ Each file uses those below it only; what an object needs of another one is passe
       ├─ commands                         commands: checked, queued, applied; commanders
       ├─ faults                           injected faults
       └─ coordinator                      what a flight and a replay have in common: participants, requests, time
-           ├─ run_statistics              figures of the run
            ├─ barrier                     participants, and whom the world waits for
-           ├─ run_clock                   simulated time and its requests
+           ├─ run_clock                   simulated time, its requests, figures of the run
            └─ outbox                      messages, events and refusals to be published
 """

@@ -24,8 +24,7 @@ from zsim.scenario.roles import ROLES, WORLD, OnDeath, agent_names, lets_drop
 from zsim.scenario.scenario import Scenario
 from zsim_world.run.barrier import Barrier, Participant
 from zsim_world.run.outbox import STRANGERS_MAX, Budgets, KeyedMessage, Refusal, RunOutbox, too_many
-from zsim_world.run.run_clock import Operation, RunClock, number
-from zsim_world.run.run_statistics import RunStatistics
+from zsim_world.run.run_clock import Operation, RunClock, RunStatistics, number
 
 RECORDER = "recorder"  # name and role
 START_TIMEOUT_S = 60.0  # wall; chosen, for processes that a launched run expects and does not start itself

@@ -1,15 +1,26 @@
-"""Simulated time of a run: its gates, whether and how fast it passes, and the requests that change this."""
+"""Simulated time of a run: its gates, whether and how fast it passes, the requests that change this, and statistics.
 
-from collections.abc import Callable
+Statistics: real-time factor, age of commands, deadline misses, least distance between drones.
+"""
+
+import math
+from array import array
+from collections.abc import Callable, Iterable
 from typing import Any, ClassVar
+
+import numpy as np
 
 from zsim.contract.run_messages import GATES_MAX, RATE_MAX, ControlAnswer, ControlRequest
 from zsim.scenario.scenario import TimeSteps
+from zsim_world.run.barrier import Participant
 from zsim_world.run.outbox import Refusal
-from zsim_world.run_state import Saved
+from zsim_world.run_state import PART, Saved
 
 Operation = Callable[[ControlRequest], Refusal | ControlAnswer | None]
 """Does what a request asks for; returns why it is refused, an answer with a result, or None when done."""
+GATES_KEPT = 256  # gates whose publication time is remembered for the age of commands; 5 s, older ones are refused
+AGES_KEPT = 1_000_000  # for the percentiles; 8 MB
+MARK_NS = 10_000_000  # wall time between two marks of the rate, which looks back over a second
 
 
 class RunClock:
@@ -127,3 +138,152 @@ def number(value: Any) -> float | None:
     """Return a number, None for anything that is none; NaN is none."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and value == value
     return value if is_number else None
+
+
+class CommandAges:
+    """Wall time from a gate's publication to the arrival of a command that answers it."""
+
+    SAVED: ClassVar[Saved] = {"_published": dict[int, int], "ages": bytes, "_oldest": int}
+
+    def __init__(self) -> None:
+        self._published: dict[int, int] = {}
+        self._ages_ns = array("q")
+        self._oldest = 0  # index of the oldest age once so many are kept
+
+    @property
+    def ages(self) -> bytes:
+        return self._ages_ns.tobytes()
+
+    @ages.setter
+    def ages(self, ages: bytes) -> None:
+        self._ages_ns = array("q", ages)
+
+    def gate(self, t_ns: int, wall_ns: int) -> None:
+        """Note when the gate t_ns was published."""
+        self._published[t_ns] = wall_ns
+        if len(self._published) > GATES_KEPT:
+            del self._published[next(iter(self._published))]
+
+    def command(self, t_ns: int, wall_ns: int) -> None:
+        """Note when a command stamped t_ns arrived; its age is unknown where no gate of that stamp is remembered."""
+        published_wall_ns = self._published.get(t_ns)
+        if published_wall_ns is None:
+            return
+        age_ns = wall_ns - published_wall_ns
+        if len(self._ages_ns) < AGES_KEPT:
+            self._ages_ns.append(age_ns)
+        else:
+            self._ages_ns[self._oldest] = age_ns
+            self._oldest = (self._oldest + 1) % AGES_KEPT
+
+    def summary_ms(self) -> dict[str, float] | None:
+        """Return p50, p99 and max in milliseconds, None when no command came."""
+        if not self._ages_ns:
+            return None
+        ages = np.array(self._ages_ns) / 1e6
+        p50, p99 = np.percentile(ages, [50, 99])
+        return {"p50": float(p50), "p99": float(p99), "max": float(ages.max())}
+
+
+class RealTimeFactor:
+    """Simulated per wall seconds, over the last wall second and over the run.
+
+    Attributes:
+        sim_ns: simulated time that has passed gate by gate since the first one.
+    """
+
+    SAVED: ClassVar[Saved] = {
+        "_marks": list[tuple[int, int]],
+        "_start_wall_ns": int | None,
+        "_last": tuple[int, int],
+        "sim_ns": int,
+    }
+
+    def __init__(self) -> None:
+        self._marks: list[tuple[int, int]] = []  # simulated and wall time; at most a second's
+        self._start_wall_ns: int | None = None
+        self._last = (0, 0)
+        self.sim_ns = 0
+
+    @property
+    def wall_s(self) -> float:
+        return 0.0 if self._start_wall_ns is None else (self._last[1] - self._start_wall_ns) / 1e9
+
+    def gate(self, t_ns: int, wall_ns: int) -> None:
+        """Note when the gate t_ns was published."""
+        if self._start_wall_ns is None:
+            self._start_wall_ns = wall_ns
+        if self._marks:
+            self.sim_ns += t_ns - self._last[0]
+        self._last, marks = (t_ns, wall_ns), self._marks
+        while len(marks) > 1 and wall_ns - marks[0][1] > 1_000_000_000:
+            del marks[0]
+        if not marks or wall_ns - marks[-1][1] >= MARK_NS:
+            marks.append(self._last)
+
+    def stand_still(self, wall_ns: int) -> None:
+        """Exclude from the run's wall time what has passed since the last gate, until wall_ns."""
+        if self._start_wall_ns is not None:
+            self._start_wall_ns += wall_ns - self._last[1]
+            self._last = (self._last[0], wall_ns)
+            self._marks = [self._last]
+
+    def jump(self) -> None:
+        """Note that simulated time jumps to the next gate rather than passing."""
+        self._marks.clear()
+
+    def now(self) -> float:
+        """Return the factor over the last wall second."""
+        (t0, w0), (t1, w1) = self._marks[0] if self._marks else self._last, self._last
+        return (t1 - t0) / (w1 - w0) if w1 > w0 else 0.0
+
+
+class RunStatistics:
+    """All figures of a run that its event `end` gives.
+
+    Attributes:
+        world_misses: gates that the world itself published too late.
+        closest_m: least distance between two drones so far, standing ones too [m]; inf for a single one.
+    """
+
+    SAVED: ClassVar[Saved] = {
+        "ages": PART,
+        "rate": PART,
+        "world_misses": int,
+        "closest_m": float,
+        "_deadline_count": int,
+    }
+
+    def __init__(self) -> None:
+        self.ages = CommandAges()
+        self.rate = RealTimeFactor()
+        self.world_misses = 0
+        self.closest_m = math.inf
+        self._deadline_count = 0
+
+    def gate(self, t_ns: int, wall_ns: int) -> None:
+        """Note when the gate t_ns was published."""
+        self.ages.gate(t_ns, wall_ns)
+        self.rate.gate(t_ns, wall_ns)
+
+    def deadlines(self, participants: Iterable[Participant], need_ns: int) -> None:
+        """Count the participants whose done for need_ns was due, and those whose done is missing."""
+        for participant in participants:
+            if participant.gating and participant.required_ns(need_ns) is not None:
+                self._deadline_count += 1
+                participant.deadline_misses += participant.blocks(need_ns)
+
+    def result(self, participants: Iterable[Participant]) -> dict[str, Any]:
+        """Return the figures of the run as far as it got."""
+        by_name = {p.name: p.deadline_misses for p in participants if p.gating}
+        sim_s, wall_s = self.rate.sim_ns / 1e9, self.rate.wall_s
+        return {
+            "sim_s": sim_s,
+            "wall_s": wall_s,
+            "real_time_factor": sim_s / wall_s if wall_s > 0 else 0.0,
+            "deadlines": self._deadline_count,
+            "deadline_misses": sum(by_name.values()) + self.world_misses,
+            "deadline_misses_by": {**by_name, "world": self.world_misses},
+            "command_age_ms": self.ages.summary_ms(),
+            "closest_m": self.closest_m if math.isfinite(self.closest_m) else None,
+        }

@@ -29,8 +29,7 @@ from zsim_world.run.inputs import Advanced, ProgressCallback, Run, Taken
 from zsim_world.run.run_clock import RunClock
 from zsim_world.run.world import World
 from zsim_world.run_state import restore
-from zsim_world.server.admission import Admission
-from zsim_world.server.liveliness import LivelinessMonitor, SlowReaders
+from zsim_world.server.liveliness import Admission, LivelinessMonitor, SlowReaders
 from zsim_world.server.run_journal import RunJournal
 from zsim_world.server.world_link import TICK_S, WorldOutputs, open_inputs, recover_lost
 

@@ -16,14 +16,18 @@ from zsim_bridges.console.histories import (
     INTERVAL_S,
     SPACING_M,
     SPAN_S,
+    STEPS_PER_WINDOW,
     TRAIL_POINTS_MAX,
     TRAILS_S,
+    WINDOWS_S,
+    AxisRange,
     CanvasTrails,
+    FlightHistory,
     VariableHistory,
+    VariablePlots,
 )
 from zsim_bridges.console.operator_input import SliderRange
 from zsim_bridges.console.picture import DronePoses
-from zsim_bridges.console.variable_plots import STEPS_PER_WINDOW, WINDOWS_S, AxisRange, FlightHistory, VariablePlots
 
 CLUSTER = scenario_file.load(Path(__file__).parents[4] / "scenarios" / "step.yaml").clusters[0]
 RANGES = [SliderRange(name, "m", 0.0, 9.0, 0.1) for name in ("x_c", "y_c", "z_c", "p")]

@@ -40,9 +40,8 @@ from zsim_bridges.gateway.client_messages import (
 )
 from zsim_bridges.gateway.client_streams import Outbox
 from zsim_bridges.gateway.gateway_server import Client
-from zsim_bridges.gateway.http_server import AccessCheck, described_sample, methods_of, value_event
+from zsim_bridges.gateway.http_server import AccessCheck, described_sample, description, methods_of, value_event
 from zsim_bridges.gateway.lockstep_session import LockstepSession, gate_keys_of
-from zsim_bridges.gateway.openapi import description
 from zsim_bridges.gateway.run_access import EchoFilter, LastValues
 
 VELOCITY = "drone/drone1/cmd/velocity"

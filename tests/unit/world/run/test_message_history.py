@@ -7,8 +7,7 @@ from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Velocity
 from zsim.contract.run_messages import Done
 from zsim.transport.session import ReceivedSample
-from zsim_world.run import message_history
-from zsim_world.run.message_history import KEEP_NS, MessageHistory
+from zsim_world.run.inputs import KEEP_NS, MessageHistory
 
 SECOND_NS = 1_000_000_000
 IMU = keys.sensor("d1", "imu")
@@ -78,7 +77,7 @@ def test_memory_is_bounded_while_time_stands_still():
 
 
 def test_strangers_push_nothing_out_and_have_room_again_when_theirs_is_forgotten(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(message_history, "FOREIGN_BYTES", 250)
+    monkeypatch.setattr("zsim_world.run.inputs.FOREIGN_BYTES", 250)
     history = MessageHistory(keep_bytes=1000)
     history.add(IMU, b"first", 0)
     for number in range(100):

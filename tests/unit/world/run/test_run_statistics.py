@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from zsim_world.run.run_statistics import GATES_KEPT, CommandAges, RealTimeFactor, RunStatistics
+from zsim_world.run.run_clock import GATES_KEPT, CommandAges, RealTimeFactor, RunStatistics
 
 MS = 1_000_000
 GATE_NS = 20 * MS
@@ -36,7 +36,7 @@ def test_the_age_of_a_command_is_counted_from_the_gate_that_it_answers(
 
 
 def test_old_ages_are_forgotten(monkeypatch):
-    monkeypatch.setattr("zsim_world.run.run_statistics.AGES_KEPT", 2)
+    monkeypatch.setattr("zsim_world.run.run_clock.AGES_KEPT", 2)
     ages = CommandAges()
     ages.gate(0, 0)
     for age_ms in (9, 8, 3, 2, 1):

@@ -12,7 +12,7 @@ from zsim.transport.link_watch import SessionTokens
 from zsim_world.run.inputs import Run
 from zsim_world.run.outbox import STRANGERS_MAX
 from zsim_world.run.world import World
-from zsim_world.server.admission import DONE_NS, HELD_NS, LOOK_NS, SHOWN_NS, TOKEN_NS, WITHHELD_MAX, Admission
+from zsim_world.server.liveliness import DONE_NS, HELD_NS, LOOK_NS, SHOWN_NS, TOKEN_NS, WITHHELD_MAX, Admission
 
 GATE_NS = 20_000_000
 ME = "estimator.d1"

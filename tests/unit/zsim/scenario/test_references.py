@@ -10,8 +10,8 @@ from zsim.contract import keys
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.consistency import unflown_plans
-from zsim.scenario.polynomial_file import HEADER
 from zsim.scenario.roles import agent_names, permits, rights_for
+from zsim.scenario.scenario_file import HEADER
 
 HEAD = ",".join(HEADER)
 PIECE = ",".join(["1.5", *(str(k) for k in range(32))])
