@@ -51,9 +51,12 @@ def triangles_of(path: Path, where: str, cell_m: float | None) -> Array:
     else:
         _refuse(path, where, f"ends in {kind or 'nothing'}", "must be .stl, .obj or .ply, or a height map .csv or .npy")
     if not len(triangles):
-        _refuse(path, where, "has no triangle", "must have one or more")
-    if not np.isfinite(triangles).all():
-        _refuse(path, where, "has a number that is not finite", "must be finite")
+        size = path.stat().st_size
+        found = f"of {size} bytes has no triangle that could be read"
+        allowed = "; a binary STL has 84 bytes and 50 for each triangle" if kind == ".stl" else ""
+        _refuse(path, where, found, f"must have one or more{allowed}")
+    if len(wrong := np.flatnonzero(~np.isfinite(triangles).all(axis=1))):
+        _refuse(path, where, f"has a number that is not finite in triangle {wrong[0] + 1}", "must be finite")
     return triangles
 
 

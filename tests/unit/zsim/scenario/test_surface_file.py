@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refused import has_terms
 
-from zsim.errors import ScenarioError
+from zsim.errors import DocumentError, ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.obstacle import COLUMNS
-from zsim.scenario.surface_file import packed, placed
+from zsim.scenario.surface_file import packed, placed, triangles_of
 from zsim.schema import plugin
 from zsim_world.physics.rays import cast, scene
 
@@ -135,3 +136,21 @@ def test_more_triangles_than_a_scenario_can_carry_are_refused(folder: Path):
     with pytest.raises(ScenarioError) as refused:
         resolved(surfaces=[{"name": "m", "file": "large.npy", "cell_m": 1}])
     assert [line.split(" ")[1] for line in refused.value.faults] == ["environment.surfaces"]
+
+
+def test_a_bad_binary_stl_is_refused_with_its_size_or_triangle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One is cut short, the second triangle of another has a NaN."""
+    triangle = np.array([0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0], "<f4")
+    bad = triangle.copy()
+    bad[4] = np.nan
+    head = bytes(80) + (2).to_bytes(4, "little")
+    monkeypatch.chdir(tmp_path)
+    path = Path("rock.stl")
+    for content, finding in (
+        (triangle.tobytes(), "132"),
+        (triangle.tobytes() + b"\0\0" + bad.tobytes() + b"\0\0", "2"),
+    ):
+        path.write_bytes(head + content)
+        with pytest.raises(DocumentError) as raised:
+            triangles_of(path, "environment.surfaces[0].file", None)
+        assert has_terms(raised.value.faults[0], "environment.surfaces[0].file", "'rock.stl'", finding)
