@@ -50,7 +50,7 @@ def test_looking_at_a_run_and_asking_its_controller(federation: Federation) -> N
     assert all(len(line["message"]["position_m"]) == 3 for line in echoed)
     (raw,) = terminal("echo", "clock", "-n", "1", "--raw").splitlines()
     assert bytes.fromhex(json.loads(raw)["message"]).startswith(b"\x87")  # a msgpack map of seven fields
-    assert "50.0 Hz" in terminal("hz", "clock", "--seconds", "2.5")
+    assert "50.0 Hz" in terminal("hz", "drone/drone1/truth", "--seconds", "2.5")  # a clock that waits is sent again
     assert "nothing/here" in terminal("hz", "nothing/here", "--seconds", "0.1", code=1)
 
     state = client.subscribe("cluster/main/state")

@@ -482,4 +482,4 @@ def _words(text: str) -> list[str]:
 
 def allowed_kinds(found: Any, known: Collection[str]) -> str:
     """Return what is allowed in place of an unknown kind of fault; there are some fifty."""
-    return f"{suggestion(found, known)}must be one of the {len(known)} that `zsim fault kinds` lists"
+    return f"{suggestion(found, known)}must be one of the {len(known)} that `zsim fault kinds SCENARIO` lists"

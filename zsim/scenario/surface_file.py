@@ -44,6 +44,9 @@ def triangles_of(path: Path, where: str, cell_m: float | None) -> Array:
             _refuse(
                 path, where, f"is a height map of {list(heights.shape)} heights", "must be 2 x 2 or more, with cell_m"
             )
+        if len(wrong := np.argwhere(~np.isfinite(heights))):
+            row, column = wrong[0] + 1
+            _refuse(path, where, f"has a height that is not finite in row {row}, column {column}", "must be finite")
         triangles = _of_heights(np.asarray(heights, dtype=float), float(cell_m or 1.0))
     elif kind in (".stl", ".obj", ".ply"):
         mesh = _read(path, where, lambda p: importlib.import_module("trimesh").load_mesh(p, process=False))

@@ -269,7 +269,7 @@ def _sheet(surface: Surface) -> Callable[[Sequence[float], float], tuple[float, 
 
 def repulsion(d: float, D: float, eta: float) -> float:
     """Return -dV/dd of Khatib's V = eta/2 (1/d - 1/D)^2 for d < D, else 0 (Int. J. Robotics Research 5(1), 1986)."""
-    if d >= D:
+    if d >= D or D <= 0.0:  # inside an obstacle d is negative
         return 0.0
     d = max(d, 0.05)  # m: within an estimate's error of contact the speed limit has long cut it
     return eta * (1.0 / d - 1.0 / D) / (d * d)

@@ -264,3 +264,4 @@ def test_repulsion_is_the_slope_of_its_potential() -> None:
 
     assert repulsion(0.8, D, eta) == pytest.approx(-(V(0.8 + dd) - V(0.8 - dd)) / (2 * dd), rel=1e-6)
     assert repulsion(D, D, eta) == 0.0
+    assert repulsion(-0.01, 0.0, eta) == 0.0  # inside of an obstacle, with avoidance switched off

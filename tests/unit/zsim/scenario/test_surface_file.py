@@ -154,3 +154,12 @@ def test_a_bad_binary_stl_is_refused_with_its_size_or_triangle(tmp_path: Path, m
         with pytest.raises(DocumentError) as raised:
             triangles_of(path, "environment.surfaces[0].file", None)
         assert has_terms(raised.value.faults[0], "environment.surfaces[0].file", "'rock.stl'", finding)
+
+
+def test_a_height_that_is_not_finite_is_named_by_row_and_column(tmp_path: Path) -> None:
+    heights = np.zeros((4, 5))
+    heights[2, 3] = np.nan
+    np.save(tmp_path / "hill.npy", heights)
+    with pytest.raises(DocumentError) as raised:
+        triangles_of(tmp_path / "hill.npy", "environment.surfaces[0].file", 1.0)
+    assert has_terms(raised.value.faults[0], "environment.surfaces[0].file", "row 3", "column 4")
