@@ -200,7 +200,7 @@ class Pilot(Agent):
         return limited(v_W, self.parameters.speed_max_m_s)
 
     def avoidance(self, p_W: Array, heard: Sequence[Heard]) -> Array:
-        """Return the repulsion (2,) from the drones that it hears, from obstacles and surfaces [m/s; W]."""
+        """Return the repulsion (2,) from the drones that it hears, obstacles and surfaces [m/s; W]."""
         reach, gain = self.parameters.avoid_m, self.parameters.avoid_m4_s
         v_W = np.zeros(2)
         for each in heard:
@@ -213,8 +213,9 @@ class Pilot(Agent):
     def obstacles_near(self, p_W: Array, reach_m: float) -> list[tuple[float, Array]]:
         """Return distance [m] and direction away (2,) of the obstacles and surfaces within reach beside the drone.
 
-        A surface is at the distance at which a level flight meets its tangent in the nearest point: that of a wall is
-        its distance, a slope is the farther the flatter it is, and level ground is none, however near it is below.
+        The distance of a surface is the one after which level flight meets its tangent plane at the nearest point. For
+        a wall, that is the distance to the wall; a slope counts as farther away the flatter it is, and level ground
+        below does not count at all.
         """
         found = []
         for row in self._obstacles:
@@ -249,11 +250,11 @@ class Pilot(Agent):
 
 @lru_cache(maxsize=SURFACES_MAX)  # pilots of one process share it: that of 40 000 triangles is made in a second
 def _sheet(surface: Surface) -> Callable[[Sequence[float], float], tuple[float, Array]]:
-    """Return the function of a point (3,) and a reach [m] that finds the distance of the surface and its nearest point.
+    """Return a function of a point (3,) and a reach [m] that finds the surface's distance and its nearest point.
 
-    The reach and the point itself where it is not nearer than that.
+    It returns the reach and the point itself if the surface is no nearer than the reach.
     """
-    from zsim.scenario.triangles import hold, nearest_points, sheet_of  # here: who has no surface needs no numba
+    from zsim.scenario.triangles import hold, nearest_points, sheet_of  # here: without a surface, numba is not loaded
 
     sheet = hold(sheet_of(SimpleNamespace(surfaces=[surface])))
 
