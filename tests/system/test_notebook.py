@@ -27,7 +27,7 @@ class Notebook:
 
     def messages(self, code: str) -> Iterator[dict[str, Any]]:
         """Run a cell; yield what the kernel says until it is through."""
-        asked = self.client.execute(dedent(code))
+        asked = self.client.execute(dedent(code), stop_on_error=False)  # else it aborts what comes soon after
         while True:
             try:
                 said = self.client.get_iopub_msg(timeout=PATIENCE_S)
