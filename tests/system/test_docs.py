@@ -53,12 +53,14 @@ from zsim.sensors.scanner import DepthConfig, LidarConfig, RangeConfig
 from zsim.sensors.sensor import ErrorModel, Mount, Sensor
 from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, STOCK, Sensors
 from zsim.vehicles import vehicle
+from zsim_analysis.report.figure_style import ReportFigure
 from zsim_deploy import inventory
 from zsim_deploy.cli.cli import app
 from zsim_deploy.launch.role_launcher import RoleProcess
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+PNG = b"\x89PNG"
 RUN_S = 4.0  # simulated seconds of a run that has no other process to serve
 LONG = (
     "cameras.md",
@@ -232,7 +234,8 @@ class Checkout:
             for line in some:
                 if steered := STEERED.search(line):
                     self._wait_for_flight(steered[1])
-                with chdir(self._folder):
+                with chdir(self._folder), pytest.MonkeyPatch.context() as patch:
+                    patch.setattr(ReportFigure, "png", lambda _: PNG)  # drawn by the tests of reports
                     done = run_here(*shlex.split(line)[1:])
                 assert done.code == 0, f"{where}: {line}\n{done}\n{self._logs()}"
 
@@ -339,7 +342,9 @@ FOREIGN = (
 )  # take the endpoint as an argument
 OURS = ("fly_square.py",)
 STEERED = re.compile(r"zsim pub .*\bdrone/(\w+)/cmd/velocity")
-PLAIN = re.compile(r"zsim (validate|keys|echo|hz|ask|pub|fault|report|export|bundle|rerun|run .*--in-process) [^|<>;&]*")
+PLAIN = re.compile(
+    r"zsim (validate|keys|echo|hz|ask|pub|fault|report|export|bundle|rerun|run .*--in-process) [^|<>;&]*"
+)
 
 
 def adapted(line: str, ports: tuple[int, ...], longest_s: float | None) -> str:
