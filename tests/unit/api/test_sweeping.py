@@ -23,42 +23,11 @@ from zsim.scenario import scenario_file
 from zsim.schema import plugin, yaml_file
 from zsim_agents.formation.control_law import ControlLaw
 from zsim_analysis.reading.recorded_flight import RecordedFlight
-from zsim_analysis.sweep import process_pool
-from zsim_analysis.sweep.process_pool import READY
 from zsim_analysis.sweep.sweep import load, read_table
-from zsim_analysis.sweep.sweep_run import Row, Task, fly, fly_scenario
+from zsim_analysis.sweep.sweep_run import fly_scenario
 
 PATIENCE_S = 30.0  # wall time within which processes end
 DOCUMENT = yaml_file.value(ONE)
-
-
-class NearWorker:
-    """A worker without a process of its own."""
-
-    def __init__(self) -> None:
-        self.link, self._far = process_pool.multiprocessing.Pipe()
-        self.ready = False
-        self.task: Task | None = None
-        self._far.send(READY)
-
-    def send(self, task: Task) -> None:
-        self.task = task
-        self._far.send(fly(task))
-
-    def receive(self) -> Row:
-        return self.link.recv()
-
-    def stop(self) -> None:
-        self._far.close()
-        self.link.close()
-
-
-@pytest.fixture
-def near(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fly the runs in this process."""
-    monkeypatch.setattr(process_pool, "WorkerProcess", NearWorker)
-    monkeypatch.setenv(plugin.FOLDERS, "")
-    monkeypatch.setattr(sys, "path", [*sys.path])
 
 
 def highest_m(flight: RecordedFlight) -> float:
