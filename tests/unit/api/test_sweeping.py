@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import numpy as np
 import pandas as pd
 import psutil
 import pytest
+from forked_commands import run_here
 from refused import has_terms, refused
 from short_flight import ONE, diverge
 
@@ -148,9 +150,8 @@ def test_workers_know_a_script_s_classes_and_do_not_run_it_again(tmp_path: Path)
     assert law.startswith(plugin.MADE)
     assert (tmp_path / f"swept/runs/000000/{law}.py").exists()
     assert not (tmp_path / f"swept/runs/000001/{law}.py").exists()  # flies the stock law
-    command = [sys.executable, "-P", "-m", "zsim_deploy", "rerun", "--trust", "swept/runs/000000"]
-    again = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert again.returncode == 0, again.stderr
+    again = run_here("rerun", "--trust", str(tmp_path / "swept/runs/000000"))
+    assert again.code == 0, again
 
 
 WAITING = """
@@ -201,7 +202,9 @@ def test_ctrl_c_ends_the_workers_and_the_same_call_goes_on(near: None, tmp_path:
     assert (plan.runs, plan.vary) == (3, ("seed=1,2,3",))
 
 
-def test_what_a_killed_sweep_has_left_is_removed_by_the_next_one(tmp_path: Path) -> None:
+def test_what_a_killed_sweep_has_left_is_removed_by_the_next_one(
+    near: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its own folder, the modules of what the script defines, and in a worker the record of a run."""
     temporary = tmp_path / "tmp"
     temporary.mkdir()
@@ -218,11 +221,11 @@ def test_what_a_killed_sweep_has_left_is_removed_by_the_next_one(tmp_path: Path)
         started = psutil.Process(killed.pid).children(recursive=True)
         killed.kill()
     assert psutil.wait_procs(started, PATIENCE_S)[1] == []
-    left = {path.name.partition("-")[0] for path in temporary.glob("*/*")}
-    assert left == {"modules", "sweep", "run"}
-    write(tmp_path, next_py="import zsim; zsim.sweep('one.yaml', {'seed': [1]}, workers=1, progress=False)")
-    subprocess.run([sys.executable, "next.py"], cwd=tmp_path, env=environment, check=True)
-    assert [*temporary.iterdir()] == []
+    left = [*temporary.glob("*/*")]
+    assert {path.name.partition("-")[0] for path in left} == {"modules", "sweep", "run"}
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    zsim.sweep(DOCUMENT, {"seed": [1]}, progress=False)
+    assert not any(path.parent.exists() for path in left)
 
 
 def test_the_same_call_flies_what_is_missing(
