@@ -1,9 +1,9 @@
 """Fixtures of the scenario tests."""
 
 import pytest
-from federation import PAIR, Federation, compiled, federation
+from federation import PAIR, Federation, compiled, federation, forked
 
-__all__ = ["compiled", "federation", "pair_sha256"]
+__all__ = ["compiled", "federation", "forked", "pair_sha256"]
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,7 @@ It saves a third of a second of processor time for each, a second for one that f
 own process, a command would have inherited: then it is started as a user would start it.
 
 A command that starts no process and changes nothing of its own is run in the process of the test (`run_here`), which
-costs no more than what it does. What the fixture of the plugin for pytest starts is forked, too (`program`).
+costs no more than what it does. What `zsim.Federation` and `zsim.run` start is forked, too, with the fixture `forked`.
 """
 
 import atexit
@@ -84,11 +84,11 @@ def start_program(command: list[str], environment: dict[str, str]) -> tuple[Role
     return process, process.stdout
 
 
-def program(words: Sequence[str], environment: Mapping[str, str], output: Path) -> Program:
-    """Start a program for `zsim.Federation`; arguments as of `Program`."""
+def program(words: Sequence[str], environment: Mapping[str, str], output: Path | int | None) -> Program:
+    """Start a program for `zsim.Federation` and `zsim.run`; arguments as of `Program`."""
     is_run = tuple(words[: len(COMMAND)]) == COMMAND
     arguments = words[len(COMMAND) :] if is_run else words[1:] if words[0] == "zsim" else ()
-    if not arguments or not _can_fork([*arguments]):
+    if not arguments or not isinstance(output, Path) or not _can_fork([*arguments]):
         return Program(words, environment, output)
     return ForkedProgram(words, [*(f"{name}={value}" for name, value in environment.items()), *arguments], output)
 
