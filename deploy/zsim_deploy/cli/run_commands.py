@@ -240,7 +240,7 @@ def _report(folder: Path, formats: Sequence[str] = ()) -> str:
     from zsim.runtime.progress import PipedConsole, cell
     from zsim_analysis.sweep.design import is_sweep
 
-    fault = ""
+    summary = None
     with Console(stderr=True).status("reading …") as status:
 
         def progress(text: str) -> None:
@@ -257,8 +257,7 @@ def _report(folder: Path, formats: Sequence[str] = ()) -> str:
             summary = make_report(folder, progress, formats)
             shown = terminal_text(summary)
     PipedConsole().print(shown)
-    if not is_sweep(folder):
-        fault = _fault_of(summary.record.complete, summary.record.state, summary.shortfalls)
+    fault = _fault_of(summary.record.complete, summary.record.state, summary.shortfalls) if summary else ""
     say(f"report: {folder / 'report.html'}")
     return fault
 
