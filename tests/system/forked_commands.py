@@ -62,10 +62,20 @@ def start(arguments: list[str], environment: dict[str, str]) -> tuple[RoleProces
         return start_program([*ZSIM, *arguments], environment)
     read, write = os.pipe()
     with os.fdopen(write, "w") as log:
-        process = _launcher(tuple(environment.items())).start(arguments, log, listened=False)
+        process = _forked(arguments, log, environment)
+    return process, os.fdopen(read)
+
+
+def start_in(folder: Path, arguments: list[str], log: IO[str]) -> RoleProcess | None:
+    """Start a command in a folder, with its output to a file; None where it cannot be forked."""
+    return _forked([f"PWD={folder}", *arguments], log) if _can_fork(arguments) else None
+
+
+def _forked(arguments: Sequence[str], log: IO[str], environment: Mapping[str, str] = COLUMNS) -> RoleProcess:
+    process = _launcher(tuple(environment.items())).start(arguments, log, listened=False)
     assert process.stdin is not None
     process.stdin.close()
-    return process, os.fdopen(read)
+    return process
 
 
 def start_program(command: list[str], environment: dict[str, str]) -> tuple[RoleProcess, IO[str]]:
@@ -99,9 +109,7 @@ class ForkedProgram(Program):
     def __init__(self, words: Sequence[str], forked: Sequence[str], output: Path) -> None:
         self.words, self.asked = tuple(words), False
         with output.open("a") as log:
-            self._process = _launcher(tuple(COLUMNS.items())).start(forked, log, listened=False)
-        assert self._process.stdin is not None
-        self._process.stdin.close()
+            self._process = _forked(forked, log)
 
     @property
     def code(self) -> int | None:
