@@ -235,7 +235,7 @@ def test_the_same_call_flies_what_is_missing(
         return zsim.sweep(DOCUMENT, {"seed": range(count)}, metrics=[highest_m], out=tmp_path / "swept")
 
     first, whole = call(2), call(3)
-    assert has_terms(capsys.readouterr().err, "2", "done already")
+    assert has_terms(capsys.readouterr().err, "2", "already done")
     pd.testing.assert_frame_equal(whole.iloc[:2], first)
     with refused(RunError, "it varies seed=0,1,2", "give out"):
         call(1)
