@@ -61,8 +61,8 @@ class Fleet:
         self.client: Client = federation.client()
         self.commands = self.client.subscribe("drone/*/cmd/*")
         self._programs: list[Program] = []
-        ports = [str(self.px4.api + i) for i in range(2)]
-        self.mavsdk = self.keep(programs.python("mavsdk_square.py", *ports))  # beside the other two: they take their time
+        ports = [str(self.px4.api + i) for i in range(2)]  # beside the other programs: they take their time
+        self.mavsdk = self.keep(programs.python("mavsdk_square.py", *ports))
         self.dronekit = self.keep(programs.python("dronekit_goto.py", f"udp:127.0.0.1:{self.ardupilot.api + 2}"))
 
     def keep(self, program: Program) -> Program:
