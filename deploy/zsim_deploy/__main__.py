@@ -1,4 +1,4 @@
-"""The `zsim` command: Ctrl-C ends it in a line from its first moment on, also while it loads what it needs."""
+"""The `zsim` command: Ctrl-C ends it with one line, even while it is loading modules."""
 
 import gc
 import os
@@ -6,13 +6,13 @@ import signal
 
 from zsim_deploy import INTERRUPTED
 
-GARBAGE_OBJECTS = 10_000  # made before cycles are searched for; at Python's 700 that is a tenth of the start
+GARBAGE_OBJECTS = 10_000  # threshold of the garbage collector; with Python's 700 it takes a tenth of the start
 
 
 def main() -> None:
     """Load the command line, and run it."""
     gc.set_threshold(GARBAGE_OBJECTS)
-    takes_interrupts = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not where a shell has it ignored
+    takes_interrupts = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # unless a shell ignores it
     if takes_interrupts:
         signal.signal(signal.SIGINT, _leave)
     from zsim_deploy.roles.closed_output import renew_streams
@@ -25,7 +25,7 @@ def main() -> None:
     try:
         cli.main()
     finally:
-        gc.freeze()  # the end of the process frees it all; a last search for cycles would take 0.1 s
+        gc.freeze()  # the process is ending; a last collection would take 0.1 s
 
 
 def _leave(*_: object) -> None:

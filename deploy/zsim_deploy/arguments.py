@@ -1,4 +1,4 @@
-"""What commands share: options that are declared once, what they are made into, and lines for a terminal."""
+"""Shared parts of the commands: common options, the values that they are combined into, and terminal output."""
 
 import inspect
 import math
@@ -14,18 +14,19 @@ from typer import Argument, BadParameter, Exit, Option
 
 from zsim.contract.run_messages import RATE_MAX
 from zsim.errors import RunError, install_command, printable
+from zsim_analysis.report import FORMATS
 
 if TYPE_CHECKING:
     from zsim.transport.tls import Identity
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-CONNECT_VARIABLE = "ZSIM_CONNECT"  # of the environment: the endpoint where --connect is not given
-RUN_ID = "{run}"  # in the folder of a record: a recorder that is started again finds the one that it had begun
+CONNECT_VARIABLE = "ZSIM_CONNECT"  # environment variable: default of --connect
+RUN_ID = "{run}"  # placeholder in the folder of a record: a restarted recorder finds the record that it began
 CONSOLE_PORT = 8080  # of its page
 PORT_MAX = 65535
-REALTIME = "--realtime"  # of the world and the routers, whose lease it shortens
-CHANGED = "--changed"  # of the world: what a launcher, whose scenario is resolved, has changed of its file
-LOOK_S = 5.0  # wall; for which a command that a person types waits for a world
+REALTIME = "--realtime"  # of the world, and of routers, whose lease it shortens
+CHANGED = "--changed"  # of the world: overrides already contained in the resolved scenario of a launcher
+LOOK_S = 5.0  # wall time for which an interactive command waits for a world
 
 # Panels of the help
 RUN, HOSTS = "Run", "On several machines"
@@ -48,13 +49,13 @@ def note(text: str) -> None:
 
 
 def failed(cause: str) -> Exit:
-    """Print why a command ends with exit code 1, as its last line; return the exception to raise."""
+    """Print the cause of exit code 1 as the last line of a command; return the exception to raise."""
     note(cause)
     return Exit(1)
 
 
 def require(command: str, needs: Mapping[str, Sequence[str]]) -> None:
-    """Refuse to begin where modules that a command needs, by the extra that brings them, are missing."""
+    """Raise RunError if modules that a command needs are missing; `needs`: modules by the extra that brings them."""
     missing = {module: extra for extra, modules in needs.items() for module in modules if find_spec(module) is None}
     if missing:
         lacking = f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} not installed"
@@ -85,14 +86,14 @@ def check_range(from_: float | None, to: float | None) -> None:
 
 
 def endpoint_origin(text: str, arguments: Sequence[str], environment: Mapping[str, str]) -> str:
-    """Add to the refusal of an endpoint that it comes from the environment, if it does."""
+    """Add to an error about an endpoint that it comes from the environment, if so."""
     value = environment.get(CONNECT_VARIABLE)
     is_given = any(each.partition("=")[0] == "--connect" for each in arguments)
     return f"{text} ({value} is from {CONNECT_VARIABLE})" if value and value in text and not is_given else text
 
 
 class RowOrder(StrEnum):
-    """By what the rows of `zsim ps` are sorted; of figures the greatest is first."""
+    """Sort keys of `zsim ps`; numbers are sorted in descending order."""
 
     ROLE = "role"
     HOST = "host"
@@ -108,36 +109,44 @@ ScenarioPath = Annotated[Path, Argument(help="Scenario file (YAML).", show_defau
 Set = Annotated[list[str] | None, Option("--set", help="Override a field: a.b.c=value. Repeatable.")]
 Seed = Annotated[int | None, Option(help="Seed instead of the scenario's.")]
 Duration = Annotated[float | None, Option(help="Simulated seconds instead of the scenario's.")]
-Realtime = Annotated[bool, Option(REALTIME, help="Pace by the wall clock and wait for nobody.")]
+Realtime = Annotated[bool, Option(REALTIME, help="Pace by the wall clock without waiting for any process.")]
 Rate = Annotated[float | None, Option(help="Simulated per wall second (realtime 1, lockstep unpaced).")]
 Connect = Annotated[str, Option("--connect", envvar=CONNECT_VARIABLE, help="Where the world (or a router) listens.")]
 Federation = Annotated[str, Option(envvar="ZSIM_FEDERATION", help="Name of the federation: the prefix of its keys.")]
-Wait = Annotated[
-    float | None, Option(callback=not_negative, help="Seconds to wait for a world; for ever if not given.")
-]
+Wait = Annotated[float | None, Option(callback=not_negative, help="Seconds to wait for a world; forever if not given.")]
 Launched = Annotated[str | None, Option("--launched", hidden=True)]  # by `zsim run`, for the run of this id
 Tls = Annotated[Path | None, Option("--tls", help="Folder of this process's certificate (zsim certs init).")]
 Access = Annotated[Path | None, Option("--access", help="Zenoh's access control (zsim certs init).")]
 Host = Annotated[str | None, Option("--host", help="Name of this host, as others see it.")]
-Insecure = Annotated[bool, Option("--insecure", help="Without TLS, on a network that nobody else uses.")]
+Insecure = Annotated[bool, Option("--insecure", help="Without TLS, on a private network.")]
 Keys = Annotated[
     list[str] | None, Option(help="Only these keys, e.g. 'drone/*/truth'. Repeatable.", show_default=False)
 ]
-Trust = Annotated[
-    bool, Option("--trust", help="Import the modules that the scenario names. That runs them: trust who wrote them.")
-]
+Trust = Annotated[bool, Option("--trust", help="Import the modules that the scenario names. This runs their code.")]
 From = Annotated[float | None, Option("--from", callback=not_negative, help="Simulated seconds of the first message.")]
 To = Annotated[float | None, Option("--to", callback=not_negative, help="Simulated seconds of the last message.")]
 Force = Annotated[
     bool, Option("--force", help="Replace an earlier run in the folder; other files there stay as they are.")
 ]
 Report = Annotated[bool, Option(help="Make the report at the end.")]
+Workers = Annotated[int | None, Option(min=1, max=1024, help="Processes (default: one per core).")]
+Formats = Annotated[
+    str | None, Option("--format", help="pdf, svg or pdf,svg: further formats of the figures.", show_default=False)
+]
 Listen = Annotated[list[str] | None, Option(help=f"Endpoint, repeatable (default {DEFAULT_ENDPOINT}).")]
 Recorded = Annotated[Path, Argument(metavar="DIR", help="Folder of a run, or its run.mcap.", show_default=False)]
 
 
+def figure_formats(text: str | None) -> tuple[str, ...]:
+    """Return the values of --format of reports."""
+    formats = tuple(text.split(",")) if text else ()
+    if not set(formats) <= set(FORMATS):
+        raise BadParameter(f"--format is {text!r}; must be {' or '.join(FORMATS)}, or both separated by a comma")
+    return formats
+
+
 def process_option(default: str) -> Any:
-    """Return the option by which a process is named; `default` is its name without a certificate."""
+    """Return the option for the name of a process; `default` is its name without a certificate."""
     return Option(help=f"Process name (default {default}, or the certificate's).")
 
 
@@ -164,9 +173,9 @@ def load_scenario(
     elsewhere: bool = False,
     modules: Iterable[Path] = (),
 ) -> Any:
-    """Return the scenario of a file with the overrides of the command line; `elsewhere`: it flies on other hosts.
+    """Load a scenario with the overrides of the command line; `elsewhere`: it flies on other hosts.
 
-    `modules`: folders in which modules that it names may stand, beside its own.
+    `modules`: further folders with modules that it names.
     """
     from zsim.scenario import scenario_file
     from zsim_agents.hosting import check_classes
@@ -177,7 +186,7 @@ def load_scenario(
 
 
 def changed_fields(overrides: Sequence[str] | None, seed: int | None, duration: float | None) -> list[str]:
-    """Return what a command line changes of a scenario as texts of `--set`."""
+    """Return the changes that a command line makes to a scenario, as texts of `--set`."""
     own = {"seed": seed, "duration_s": duration}
     return [*(overrides or ()), *(f"{name}={value}" for name, value in own.items() if value is not None)]
 
@@ -191,7 +200,7 @@ def pace_options(mode: str, rate: float) -> list[str]:
 
 
 class FlightOptions(NamedTuple):
-    """What is to be flown, and how fast; seed, duration and overrides (texts `a.b.c=value`) change the scenario."""
+    """A scenario to fly, and its pace; seed, duration and overrides (texts `a.b.c=value`) change the scenario."""
 
     path: Path
     seed: int | None
@@ -201,7 +210,7 @@ class FlightOptions(NamedTuple):
     overrides: list[str] | None
 
     def scenario(self, elsewhere: bool = False) -> Any:
-        """Return the scenario, the classes that it names loaded here; `elsewhere`: it flies on other hosts."""
+        """Load the scenario and, unless it flies on other hosts (`elsewhere`), the classes that it names."""
         from zsim.scenario.roles import check_pace
 
         scenario = load_scenario(self.path, self.overrides, self.seed, self.duration, elsewhere)
@@ -212,7 +221,7 @@ class FlightOptions(NamedTuple):
         return changed_fields(self.overrides, self.seed, self.duration)
 
     def mode_and_rate(self) -> tuple[str, float]:
-        """Return the mode of a run, and its pace in simulated per wall seconds; 0 is as fast as it goes."""
+        """Return the mode of a run, and its pace in simulated per wall seconds; 0 is as fast as possible."""
         if self.rate is not None and not 0 < self.rate <= RATE_MAX:
             raise BadParameter(f"--rate is {self.rate:g}; must be > 0 and <= {RATE_MAX:g}")
         return ("realtime", self.rate or 1.0) if self.realtime else ("lockstep", self.rate or 0.0)
@@ -230,7 +239,7 @@ class WorldAccess(NamedTuple):
     tls: Path | None  # folder of the process's certificate
     insecure: bool
     host: str | None  # its name, as others see it
-    launched: str | None = None  # run of which it is a part, of processes that a launcher starts
+    launched: str | None = None  # id of the run, if a launcher started the process
 
     @property
     def who(self) -> "Identity":
@@ -238,9 +247,9 @@ class WorldAccess(NamedTuple):
 
 
 def option_group(argument: str, make: Callable[..., Any], options: Mapping[str, tuple[Any, Any]]) -> Callable[..., Any]:
-    """Return a decorator that gives a command some options, by annotation and default, in place of one argument.
+    """Return a decorator that replaces one argument of a command by options (annotation and default by name).
 
-    `make` makes that argument of their values, in the order of the options.
+    `make` builds that argument from their values, in the order of the options.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
@@ -285,18 +294,18 @@ flight_options = option_group(
     },
 )
 observer_options = option_group("reach", WorldAccess, _OBSERVER)
-"""Of a command that a person types, with an argument `reach`."""
+"""For interactive commands, with an argument `reach`."""
 participant_options = option_group("reach", WorldAccess, _PARTICIPANT)
-"""Of a command that runs a process of a federation, with an argument `reach`: it waits for a world."""
+"""For commands that run a process of a federation, with an argument `reach`: it waits for a world."""
 several_options = option_group(
     "reach",
     lambda connect, federation, wait, *more: WorldAccess(connect, federation, wait, None, *more),
     {name: each for name, each in _PARTICIPANT.items() if name != "tls"},
 )
-"""The same for a process that stands for several, which can have no certificate: that is for one."""
+"""The same for a process that hosts several, which cannot have a certificate: that is for a single name."""
 listener_options = option_group(
     "who",
     identity,
     {"host": (Host, None), "tls": (Tls, None), "insecure": (Insecure, False), "access": (Access, None)},
 )
-"""Of a command that runs a process to which others connect, with an argument `who`."""
+"""For commands that run a process to which others connect, with an argument `who`."""

@@ -2,7 +2,7 @@
 
 CACHE/environments/KEY    one for each Python, lock and version of zsim; KEY is a hash of these
 
-zsim itself is the one that is here: a bundle brings none.
+zsim itself is that of this machine; a bundle does not contain it.
 """
 
 import hashlib
@@ -27,19 +27,19 @@ from zsim_deploy.hosts.push import default_cache
 from zsim_deploy.hosts.wheelhouse import PROJECT, checkout, requirement
 
 KEY_DIGITS = 16
-READY = "ready"  # in an environment that is whole
+READY = "ready"  # marks a complete environment
 LEFT_OUT = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
 
 
 def rerun_in_environment(
     bundle: Path, python: Path | None, commands_only: bool, trust: bool, note: Callable[[str], None]
 ) -> int:
-    """Make the environment of a bundle if it is not there, and fly it again in there; return the exit code of that.
+    """Fly a bundle again in its environment, which is made if missing; return the exit code of the flight.
 
     Args:
         python: of the environment; None for this one.
-        trust: whether its own code may be run, and the packages that this needs be installed.
-        note: takes a line on what is done.
+        trust: whether the bundle's own code may be run, and the packages that it needs be installed.
+        note: takes a line about each step.
 
     Raises:
         RunError: the bundle is refused, or the environment cannot be made.
@@ -58,42 +58,29 @@ def rerun_in_environment(
 
 def _environment(python: str, lock: Sequence[str], needs: Sequence[str], note: Callable[[str], None]) -> Path:
     """Return the folder of an environment with the packages of a lock."""
-    version = _output([python, "-c", "import sys; print(sys.version)"], f"{python}: is no Python")
-    source = checkout()
-    wanted = [f"{source}[{','.join(EXTRAS)}]" if source else _with_extras(), *needs]
+    version = _output([python, "-c", "import sys; print(sys.version)"], f"{python}: is not a Python")
+    name, origin = str(checkout() or ""), ""
+    if not name:
+        name, separator, rest = requirement(distribution(PROJECT)).partition(" @ ")
+        name, origin = (PROJECT, f" @ {rest}") if separator else (PROJECT, name.removeprefix(PROJECT))
+    wanted = [f"{name}[{','.join(EXTRAS)}]{origin}", *needs]
     key = hashlib.sha256(json.dumps([python, version, __version__, wanted, list(lock)]).encode()).hexdigest()
     folder = default_cache() / "environments" / key[:KEY_DIGITS]
     with file_fault(folder, "cannot be made", "set XDG_CACHE_HOME to a folder that can be written"):
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / "lock").open("a") as held:
             if not take_lock(held):
-                raise RunError(f"{folder}: another command makes this environment now; wait for it to end")
+                raise RunError(f"{folder}: another command is making this environment; wait for it to end")
             if not (folder / READY).exists():
                 note(f"making an environment with {len(lock)} packages in {folder}")
                 shutil.rmtree(folder / "venv", ignore_errors=True)
                 _output([python, "-m", "venv", str(folder / "venv")], f"{folder}: no environment can be made")
                 (folder / names.LOCK).write_text("".join(f"{line}\n" for line in lock), "utf-8")
-                pip = [
-                    str(_python_of(folder)),
-                    "-m",
-                    "pip",
-                    "install",
-                    "--disable-pip-version-check",
-                    "--no-input",
-                    "-q",
-                ]
+                pip = [str(_python_of(folder)), "-m", "pip", "install", "--disable-pip-version-check", "--no-input"]
                 what = "the packages of the bundle cannot be installed with this Python"
-                _output([*pip, "--constraint", str(folder / names.LOCK), *wanted], f"{folder}: {what}")
+                _output([*pip, "-q", "--constraint", str(folder / names.LOCK), *wanted], f"{folder}: {what}")
                 (folder / READY).touch()
     return folder
-
-
-def _with_extras() -> str:
-    """Return the requirement by which pip gets the zsim that is installed here again."""
-    name, separator, rest = requirement(distribution(PROJECT)).partition(" @ ")
-    if separator:
-        return f"{PROJECT}[{','.join(EXTRAS)}] @ {rest}"
-    return name.replace(PROJECT, f"{PROJECT}[{','.join(EXTRAS)}]", 1)
 
 
 def _python_of(environment: Path) -> Path:
@@ -101,12 +88,12 @@ def _python_of(environment: Path) -> Path:
 
 
 def _clean() -> dict[str, str]:
-    """Return the environment variables without those by which a Python takes modules of another one."""
+    """Return the environment variables without those that make a Python import modules of another one."""
     return {name: value for name, value in os.environ.items() if name not in LEFT_OUT}
 
 
 def _output(words: Sequence[str], fault: str) -> str:
-    """Run a program and return what it prints; RunError with its last line of error if it fails."""
+    """Run a program and return its output; RunError with its last error line if it fails."""
     try:
         done = subprocess.run(words, env=_clean(), capture_output=True, text=True, errors="replace", check=False)
     except OSError as error:

@@ -1,9 +1,10 @@
 """Fixtures of the scenario tests."""
 
 import pytest
-from federation import PAIR, Federation, compiled, federation
+from federation import PAIR, Federation, compiled, federation, forked
+from near_worker import near
 
-__all__ = ["compiled", "federation", "pair_sha256"]
+__all__ = ["compiled", "federation", "forked", "near", "pair_sha256"]
 
 
 @pytest.fixture(scope="session")

@@ -129,7 +129,6 @@ def modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "talkers.py").write_text(TALKERS)
     for folder in (EXAMPLES, tmp_path):
         monkeypatch.syspath_prepend(str(folder))
-    monkeypatch.setenv("PYTHONPATH", f"{EXAMPLES}:{tmp_path}")
 
 
 def heard(groups: list[list[str]], gates_max: int, kind: str = "Talker", **more: Any) -> dict[str, list[Any]]:
@@ -247,7 +246,7 @@ def test_over_a_radio_each_hears_whom_it_reaches_and_when_it_does(groups: list[l
     ]
 
 
-def test_as_processes_and_flown_again_they_have_the_same_bits(tmp_path: Path, compiled: None) -> None:
+def test_as_processes_and_flown_again_they_have_the_same_bits(tmp_path: Path, forked: None) -> None:
     """Over a radio that loses and delays messages, with a ridge between two drones; killed in the middle, a pilot goes on
     from its snapshot."""
     (tmp_path / "ridge.csv").write_text(RIDGE)
@@ -272,7 +271,7 @@ def test_as_processes_and_flown_again_they_have_the_same_bits(tmp_path: Path, co
 
 
 @pytest.mark.soak
-def test_hosted_they_have_the_same_bits(federation: Federation, tmp_path: Path, compiled: None) -> None:
+def test_hosted_they_have_the_same_bits(federation: Federation, tmp_path: Path) -> None:
     (tmp_path / "swarm.yaml").write_text(SWARM)
     alone = zsim.run(tmp_path / "swarm.yaml", out=tmp_path / "alone", progress=False)
     federation.run(SWARM, "--hosted").ends(with_code=0)
@@ -291,7 +290,7 @@ def test_the_pentagon_closes(tmp_path: Path) -> None:
     assert sides == pytest.approx([3.5267] * 5, abs=0.3)  # 2 · 3 m · sin(36°)
 
 
-def test_their_parameters_are_swept_by_path(tmp_path: Path) -> None:
+def test_their_parameters_are_swept_by_path(near: None, tmp_path: Path) -> None:
     """The takeoff of one run comes after its end."""
     path = "agents.pilot.parameters.takeoff_s"
     (tmp_path / "swarm.yaml").write_text(SWARM)

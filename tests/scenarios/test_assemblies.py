@@ -59,7 +59,7 @@ def places(run: Any, at_s: float) -> np.ndarray:
     return np.array([run.truth(f"d{k}")[columns].to_numpy()[round(at_s * 50)] for k in range(1, 6)])
 
 
-def test_from_a_line_to_a_pentagon_and_turned_with_the_same_bits_after_a_kill(tmp_path: Path, compiled: None) -> None:
+def test_from_a_line_to_a_pentagon_and_turned_with_the_same_bits_after_a_kill(tmp_path: Path, forked: None) -> None:
     """The line is in no formation at the start. Turned by half a turn, each drone flies to the next place only.
 
     Expected: places of a pentagon within half a metre; from 21 s to 32 s each drone moves by 2 * 4 m * sin(18 deg).
@@ -92,7 +92,7 @@ def test_from_a_line_to_a_pentagon_and_turned_with_the_same_bits_after_a_kill(tm
 
 @pytest.mark.soak
 @pytest.mark.parametrize("kill_s", [8.0, 23.5, 30.0])
-def test_without_snapshots_the_step_of_the_plan_is_flown_again(kill_s: float, tmp_path: Path, compiled: None) -> None:
+def test_without_snapshots_the_step_of_the_plan_is_flown_again(kill_s: float, tmp_path: Path, forked: None) -> None:
     path = written({**LINE, "processes": {"snapshot_s": 0}}, tmp_path)
     with zsim.Federation(path, out=tmp_path / "many") as flight:
         flight.wait_until(kill_s)

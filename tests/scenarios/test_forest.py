@@ -42,7 +42,7 @@ def test_five_drones_fly_among_the_trunks_and_touch_none(tmp_path: Path, compile
     assert run.events[run.events.kind == "collision"].empty
 
 
-def test_as_processes_they_have_the_same_bits_though_a_pilot_is_killed(tmp_path: Path, compiled: None) -> None:
+def test_as_processes_they_have_the_same_bits_though_a_pilot_is_killed(tmp_path: Path, forked: None) -> None:
     document = yaml.safe_load((EXAMPLES / "forest.yaml").read_text())
     (tmp_path / "forest.yaml").write_text(yaml.safe_dump({**document, "drones": document["drones"][:3]}))
     alone = zsim.run(tmp_path / "forest.yaml", duration_s=9, out=tmp_path / "alone", progress=False)

@@ -68,7 +68,7 @@ def test_each_law_flies_what_it_promises(
 
 
 def test_a_pilot_keeps_off_a_surface_that_it_knows_as_processes_and_after_a_kill_to_the_same_bits(
-    tmp_path: Path, compiled: None
+    tmp_path: Path, forked: None
 ) -> None:
     """A wall of triangles is between d3 and its flock, 2 m from it; without the map d3 flies into it.
 

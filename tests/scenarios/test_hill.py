@@ -42,7 +42,7 @@ def hill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 @pytest.mark.soak
-def test_a_pair_lands_on_a_hill_and_rests_there(hill: dict[str, Any], tmp_path: Path, compiled: None) -> None:
+def test_a_pair_lands_on_a_hill_and_rests_there(hill: dict[str, Any], tmp_path: Path, forked: None) -> None:
     """Expected: both stand on it to millimetres at its slope, and nothing is told but the landing; likewise as processes,
     of which the world is killed while they come down."""
     path = tmp_path / "hill.yaml"  # beside the height map

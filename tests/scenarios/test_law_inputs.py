@@ -49,11 +49,10 @@ class Misled(Seeing):
 @pytest.fixture(autouse=True)
 def modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "seeing.py").write_text(LAWS)
-    monkeypatch.setenv("PYTHONPATH", str(EXAMPLES))
     monkeypatch.syspath_prepend(str(tmp_path))
 
 
-def test_the_formation_stops_before_the_wall_with_the_same_bits_after_a_kill(tmp_path: Path, compiled: None) -> None:
+def test_the_formation_stops_before_the_wall_with_the_same_bits_after_a_kill(tmp_path: Path, forked: None) -> None:
     """The law keeps 2 m from what the beams see, whose noise and bias are 1 cm each; without them the target is 9 m on."""
     alone = zsim.run(WALL, duration_s=FLOWN_S, out=tmp_path / "alone", progress=False)
     assert 1.8 < min(alone.summary.obstacle_distance_m.values()) < 2.2
@@ -69,7 +68,7 @@ def test_the_formation_stops_before_the_wall_with_the_same_bits_after_a_kill(tmp
 
 
 @pytest.mark.soak
-def test_hosted_they_are_the_same_too(tmp_path: Path, compiled: None) -> None:
+def test_hosted_they_are_the_same_too(tmp_path: Path, forked: None) -> None:
     alone = zsim.run(WALL, duration_s=FLOWN_S, out=tmp_path / "alone", progress=False)
     hosted = zsim.run(WALL, duration_s=FLOWN_S, out=tmp_path / "hosted", processes=True, options=["--hosted"])
     assert hosted.truth_sha256 == alone.truth_sha256

@@ -48,7 +48,7 @@ def test_six_drones_fly_the_public_swap(tmp_path: Path) -> None:
         assert np.linalg.norm((drone[-1] - other[0])[:2]) < 0.3
 
 
-def test_as_processes_after_deaths_and_flown_again_they_have_the_same_bits(tmp_path: Path, compiled: None) -> None:
+def test_as_processes_after_deaths_and_flown_again_they_have_the_same_bits(tmp_path: Path, forked: None) -> None:
     """One follows its path, the other one a mission that it is asked for in flight; both of their pilots are killed."""
     (tmp_path / "short.yaml").write_text(SHORT)
     places, how = [[3, 1, 1], [4, 1, 1.2]], {"speed_m_s": 0.6, "radius_m": 0.3, "yaw_deg": 90}
@@ -101,7 +101,7 @@ def test_a_drone_flies_where_it_is_asked_to_and_a_rerun_does_too(tmp_path: Path)
     assert rerun_record(tmp_path / "run", False, said.append, said.append) == ""
 
 
-def test_a_slower_path_is_swept_and_kept_to_better(tmp_path: Path) -> None:
+def test_a_slower_path_is_swept_and_kept_to_better(near: None, tmp_path: Path) -> None:
     (tmp_path / "short.yaml").write_text(SHORT)
     path = "drones.d1.reference.time_scale"
     options: dict[str, Any] = {"workers": 1, "progress": False, "set": {"drones.d1.reference.land_s": 17}}

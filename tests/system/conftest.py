@@ -1,22 +1,20 @@
 """Fixtures of the tests that start processes."""
 
-import forked_commands
 import pytest
 from chromium import browser
 from console_browser import opened
 from deployment import deployment, faketime, small_disk
-from federation import compiled, federation
+from federation import compiled, federation, forked
 from lab import lab
 
 from zsim_api.pytest_plugin import Federations
 from zsim_api.pytest_plugin import federation as users_federation  # as users have it; ours starts single commands, too
 
-__all__ = ["browser", "compiled", "deployment", "faketime", "federation", "lab", "opened", "small_disk"]
+__all__ = ["browser", "compiled", "deployment", "faketime", "federation", "forked", "lab", "opened", "small_disk"]
 __all__ += ["users_federation"]
 
 
 @pytest.fixture
-def flights(users_federation: Federations, compiled: None, monkeypatch: pytest.MonkeyPatch) -> Federations:
-    """The fixture `federation` of the plugin; its `zsim` commands are forked (test_own_tests.py starts real ones)."""
-    monkeypatch.setattr("zsim_api.federation.Program", forked_commands.program)
+def flights(users_federation: Federations, forked: None) -> Federations:
+    """The fixture `federation` of the plugin; its `zsim` commands are forked."""
     return users_federation

@@ -359,6 +359,13 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 
 @pytest.fixture
+def forked(compiled: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fork the `zsim run` that `zsim.Federation` and `zsim.run` start; test_own_tests.py starts it as a user does."""
+    for module in ("federation", "flight"):
+        monkeypatch.setattr(f"zsim_api.{module}.Program", forked_commands.program)
+
+
+@pytest.fixture
 def federation(tmp_path: Path, compiled: None) -> Iterator[Federation]:
     """A federation of the test's own; nobody of it outlives the test."""
     with Federation(tmp_path) as made:

@@ -4,7 +4,7 @@ It saves a third of a second of processor time for each, a second for one that f
 own process, a command would have inherited: then it is started as a user would start it.
 
 A command that starts no process and changes nothing of its own is run in the process of the test (`run_here`), which
-costs no more than what it does. What the fixture of the plugin for pytest starts is forked, too (`program`).
+costs no more than what it does. What `zsim.Federation` and `zsim.run` start is forked, too, with the fixture `forked`.
 """
 
 import atexit
@@ -62,10 +62,20 @@ def start(arguments: list[str], environment: dict[str, str]) -> tuple[RoleProces
         return start_program([*ZSIM, *arguments], environment)
     read, write = os.pipe()
     with os.fdopen(write, "w") as log:
-        process = _launcher(tuple(environment.items())).start(arguments, log, listened=False)
+        process = _forked(arguments, log, environment)
+    return process, os.fdopen(read)
+
+
+def start_in(folder: Path, arguments: list[str], log: IO[str]) -> RoleProcess | None:
+    """Start a command in a folder, with its output to a file; None where it cannot be forked."""
+    return _forked([f"PWD={folder}", *arguments], log) if _can_fork(arguments) else None
+
+
+def _forked(arguments: Sequence[str], log: IO[str], environment: Mapping[str, str] = COLUMNS) -> RoleProcess:
+    process = _launcher(tuple(environment.items())).start(arguments, log, listened=False)
     assert process.stdin is not None
     process.stdin.close()
-    return process, os.fdopen(read)
+    return process
 
 
 def start_program(command: list[str], environment: dict[str, str]) -> tuple[RoleProcess, IO[str]]:
@@ -84,11 +94,11 @@ def start_program(command: list[str], environment: dict[str, str]) -> tuple[Role
     return process, process.stdout
 
 
-def program(words: Sequence[str], environment: Mapping[str, str], output: Path) -> Program:
-    """Start a program for `zsim.Federation`; arguments as of `Program`."""
+def program(words: Sequence[str], environment: Mapping[str, str], output: Path | int | None) -> Program:
+    """Start a program for `zsim.Federation` and `zsim.run`; arguments as of `Program`."""
     is_run = tuple(words[: len(COMMAND)]) == COMMAND
     arguments = words[len(COMMAND) :] if is_run else words[1:] if words[0] == "zsim" else ()
-    if not arguments or not _can_fork([*arguments]):
+    if not arguments or not isinstance(output, Path) or not _can_fork([*arguments]):
         return Program(words, environment, output)
     return ForkedProgram(words, [*(f"{name}={value}" for name, value in environment.items()), *arguments], output)
 
@@ -99,9 +109,7 @@ class ForkedProgram(Program):
     def __init__(self, words: Sequence[str], forked: Sequence[str], output: Path) -> None:
         self.words, self.asked = tuple(words), False
         with output.open("a") as log:
-            self._process = _launcher(tuple(COLUMNS.items())).start(forked, log, listened=False)
-        assert self._process.stdin is not None
-        self._process.stdin.close()
+            self._process = _forked(forked, log)
 
     @property
     def code(self) -> int | None:

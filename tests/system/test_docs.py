@@ -41,7 +41,7 @@ import pytest
 import typer
 import yaml
 from federation import free_port
-from forked_commands import run_here
+from forked_commands import run_here, start_in
 from msgspec import inspect as types
 
 from zsim.contract import messages
@@ -53,11 +53,14 @@ from zsim.sensors.scanner import DepthConfig, LidarConfig, RangeConfig
 from zsim.sensors.sensor import ErrorModel, Mount, Sensor
 from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, STOCK, Sensors
 from zsim.vehicles import vehicle
+from zsim_analysis.report.figure_style import ReportFigure
 from zsim_deploy import inventory
 from zsim_deploy.cli.cli import app
+from zsim_deploy.launch.role_launcher import RoleProcess
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+PNG = b"\x89PNG"
 RUN_S = 4.0  # simulated seconds of a run that has no other process to serve
 LONG = (
     "cameras.md",
@@ -202,7 +205,7 @@ class Checkout:
         self._environment = {**os.environ, "PATH": path, "COLUMNS": "100"}
         self._folder = folder
         self._ports = tuple(free_port() for _ in PORTS)
-        self._terminals: list[tuple[str, Path, subprocess.Popen[bytes]]] = []
+        self._terminals: list[tuple[str, Path, RoleProcess]] = []
 
     def __enter__(self) -> "Checkout":
         return self
@@ -231,7 +234,8 @@ class Checkout:
             for line in some:
                 if steered := STEERED.search(line):
                     self._wait_for_flight(steered[1])
-                with chdir(self._folder):
+                with chdir(self._folder), pytest.MonkeyPatch.context() as patch:
+                    patch.setattr(ReportFigure, "png", lambda _: PNG)  # drawn by the tests of reports
                     done = run_here(*shlex.split(line)[1:])
                 assert done.code == 0, f"{where}: {line}\n{done}\n{self._logs()}"
 
@@ -258,8 +262,12 @@ class Checkout:
         for line in lines(block):
             text = adapted(line, self._ports, None)
             log = self._folder / f"terminal-{len(self._terminals)}-{time.monotonic_ns()}.log"
+            words = shlex.split(text)
             with log.open("w") as out:
-                process = subprocess.Popen(
+                forked = (
+                    start_in(self._folder, words[1:], out) if words[0].removeprefix(".venv/bin/") == "zsim" else None
+                )
+                process = forked or subprocess.Popen(
                     ["bash", "-c", f"exec env {text}"],
                     cwd=self._folder,
                     env=self._environment,
@@ -305,7 +313,7 @@ class Checkout:
         """Press Ctrl-C where a run is led or routed; every process must leave well, the others by themselves."""
         for text, _, process in self._terminals:
             if process.poll() is None and re.search(LEADERS, text):
-                process.send_signal(signal.SIGINT)
+                os.kill(process.pid, signal.SIGINT)
         for text, _, process in self._terminals:
             code = process.wait(timeout=PATIENCE_S)
             # −2: Ctrl-C met Python on its way out
@@ -336,7 +344,9 @@ FOREIGN = (
 )  # take the endpoint as an argument
 OURS = ("fly_square.py",)
 STEERED = re.compile(r"zsim pub .*\bdrone/(\w+)/cmd/velocity")
-PLAIN = re.compile(r"zsim (validate|keys|echo|hz|ask|pub|fault|report|export|rerun) [^|<>;&]*")
+PLAIN = re.compile(
+    r"zsim (validate|keys|echo|hz|ask|pub|fault|report|export|bundle|rerun|run .*--in-process) [^|<>;&]*"
+)
 
 
 def adapted(line: str, ports: tuple[int, ...], longest_s: float | None) -> str:

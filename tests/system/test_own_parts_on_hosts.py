@@ -74,7 +74,9 @@ def test_drones_that_talk_to_each_other_fly_as_in_one_process(
         assert len(record.all("swarm/drone1/position")) == DURATION_S / 0.02 + 1
 
 
-def test_a_program_without_a_place_is_started_here_and_named_where_it_fails(lab: Lab, tmp_path: Path) -> None:
+def test_a_program_without_a_place_is_started_here_and_named_where_it_fails(
+    lab: Lab, tmp_path: Path, forked: None
+) -> None:
     """To the bits that it flies to under `zsim run`."""
     client, dies = EXAMPLES / "plain_client.yaml", tmp_path / "dies.yaml"
     dies.write_text(

@@ -21,7 +21,7 @@ def scenario(command: list[str], processes: dict[str, Any] | None = None, **more
     return ONE + yaml.safe_dump({"programs": programs, "processes": processes or {}})
 
 
-def test_a_program_in_the_folder_of_the_scenario_flies_a_drone(tmp_path: Path) -> None:
+def test_a_program_in_the_folder_of_the_scenario_flies_a_drone(tmp_path: Path, forked: None) -> None:
     runs = [
         zsim.run(EXAMPLES / "plain_client.yaml", duration_s=5, processes=True, out=tmp_path / name, progress=False)
         for name in ("first", "second")

@@ -66,6 +66,7 @@ def test_of_a_program_that_hangs(federation):
     flight.kill("estimator.drone2")
     flight.wait_until("engaged", within_s=1)
 """
+KEPT = "test_mine.py-test_of_a_program_that_hangs"  # of the failed test
 
 
 def pytest_run(folder: Path, test: str, *options: str) -> subprocess.Popen[str]:
@@ -111,18 +112,12 @@ def left_in(folder: Path) -> list[int]:
     return found
 
 
-def test_a_passing_test(compiled: None, tmp_path: Path) -> None:
-    process = pytest_run(tmp_path, PASSING)
-    output = output_of(process)
-    assert process.returncode == 0, output
-    assert left_in(tmp_path) == []
-    assert not (tmp_path / "runs").exists()
-
-
-def test_a_failing_test_says_who_waits_and_keeps_the_record(compiled: None, tmp_path: Path) -> None:
-    process = pytest_run(tmp_path, FAILING)
+def test_one_passes_and_one_that_fails_says_who_waits_and_keeps_its_record(compiled: None, tmp_path: Path) -> None:
+    process = pytest_run(tmp_path, PASSING + FAILING)
     output = output_of(process)
     assert process.returncode == 1, output
+    assert "1 failed, 1 passed" in output
+    assert [each.name for each in (tmp_path / "runs/failed").iterdir()] == [KEPT]
     assert re.search(r"t = 0.00 s, waiting; waiting_for:\n +ground.main ", output), output
     logs = re.findall(r"^--- (\S+).log(.*)", output, re.MULTILINE)
     names = [name for name, _ in logs]
@@ -132,7 +127,7 @@ def test_a_failing_test_says_who_waits_and_keeps_the_record(compiled: None, tmp_
     assert first | others == {"controller.main", "estimator.drone1", "estimator.drone2", "ground.main", "recorder"}
     assert [bool(rest) for _, rest in logs] == [place > launcher for place in range(len(logs))]  # one line is all
     assert re.search("--- ground.main.log\nhere on tcp/127.0.0.1:[0-9]+\n", output)
-    kept = tmp_path / "runs/failed/test_mine.py-test_of_a_program_that_hangs/run1"
+    kept = tmp_path / "runs/failed" / KEPT / "run1"
     assert f"kept in {kept}" in output
     assert (kept / "logs/ground.main.log").exists()
     with RecordReader(kept / "run.mcap") as reader:

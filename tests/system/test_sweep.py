@@ -207,7 +207,7 @@ def test_a_scenario_file_of_any_name(federation: Federation, name: str) -> None:
 BAD = {
     "no such field": (("--vary", "wings=1"), "wings is not known; allowed: "),
     "several at once": (("--vary", "duration_s=1,-1", "--vary", "time.gate_ms=0"), "\npair.yaml: duration_s is -1"),
-    "no variation": (
+    "not a variation": (
         ("--vary", "duration_s"),
         "--vary duration_s: is no variation; must be seed, seed=paired, a.b.c=v1,v2",
     ),

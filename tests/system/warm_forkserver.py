@@ -80,10 +80,12 @@ def end_with_parent() -> None:
 
 
 def run_role(arguments: list[str], files: list[int]) -> NoReturn:
-    """Run a role with the variables that stand before its arguments, NAME=VALUE each."""
+    """Run a role with the variables that stand before its arguments, NAME=VALUE each; PWD is where it runs."""
     while "=" in arguments[0]:
         name, _, value = arguments.pop(0).partition("=")
         os.environ[name] = value
+        if name == "PWD":
+            os.chdir(value)
         if name == "PYTHONPATH":
             sys.path[:0] = value.split(os.pathsep)
     RUN_ROLE(arguments, files)

@@ -1,4 +1,4 @@
-"""The workers of a sweep on several hosts: those of a running Dask cluster.
+"""The workers of a sweep on several hosts: a running Dask cluster.
 
 Dask repeats a run whose worker died, and gives up a run in which several workers died.
 """
@@ -28,17 +28,17 @@ _alone = threading.Lock()
 
 
 def fly_alone(task: Task) -> Row:
-    """Fly a run, one at a time in each process, whose threads would only wait for each other."""
+    """Fly a run, one at a time in each process: more threads would only wait for each other."""
     with _alone:
         return fly(task)
 
 
 class UserCode(WorkerPlugin):
-    """Lets the workers of a cluster, and those that join later, find what a notebook or a script defines.
+    """Makes definitions of a notebook or a script importable on all workers, including those that join later.
 
     Args:
-        modules: texts of modules by the names of their files.
-        folders: searched for other modules, too, where a worker's host has them.
+        modules: source texts by file name.
+        folders: further folders to search for modules, if a worker's host has them.
     """
 
     name = "zsim-user-code"
@@ -59,10 +59,10 @@ class DaskPool:
 
     Args:
         cluster: a client, which stays open, or the address of a scheduler.
-        modules: of `UserCode`.
+        modules: see `UserCode`.
 
     Raises:
-        RunError: no scheduler answers there, or a worker has another zsim than this host.
+        RunError: no scheduler answers.
     """
 
     def __init__(self, cluster: Any, say: Callable[[str], None], modules: Mapping[str, str] = {}) -> None:
@@ -80,17 +80,17 @@ class DaskPool:
             await (await connect(cluster, timeout=CONNECT_S)).close()
 
         try:
-            asyncio.run(connect_once())  # first, since a client takes long to give up
+            asyncio.run(connect_once())  # tried first, because a client takes long to give up
             self._client: Any = Client(cluster, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
             reason = " ".join(str(error).split()) or type(error).__name__
             raise RunError(f"{self._where}: no scheduler ({reason}); start `dask scheduler` there") from error
 
     def rows(self, tasks: Iterator[Task]) -> Generator[Row]:
-        """Yield the rows of tasks as they are finished; when closed, the cluster drops the rest.
+        """Yield the rows of tasks as they finish; when closed, the cluster drops the rest.
 
         Raises:
-            RunError: the cluster is gone, or rows cannot be recorded.
+            RunError: the cluster is gone, a worker has another zsim version, or rows cannot be recorded.
         """
         pending: dict[Any, Task] = {}  # by future
         try:
@@ -104,7 +104,7 @@ class DaskPool:
                         try:
                             row = future.result()
                         except KilledWorker:
-                            row = failed_row(task, "several workers died of it, see Dask's allowed-failures")
+                            row = failed_row(task, "several workers died in it, see Dask's allowed-failures")
                         except CancelledError:
                             raise
                         except Exception as error:  # raised by `fly`: every further run would fail as well
@@ -115,10 +115,10 @@ class DaskPool:
                     if self._is_lent and pending:
                         self._client.cancel(list(pending))
         except (OSError, CancelledError) as error:  # broken links are OSErrors too
-            raise RunError(f"{self._where}: the cluster is gone; the same command goes on") from error
+            raise RunError(f"{self._where}: the cluster is gone; the same command continues") from error
 
     def _prepare(self) -> None:
-        """Wait for workers, which have this zsim, and let them find the user's modules."""
+        """Wait for workers, check that they have this zsim version, and give them the user's modules."""
         if not self._client.nthreads():
             self._say(f"waiting for workers at {self._at}; start `dask worker {self._at}` on every host")
             self._client.wait_for_workers(1)
@@ -142,7 +142,7 @@ class DaskPool:
 
 
 def _checked(client: Any) -> Any:
-    """Return a client that can be used here; RunError for another one, or for something else."""
+    """Return `client` if it is usable: a connected synchronous Client; otherwise raise RunError."""
     if not isinstance(client, Client) or client.asynchronous or client.status != "running":
         found = "that is closed" if isinstance(client, Client) and client.status != "running" else "asynchronous"
         shown = f"a Client {found}" if isinstance(client, Client) else show(str(type(client).__name__))

@@ -1,7 +1,7 @@
-"""The plan of a sweep, and its design: what varies, the values of each run, and their scenarios.
+"""The plan of a sweep, and its design: the axes that vary, the values of each run, and their scenarios.
 
-An axis is seeds, values of a field in turn, or values drawn for each run. The combinations of all fields with values in
-turn are the points of the grid.
+An axis is seeds, a list of values of a field, or values drawn for each run. The combinations of all listed values are
+the points of the grid.
 """
 
 import copy
@@ -34,7 +34,7 @@ METRICS = "report.metrics"  # names the user's functions that compute metrics of
 RUNS_MAX = 1_000_000
 SEED = "seed"
 SHOWN_MAX = 24  # characters of a value in a table or figure
-SEEDS = 2**32  # exclusive limit of drawn seeds: ten digits that a person can type
+SEEDS = 2**32  # exclusive limit of drawn seeds: at most ten digits
 SYNTAX = "seed, seed=paired, a.b.c=v1,v2,… or a.b.c=uniform(low,high) or a.b.c=normal(mean,std)"
 PAIRED = "paired"
 FieldPath = tuple[str | int, ...]  # steps to a field of a scenario from the top
@@ -50,21 +50,20 @@ class SweepPlan(Struct, frozen=True, kw_only=True):
     source: str  # name of the scenario's file, for messages
     document: dict[str, Any]  # the file with the overrides of the command line, presets not yet expanded
     vary: tuple[str, ...]  # texts of `--vary`, in their order
-    runs: int  # their number; a plan with more runs begins with the same ones
+    runs: int  # a plan with more runs begins with the same ones
     records: bool = False  # whether every run keeps its record
-    # texts `a.b.c=value` by which the command line differs from the file; None: not known
-    changed: tuple[str, ...] | None = None
-    version: str = __version__  # of zsim; another one need not give the same numbers
+    changed: tuple[str, ...] | None = None  # overrides `a.b.c=value` of the command line; None: not known
+    version: str = __version__  # of zsim; another version may give other numbers
 
 
 def difference(old: SweepPlan, new: SweepPlan) -> str | None:
     """Return how two plans differ, None if `new` continues `old`."""
     if old.version != new.version:
-        return f"it was begun by zsim {old.version}, this is {new.version}"
+        return f"it was started by zsim {old.version}, this is {new.version}"
     if old.document != new.document:
         keys = sorted(old.document.keys() | new.document.keys())
         other = next(key for key in keys if old.document.get(key) != new.document.get(key))
-        return f"{other} of its scenario is another one"
+        return f"its scenario has another {other}"
     fields = []  # of each plan: values by paths from the top of the scenario
     for plan in (old, new):
         parts = [text.partition("=") for text in plan.vary]
@@ -88,14 +87,14 @@ def is_sweep(folder: Path) -> bool:
 
 
 class Seeds(Struct, frozen=True):
-    """A distinct seed for every run or, paired, for every run of a combination: all combinations have the same ones."""
+    """A distinct seed for every run or, if paired, for every run of a combination, with the same seeds in each."""
 
     path: str = SEED
-    paired: bool = False  # drawn values are the same for all combinations, too
-    values: tuple[int, ...] = ()  # the seeds; none: they are drawn from the scenario's own
+    paired: bool = False  # drawn values are then the same for all combinations, too
+    values: tuple[int, ...] = ()  # the seeds; empty: drawn with the scenario's seed
 
     def draw(self, seed: int, count: int) -> list[int]:
-        """Return the first seeds, drawn from a scenario's seed; a larger count begins with the same ones."""
+        """Return the first seeds, drawn with a scenario's seed; a larger count begins with the same ones."""
         if self.values:
             return list(self.values[:count])
         rng = stream(seed, "sweep/seed")
@@ -113,14 +112,14 @@ class Grid(Struct, frozen=True):
 
     @property
     def names(self) -> list[str]:
-        """Abbreviated values; those cut to the same text as their differing part, or with their number."""
+        """Abbreviated values; values cut to the same text are shown by their differing part, or numbered."""
         texts = [f"{value:g}" if isinstance(value, float) else text_of(value) for value in self.values]
         made = {place: without_made(text) for place, text in enumerate(texts) if text.startswith(plugin.MADE)}
         names = [*map(_cut, distinct(texts, made))]
         for short in [name for name, often in Counter(names).items() if often > 1]:
             alike = [place for place, name in enumerate(names) if name == short]
             texts = parts = [text_of(self.values[place]) for place in alike]
-            if any(len(text) > SHOWN_MAX for text in texts):  # from the first word in which they differ on
+            if any(len(text) > SHOWN_MAX for text in texts):  # show them from the first differing word on
                 letters = enumerate(zip(*texts, strict=False))
                 whole = next((place for place, each in letters if len(set(each)) > 1), min(map(len, texts)))
                 start = max(texts[0].rfind(mark, 0, whole) for mark in " ,[{:") + 1
@@ -133,7 +132,7 @@ class Grid(Struct, frozen=True):
 
 
 class Draw(Struct, frozen=True):
-    """Values of a field drawn anew for every run: uniform from low to high, or normal of mean and std."""
+    """Values of a field drawn for every run: uniform in [low, high], or normal with mean and std."""
 
     path: str
     kind: str
@@ -141,7 +140,7 @@ class Draw(Struct, frozen=True):
     second: float
 
     def draw(self, seed: int, count: int) -> list[float]:
-        """Return the values of the first runs; each field has a stream of its own."""
+        """Return the values of the first runs; each field has its own random stream."""
         rng = stream(seed, f"sweep/{self.path}")
         draw = rng.uniform if self.kind == "uniform" else rng.normal
         return draw(self.first, self.second, count).tolist()
@@ -151,16 +150,16 @@ Axis = Seeds | Grid | Draw
 
 
 def parse(text: str, document: Mapping[str, Any] = NOTHING) -> Axis:
-    """Return the axis of a text of `--vary`, for a raw document.
+    """Parse a text of `--vary`, for a raw document.
 
     Raises:
-        ValueError: it is not of the form of SYNTAX, or its path is ambiguous.
+        ValueError: it does not match SYNTAX, or its path is ambiguous.
     """
     path, equals, values = text.partition("=")
     if text.strip() == SEED:
         return Seeds()
     if not equals or not path.strip():
-        raise ValueError(f"is no variation; must be {SYNTAX}")
+        raise ValueError(f"is not a variation; must be {SYNTAX}")
     path = whole_path(path.strip(), document)
     if path == SEED and values.strip() == PAIRED:
         return Seeds(paired=True)
@@ -197,24 +196,24 @@ def _grid_values(text: str) -> tuple[Any, ...]:
     for value in values:
         each = isinstance(value, bool), json.dumps(value) if isinstance(value, list | dict) else value
         if each in known:
-            raise ValueError(f"gives {show(known[each])} twice; every value once")
+            raise ValueError(f"gives {show(known[each])} twice; give every value once")
         known[each] = value
     return tuple(values)
 
 
 def text_of(value: Any) -> str:
-    """Return a value as `--set` takes it, in one line."""
+    """Format a value as `--set` takes it, on one line."""
     return value if isinstance(value, str) else json.dumps(value, default=str)
 
 
 def without_made(value: Any) -> str:
-    """Return a value as text; a class of a notebook or a script without the module that was made for it."""
+    """Format a value; a class of a notebook or a script without the module that was generated for it."""
     text = text_of(value)
     return text.partition(":")[2] if text.startswith(plugin.MADE) else text
 
 
 def distinct(texts: Sequence[str], made: Mapping[int, str]) -> list[str]:
-    """Return texts with other ones in some places, a later one of these that is there already numbered: `Law-2`.
+    """Return `texts` with those of `made` in their places, numbered if already in use: `Law-2`.
 
     All classes that a function makes have the same name.
     """
@@ -232,9 +231,9 @@ def _cut(text: str) -> str:
 
 
 def field_path(document: dict[str, Any], path: str) -> FieldPath:
-    """Return the steps to a field from the top; list entries count from 0, whether given by index or by name.
+    """Return the steps to a field from the top; entries of lists, given by index or name, become indices from 0.
 
-    Steps to fields that the raw document does not have are kept as text.
+    Steps to fields that are missing in the raw document are kept as text.
     """
     steps: list[str | int] = []
     value: Any = document
@@ -261,10 +260,10 @@ def is_inside(one: FieldPath, other: FieldPath) -> bool:
 
 
 class SweepDesign:
-    """The runs of a plan; runs and points, which are combinations of the grid's values, count from 0.
+    """The runs of a plan; runs and points (combinations of the grid's values) are numbered from 0.
 
-    Run i flies the i-th point, then the first again. `seeds` says how they vary, None: all are the scenario's own;
-    `paired`: the n-th runs of all points have the same seed.
+    Run i flies point i modulo the number of points. `seeds` is the axis of seeds, None: all runs have the scenario's
+    seed; `paired`: the n-th runs of all points have the same seed.
     """
 
     def __init__(self, plan: SweepPlan) -> None:
@@ -278,20 +277,20 @@ class SweepDesign:
 
     @property
     def seed(self) -> int:
-        """The scenario's own seed, from which seeds and values are drawn; an invalid one is never flown."""
+        """The scenario's seed, with which seeds and values are drawn; an invalid one is never flown."""
         seed = self.plan.document.get(SEED)
         return seed if isinstance(seed, int) and seed >= 0 else _DEFAULT_SEED
 
     @property
     def varied(self) -> list[str]:
-        """The paths that vary, without the seed's."""
+        """The varied paths, without the seed."""
         return [axis.path for axis in self.axes if axis.path != SEED]
 
     def point(self, run: int) -> int:
         return run % self.points
 
     def at(self, point: int) -> dict[str, Any]:
-        """Return the values of a point by path; those of the last axis change fastest."""
+        """Return the values of a point by path; the last axis changes fastest."""
         return {grid.path: grid.values[place] for grid, place in self._places(point)}
 
     def names(self, point: int) -> dict[str, str]:
@@ -316,10 +315,10 @@ class SweepDesign:
         return {axis.path: axis.draw(self.seed, count) for axis in drawn}
 
     def scenario(self, run: int) -> Scenario:
-        """Return the resolved scenario of a run, which is flown in lockstep.
+        """Return the resolved scenario of a run; sweeps fly in lockstep.
 
         Raises:
-            ScenarioError: with every fault, a line each.
+            ScenarioError: with one line for every fault.
         """
         document, faults = copy.deepcopy(self.plan.document), []
         for path, value in self.values(run).items():
@@ -379,15 +378,15 @@ def make_plan(
     earlier_faults: Sequence[str] = (),
     changed: Sequence[str] | None = None,
 ) -> SweepPlan:
-    """Return the plan of a sweep, all its combinations checked; arguments as of the plan, and:
+    """Return the plan of a sweep after checking all its combinations; arguments as of SweepPlan, and:
 
     Args:
-        runs: their number, None: as many as the grid has combinations, for each given seed.
-        progress: called with the number of the combination that is checked, and their number.
+        runs: None: one for each combination of the grid and each given seed.
+        progress: called with the index of the combination that is checked, and their number.
         earlier_faults: of the overrides, reported with the others.
 
     Raises:
-        ScenarioError: with every fault of the variations and of the resulting scenarios, a line each.
+        ScenarioError: with one line for every fault of the variations and of the resulting scenarios.
     """
     fields: dict[FieldPath, str] = {}  # the valid texts of `--vary`
     vary_faults = []
@@ -423,18 +422,17 @@ def _shown(text: str) -> str:
 
 
 def _refuse_overlap(path: str, steps: FieldPath, fields: dict[FieldPath, str]) -> None:
-    """Raise ValueError for a path of which a part, or the whole, varies already."""
+    """Raise ValueError for a path that overlaps a varied one."""
     for other, text in fields.items():
         if steps == other:
-            raise ValueError(f"{path} varies already by {_shown(text)}; give it once")
-        if is_inside(steps, other):
-            raise ValueError(f"{path} is part of what varies already by {_shown(text)}; vary one of the two")
-        if is_inside(other, steps):
-            raise ValueError(f"{path} holds what varies already by {_shown(text)}; vary one of the two")
+            raise ValueError(f"{path} is already varied by {_shown(text)}; give it once")
+        if is_inside(steps, other) or is_inside(other, steps):
+            relation = "is part of" if is_inside(steps, other) else "contains"
+            raise ValueError(f"{path} {relation} a field that is already varied by {_shown(text)}; vary one of the two")
 
 
 def _count_faults(design: SweepDesign, all_known: bool) -> list[str]:
-    """Return the faults of the number of runs; `all_known`: no axis was refused, which might have been a drawn one."""
+    """Return the faults of the number of runs; `all_known`: no axis was refused (it might have been a drawn one)."""
     runs, points = design.plan.runs, design.points
     if runs > RUNS_MAX:
         return [f"--runs is {runs}; must be at most {RUNS_MAX}"]
@@ -442,9 +440,9 @@ def _count_faults(design: SweepDesign, all_known: bool) -> list[str]:
         return [f"--runs is {runs}; must be at least {points}, the combinations of the grid"]
     seeds = len(design.seeds.values) if design.seeds else 0
     if seeds and runs > points * seeds:
-        return [f"--runs is {runs}; must be at most {points * seeds}, each seed that is given for every combination"]
+        return [f"--runs is {runs}; must be at most {points * seeds}: every given seed for every combination"]
     if all_known and runs > points and all(isinstance(axis, Grid) for axis in design.axes):
-        return [f"--runs is {runs}; must be {points}, for further ones would have the same bits, or add --vary seed"]
+        return [f"--runs is {runs}; must be {points}, because more would repeat the same flights, or add --vary seed"]
     return []
 
 
@@ -454,7 +452,7 @@ def read_document(path: Path, set_texts: list[str], **values: Any) -> tuple[dict
     `set_texts` are texts `a.b.c=value` of `--set`; `values` replace top-level fields of the file, unless None.
 
     Raises:
-        ScenarioError: the file holds no map.
+        ScenarioError: the file does not contain a map.
     """
     plugin.search(path.parent)
     document = yaml_file.read(path, EXAMPLE, ScenarioError)

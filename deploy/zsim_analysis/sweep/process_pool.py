@@ -1,4 +1,4 @@
-"""The worker processes of a sweep on this host: one that dies is replaced, and its run is flown again.
+"""The worker processes of a sweep on this host: one that dies is replaced, and its run is repeated.
 
 A worker flies many runs, so that imports and kernels are loaded once. `ProcessPoolExecutor` would break as a whole when
 a worker dies, without showing which run was fatal.
@@ -43,7 +43,7 @@ def work(link: Connection) -> None:
             wait([launcher.sentinel])
             os._exit(1)
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launcher, which receives it as well, handles it
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launcher receives and handles it
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     threading.Thread(target=exit_with_launcher, name="launcher-monitor", daemon=True).start()
     warnings.simplefilter("ignore", RuntimeWarning)  # a state that overflows is reported in the run's row
@@ -68,10 +68,10 @@ def cores() -> int:
 
 @contextlib.contextmanager
 def _bare_start() -> Iterator[None]:
-    """Start processes that neither import from the working folder first, nor the program that starts them.
+    """Start processes that import neither from the working folder nor the main module of this program.
 
-    `spawn` imports the main module again, which a script without `if __name__ == "__main__"` does not stand. A worker
-    needs nothing of it: what a script defines has a module of its own.
+    `spawn` imports the main module again, which would rerun a script without `if __name__ == "__main__"`. Workers do
+    not need it: classes that a script defines are put into a module of their own.
     """
     main, former = sys.modules["__main__"], os.environ.get(SAFE_PATH)
     sys.modules["__main__"] = ModuleType("__main__")
@@ -97,7 +97,7 @@ class WorkerProcess:
         self.task: Task | None = None
 
     def send(self, task: Task) -> None:
-        """Send a task; the death of a worker is noticed by `receive`."""
+        """Send a task; a dead worker is noticed by `receive`."""
         self.task = task
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.link.send(task)
@@ -135,9 +135,9 @@ class ProcessPool:
         self._deaths_at_start = 0
 
     def rows(self, tasks: Iterator[Task | None]) -> Generator[Row]:
-        """Yield the rows of tasks as they are finished; when exhausted or closed, all workers have ended.
+        """Yield the rows of tasks as they finish; when exhausted or closed, all workers have ended.
 
-        A task that depends on rows which are not finished yet is None: it is asked for again after the next row.
+        `tasks` yields None while its next task depends on unfinished rows; it is asked again after the next row.
 
         Raises:
             RunError: workers cannot start, or rows cannot be recorded.
@@ -161,7 +161,7 @@ class ProcessPool:
         self._workers[worker.link] = worker
 
     def _hand_out(self, tasks: Iterator[Task | None]) -> None:
-        """Give each idle worker a task; one for which there is none any more ends."""
+        """Give each idle worker a task, or end it if there are no more."""
         for worker in [each for each in self._workers.values() if each.ready and each.task is None]:
             task = self._again.popleft() if self._again else next(tasks, _END)
             if isinstance(task, str):
@@ -198,9 +198,9 @@ class ProcessPool:
         run = worker.task.run
         self._deaths[run] += 1
         if self._deaths[run] < DEATHS_MAX:
-            self._say(f"the worker of run {run} died ({worker.cause()}); another one flies it again")
+            self._say(f"the worker of run {run} died ({worker.cause()}); another worker repeats it")
             self._again.append(worker.task)
         else:
             from zsim_analysis.sweep.sweep_run import failed_row
 
-            yield failed_row(worker.task, f"{DEATHS_MAX} workers died of it, the last one {worker.cause()}")
+            yield failed_row(worker.task, f"{DEATHS_MAX} workers died in it, the last one {worker.cause()}")

@@ -1,10 +1,10 @@
-"""Flies a whole sweep into its folder: plan in; finished runs, and their table, out; a live line on the terminal.
+"""Flies a sweep into its folder: plan in; finished runs and their table out; a live line on the terminal.
 
 The folder of a sweep:
 
-    plan.json        what is flown
-    journal.jsonl    finished runs that are not in the table yet, a line of JSON each
-    sweep.parquet    finished runs, a row each
+    plan.json        the plan
+    journal.jsonl    finished runs that are not in the table yet, one JSON line each
+    sweep.parquet    finished runs, one row each
     runs/000012/     record of run 12, if records are kept
 """
 
@@ -45,24 +45,24 @@ _TYPES: dict[Any, pa.DataType] = {int: pa.int64(), float: pa.float64(), bool: pa
 
 
 class SweepRequest(Struct, frozen=True):
-    """What to fly, where to, and by which processes."""
+    """A sweep to fly: its plan, its folder and its workers."""
 
-    plan: SweepPlan  # what is flown
+    plan: SweepPlan
     out: Path  # folder of the sweep
     workers: int | None = None  # processes on this host, None: one per core
     dask: Any = None  # a Dask client, or the address of a scheduler, whose workers are used instead
     force: bool = False  # whether the folder may hold other files
     console: Console | None = None  # where progress is shown, None: stderr
-    open_run: Callable[[Path], Any] | None = None  # as of a task
-    modules: tuple[Path, ...] = ()  # made for what a notebook or a script defines; copied into the folder
+    open_run: Callable[[Path], Any] | None = None  # see Task
+    modules: tuple[Path, ...] = ()  # with definitions of a notebook or a script; copied into the folder
 
 
 def sweep(request: SweepRequest) -> list[Row]:
-    """Fly the runs that the folder does not hold yet; return all that it then holds, also after Ctrl-C.
+    """Fly the runs that are missing in the folder; return the rows of all finished runs.
 
     Raises:
         RunError: the folder holds something else, or cannot be written; workers cannot start.
-        KeyboardInterrupt: the finished runs are in the table.
+        KeyboardInterrupt: on Ctrl-C, with the finished runs in the table.
     """
     plan = request.plan
     with locked(request.out, plan, request.force) as folder:
@@ -76,7 +76,7 @@ def sweep(request: SweepRequest) -> list[Row]:
             over = f" over {points} combinations" if points > 1 else ""
             screen.say(f"{plan.source}: {plan.runs} runs{over}, into {folder.path}")
             if done:
-                screen.say(f"{len(done)} of them {'is' if len(done) == 1 else 'are'} done already")
+                screen.say(f"{len(done)} of them {'is' if len(done) == 1 else 'are'} already done")
             try:
                 if missing:
                     _fly(folder, request, missing, screen)
@@ -110,7 +110,7 @@ def _fly(folder: "SweepFolder", request: SweepRequest, missing: list[int], scree
 
 
 def _tasks(folder: "SweepFolder", runs: list[int], open_run: Callable[[Path], Any] | None) -> Iterator[Task]:
-    """Yield the tasks of some runs, each made on demand."""
+    """Yield the tasks of some runs lazily."""
     design = folder.design
     for run in runs:
         values = design.values(run)
@@ -125,7 +125,7 @@ def _tasks(folder: "SweepFolder", runs: list[int], open_run: Callable[[Path], An
 
 
 class SweepScreen:
-    """Shows the progress of a sweep while it is entered: a live line on a terminal and in a notebook, else lines."""
+    """A context that shows the progress of a sweep: a live line on a terminal or in a notebook, else plain lines."""
 
     def __init__(
         self, total: int, done: int, console: Console | None = None, now_s: Callable[[], float] = time.monotonic
@@ -172,14 +172,14 @@ class SweepScreen:
             self.say(self.line())
 
     def unmeasured(self, run: int, reason: str) -> None:
-        """Show a line about a run without metrics of the user, for the first such runs."""
+        """Report a run whose user metrics failed; only the first UNMEASURED_MAX are reported."""
         self._unmeasured += 1
         if self._unmeasured <= UNMEASURED_MAX:
             more = "; further ones are in the table" if self._unmeasured == UNMEASURED_MAX else ""
             self.say(f"run {run}: {reason}{more}")
 
     def line(self) -> str:
-        """Return runs done, runs per hour since the start, and the remaining time at that rate."""
+        """Return the finished runs, the runs per hour since the start, and the remaining time at that rate."""
         filled = int(BAR * self._done / self._total)
         text = f"{'█' * filled}{'░' * (BAR - filled)} {self._done} / {self._total} runs"
         flown, elapsed_s = self._done - self._before, self._now_s() - self._start_s
@@ -188,12 +188,12 @@ class SweepScreen:
             if self._done < self._total:
                 text += f"  {span((self._total - self._done) * elapsed_s / flown)} to go"
         elif self._done < self._total:
-            text += f"  the first ones are flying, {span(elapsed_s)}"
+            text += f"  the first runs are flying, {span(elapsed_s)}"
         return text + (f"  {self._failed} failed" if self._failed else "")
 
 
 def span(seconds: float) -> str:
-    """Return a time as text, to the second below an hour."""
+    """Format a duration, to the second below an hour."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:
@@ -221,7 +221,7 @@ class SweepFolder:
         return [rows[run] for run in sorted(rows)]
 
     def compact(self) -> list[Row]:
-        """Put all finished runs into the table, and return it; a crash in between loses nothing.
+        """Move the journal's rows into the table, and return all rows; a crash in between loses nothing.
 
         Raises:
             ReportError: the table cannot be written.
@@ -237,30 +237,30 @@ def load(path: Path) -> SweepFolder:
     try:
         return SweepFolder(path, msgspec.json.decode((path / PLAN).read_bytes(), type=SweepPlan))
     except (OSError, msgspec.MsgspecError, ValueError) as error:
-        raise RunError(f"{path / PLAN}: cannot be read ({error}); it should be the plan of a sweep") from error
+        raise RunError(f"{path / PLAN}: cannot be read ({error}); must be the plan of a sweep") from error
 
 
 @contextmanager
 def locked(path: Path, plan: SweepPlan, force: bool = False) -> Iterator[SweepFolder]:
-    """Yield the folder of a sweep, new or continued, locked against other sweeps.
+    """Yield the folder of a new or continued sweep, locked against other sweeps.
 
     With `force` it may hold other files; a run, or another sweep, is always refused.
 
     Raises:
-        RunError: another sweep is at work there, or it holds something else.
+        RunError: another sweep is running there, or it holds something else.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
         if not is_sweep(path):
             if (path / "run.mcap").exists() or (path / TABLE).exists():
-                raise RunError(f"{path}: holds something else already; give --out another folder")
+                raise RunError(f"{path}: holds another run or sweep; give --out another folder")
             refuse_others(path, (LOCK, NEW_PLAN), force, "sweep into")
         lock = (path / LOCK).open("w")
     except OSError as error:
         raise RunError(f"{path}: cannot be made ({error.strerror}); give --out another folder") from error
     with lock:
         if not take_lock(lock):
-            raise RunError(f"{path}: another sweep is at work there; give --out another folder")
+            raise RunError(f"{path}: another sweep is running there; give --out another folder")
         if warning := no_locks(path):
             print(printable(warning), file=sys.stderr)
         _write_plan(path, plan)
@@ -273,7 +273,7 @@ def _write_plan(path: Path, plan: SweepPlan) -> None:
         content = msgspec.json.format(msgspec.json.encode(plan), indent=2) + b"\n"
     except UnicodeEncodeError as error:
         character = error.object[error.start : error.end][:1]
-        reason = f"cannot be written ({character!a} is no character); give text in UTF-8"
+        reason = f"cannot be written ({character!a} is not a character); give text in UTF-8"
         raise RunError(f"{path / PLAN}: {reason}") from error
     if is_sweep(path):
         present = load(path)
@@ -289,7 +289,7 @@ def _write_plan(path: Path, plan: SweepPlan) -> None:
 
 
 class Journal:
-    """Appends rows, each on the disk before its run counts as finished; a line that a crash has cut is dropped.
+    """Appends rows, each synced to the disk before its run counts as finished; a line cut by a crash is dropped.
 
     Raises:
         RunError: it cannot be written.
@@ -312,7 +312,7 @@ class Journal:
         os.close(self._file)
 
     def append(self, row: Row) -> None:
-        """Add a row; when this returns, the row survives the process and a loss of power.
+        """Append a row; once this returns, it survives a crash and a power failure.
 
         Raises:
             RunError: it cannot be written.
@@ -326,17 +326,17 @@ class Journal:
             raise self._error(error) from error
 
     def _error(self, error: OSError) -> RunError:
-        return RunError(f"{self._path}: cannot be written ({error.strerror}); what is finished so far is kept")
+        return RunError(f"{self._path}: cannot be written ({error.strerror}); the runs finished so far are kept")
 
 
 def read_journal(path: Path) -> list[Row]:
-    """Return the whole lines of a journal, none if there is no such file."""
+    """Return the rows of a journal without an incomplete last line; none if there is no such file."""
     content = path.read_bytes() if path.exists() else b""
     return msgspec.json.Decoder().decode_lines(content[: content.rfind(b"\n") + 1])
 
 
 def write_table(path: Path, rows: Iterable[Row], plan: SweepPlan, axes: Sequence[Axis]) -> None:
-    """Write the rows in the order of the runs, all or nothing. Raises ReportError: it cannot be written."""
+    """Write the rows atomically, in the order of the runs. Raises ReportError: the file cannot be written."""
     ordered = sorted(rows, key=lambda row: row["run"])
     schema = _schema(ordered, axes).with_metadata({PLAN_METADATA: msgspec.json.encode(plan)})
     json_columns = [field.name for field in schema if field.metadata]
@@ -356,16 +356,16 @@ def read_table(path: Path) -> list[Row]:
     """Return the rows of a table, none if there is no such file; empty cells are None.
 
     Raises:
-        ReportError: it is no such table.
+        ReportError: the file is not a table of a sweep.
     """
     if not path.exists():
         return []
     try:
-        with path.open("rb") as file:  # Arrow takes a path with a colon for an address
+        with path.open("rb") as file:  # Arrow would parse a path with a colon as a URL
             table = pq.read_table(file)
     except (OSError, pa.ArrowException) as error:
         reason = " ".join(str(error).split())[:200]
-        raise ReportError(f"{path}: cannot be read ({reason}); remove it to go on") from error
+        raise ReportError(f"{path}: cannot be read ({reason}); remove it to continue") from error
     json_columns = [field.name for field in table.schema if field.metadata]
     rows = table.to_pylist()
     for row in rows:
@@ -379,7 +379,7 @@ def _schema(rows: Sequence[Row], axes: Sequence[Axis]) -> pa.Schema:
         (name, next(_TYPES[each] for each in (*getattr(kind, "__args__", ()), kind) if each in _TYPES))
         for name, kind in FIXED.items()
     ]
-    varied: list[tuple[str, pa.DataType | None]] = []  # None: of values that are not all of one kind
+    varied: list[tuple[str, pa.DataType | None]] = []  # None: values of different types, stored as JSON
     for axis in axes:
         kinds = {type(value) for value in axis.values} if isinstance(axis, Grid) else {float}
         if kinds == {int, float}:
@@ -389,5 +389,5 @@ def _schema(rows: Sequence[Row], axes: Sequence[Axis]) -> pa.Schema:
     known = {*FIXED, *(path for path, _ in varied)}
     errors = {name: (name, pa.float64()) for row in rows for name in row if name not in known}
     fields = [*fixed[:3], *varied, *fixed[3:], *errors.values()]
-    mixed = {b"encoding": b"json"}  # of values of different types
+    mixed = {b"encoding": b"json"}
     return pa.schema([pa.field(name, kind or pa.string(), metadata=None if kind else mixed) for name, kind in fields])

@@ -32,10 +32,10 @@ from zsim_analysis.sweep.sweep_summary import (
     share_interval,
 )
 
-PANELS_MAX = 24  # quantities in one figure; 6 drones
+PANELS_MAX = 24  # quantities in one figure, enough for 6 drones
 COLUMNS = 3  # of panels
 NARROW_MAX = 8  # points side by side in a panel of a third of the page
-SLICES = 6  # of a drawn value's range, each with a mean of its own
+SLICES = 6  # of a drawn value's range, each with its own mean
 LEGEND_COLUMNS = 4
 ONE_RUN, BEYOND_AXIS, TABLE_I = "one run", "the interval goes beyond the axis", "the paper's Table I"
 NEVER_AS_PLANNED = "no run as planned"
@@ -49,7 +49,7 @@ FORMULA = re.compile(r"\$[^$]*\$")
 
 
 class Panel(Struct, frozen=True):
-    """A quantity in a panel of its own: its column, its full name with its unit, and the paper's value of it."""
+    """A quantity with a panel: its column, its label with its unit, and the paper's value."""
 
     column: str
     label: str
@@ -57,7 +57,7 @@ class Panel(Struct, frozen=True):
 
 
 def figures(results: SweepResults) -> Iterator[style.ReportFigure]:
-    """Yield the figures for which the runs have data, with a panel for each quantity."""
+    """Yield the figures for which there are data, with a panel for each quantity."""
     own = [Panel(column, str(field_name(column))) for column in results.metrics[:PANELS_MAX]]
     rms, std = list[Panel](), list[Panel]()
     for prefix, each in list(results.parameters.items())[:PANELS_MAX]:
@@ -73,7 +73,7 @@ def figures(results: SweepResults) -> Iterator[style.ReportFigure]:
     window = f" ({span_text(windows_s)})" if windows_s else ""
     more = ""
     if results.design.points > POINTS_MAX and not GridAxis(results.design).field:
-        more = f" The first {POINTS_MAX} points are shown, the tables have all."
+        more = f" The first {POINTS_MAX} points are shown; the tables have all."
     beside = ", beside the paper" if results.paper_std else ""
     for name, title, what, panels in (
         ("metrics", "Figures of the user's own", f"What {results.metrics_function} returned of each run.", own),
@@ -89,16 +89,16 @@ def figures(results: SweepResults) -> Iterator[style.ReportFigure]:
             yield style.ReportFigure(f"{name}.png", title, f"{what}{more}", _draw_panels(results, panels))
     yield style.ReportFigure(
         "safety.png",
-        "How the runs ended, and how near the drones came to each other",
+        "How the runs ended, and how close the drones came to each other",
         "(a) Share of runs that ended well, and of those flown as planned and without a collision, "
-        f"with exact intervals. (b) Least true distance of two drones in the air.{more}",
+        f"with exact intervals. (b) Least true distance between two drones in the air.{more}",
         _draw_safety(results),
     )
     for i, path in enumerate(results.drawn if own or rms else ()):
         yield style.ReportFigure(
             f"drawn_{i + 1}.png",
             f"Against {field_name(path)}",
-            f"Each quantity over the value that was drawn; means of {SLICES} slices with as many runs each.",
+            f"Each quantity over the drawn value; means of {SLICES} slices with equally many runs.",
             _draw_slices(results, path, [*own, *rms]),
         )
 
@@ -125,7 +125,7 @@ def _panel_grid(count: int, across: int, row_in: float) -> tuple[Figure, Any]:
 
 
 def _draw_safety(results: SweepResults) -> Figure:
-    """Return the shares of runs that ended well, and the least separations if there are any."""
+    """Draw the shares of runs that ended well, and the least separations if there are any."""
     axis = GridAxis(results.design) if results.design.points > 1 else None
     has_separations = len(finite(results.flown(SEPARATION))) > 0
     figure = style.new_figure(style.PAGE_IN if has_separations else style.COLUMN_IN, 3.0)
@@ -143,7 +143,7 @@ def _draw_safety(results: SweepResults) -> Figure:
                 x = place.x + 0.5 * side * (place.room[1] - place.room[0])
                 look: dict[str, Any] = {"color": tint, "mfc": "white" if side >= 0 else tint}
                 axes.errorbar([x], [share.value], yerr=ends, fmt=mark, ms=5, lw=1.4, capsize=4, **look)
-        shown = style.GREY if axis and len(axis.series) > 1 else own  # the colours are those of the series
+        shown = style.GREY if axis and len(axis.series) > 1 else own  # colours then mark the series
         axes.plot([], [], mark, color=shown, mfc="white" if side >= 0 else shown, ms=5, label=name)
     axes.set_ylim(-0.03, 1.03)
     if axis:
@@ -168,7 +168,7 @@ def _name(
     paper: bool = False,
     means: bool = True,
 ) -> None:
-    """Put the legend of dots, means, boxes, marks and colours above a figure."""
+    """Add the legend of dots, means, boxes, marks and colours above a figure."""
     mean = style.VERMILION if not axis or len(axis.series) == 1 else style.GREY
     if axis and means and most_runs(results) == 1:
         axes.plot([], [], "o", color=mean, ms=4, label=ONE_RUN)
@@ -197,12 +197,12 @@ def _name(
 
 
 def most_runs(results: SweepResults) -> int:
-    """Return how many runs of one point have ended well, at most."""
+    """Return the largest number of runs of one point that ended well."""
     return max((results.ended_well(point)[0] for point in range(results.design.points)), default=0)
 
 
 def mean_label(results: SweepResults) -> str:
-    """Return the legend of a mean, with the number of its runs, called seeds if only these differ."""
+    """Return the legend of a mean, with its number of runs, called seeds if only those differ."""
     counts = {results.ended_well(point)[0] for point in range(results.design.points)} - {0}
     many = " to ".join(f"{count}" for count in sorted({min(counts), max(counts)})) if counts else "no"
     what = "runs" if results.drawn or not results.has_seeds else "seeds"
@@ -211,7 +211,7 @@ def mean_label(results: SweepResults) -> str:
 
 
 def _draw_slices(results: SweepResults, path: str, panels: Sequence[Panel]) -> Figure:
-    """Return quantities over a drawn value, with the means of slices of it."""
+    """Draw quantities over a drawn value, with the means of slices of it."""
     figure, grid = _panel_grid(len(panels), COLUMNS, 1.8)
     x, beyond = results.values(path), False
     for axes, panel in zip(grid, panels, strict=True):
@@ -236,7 +236,7 @@ def _draw_slices(results: SweepResults, path: str, panels: Sequence[Panel]) -> F
 
 
 def slices(x: Samples, y: Samples) -> Sequence[tuple[float, Samples]]:
-    """Return the mean x and the y of SLICES groups of runs by rising x, of nearly equal sizes."""
+    """Sort runs by x into SLICES groups of nearly equal size; return mean x and all y of each."""
     both = np.isfinite(x) & np.isfinite(y)
     order = np.argsort(x[both], kind="stable")
     groups = [part for part in np.array_split(order, SLICES) if len(part) >= 2]
@@ -244,7 +244,7 @@ def slices(x: Samples, y: Samples) -> Sequence[tuple[float, Samples]]:
 
 
 def wrapped(text: str, letters: int) -> str:
-    """Return a label in lines of at most so many letters, broken between words; a formula counts as two letters."""
+    """Wrap a label between words to lines of at most `letters`; a formula counts as two letters."""
     lines: list[str] = []
     for each in text.split("\n"):
         line = ""
@@ -267,7 +267,7 @@ GOLDEN = 0.6180339887  # multiples of the golden ratio, modulo 1, spread dots ev
 
 
 def draw_distribution(axes: Axes, results: SweepResults, panel: Panel, axis: "GridAxis | None") -> bool:
-    """Draw one quantity: a histogram of one point, otherwise the points; return whether an interval leaves the axis."""
+    """Draw one quantity: a histogram without an axis, else all points; return whether an interval leaves the axis."""
     if axis is None:
         style.dress(axes)
         axes.set_xlabel(wrapped(panel.label, LEVEL_LETTERS), fontsize=style.PAPER_PT)
@@ -281,7 +281,7 @@ def draw_distribution(axes: Axes, results: SweepResults, panel: Panel, axis: "Gr
         if len(samples := finite(results.flown(panel.column, point))):
             mean = _draw_point(axes, samples, place, axis)
             drawn.append((place, mean))
-            if count := count_text(len(samples), results.ended_well(point)[0]):  # fewer than the legend says
+            if count := count_text(len(samples), results.ended_well(point)[0]):
                 look: dict[str, Any] = {"fontsize": style.PAPER_PT - 1, "color": mean.colour, "zorder": 6}
                 offset: dict[str, Any] = {"xytext": (0, 7), "textcoords": "offset points", "ha": "center"}
                 axes.annotate(count, (mean.x, mean.mean.value), **look, **offset)
@@ -319,7 +319,7 @@ def _draw_histogram(axes: Axes, samples: Samples, printed: float | None) -> bool
 
 
 def _with_printed(low: float, high: float, value: float) -> tuple[float, float]:
-    """Return the range of an axis, extended so that it holds the paper's value."""
+    """Return the limits of an axis, extended to the paper's value."""
     room = 0.05 * (high - low)
     return min(low, value - room), max(high, value + room)
 
@@ -337,7 +337,7 @@ def _draw_point(axes: Axes, samples: Samples, place: "Place", axis: "GridAxis") 
     shares = ((np.arange(len(dots)) + 0.5) * GOLDEN + 0.5 * (1 - GOLDEN)) % 1
     low, high = place.room
     size = 7 if len(dots) < 30 else 4
-    if len(samples) > 1:  # else it is the mean, at the middle
+    if len(samples) > 1:  # a single run is drawn as the mean
         spread = low + shares * (high - low)
         axes.plot(spread, dots, ".", color=colour, ms=size, alpha=0.45, mew=0, zorder=3, clip_on=False)
     mean_x = place.x if axis.field or len(samples) == 1 else place.x + 0.36  # beside the box
@@ -348,12 +348,12 @@ def _draw_point(axes: Axes, samples: Samples, place: "Place", axis: "GridAxis") 
 
 # Means and their intervals
 
-MEAN_ROOM = 0.08  # share of the range of samples at each end of an axis; an interval of two runs may be far wider
+MEAN_ROOM = 0.08  # margin at each end of an axis, as a share of the samples' range; intervals may exceed it
 BEYOND = {"y": ("v", "^"), "x": ("<", ">")}  # marks at the low and the high end of an axis
 
 
 class DrawnMean(Struct, frozen=True):
-    """A mean with its interval in a figure, at x."""
+    """A mean with its interval, drawn at x."""
 
     x: float
     mean: ConfidenceInterval
@@ -366,7 +366,7 @@ class DrawnMean(Struct, frozen=True):
 
 
 def mark_beyond(axes: Axes, means: Sequence[DrawnMean], along: Literal["x", "y"] = "y") -> bool:
-    """Mark at the ends of an axis which intervals along it extend beyond it; return whether any does."""
+    """Mark intervals that extend beyond the ends of an axis; return whether any does."""
     low, high = axes.get_xlim() if along == "x" else axes.get_ylim()
     found = False
     for each in means:
@@ -381,15 +381,15 @@ def mark_beyond(axes: Axes, means: Sequence[DrawnMean], along: Literal["x", "y"]
 
 # The x axis of a grid
 
-POINTS_MAX = 24  # beside each other in one panel; the tables have all
+POINTS_MAX = 24  # side by side in one panel; the tables have all
 # colours of the combinations of the other fields
 SERIES = (style.BLUE, style.GREEN, style.PURPLE, style.ORANGE, style.SKY, style.BLACK)
-DECADES_MIN = 30.0  # ratio of the greatest and the least value from which an axis is logarithmic
+DECADES_MIN = 30.0  # ratio of the largest to the smallest value from which an axis may be logarithmic
 TURNED_FROM = 34  # characters of all labels, with a space each, that fit side by side in a panel
-ABOVE = 1.1  # of the height of axes: clear of runs, and of the marks of intervals that leave the axes
+ABOVE = 1.1  # of the height of axes: above the runs and the marks of intervals that leave the axes
 MARK = style.VERMILION
-GROUP_MAX = 0.3  # of the range of values, that the combinations at one value take: six marks stand beside each other
-TICKS_MAX = 8  # labelled values of an axis; of more, some
+GROUP_MAX = 0.3  # share of the range that the combinations at one value take: room for six marks
+TICKS_MAX = 8  # labelled values of an axis; of more values only some are labelled
 
 
 class Place(Struct, frozen=True):
@@ -401,11 +401,11 @@ class Place(Struct, frozen=True):
 
 
 class GridAxis:
-    """The x axis of a sweep over several points: numbers at their value, everything else side by side.
+    """The x axis of a sweep over several points: numbers at their value, anything else side by side.
 
     Attributes:
-        field: whose numbers the axis has; None if the points stand side by side.
-        series: texts of the combinations of the other fields, one "" if there are none.
+        field: the field on the axis; None if the points stand side by side.
+        series: texts of the combinations of the other fields; [""] if there are none.
         places: by point.
     """
 
@@ -430,7 +430,7 @@ class GridAxis:
         self.field = field
         self._numbers = [float(design.at(point)[field]) for point in range(design.points)]
         values = sorted(set(self._numbers))
-        if values[0] > 0 and values[-1] >= DECADES_MIN * values[0]:  # over decades, and most of them small?
+        if values[0] > 0 and values[-1] >= DECADES_MIN * values[0]:  # over decades, with most values small
             steps = np.diff(values)
             self._is_logarithmic = bool(steps.max() > 2 * steps.min())
         combinations = [

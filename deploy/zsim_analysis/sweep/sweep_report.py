@@ -1,7 +1,7 @@
 """Makes the report of a sweep: table in; summary.json, figures/*.png and report.html out; and tables for the terminal.
 
-A table has a row for each point of the grid: on the page with intervals, in tables that fit it; on a terminal briefly,
-in as few tables as its width allows, every name whole.
+A table has a row for each point of the grid. On the page it has intervals, and is split to fit the page; on a terminal
+it is brief, and split into as few tables as its width allows without cutting names.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -43,17 +43,17 @@ POINTS_MAX = 200  # in a table of the page; sweep.parquet has all
 DETAILED_MAX = 24  # points with a table of their own
 OVERVIEW = ("runs", "ended well", "as planned", "engaged", "no collision", "separation (m)", "least (m)")
 OWN = "figures of your own"
-BLOCK_COLUMNS = 6  # of a table that fits the page, including those of the grid's fields
+BLOCK_COLUMNS = 6  # that fit the page, including those of the grid's fields
 QUANTILES = "true RMS, 5 to 95 %"
 
 
 def make_sweep_report(
     directory: Path, progress: Callable[[str], None] = lambda _: None, formats: Sequence[str] = ()
 ) -> SweepSummary:
-    """Read the finished runs of a sweep, which may still be running; write its report as `write_report`.
+    """Write the report of a sweep, which may still be running, as `write_report` does.
 
     Raises:
-        RunError: it holds no sweep.
+        RunError: the directory is not that of a sweep.
         ReportError: no run is finished yet, or the directory cannot be written.
     """
     sweep = load(directory)
@@ -67,7 +67,7 @@ def make_sweep_report(
 
 
 class PointTable(NamedTuple):
-    """Heads, and a row of cells for each point, without the fields of the grid."""
+    """Column heads and a row of cells for each point, without the grid's fields."""
 
     heads: list[str]
     rows: list[list[str]]
@@ -78,7 +78,7 @@ class PointTable(NamedTuple):
 def _table(
     points: Sequence[GridPoint], titles: Mapping[str, str], text: Callable[[GridPoint, str], str], *about: str
 ) -> PointTable:
-    """Return the table of some columns, given their titles and the text of a column at a point."""
+    """Return the table of the columns in `titles`; `text` formats a column at a point."""
     return PointTable(list(titles.values()), [[text(p, column) for column in titles] for p in points], *about)
 
 
@@ -113,7 +113,7 @@ def page(summary: SweepSummary, pictures: Sequence[Picture]) -> str:
 
 
 def axes_of(summary: SweepSummary) -> list[FieldName]:
-    """Return the names of the fields of the grid; without any, that of a column which holds all runs."""
+    """Return the names of the grid's fields; without any, one for the only point."""
     return [field_name(path) for path in summary.points[0].values] or [FieldName("point")]
 
 
@@ -122,7 +122,7 @@ def values_of(point: GridPoint) -> list[str]:
 
 
 def heading_of(point: GridPoint) -> str:
-    """Return the fields of a point with their values, in words."""
+    """Return the fields of a point with their values as words."""
     return ", ".join(field_name(path).at(value) for path, value in point.names.items()) or point.label
 
 
@@ -138,7 +138,7 @@ def differing(summary: SweepSummary) -> dict[str, str]:
 def _blocks(
     points: Sequence[GridPoint], axes: Sequence[FieldName], table: PointTable
 ) -> list[tuple[list[str], list[list[str]]]]:
-    """Return heads and rows of tables that fit the page, each with the fields of the grid."""
+    """Split a table into blocks of columns that fit the page; return heads and rows, each with the grid's fields."""
     across = max(2, BLOCK_COLUMNS - len(axes))
     blocks = []
     for part in np.array_split(np.arange(len(table.heads)), max(1, -(-len(table.heads) // across))):
@@ -149,7 +149,7 @@ def _blocks(
 
 
 def facts(summary: SweepSummary) -> list[tuple[str, str]]:
-    """Return the lines at the head of the page: pairs of a label and its value."""
+    """Return the lines at the top of the page: label and value."""
     well = summary.finished - sum(summary.failed.values())
     hosts = ", ".join(f"{host} ({count})" for host, count in summary.hosts.items())
     return [
@@ -194,12 +194,12 @@ def notes(summary: SweepSummary) -> list[str]:
         )
     lines += [f"{count} of {summary.finished} runs have no {OWN}: {why}" for why, count in summary.unmeasured.items()]
     if len(summary.fingerprints) > 1:
-        lines.append("The hosts have different code (fingerprints); the same bits are not promised.")
+        lines.append("The hosts have different code (fingerprints); the same bits are not guaranteed.")
     return lines
 
 
 def without_data(summary: SweepSummary) -> str:
-    """Describe quantities missing from every run, "" if there are none."""
+    """Describe quantities that are missing in every run; empty if there are none."""
     errors = {each.titled: prefix for prefix, each in summary.parameters.items()}
     own = {str(field_name(column)): column for column in summary.metrics}
     known = summary.known | {column.rpartition(".")[0] for column in summary.known}
@@ -212,7 +212,7 @@ def without_data(summary: SweepSummary) -> str:
 
 
 def details(point: GridPoint, names: dict[str, FormationParameter], paper_std: dict[str, float]) -> list[list[str]]:
-    """Return the table of one point, a row per formation parameter; no row if no run there has errors."""
+    """Return the table of one point, a row per formation parameter; empty if no run there has errors."""
     rows: list[list[str]] = []
     if not any(f"{prefix}.true_rms" in point.spreads for prefix in names):
         return rows
@@ -240,7 +240,7 @@ def overview(point: GridPoint, brief: bool = False) -> list[str]:
 
 
 def _mean(point: GridPoint, column: str, form: str = ".4f", brief: bool = False) -> str:
-    """Return the mean of a column, with its interval unless brief, and its number of runs if they are not all."""
+    """Return the mean of a column, with its interval unless brief, and its number of runs if not all."""
     spread = point.spreads.get(column)
     if spread is None:
         return "–"
@@ -262,7 +262,7 @@ def _difference(point: GridPoint, column: str, brief: bool = False) -> str:
 
 
 def _spread(spread: Distribution, form: str) -> str:
-    """Return a mean with half the width of its interval, or the runs themselves if they are too few for one."""
+    """Return a mean with half the width of its interval, or the samples if they are too few for one."""
     if spread.samples:
         return ", ".join(f"{each:{form}}" for each in spread.samples)
     half = spread.mean.high - spread.mean.value
@@ -277,14 +277,14 @@ def _noted(text: str, note: str) -> str:
 
 TERMINAL_POINTS_MAX = 40
 BETWEEN = 3  # characters between two columns of a table
-EDGE = 1  # fewer characters after the last column of a table, including its edges
+EDGE = 1  # characters saved after the last column of a table, including its edges
 ERRORS_MAX = 9  # parameters, as many as in the paper's Table I
-HEAD = 8  # characters of a head that stand in one line, at least
-AXES_MAX = 3  # fields of the grid with a column each; more of them share one
+HEAD = 8  # characters of a head that are not wrapped
+AXES_MAX = 3  # fields of the grid with a column each; more share one
 
 
 class TerminalColumn(Struct, frozen=True):
-    """A column with its head, which is broken only between words, and a cell for each point."""
+    """A column: its head, which is wrapped only between words, and a cell for each point."""
 
     head: str
     cells: tuple[str, ...]
@@ -295,12 +295,12 @@ class TerminalColumn(Struct, frozen=True):
 
     @property
     def width(self) -> int:
-        """Characters that it takes, with the space to the next column."""
+        """Its characters, with the space to the next column."""
         return max(map(len, (*self.lines, *self.cells))) + BETWEEN
 
 
 class TerminalText(Struct, frozen=True):
-    """The deviations of the runs from their plan; at each point the user's metrics, how the runs ended, and errors."""
+    """Text for the terminal, fitted to its width: deviations from the plan, then the tables."""
 
     summary: SweepSummary
 
@@ -313,19 +313,14 @@ class TerminalText(Struct, frozen=True):
             yield cell(missing)
 
 
-def terminal_text(summary: SweepSummary) -> TerminalText:
-    """Return the tables of a sweep, which fit the terminal that shows them."""
-    return TerminalText(summary)
-
-
 def terminal_tables(summary: SweepSummary) -> list[PointTable]:
-    """Return the user's metrics, paired differences, how the runs ended, and errors; tables without heads are empty."""
+    """Return the user's metrics, paired differences, ends of runs, and errors; a table may have no columns."""
     points, level = summary.flown[:TERMINAL_POINTS_MAX], f"{100 * summary.level:g} %"
     own = {column: str(field_name(column)) for column in summary.metrics if column in summary.known}
     columns = {f"{prefix}.true_rms": each for prefix, each in summary.parameters.items()}
     flown = {column: each for column, each in columns.items() if column in summary.known}
     cluster = next((each.cluster for each in flown.values()), None)
-    # the first parameters of the first cluster that are no headings, which for Test 1 are the paper's
+    # the first parameters of the first cluster except headings; for Test 1 these are the paper's
     shown = [(column, each.name) for column, each in flown.items() if each.cluster == cluster]
     errors = dict([(column, name) for column, name in shown if not name.startswith("phi_")][:ERRORS_MAX])
     compared = {  # of the user's metrics, otherwise of the errors
@@ -338,10 +333,9 @@ def terminal_tables(summary: SweepSummary) -> list[PointTable]:
     title = f"RMS of truth − desired{of} from {windows_of(summary)}, means over the runs as planned"
     title_own = "Figures of your own, means over the runs as planned"
     title_pairs = f"Differences from {heading_of(summary.points[0])} of runs with the same seed"
-    caption_pairs = f"means ± half of the {level} interval, of n pairs; of few pairs each one\n"
+    caption_pairs = f"means ± half of the {level} interval, of n pairs; few pairs are listed\n"
     title_ends = f"{summary.scenario}: {summary.finished} of {summary.runs} runs"
-    caption_ends = "means are of the runs as planned, not of those excluded; least of all; "
-    caption_ends += f"{level} intervals are in the report\n"
+    caption_ends = f"means over the runs as planned; least over all runs; {level} intervals are in the report\n"
     ends = [overview(point, brief=True) for point in points]
     return [
         _table(points, own, partial(_mean, form=".4g", brief=True), title_own),
@@ -352,7 +346,7 @@ def terminal_tables(summary: SweepSummary) -> list[PointTable]:
 
 
 def _fitted(table: PointTable, summary: SweepSummary, width: int) -> Iterator[Text | Table]:
-    """Yield title, tables and caption; tables are at most `width` characters wide if one column fits."""
+    """Yield title, tables and caption; tables are at most `width` characters wide if a single column fits."""
     names = [str(name) for name in axes_of(summary)]
     values = [values_of(point) for point in summary.flown[:TERMINAL_POINTS_MAX]]
     if len(names) > AXES_MAX:
@@ -375,7 +369,7 @@ def _fitted(table: PointTable, summary: SweepSummary, width: int) -> Iterator[Te
 
 
 def _parted(columns: Sequence[TerminalColumn], room: int) -> list[Sequence[TerminalColumn]]:
-    """Return columns in as few parts of similar size as fit a width in characters; a wider one stands alone."""
+    """Split columns into as few parts of similar size as fit a width in characters; wider columns stand alone."""
     for count in range(1, len(columns) + 1):
         ends = np.linspace(0, len(columns), count + 1).round().astype(int).tolist()
         parts = [columns[start:end] for start, end in pairwise(ends)]

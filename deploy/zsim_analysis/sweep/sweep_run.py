@@ -1,4 +1,4 @@
-"""One run of a sweep: its task, how it is flown in this process, and its row of the table.
+"""One run of a sweep: its task, its flight in this process, and its row of the table.
 
 It is judged as by `zsim report`, without a record on disk. `report.metrics` names functions of the user that compute
 further figures from the flight:
@@ -6,11 +6,12 @@ further figures from the flight:
     def metrics(flight: RecordedFlight) -> float | Mapping[str, float]
     def metrics(run: zsim.Run) -> float | Mapping[str, float]
 
-The name of its argument says what it is given: `flight` the arrays of a RecordedFlight, any other the run on record.
+The name of the argument decides what is passed: `flight` the arrays of a RecordedFlight, any other name the recorded
+run.
 
 A number becomes the column `metrics.` and the function's name, a mapping a column `metrics.NAME` for each of its names.
 The unit at the end of a name, as in scenarios (`overshoot_m`), is shown in tables and figures. NaN, infinity and None
-are empty. An exception of a function becomes the run's `metrics_failure`, and nothing else is lost.
+become empty cells. An exception of a function becomes the run's `metrics_failure`; its other columns are kept.
 """
 
 import math
@@ -48,7 +49,7 @@ from zsim_analysis.report.summary import RunSummary, summarise
 from zsim_analysis.sweep.design import METRICS
 
 METRIC = "metrics."  # prefix of the columns of the user's metrics
-FLIGHT = "flight"  # argument of a function that is given a RecordedFlight
+FLIGHT = "flight"  # name of the argument for a RecordedFlight
 METRICS_MAX = 100  # of one function
 _NAME = re.compile(r"[A-Za-z]\w{0,63}", re.ASCII)
 
@@ -66,9 +67,9 @@ class Task(Struct, frozen=True):
     scenario: Scenario  # resolved, with the run's seed
     record: str | None = None  # folder for the record, None to keep none
     open_run: Callable[[Path], Any] | None = None  # makes a `zsim.Run` of a record, for metrics
-    more: Callable[[RecordedFlight], Mapping[str, Any]] | None = None  # returns further columns, of values as in JSON
-    processes: Callable[[Scenario, Path], None] | None = None  # flies it as processes, into a folder; None: here
-    judge: Callable[[RunSummary, Row], Mapping[str, Any]] | None = None  # more, of its summary
+    more: Callable[[RecordedFlight], Mapping[str, Any]] | None = None  # returns further columns, of JSON values
+    processes: Callable[[Scenario, Path], None] | None = None  # flies it as processes into a folder; None: in process
+    judge: Callable[[RunSummary, Row], Mapping[str, Any]] | None = None  # returns further columns from its summary
 
 
 class RunResult(Struct, frozen=True, kw_only=True):
@@ -77,7 +78,7 @@ class RunResult(Struct, frozen=True, kw_only=True):
     run: int
     point: int
     seed: int
-    failure: str | None = None  # why it did not end well, None if it did
+    failure: str | None = None  # why it did not end well
     ended: str | None = None  # the reason given by the world
     truth_sha256: str | None = None
     sim_s: float | None = None
@@ -93,15 +94,15 @@ class RunResult(Struct, frozen=True, kw_only=True):
     # whether every cluster was engaged at every instant of it, None without a cluster
     engaged_throughout: bool | None = None
     as_planned: bool | None = None  # whether the flight followed its plan
-    shortfall: str | None = None  # the first deviation by which it did not
-    metrics_failure: str | None = None  # why it has no metrics of the user, None if it has, or none are requested
+    shortfall: str | None = None  # its first deviation from the plan
+    metrics_failure: str | None = None  # why it lacks requested metrics of the user
     # window_from_s, window_to_s: the judged window
     window_from_s: float | None = None
     window_to_s: float | None = None
     window_note: str | None = None  # why it is not that of the scenario, empty if it is
     date: str | None = None  # when it was flown (ISO 8601, UTC)
     host: str = ""  # where it was flown
-    fingerprint: str = ""  # equal ones promise equal bits
+    fingerprint: str = ""  # hosts with equal fingerprints give equal bits
 
 
 # columns with the value of the same name in the run's summary
@@ -143,7 +144,11 @@ def fly(task: Task) -> Row:
     where: Row = {"host": socket.gethostname(), "fingerprint": fingerprint()}
     try:
         if task.processes:
-            flight, diverged = _fly_as_processes(task, task.processes), None
+            folder = Path(task.record or "")
+            rmtree(folder, ignore_errors=True)
+            task.processes(task.scenario, folder)
+            answers = task.more is not None or bool(task.scenario.report.metric_names)
+            flight, diverged = read_flight(folder / RECORD, answers), None
         else:
             with _record(task) as writer:
                 flight, diverged = fly_scenario(task.scenario, writer, answers=task.more is not None)
@@ -176,9 +181,8 @@ def fly(task: Task) -> Row:
     )
     columns: dict[str, float | None] = {engaged_column(name): engaged.get(name) for name in clusters}
     for i, (name, cluster) in enumerate([] if diverged else summary.clusters.items()):
-        # Errors by their paths in summary.json. Those of a cluster that was not engaged are None, and all of a flight
-        # that was not as planned: drones that stay on the ground, or hover instead of following a trajectory, do not
-        # hold the requested formation, and a drone that fell errs for a shorter time.
+        # Errors by their paths in summary.json. They are None for a cluster that was not engaged, and for a flight
+        # that was not as planned: the errors of drones that stay on the ground, hover or fall are not comparable.
         prefix = "errors" if i == 0 else f"clusters.{name}.errors"
         counts = summary.as_planned and engaged[name] is not None
         for parameter, errors in cluster.errors.items():
@@ -192,20 +196,12 @@ def fly(task: Task) -> Row:
     return {**row, **task.judge(summary, row)} if task.judge and not diverged else row
 
 
-def _fly_as_processes(task: Task, fly_into: Callable[[Scenario, Path], None]) -> RecordedFlight:
-    folder = Path(task.record or "")
-    rmtree(folder, ignore_errors=True)
-    fly_into(task.scenario, folder)
-    answers = task.more is not None or bool(task.scenario.report.metric_names)
-    return read_flight(folder / RECORD, answers)
-
-
 def fly_scenario(
     scenario: Scenario, writer: RecordWriter | None = None, answers: bool = False
 ) -> tuple[RecordedFlight, Exception | None]:
-    """Fly a resolved scenario; return the flight, and the error by which it diverged if it did.
+    """Fly a resolved scenario; return the flight, and the error if it diverged.
 
-    With `answers`, and for metrics of the user, it has the drones' estimates and commands, too.
+    With `answers`, and for metrics of the user, it includes the drones' estimates and commands.
     """
     flight, cpu = InProcessFlight(scenario), _CpuTime()
     reader = FlightReader(answers or bool(scenario.report.metric_names))
@@ -216,7 +212,7 @@ def fly_scenario(
 
 
 class _CpuTime:
-    """Observes a flight: the CPU time of this process from its first gate to its last."""
+    """An observer of a flight: measures the CPU time of this process from the first gate to the last."""
 
     def __init__(self) -> None:
         self._gates_s: list[float] = []
@@ -226,7 +222,7 @@ class _CpuTime:
         return self._gates_s[-1] - self._gates_s[0] if self._gates_s else None
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
-        """Nothing: every gate has messages of the world."""
+        """Do nothing: the time is read at gates."""
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
         self._gates_s[1:] = [time.process_time()]
@@ -266,7 +262,7 @@ def _record(task: Task) -> Iterator[RecordWriter | None]:
 
 
 def made_modules(names: Iterable[str], folders: Iterable[Path]) -> list[Path]:
-    """Return the files of the modules that were made for what a notebook or a script defines, among some names."""
+    """Return the files of modules among `names` that were generated for definitions of a notebook or a script."""
     made = dict.fromkeys(name.partition(":")[0] for name in names if name.startswith(plugin.MADE))
     files = [folder / f"{module}.py" for module in made for folder in folders]
     return [file for file in files if file.is_file()]
@@ -279,7 +275,7 @@ def engaged_s(formations: list[Formation], window_s: tuple[float, float]) -> dic
 
 
 def metrics_of(task: Task, flight: RecordedFlight) -> tuple[dict[str, float | None], str | None]:
-    """Return the metrics of a flight by the user's functions, by column, and in one line why some have none."""
+    """Return the metrics that the user's functions compute, by column, and why some are missing, in one line."""
     metrics: dict[str, float | None] = {}
     failures: list[str] = []
 
@@ -292,7 +288,7 @@ def metrics_of(task: Task, flight: RecordedFlight) -> tuple[dict[str, float | No
         found, failure = _metrics_of(name, run if task.open_run and _takes_run(name) else lambda: flight)
         if twice := found.keys() & metrics.keys():
             returned = min(twice).removeprefix(METRIC)
-            failures.append(f"{METRICS} {name}: returned {returned}, which another function returns, too")
+            failures.append(f"{METRICS} {name}: returned {returned}, which another function also returns")
         elif failure:
             failures.append(failure)
         else:
@@ -301,10 +297,10 @@ def metrics_of(task: Task, flight: RecordedFlight) -> tuple[dict[str, float | No
 
 
 def _takes_run(name: str) -> bool:
-    """Tell whether a function of the user is given the run on record; not one whose argument is `flight`."""
+    """Return whether a user's function takes the recorded run: its argument is not called `flight`."""
     try:
         arguments = signature(plugin.load_function(name, METRICS)).parameters
-    except (DocumentError, TypeError, ValueError):  # which is reported when it is called
+    except (DocumentError, TypeError, ValueError):  # reported when it is called
         return False
     return next(iter(arguments), FLIGHT) != FLIGHT
 

@@ -26,7 +26,7 @@ from zsim_analysis.sweep.sweep_run import FIXED, METRIC, Row, engaged_column
 Samples = NDArray[np.float64]
 
 LEVEL = 0.95  # of all intervals
-RUNS_MIN = 5  # chosen: of two runs Student's interval is nine times as wide as their distance; fewer are listed
+RUNS_MIN = 5  # chosen: Student's interval of two runs is nine times as wide as their distance; fewer are listed
 SEPARATION = "min_separation_m"
 OBSTACLE_DISTANCE = "min_obstacle_distance_m"
 _FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")  # in a text, but not in a name such as drone1
@@ -34,7 +34,7 @@ _COLUMN = re.compile(r"(?:clusters\.(.+?)\.)?errors\.(.+)")  # of a parameter: i
 
 
 class ConfidenceInterval(Struct, frozen=True):
-    """A value with the ends of its confidence interval, which are NaN for too few samples."""
+    """A value with the limits of its confidence interval, which are NaN for too few samples."""
 
     value: float
     low: float
@@ -44,7 +44,7 @@ class ConfidenceInterval(Struct, frozen=True):
 def mean_interval(samples: Samples) -> ConfidenceInterval:
     """Return the mean of samples (n,) with Student's interval: mean ± t(n − 1) s / √n; none below RUNS_MIN samples.
 
-    It holds for normal samples, and for others by the central limit theorem as n grows.
+    It is exact for normal samples, and for others asymptotically by the central limit theorem.
     """
     n = len(samples)
     middle = float(np.mean(samples)) if n else math.nan
@@ -57,7 +57,7 @@ def mean_interval(samples: Samples) -> ConfidenceInterval:
 def share_interval(count: int, of: int) -> ConfidenceInterval:
     """Return count / of with the exact interval of Clopper and Pearson (Biometrika 26, 1934); of > 0.
 
-    It covers the true share at least as often as LEVEL says, whatever the share and the number of runs.
+    Its coverage is at least LEVEL for every share and number of runs.
     """
     tail = (1 - LEVEL) / 2
     low = float(betaincinv(count, of - count + 1, tail)) if count else 0.0
@@ -76,7 +76,7 @@ class Distribution(Struct, frozen=True):
     p95: float
     least: float
     greatest: float
-    samples: tuple[float, ...] = ()  # all of them if they are too few for an interval, otherwise empty
+    samples: tuple[float, ...] = ()  # all of them if too few for an interval, otherwise empty
 
 
 def distribution(samples: Samples) -> Distribution | None:
@@ -95,7 +95,7 @@ def finite(samples: Samples) -> Samples:
 
 
 def count_text(count: int, of: int) -> str:
-    """Return the number of runs behind a mean if it is less than all of them, otherwise ""."""
+    """Return the number of runs behind a mean as text, empty if it is all of them."""
     return f"n = {count}" if count < of else ""
 
 
@@ -107,18 +107,18 @@ class FormationParameter(Struct, frozen=True):
 
     @property
     def titled(self) -> str:
-        """The name with its unit, and the cluster's if there are several."""
+        """The name with its unit, and the cluster if there are several."""
         return self.labelled(f"{self.name} ({unit(self.name)})")
 
     def labelled(self, text: str) -> str:
-        """Return a text about the variable, with the cluster's name if there are several."""
+        """Prefix a text with the cluster's name if there are several."""
         return f"{self.cluster}: {text}" if self.cluster else text
 
 
 def parameters(columns: Iterable[str], clusters: Sequence[str]) -> dict[str, FormationParameter]:
     """Return the formation parameters of columns of errors, by the columns' prefix; names may contain points.
 
-    Columns are such as errors.x_c.true_rms, or clusters.NAME.errors.x_c.true_rms of a second one of the clusters.
+    Columns are such as errors.x_c.true_rms, or clusters.NAME.errors.x_c.true_rms for clusters after the first.
     """
     prefixes = dict.fromkeys(column.rpartition(".")[0] for column in columns)
     matches = {each: match for each in prefixes if (match := _COLUMN.fullmatch(each))}
@@ -135,21 +135,20 @@ class GridPoint(Struct, frozen=True):
     names: dict[str, str]  # the abbreviated values, unique for each field
     runs: int  # finished ones
     ended_well: ConfidenceInterval | None  # share of them; None without a run
-    # share of those that ended well in which no drone collided with anything, or fell
+    # share of the runs that ended well in which no drone collided or fell
     without_collision: ConfidenceInterval | None
-    # runs that ended well with every cluster engaged at some instant of the judged window; None if no run has a
-    # cluster
+    # runs that ended well with every cluster engaged at some instant of the judged window; None without clusters
     engaged: int | None
-    as_planned: ConfidenceInterval | None  # share of those that ended well that followed their plan
-    spreads: dict[str, Distribution]  # by column of the table, of those that ended well and followed their plan
-    excluded: int = 0  # runs that ended well and did not follow their plan: they are in no spread and no difference
-    least_separation_m: float | None = None  # of all that ended well, None if no run has any
-    # by column, of its value less that at the first point in the run with the same seed, over the pairs of runs of
-    # which both are in the spreads; empty at the first point, and if seeds are not paired
+    as_planned: ConfidenceInterval | None  # share of the runs that ended well that followed their plan
+    spreads: dict[str, Distribution]  # by column, of the runs that ended well and followed their plan
+    excluded: int = 0  # runs that ended well without following their plan: not in spreads and differences
+    least_separation_m: float | None = None  # of all runs that ended well, None if unknown
+    # by column: its value minus that of the run with the same seed at the first point, over the pairs of which both
+    # runs are in the spreads; empty at the first point, and if seeds are not paired
     differences: dict[str, Distribution] = {}
 
     def count(self, column: str) -> str:
-        """Return the number of runs behind a mean, "" if it is of all that ended well."""
+        """Return the number of runs behind a mean as text, empty if it is all that ended well."""
         well = round(self.ended_well.value * self.runs) if self.ended_well else 0
         spread = self.spreads.get(column)
         return count_text(spread.runs, well) if spread else ""
@@ -161,20 +160,20 @@ class SweepSummary(Struct, frozen=True):
     scenario: str
     seed: int
     vary: tuple[str, ...]
-    changed: tuple[str, ...] | None  # texts `a.b.c=value` by which the scenario differs from its file; None: not known
+    changed: tuple[str, ...] | None  # overrides `a.b.c=value` of the command line; None: not known
     # when the first and the last run were flown (ISO 8601, UTC); None if no run has a date
     dates: tuple[str, str] | None
     runs: int
     finished: int
     failed: dict[str, int]
     not_engaged: int  # runs that ended well, but a cluster was never engaged within the judged window
-    # number of runs that ended well and did not follow their plan, by the first deviation; texts that differ in
-    # figures only are one
+    # number of runs that ended well without following their plan, by the first deviation; texts that differ only in
+    # numbers count as one
     not_as_planned: dict[str, int]
     judged_unengaged: int  # runs that ended well whose window holds instants at which a cluster was not engaged
     # the judged windows, least start and greatest end of all runs; None if no run has one
     windows_s: tuple[float, float] | None
-    paper_std: dict[str, float]  # Table I by parameter, empty for any flight but Test 1
+    paper_std: dict[str, float]  # Table I by parameter, empty except for Test 1
     level: float
     flown_wall_s: float
     hosts: dict[str, int]
@@ -182,9 +181,9 @@ class SweepSummary(Struct, frozen=True):
     version: str
     parameters: dict[str, FormationParameter]  # of the formations, by the prefix of their columns
     metrics: tuple[str, ...]  # columns of the user's metrics
-    unmeasured: dict[str, int]  # number of runs that have none of those, by the reason
+    unmeasured: dict[str, int]  # number of runs without those, by the reason
     points: list[GridPoint]
-    window_notes: dict[str, int] = {}  # number of runs that ended well, by why their window is not that of the scenario
+    window_notes: dict[str, int] = {}  # number of runs that ended well, by why their window is not the scenario's
 
     def json(self) -> bytes:
         return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
@@ -195,7 +194,7 @@ class SweepSummary(Struct, frozen=True):
 
     @property
     def known(self) -> set[str]:
-        """The columns of which some run at some point has a number."""
+        """The columns that have a number in some run."""
         return {column for point in self.points for column in point.spreads}
 
 
@@ -234,11 +233,11 @@ class SweepResults:
         return np.array([np.nan if cell is None else cell for cell in cells], np.float64)
 
     def flown(self, column: str, point: int | None = None) -> Samples:
-        """Return `values`, NaN for runs that did not follow their plan, by which statistics would look better."""
+        """Return `values`, NaN for runs that did not follow their plan, which would bias the statistics."""
         return np.where(self.values("as_planned", point) == 0, np.nan, self.values(column, point))
 
     def differences(self, column: str, point: int) -> Samples:
-        """Return value − value at the first point of each pair of runs with one seed that are both of `flown`.
+        """Return value − value at the first point for each pair of runs with equal seeds that are both in `flown`.
 
         Empty at the first point, and if seeds are not paired.
         """
@@ -248,12 +247,12 @@ class SweepResults:
         return finite(np.array([value - first.get(run - point, np.nan) for run, value in own.items()], np.float64))
 
     def ended_well(self, point: int) -> tuple[int, int]:
-        """Return how many of a point's finished runs ended well, and their number."""
+        """Return how many of a point's finished runs ended well, and how many there are."""
         at_point = self.points == point
         return int((at_point & self.well).sum()), int(at_point.sum())
 
     def without_collision(self, point: int) -> tuple[int, int]:
-        """Return in how many of a point's runs that ended well no drone collided or fell, and their number."""
+        """Return in how many of a point's runs that ended well no drone collided or fell, and how many there are."""
         collisions, crashed = self.values("collisions", point), self.values("crashed", point)
         return int(((collisions == 0) & (crashed != 1)).sum()), len(collisions)
 
@@ -263,11 +262,11 @@ class SweepResults:
         return int((flags == 1).sum()), int(np.isfinite(flags).sum())
 
     def never_as_planned(self) -> list[int]:
-        """Return the points with finished runs of which none ended well and followed its plan."""
+        """Return the points with finished runs, none of which ended well and followed its plan."""
         points = []
         for point in range(self.design.points):
             (well, runs), (planned, of) = self.ended_well(point), self.count("as_planned", point)
-            if runs and not planned and (of or not well):  # without a cluster no run that ended well is judged
+            if runs and not planned and (of or not well):  # without a cluster runs are not judged
                 points.append(point)
         return points
 
@@ -282,7 +281,7 @@ class SweepResults:
             return [row[column] for row in rows if row.get(column)]
 
         def counted(texts: Iterable[str]) -> dict[str, int]:
-            """Count texts, most frequent first; those that differ in figures only count as the first one."""
+            """Count texts, most frequent first; those that differ only in numbers count as the first one."""
             first: dict[str, str] = {}
             return dict(Counter(first.setdefault(_FIGURE.sub("#", text), text) for text in texts).most_common())
 
@@ -344,7 +343,7 @@ class SweepResults:
 
 # Names of fields
 
-UNITS = {  # by the end of a name, longer ones first
+UNITS = {  # by suffix, longer ones first
     "_kg_m2": "kg m²", "_kg_m3": "kg/m³", "_nm_s2": "N m s²", "_rad_s": "rad/s", "_deg_s": "deg/s", "_n_s_m": "N s/m",
     "_n_s2": "N s²", "_1_s2": "1/s²", "_m_s2": "m/s²", "_percent": "%", "_1_s": "1/s", "_m_s": "m/s", "_px2": "px²",
     "_deg": "deg", "_rad": "rad", "_mah": "mAh", "_px": "px", "_kg": "kg", "_hz": "Hz", "_ms": "ms", "_ut": "µT",
@@ -353,25 +352,18 @@ UNITS = {  # by the end of a name, longer ones first
 OF_CHANNEL = {  # units relative to that of the channel: zsim.sensors
     "noise": "", "density": "/√Hz", "bias": "", "bias_walk": "/√s", "bias_instability": "", "quantum": "",
 }  # fmt: skip
-SECTIONS = (
-    "environment",
-    "sensors",
-    "drones",
-    "clusters",
-    "agents",
-    "metrics",
-)  # left out before the names of their fields
+SECTIONS = ("environment", "sensors", "drones", "clusters", "agents", "metrics")  # omitted from names of their fields
 WORDS = {
     "gps": "GPS", "imu": "IMU", "mag": "magnetometer", "baro": "barometer", "accel": "accelerometer",
     "gyro": "gyroscope", "takeoff": "take-off",
 }  # fmt: skip
 OF_VARIABLES = ("target", "values", "expressions")  # maps of a plan, by the variables of its cluster
-OF_CLASS = ("parameters", "law_parameters", "space_parameters")  # sections whose names say nothing of a field
+OF_CLASS = ("parameters", "law_parameters", "space_parameters")  # omitted from names too
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # as in zsim.scenario.overrides
 
 
 class FieldName(Struct, frozen=True):
-    """Words and unit of a field; the unit is empty if it has none."""
+    """Words and unit of a field; the unit may be empty."""
 
     words: str
     unit: str = ""
@@ -385,7 +377,7 @@ class FieldName(Struct, frozen=True):
 
 
 def field_name(path: str) -> FieldName:
-    """Return the name of a field of a scenario, or of a column `metrics.NAME`, by its path from the top.
+    """Return the name of a scenario field, or of a column `metrics.NAME`, given its path.
 
     For example, sensors.gps.position_m.noise is the "GPS position noise" in m.
     """

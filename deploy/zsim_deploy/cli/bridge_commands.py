@@ -1,7 +1,8 @@
-"""The processes that show or translate a run: `console`, `gateway`, `ros1`, `ros2`, `mavlink`, `ardrone`; `fmu`."""
+"""The commands of bridges: `console`, `gateway`, `ros1`, `ros2`, `mavlink`, `ardrone`, `fmu`."""
 
 import math
 import time
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -22,11 +23,11 @@ if TYPE_CHECKING:
     from zsim.transport.session import Session
     from zsim_bridges.vehicle_links.failsafe import FlightLimits
 
-FIRST_ADDRESS = "127.0.0.2"  # of the first AR.Drone; 127.0.0.1 is where programs on this host send from
-TOKEN = "ZSIM_TOKEN"  # in the environment: a command line can be read by everybody on the machine
-DOMAIN_MAX = 232  # the highest ROS_DOMAIN_ID that ROS 2 takes
+FIRST_ADDRESS = "127.0.0.2"  # of the first AR.Drone; programs on this host send from 127.0.0.1
+TOKEN = "ZSIM_TOKEN"  # environment variable, because a command line is visible to all users of the machine
+DOMAIN_MAX = 232  # the highest ROS_DOMAIN_ID of ROS 2
 KEY_BYTES = 32
-GCS_PORT, GCS_LOCAL_PORT = 14550, 18570  # PX4's simulation: to the ground station, and the first port here
+GCS_PORT, GCS_LOCAL_PORT = 14550, 18570  # of PX4's simulation: the ground station, and the first local port
 API_PORT, API_LOCAL_PORT = 14540, 14580  # likewise for programs
 GATEWAY_NEEDS = {"gateway": ("aiohttp",)}
 FMU_NEEDS = {"fmu": ("fmpy",)}
@@ -45,8 +46,8 @@ PaceAsked = Annotated[
 SigningKey = Annotated[
     Path | None, Option(help="File with the key of MAVLink 2 signatures; unsigned messages are refused.")
 ]
-DroneName = Annotated[str, Argument(help="The drone of the run that it is; `body: external` in the scenario.")]
-Armed = Annotated[bool, Option("--armed", help="Obey from the start; else an operator asks `arm` first.")]
+DroneName = Annotated[str, Argument(help="Its drone in the run, with `body: external` in the scenario.")]
+Armed = Annotated[bool, Option("--armed", help="Obey from the start; otherwise an operator must ask `arm` first.")]
 
 
 @app.command(rich_help_panel=opt.WATCH)
@@ -56,7 +57,7 @@ def console(
     listen: Annotated[str, Option(help="Address on which the page is served.")] = "127.0.0.1",
     port: Annotated[
         int | None,
-        opt.port_option(f"Port of the page ({opt.CONSOLE_PORT}, or another where that is taken).", show_default=False),
+        opt.port_option(f"Port of the page ({opt.CONSOLE_PORT}, or another if that is in use).", show_default=False),
     ] = None,
     token: Annotated[str | None, Option(envvar=TOKEN, help="What operators must show; needed off loopback.")] = None,
     rate_hz: Annotated[
@@ -65,7 +66,7 @@ def console(
     ] = None,
     name: Annotated[str, Option(help="Process name (default the certificate's, or console.1, .2, …).")] = "",
     folder: Annotated[
-        Path | None, Option(help="Folder of the run, named on the page when it is over.", show_default=False)
+        Path | None, Option(help="Folder of the run, shown on the page when it is over.", show_default=False)
     ] = None,
 ) -> None:
     """Show a run in the browser, and steer it: scene, plots, events, faults."""
@@ -76,7 +77,7 @@ def console(
     from zsim_bridges.console.page_server import ListenAddress
     from zsim_deploy.roles.roles import log_printer, process_name
 
-    # Of normal priority: an operator's emergency goes through it, and one that gave way would be reported as silent.
+    # Of normal priority, because an operator's emergency stop goes through it.
     own_name = process_name("console", name, reach.who, "*")
     tell = JsonProgress().say if reach.launched else log_printer(None)
     require_files(SERVER_FILES, "a console and its pages")
@@ -91,7 +92,7 @@ def console(
 @opt.participant_options
 def gateway(
     reach: opt.WorldAccess,
-    listen: Annotated[str, Option(help="Address on which clients come in.")] = "127.0.0.1",
+    listen: Annotated[str, Option(help="Address on which clients connect.")] = "127.0.0.1",
     http: Annotated[int, opt.port_option("Port of HTTP and WebSocket.")] = 8000,
     lines: Annotated[int, opt.port_option("Port of JSON lines on TCP.")] = 7470,
     token: Annotated[str | None, Option(envvar=TOKEN, help="What clients must show; needed off loopback.")] = None,
@@ -111,7 +112,7 @@ def gateway(
 
     def connect_as(process: str) -> "AbstractContextManager[tuple[Session, Info]]":
         who = reach.who
-        if who.tls is not None:  # the certificate of a client lies beside the gateway's
+        if who.tls is not None:  # a client's certificate is beside the gateway's
             folder = who.tls.parent / process
             if not folder.is_dir():
                 remedy = "name it in the scenario and in the inventory"
@@ -220,7 +221,7 @@ def serve_mavlink(
     """Offer each drone as a vehicle: QGroundControl, MAVSDK, DroneKit, MAVProxy fly it."""
     from zsim_bridges.mavlink.mavlink_server import MavlinkOptions, MavlinkServer
 
-    ahead = first_system_id - 1  # as of PX4's simulation, whose ports go by the system id too
+    ahead = first_system_id - 1  # PX4's simulation derives its ports from the system id, too
     options = MavlinkOptions(
         autopilot=autopilot,
         level=telemetry,
@@ -250,14 +251,14 @@ def _endpoint(option: str, text: str, listen: str) -> tuple[str, int]:
     try:
         address = gethostbyname(host)
     except (gaierror, UnicodeError) as error:
-        raise BadParameter(f"{option} is {text!r}; {host} is no host that is known here") from error
+        raise BadParameter(f"{option} is {text!r}; host {host} is not known here") from error
     if is_loopback(listen) and not is_loopback(address):
         raise BadParameter(f"{option} is {text!r}, which {listen} does not reach; give --listen an address")
     return address, int(port)
 
 
 def read_key(path: Path) -> bytes:
-    """Return the key in a file: 32 bytes, 64 hexadecimal digits, or a passphrase, whose SHA-256 it is."""
+    """Read a key from a file: 32 bytes, 64 hexadecimal digits, or a passphrase, of which it is the SHA-256."""
     from hashlib import sha256
 
     with file_fault(path, "cannot be read", "give --signing-key a file with the key"):
@@ -267,12 +268,11 @@ def read_key(path: Path) -> bytes:
     text = content.strip()
     if not text:
         allowed = f"{KEY_BYTES} bytes, {2 * KEY_BYTES} hexadecimal digits, or a passphrase"
-        raise RunError(f"{path}: is empty; must hold {allowed}")
-    try:
-        key = bytes.fromhex(text.decode())
-    except ValueError:
-        return sha256(text).digest()
-    return key if len(key) == KEY_BYTES else sha256(text).digest()
+        raise RunError(f"{path}: is empty; must contain {allowed}")
+    with suppress(ValueError):
+        if len(key := bytes.fromhex(text.decode())) == KEY_BYTES:
+            return key
+    return sha256(text).digest()
 
 
 @ardrone.command("serve")
@@ -280,16 +280,16 @@ def read_key(path: Path) -> bytes:
 def serve_ardrone(
     reach: opt.WorldAccess,
     addresses: Annotated[
-        str, Option(help="Address of the first drone, the others follow it; or DRONE=ADDRESS,DRONE=ADDRESS.")
+        str, Option(help="Address of the first drone, +1 each; or DRONE=ADDRESS,DRONE=ADDRESS.")
     ] = FIRST_ADDRESS,
     peer: Annotated[
         list[str] | None,
-        Option(help="Host that is obeyed on addresses that are not loopback. Repeatable.", show_default=False),
+        Option(help="Host that may command drones on non-loopback addresses. Repeatable.", show_default=False),
     ] = None,
     rate: PaceAsked = None,
     name: Annotated[str, opt.process_option("ardrone.main")] = "",
 ) -> None:
-    """Offer each drone as an AR.Drone 2.0 on an address of its own."""
+    """Offer each drone as an AR.Drone 2.0 on its own address."""
     from zsim_bridges.ardrone.ardrone_server import ArdroneOptions, ArdroneServer
     from zsim_bridges.ardrone.ports import peer_addresses
 
@@ -297,13 +297,10 @@ def serve_ardrone(
     serve_as("ardrone", name, partial(ArdroneServer.serve, options=options), reach)
 
 
-def _bounds(
-    armed: bool, speed: float, climb: float, radius: float | None, ceiling: float | None
-) -> "tuple[FlightLimits, bool]":
+def _bounds(armed: bool, speed: float, climb: float, radius: float, ceiling: float) -> "tuple[FlightLimits, bool]":
     from zsim_bridges.vehicle_links.failsafe import FlightLimits
 
-    radius_m, ceiling_m = (math.inf if limit is None else limit for limit in (radius, ceiling))
-    return FlightLimits(speed, climb, radius_m=radius_m, ceiling_m=ceiling_m), armed
+    return FlightLimits(speed, climb, radius_m=radius or math.inf, ceiling_m=ceiling or math.inf), armed
 
 
 driver_options = opt.option_group(
@@ -328,10 +325,10 @@ def drive_mavlink(
     drone: DroneName,
     address: Annotated[str, Argument(help="UDP port of the vehicle: udp://HOST:PORT.")],
     local_port: Annotated[int, opt.port_option("UDP port here; 0 for any.", least=0)] = 0,
-    system: Annotated[int, Option(min=0, max=255, help="Its system id; 0 for the first that shows itself.")] = 0,
+    system: Annotated[int, Option(min=0, max=255, help="Its system id; 0 for the first that sends.")] = 0,
     signing_key: SigningKey = None,
     origin: Annotated[
-        str | None, Option(help="Where its local frame begins, X,Y,Z m in W (default: as it says).")
+        str | None, Option(help="Origin of its local frame, X,Y,Z m in W (default: as it reports).")
     ] = None,
 ) -> None:
     """Let a MAVLink vehicle (PX4, ArduPilot, or its simulator) fly as a drone of the run."""
@@ -355,14 +352,14 @@ def drive_ardrone(
     drone: DroneName,
     address: Annotated[str, Argument(help="Address of the aircraft, such as 192.168.1.12.")],
     origin: Annotated[
-        str | None, Option(help="Where it stands at the start, X,Y,Z m in W (default: the scenario's place).")
+        str | None, Option(help="Its position at the start, X,Y,Z m in W (default: the scenario's).")
     ] = None,
     yaw: Annotated[
         float | None,
         Option(callback=opt.finite, help="Its heading at the start, deg from east (default: by its magnetometer)."),
     ] = None,
     ultrasound: Annotated[
-        int, Option(min=7, max=8, help="Of its sonar, 7 or 8; neighbours that differ disturb each other less.")
+        int, Option(min=7, max=8, help="Channel of its sonar; different channels interfere less.")
     ] = 8,
 ) -> None:
     """Let an AR.Drone 2.0 fly as a drone of the run."""
@@ -379,10 +376,8 @@ def drive_ardrone(
 @opt.participant_options
 def fmu(
     reach: opt.WorldAccess,
-    path: Annotated[
-        Path, Argument(metavar="FILE", help="The FMU: FMI 2 or 3, for co-simulation. Trust it: it is run.")
-    ],
-    drone: Annotated[str | None, Option(help="The drone that places mean that name none.", show_default=False)] = None,
+    path: Annotated[Path, Argument(metavar="FILE", help="The FMU: FMI 2 or 3, for co-simulation. Its code is run.")],
+    drone: Annotated[str | None, Option(help="Drone of the places that name none.", show_default=False)] = None,
     map_: Annotated[
         list[str] | None,
         Option("--map", metavar="NAME=PLACE", help="vx=velocity_m_s.0, or z=drone2/estimate.position_m.2. Repeatable."),
@@ -392,16 +387,16 @@ def fmu(
     ] = None,
     period: Annotated[
         float | None,
-        opt.positive_option("Communication step, s (default what the FMU suggests, or the gate).", show_default=False),
+        opt.positive_option("Communication step, s (default the FMU's, or the gate).", show_default=False),
     ] = None,
     takeoff: Annotated[
         float | None,
-        Option(
-            callback=opt.not_negative, help="When the drones that it commands take off, s; others' task if not given."
-        ),
+        Option(callback=opt.not_negative, help="When the drones that it commands take off, s; by default not by it."),
     ] = None,
     frame: Annotated[Literal["heading", "world"], Option(help="Of velocity commands.")] = "heading",
-    log: Annotated[bool, Option("--log", help="Print all that the FMU logs, not only warnings and errors.")] = False,
+    log: Annotated[
+        bool, Option("--log", help="Print all log messages of the FMU, not only warnings and errors.")
+    ] = False,
     name: Annotated[
         str, Option(help="Process name (default fmu.DRONE, or the certificate's); controller.main replaces that one.")
     ] = "",

@@ -1,4 +1,4 @@
-"""The command line: the commands put together, run, and one line for a fault."""
+"""The command line: assembles the commands, runs them, and reports a user's fault in one line."""
 
 import errno
 import importlib
@@ -34,10 +34,10 @@ from zsim_deploy.roles.closed_output import STREAMS, is_unread
 
 UsageError: Any = importlib.import_module(typer.BadParameter.__module__).UsageError  # of the click that typer uses
 UNREAD = 128 + 13  # exit code of a command whose output is no longer read: that of SIGPIPE
-# of a path that a person gave, or of its disk, wherever it is looked at first
+# faults of a path given by the user, or of its disk, wherever it is first accessed
 FILE_FAULTS = {errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ELOOP, errno.EROFS, errno.EIO, errno.ESTALE}
 PATH_SHOWN = 200  # characters
-EXIT_CODES = {  # of what is no wrong input
+EXIT_CODES = {  # of errors that are not wrong input
     **dict.fromkeys((BehindError, RequestRefusedError, RunFailedError, UserCodeError), 1),
     SupersededError: 3,
 }
@@ -78,7 +78,7 @@ def options(
 
 @cache
 def command() -> Any:
-    """Return the command line, made once: a process that is forked has it already."""
+    """Return the command line, built once; a forked process inherits it."""
     return get_command(app)
 
 
@@ -88,9 +88,9 @@ def main() -> None:
         code = _run()
     except BrokenPipeError:
         if not any(map(is_unread, STREAMS)):
-            raise  # of a connection
+            raise  # it was a connection
         code = UNREAD
-    except SystemExit as ended:  # click exits with 1 where the output is not read
+    except SystemExit as ended:  # click exits with 1 if the output is not read
         code = UNREAD if isinstance(ended.__context__, BrokenPipeError) else ended.code
     try:
         sys.stdout.flush()
@@ -141,7 +141,7 @@ def _is_in_a_folder() -> bool:
 
 
 def _show_usage(error: Any) -> None:
-    """Print what was wrong with a command line in one line; after a bare `zsim` the help has been printed."""
+    """Print a usage error in one line; after a bare `zsim` its text is empty, because the help was printed."""
     if isinstance(error, typer.BadParameter) and error.param is None:
         text = error.message
     else:

@@ -37,7 +37,7 @@ def keys(
         str, Argument(metavar="[KEY]", help="Only these, e.g. 'drone/drone1/**'.", show_default=False)
     ] = "**",
 ) -> None:
-    """List the keys in use, with their message and how many came in a second."""
+    """List the keys in use, with their message type and the number of messages within a second."""
     from zsim_deploy.cli import inspection
 
     with connected(reach) as (link, _):
@@ -53,9 +53,9 @@ def keys(
 def echo(
     reach: WorldAccess,
     key: Annotated[str, Argument(help="Key or expression, e.g. drone/drone1/sensor/imu or 'drone/*/truth'.")],
-    count: Annotated[int | None, Option("--count", "-n", min=1, help="Stop after so many messages.")] = None,
+    count: Annotated[int | None, Option("--count", "-n", min=1, help="Stop after this many messages.")] = None,
     raw: Annotated[bool, Option("--raw", help="Payload as hexadecimal digits.")] = False,
-    timeout: Annotated[float | None, Option(callback=positive, help="Stop after so many seconds.")] = None,
+    timeout: Annotated[float | None, Option(callback=positive, help="Stop after this many seconds.")] = None,
 ) -> None:
     """Print the messages on a key as JSON lines; exit code 1 if they have not arrived when --timeout expires."""
     from zsim_deploy.cli import inspection
@@ -74,10 +74,10 @@ def echo(
 def hz(
     reach: WorldAccess,
     key: Annotated[str, Argument(help="Key or expression.")],
-    window: Annotated[int, Option(help="Messages that the rate is taken over.", min=2, max=1_000_000)] = 1000,
-    seconds: Annotated[float | None, Option(callback=positive, help="Stop after so many seconds.")] = None,
+    window: Annotated[int, Option(help="Messages over which the rate is measured.", min=2, max=1_000_000)] = 1000,
+    seconds: Annotated[float | None, Option(callback=positive, help="Stop after this many seconds.")] = None,
 ) -> None:
-    """Print how often messages come on a key, in wall and in simulated time."""
+    """Print the rate of messages on a key, in wall and in simulated time."""
     from zsim_deploy.cli import inspection
 
     with connected(reach) as (link, _):
@@ -137,7 +137,7 @@ def connected(reach: WorldAccess) -> Iterator[tuple["Session", "Info"]]:
 
 
 def duration(text: str | None) -> str | None:
-    """Refuse an option that is no duration such as 10s, 500ms or 2min."""
+    """Refuse an option that is not a duration such as 10s, 500ms or 2min."""
     _seconds(text)
     return text
 
@@ -152,10 +152,10 @@ def _seconds(text: str | None) -> float | None:
 
 
 For = Annotated[
-    str | None, Option("--for", callback=duration, help="E.g. 10s, 500ms, 2min; until it is cleared if not given.")
+    str | None, Option("--for", callback=duration, help="E.g. 10s, 500ms, 2min; by default until it is cleared.")
 ]
 At = Annotated[
-    str | None, Option("--at", callback=duration, help="Simulated time when it begins, e.g. 40s; now if not given.")
+    str | None, Option("--at", callback=duration, help="Simulated time when it begins, e.g. 40s; by default now.")
 ]
 
 
@@ -164,7 +164,7 @@ At = Annotated[
 def add(
     reach: WorldAccess,
     target: Annotated[
-        str, Argument(help="Drone, link (a/b), process, cluster, or world: as the kind asks.", show_default=False)
+        str, Argument(help="Drone, link (a/b), process, cluster or world, depending on the kind.", show_default=False)
     ],
     kind: Annotated[str, Argument(help="One of `zsim fault kinds`.", show_default=False)],
     parameters: Annotated[
@@ -196,14 +196,14 @@ def clear(
     """End faults: all, or those of a number, a target or a kind."""
     with connected(reach) as (link, info):
         done = _ask(link, "fault_clear", selector(which, info.scenario))
-    cleared = ", ".join(map(str, done["cleared"])) or "nothing: no fault was planned or acting"
+    cleared = ", ".join(map(str, done["cleared"])) or "nothing: no fault was planned or active"
     say(f"cleared {cleared}")
 
 
 @faults.command("list")
 @observer_options
 def list_(reach: WorldAccess) -> None:
-    """List the faults that are planned or act."""
+    """List the faults that are planned or active."""
     from zsim.contract import keys, messages
     from zsim.presentation import Column, FittedTable, print_table
 
@@ -216,17 +216,17 @@ def list_(reach: WorldAccess) -> None:
         kinds = ("figure", "figure", "name", "name", "figure", "text")
         print_table(FittedTable([Column("", kind) for kind in kinds], rows))
     else:
-        note("no fault is planned or acts")
+        note("no fault is planned or active")
 
 
 @faults.command()
 def kinds(
     scenario: Annotated[
-        Path | None, Argument(help="A scenario, for the kinds of its users' sensors too.", show_default=False)
+        Path | None, Argument(help="A scenario, for the kinds of its custom sensors too.", show_default=False)
     ] = None,
     trust: Trust = False,
 ) -> None:
-    """List the kinds of faults: whom they strike, and their parameters."""
+    """List the kinds of faults: their targets and parameters."""
     from zsim.presentation import Column, FittedTable, print_table
     from zsim.scenario import faults as fault_kinds
     from zsim.scenario import scenario_file
@@ -248,7 +248,7 @@ def kinds(
 
 
 def selector(which: str, scenario: str) -> dict[str, Any]:
-    """Return the arguments of `fault_clear` that a word means in the run of a scenario, given as text."""
+    """Return the arguments of `fault_clear` for a word: a number, kind or target in the run of a scenario's text."""
     from zsim.scenario import faults as fault_kinds
     from zsim.scenario import scenario_file
     from zsim.sensors.sensor_catalogue import declarations

@@ -1,10 +1,10 @@
-"""The fork server: it has imported what roles need and loaded what is compiled, and forks a role for each request.
+"""The fork server: imports what roles need, loads the compiled kernels, and forks a role for each request.
 
-Standard input is a socket of sequenced packets from the launcher. When all is loaded the fork server sends READY. From
+Standard input is a socket of sequenced packets from the launcher. When all is loaded, the fork server sends READY. From
 then on each packet from the launcher is the arguments of a `zsim` command as a JSON list, with four open files: the
 role's standard input, output and error, and one from which it reads a byte before it begins. The answer is the role's
-process number. The role is a child of the launcher, not of this process, which ends as soon as the launcher closes the
-socket, or dies. A role whose number has not reached the launcher never gets that byte, and ends too.
+process id. The role is a child of the launcher, not of this process, which ends as soon as the launcher closes the
+socket or dies. A role whose process id has not reached the launcher never gets that byte, and ends too.
 """
 
 import atexit
@@ -54,7 +54,7 @@ def main() -> None:
 
 
 def _prepare() -> None:
-    """Import what roles import, and load what they run; a role for which that fails reports it when it is started."""
+    """Import the modules of roles, and load the kernels; errors are reported by the roles when they start."""
     with suppress(Exception):
         import zsim_agents.recorder  # noqa: F401
         from zsim_deploy.cli import cli
@@ -67,7 +67,7 @@ def _prepare() -> None:
 
 
 def _fork() -> int:
-    """Return the number of a new process whose parent is the launcher, and in that process 0.
+    """Fork a process whose parent is the launcher; return its process id, and 0 in the new process.
 
     The process between them ends at once; the launcher inherits its child (PR_SET_CHILD_SUBREAPER).
     """
@@ -88,7 +88,7 @@ def _fork() -> int:
 
 
 def _run_role(arguments: list[str], files: list[int]) -> NoReturn:
-    """Run the role, once the launcher has its number, and end this process."""
+    """Run the role once the launcher has its process id, and end this process."""
     *standard, go = files
     if not os.read(go, 1):
         os._exit(0)
@@ -114,9 +114,9 @@ def _run_role(arguments: list[str], files: list[int]) -> NoReturn:
 
 
 def finish(code: object) -> NoReturn:
-    """End this process as an interpreter does, but leave its memory to the system.
+    """End this process as the interpreter does, but without freeing objects.
 
-    A role has inherited all that the fork server had imported: freeing it object by object copies every page of it.
+    A role shares the pages of all modules that the fork server imported; freeing the objects would copy every page.
     """
     with suppress(BaseException):
         threading._shutdown()  # type: ignore[attr-defined]
@@ -131,7 +131,7 @@ def finish(code: object) -> NoReturn:
 
 
 def _show_as(name: str, command: list[str]) -> None:
-    """Let `ps` and `pgrep -f` show a command line, cut to the length of the one of this process."""
+    """Set the command line that `ps` and `pgrep -f` show, cut to the length of this process's original one."""
     with suppress(OSError, ValueError, IndexError):
         fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
         start, end = (int(fields[i - 2]) for i in (ARG_START, ARG_END))

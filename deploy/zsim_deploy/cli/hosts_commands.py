@@ -1,4 +1,4 @@
-"""The commands of a run on several hosts, from `zsim push` to `zsim down`, and `zsim certs` and `zsim render`."""
+"""The commands for runs on several hosts, from `zsim push` to `zsim down`, and `zsim certs` and `zsim render`."""
 
 import codecs
 import contextlib
@@ -21,11 +21,11 @@ from zsim_deploy.hosts import control_socket
 
 UP_NEEDS = {"hosts": ("asyncssh", "cryptography"), "record": ("mcap", "zstandard")}
 EVERY = ""  # federation
-FOLLOW_S = 0.2  # between two looks at a log that is followed
+FOLLOW_S = 0.2  # polling interval of a log that is followed
 FIRST_OPERATOR = "main"
 DAYS_MIN = 0.05  # an hour, longer than a flight
-DAYS_MAX = 825.0  # what browsers took at most; CA/Browser Forum, ballot 193
-WARN = timedelta(days=3)  # before a certificate ends, when `show` warns
+DAYS_MAX = 825.0  # the longest lifetime that browsers accepted; CA/Browser Forum, ballot 193
+WARN = timedelta(days=3)  # remaining lifetime of a certificate from which `show` warns
 
 app = typer.Typer()
 certs = typer.Typer(name="certs", help="Make and show the certificates of a federation.", no_args_is_help=True)
@@ -33,14 +33,14 @@ rendering = typer.Typer(
     name="render", help="Write systemd units, compose files or manifests for an inventory.", no_args_is_help=True
 )
 
-Hosts = Annotated[Path, Option("--hosts", help="Inventory (YAML): which hosts, which role where.")]
-Inventory = Annotated[Path, Argument(help="Inventory (YAML): hosts and which role runs where.", show_default=False)]
+Hosts = Annotated[Path, Option("--hosts", help="Inventory (YAML): hosts, and which role runs where.")]
+Inventory = Annotated[Path, Argument(help="Inventory (YAML): hosts, and which role runs where.", show_default=False)]
 Federation = Annotated[str, Option(help="Federation that is up.")]
 Only = Annotated[
     list[str] | None,
-    Option("--only", help="Only roles that match, or what they work for, or hosts: 'drone1*'. Repeatable."),
+    Option("--only", help="Only matching roles, drones, formations or hosts: 'drone1*'. Repeatable."),
 ]
-Sort = Annotated[opt.RowOrder | None, Option("--sort", help="By what rows are sorted, the greatest figure first.")]
+Sort = Annotated[opt.RowOrder | None, Option("--sort", help="Sort the rows; numbers in descending order.")]
 Role = Annotated[str, Argument(help="Process name, e.g. estimator.drone2.", show_default=False)]
 
 
@@ -52,7 +52,7 @@ def push(
         list[str] | None, Option("--extra", help="An extra beside those of the host's roles. Repeatable.")
     ] = None,
 ) -> None:
-    """Install zsim on the hosts, each with the extras that its roles need; they need ssh and Python, no internet."""
+    """Install zsim on the hosts with the extras that their roles need; they need ssh and Python, but no internet."""
     import asyncio
 
     from zsim_deploy import inventory
@@ -63,21 +63,21 @@ def push(
     with PushProgress() as stages:
         done = asyncio.run(push_to(placed, host or [], extra or [], stages.update, default_cache()))
     changed = sum(done.values())
-    nothing = "nothing to do; all hosts have what they need"
+    nothing = "nothing to do; all hosts are up to date"
     say(f"installed on {changed} of {len(done)} hosts" if changed else nothing)
 
 
 @app.command(rich_help_panel=opt.HOSTS)
 def doctor(
     scenario: Annotated[
-        Path | None, Argument(help="Scenario whose roles are to be placed, or that is to be flown.")
+        Path | None, Argument(help="Scenario whose roles are placed on the hosts; without --hosts it is flown.")
     ] = None,
-    hosts: Annotated[Path | None, Option("--hosts", help="Inventory (YAML): which hosts, which role where.")] = None,
+    hosts: Annotated[Path | None, Option("--hosts", help="Inventory (YAML): hosts, and which role runs where.")] = None,
     duration: Annotated[float, Option(callback=opt.between(0.1, 1e6), help="Simulated seconds to fly.")] = 20.0,
 ) -> None:
-    """Check every host: ssh, versions, clock, load, and how the hosts reach each other.
+    """Check every host: ssh, versions, clock, load, and the network between the hosts.
 
-    Without --hosts, fly the scenario twice, as two processors compute, and tell whether the flights are the same.
+    Without --hosts, fly the scenario as on two different processors, and tell whether the flights are identical.
     """
     if hosts is None:
         from zsim_deploy.hosts.processor_check import check_processor
@@ -120,7 +120,7 @@ def up(
 ) -> None:
     """Fly a scenario on several hosts: check them, start every role over ssh, watch, record, end everything.
 
-    --only and --sort are of the table that is shown; every role is started whatever they are.
+    --only and --sort affect only the table; every role is started.
     """
     require("up", UP_NEEDS | (opt.REPORT_NEEDS if report else {}))
     from zsim.transport.zenoh_settings import host_launcher_files, require_files
@@ -148,7 +148,7 @@ def up(
                 outcome = HostRun(loaded, placed, folder, launch, status).run()
             conclude(outcome, folder, report)
         finally:
-            if not was_there:  # and the run was refused: nothing is in it
+            if not was_there:  # fails unless it is empty because the run was refused
                 with contextlib.suppress(OSError):
                     folder.rmdir()
 
@@ -165,7 +165,7 @@ def ps(
 ) -> None:
     """Show the processes of the runs on this machine: role, host, pid, state, lag, age, messages/s, restarts.
 
-    A narrow terminal shows fewer columns, --json all of them, in a line for each run.
+    A narrow terminal shows fewer columns; --json has all of them, one line for each run.
     """
     from zsim.presentation import print_table
     from zsim_deploy.hosts.status_table import RowChoice, table
@@ -173,11 +173,11 @@ def ps(
     runs = []
     for name in control_socket.launchers():
         if name == federation or name.startswith(f"{federation}@") or federation == EVERY:
-            with contextlib.suppress(RunError):  # its launcher was killed, or ends
+            with contextlib.suppress(RunError):  # its launcher was killed or is ending
                 runs.append(control_socket.ask(name, "ps"))
     if not runs:
         whose = "" if federation == EVERY else f" of federation {federation!r}"
-        raise RunError(f"no run{whose} that `zsim run` or `zsim up` has started goes on on this machine")
+        raise RunError(f"no run{whose} of `zsim run` or `zsim up` is active on this machine")
     choice = RowChoice([*(roles or ()), *(only or ())], sort)
     choice.check([row for status in runs for row in status["rows"]])
     for status in runs:
@@ -193,10 +193,10 @@ def ps(
 @app.command(rich_help_panel=opt.HOSTS)
 def logs(
     role: Role,
-    follow: Annotated[bool, Option("--follow", "-f", help="Go on with what is written from now on.")] = False,
+    follow: Annotated[bool, Option("--follow", "-f", help="Continue with new lines as they are written.")] = False,
     federation: Federation = "zsim",
 ) -> None:
-    """Print the log of a process of the run that is up; progress and events are shown by `zsim up` itself."""
+    """Print the log of a process of the active run; progress and events are shown by `zsim up` itself."""
     where = control_socket.ask(federation, "where")
     if role not in where["roles"]:
         raise RunError(f"role is {role!r}; must be one of {', '.join(where['roles'])}")
@@ -236,30 +236,32 @@ def move(
     host: Annotated[str, Argument(help="Host of the inventory.", show_default=False)],
     federation: Federation = "zsim",
 ) -> None:
-    """Let another host run a process of the run from now on."""
+    """Move a process of the run to another host."""
     say(f"moving {control_socket.ask(federation, 'move', role=role, host=host)}")
 
 
 @app.command(rich_help_panel=opt.HOSTS)
 def down(federation: Federation = "zsim") -> None:
-    """End the run that is up, on all hosts."""
+    """End the active run on all hosts."""
     control_socket.ask(federation, "down")
 
 
 @certs.command()
 def init(
     hosts: Inventory,
-    scenario: Annotated[Path, Option(help="Scenario whose processes they are for.", show_default=False)],
+    scenario: Annotated[Path, Option(help="Scenario whose processes get certificates.", show_default=False)],
     set_: opt.Set = None,
     operator: Annotated[
         list[str] | None,
-        Option(help=f"NAME or NAME@HOST of who looks and commands, beside who is there ({FIRST_OPERATOR} at first)."),
+        Option(help=f"NAME or NAME@HOST of a further operator (default: those there are, {FIRST_OPERATOR} at first)."),
     ] = None,
-    days: Annotated[float, Option(callback=opt.between(DAYS_MIN, DAYS_MAX), help="How long they are good for.")] = DAYS,
-    renew: Annotated[bool, Option("--renew", help="Make all of them anew, by the same authority.")] = False,
-    force: Annotated[bool, Option("--force", help="Make a new authority; nothing made before is good.")] = False,
+    days: Annotated[float, Option(callback=opt.between(DAYS_MIN, DAYS_MAX), help="Lifetime of certificates.")] = DAYS,
+    renew: Annotated[bool, Option("--renew", help="Renew all of them, with the same authority.")] = False,
+    force: Annotated[
+        bool, Option("--force", help="Make a new authority; earlier certificates become invalid.")
+    ] = False,
 ) -> None:
-    """Make what is missing: authority, certificates, and access control for the world and the routers."""
+    """Make missing certificates, their authority, and access control for the world and the routers."""
     from zsim_deploy import certificates, inventory
 
     placed, now = inventory.load(hosts), datetime.now(UTC)
@@ -281,7 +283,7 @@ def init(
 
 @certs.command()
 def show(hosts: Inventory) -> None:
-    """List the certificates that are there: for whom, for which addresses, until when."""
+    """List the certificates: process, addresses, expiry."""
     from zsim.presentation import Column, FittedTable, print_table
     from zsim_deploy import certificates, inventory
 
@@ -298,14 +300,14 @@ def show(hosts: Inventory) -> None:
         rows.append((status.host, status.process, until, addresses, status.fault or soon))
     print_table(FittedTable([Column("", kind) for kind in ("name", "name", "figure", "text", "text")], rows))
     if over or any(status.fault for status in statuses):
-        note(f"make them anew with `{certificates.init_command(placed, renew=over)}`")
+        note(f"renew them with `{certificates.init_command(placed, renew=over)}`")
     if warning := certificates.exposed_keys(placed):
         note(f"warning: {warning}")
 
 
-Out = Annotated[Path, Option("--out", help="Folder to write into; what was rendered there before is replaced.")]
+Out = Annotated[Path, Option("--out", help="Folder to write into; an earlier rendering there is replaced.")]
 ForceRendering = Annotated[
-    bool, Option("--force", help="Overwrite files that no rendering wrote, or that were changed since.")
+    bool, Option("--force", help="Overwrite files that were not rendered, or were changed since.")
 ]
 
 
@@ -329,10 +331,10 @@ def kubernetes(
     flight: opt.FlightOptions,
     hosts: Hosts,
     out: Out,
-    image: Annotated[str | None, Option(help="Image as the nodes find it (default zsim:VERSION).")] = None,
+    image: Annotated[str | None, Option(help="Image reference for the nodes (default zsim:VERSION).")] = None,
     force: ForceRendering = False,
 ) -> None:
-    """Write the manifests of a run, a Dockerfile, and a script that makes the Secrets from the certificates."""
+    """Write manifests, a Dockerfile, and a script that makes the Secrets from the certificates."""
     _render("kubernetes", flight, hosts, out, force, *([image] if image else []))
 
 
@@ -347,5 +349,5 @@ def _render(target: str, flight: opt.FlightOptions, hosts: Path, out: Path, forc
         placed, loaded, flight.pace(), *more
     )
     removed = render.write(out, target, texts, force)
-    also = f"; removed of an earlier rendering: {', '.join(removed)}" if removed else ""
+    also = f"; removed from an earlier rendering: {', '.join(removed)}" if removed else ""
     say(f"{len(texts)} files in {out}{also}")

@@ -1,4 +1,4 @@
-"""A running federation inspected as users of `ros2 topic` expect, and messages and requests sent to it by hand."""
+"""Inspecting a running federation, as `ros2 topic` does, and sending messages and requests to it by hand."""
 
 import json
 import math
@@ -17,13 +17,13 @@ from zsim.errors import DecodeError, RunError
 from zsim.transport.session import RawSample, ReceivedSample, Session, Subscription, check_expression, result_of
 
 LISTEN_S = 1.0  # wall time that `keys` listens: every live key of the contract has a message at least once a second
-PACKET_S = 0.05  # wait between two looks into an empty subscription
+PACKET_S = 0.05  # polling interval of an empty subscription
 LINE_S = 1.0  # between two lines of `hz`
-SILENCE_S = 1.0  # after which a key with messages is reported as silent; later where its own gaps are longer
+SILENCE_S = 1.0  # after which a key with messages is reported as silent; twice its longest gap if that is longer
 UNHEARD_S = 3.0  # after which a key without messages is reported; every live key has one at least once a second
-NAMED_MAX = 5  # similar keys that are named where a key has no publisher
-OUTCOME_S = 3.0  # wall; how long the world may take to say what becomes of a command; a standing one does not say it
-UNKNOWN_SENDER = "somebody"  # source of the event of a message that could not be decoded
+NAMED_MAX = 5  # similar keys that are suggested for a key without a publisher
+OUTCOME_S = 3.0  # wall time for the world to report the outcome of a command; a paused one does not
+UNKNOWN_SENDER = "somebody"  # source in the event of a message that could not be decoded
 PUB, ASK = "zsim.pub", "zsim.ask"
 COMMANDS = "drone/*/cmd/*"
 
@@ -50,9 +50,9 @@ def echo(
     timeout_s: float = math.inf,
     note: Callable[[str], None] = lambda text: None,
 ) -> int:
-    """Hand the messages on an expression to `emit` until `count` came, or the time is over; return how many came.
+    """Pass the messages on an expression to `emit` until `count` or the timeout is reached; return their number.
 
-    `emit` takes key and message, its payload in hexadecimal digits if `raw`; `note` takes lines for people.
+    `emit` takes key and message, or the payload in hexadecimal digits if `raw`; `note` takes notices for the user.
     """
     subscription = link.subscribe(expression)
     until_s, number = time.monotonic() + timeout_s, 0
@@ -66,19 +66,19 @@ def echo(
         if time.monotonic() >= until_s:
             return number
         if not number:
-            note(f"nobody has published on {expression} for {UNHEARD_S:g} s{keys_like(link, expression)}")
+            note(f"no message on {expression} for {UNHEARD_S:g} s{keys_like(link, expression)}")
         unheard_s = until_s
 
 
 def keys_like(link: Session, expression: str) -> str:
-    """Return the end of a line on a key without a publisher: the keys in use most like it."""
+    """Return the end of a line about a key without a publisher: similar keys that are in use."""
     in_use = [key for key, _, _ in list_keys(link, "**")]
     named = ", ".join(get_close_matches(expression, in_use, NAMED_MAX))
-    return f"; keys in use like it: {named}" if named else "; `zsim keys` lists the keys in use"
+    return f"; similar keys in use: {named}" if named else "; `zsim keys` lists the keys in use"
 
 
 def readable(sample: ReceivedSample) -> Any:
-    """Return a message as JSON values; one outside of the contract is decoded as far as possible."""
+    """Return a message as JSON values; one outside the contract is decoded as far as possible."""
     try:
         return _plain(messages.decode(sample.key, sample.payload))
     except DecodeError as error:
@@ -89,7 +89,7 @@ def readable(sample: ReceivedSample) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON values: bytes in base64, and as its repr what JSON cannot represent."""
+    """Convert a value to JSON values: bytes to base64, and values that JSON cannot represent to their repr."""
     try:
         return msgspec.to_builtins(value, str_keys=True, enc_hook=repr)
     except messages.REFUSALS:  # for instance a key that is neither text nor a number
@@ -97,7 +97,7 @@ def _plain(value: Any) -> Any:
 
 
 class MessageRate:
-    """How often messages come, in wall and in simulated time, over a window of messages."""
+    """The rate of messages, in wall and in simulated time, over a window of messages."""
 
     def __init__(self, window: int) -> None:
         self._walls: deque[float] = deque(maxlen=window)
@@ -114,7 +114,7 @@ class MessageRate:
         gaps = [b - a for a, b in zip(self._walls, list(self._walls)[1:], strict=False)]
         silent_s = now_s - self._walls[-1]
         if silent_s > max(SILENCE_S, 2 * max(gaps, default=0.0)):
-            return f"nothing for {silent_s:.1f} s, {self.total} messages before"
+            return f"no messages for {silent_s:.1f} s, {self.total} messages before"
         if not gaps:
             return f"{self.total} message"
         wall_hz = len(gaps) / max(1e-9, sum(gaps))
@@ -126,11 +126,11 @@ class MessageRate:
 
 
 def hz(link: Session, expression: str, window: int, seconds: float, emit: Callable[[str], None]) -> int:
-    """Show once a second, and at the end, how often messages come on an expression; return how many came."""
+    """Show the rate of messages on an expression once a second and at the end; return their number."""
     check_expression(expression)
     arrived: deque[tuple[float, bytes]] = deque()
 
-    def arrive(sample: RawSample) -> None:  # in Zenoh's thread, so that a gap is one between messages
+    def arrive(sample: RawSample) -> None:  # called in Zenoh's thread, so that times are those of arrival
         if sample.payload:  # empty: a deletion
             arrived.append((time.monotonic(), sample.payload))
 
@@ -157,7 +157,7 @@ class _Stamp(msgspec.Struct):
 
 
 def _samples(subscription: Subscription, until_s: float) -> Iterator[ReceivedSample]:
-    """Yield what arrives until a wall time; wakes to look at the clock and to let Ctrl-C in."""
+    """Yield samples until a wall time; polls, so that Ctrl-C is handled."""
     while time.monotonic() < until_s:
         arrived = False
         for sample in subscription.drain():
@@ -170,26 +170,26 @@ def _samples(subscription: Subscription, until_s: float) -> Iterator[ReceivedSam
 
 
 class Published(NamedTuple):
-    """What became of commands that were sent by hand."""
+    """The outcome of commands that were sent by hand."""
 
     sent: int
-    refused: int = 0  # how many of them the world refused, as far as its events say
+    refused: int = 0  # number that the world refused, according to its events
     reason: str = ""  # of the first refusal
-    note: str = ""  # why nothing is known of them, empty if it is
+    note: str = ""  # why the outcome is not known, empty if it is
 
 
 def publish(link: Session, info: messages.Info, key: str, text: str, count: int, rate_hz: float) -> Published:
-    """Publish a JSON text as the command of its key, `count` times, and wait for what becomes of it.
+    """Publish a JSON text as a command on its key, `count` times, and wait for the outcome.
 
-    t_ns, seq and source are filled in. RunError where it is no JSON, not the message of that key, or no key of a
-    drone of the run that takes commands.
+    t_ns, seq and source are filled in. RunError if the text is not the key's message in JSON, or the key is not a
+    command of a drone in the run.
     """
     _refuse_wildcards(key, "pub")
     kind = messages.type_of(key)
     if kind is None:
-        raise RunError(f"{key}: is no key of the contract; `zsim keys` lists those in use, docs/protocol.md all")
+        raise RunError(f"{key}: is not a key of the contract; `zsim keys` lists those in use, docs/protocol.md all")
     if not keys.matches(COMMANDS, key):
-        raise RunError(f"{key}: only the process that this is about writes here; must be {COMMANDS.replace('*', '…')}")
+        raise RunError(f"{key}: is written only by its own process; must be {COMMANDS.replace('*', '…')}")
     drones = [drone.name for drone in info.drones]
     if keys.thing(key) not in drones:
         raise RunError(f"{key}: drone is {keys.thing(key)!r}; must be one of {', '.join(drones)}")
@@ -211,12 +211,12 @@ def publish(link: Session, info: messages.Info, key: str, text: str, count: int,
 
 
 def _outcome(events: Subscription, clock: "_Now", gate_ns: int, ours: tuple[str, str], sent: int) -> Published:
-    """Return what the world's events say of commands, once the last has taken effect or was refused."""
+    """Return the outcome of commands from the world's events, once the last has taken effect or was refused."""
     key, source = ours
     accepted, refused, last_ns, reason = 0, 0, 0, ""
     until_s = time.monotonic() + OUTCOME_S
     while True:
-        now_ns = clock.t_ns()  # before the events: what is refused at a gate is said before its clock
+        now_ns = clock.t_ns()  # read before the events: refusals at a gate are published before its clock
         for sample in events.drain():
             with suppress(DecodeError):
                 event: run_messages.Event = messages.decode(keys.EVENT, sample.payload)
@@ -231,13 +231,13 @@ def _outcome(events: Subscription, clock: "_Now", gate_ns: int, ours: tuple[str,
         if time.monotonic() >= until_s:
             now = clock.clock()
             state = now.state if now else "unknown"
-            note = f"the world is {state}; whether it carries them out is known when time goes on"
+            note = f"the world is {state}; the outcome is known only when time continues"
             return Published(sent, min(refused, sent), reason, note)
         time.sleep(PACKET_S)
 
 
 class _Now:
-    """The simulated time, as a sender that takes part in nothing knows it."""
+    """The simulated time, from the published clock."""
 
     def __init__(self, link: Session) -> None:
         self._subscription = link.subscribe(keys.CLOCK)
@@ -259,11 +259,11 @@ def _refuse_wildcards(key: str, command: str) -> None:
 
 
 def _map(what: str, text: str, example: str) -> dict[str, Any]:
-    """Return the map that a JSON text holds; `what` opens the line of a fault."""
+    """Parse a JSON text that must be a map; `what` begins the error line."""
     try:
         fields = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise RunError(f"{what} is no JSON ({error}); must be a map such as '{example}'") from error
+        raise RunError(f"{what} is not JSON ({error}); must be a map such as '{example}'") from error
     if not isinstance(fields, dict):
         raise RunError(f"{what} is {text[:40]!r}; must be a map such as '{example}'")
     try:
@@ -274,9 +274,9 @@ def _map(what: str, text: str, example: str) -> dict[str, Any]:
 
 
 def ask(link: Session, key: str, op: str, text: str) -> Any:
-    """Send a request with the arguments in a JSON text; return its result as JSON can hold it, or raise its refusal."""
+    """Send a request with arguments as JSON text; return its result as JSON values, or raise its refusal."""
     _refuse_wildcards(key, "ask")
     result = result_of(link.request(key, op, ASK, _map(f"{op}: args", text, '{"gates": 50}')))
-    with suppress(DecodeError):  # a replay is the only result that holds messages
+    with suppress(DecodeError):  # only the result of a replay contains messages
         return [{"key": key, "message": readable(ReceivedSample(key, payload))} for key, payload in pairs_of(result)]
     return msgspec.to_builtins(result, str_keys=True)

@@ -1,4 +1,4 @@
-"""The commands that are one role of a federation each."""
+"""The commands that each run one role of a federation."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -30,7 +30,7 @@ def world(
     listen: opt.Listen = None,
     expect: Annotated[list[str] | None, Option(help="Wait for this process too, e.g. recorder.")] = None,
     journal: Annotated[
-        Path | None, Option(help="Folder of the run's journal: started again with it, it goes on.")
+        Path | None, Option(help="Folder of the run's journal, with which a restarted world continues.")
     ] = None,
     all_died: Annotated[bool, Option("--all-died", hidden=True)] = False,
     changed: Annotated[list[str] | None, Option(opt.CHANGED, hidden=True)] = None,
@@ -43,7 +43,7 @@ def world(
     from zsim_deploy.roles import world_role
 
     path, overrides = flight.path, flight.overrides or ()
-    # its launcher has resolved what is flown into the run's folder, and has read it where the modules are
+    # a launcher has written the resolved scenario into the run's folder, and passes the folders of its modules
     modules = plugin.folders() if launched else ()
     loaded = scenario_file.load(
         path, overrides, modules, imports=not launched, seed=flight.seed, duration_s=flight.duration
@@ -116,7 +116,7 @@ def own_agent(
     ] = None,
     name: Annotated[str, Option(help="Process name (default: the class's own).", show_default=False)] = "",
 ) -> None:
-    """Run an agent of your own, a class of a module on PYTHONPATH or in this folder."""
+    """Run your own agent: a class in a module on PYTHONPATH or in this folder."""
     from zsim.schema import plugin
     from zsim_agents.hosting import AgentSpec
     from zsim_deploy.roles import roles
@@ -157,7 +157,7 @@ def router(
     realtime: opt.Realtime = False,
     launched: opt.Launched = None,
 ) -> None:
-    """Run a router: carries the clients of one network to a world, or a router, in another."""
+    """Run a router: connects the clients of one network to a world, or a router, in another."""
     from zsim_deploy.roles import roles
 
     roles.router(name, listen, connect, federation, "realtime" if realtime else "lockstep", launched, who)
@@ -170,7 +170,7 @@ def camera(
     drones: Drones = None,
     name: Annotated[str, opt.process_option("camera.DRONE, camera.main for several")] = "",
 ) -> None:
-    """Draw what the cameras of one drone see, or of several in one process, as JPEG."""
+    """Render the cameras of one drone, or of several in one process, as JPEG."""
     require("camera", opt.CAMERA_NEEDS)
     from zsim_deploy.roles import roles
 
@@ -187,7 +187,7 @@ def detect(
     ] = None,
     name: Annotated[str, opt.process_option("detector.DRONE, detector.main for several")] = "",
 ) -> None:
-    """Find magenta hats in the pictures of one drone, or of several in one process."""
+    """Detect magenta hats in the pictures of one drone, or of several in one process."""
     require("detect", opt.CAMERA_NEEDS)
     from zsim_deploy.roles import roles
 
@@ -203,9 +203,9 @@ def serve_as(
     lowered: bool = False,
     remain: "Remain | None" = None,
 ) -> None:
-    """Serve one run after the other as the process that role, name and thing mean.
+    """Serve one run after the other, as the process named by role, name and thing.
 
-    `lowered`: with lower priority than what the world waits for; `remain`: what is left to do after a launched run.
+    `lowered`: with lower priority than the processes that the world waits for; `remain`: called after a launched run.
     """
     from zsim_deploy.roles import roles
     from zsim_deploy.roles.roles import process_name

@@ -1,4 +1,4 @@
-"""`zsim run` and `validate`; what is done with records: `report`, `sweep`, `export`, `replay`, `rerun`, `bundle`."""
+"""`zsim run`, `validate` and `sweep`; commands on records: `report`, `export`, `replay`, `rerun`, `bundle`."""
 
 import shlex
 import signal
@@ -15,7 +15,6 @@ from typer import Argument, BadParameter, Option
 from zsim.contract.run_messages import RATE_MAX
 from zsim.errors import ZsimError, printable
 from zsim_analysis.export import Format
-from zsim_analysis.report import FORMATS
 from zsim_deploy import INTERRUPTED
 from zsim_deploy import arguments as opt
 from zsim_deploy.arguments import failed, note, require, say
@@ -56,7 +55,7 @@ def run(
     ] = False,
     console: Annotated[bool, Option("--console", help="Show it in the browser, and steer it there.")] = False,
     cameras: Annotated[
-        bool, Option("--cameras", help="Draw what cameras see; front and bottom where no drone has any.")
+        bool, Option("--cameras", help="Render the cameras; front and bottom if no drone has any.")
     ] = False,
     detect: Annotated[bool, Option("--detect", help="Find hats in the cameras' pictures.")] = False,
     agent: Annotated[
@@ -87,14 +86,14 @@ def run(
     shown = RunConsole() if console else None
     if continue_:
         if useless := _given(context, OF_A_NEW_RUN):
-            raise BadParameter(f"--continue goes on as the run was launched; leave out {useless}")
+            raise BadParameter(f"--continue uses the options of the interrupted run; leave out {useless}")
         options = options_of(flight.path)
     else:
         check_endpoint(listen, insecure)
         mode, pace = flight.mode_and_rate()
         scenario = with_cameras(flight.scenario()) if cameras else flight.scenario()
         if in_process:
-            check_plans(scenario, flight.path.name)  # as processes, controllers refuse them
+            check_plans(scenario, flight.path.name)  # otherwise the controllers do
         if agent:
             plugin.search(*plugin.folders(), Path.cwd())
         agents = [AgentSpec.parse(shlex.split(each) or [""]) for each in agent or ()]
@@ -120,13 +119,13 @@ def run(
 
 
 def _given(context: typer.Context, options: Sequence[str]) -> str:
-    """Return which of some options the command line has, as a text; empty if none."""
+    """Return which of some options the command line has, joined by "and"; empty if none."""
     sources = {each.opts[0]: context.get_parameter_source(each.name or "") for each in context.command.params}
     return " and ".join(option for option in options if (source := sources[option]) and source.name == "COMMANDLINE")
 
 
 def conclude(outcome: Any, out: Path, report: bool) -> None:
-    """Print how a run ended, make its report, and end with the exit code for it."""
+    """Print how a run ended, make its report, and exit with the code for it."""
     record, fault = out / "run.mcap", "nothing was recorded"
     if outcome.interrupted:
         note(f"ended: {outcome.reason}")
@@ -159,21 +158,21 @@ def conclude(outcome: Any, out: Path, report: bool) -> None:
 
 
 def _fault_of(complete: bool, state: str, shortfalls: "Sequence[Shortfall]") -> str:
-    """Print whether the record is complete; return what it lacks, or what the flight did not do, empty if nothing."""
+    """Print whether the record is complete; return its fault, or the first one of the flight; empty if none."""
     say(f"record: {state}{f' ({GATE})' if 'gates' in state else ''}")
     lacking = "" if complete else f"the record is {state}"
     return lacking or next((each.text for each in shortfalls if each.fails), "")
 
 
 def note_skipped(names: Sequence[str]) -> None:
-    """Print which code that a document names was found, and not imported."""
+    """Print which modules named by a document were found but not imported."""
     for name in names:
-        note(f"note: {name} was found and not imported; --trust imports it, and checks its parameters")
+        note(f"note: {name} was found but not imported; --trust imports it and checks its parameters")
 
 
 @app.command(rich_help_panel=opt.RUN)
 def validate(scenario: opt.ScenarioPath, set_: opt.Set = None, trust: opt.Trust = False) -> None:
-    """Check a scenario and print what it resolves to; every fault is a line. Code that it names is not run."""
+    """Check a scenario and print it resolved; every fault is one line. Code that it names is not run."""
     from zsim.scenario import scenario_file
     from zsim.scenario.consistency import unflown_plans
     from zsim.schema import plugin
@@ -182,8 +181,8 @@ def validate(scenario: opt.ScenarioPath, set_: opt.Set = None, trust: opt.Trust 
     with plugin.names_only(not trust) as skipped:
         loaded = opt.load_scenario(scenario, set_)
         check_plans(loaded, scenario.name)
-    if modules := [name for name in skipped if ":" not in name]:  # of vehicles and sensors: their numbers are in there
-        note(f"{scenario.name}: the resolved scenario is not printed, since it depends on {', '.join(modules)}")
+    if modules := [name for name in skipped if ":" not in name]:  # they hold parameters of vehicles and sensors
+        note(f"{scenario.name}: the resolved scenario is not printed because it depends on {', '.join(modules)}")
     else:
         print(printable(scenario_file.to_text(loaded)), end="", flush=True)
     for line in unflown_plans(loaded):
@@ -198,23 +197,18 @@ def report(
         list[Path], Argument(metavar="DIR...", help="Folder of a run or a sweep; of several runs, to compare.")
     ],
     out: Annotated[
-        Path | None, Option(help="Page that compares (default compare-NAMES.html beside the first).")
+        Path | None, Option(help="Page that compares runs (default compare-NAMES.html beside the first).")
     ] = None,
-    formats: Annotated[
-        str | None, Option("--format", help="pdf, svg or pdf,svg: figures are written so too.", show_default=False)
-    ] = None,
+    formats: opt.Formats = None,
     trust: opt.Trust = False,
 ) -> None:
-    """Make summary.json, figures and report.html of a run from its record, or of a sweep; or compare several runs."""
+    """Make summary.json, figures and report.html of a run or a sweep; or compare several runs."""
     require("report", opt.REPORT_NEEDS)
     from zsim.output_folder import record_in
     from zsim.schema import plugin
     from zsim_analysis.sweep.design import is_sweep
 
-    wanted = tuple(formats.split(",")) if formats else ()
-    if not set(wanted) <= set(FORMATS):
-        allowed = f"{' or '.join(FORMATS)}, or both with a comma between"
-        raise BadParameter(f"--format is {formats!r}; must be {allowed}")
+    wanted = opt.figure_formats(formats)
     with plugin.names_only(not trust) as skipped:
         if len(directories) > 1:
             from rich.console import Console
@@ -224,15 +218,14 @@ def report(
 
             for directory in directories:
                 if is_sweep(directory):
-                    why = "runs can be compared, a sweep has a report of its own"
-                    raise BadParameter(f"{directory} is a sweep; {why}")
+                    raise BadParameter(f"{directory} is a sweep; only runs can be compared")
                 record_in(directory)
             page = out or comparison_path(directories)
             with Console(stderr=True).status("reading the records …") as status:
                 compare(directories, page, lambda text: status.update(cell(text)), wanted)
             say(f"report: {page}")
         elif out is not None:
-            raise BadParameter("--out is for the page that compares several runs; leave it out")
+            raise BadParameter("--out is for the comparison of several runs; leave it out")
         else:
             if not is_sweep(directories[0]):
                 record_in(directories[0])
@@ -241,22 +234,30 @@ def report(
 
 
 def _report(folder: Path, formats: Sequence[str] = ()) -> str:
-    """Make the report of a run or of a sweep, and print its table; return what the run did not do, or lacks."""
+    """Make the report of a run or a sweep, and print its table; return the fault of a run as `_fault_of`."""
     from rich.console import Console
 
     from zsim.runtime.progress import PipedConsole, cell
     from zsim_analysis.sweep.design import is_sweep
 
-    if is_sweep(folder):
-        from zsim_analysis.sweep.sweep_report import make_sweep_report as make
-        from zsim_analysis.sweep.sweep_report import terminal_text
-    else:
-        from zsim_analysis.report.make_report import make_report as make
-        from zsim_analysis.report.summary import terminal_text
+    summary = None
     with Console(stderr=True).status("reading …") as status:
-        summary: Any = make(folder, lambda text: status.update(cell(text)), formats)
-    PipedConsole().print(terminal_text(summary))
-    fault = "" if is_sweep(folder) else _fault_of(summary.record.complete, summary.record.state, summary.shortfalls)
+
+        def progress(text: str) -> None:
+            status.update(cell(text))
+
+        if is_sweep(folder):
+            from zsim_analysis.sweep.sweep_report import TerminalText, make_sweep_report
+
+            shown: Any = TerminalText(make_sweep_report(folder, progress, formats))
+        else:
+            from zsim_analysis.report.make_report import make_report
+            from zsim_analysis.report.summary import terminal_text
+
+            summary = make_report(folder, progress, formats)
+            shown = terminal_text(summary)
+    PipedConsole().print(shown)
+    fault = _fault_of(summary.record.complete, summary.record.state, summary.shortfalls) if summary else ""
     say(f"report: {folder / 'report.html'}")
     return fault
 
@@ -279,13 +280,13 @@ def sweep(
     out: Annotated[
         Path | None, Option(help="Folder (default runs/NAME-sweep-TIME); an unfinished one is continued.")
     ] = None,
-    workers: Annotated[int | None, Option(min=1, max=1024, help="Processes (default: one per core).")] = None,
+    workers: opt.Workers = None,
     dask: Annotated[str | None, Option(help="Scheduler of a Dask cluster that flies the runs instead.")] = None,
     keep_records: Annotated[bool, Option("--keep-records", help="Keep the record of every run.")] = False,
     report: opt.Report = True,
     force: Annotated[bool, Option("--force", help="Sweep into a folder that holds other files, too.")] = False,
 ) -> None:
-    """Fly a scenario many times, with other seeds and values of its fields: one table, one report."""
+    """Fly a scenario many times with different seeds and values of its fields: one table, one report."""
     if dask is not None and (keep_records or workers is not None):
         useless = "--keep-records" if keep_records else "--workers"
         raise BadParameter(f"{useless} is for processes of this host; leave it out, or --dask")
@@ -304,7 +305,7 @@ def sweep(
     try:
         rows = flown(plan, folder, workers, dask, force)
     except KeyboardInterrupt:
-        note(f"interrupted; the same command with --out {folder} goes on, the table so far is in it")
+        note(f"interrupted; the same command with --out {folder} continues; the table so far is in it")
         sys.exit(INTERRUPTED)
     failures = [row["failure"] for row in rows if row["failure"]]
     short = [row["shortfall"] for row in rows if row.get("shortfall") and not row["failure"]]
@@ -312,7 +313,7 @@ def sweep(
 
 
 def _conclude(folder: Path, failures: list[str], runs: int, report: bool, short: Sequence[str] = ()) -> None:
-    """Make the report, and fail if a run did not end well, or none flew its plan."""
+    """Make the report, and fail if a run did not end well, or none followed its plan."""
     if report:
         _report(folder)
     say(f"table: {folder / 'sweep.parquet'}")
@@ -339,13 +340,13 @@ def export(
     ] = None,
     force: Annotated[bool, Option("--force", help="Replace an earlier export.")] = False,
     by_name: Annotated[
-        bool, Option("--by-name", help="One table per drone, cluster and process, in each of which time increases.")
+        bool, Option("--by-name", help="One table per drone, cluster and process, each ordered by time.")
     ] = False,
     trust: opt.Trust = False,
 ) -> None:
     """Write the record of a run as tables, for MATLAB, or for Foxglove and Rerun."""
     if by_name and form not in (Format.CSV, Format.PARQUET):
-        raise BadParameter("--by-name is for tables; leave it out, or say --format csv or parquet")
+        raise BadParameter("--by-name is for tables; leave it out, or give --format csv or parquet")
     require("export", {"export": ("mcap", "zstandard", WRITERS[form])})
     from rich.console import Console
     from rich.progress import Progress
@@ -363,7 +364,7 @@ def export(
 
     shown = Progress(console=console, transient=True, disable=not console.is_terminal)
     with interruptible(), plugin.names_only(not trust) as skipped, shown as bar:
-        task = bar.add_task("looking through the record", total=None)
+        task = bar.add_task("scanning the record", total=None)
 
         def advance(count: int, of: int) -> None:
             bar.update(task, description="reading messages", completed=count, total=of)
@@ -383,7 +384,7 @@ def replay(
     who: "Identity",
     directory: opt.Recorded,
     rate: Annotated[
-        float, Option(callback=opt.between(0, RATE_MAX), help="Simulated per wall second; 0 = as fast as it goes.")
+        float, Option(callback=opt.between(0, RATE_MAX), help="Simulated per wall second; 0 = as fast as possible.")
     ] = 1.0,
     from_: opt.From = 0.0,
     to: opt.To = None,
@@ -392,9 +393,9 @@ def replay(
         list[str] | None,
         Option(help="Begin when this process has joined, e.g. estimator.drone1, console.1. Repeatable."),
     ] = None,
-    paused: Annotated[bool, Option("--paused", help="Stand at the first instant until asked to resume.")] = False,
+    paused: Annotated[bool, Option("--paused", help="Pause at the first instant until asked to resume.")] = False,
     console: Annotated[
-        bool, Option("--console", help="Show it in the browser, with a timeline; stand still at its end.")
+        bool, Option("--console", help="Show it in the browser, with a timeline; pause at its end.")
     ] = False,
     listen: opt.Listen = None,
     federation: Annotated[str | None, Option(help="Name of the federation (default the record's).")] = None,
@@ -426,12 +427,12 @@ def bundle(
         Path | None, Option("--out", "-o", help="File (default NAME.zsim of the scenario).", show_default=False)
     ] = None,
     no_record: Annotated[
-        bool, Option("--no-record", help="Leave the record out: much smaller; what differs is then known by gate only.")
+        bool, Option("--no-record", help="Omit the record: much smaller, but differences are known only by gate.")
     ] = False,
     force: Annotated[bool, Option("--force", help="Replace the file.")] = False,
     trust: opt.Trust = False,
 ) -> None:
-    """Put a flight into one file, with all that flying it again on another machine needs."""
+    """Pack a flight into one file, with all that is needed to fly it again on another machine."""
     require("bundle", BUNDLE_NEEDS)
     from rich.console import Console
 
@@ -444,7 +445,7 @@ def bundle(
     with plugin.names_only(not trust) as skipped, Console(stderr=True).status("reading the record …"):
         written = make_bundle(run, out, not no_record, force, note)
     for name in skipped:
-        note(f"note: {name} was found and not imported; --trust imports it, for the errors in its figures")
+        note(f"note: {name} was found but not imported; --trust imports it, for the errors in its figures")
     say(f"{written.path}: {written.size_bytes / 1e6:.1f} MB, SHA-256 {written.sha256}")
 
 
@@ -458,22 +459,22 @@ def rerun(
     ] = False,
     trust: opt.Trust = False,
     install: Annotated[
-        bool, Option("--install", help="Of a bundle: in an environment with its versions of packages, made for it.")
+        bool, Option("--install", help="For a bundle: fly it in a new environment with its package versions.")
     ] = False,
     python: Annotated[
         Path | None, Option("--python", help="Python of that environment (default: this one).", show_default=False)
     ] = None,
 ) -> None:
-    """Fly a run again, of a record or a bundle, and print whether all is the same; exit code 0 or 1."""
+    """Fly the run of a record or a bundle again, and print whether it is identical; exit code 0 or 1."""
     require("rerun", opt.FLIGHT_NEEDS)
     from zsim.schema import plugin
     from zsim_analysis.bundle.bundle_file import is_bundle
 
     is_one = is_bundle(place)
     if (install or python) and not is_one:
-        raise BadParameter(f"--install is for a bundle, and {place} is none; leave it out")
+        raise BadParameter(f"--install is for a bundle, and {place} is not one; leave it out")
     if python and not install:
-        raise BadParameter("--python is for the environment that --install makes; leave it out, or say --install")
+        raise BadParameter("--python is for the environment that --install makes; leave it out, or give --install")
     with plugin.names_only(not trust):
         if install:
             from zsim_deploy.environment import rerun_in_environment

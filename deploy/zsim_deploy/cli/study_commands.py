@@ -1,6 +1,6 @@
-"""Studies of many flights: `zsim hunt` searches, `zsim board` compares.
+"""Studies of many flights.
 
-hunt     searches for the flight that breaks a requirement, and leaves the least of it
+hunt     searches for a flight that breaks a requirement, and reduces it to the essential
 board    compares formation laws in the same scenarios
 """
 
@@ -14,14 +14,13 @@ from typing import Annotated
 import typer
 from typer import BadParameter, Option
 
-from zsim_analysis.report import FORMATS
 from zsim_deploy import INTERRUPTED
 from zsim_deploy import arguments as opt
 from zsim_deploy.arguments import failed, note, require, say
 from zsim_deploy.cli.run_commands import SWEEP_NEEDS
 
-BUDGET_S = 600.0  # where neither it nor flights are given
-MOST = 3  # faults of one flight, chosen: failures of software seldom need more conditions
+BUDGET_S = 600.0  # if neither --budget nor --flights is given
+MOST = 3  # faults of one flight, chosen: software failures seldom need more conditions
 
 app = typer.Typer()
 
@@ -37,23 +36,25 @@ def hunt(
     flights: Annotated[int | None, Option(min=1, max=10**9, help="Flights of the search.", show_default=False)] = None,
     fault: Annotated[
         list[str] | None,
-        Option(help="A kind that is drawn, and within what: 'gust velocity_m_s=1..6' (default all). Repeatable."),
+        Option(help="A kind to draw, and its ranges: 'gust velocity_m_s=1..6' (default all). Repeatable."),
     ] = None,
-    without: Annotated[list[str] | None, Option(help="A kind that is not drawn. Repeatable.")] = None,
+    without: Annotated[list[str] | None, Option(help="A kind not to draw. Repeatable.")] = None,
     most: Annotated[int, Option(min=0, max=6, help="Faults in one flight.")] = MOST,
     vary: Annotated[
         list[str] | None,
         Option(help="a.b.c=uniform(low,high), … as of a sweep (default wind.gust_m_s=uniform(0,2)). Repeatable."),
     ] = None,
-    draws: Annotated[int, Option("--draws", min=0, max=2**62, help="Seed of what is drawn.")] = 1,
+    draws: Annotated[int, Option("--draws", min=0, max=2**62, help="Seed of the draws.")] = 1,
     set_: opt.Set = None,
     seed: opt.Seed = None,
     duration: opt.Duration = None,
     out: Annotated[Path | None, Option(help="Folder (default runs/NAME-hunt-TIME).", show_default=False)] = None,
-    workers: Annotated[int | None, Option(min=1, max=1024, help="Processes (default: one per core).")] = None,
-    force: Annotated[bool, Option("--force", help="Replace an earlier hunt; take a folder with other files.")] = False,
+    workers: opt.Workers = None,
+    force: Annotated[
+        bool, Option("--force", help="Replace an earlier hunt; accept a folder with other files.")
+    ] = False,
 ) -> None:
-    """Search for faults, wind and delays that break a requirement, and shrink them; exit code 1 where one is found."""
+    """Search for faults, wind and delays that break a requirement, and shrink them; exit code 1 if any are found."""
     require("hunt", SWEEP_NEEDS)
     from rich.console import Console
 
@@ -120,16 +121,14 @@ def board(
     out: Annotated[
         Path | None, Option("--out", "-o", help="Folder (default runs/board-TIME); an unfinished one is continued.")
     ] = None,
-    workers: Annotated[int | None, Option(min=1, max=1024, help="Processes (default: one per core).")] = None,
-    formats: Annotated[
-        str | None, Option("--format", help="pdf, svg or pdf,svg: figures are written so too.", show_default=False)
-    ] = None,
+    workers: opt.Workers = None,
+    formats: opt.Formats = None,
     force: Annotated[bool, Option("--force", help="Use a folder that holds other files, too.")] = False,
     papers: Annotated[
-        bool, Option("--papers", help="Fly nothing: compute figures of the laws' papers again, numbers side by side.")
+        bool, Option("--papers", help="Instead of flying, reproduce figures of the laws' papers and compare numbers.")
     ] = False,
 ) -> None:
-    """Fly formation laws in the same scenarios, with the same seeds and sensors: one table, with figures."""
+    """Fly formation laws in the same scenarios with the same seeds and sensors: one table, with figures."""
     require("sweep", SWEEP_NEEDS)
     from rich.console import Console
 
@@ -150,9 +149,7 @@ def board(
     from zsim_analysis.board.board_report import make_board_report, terminal_text
     from zsim_analysis.board.entries import LAW_NAMES, chosen, scenario_names
 
-    wanted = tuple(formats.split(",")) if formats else ()
-    if not set(wanted) <= set(FORMATS):
-        raise BadParameter(f"--format is {formats!r}; must be {' or '.join(FORMATS)}, or both with a comma between")
+    wanted = opt.figure_formats(formats)
     folder = out or Path("runs") / f"board-{time.strftime('%Y%m%d-%H%M%S')}"
     request = BoardRequest(
         chosen(laws, LAW_NAMES, "--laws", open_to_classes=True),
@@ -166,7 +163,7 @@ def board(
     try:
         rows = fly_board(request)
     except KeyboardInterrupt:
-        note(f"interrupted; the same command with --out {folder} goes on")
+        note(f"interrupted; the same command with --out {folder} continues")
         sys.exit(INTERRUPTED)
     with Console(stderr=True).status("drawing …") as status:
         made = make_board_report(request, rows, lambda text: status.update(cell(text)), wanted)

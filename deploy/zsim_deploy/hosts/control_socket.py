@@ -21,30 +21,30 @@ from zsim.output_folder import no_locks, take_lock
 from zsim_deploy.arguments import note
 
 REQUEST_S = 5.0  # from the same machine
-ANSWER_S = 150.0  # a move connects to a host, asks it about itself, and brings a certificate: 135 s at most
+ANSWER_S = 150.0  # a move connects to a host, checks it, and copies a certificate: 135 s at most
 LINE_MAX = 1_000_000  # bytes
-PATH_MAX = 107  # bytes of a socket's path; unix(7), without the last zero. macOS has 103, and its error says so
+PATH_MAX = 107  # bytes of a socket's path, without the final zero; unix(7). On macOS 103, and its error says so
 
 Act = Callable[..., Any]
 
 
 def place(federation: str) -> Path:
-    """Return where the launcher of a federation listens; only its user may connect. RunError on Windows."""
+    """Return the socket of a federation's launcher; only its user may connect. RunError on Windows."""
     if not hasattr(socket, "AF_UNIX") or not hasattr(os, "getuid"):
-        raise RunError("this system has no Unix sockets with owners, by which launchers are reached; use Linux or WSL")
+        raise RunError("launchers are reached by Unix sockets with owners, which this system lacks; use Linux or WSL")
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     folder = Path(runtime) / "zsim" if runtime else Path(tempfile.gettempdir()) / f"zsim-{os.getuid()}"
     return folder / f"{federation}.sock"
 
 
 def launchers() -> list[str]:
-    """Return the names under which this user's launchers listen here; what killed ones left is removed."""
+    """Return the names of this user's launchers on this machine; remove the sockets of killed ones."""
     found = []
     for path in sorted(place("").parent.glob("*.sock")):
         _, is_of_run, pid = path.stem.partition("@")
         try:
             if is_of_run:
-                os.kill(int(pid), 0)  # fails if it does not live
+                os.kill(int(pid), 0)  # fails if there is no such process
             found.append(path.stem)
         except (OSError, ValueError):
             path.unlink(missing_ok=True)
@@ -53,7 +53,7 @@ def launchers() -> list[str]:
 
 
 def ask(federation: str, op: str, **args: Any) -> Any:
-    """Ask the launcher of a federation on this machine; RunError if none is up, or it does not answer, or refuses."""
+    """Send a request to a federation's launcher on this machine; RunError if none runs, answers or accepts it."""
     path = place(federation)
     with socket.socket(socket.AF_UNIX) as line:
         line.settimeout(ANSWER_S)
@@ -77,7 +77,7 @@ def ask(federation: str, op: str, **args: Any) -> Any:
 
 @contextlib.contextmanager
 def seen_by_ps(federation: str, status: Callable[[], dict[str, Any]]) -> Iterator[None]:
-    """Let `zsim ps` see a run of this process while it lasts; a machine without a place to listen goes without."""
+    """Show a run of this process in `zsim ps` for the duration of the block, if this machine allows a socket."""
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(RunError):
             name = f"{federation}@{os.getpid()}"  # there may be several of a federation
@@ -86,10 +86,10 @@ def seen_by_ps(federation: str, status: Callable[[], dict[str, Any]]) -> Iterato
 
 
 class ControlSocket:
-    """The launcher's end. RunError if another launcher of the federation runs here, or there is no place to listen.
+    """The launcher's end. RunError if another launcher of the federation runs here, or no socket can be opened.
 
     Args:
-        acts: by name; each is called in a thread, with the request's arguments, and returns what JSON can hold.
+        acts: by name; each is called in a thread, with the request's arguments, and returns a JSON value.
     """
 
     def __init__(self, federation: str, acts: dict[str, Act]) -> None:
@@ -107,7 +107,7 @@ class ControlSocket:
                 f"federation {federation!r} is up already on this machine; end it with "
                 f"`zsim down --federation {federation}`, or fly in another one: --set federation=NAME"
             )
-        if "@" not in path.stem and (warning := no_locks(path.parent)):  # a run has a name of its own
+        if "@" not in path.stem and (warning := no_locks(path.parent)):  # the name of a single run is unique
             note(warning)
         self._socket = socket.socket(socket.AF_UNIX)
         try:
@@ -143,14 +143,14 @@ class ControlSocket:
                 inspect.signature(act).bind(**args)
             except (ValueError, KeyError, TypeError) as error:
                 other = "is `zsim up` of another version?"
-                answer["error"] = f"it is no request of zsim {__version__} ({error}); {other}"
+                answer["error"] = f"it is not a request of zsim {__version__} ({error}); {other}"
             else:
                 try:
                     answer = {"ok": True, "result": act(**args)}
                 except (ZsimError, TimeoutError) as error:
                     answer["error"] = str(error) or "it took too long"
                 except Exception as error:
-                    answer["error"] = f"it failed by a fault of zsim: {error!r}"
+                    answer["error"] = f"an internal error of zsim: {error!r}"
             connection.sendall(json.dumps(answer).encode() + b"\n")
 
     def close(self) -> None:
@@ -160,7 +160,7 @@ class ControlSocket:
         self._path.unlink(missing_ok=True)
         self._thread.join(1.0)
         os.close(self._lock)
-        if "@" in self._path.stem:  # of one run: no other launcher waits for its lock
+        if "@" in self._path.stem:  # of a single run: no other launcher uses its lock
             self._path.with_suffix(".lock").unlink(missing_ok=True)
 
     def __enter__(self) -> "ControlSocket":
@@ -175,6 +175,6 @@ def _refuse_if_foreign(folder: Path) -> None:
     status = folder.lstat()
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
         raise RunError(
-            f"{folder}: is not a folder that is yours alone (owner {status.st_uid}, mode {status.st_mode & 0o777:o}); "
-            f"must be of user {os.getuid()} with mode 700; remove it, or set XDG_RUNTIME_DIR to a folder of yours"
+            f"{folder}: is not your private folder (owner {status.st_uid}, mode {status.st_mode & 0o777:o}); "
+            f"must belong to user {os.getuid()} with mode 700; remove it, or set XDG_RUNTIME_DIR to a folder of yours"
         )

@@ -1,4 +1,4 @@
-"""`zsim doctor`: whether the hosts of an inventory can fly together; nothing is started on them."""
+"""`zsim doctor`: check whether the hosts of an inventory can fly together, without starting a run."""
 
 import asyncio
 import time
@@ -17,18 +17,18 @@ from zsim_deploy.hosts.host_plan import leftovers, port_in_use
 from zsim_deploy.inventory import InventoryFile
 
 CLOCK_OFFSET_MAX_S = 1.0  # certificates are back-dated by a day and logs are compared; time on the wire is simulated
-LOAD_MAX = 0.5  # of the cores; a busy host slows all the others in lockstep
-FREE_MIN_BYTES = 1_000_000_000  # a run of an hour with three drones records about this
+LOAD_MAX = 0.5  # share of the cores; a busy host slows all the others in lockstep
+FREE_MIN_BYTES = 1_000_000_000  # about the record of an hour with three drones
 BITS_PER_S_MIN = 10e6  # three drones in realtime send 2 Mbit/s to a recorder; lockstep goes as fast as the link
 PERFORMANCE = {"performance"}
 ABOUT_S = 20.0  # wall time to answer; a small computer takes 5 s to import numpy
-READY_S = 20.0  # wall time to listen; as long as to import numpy
-REACH_S = 60.0  # wall time to measure a path; 9 pings and at most 9 bulks take 40 s at a round trip of 2 s
+READY_S = 20.0  # wall time to listen, which includes importing numpy
+REACH_S = 60.0  # wall time to measure a path; 9 pings and at most 9 bulk transfers take 40 s at a round trip of 2 s
 NO_MODULE = "no module named"  # in Python's error, in lower case
 NO_PROGRAM = ("not found", "no such file")  # in the errors of shells, in lower case …
-NO_PROGRAM_CODES = (126, 127)  # … and the codes with which they end; POSIX, 2.8.2
-NEEDED_TO_COMPUTE = "scipy"  # without it a host runs no world and no agent; a router, or a recorder, does without
-OFFSET_ASKS = 3  # the answer with the shortest round trip gives the clock's offset best
+NO_PROGRAM_CODES = (126, 127)  # … and their exit codes; POSIX, 2.8.2
+NEEDED_TO_COMPUTE = "scipy"  # needed by world and agents; a router or a recorder runs without it
+OFFSET_ASKS = 3  # the answer with the shortest round trip gives the best estimate of the clock offset
 HOST_COLUMNS = (
     Column("host", "name"),
     Column("python", worth=3),
@@ -50,12 +50,12 @@ PATH_COLUMNS = (
 
 
 class HostReport(NamedTuple):
-    """The facts of a host by its own probe, and what asking it showed."""
+    """The facts that a host's probe reports, and measurements of the link to it."""
 
     facts: dict[str, Any]
     round_trip_s: float
-    clock_offset_s: float  # its wall clock minus ours, good to half the round trip
-    remedy: str = "run `zsim push --hosts FILE`"  # how it gets another zsim
+    clock_offset_s: float  # its wall clock minus ours, accurate to half the round trip
+    remedy: str = "run `zsim push --hosts FILE`"  # how another zsim is installed there
 
 
 class NetworkPath(NamedTuple):
@@ -66,7 +66,7 @@ class NetworkPath(NamedTuple):
 
 
 class CheckResult(NamedTuple):
-    """What is to be shown of the hosts, and what is wrong with them, a line each."""
+    """Tables on the hosts, and their faults and warnings, a line each."""
 
     tables: list[FittedTable]
     faults: list[str]
@@ -74,7 +74,7 @@ class CheckResult(NamedTuple):
 
 
 def check_hosts(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
-    """Check certificates and hosts; with a placement also the paths to where the world and the routers listen."""
+    """Check certificates and hosts; with a placement also the network paths to the world and the routers."""
 
     async def check() -> tuple[list[FittedTable], list[str], list[str]]:
         links = {name: HostLink(name, host, placed.folder) for name, host in placed.inventory.hosts.items()}
@@ -108,8 +108,8 @@ def check_hosts(placed: InventoryFile, places: dict[str, str] | None) -> CheckRe
 
 
 async def host_report(link: HostLink, python: str, hosts: str = "FILE") -> HostReport:
-    """Ask a host about itself; HostsError if it has no zsim, or cannot be asked. `hosts`: the inventory's path."""
-    push = f"run `zsim push --hosts {hosts}`"  # which leaves a zsim with a Python of its own alone
+    """Ask a host about itself; HostsError if it has no zsim or cannot be reached. `hosts`: the inventory's path."""
+    push = f"run `zsim push --hosts {hosts}`"  # has no effect on a host with a `python` of its own
     remedy = f"install it there, or leave hosts.{link.name}.python out and {push}" if link.host.python else push
     answers: list[tuple[float, float]] = []  # round trip of a line and the clock's offset, in seconds
     try:
@@ -133,7 +133,7 @@ def _probe_fault(link: HostLink, python: str, remedy: str, error: ProgramEndedEr
     if error.status not in NO_PROGRAM_CODES and not any(sign in text for sign in NO_PROGRAM):
         return f"{python}: the probe ended with code {error.status} ({why}); is it a Python that has zsim?"
     if link.host.python:
-        return f"python {python} is no program there ({why}); correct hosts.{link.name}.python, or {remedy}"
+        return f"python {python} is not a program there ({why}); correct hosts.{link.name}.python, or {remedy}"
     return f"has no zsim in {link.host.folder}; {remedy}"
 
 
@@ -167,7 +167,7 @@ def compare_reports(reports: dict[str, HostReport]) -> tuple[list[str], list[str
 
 
 def _different_fingerprints(reports: dict[str, HostReport]) -> Iterator[str]:
-    """Yield a warning of different fingerprints, with the parts that differ."""
+    """Yield a warning if fingerprints differ, with the parts that differ."""
     prints = {name: report.facts["fingerprint"] for name, report in reports.items()}
     if len(set(prints.values())) < 2:
         return
@@ -181,11 +181,11 @@ def _different_fingerprints(reports: dict[str, HostReport]) -> Iterator[str]:
 
 
 def _lacking(reports: dict[str, HostReport]) -> Iterator[str]:
-    """Yield a warning for each host without a package with which others compute: it is slower, with the same bits."""
+    """Yield a warning for each host that lacks a package other hosts compute with: it is slower, with the same bits."""
     for name, report in reports.items():
         others = {part for each in reports.values() for part in each.facts["machine"]}
         if lacking := " and ".join(sorted(others - set(report.facts["machine"]))):
-            yield f"{name}: has no {lacking}, with which others compute; {report.remedy}"
+            yield f"{name}: has no {lacking}, which other hosts compute with; {report.remedy}"
 
 
 def hosts_table(reports: Mapping[str, HostReport]) -> FittedTable:
@@ -200,7 +200,7 @@ def hosts_table(reports: Mapping[str, HostReport]) -> FittedTable:
 async def network_paths(
     links: Sequence[HostLink], target: HostLink, python: dict[str, str], port: int
 ) -> list[NetworkPath]:
-    """Return how the hosts reach a port of another, on which nothing else may listen."""
+    """Measure how hosts reach a port of another host; no other program may listen on it."""
 
     async def reach(link: HostLink) -> dict[str, Any]:
         try:
@@ -220,18 +220,18 @@ async def network_paths(
 
 
 def path_faults(paths: Sequence[NetworkPath]) -> tuple[list[str], list[str]]:
-    """Return the paths that do not exist, and those that are slow, a line each."""
+    """Return a line for each path that is blocked, and for each that is slow."""
     faults, slow = [], []
     for path in paths:
         why, taken = path.figures.get("error"), path.figures.get("taken")
         if why is None:
             if path.figures["bits_per_s"] < BITS_PER_S_MIN:
                 shown = f"{path.figures['bits_per_s'] / 1e6:.1f} Mbit/s"
-                slow.append(f"{path.source} reaches {path.target} at {shown} only")
+                slow.append(f"{path.source} reaches {path.target} at only {shown}")
         elif taken:
             faults.append(port_in_use(path.target, path.port))
         elif taken is False:
-            fault = f"nothing may listen on port {path.port} there ({why}); give another port in the inventory"
+            fault = f"port {path.port} there cannot be listened on ({why}); give another port in the inventory"
             faults.append(f"{path.target}: {fault}")
         else:
             fault = f"port {path.port} of {path.target} cannot be reached ({why}); is it open in the firewall?"

@@ -1,6 +1,6 @@
-"""The launcher's way to the hosts of an inventory: ssh connections, commands and programs on them, files both ways.
+"""Access to the hosts of an inventory over ssh: connections, commands, long-lived programs, and file transfer.
 
-Every failure is one line: host, what failed, what to do. All connections live on one event loop in a thread of its own
+Every failure is one line: host, what failed, what to do. All connections belong to one event loop in its own thread
 (`EventLoopThread`), so that the supervisor of a run stays a plain loop.
 """
 
@@ -27,16 +27,16 @@ from zsim.errors import HostsError, ZsimError
 from zsim_deploy.inventory import SSH_PORT, Host, InventoryFile
 
 CONNECT_S = 10.0  # wall time; a host on a poor link answers within a few round trips
-KEEPALIVE_S = 15.0  # asked when nothing came for so long …
-KEEPALIVE_COUNT = 4  # … and given up after a minute: a link that is cut for 20 s keeps its connection
-ECHO_S = 0.5  # how often a line goes to the host and back
-RETRY_S = 0.5  # between two attempts to connect again
+KEEPALIVE_S = 15.0  # a keepalive is sent after this long without data …
+KEEPALIVE_COUNT = 4  # … and the connection given up after a minute: it survives an outage of 20 s
+ECHO_S = 0.5  # interval at which a line is echoed by the host
+RETRY_S = 0.5  # between two attempts to reconnect
 CLOSE_S = 1.0  # how long a connection may take to close; a cut one never does
 ANSWER_S = 10.0  # how long a short command may take; a host on a poor link answers within a few round trips
-CHANNELS = 8  # kept open on one connection; sshd allows 10 (MaxSessions of sshd_config(5)), and a closed one goes later
-OPEN_S = 10.0  # until the host lets us read; a few round trips of a poor link
-STALL_S = 20.0  # without anything more the host is taken for lost; TCP repeats within that what a poor link loses
-BLOCK_BYTES = 32_768  # asked for at once; even at 100 kbit/s one comes within 3 s
+CHANNELS = 8  # open on one connection; sshd allows 10 (MaxSessions of sshd_config(5)), and counts closed ones a while
+OPEN_S = 10.0  # until SFTP is open; a few round trips of a poor link
+STALL_S = 20.0  # after this long without data the host is considered lost; TCP retransmits well within that
+BLOCK_BYTES = 32_768  # requested at once; even at 100 kbit/s one arrives within 3 s
 
 Result = TypeVar("Result")
 Connection = asyncssh.SSHClientConnection
@@ -49,7 +49,7 @@ class EventLoopThread:
         self._thread.start()
 
     def call(self, work: Coroutine[Any, Any, Result], timeout_s: float | None = None) -> Result:
-        """Run a coroutine to its end and return its result; TimeoutError, and it is cancelled, if it takes longer."""
+        """Run a coroutine and return its result; TimeoutError, after cancelling it, if it takes longer."""
         future = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return future.result(timeout_s)
@@ -64,7 +64,7 @@ class EventLoopThread:
         self._loop.call_soon_threadsafe(act, *args)
 
     def close(self) -> None:
-        """Cancel what runs, and end the thread."""
+        """Cancel the running tasks and end the thread."""
 
         async def cancel_all() -> None:
             others = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
@@ -80,19 +80,19 @@ class EventLoopThread:
 
 
 class HostLink:
-    """One host; more connections are opened to it as one has no room for another channel."""
+    """One host; further connections are opened to it when all channels of one are in use."""
 
     def __init__(self, name: str, host: Host, base: Path) -> None:
         self.name = name
         self.host = host
-        self.round_trip_s = 0.0  # of the last line that came back
-        self.answered_s = 0.0  # monotonic time of it; 0 before the first
-        self._base = base  # folder of the inventory, from which relative paths count
-        self._channels: dict[Connection, int] = {}  # in use, by connection
+        self.round_trip_s = 0.0  # of the last echoed line
+        self.answered_s = 0.0  # monotonic time of that; 0 before the first
+        self._base = base  # folder of the inventory, to which relative paths refer
+        self._channels: dict[Connection, int] = {}  # number in use, by connection
         self._lock = asyncio.Lock()
 
     async def open(self) -> Connection:
-        """Return a connection with room for one more short use; HostsError if the host does not let us in."""
+        """Return a connection with a free channel; HostsError if the host cannot be logged into."""
         async with self._lock:
             for connection, channels in list(self._channels.items()):
                 if connection.is_closed():
@@ -105,7 +105,7 @@ class HostLink:
 
     @contextlib.asynccontextmanager
     async def channel(self, retry: bool = False) -> AsyncIterator[Connection]:
-        """Yield a connection for one channel; `retry`: try until the host is there, else raise as `open` does."""
+        """Yield a connection for one channel; `retry`: try until the host is reached, else raise as `open` does."""
         while True:
             try:
                 connection = await self.open()
@@ -124,9 +124,9 @@ class HostLink:
     async def run(
         self, command: str, stdin: bytes = b"", timeout_s: float = ANSWER_S, what: str = "", retry: bool = False
     ) -> bytes:
-        """Return what a line of a POSIX shell prints; HostsError with its last line if it fails or takes too long.
+        """Return the output of a POSIX shell command; HostsError with its last line if it fails or takes too long.
 
-        `what` it does, for errors; `retry`: try until the host is there, the time counts from then.
+        `what`: what it does, for errors; `retry`: try until the host is reached; the time counts from then.
         """
         async with self.channel(retry) as connection:
             try:
@@ -146,9 +146,9 @@ class HostLink:
     async def put_files(
         self, folder: str, files: Mapping[str, bytes], timeout_s: float = ANSWER_S, retry: bool = False
     ) -> None:
-        """Write files, by path below a folder, readable by their owner alone: all, or none where the link breaks.
+        """Write files, by path below a folder, readable by their owner alone; none if the link breaks.
 
-        Raises HostsError if they cannot be written.
+        HostsError if they cannot be written.
         """
         packed = io.BytesIO()
         with tarfile.open(fileobj=packed, mode="w", format=tarfile.USTAR_FORMAT) as tar:
@@ -164,7 +164,7 @@ class HostLink:
         await self.run(script, archive, timeout_s, what=f"writing into {folder}", retry=retry)
 
     async def measure_round_trips(self) -> None:
-        """Send a line there and back indefinitely, so that a lost host is noticed within a second."""
+        """Have the host echo a line again and again, so that a lost host is noticed within a second."""
         while True:
             with contextlib.suppress(HostsError, asyncssh.Error, OSError):
                 async with self.channel() as connection, connection.create_process("cat", encoding="utf-8") as mirror:
@@ -182,7 +182,7 @@ class HostLink:
         return max(0.0, time.monotonic() - self.answered_s - ECHO_S) if self.answered_s else 0.0
 
     async def close(self) -> None:
-        """Close all connections; what still runs there on their pipes ends by itself."""
+        """Close all connections; programs that still run on their pipes end by themselves."""
         for connection in self._channels:
             connection.close()
         closed = asyncio.gather(*(each.wait_closed() for each in self._channels), return_exceptions=True)
@@ -200,10 +200,10 @@ class HostLinks:
     def __init__(self, placed: InventoryFile, names: Iterable[str], loop: EventLoopThread) -> None:
         self._placed = placed
         self._loop = loop
-        self.by_name = {name: self.to(name) for name in names}  # a new one when a link is added: others look at it
+        self.by_name = {name: self.to(name) for name in names}  # replaced, not changed: other threads read it
 
     def to(self, name: str) -> HostLink:
-        """Return a new link to a host of the inventory, which is not kept."""
+        """Return a new link to a host of the inventory, without adding it."""
         return HostLink(name, self._placed.inventory.hosts[name], self._placed.folder)
 
     def add(self, link: HostLink) -> None:
@@ -211,7 +211,7 @@ class HostLinks:
         self._loop.spawn(link.measure_round_trips())
 
     def listen(self) -> None:
-        """Measure from now on whether each host answers."""
+        """Start measuring whether each host answers."""
         for link in self.by_name.values():
             self._loop.spawn(link.measure_round_trips())
 
@@ -248,7 +248,7 @@ def raise_faults(results: list[Any]) -> list[Any]:
 
 
 class ProgramEndedError(HostsError):
-    """A program on a host has ended without an answer, with an exit code and a last line on standard error."""
+    """A program on a host ended without an answer: its exit code, and its last line on standard error."""
 
     def __init__(self, name: str, status: int | None, last: str) -> None:
         super().__init__(f"{name}: it ended with code {status} ({last or 'it printed nothing'})")
@@ -266,9 +266,9 @@ class RemoteProgram:
         self._process.stdin.write(text)
 
     async def answer(self, within_s: float, late: str = "") -> dict[str, Any]:
-        """Return its next answer; a greeting of the login shell is skipped.
+        """Return its next answer, skipping any greeting of the login shell.
 
-        ProgramEndedError if it has ended, HostsError if it took longer, with the text `late` if that is given.
+        ProgramEndedError if it has ended; HostsError if it took longer, with the text `late` if that is given.
         """
         try:
             async with asyncio.timeout(within_s):
@@ -298,10 +298,10 @@ async def open_program(link: HostLink, command: str) -> AsyncIterator[RemoteProg
 
 
 async def fetch(link: HostLink, source: str, into: Path) -> bool:
-    """Copy a file from a host, under its name only when it is whole; return False if there is none.
+    """Copy a file from a host; return False if there is none.
 
-    What has come so far lies beside it, with .part at the end. HostsError if it cannot be read, or nothing comes any
-    more; OSError if it cannot be written here.
+    Until it is complete, it is written to the same path with .part appended. HostsError if it cannot be read or the
+    transfer stalls; OSError if it cannot be written here.
     """
     part, moved = into.with_name(f"{into.name}.part"), asyncio.Event()
     try:
@@ -316,11 +316,11 @@ async def fetch(link: HostLink, source: str, into: Path) -> bool:
             try:
                 while not (await asyncio.wait([copy], timeout=STALL_S))[0]:
                     if not moved.is_set():
-                        raise HostsError(f"nothing came for {STALL_S:g} s; what did is {part}")
+                        raise HostsError(f"no data for {STALL_S:g} s; what was received is {part}")
                     moved.clear()
             finally:
                 copy.cancel()
-                sftp.exit()  # not waited for: a link that is cut does not report that it has closed
+                sftp.exit()  # not waited for: on a link that is cut it would not return
             copy.result()
     except TimeoutError as error:
         raise HostsError(f"{link.name}: no answer within {OPEN_S:g} s") from error
@@ -333,7 +333,7 @@ async def fetch(link: HostLink, source: str, into: Path) -> bool:
 
 
 async def start_sftp(name: str, connection: Connection) -> asyncssh.SFTPClient:
-    """Return a way to copy files over a connection; HostsError if the host has no SFTP."""
+    """Open SFTP on a connection; HostsError if the host has none."""
     try:
         return await connection.start_sftp_client()
     except (asyncssh.ChannelOpenError, asyncssh.SFTPConnectionLost, asyncssh.SFTPEOFError) as error:
@@ -345,7 +345,7 @@ async def start_sftp(name: str, connection: Connection) -> asyncssh.SFTPClient:
 
 
 def shell_word(path: str) -> str:
-    """Return a path as one word of a shell; a leading ~/ stays the home of the user there."""
+    """Quote a path as one word of a shell; a leading ~/ stays the home of the user there."""
     return f"~/{shlex.quote(path[2:])}" if path.startswith("~/") else shlex.quote(path)
 
 
@@ -364,7 +364,7 @@ def json_answer(lines: Iterable[str]) -> dict[str, Any] | None:
 
 
 class _Client(asyncssh.SSHClient):
-    """Notes the host key that is refused: the host name, address and port that it was looked for under, and the key."""
+    """Remembers a refused host key: the host name, address and port that it was looked up by, and the key."""
 
     refused: tuple[str, str, int, asyncssh.SSHKey] | None = None
 
@@ -374,10 +374,10 @@ class _Client(asyncssh.SSHClient):
 
 
 async def connect(name: str, host: Host, base: Path) -> Connection:
-    """Connect to a host; what its entry leaves open is filled in by ~/.ssh/config.
+    """Connect to a host; ~/.ssh/config fills in what its inventory entry leaves out.
 
-    Relative paths of `key` and `known_hosts` count from `base`, the folder of the inventory. HostsError if the host
-    cannot be reached, has another key than known_hosts, or refuses the user or key.
+    Relative paths of `key` and `known_hosts` refer to `base`, the folder of the inventory. HostsError if the host
+    cannot be reached, shows another key than known_hosts has, or refuses the user or key.
     """
     client, address = _Client(), host.ssh or host.address
     options: dict[str, Any] = {"keepalive_interval": KEEPALIVE_S, "keepalive_count_max": KEEPALIVE_COUNT}
@@ -396,7 +396,7 @@ async def connect(name: str, host: Host, base: Path) -> Connection:
         refused = client.refused
         if refused is None and isinstance(
             error, asyncssh.ConnectionLost | asyncssh.KeyExchangeFailed | ConnectionResetError
-        ):  # there may be no host key to agree on: only known kinds are asked for
+        ):  # perhaps no host key algorithm was agreed on: only those in known_hosts are asked for
             with contextlib.suppress(asyncssh.Error, OSError, ValueError, TimeoutError):
                 key = await asyncio.wait_for(asyncssh.get_server_host_key(address, host.port), CONNECT_S)
                 refused = (address, "", host.port, key) if key else None
@@ -407,7 +407,7 @@ async def connect(name: str, host: Host, base: Path) -> Connection:
 def _changed_key(
     name: str, host: Host, known: Path, looked_for: str, address: str, port: int, shown: asyncssh.SSHKey
 ) -> str:
-    """Return that a host shows another key than is known of it, where it does; empty otherwise."""
+    """Describe a host key that differs from the known one; empty if it does not, or none is known."""
     path = str(known.expanduser())
     try:
         keys = asyncssh.match_known_hosts(path, looked_for, address, None if port == SSH_PORT else port)[0]
@@ -438,15 +438,15 @@ def _reason(name: str, host: Host, base: Path, known: Path, error: Exception) ->
         case asyncssh.KeyImportError() if "Passphrase" in str(error):
             return f"{key} has a passphrase; add it to the agent with ssh-add and leave hosts.{name}.key out"
         case asyncssh.KeyImportError():
-            return f"{key} is no private key ({error}); correct hosts.{name}.key"
+            return f"{key} is not a private key ({error}); correct hosts.{name}.key"
         case OSError() if error.filename:
             return f"{error.filename} cannot be read ({error.strerror}); correct hosts.{name}.key or known_hosts"
         case TimeoutError() if error.errno is None:
-            return f"ssh at {at} did not answer within {CONNECT_S:g} s; is it on, is the address right, the port open?"
+            return f"ssh at {at} did not answer within {CONNECT_S:g} s; is it on, the address right and the port open?"
         case socket.gaierror():
             return f"address {address!r} is not known; correct hosts.{name}.address or ssh"
         case OSError():
             why = os.strerror(error.errno) if error.errno else error
-            return f"ssh at {at} cannot be reached ({why}); is sshd on there, the port open?"
+            return f"ssh at {at} cannot be reached ({why}); is sshd running there and the port open?"
         case _:
             return f"ssh at {at} failed ({error}); try `ssh -p {host.port} {user}@{address}`"

@@ -1,4 +1,4 @@
-"""What a run puts on each host, processes and files, and what earlier runs have left there."""
+"""The processes and files that a run places on each host, and the leftovers of earlier runs there."""
 
 import shlex
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from zsim_deploy.roles.stop_channel import FOLDER
 ACCESS = "access.json"
 RECORD = "run.mcap"
 RUNS = "runs"  # below the folder of zsim on a host: a folder per run
-# A run whose processes still run is no earlier run; where there is no ps, none is known to run.
+# A run whose processes are still running is not listed; without ps all are.
 LIST_RUNS = f"""
 alive=$(ps -A -ww -o args 2>/dev/null || ps -A -o args 2>/dev/null)
 for run in *; do
@@ -32,7 +32,7 @@ for run in *; do
 done
 true
 """
-# Run there by its Python: `- ADDRESS PORT...`. What else may be wrong with a port is in the log of its process.
+# Run by the host's Python: `- ADDRESS PORT...`. Other faults of a port are in the log of the process that uses it.
 TRY_PORTS = """
 import errno, json, socket, sys
 address, taken = sys.argv[1], []
@@ -51,7 +51,7 @@ TRY_PORTS_S = 20.0  # wall time to start Python on a small computer
 
 
 class HostPlan:
-    """The processes of one run that zsim starts, and where; it does not change. InventoryError if one has no place."""
+    """The processes of one run that zsim starts, and their hosts; immutable. InventoryError if one has no place."""
 
     def __init__(self, placed: InventoryFile, scenario: Scenario, run_id: str, pace: Sequence[str] = ()) -> None:
         self.placed = placed
@@ -60,12 +60,12 @@ class HostPlan:
         self._pace = pace  # options of the world
         in_order = sorted(inv.processes(placed, scenario, pace), key=lambda process: process.role != ROUTER)
         self.processes = {process.name: process for process in in_order}  # each after the one that it connects to
-        self.programs = inv.programs_here(placed, scenario)  # of the user's own, that are started here
-        # on those that are placed on a host, which are not started: what they need is the user's to bring there
+        self.programs = inv.programs_here(placed, scenario)  # the user's own, started on this machine
+        # on the user's programs that are placed on a host: zsim does not start those
         self.remarks = [line for host in placed.inventory.hosts for line in inv.own_programs(placed, scenario, host)]
 
     def moved(self, name: str, host: str) -> "HostPlan":
-        """Return the same plan but for the host of one process."""
+        """Return a plan with another host for one process."""
         places = {**inv.placement(self.placed, self._scenario), name: host}
         placed = self.placed._replace(inventory=replace(self.placed.inventory, roles=places))
         return HostPlan(placed, self._scenario, self._run_id, self._pace)
@@ -80,18 +80,18 @@ class HostPlan:
         return f"{runs_folder(self.placed.inventory.hosts[host])}/{self._run_id}"
 
     def keys(self, host: str) -> str:
-        """Return the folder in which the keys of this run's processes are on a host."""
+        """Return the folder on a host that holds the private keys of this run's processes."""
         return f"{self.folder(host)}/{FOLDER}"
 
     def endpoint(self) -> str:
-        """Return where the programs that are started here find the run."""
+        """Return the endpoint to which programs on this machine connect."""
         return inv.endpoint(self.placed, inv.placement(self.placed, self._scenario), self.host(WORLD))
 
     def record(self) -> str:
         return f"{self.folder(self.host(RECORDER))}/{RECORD}"
 
     def way_to_record(self) -> str:
-        """Return where the record is, and the command that fetches it."""
+        """Return the location of the record, with the command that fetches it."""
         name = self.host(RECORDER)
         command = scp(self.placed.inventory.hosts[name], self.placed.folder, self.record())
         return f"{name}:{self.record()} (fetch it with `{command}`)"
@@ -115,7 +115,7 @@ class HostPlan:
         return [role, "--launched", self._run_id, *journal, *options]
 
     def files(self, host: str) -> dict[str, bytes]:
-        """Return what the processes of a host need, by path below the run's folder; HostsError as `identity`."""
+        """Return the files that a host needs, by path below the run's folder; HostsError as in `identity`."""
         contents: dict[str, bytes] = {}
         for name, process in self.processes.items():
             if process.host == host:
@@ -127,7 +127,7 @@ class HostPlan:
     def identity(self, name: str) -> dict[str, bytes]:
         """Return certificate, key and access control of a process, by path below the run's folder.
 
-        HostsError if one is not there.
+        HostsError if one is missing.
         """
         process = self.processes[name]
         if not process.secure:
@@ -146,14 +146,14 @@ class HostPlan:
 
 
 def runs_folder(host: Host) -> str:
-    """Return the folder of runs on a host, from its root or as ~/ from the home."""
+    """Return the folder of runs on a host, absolute or relative to the home (~/)."""
     return f"{inv.below_home(host.folder)}/{RUNS}"
 
 
 async def leftovers(link: HostLink, base: Path) -> list[str]:
-    """Describe what earlier runs have left on a host: at most a line on records, and one on private keys.
+    """Describe the leftovers of earlier runs on a host: at most a line on records, and one on private keys.
 
-    A greeting of the login shell is skipped. HostsError if the host could not be asked.
+    A greeting of the login shell is skipped. HostsError if the host cannot be asked.
     """
     name, folder = link.name, runs_folder(link.host)
     script = f"cd {shell_word(folder)} 2>/dev/null || exit 0{LIST_RUNS}"
@@ -168,14 +168,14 @@ async def leftovers(link: HostLink, base: Path) -> list[str]:
         )
     if keys := [f"{folder}/{run}/{FOLDER}" for run in runs[KEY]]:
         lines.append(
-            f"{name}: private keys of earlier runs were left: {', '.join(f'{name}:{path}' for path in keys)}; "
+            f"{name}: private keys of earlier runs remain: {', '.join(f'{name}:{path}' for path in keys)}; "
             f"remove them there with `rm -r {shell_line(keys)}`"
         )
     return lines
 
 
 def scp(host: Host, base: Path, path: str) -> str:
-    """Return the command that copies a file from a host to here, as `zsim up` reaches the host."""
+    """Return the scp command that copies a file from a host to here, with the ssh settings of `zsim up`."""
     address = host.ssh or host.address
     shown = f"[{address}]" if ":" in address else address
     words = ["scp", *(["-P", str(host.port)] if host.port != SSH_PORT else [])]
@@ -187,7 +187,7 @@ def scp(host: Host, base: Path, path: str) -> str:
 
 
 async def port_faults(link: HostLink, python: str, ports: Sequence[int]) -> list[str]:
-    """Return a line for each port of a host that another program uses; HostsError if it could not be asked."""
+    """Return a line for each port of a host that another program uses; HostsError if the host cannot be asked."""
     if not ports:
         return []
     command = f"{shell_word(python)} - {shell_line([link.host.address, *map(str, ports)])}"

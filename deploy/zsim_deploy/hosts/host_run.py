@@ -38,22 +38,22 @@ from zsim_deploy.launch.program_process import programs_of
 from zsim_deploy.launch.role_launcher import SINGLE_THREADED
 from zsim_deploy.launch.supervisor import EndSignals, Outcome, Supervisor, end_text
 
-CONNECT_S = 30.0  # how long all hosts together may take to let us in, …
+CONNECT_S = 30.0  # how long all hosts together may take to accept the login, …
 CHECK_S = 60.0  # … to be checked: a small computer takes 5 s to import numpy, a poor link adds a dozen round trips, …
-PREPARE_S = 30.0  # … and to take their files
+PREPARE_S = 30.0  # … and to receive their files
 CLEAN_S = 5.0  # how long a host may take to remove the run's folder; a lost host delays the end no longer than this
 JOIN_S = 60.0  # until a host that was not used so far is connected and checked
 IMPORT_S = 20.0  # until a Python has shown that it can run a role; a small computer takes 5 s
 BRING_S = 30.0  # until a certificate is on a host
-LEAVE_S = 20.0  # until a process whose place was taken a moment ago has ended, which takes a second
-LOOK_S = 0.1  # between two looks whether it has
-ORDER_S = 5.0  # until the supervisor, which looks every 50 ms, carries out an order
-BEAT_S = 1.0  # how often the launcher shows that it lives
-ORPHAN_S = 60.0  # without a beat a process ends itself; a link may be cut for shorter than that
+LEAVE_S = 20.0  # until a process that was replaced a moment ago has ended, which takes a second
+LOOK_S = 0.1  # between two checks whether it has ended
+ORDER_S = 5.0  # until the supervisor, which polls every 50 ms, carries out an order
+BEAT_S = 1.0  # interval of the launcher's heartbeat
+ORPHAN_S = 60.0  # a process ends itself after this long without a heartbeat; shorter link outages are survived
 LEND_S = 60.0  # how long its files may take to reach the host again; as long as a link may be cut
 KILL_S = 5.0  # how long a kill may take to reach the host: a few round trips
 LOST = -1000  # code of a process whose end is not known
-PID = "zsim-pid "  # begins the line with its process id; a login shell may print something before
+PID = "zsim-pid "  # prefix of the line with the process id; a login shell may print something before it
 
 
 class HostRun:
@@ -76,10 +76,10 @@ class HostRun:
         self._one_at_a_time = threading.Lock()  # of requests that replace a process
 
     def run(self) -> Outcome:
-        """Run to the end; whatever happens, no process or key of it is left on any host that can be reached.
+        """Run to the end; in every case, no process or key of the run is left on a host that can be reached.
 
-        RunError if the federation is up already on this machine; HostsError with a line for every certificate that is
-        missing, or every host that cannot take part.
+        RunError if the federation already runs on this machine; HostsError with a line for every missing certificate
+        and every host that cannot take part.
         """
         requests = {
             "ps": lambda: {"rows": self._status.rows(), "clock": self._status.clock_now, **self._where()},
@@ -115,7 +115,7 @@ class HostRun:
 
     def _check(self) -> None:
         async def inspect(link: HostLink) -> tuple[HostReport, list[str], list[str]]:
-            """Return the report of a host, the ports that are taken there, and what earlier runs have left."""
+            """Return the report of a host, its ports that are in use, and what earlier runs have left there."""
             python = self._plan.python(link.name)
             report = await host_report(link, python, self._placed.word)
             taken = await port_faults(link, python, self._plan.ports(link.name))
@@ -129,7 +129,7 @@ class HostRun:
             raise HostsError("\n".join(faults))
 
     async def _prepare(self, link: HostLink) -> None:
-        """Put the scenario, and the certificates where there are any, on a host."""
+        """Copy the scenario and any certificates to a host."""
         if files := self._plan.files(link.name):
             await link.put_files(self._plan.folder(link.name), files, PREPARE_S)
 
@@ -150,7 +150,7 @@ class HostRun:
             fault = self._fetch()
         except KeyboardInterrupt:
             where = self._plan.way_to_record()
-            self._status.say(f"the record was not fetched; what there is of it is at {where}")
+            self._status.say(f"the record was not fetched; what was recorded is at {where}")
             raise
         if fault and not outcome.failed and not outcome.interrupted:
             return replace(outcome, reason=fault, failed=True)
@@ -159,7 +159,7 @@ class HostRun:
         return outcome
 
     def _look(self) -> None:
-        """End the run when nobody can see its output any more; show which hosts are silent."""
+        """End the run on a hang-up or termination signal; report the hosts that have stopped answering."""
         if reason := self._signals.look():
             self._supervisor.interrupt(reason)
         self._status.report_silent_hosts()
@@ -173,7 +173,7 @@ class HostRun:
         return RemoteProcess(name, command, self._links.by_name[host], self._loop, log, on_line, files)
 
     def _fetch(self) -> str:
-        """Fetch the record; return why that failed, empty if it did not."""
+        """Fetch the record; return why that failed, or an empty string."""
         host, into = self._plan.host(RECORDER), self._out / RECORD
         self._status.say(f"fetching the record from {host}:{self._plan.record()} …")
         try:
@@ -182,7 +182,7 @@ class HostRun:
                 repair(into)
         except (ZsimError, OSError) as error:
             where = self._plan.way_to_record()
-            return f"the record could not be fetched ({error}); what there is of it is at {where}"
+            return f"the record could not be fetched ({error}); what was recorded is at {where}"
         self._record_stays = False
         return "" if is_there else "nothing was recorded"
 
@@ -216,7 +216,7 @@ class HostRun:
     def _restart(self, role: str) -> str:
         self._refuse_unless_runs(role)
         if role in (WORLD, RECORDER):
-            raise RunError(f"{role} cannot be restarted: the run lives in it; end the run with `zsim down`")
+            raise RunError(f"{role} cannot be restarted: the run depends on it; end the run with `zsim down`")
         with self._one_at_a_time:
             return self._take_over(self._plan, role)
 
@@ -236,12 +236,12 @@ class HostRun:
 
     def _refuse_unless_runs(self, role: str) -> None:
         if not self._supervisor.members:
-            raise RunError("the run has not started yet; try again when it flies")
+            raise RunError("the run has not started yet; try again once it flies")
         if role not in self._plan.processes:
             raise RunError(f"role is {role!r}; must be one of {', '.join(self._plan.processes)}")
 
     def _join(self, host: str) -> HostLink:
-        """Return a link to a host that was not used so far, after checking it."""
+        """Return a link to a host that the run has not used so far, after checking the host."""
         link = self._links.to(host)
         try:
             report = self._loop.call(host_report(link, self._plan.python(host)), JOIN_S)
@@ -258,7 +258,7 @@ class HostRun:
         return link
 
     def _take_over(self, plan: HostPlan, role: str) -> str:
-        """Start a process that takes over the name of another, which leaves by itself, or is killed if it hangs."""
+        """Start a process that takes over another's name; the old one leaves by itself, or is killed if it hangs."""
         host = plan.host(role)
         if files := plan.identity(role):
             self._loop.call(self._links.by_name[host].put_files(plan.folder(host), files, BRING_S))
@@ -273,16 +273,16 @@ class HostRun:
 
         carried_out = self._supervisor.submit(take)
         wait([carried_out], ORDER_S)
-        carried_out.cancel()  # changes nothing where it is being carried out
+        carried_out.cancel()  # has no effect once the order is being carried out
         try:
             carried_out.result()
         except CancelledError as error:
-            raise RunError("the run is ending; nothing is started any more") from error
+            raise RunError("the run is ending; no process is started any more") from error
         return f"{role} on {host}"
 
 
 async def _refuse_unless_able(link: HostLink, python: str, role: str) -> None:
-    """Refuse a host whose Python cannot import what a role is made of: HostsError with what it lacks."""
+    """Refuse a host whose Python cannot import what a role needs: HostsError with what is missing."""
     for extra in extras([role]):
         code = f"import {MODULES[extra]}"
         command = f"{shell_word(python)} -c {shell_word(code)}"
@@ -294,14 +294,14 @@ async def _refuse_unless_able(link: HostLink, python: str, role: str) -> None:
 
 
 class RemoteProcess:
-    """A role on another host, over ssh: started, watched, stopped, its output kept in a file here.
+    """A role on another host, over ssh: started, watched and stopped; its output goes to a file on this machine.
 
-    The process has our end of the ssh channel as standard input. It ends when that closes, which sshd does when the
-    launcher dies; and when nothing came on it for ORPHAN_S, as when the launcher's host is gone
+    The standard input of the process is the ssh channel. The process ends when that closes, which sshd does when the
+    launcher dies, and when nothing has come on it for ORPHAN_S, as when the launcher's host is down
     (roles/stop_channel.py).
 
-    `on_line` takes every line of its standard output; None sends that to the log too. `files`: what it needs below a
-    folder and takes away when it ends; brought again whenever it is started again.
+    `on_line` takes every line of its standard output; with None they go to the log too. `files`: a folder, and the
+    files that it needs below it; it removes them when it ends, so each restart copies them again.
     """
 
     is_program = False
@@ -330,7 +330,7 @@ class RemoteProcess:
         self._starts = 0
         self._process: asyncssh.SSHClientProcess[str] | None = None
         self._life: Future[None] | None = None
-        self.code: int | None = None  # exit code, None while it lives or is on its way; negative for a signal
+        self.code: int | None = None  # exit code, None while it starts or runs; negative for a signal
         self._fault = ""
         self._ended = threading.Event()
         self._stop: str | None = None
@@ -342,14 +342,14 @@ class RemoteProcess:
         return "running" if self.pid else "starting"
 
     def start(self) -> None:
-        """Start it, or start it again; returns at once."""
+        """Start or restart it; return at once."""
         self._starts += 1
         self.pid, self.code, self._process, self._stop, self._fault = 0, None, None, None, ""
         self._ended.clear()
         self._life = self._loop.spawn(self._live())
 
     async def _live(self) -> None:
-        """Run the process to its end, and note how it ended in every case."""
+        """Run the process to its end, and record how it ended in every case."""
         code = LOST
         try:
             code = await self._run()
@@ -410,7 +410,7 @@ class RemoteProcess:
         return self._log.last
 
     def request_stop(self, reason: str) -> None:
-        """Ask it to leave; harmless when it is gone, remembered when it is still on its way."""
+        """Ask it to leave: no effect once it has ended, and remembered while it is still starting."""
         self._stop = reason
         self._loop.call_soon(self._send, f"stop {reason}\n")
 
@@ -423,7 +423,7 @@ class RemoteProcess:
         return self._ended.wait(max(0.0, timeout_s))
 
     def kill(self) -> None:
-        """Send SIGKILL, as to one that hangs, or stop trying to start it; returns at once."""
+        """Send SIGKILL, or stop trying to start it; return at once."""
         if self.code is not None or self._life is None:
             return
         if not self.pid:
@@ -437,17 +437,17 @@ class RemoteProcess:
         self._loop.spawn(kill(f"kill -9 {self.pid}"))
 
     def close(self) -> None:
-        """End it in any case; one that cannot be reached ends by itself."""
+        """End it; one that cannot be reached ends by itself."""
         if self._life is not None:
             self.kill()
             self._ended.wait(KILL_S)
 
 
 class ProcessLog:
-    """The log file of a process; where it cannot be written, `say` is told once, and only the last line is kept."""
+    """The log file of a process; if it cannot be written, that is said once, and only the last line is kept."""
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:
-        self.last = ""  # line that is not empty
+        self.last = ""  # the last line that is not empty
         self._path = path
         self._say = say
         self._is_whole = True
@@ -460,4 +460,4 @@ class ProcessLog:
         except OSError as error:
             if self._is_whole:
                 self._is_whole = False
-                self._say(f"{self._path}: cannot be written ({error.strerror}); what it would have there is lost")
+                self._say(f"{self._path}: cannot be written ({error.strerror}); this process's output is lost")

@@ -1,12 +1,12 @@
-"""What `zsim push` runs on a host, with the Python that is there and nothing else; it is sent as text.
+"""The program that `zsim push` runs on a host; it is sent as text and needs only the Python there.
 
-Standard input is this text, and then an order a line, as JSON; each is answered by a line of JSON on standard output.
-When standard input ends, or nothing came for a while, not even an empty line, the push is over, or its launcher is
-gone: the command under way is killed.
+Standard input is this text, followed by orders, one JSON line each; each is answered by a JSON line on standard output.
+When standard input ends, or not even an empty line has come for a while, the push is over or its launcher is gone: the
+current command is killed.
 
-{"act": "look"}                      what decides which wheels fit, what is installed, wheels that are there
-{"act": "install", ...}              make FOLDER/venv what is wanted
-{"act": "warm_up", ...}              run a module of what is installed, with the extras as its arguments
+{"act": "look"}                      report Python and platform, what is installed, and the wheels in FOLDER
+{"act": "install", ...}              install wheels into FOLDER/venv
+{"act": "warm_up", ...}              run an installed module, with the extras as its arguments
 
 Only one instance works in a folder at a time; another one reports who holds it, and waits.
 """
@@ -28,8 +28,8 @@ import venv
 from collections.abc import Iterator
 from pathlib import Path
 
-LOCK = "push.lock"  # in the folder: locked by the instance that works in it, with a line on who that is
-NOTE = "zsim-installed.json"  # in the environment: what was installed; missing while something is being changed
+LOCK = "push.lock"  # in the folder: locked by the instance that works in it, and names it
+NOTE = "zsim-installed.json"  # in the environment: what was installed; missing during an installation
 
 
 def inspect_folder(folder: Path) -> dict:
@@ -49,7 +49,7 @@ def inspect_folder(folder: Path) -> dict:
 
 
 def _installed(environment: Path) -> dict | None:
-    """Return what an earlier push noted, if its environment still has the Python that runs this."""
+    """Return the note of an earlier push, if its environment has the Python that runs this."""
     if not os.access(environment / "bin" / "python", os.X_OK):
         return None
     with contextlib.suppress(OSError, ValueError):
@@ -63,7 +63,7 @@ class CommandError(Exception):
 
 
 class CommandRunner:
-    """Runs commands one after the other, until they are all ended."""
+    """Runs one command after the other, until `end`."""
 
     def __init__(self) -> None:
         self._gate = threading.Lock()
@@ -83,7 +83,7 @@ class CommandRunner:
             raise CommandError(f"{' '.join(command[-2:])[-80:]}: {errors[-1]}")
 
     def end(self) -> None:
-        """Kill the running command with all that it started, and start no other."""
+        """Kill the running command with its children, and start no other."""
         self._gate.acquire()
         if self._child and self._child.poll() is None:
             with contextlib.suppress(ProcessLookupError):
@@ -92,10 +92,10 @@ class CommandRunner:
 
 
 def install(folder: Path, order: dict, children: CommandRunner) -> None:
-    """Install wheels that lie in FOLDER/wheels, and nothing from anywhere else.
+    """Install wheels from FOLDER/wheels alone.
 
-    Order: project and pip (names of their wheels), wheels (names of the others that are new), extras, modules (to
-    import for proof), note (to keep). CommandError if pip or the proof fails, OSError where there is no room.
+    Order: project and pip (names of their wheels), wheels (names of other new ones), extras, modules (imported as a
+    check), note (to keep). CommandError if pip or the check fails, OSError if the disk is full.
     """
     environment, wheels = folder / "venv", folder / "wheels"
     fresh = _installed(environment) is None
@@ -109,7 +109,7 @@ def install(folder: Path, order: dict, children: CommandRunner) -> None:
     project = str(wheels / order["project"]) + (f"[{','.join(order['extras'])}]" if order["extras"] else "")
     files = [str(wheels / name) for name in order["wheels"]]
     children.run([*pip, "install", "--no-index", "--no-compile", "--find-links", str(wheels), project, *files])
-    # What the roles import is compiled by this proof; all the rest of the packages would take longer than to install.
+    # This check also compiles the modules that the roles import; compiling whole packages would take longer.
     children.run([python, "-P", "-c", f"import {', '.join(order['modules'])}"])
     (environment / NOTE).write_text(json.dumps({**order["note"], "python": list(sys.version_info[:2])}))
     shutil.rmtree(wheels)
@@ -117,7 +117,7 @@ def install(folder: Path, order: dict, children: CommandRunner) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path, who: str) -> Iterator[str]:
-    """Work in a folder alone; while another does, report who, and wait. Yield why that cannot be, empty if it can."""
+    """Lock a folder; while another instance holds it, report which, and wait. Yield why it cannot be locked, or ''."""
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / LOCK, "a+") as file:
         fault = ""
@@ -127,7 +127,7 @@ def locked(folder: Path, who: str) -> Iterator[str]:
             file.seek(0)
             say({"waits": file.read() or "another"})
             fcntl.flock(file, fcntl.LOCK_EX)
-        except OSError as error:  # of a file system without locks
+        except OSError as error:  # a file system without locks
             fault = str(error.strerror)
         file.truncate(0)
         file.write(f"{who} (process {os.getpid()} there)")
@@ -153,16 +153,16 @@ def execute(folder: Path, order: dict, children: CommandRunner) -> dict:
 
 
 def main(folder: Path, who: str, silent_s: float) -> None:
-    """Carry out orders until standard input ends, or nothing has come on it for some seconds."""
+    """Carry out orders until standard input ends or stays silent for `silent_s`."""
     orders, children, received = queue.SimpleQueue(), CommandRunner(), threading.Event()
 
     def exit_now() -> None:
-        """End everything at once; a thread that reads standard input does not end otherwise."""
+        """End at once; sys.exit would wait for the thread that reads standard input."""
         children.end()
         os._exit(0)
 
     def follow() -> None:
-        """Queue the orders that come, and note each sign of life."""
+        """Queue orders, and note each sign of life."""
         try:
             for line in sys.stdin.buffer:
                 received.set()

@@ -1,10 +1,10 @@
-"""The facts of a host, and how well it reaches another: run there by `zsim doctor`, a JSON line each.
+"""Facts of a host, and its network path to another: run there by `zsim doctor`; prints JSON lines.
 
-python -m zsim_deploy.hosts.probe about FOLDER           then, for each line that comes, its clock
+python -m zsim_deploy.hosts.probe about FOLDER           then its clock, for each line of standard input
 python -m zsim_deploy.hosts.probe serve PORT             until standard input ends
 python -m zsim_deploy.hosts.probe reach ADDRESS PORT
 
-What is sent to a port: a size as 8 bytes, big-endian, and so many bytes; the answer is one byte when all are there.
+What is sent to a port: a size as 8 bytes, big-endian, and that many bytes; the answer is one byte after the last.
 """
 
 import errno
@@ -25,18 +25,18 @@ from zsim.contract.fingerprint import fingerprint, machine, parts
 
 GOVERNORS = "/sys/devices/system/cpu"  # Linux, cpufreq
 PINGS = 9
-SIZE_BYTES = 8  # of the size that comes before what is sent
+SIZE_BYTES = 8  # of the size prefix
 BULKS_BYTES = tuple(16_384 << power for power in range(9))  # up to 4 MB, which take 0.3 s on a link of 100 Mbit/s
-BULK_S = 1.0  # a bulk that takes so long is long enough to measure the bandwidth
+BULK_S = 1.0  # a transfer of this length is long enough to measure the bandwidth
 CHUNK_BYTES = 65_536
-TIMEOUT_S = 10.0  # wall time; the least bulk takes so long at 13 kbit/s, and no other is sent unless half took 1 s
-SERVE_S = 60.0  # a server that is no longer needed ends by itself
-SHORTEST_S = 1e-4  # what remains of a bulk's time without the round trip is at least this; 4 MB in it are 300 Gbit/s
+TIMEOUT_S = 10.0  # wall time; the smallest transfer takes as long at 13 kbit/s
+SERVE_S = 60.0  # without a connection for this long a server ends by itself
+SHORTEST_S = 1e-4  # lower limit of a transfer's time without the round trip; 4 MB in it are 300 Gbit/s
 DONE = b"."
 
 
 def about(folder: Path) -> dict[str, Any]:
-    """Return what matters for a run about this host, where a folder is to be written."""
+    """Return the facts of this host that matter for a run; `folder`: of zsim, to be written."""
     return {
         "python": platform.python_version(),
         "zsim": __version__,
@@ -55,8 +55,8 @@ def unwritable(folder: Path) -> str | None:
     """Return why a folder cannot be made or written, None if it can."""
     there = _nearest(folder)
     if not there.is_dir():
-        return f"{there} is no folder"
-    return None if os.access(there, os.W_OK | os.X_OK) else f"{there} may not be written"
+        return f"{there} is not a folder"
+    return None if os.access(there, os.W_OK | os.X_OK) else f"{there} cannot be written"
 
 
 def _nearest(folder: Path) -> Path:
@@ -70,7 +70,7 @@ def clock(requests: TextIO) -> None:
 
 
 def governors(folder: Path) -> list[str]:
-    """Return the CPU governors in use; none where the system does not show them."""
+    """Return the CPU governors in use; empty if the system does not report them."""
     names = set()
     for path in folder.glob("cpu[0-9]*/cpufreq/scaling_governor"):
         try:
@@ -97,14 +97,14 @@ def serve(port: int) -> None:
 
 
 def listening(port: int) -> socket.socket:
-    """Return a socket that listens on all addresses, of IPv6 too where the host has that."""
+    """Return a socket that listens on all addresses, including IPv6 where available."""
     if socket.has_dualstack_ipv6():
         return socket.create_server(("", port), family=socket.AF_INET6, dualstack_ipv6=True)
     return socket.create_server(("", port))
 
 
 def answer(connection: socket.socket) -> None:
-    """Read what is sent, and confirm that each time."""
+    """Read each transfer and confirm it."""
     connection.settimeout(TIMEOUT_S)
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     try:
@@ -119,9 +119,9 @@ def answer(connection: socket.socket) -> None:
 
 
 def reach(address: str, port: int) -> dict[str, Any]:
-    """Return the round trip [s] and the bandwidth [bit/s] to a host that serves, or why there is none.
+    """Return the round trip [s] and the bandwidth [bit/s] to a serving host, or an error.
 
-    The bandwidth is that of the first bulk that takes a while, so that a slow link is not kept busy for minutes.
+    The bandwidth is that of the first transfer that takes BULK_S, so that a slow link is not kept busy for minutes.
     """
     try:
         with socket.create_connection((address, port), TIMEOUT_S) as link:
@@ -138,7 +138,7 @@ def reach(address: str, port: int) -> dict[str, Any]:
 
 
 def _send_s(link: socket.socket, size: int) -> float:
-    """Return the time to send so many bytes and to have them confirmed [s]."""
+    """Return the time until a transfer is confirmed [s]."""
     start_s = time.monotonic()
     link.sendall(size.to_bytes(SIZE_BYTES, "big") + bytes(size))
     if not link.recv(len(DONE)):

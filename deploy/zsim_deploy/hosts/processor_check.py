@@ -1,8 +1,8 @@
-"""`zsim doctor SCENARIO`: whether a flight depends on the processor, by flying it twice on this one.
+"""`zsim doctor SCENARIO`: check whether a flight depends on the processor, by flying it twice on this one.
 
-It is flown as this machine computes, and its record is flown again by the C library's, BLAS's and numpy's code for a
-processor of 2008 without fused operations. zsim's own code computes the same with both. What differs is a class of the
-user's own that calls what is free to differ: np.linalg or `@`, np.exp on arrays, math.sin.
+The scenario is flown normally; its record is then rerun with the code of the C library, BLAS and numpy for a processor
+of 2008 without fused operations. zsim's own code gives the same results with both. A difference comes from a user's
+class that calls functions whose results depend on the processor: np.linalg or `@`, np.exp on arrays, math.sin.
 """
 
 import importlib
@@ -21,8 +21,8 @@ ADVICE = "see docs/extending.md, The same bits on every processor"
 
 
 def older_processor() -> dict[str, str]:
-    """Return the variables by which libraries compute as for an older processor of this machine's kind."""
-    numpy_core = importlib.import_module("numpy._core._multiarray_umath")  # names what numpy has code for
+    """Return the environment variables that make libraries compute as on an older processor of this architecture."""
+    numpy_core = importlib.import_module("numpy._core._multiarray_umath")  # lists the CPU features it dispatches on
     settings = {"NPY_DISABLE_CPU_FEATURES": " ".join(getattr(numpy_core, "__cpu_dispatch__", ()))}
     if platform.machine() in ("x86_64", "AMD64"):
         settings["OPENBLAS_CORETYPE"] = "Nehalem"  # SSE4.2 at most
@@ -33,7 +33,7 @@ def older_processor() -> dict[str, str]:
 
 
 def check_processor(scenario: Path, duration_s: float, say: Callable[[str], None]) -> str:
-    """Fly the first seconds of a scenario twice; return how the flights differ first, empty if they do not.
+    """Fly the first seconds of a scenario twice; return where the flights first differ, empty if they do not.
 
     Raises:
         RunError: it cannot be flown in one process.
@@ -42,13 +42,13 @@ def check_processor(scenario: Path, duration_s: float, say: Callable[[str], None
         out = str(Path(folder, "run"))
         flight = ("run", str(scenario), "--in-process", "--no-report", "--out", out, "--duration", f"{duration_s:g}")
         _finished(flight, {}, (0,))
-        say(f"{scenario.name}: {duration_s:g} s flown as this processor computes")
-        code, text = _finished(("rerun", out, "--trust"), older_processor(), (0, 1))  # whose code has just flown
+        say(f"{scenario.name}: {duration_s:g} s flown on this processor")
+        code, text = _finished(("rerun", out, "--trust"), older_processor(), (0, 1))  # the same code has just flown
     if code:
         named = [line for line in text.splitlines() if "differs" in line]
         found = "; ".join(dict.fromkeys(named)) or (text.strip() or "it printed nothing").splitlines()[-1]
         return f"{scenario}: on another processor, {found}; {ADVICE}"
-    say("flown again as an older processor computes: the same to the bit")
+    say("flown again as on an older processor: the same to the bit")
     return ""
 
 

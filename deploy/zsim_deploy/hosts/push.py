@@ -1,4 +1,4 @@
-"""`zsim push`: install zsim on the hosts of an inventory, over ssh alone; the hosts need no internet."""
+"""`zsim push`: install zsim on the hosts of an inventory over ssh; the hosts need no internet access."""
 
 import asyncio
 import contextlib
@@ -39,27 +39,27 @@ from zsim_deploy.roles import warm_up
 LAUNCHER = "launcher"  # name of this machine among the hosts, in progress lines
 ASK_S = 30.0  # wall time for a host to start a few Pythons; a small computer takes seconds
 INSTALL_S = 900.0  # wall time to unpack 100 MB of wheels on a slow memory card
-COMPILE_S = 900.0  # wall time to compile what flies; half a minute on a laptop's core
-COPIES = 4  # files under way to one host at a time
+COMPILE_S = 900.0  # wall time to compile the kernels; half a minute on a laptop's core
+COPIES = 4  # files copied to one host at a time
 START_S = 30.0  # wall time to start a Python on a small computer, over a poor link
-BEAT_S = 5.0  # how often the launcher shows that it lives
-SILENT_S = 60.0  # wall time without that, after which the program ends by itself; a link may be cut for shorter
-WAIT_S = 1800.0  # wall time for another push to end; as long as it may take to install and to compile
+BEAT_S = 5.0  # interval of the launcher's heartbeat
+SILENT_S = 60.0  # without a heartbeat for this long the program ends itself; shorter link outages are survived
+WAIT_S = 1800.0  # wall time for another push to end: as long as installing and compiling may take
 OLDEST_MINOR = 11  # pyproject.toml, requires-python
-NEWEST_MINOR = 14  # the last Python whose name is tried
+NEWEST_MINOR = 14  # the newest Python that is looked for
 PLAIN = "python3"
 ANSWER = re.compile(r"(python3(?:\.\d+)?) (\d+)\.(\d+)\.(\d+) (/.*)")  # command, version, path
 
-Progress = Callable[[str, str], None]  # host, what is being done there
+Progress = Callable[[str, str], None]  # host, current step
 
 
 async def push(
     placed: InventoryFile, names: Sequence[str], more: Iterable[str], progress: Progress, cache: Path
 ) -> dict[str, bool]:
-    """Install on hosts, by default on all, what their roles need; return for each whether anything had to be done.
+    """Install on hosts, by default on all, what their roles need; return for each whether anything was installed.
 
     `more`: extras for each of them beside those of its roles; `cache`: folder of the wheelhouse. InventoryError if a
-    host or an extra is unknown; HostsError with a line for each host at which it failed; the others are done.
+    host or an extra is unknown; HostsError with a line for each host that failed, after all others were installed.
     """
     hosts = placed.inventory.hosts
     more = list(more)
@@ -80,11 +80,11 @@ async def _push_to(
     name: str, host: Host, base: Path, wanted: frozenset[str], wheelhouse: Wheelhouse, progress: Progress
 ) -> bool:
     if host.python:
-        progress(name, f"has zsim of its own in {host.python}")
+        progress(name, f"uses its own zsim, in {host.python}")
         return False
     link = HostLink(name, host, base)
     try:
-        progress(name, "looking what is there")
+        progress(name, "looking for Python")
         output = await link.run(shell_line(["sh", "-c", interpreter_query()]), timeout_s=ASK_S)
         interpreters = parse_interpreters(output.decode(errors="replace"))
         python = choose_interpreter(name, interpreters, sys.version_info[:2]).path
@@ -100,7 +100,7 @@ async def _push_to(
 async def _install(
     link: HostLink, there: "Installer", wanted: frozenset[str], wheelhouse: Wheelhouse, progress: Callable[[str], None]
 ) -> bool:
-    """Install what is wanted; return whether anything had to be done."""
+    """Install zsim with the wanted extras; return whether anything was installed."""
     facts = await there.ask("look", ASK_S)
     needed = await wheelhouse.wheel_set(link.name, wheel_target(link.name, facts), wanted)
     described = " ".join(("zsim", __version__, *(f"+{extra}" for extra in needed.extras)))
@@ -119,14 +119,14 @@ async def _install(
     }
     await there.ask("install", INSTALL_S, **order)
     if any(wheel.path.name.startswith("numba-") for wheel in needed.others):
-        progress("compiling what flies")
+        progress("compiling the kernels")
         await there.ask("warm_up", COMPILE_S, module=warm_up.__name__, extras=needed.extras)
     progress(f"{described} installed")
     return True
 
 
 def is_installed(wanted: WheelSet, installed: dict[str, Any] | None) -> bool:
-    """Return whether a host has all that it needs in these versions, by the note of the last push."""
+    """Return whether a host has these wheels installed, according to the note of the last push."""
     if installed is None or installed["project"] != wanted.project.sha256:
         return False
     return set(wanted.extras) <= set(installed["extras"]) and not _new(wanted, installed)
@@ -139,14 +139,14 @@ def _new(wanted: WheelSet, installed: dict[str, Any] | None) -> list[Wheel]:
 
 
 def missing(wanted: WheelSet, facts: dict[str, Any]) -> list[Wheel]:
-    """Return the wheels that must be copied to a host, small ones last so that progress is smooth."""
+    """Return the wheels that must be copied to a host, small ones last for smooth progress."""
     needed = [wanted.project, wanted.pip, *_new(wanted, facts["installed"])]
     lacking = [wheel for wheel in needed if facts["wheels"].get(wheel.path.name) != wheel.sha256]
     return sorted(lacking, key=lambda wheel: -wheel.size_bytes)
 
 
 async def _copy(link: HostLink, folder: str, wheels: Sequence[Wheel], progress: Callable[[str], None]) -> None:
-    """Copy wheels into a folder of a host; an incomplete copy never has the name of a wheel."""
+    """Copy wheels into a folder of a host; incomplete copies end in .part."""
     total, done = sum(wheel.size_bytes for wheel in wheels), 0
     gate = asyncio.Semaphore(COPIES)
 
@@ -176,7 +176,7 @@ def default_cache() -> Path:
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zsim"
     except RuntimeError as error:  # HOME is not set, and the system does not know the user
-        why = "this user has no home for what is downloaded; set XDG_CACHE_HOME to a folder"
+        why = "this user has no home folder for the cache; set XDG_CACHE_HOME to a folder"
         raise HostsError(f"push: {why}") from error
 
 
@@ -187,22 +187,22 @@ class Interpreter(NamedTuple):
 
 
 def interpreter_query() -> str:
-    """Return a line of POSIX shell that prints command, version and path of every Python of a host."""
+    """Return a POSIX shell command that prints command, version and path of every Python of a host."""
     names = [PLAIN, *(f"python3.{minor}" for minor in range(NEWEST_MINOR, OLDEST_MINOR - 1, -1))]
     code = 'import sys; print("%d.%d.%d" % sys.version_info[:3], sys.executable)'
     return f"for p in {' '.join(names)}; do facts=$($p -c '{code}' 2>/dev/null) && echo $p $facts; done; true"
 
 
 def parse_interpreters(answer: str) -> list[Interpreter]:
-    """Return what `interpreter_query` printed; a greeting of the login shell is skipped."""
+    """Parse the output of `interpreter_query`, skipping any greeting of the login shell."""
     matches = filter(None, map(ANSWER.fullmatch, answer.splitlines()))
     return [Interpreter(each[1], (int(each[2]), int(each[3]), int(each[4])), each[5]) for each in matches]
 
 
 def choose_interpreter(name: str, interpreters: Sequence[Interpreter], here: tuple[int, int]) -> Interpreter:
-    """Return the Python to install for: of the launcher's minor version, `python3` rather than another.
+    """Return the Python to install for: one of the launcher's minor version, preferably called `python3`.
 
-    HostsError if there is none; no run takes a host with another one, as its bits would differ.
+    HostsError if there is none: runs with different Pythons would not have the same bits.
     """
     fit = [each for each in interpreters if each.version[:2] == here]
     if fit:
@@ -214,12 +214,12 @@ def choose_interpreter(name: str, interpreters: Sequence[Interpreter], here: tup
     found = ", ".join(f"{command} {version}" for version, command in by_version.items())
     raise HostsError(
         f"{name}: has {found}; must be Python {wanted} as here, for the same bits; install python{wanted} beside it, "
-        "or start zsim here with a Python that it has"
+        "or run zsim here with a Python that the host has"
     )
 
 
 class Installer:
-    """on_host.py as it runs on a host: asked over one ssh channel, it ends with all that it does when that closes."""
+    """on_host.py running on a host, reached over one ssh channel; it ends, with its children, when that closes."""
 
     def __init__(self, name: str, python: str, program: RemoteProgram) -> None:
         self._name, self._python, self._program = name, python, program
@@ -244,13 +244,13 @@ class Installer:
 async def open_installer(
     link: HostLink, python: str, folder: str, progress: Callable[[str], None]
 ) -> AsyncIterator[Installer]:
-    """Let the program run by a Python of a host as long as the block lasts; it alone installs there.
+    """Run on_host.py with a Python of a host for the duration of the block; only one instance installs at a time.
 
-    `folder`: of zsim on the host; `progress` takes a line on who is waited for. HostsError if the host cannot be
-    reached, its folder not be used or another push takes too long.
+    `folder`: of zsim on the host; `progress` takes a line on which push is waited for. HostsError if the host cannot
+    be reached, its folder cannot be used or another push takes too long.
     """
     script = Path(on_host.__file__).read_bytes()
-    start = f"import sys; exec(sys.stdin.buffer.read({len(script)}))"  # not to the end: that means to end
+    start = f"import sys; exec(sys.stdin.buffer.read({len(script)}))"  # orders follow on the same stream
     who = f"{getpass.getuser()}@{socket.gethostname()}"
     async with open_program(link, shell_line([python, "-P", "-c", start, folder, who, f"{SILENT_S:g}"])) as program:
 
@@ -280,7 +280,7 @@ async def open_installer(
 
 
 class PushProgress:
-    """Shows the stage of each host while it is entered."""
+    """A context that shows the current step of each host."""
 
     def __init__(self, console: Console | None = None) -> None:
         self._console = console or Console(stderr=True)

@@ -1,4 +1,4 @@
-"""What `zsim up` shows and `zsim ps` prints: one table of all processes on all hosts, kept while the run goes on."""
+"""The table of all processes on all hosts that `zsim up` shows and `zsim ps` prints."""
 
 import time
 from collections import Counter
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     from zsim_deploy.hosts.host_link import HostLink
 
 FIRST_S = 1.0  # simulated; from then on it flies
-SILENT_S = 1.0  # a host that has not answered for so long is shown as silent; it is asked twice a second …
-ROUND_TRIPS = 2.0  # … and so many of its round trips more: over a slow link every answer takes long
-WAITED_S = 0.5  # a process that is waited for longer is shown so; waiting for less is what lockstep is
-SILENT_PROCESS_S = 1.8  # health comes once a second; so one that is stopped is shown within 2 s
+SILENT_S = 1.0  # a host that has not answered for this long is shown as silent; it is asked twice a second …
+ROUND_TRIPS = 2.0  # … plus this many of its round trips, because over a slow link every answer takes long
+WAITED_S = 0.5  # a process that is waited for longer is shown so; shorter waits are normal in lockstep
+SILENT_PROCESS_S = 1.8  # health comes once a second; a stopped process is shown within 2 s
 STALE_S = 3.0  # health comes once a second; older figures are not shown
-AROUND = 4  # lines of a terminal beside the rows: progress, two of the head, and how many rows are not shown
+AROUND = 4  # lines of a terminal beside the rows: progress, two of the head, and the count of hidden rows
 NAMED_MAX = 8  # roles that a refusal names
-LONGEST_S = float("inf")  # of a process that was never heard of: shown before all others
-ATTENTION = (  # beginnings of states, the most urgent first; then all others, and last those of NOTHING_AMISS
+LONGEST_S = float("inf")  # of a process that has sent no health yet: shown before all others
+ATTENTION = (  # prefixes of states, the most urgent first; then all others, and last those of NOTHING_AMISS
     "ended (",
     "lost",
     "no sign of life",
@@ -37,7 +37,7 @@ ATTENTION = (  # beginnings of states, the most urgent first; then all others, a
     "waits for",
 )
 NOTHING_AMISS = ("running", "ended")
-FIGURES = {  # by which rows are sorted, the greatest first: field, and what stands for one that is not known
+FIGURES = {  # sort keys, the greatest first: field, and the value in place of an unknown one
     "age": ("age_s", LONGEST_S),
     "lag": ("lag_ms", LONGEST_S),
     "messages": ("messages_per_s", 0.0),
@@ -63,13 +63,13 @@ class StatusTable(Screen):
     def __init__(self, duration_s: float, console: Console | None = None, choice: "RowChoice | None" = None) -> None:
         super().__init__(duration_s, console)
         self._choice = choice or RowChoice()
-        self.members: Sequence[Any] = ()  # to be given before it is shown
+        self.members: Sequence[Any] = ()  # must be set before it is shown
         self.links: dict[str, HostLink] = {}
         self.stages_s: dict[str, float] = {}  # how long each step before the processes' start took
         self._begun_s = time.monotonic()
         self._flies = False
         self._health: dict[str, dict[str, Any]] = {}
-        self.clock_now: dict[str, Any] | None = None  # the world's last line on time
+        self.clock_now: dict[str, Any] | None = None  # the world's last clock line
         self._silent: set[str] = set()
         self._live = Live(get_renderable=self._render, console=self.console, refresh_per_second=4, transient=True)
 
@@ -84,7 +84,7 @@ class StatusTable(Screen):
             super().clock(line)
 
     def health(self, line: dict[str, Any]) -> None:
-        """Take a process's health; the messages that it has received since the last one give its rate."""
+        """Take a process's health; its message rate is the difference to the previous one."""
         now_s = time.monotonic()
         former = self._health.get(line["name"])
         rate = None
@@ -112,7 +112,7 @@ class StatusTable(Screen):
             if member.name == WORLD and self.clock_now is not None:
                 last_s = max(last_s or 0.0, self.clock_now["wall_s"])
             row = status_row(member.name, member.host, member.pid, self._state(member, link), member.restarts)
-            row["age_s"] = None if last_s is None else now_s - last_s  # since anything has come of it
+            row["age_s"] = None if last_s is None else now_s - last_s  # since its last sign of life
             if health and now_s - health["wall_s"] < STALE_S:
                 row |= {"lag_ms": health["lag_ns"] / 1e6, "messages_per_s": health["per_s"]}
             if link and link.answered_s and not _is_silent(link):
@@ -136,9 +136,9 @@ class StatusTable(Screen):
         return member.state
 
     def _no_sign_s(self, name: str, round_trip_s: float) -> float:
-        """Return for how long a process has been silent, 0 where that is not long [s, wall].
+        """Return how long a process has been silent, 0 if not unusually long [s, wall].
 
-        All that is known of the others comes from the world: while that is silent, only the world is known to be.
+        The health of all other processes comes through the world: while the world is silent, only it is called silent.
         """
         now_s, patience_s = time.monotonic(), SILENT_PROCESS_S + ROUND_TRIPS * round_trip_s
         heard_s = self._health[name]["wall_s"] if name in self._health else None
@@ -167,13 +167,13 @@ def _is_silent(link: "HostLink") -> bool:
 
 
 def table(rows: Sequence[dict[str, Any]], one_line: bool = False) -> FittedTable:
-    """Return the rows as a table for people; `one_line`: what a line has no room for is cut."""
+    """Return the rows as a table; `one_line`: text that does not fit on its line is cut."""
     cells = [
         (
             row["role"],
             row["host"],
             str(row["pid"] or "-"),
-            row["state"],  # it may hold output of a process
+            row["state"],
             _figure(row["lag_ms"], "{:.0f} ms"),
             _figure(row.get("age_s"), "{:.1f} s"),
             _figure(row["messages_per_s"], "{:.0f}"),
@@ -189,17 +189,14 @@ def _figure(value: float | None, form: str) -> str:
     return "-" if value is None else form.format(value)
 
 
-# Which rows are shown, and in which order
-
-
 class RowChoice(NamedTuple):
-    """What of a table is shown: rows by patterns of roles (`estimator.*2`), of what they work for, or of hosts."""
+    """Which rows are shown, and in what order: patterns of roles (`estimator.*2`), of their subjects, or of hosts."""
 
     only: Sequence[str] = ()  # all rows if empty
-    sort: RowOrder | None = None  # by what; as they come if None
+    sort: RowOrder | None = None  # unsorted if None
 
     def of(self, rows: Sequence[Row]) -> list[Any]:
-        """Return the rows that are shown, in their order; of equal ones the first stays first."""
+        """Return the selected rows in order; the sort is stable."""
         shown = [row for row in rows if not self.only or any(_matches(pattern, row) for pattern in self.only)]
         if self.sort is None:
             return shown
@@ -212,13 +209,13 @@ class RowChoice(NamedTuple):
         return sorted(shown, key=lambda row: -(unknown if row.get(field) is None else row[field]))
 
     def check(self, rows: Sequence[Row]) -> None:
-        """Refuse a pattern that matches no row: RunError with some roles that there are."""
+        """Refuse a pattern that matches no row: RunError with some of the existing roles."""
         for pattern in self.only:
             if not any(_matches(pattern, row) for row in rows):
                 roles = [row["role"] for row in rows]
                 more = [f"and {len(roles) - NAMED_MAX} more"] if len(roles) > NAMED_MAX else []
                 named = ", ".join([*roles[:NAMED_MAX], *more]) or "none"
-                raise RunError(f"role is {pattern!r}; must match a role, what it works for, or a host: {named}")
+                raise RunError(f"role is {pattern!r}; must match a role, its drone or formation, or a host: {named}")
 
 
 def _matches(pattern: str, row: Row) -> bool:

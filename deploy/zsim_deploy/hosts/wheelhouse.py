@@ -1,8 +1,8 @@
-"""The wheels that hosts need, gathered on the launcher's machine by pip, once for each content.
+"""The wheels that hosts need, collected on the launcher's machine by pip, and cached.
 
 CACHE/wheels/*.whl           wheels of other projects, for all hosts
-CACHE/build/*.whl            wheels of what builds this project, for this machine
-CACHE/houses/KEY.json        names of the wheels that one kind of host needs; KEY is a hash of what was asked
+CACHE/build/*.whl            wheels of this project's build requirements, for this machine
+CACHE/houses/KEY.json        names of the wheels that one kind of host needs; KEY is a hash of the request
 CACHE/zsim/KEY/zsim-*.whl    this project, built; KEY is a hash of its sources
 """
 
@@ -28,12 +28,12 @@ from zsim.errors import HostsError
 from zsim_deploy import SAFE_PATH
 
 PROJECT = "zsim"
-KEY_DIGITS = 16  # 64 bits of a SHA-256; what one person builds never collides
+KEY_DIGITS = 16  # 64 bits of a SHA-256
 LOCK = "constraints.txt"  # in a checkout
-PIP = "pip"  # installs on a host that has none; never held to the version here, which may be too old for a newer Python
-RETRIES = "1"  # of pip, for each page of an index; with its own 5 it takes minutes where there is no network
-LINE_BYTES = 1 << 20  # of the longest line that pip prints
-NO_INDEX = re.compile(r"connection broken by '\w+\((.*)\)': ")  # pip, before it tries again, with the reason
+PIP = "pip"  # for hosts without it; not constrained to the version here, which may be too old for a newer Python
+RETRIES = "1"  # of pip, for each page of an index; its default of 5 takes minutes without a network
+LINE_BYTES = 1 << 20  # limit of a line that pip prints
+NO_INDEX = re.compile(r"connection broken by '\w+\((.*)\)': ")  # printed by pip before it retries, with the reason
 MANYLINUX_OLDEST = 5  # glibc 2.5; PEP 600
 MANYLINUX2014 = 17  # glibc 2.17; PEP 599. pip takes manylinux2010 and manylinux1 together with manylinux2014
 
@@ -49,14 +49,14 @@ class UnreachableError(Exception):
 
 
 class WheelTarget(NamedTuple):
-    """What wheels must fit."""
+    """The Python and platform that wheels are for."""
 
     version: tuple[int, int]
     abi: str  # such as cp311; PEP 425
-    platforms: tuple[str, ...]  # tags of those that run there, the best first
+    platforms: tuple[str, ...]  # compatible platform tags, the best first
 
     def options(self) -> list[str]:
-        """Return them as options of pip."""
+        """Return the options of pip that select it."""
         platforms = [word for name in self.platforms for word in ("--platform", name)]
         version = ".".join(map(str, self.version))
         return ["--implementation", "cp", "--python-version", version, "--abi", self.abi, *platforms]
@@ -66,7 +66,7 @@ class WheelTarget(NamedTuple):
 
 
 def wheel_target(name: str, facts: Mapping[str, Any]) -> WheelTarget:
-    """Return what wheels for a host must fit, from what on_host.py says of it; HostsError where none are made."""
+    """Return the target of wheels for a host from the facts of on_host.py; HostsError if there are no wheels for it."""
     major, minor = facts["version"]
     if facts["implementation"] != "cpython":
         raise HostsError(f"{name}: its Python is {facts['implementation']}; must be CPython; install that there")
@@ -98,7 +98,7 @@ class Wheel(NamedTuple):
 
 
 class WheelSet(NamedTuple):
-    """What one host needs."""
+    """The wheels that one host needs."""
 
     project: Wheel
     pip: Wheel
@@ -111,7 +111,7 @@ class WheelSet(NamedTuple):
 
 
 class Wheelhouse:
-    """Builds and downloads what is not there yet, one thing at a time."""
+    """Builds and downloads missing wheels, for one host at a time."""
 
     def __init__(self, folder: Path, progress: Progress) -> None:
         self._folder, self._progress = folder, progress
@@ -122,13 +122,13 @@ class Wheelhouse:
             made.mkdir(parents=True, exist_ok=True)
 
     async def wheel_set(self, host: str, target: WheelTarget, extras: Iterable[str]) -> WheelSet:
-        """Return what a host needs.
+        """Return the wheels that a host needs.
 
-        HostsError if the project cannot be built, a wheel that fits the host does not exist, or pip has no index.
+        HostsError if the project cannot be built, there is no wheel for the host, or no package index is reached.
         """
         async with self._lock:
             if self._unreachable:
-                raise HostsError(self._unreachable)  # for the next host it would take as long again
+                raise HostsError(self._unreachable)  # another attempt would take as long again
             try:
                 project = await self._project()
                 wanted = tuple(sorted(extras))
@@ -149,9 +149,9 @@ class Wheelhouse:
         return WheelSet(_wheel(project), installer, others, wanted)
 
     async def _project(self) -> Path:
-        """Return the wheel of this project: of the checkout, or of what is installed.
+        """Return the wheel of this project, built from the checkout or from the installed version.
 
-        What builds it is kept, so that the next time no index is asked.
+        Its build requirements are kept, so that the next build needs no index.
         """
         root = checkout()
         source = str(root) if root else requirement(importlib.metadata.distribution(PROJECT))
@@ -172,7 +172,7 @@ class Wheelhouse:
                 try:
                     built.rename(folder)
                 except OSError:
-                    if not folder.is_dir():  # else another process has put the same there meanwhile
+                    if not folder.is_dir():  # else another process has built the same meanwhile
                         raise
                     shutil.rmtree(built)
         return next(folder.glob("*.whl"))
@@ -190,16 +190,14 @@ class Wheelhouse:
             except PipError as error:
                 line = f"no wheels for {target}: {error}"
                 if match := re.search(r"satisfies the requirement ([\w.-]+)", str(error)):
-                    other = (
-                        "take another Python there, or build it there and give its folder to pip here (PIP_FIND_LINKS)"
-                    )
-                    line = f"no wheel of {match[1]} for {target}; {other}"
+                    remedy = "use another Python there, or build it there and give pip here its folder (PIP_FIND_LINKS)"
+                    line = f"no wheel of {match[1]} for {target}; {remedy}"
                 raise HostsError(f"{host}: {line}") from error
             names = sorted(path.name for path in Path(temporary).glob("*.whl") if path.name != project.name)
             for name in names:
                 os.replace(Path(temporary, name), self._wheels / name)
         if other_versions:
-            self._progress(f"{host}: {target} gets other versions of packages than are here: not the same bits")
+            self._progress(f"{host}: {target} gets other package versions than this machine: not the same bits")
         note.with_suffix(".part").write_text(json.dumps(names))
         os.replace(note.with_suffix(".part"), note)
         return names
@@ -213,7 +211,7 @@ def requirements(project: Path) -> list[str]:
 
 
 def requirement(installed: importlib.metadata.Distribution) -> str:
-    """Return the requirement by which pip gets an installed distribution again: where it came from, or its version."""
+    """Return the requirement with which pip finds an installed distribution again: its origin or its version."""
     origin = json.loads(installed.read_text("direct_url.json") or "{}")  # PEP 610
     if "vcs_info" in origin:
         return f"{PROJECT} @ {origin['vcs_info']['vcs']}+{origin['url']}@{origin['vcs_info']['commit_id']}"
@@ -222,7 +220,7 @@ def requirement(installed: importlib.metadata.Distribution) -> str:
 
 @cache
 def constraints() -> list[str]:
-    """Return the versions of what is installed here from an index."""
+    """Return the versions of the packages that are installed here from an index, as constraints of pip."""
     versions = set()
     for each in importlib.metadata.distributions():
         name = each.metadata["Name"].lower()
@@ -232,14 +230,14 @@ def constraints() -> list[str]:
 
 
 def lock() -> list[str]:
-    """Return the versions with which a checkout is tested, as constraints of pip; none without a checkout."""
+    """Return the versions that a checkout is tested with, as constraints of pip; none without a checkout."""
     root = checkout()
     path = root / LOCK if root else None
     return path.read_text("utf-8").splitlines() if path and path.exists() else []
 
 
 def checkout() -> Path | None:
-    """Return the folder from which this very code is imported, if it is a checkout of the project."""
+    """Return the folder that this code is imported from, if it is a checkout of the project."""
     root = Path(zsim.__file__).resolve().parents[1]
     is_checkout = (root / "pyproject.toml").exists() and _description(root).get("project", {}).get("name") == PROJECT
     return root if is_checkout else None
@@ -250,7 +248,7 @@ def _description(root: Path) -> dict[str, Any]:
 
 
 def _sources(root: Path) -> list[tuple[str, str]]:
-    """Return path and hash of every file that goes into the wheel, or decides how it is made."""
+    """Return path and hash of every file that affects the wheel."""
     files = [root / "pyproject.toml", root / "README.md"]
     for package in _description(root)["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]:
         files += sorted(path for path in (root / package).rglob("*") if path.is_file())
@@ -271,7 +269,7 @@ def _key(content: Any) -> str:
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:KEY_DIGITS]
 
 
-# pip of this Python, which gathers wheels for other ones
+# Running pip
 
 
 async def download_wheels(
@@ -282,22 +280,21 @@ async def download_wheels(
     kept: Path,
     progress: Progress,
 ) -> bool:
-    """Collect wheels for a target; where a project has only sources, build them here.
+    """Collect wheels for a target; projects that have only sources are built here.
 
-    The versions are those of this machine (the first of `held`, constraints of pip) where there are such wheels for the
-    target, because equal versions are a condition for equal bits; else those of the next one that has any; else the
-    newest. Return whether they had to differ. No index is asked where
-    all of them are in the folder `kept` already. PipError if there are no wheels for the target, UnreachableError if
-    the index does not answer, so that it is unknown whether there are.
+    `held` are lists of pip constraints, in order of preference: first the versions of this machine, because equal bits
+    need equal versions. The first list that can be met is used, else the newest versions. No index is needed where the
+    folder `kept` has all wheels. Return whether another list than the first was used. PipError if there are no wheels
+    for the target; UnreachableError if the index does not answer.
     """
     fit = ("download", "--only-binary=:all:", *target.options(), "--dest", str(into))
 
     async def download(wanted: Sequence[str], built: str) -> None:
-        """Download wheels; if that fails, build what has only sources into a folder, and take it from there."""
+        """Download wheels; if that fails, first build the projects that have only sources, into a folder."""
         try:
             await pip(*fit, *wanted, progress=progress)
         except PipError:
-            progress("building here what has only sources")
+            progress("building packages that have only sources")
             await pip("wheel", "--wheel-dir", built, *wanted, progress=progress)
             await pip(*fit, "--find-links", built, *wanted, progress=progress)
 
@@ -312,13 +309,13 @@ async def download_wheels(
                 await download(same, f"{aside}/{count}")
                 return count > 0
             except PipError:
-                progress("looking for other versions than those here")
+                progress("looking for other package versions")
         await download(wanted, f"{aside}/other")
         return True
 
 
 async def is_kept(kept: Path, arguments: Sequence[str], progress: Progress) -> bool:
-    """Run pip with the wheels of a folder alone, and no index; return whether they were enough."""
+    """Run pip with the wheels of a folder and no index; return whether they were enough."""
     if not any(kept.glob("*.whl")):
         return False
     try:
@@ -329,9 +326,9 @@ async def is_kept(kept: Path, arguments: Sequence[str], progress: Progress) -> b
 
 
 async def pip(*arguments: str, progress: Progress) -> None:
-    """Run pip of this Python, as the user has configured it but for how often it tries again.
+    """Run pip of this Python with the user's configuration, except for the number of retries.
 
-    PipError with its last line; UnreachableError with the reason why an index did not answer.
+    PipError with its error line; UnreachableError with the reason why an index did not answer.
     """
     options = ("--disable-pip-version-check", "--no-input", "-q")
     process = await asyncio.create_subprocess_exec(
@@ -361,6 +358,6 @@ async def pip(*arguments: str, progress: Progress) -> None:
 
 
 def _reason(error: str) -> str:
-    """Return the reason in an error that pip shows, without what surrounds it."""
+    """Extract the reason from a connection error that pip prints."""
     last = re.split(r"[:,] ", error)[-1].strip("\"')")
     return re.sub(r"\[Errno -?\d+\] ", "", last) + (")" if "(" in last else "")

@@ -496,7 +496,7 @@ def test_nothing_of_an_earlier_rendering_is_left(
     assert done.exit_code == 0, done.output
     assert files(out) == TARGETS[target](moved, step)
     assert {path.name for path in out.iterdir() if path.is_dir()} == {"one", "two"}
-    gone = done.stdout.strip().partition("; removed of an earlier rendering: ")[2].split(", ")
+    gone = done.stdout.strip().partition("; removed from an earlier rendering: ")[2].split(", ")
     assert set(gone) == former - set(files(out))
     assert any(name.startswith("lab/") for name in gone)
 

@@ -64,8 +64,8 @@ def test_variations(text: str, axis: Seeds | Grid | Draw) -> None:
 @pytest.mark.parametrize(
     ("text", "terms"),
     [
-        ("wind", ("no variation", "seed", "a.b.c=v1,v2…")),
-        ("=1", ("no variation",)),
+        ("wind", ("not a variation", "seed", "a.b.c=v1,v2…")),
+        ("=1", ("not a variation",)),
         ("duration_s=", ("no value",)),
         ("duration_s=[1", ("YAML",)),
         ("duration_s=5,5.0", ("5", "twice")),
@@ -165,7 +165,7 @@ def test_draws_are_of_their_distribution_and_know_nothing_of_each_other() -> Non
 def test_all_faults_are_told_at_once_before_anything_flies() -> None:
     found = faults("seed", "wind.gust_m_s=0,-1,-2", "wings=1,2", "estimation.flow", "drones.drone9.mass_kg=1", runs=30)
     assert len(found) == 4
-    assert has_terms(found[0], "--vary estimation.flow", "no variation")
+    assert has_terms(found[0], "--vary estimation.flow", "not a variation")
     assert has_terms(found[1], "--vary drones.drone9.mass_kg=1", "drone9", "drones")
     assert has_terms(found[2], "step.yaml", "wings", "known")
     assert has_terms(found[3], "step.yaml", GUST, "-1")
@@ -229,7 +229,7 @@ def test_which_plans_are_the_same_sweep() -> None:
         ({"runs": 2}, "4 runs", "2"),
         ({"vary": ("seed",)}, "seed wind.gust_m_s=0,1", "seed"),
         ({"vary": ("seed", f"{GUST}=0,2")}, "wind.gust_m_s=0,1", f"{GUST}=0,2"),
-        ({"document": other}, "duration_s", "another"),
+        ({"document": other}, "another", "duration_s"),
         ({"records": True}, "records"),
         ({"version": "9"}, "9"),
     ):
@@ -243,7 +243,7 @@ def test_which_plans_are_the_same_sweep() -> None:
         ("drones.drone2.mass_kg=0.40,0.45", "drones[1].mass_kg=0.42,0.43", ("drones[1].mass_kg", "already")),
         ("drones[0].mass_kg=uniform(0.4,0.5)", "drones[drone1].mass_kg=0.42", ("drones[drone1].mass_kg", "already")),
         (GAINS, "clusters[0].gains.proportional_1_s=0.6,0.4", ("clusters[0].gains.proportional_1_s", "part")),
-        ("wind.gust_m_s=0,1", "environment.wind={gust_m_s: 2}", ("environment.wind", "holds")),
+        ("wind.gust_m_s=0,1", "environment.wind={gust_m_s: 2}", ("environment.wind", "contains")),
     ],
 )
 def test_one_field_varies_once_under_whichever_of_its_names(first: str, second: str, terms: tuple[str, ...]) -> None:

@@ -19,7 +19,7 @@ from zsim.math.random_streams import stream
 from zsim_analysis.sweep.design import SweepDesign, SweepPlan
 from zsim_analysis.sweep.sweep import locked, read_table
 from zsim_analysis.sweep.sweep_figures import BEYOND_AXIS, NEVER_AS_PLANNED, figures, slices
-from zsim_analysis.sweep.sweep_report import OVERVIEW, make_sweep_report, overview, terminal_text, without_data
+from zsim_analysis.sweep.sweep_report import OVERVIEW, TerminalText, make_sweep_report, overview, without_data
 from zsim_analysis.sweep.sweep_run import Row
 from zsim_analysis.sweep.sweep_summary import SweepResults, field_name
 
@@ -38,7 +38,7 @@ def judged(of: SweepPlan, rows: list[Row]) -> SweepResults:
 
 
 def terminal(of: SweepPlan, rows: list[Row], width: int = 80) -> str:
-    return printed(terminal_text(judged(of, rows).summary()), width)
+    return printed(TerminalText(judged(of, rows).summary()), width)
 
 
 def report_of(folder: Path, of: SweepPlan, rows: list[Row]) -> tuple[str, Any]:
@@ -46,7 +46,7 @@ def report_of(folder: Path, of: SweepPlan, rows: list[Row]) -> tuple[str, Any]:
     with locked(folder, of) as sweep, sweep.journal() as book:
         for each in rows:
             book.append(each)
-    printed(terminal_text(make_sweep_report(folder)), 100)
+    printed(TerminalText(make_sweep_report(folder)), 100)
     return (folder / "report.html").read_text(), msgspec.json.decode((folder / "summary.json").read_bytes())
 
 

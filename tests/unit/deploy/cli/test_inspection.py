@@ -89,7 +89,7 @@ def test_a_key_that_fell_silent_is_told_and_not_one_of_few_messages():
     for number in range(5):
         rate.add(10 + 0.02 * number, 20_000_000 * number)
     assert has_terms(rate.line(10.1), "50.0 Hz wall", "20.0", "20.0 ms", "50.0 Hz simulated")
-    assert has_terms(rate.line(12.08), "nothing", "2.0 s", "5 messages")
+    assert has_terms(rate.line(12.08), "no messages", "2.0 s", "5 messages")
     for wall_s in (0.0, 3.0, 6.0):
         slow.add(wall_s, None)
     assert slow.line(11.0).startswith("0.3 Hz wall")

@@ -50,9 +50,9 @@ def test_an_answer_comes_back_and_a_federation_is_up_only_once():
         ("refuse", {}, ("host", "'h9'")),
         ("lack", {}, ("certs/h3/x/key.pem", "read")),
         ("hang", {}, ("too long",)),
-        ("fail", {}, ("failed", "ValueError('1…")),
-        ("dance", {}, ("no request",)),
-        ("add", {"a": 1}, ("no request",)),
+        ("fail", {}, ("internal error", "ValueError('1…")),
+        ("dance", {}, ("not a request",)),
+        ("add", {"a": 1}, ("not a request",)),
     ],
 )
 def test_what_is_refused_says_why(op, args, terms):
@@ -100,7 +100,7 @@ def test_a_folder_in_which_others_may_write_or_read_or_a_link_is_refused(tmp_pat
     else:
         folder.mkdir()
         folder.chmod(mode)
-    with refused(RunError, "yours alone", *([f"mode {mode:o}"] if mode else [])):
+    with refused(RunError, "private folder", *([f"mode {mode:o}"] if mode else [])):
         ControlSocket("zsim", {})
 
 

@@ -198,7 +198,7 @@ PUSH = "zsim push --hosts lab.yaml"
         (None, 127, "bash: line 1: PYTHON: No such file or directory", ("no zsim", ".zsim", PUSH)),
         (None, 1, "PYTHON: Command not found.", ("no zsim", ".zsim", PUSH)),
         ("PYTHON", 1, "PYTHON: No module named zsim_deploy", ("PYTHON", "no zsim", __version__, "install", "hosts.h1.python", PUSH)),
-        ("PYTHON", 126, "bash: line 1: PYTHON: Is a directory", ("PYTHON", "no program", "PYTHON", os.strerror(errno.EISDIR), "hosts.h1.python", "install", PUSH)),
+        ("PYTHON", 126, "bash: line 1: PYTHON: Is a directory", ("PYTHON", "not a program", os.strerror(errno.EISDIR), "hosts.h1.python", "install", PUSH)),
         (None, 1, "Traceback (most recent call last):\nMemoryError", ("PYTHON", "code 1", "MemoryError")),
         (None, 0, "", ("PYTHON", "code 0", "nothing")),
     ],
@@ -299,6 +299,6 @@ def test_a_port_that_is_taken_is_said(capsys):
 def test_a_folder_is_asked_for_where_it_would_be_made(tmp_path, monkeypatch):
     assert probe.unwritable(tmp_path / "zsim" / "runs") is None
     (tmp_path / "file").touch()
-    assert has_terms(probe.unwritable(tmp_path / "file" / "zsim"), f"{tmp_path}/file", "no folder")
+    assert has_terms(probe.unwritable(tmp_path / "file" / "zsim"), f"{tmp_path}/file", "not a folder")
     monkeypatch.setattr(probe.os, "access", lambda path, _mode: path != tmp_path)
     assert has_terms(probe.unwritable(tmp_path / "zsim"), str(tmp_path), "written")

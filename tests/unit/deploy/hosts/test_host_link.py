@@ -200,7 +200,7 @@ def test_a_file_comes_under_its_name_and_may_take_longer_than_a_stall(
 @pytest.mark.parametrize(
     ("get", "terms", "left"),
     [
-        (for_ever, ("nothing", "0.05 s"), ["run.mcap.part"]),
+        (for_ever, ("no data", "0.05 s"), ["run.mcap.part"]),
         (None, ("h2", "no answer", "0.05 s"), []),
         (raising(asyncssh.SFTPPermissionDenied("Permission denied")), ("h2", os.strerror(errno.EACCES)), []),
     ],
