@@ -2,8 +2,9 @@
 
 import pytest
 from federation import PAIR, Federation, compiled, federation, forked
+from near_worker import near
 
-__all__ = ["compiled", "federation", "forked", "pair_sha256"]
+__all__ = ["compiled", "federation", "forked", "near", "pair_sha256"]
 
 
 @pytest.fixture(scope="session")

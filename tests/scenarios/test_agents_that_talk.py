@@ -290,7 +290,7 @@ def test_the_pentagon_closes(tmp_path: Path) -> None:
     assert sides == pytest.approx([3.5267] * 5, abs=0.3)  # 2 · 3 m · sin(36°)
 
 
-def test_their_parameters_are_swept_by_path(tmp_path: Path) -> None:
+def test_their_parameters_are_swept_by_path(near: None, tmp_path: Path) -> None:
     """The takeoff of one run comes after its end."""
     path = "agents.pilot.parameters.takeoff_s"
     (tmp_path / "swarm.yaml").write_text(SWARM)

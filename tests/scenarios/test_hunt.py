@@ -94,7 +94,7 @@ def test_no_death_of_a_process_costs_a_bit(tmp_path: Path) -> None:
         ([], 2),
     ],
 )
-def test_what_cannot_be_hunted_is_a_line(tmp_path: Path, options: list[str], code: int) -> None:
+def test_what_cannot_be_hunted_is_a_line(near: None, tmp_path: Path, options: list[str], code: int) -> None:
     scenario = tmp_path / "pair.yaml"
     scenario.write_text(PAIR)
     done = run_here(

@@ -101,7 +101,7 @@ def test_a_drone_flies_where_it_is_asked_to_and_a_rerun_does_too(tmp_path: Path)
     assert rerun_record(tmp_path / "run", False, said.append, said.append) == ""
 
 
-def test_a_slower_path_is_swept_and_kept_to_better(tmp_path: Path) -> None:
+def test_a_slower_path_is_swept_and_kept_to_better(near: None, tmp_path: Path) -> None:
     (tmp_path / "short.yaml").write_text(SHORT)
     path = "drones.d1.reference.time_scale"
     options: dict[str, Any] = {"workers": 1, "progress": False, "set": {"drones.d1.reference.land_s": 17}}

@@ -264,7 +264,9 @@ class Checkout:
             log = self._folder / f"terminal-{len(self._terminals)}-{time.monotonic_ns()}.log"
             words = shlex.split(text)
             with log.open("w") as out:
-                forked = start_in(self._folder, words[1:], out) if words[0] == "zsim" else None
+                forked = (
+                    start_in(self._folder, words[1:], out) if words[0].removeprefix(".venv/bin/") == "zsim" else None
+                )
                 process = forked or subprocess.Popen(
                     ["bash", "-c", f"exec env {text}"],
                     cwd=self._folder,

@@ -26,8 +26,9 @@ class Finder(PathFinder):
 
 sys.meta_path[sys.meta_path.index(PathFinder)] = Finder
 import zsim.scenario.scenario_file
-from zsim_deploy.cli.cli import main
+from zsim_deploy.cli.cli import command, main
 
+command().commands["console"].make_context("console", [], resilient_parsing=True)  # once: it imports much
 for number, words in enumerate(commands):
     if not (pid := os.fork()):
         for stream in (1, 2):

@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import numpy as np
 import pandas as pd
 import psutil
 import pytest
+from forked_commands import run_here
 from refused import has_terms, refused
 from short_flight import ONE, diverge
 
@@ -23,42 +25,11 @@ from zsim.scenario import scenario_file
 from zsim.schema import plugin, yaml_file
 from zsim_agents.formation.control_law import ControlLaw
 from zsim_analysis.reading.recorded_flight import RecordedFlight
-from zsim_analysis.sweep import process_pool
-from zsim_analysis.sweep.process_pool import READY
 from zsim_analysis.sweep.sweep import load, read_table
-from zsim_analysis.sweep.sweep_run import Row, Task, fly, fly_scenario
+from zsim_analysis.sweep.sweep_run import fly_scenario
 
 PATIENCE_S = 30.0  # wall time within which processes end
 DOCUMENT = yaml_file.value(ONE)
-
-
-class NearWorker:
-    """A worker without a process of its own."""
-
-    def __init__(self) -> None:
-        self.link, self._far = process_pool.multiprocessing.Pipe()
-        self.ready = False
-        self.task: Task | None = None
-        self._far.send(READY)
-
-    def send(self, task: Task) -> None:
-        self.task = task
-        self._far.send(fly(task))
-
-    def receive(self) -> Row:
-        return self.link.recv()
-
-    def stop(self) -> None:
-        self._far.close()
-        self.link.close()
-
-
-@pytest.fixture
-def near(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fly the runs in this process."""
-    monkeypatch.setattr(process_pool, "WorkerProcess", NearWorker)
-    monkeypatch.setenv(plugin.FOLDERS, "")
-    monkeypatch.setattr(sys, "path", [*sys.path])
 
 
 def highest_m(flight: RecordedFlight) -> float:
@@ -179,9 +150,8 @@ def test_workers_know_a_script_s_classes_and_do_not_run_it_again(tmp_path: Path)
     assert law.startswith(plugin.MADE)
     assert (tmp_path / f"swept/runs/000000/{law}.py").exists()
     assert not (tmp_path / f"swept/runs/000001/{law}.py").exists()  # flies the stock law
-    command = [sys.executable, "-P", "-m", "zsim_deploy", "rerun", "--trust", "swept/runs/000000"]
-    again = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert again.returncode == 0, again.stderr
+    again = run_here("rerun", "--trust", str(tmp_path / "swept/runs/000000"))
+    assert again.code == 0, again
 
 
 WAITING = """
@@ -232,7 +202,9 @@ def test_ctrl_c_ends_the_workers_and_the_same_call_goes_on(near: None, tmp_path:
     assert (plan.runs, plan.vary) == (3, ("seed=1,2,3",))
 
 
-def test_what_a_killed_sweep_has_left_is_removed_by_the_next_one(tmp_path: Path) -> None:
+def test_what_a_killed_sweep_has_left_is_removed_by_the_next_one(
+    near: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its own folder, the modules of what the script defines, and in a worker the record of a run."""
     temporary = tmp_path / "tmp"
     temporary.mkdir()
@@ -249,11 +221,11 @@ def test_what_a_killed_sweep_has_left_is_removed_by_the_next_one(tmp_path: Path)
         started = psutil.Process(killed.pid).children(recursive=True)
         killed.kill()
     assert psutil.wait_procs(started, PATIENCE_S)[1] == []
-    left = {path.name.partition("-")[0] for path in temporary.glob("*/*")}
-    assert left == {"modules", "sweep", "run"}
-    write(tmp_path, next_py="import zsim; zsim.sweep('one.yaml', {'seed': [1]}, workers=1, progress=False)")
-    subprocess.run([sys.executable, "next.py"], cwd=tmp_path, env=environment, check=True)
-    assert [*temporary.iterdir()] == []
+    left = [*temporary.glob("*/*")]
+    assert {path.name.partition("-")[0] for path in left} == {"modules", "sweep", "run"}
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    zsim.sweep(DOCUMENT, {"seed": [1]}, progress=False)
+    assert not any(path.parent.exists() for path in left)
 
 
 def test_the_same_call_flies_what_is_missing(

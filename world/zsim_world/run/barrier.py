@@ -1,7 +1,7 @@
-"""The participants of the lockstep, how far each has come, and whom the world waits for.
+"""The participants of the lockstep, their progress, and those that the world waits for.
 
-Pure bookkeeping: no session, no clock; wall times are passed in. To integrate from t on, the world needs every gating
-participant's done for t minus the command delay. That is the only wait there is.
+Pure bookkeeping: no session, no clock; wall times are passed in. To integrate from t on, the world needs the done of
+every gating participant for t minus the command delay. It waits for nothing else.
 """
 
 from collections.abc import Callable
@@ -19,28 +19,28 @@ from zsim_world.run_state import Saved
 
 @dataclass
 class Participant:
-    """One process that has joined, by its newest incarnation."""
+    """A process that has joined, in its newest incarnation."""
 
     name: str
     join: Join
-    from_ns: int  # first gate that it is waited for
+    from_ns: int  # the first gate at which the world waits for it
     done_ns: int = -1  # newest gate that it has completed
     surplus: int = 0  # outputs that have arrived since its last done
-    missing: int = 0  # outputs counted in its dones that have not arrived
+    missing: int = 0  # outputs that its dones counted and that have not arrived
     done_seq: int | None = None  # number of its newest done, None before the first of its process
-    lost_done: bool = False  # and with it the count of the outputs before it
+    lost_done: bool = False  # a done was lost, and with it the count of the outputs before it
     was_incomplete: bool = False  # outputs were missing at the last gate, in realtime
-    rejoined: bool = False  # another incarnation of its name was there before
-    repeats: bool = False  # it may publish again what was counted before
-    successor: bool = False  # it has replaced another process that was alive
+    rejoined: bool = False  # another incarnation of this name joined before
+    repeats: bool = False  # it may publish outputs again that were already counted
+    successor: bool = False  # it has replaced a process that was alive
     alive: bool = True
     since_wall_ns: int = 0  # when it last joined, sent a done or died
     joined_wall_ns: int = 0  # when this incarnation joined
     deadline_misses: int = 0  # dones that were late in realtime
-    away: bool = False  # it has yet to come back to a world that was started again
-    silent_wall_ns: int | None = None  # when its last health came, if it has fallen silent since
-    # its bye, if that names no incarnation and so may be somebody else's; it counts when the token is lost, and is
-    # taken back by the next done
+    away: bool = False  # it has not yet rejoined a restarted world
+    silent_wall_ns: int | None = None  # when its last health message arrived, if it has been silent since
+    # Its bye, if that names no incarnation and so may come from another process: it takes effect when the token is
+    # lost, and the next done cancels it.
     farewell: Bye | None = None
 
     def __str__(self) -> str:
@@ -48,12 +48,12 @@ class Participant:
 
     @property
     def place(self) -> dict[str, Any]:
-        """Return where it runs, for the data of an event."""
+        """Return the host and process id, for the data of an event."""
         return {"host": self.join.host, "pid": self.join.pid}
 
     @property
     def is_missed(self) -> bool:
-        """Tell whether it is dead, silent, or has yet to come back."""
+        """Tell whether it is dead, silent or away."""
         return not self.alive or self.away or self.silent_wall_ns is not None
 
     @property
@@ -65,7 +65,7 @@ class Participant:
         return self.gating or self.join.slack_ns > 0
 
     def is_process_of(self, join: Join) -> bool:
-        """Tell whether another join comes from the same process, taking part in the same way."""
+        """Tell whether another join comes from the same process with the same kind of participation."""
         fields = ("host", "pid", "role", "period_ns", "slack_ns", "serves")
         return all(getattr(self.join, name) == getattr(join, name) for name in fields)
 
@@ -75,7 +75,7 @@ class Participant:
 
     @property
     def incomplete(self) -> bool:
-        """Tell whether outputs counted in its dones have not arrived, or a done was lost."""
+        """Tell whether outputs or a done of it were lost or are still on their way."""
         return self.missing > 0 or self.lost_done
 
     def required_ns(self, need_ns: int) -> int | None:
@@ -90,22 +90,22 @@ class Participant:
         return required if required >= self.from_ns else None
 
     def blocks(self, need_ns: int) -> bool:
-        """Tell whether its done for `need_ns`, or an output that it counted, has not arrived."""
+        """Tell whether its done for `need_ns`, or an output counted by a done, has not arrived."""
         required = self.required_ns(need_ns)
-        return required is not None and (self.done_ns < required or self.missing > 0 or self.lost_done)
+        return required is not None and (self.done_ns < required or self.incomplete)
 
     def reset_counts(self) -> int:
-        """Restart the counts once outputs were requested again; return how many are missing for good.
+        """Reset the counts once lost outputs were requested again; return how many remain missing.
 
-        A surplus would hide the next loss: outputs that belong to the next done do not come while some are missing. Of
-        the outputs repeated after a rejoin some were counted before: these are not missing.
+        A surplus would hide the next loss: no outputs of the next done arrive while some are missing. Outputs repeated
+        after a rejoin may have been counted before; those are not missing.
         """
         missing = 0 if self.repeats else self.missing
         self.missing, self.surplus, self.lost_done, self.repeats = 0, 0, False, False
         return missing
 
     def waiting(self, wall_ns: int, held_by: tuple[str, ...] = (), since_ns: int | None = None) -> Waiting:
-        """Return the entry of `clock` that names it, as waited for since its last sign or since `since_ns`."""
+        """Return its entry in `clock`: waited for since its last done, join or death, or since `since_ns`."""
         since_ns = self.since_wall_ns if since_ns is None else since_ns
         return Waiting(self.name, self.join.host, (wall_ns - since_ns) / 1e9, held_by)
 
@@ -114,9 +114,9 @@ class Barrier:
     """The participants of a run.
 
     Args:
-        run_id: joins and dones of other runs are refused.
-        gate_ns: every period is a multiple of it.
-        expected: names without which the run does not start.
+        run_id: of this run; joins and dones of other runs are refused.
+        gate_ns: gate interval [ns]; every period is a multiple of it.
+        expected: names of the processes required at the start.
     """
 
     SAVED: ClassVar[Saved] = {"_expected": list[str], "participants": dict[str, Participant]}
@@ -134,10 +134,10 @@ class Barrier:
     # Joins
 
     def join(self, name: str, message: Join, next_gate_ns: int, wall_ns: int) -> Refusal | None:
-        """Admit a participant; return why it is refused.
+        """Admit a participant; return the refusal, or None.
 
-        The new incarnation of a known name continues from its progress; so does a participant that does all the work of
-        others that are dead, and replaces them. The same join again changes nothing.
+        A new incarnation of a known name continues from the progress of the former one; so does a participant that does
+        all the work of dead ones, which it replaces. Repeating a join has no effect.
         """
         if refusal := self.join_refusal(name, message):
             return refusal
@@ -164,7 +164,7 @@ class Barrier:
         )
         return None
 
-    def takes_place(self, name: str, message: Join) -> bool:
+    def would_replace(self, name: str, message: Join) -> bool:
         """Tell whether a join would replace another process."""
         if self.join_refusal(name, message):
             return False
@@ -172,12 +172,12 @@ class Barrier:
         return (former is not None and not former.is_process_of(message)) or bool(self.replaced(name, message))
 
     def replaced(self, name: str, message: Join) -> list[Participant]:
-        """Return the dead whose work a newcomer of another name is to do."""
+        """Return the dead participants whose work a newcomer of another name would take over."""
         served = {name, *message.serves}
         return [p for p in self.participants.values() if not p.alive and p.name != name and p.served_names <= served]
 
     def join_refusal(self, name: str, message: Join) -> Refusal | None:
-        """Return why a join does not fit the run."""
+        """Return the refusal of a join that does not fit the run, or None."""
         if name == WORLD or not keys.PROCESS_NAME.fullmatch(name):
             return Refusal("name", repr(name[:60]), f"must be a role, a dot and a name of a-z 0-9 _ . -, not {WORLD!r}")
         if message.run_id != self._run_id:
@@ -192,9 +192,9 @@ class Barrier:
     # Dones, outputs and byes
 
     def done(self, name: str, message: Done, now_ns: int, wall_ns: int) -> Refusal | None:
-        """Note that a participant has completed the gate `done_ns`; return why the done is refused.
+        """Note that a participant has completed the gate `done_ns`; return the refusal, or None.
 
-        A gap in the numbers of its dones shows that one was lost. More outputs than a done counts belong to the next.
+        A gap in the sequence numbers shows that a done was lost. Outputs beyond the count belong to the next done.
         """
         participant = self.participants.get(name)
         if participant is None:
@@ -220,7 +220,7 @@ class Barrier:
         return None
 
     def count_output(self, name: str) -> None:
-        """Count one output that has arrived, of a participant or of one whose work it does."""
+        """Count an output that has arrived from a participant, or from a process whose work a participant does."""
         participant = self.participants.get(name)
         if participant is None:
             participant = next((each for each in self.participants.values() if name in each.join.serves), None)
@@ -232,9 +232,9 @@ class Barrier:
             participant.surplus += 1
 
     def give_up_late(self) -> None:
-        """At a gate in realtime, give up outputs that were missing at the gate before: they are lost.
+        """At a gate in realtime, give up the outputs that were already missing at the previous gate: they are lost.
 
-        They are not requested again, and every later gate would count as a deadline miss of their sender.
+        They are not requested again, and would make every later gate a deadline miss of their sender.
         """
         for participant in self.participants.values():
             if participant.incomplete and participant.was_incomplete:
@@ -242,7 +242,7 @@ class Barrier:
             participant.was_incomplete = participant.incomplete
 
     def bye_refusal(self, participant: Participant, message: Bye) -> Refusal | None:
-        """Return the refusal of a bye that names another run or incarnation."""
+        """Return the refusal of a bye that names another run or incarnation, or None."""
         if message.run_id not in (UNSET, self._run_id):
             return self._run_id_refusal(str(message.run_id))
         if message.incarnation not in (UNSET, participant.join.incarnation):
@@ -255,7 +255,7 @@ class Barrier:
         return participant is not None and participant.farewell is not None
 
     def take_back_bye(self, name: str) -> Refusal | None:
-        """Drop the bye of a participant that goes on: it was somebody else's; return its refusal."""
+        """Drop the bye of a participant that continues: another process sent it. Return its refusal, or None."""
         participant = self.participants[name]
         if participant.farewell is None:
             return None
@@ -263,7 +263,7 @@ class Barrier:
         return _incarnation_refusal(participant, "missing")
 
     def remove(self, name: str) -> None:
-        """Remove a participant that has said bye or is dropped; it is not expected any more."""
+        """Remove a participant that has said bye or is dropped; it is no longer expected."""
         removed = self.participants.pop(name, None)
         gone = (name, *(removed.join.serves if removed else ()))
         self._expected = [expected for expected in self._expected if expected not in gone]
@@ -280,7 +280,7 @@ class Barrier:
         return participant
 
     def await_return(self, wall_ns: int, all_died: bool) -> None:
-        """Wait for all to come back to a world that was started again."""
+        """Wait until all participants have rejoined a restarted world."""
         for participant in self.participants.values():
             participant.since_wall_ns = participant.joined_wall_ns = wall_ns
             participant.alive = participant.alive and not all_died
@@ -289,18 +289,18 @@ class Barrier:
     # Who is there, and who is waited for
 
     def is_gating(self, name: str) -> bool:
-        """Tell whether a process gates, even one that seems dead: its outputs may arrive before it rejoins."""
+        """Tell whether a process gates, even one that is marked dead: its outputs may arrive before it rejoins."""
         participant = self.participants.get(name)
         return participant is not None and participant.gating
 
     def substitute(self, name: str) -> Participant | None:
-        """Return a living participant that does all the work of another as well, None if there is none."""
+        """Return a living participant that also does all the work of another, or None."""
         served = self.participants[name].served_names
         others = (p for p in self.participants.values() if p.name != name and p.alive)
         return next((p for p in others if served <= p.served_names), None)
 
     def duplicates(self, name: str) -> dict[str, set[str]]:
-        """Return the names that living participants serve in common with one, by participant."""
+        """Return, by living participant, the names that it serves in common with this one."""
         served = self.participants[name].served_names
         others = (p for p in self.participants.values() if p.name != name and p.alive)
         return {p.name: both for p in others if (both := served & p.served_names)}
@@ -311,7 +311,7 @@ class Barrier:
         return [name for name in self._expected if name not in present]
 
     def away(self) -> list[Participant]:
-        """Return the participants that have not come back to a world that was started again."""
+        """Return the participants that have not yet rejoined a restarted world."""
         return [p for p in self.participants.values() if p.away]
 
     def blocking(self, need_ns: int) -> list[Participant]:
@@ -325,16 +325,16 @@ class Barrier:
     def waiting_for(
         self, need_ns: int, wall_ns: int, start_wall_ns: int, feeds: Callable[[str, str], bool]
     ) -> tuple[Waiting, ...]:
-        """Return whom the world waits for, as entries of `clock`: first the dead, then by time without a done.
+        """Return the processes that the world waits for, as entries of `clock`: the dead first, then by time waited.
 
-        `feeds` tells whether one process reads another's outputs, and so may only be waiting itself.
+        `feeds(writer, reader)` tells whether the reader may be waiting for the writer's outputs.
         """
         absent = [Waiting(name, "", (wall_ns - start_wall_ns) / 1e9) for name in self.absent()]
         rank = {name: place for place, name in enumerate(self._expected)}
         awaited = {p.name: p for p in (*self.away(), *self.blocking(need_ns))}.values()
         late = sorted(awaited, key=lambda p: (p.alive, p.since_wall_ns, rank.get(p.name, len(rank))))
         waiting = []
-        for victim in late:  # it may only wait itself for the outputs of others that are late
+        for victim in late:  # may itself be waiting for the outputs of others that are late
             read_by = victim.served_names if victim.gating and victim.alive and not victim.away else ()
             others = (p for p in late if p is not victim and p.gating)
             held_by = (p.name for p in others if any(feeds(w, r) for w in p.served_names for r in read_by))

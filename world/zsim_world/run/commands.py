@@ -1,4 +1,4 @@
-"""Commands from their arrival to the firmware: checked, delayed by their link, queued, applied, published as events.
+"""Commands from arrival to firmware: checked, delayed by their link, queued, applied, published as events.
 
 The first source that sends a setpoint to a drone without a commander is its commander, until it releases it, leaves or
 dies. Commands of one instant are ordered by (priority of the source, source, seq): the last wins.
@@ -30,15 +30,15 @@ RECENT_PER_DRONE = 32  # commands remembered to recognise duplicates; a rejoin r
 
 
 class CommandIntake:
-    """Takes commands as they arrive, and passes them to the fleet at their instants.
+    """Accepts commands as they arrive and passes them to the fleet when they take effect.
 
     Args:
-        run: whose participants send commands.
-        drivers: of the external drones of the fleet.
-        faults_at: returns the faults of links and radios that act in a gate.
+        run: the run whose participants send commands.
+        drivers: drivers of the external drones of the fleet.
+        faults_at: returns the link and radio faults that act in a gate.
 
     Attributes:
-        queue: of the commands, with the commander of each drone.
+        queue: pending commands and the commander of each drone.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class CommandIntake:
         self._cluster_of = {drone: cluster.name for cluster in run.scenario.clusters for drone in cluster.drones}
 
     def accept(self, drone: str, kind: str, message: Any) -> bool:
-        """Queue a command for its instant, or refuse it; return False for a duplicate."""
+        """Queue a command, or refuse it; return False for a duplicate."""
         source = message.source
         gating = self._barrier.is_gating(source)  # its name was checked when it joined
         if not gating and not keys.PROCESS_NAME.fullmatch(source):
@@ -70,12 +70,12 @@ class CommandIntake:
         gate_ns = message.t_ns if gating else self._clock.next_ns
         late_ns = self._link_delay_ns(drone, kind, message, gate_ns)
         if late_ns is None:
-            return True  # the link loses it; its sender has sent it all the same
+            return True  # lost by the link, but sent, so it counts as an output
         external, delay_ns = index in self._drivers, self._clock.delay_ns
-        if external:  # its link is real, and delays commands by itself
+        if external:  # its real link delays commands already
             gate_ns, delay_ns = min(gate_ns, self._clock.now_ns), 0
         apply_ns = gate_ns + delay_ns + late_ns
-        if not gating:  # a rerun needs the event: without it the command is not carried out
+        if not gating:  # a rerun repeats these commands from their events
             if not self._budgets.spend(source, f"drone/{drone}/cmd/", source in self._barrier.participants):
                 return self._refuse(source, drone, kind, too_many(source))
             fields = {name: getattr(message, name) for name in messages.fields(type(message))}
@@ -102,9 +102,9 @@ class CommandIntake:
         return None
 
     def _link_delay_ns(self, drone: str, kind: str, message: Any, gate_ns: int) -> int | None:
-        """Return the delay of a command by faults of its link, in whole gates; None if the link loses it.
+        """Return the delay by faults of the link to the world [ns], in whole gates; None if the link loses the command.
 
-        The world is the receiver of this link; gate_ns is the gate that the command belongs to.
+        `gate_ns` is the gate that the command belongs to.
         """
         acting = self._faults_at(gate_ns)
         if not acting:
@@ -134,17 +134,17 @@ class CommandIntake:
         return total_delay_ns(radios, self._scenario.seed, WORLD, key, command.message, distance_m) is NEVER
 
     def _sender(self, drone: str, source: str) -> str:
-        """Return the sender of a command: of the controllers that share a process, that of the drone's cluster."""
+        """Return the sender of a command; for a process with several controllers, the controller of the drone."""
         controller = f"controller.{self._cluster_of.get(drone)}"
         participant = self._barrier.participants.get(source)
         return controller if participant is not None and controller in participant.join.serves else source
 
     def _position_m(self, drone: str) -> list[float] | None:
-        """Return the true position of a drone [m; W], None for an unknown one."""
+        """Return the true position of a drone [m; W], None for an unknown drone."""
         i = self._index.get(drone)
         return self._fleet.bodies.state[i, :3].tolist() if i is not None else None
 
-    # At their instants
+    # When they take effect
 
     def apply(self, t_ns: int) -> None:
         """Pass the commands that take effect at t_ns to the firmware."""
@@ -192,7 +192,7 @@ class CommandIntake:
         return refusal
 
     def _hand_on(self, command: QueuedCommand) -> str | None:
-        """Repeat a command for the driver of an external drone; return why it is refused."""
+        """Publish a command for the driver of an external drone; return why it is refused."""
         refusal = self._drivers.command_refusal(command.drone, command.kind, command.message)
         if refusal is None:
             self._put_accepted(command.drone, command.kind, command.message)
@@ -203,7 +203,7 @@ class CommandIntake:
         self._outbox.put(key, msgspec.structs.replace(message, seq=self._outbox.next_seq(key)))
 
     def _release_drone(self, i: int) -> None:
-        """Let a drone hover that has no commander any more."""
+        """Let a drone that has lost its commander hover."""
         if i in self._drivers:
             hover = Ardrone(self._clock.now_ns, 0, WORLD, 0.0, 0.0, 0.0, 0.0, hover=True)
             self._put_accepted(i, "ardrone", hover)
@@ -211,7 +211,7 @@ class CommandIntake:
             self._fleet.release(i)
 
     def release_all(self, source: str) -> None:
-        """Release the drones commanded by a process that is gone: they hover."""
+        """Release the drones commanded by a process that has left or died: they hover."""
         for i in self.queue.remove_source(source):
             self._release_drone(i)
             self._outbox.event("release", self._fleet.names[i], f"{source} flies it no longer", source=source)
@@ -219,7 +219,7 @@ class CommandIntake:
     # Requests
 
     def operations(self) -> dict[str, Operation]:
-        """Return what each `op` on `world/control` that is about commanders does."""
+        """Return the handlers of the `op` values on `world/control` that concern commanders."""
         return dict.fromkeys(("acquire", "release", "mission"), self._operate)
 
     def _operate(self, request: ControlRequest) -> Refusal | None:
@@ -241,7 +241,7 @@ class CommandIntake:
         return self.queue.acquire(index, request.source, int(priority))
 
     def _report_mission(self, request: ControlRequest, drone: str) -> Refusal | None:
-        """Publish how far the commander of a drone has flown its mission."""
+        """Publish the progress of a mission that the commander of a drone flies."""
         args = request.args
         if args.get("state") not in MISSION_STATES:
             return refused_argument(request, "state", f"one of {', '.join(MISSION_STATES)}")
@@ -257,26 +257,26 @@ class CommandIntake:
 
 
 class QueuedCommand(NamedTuple):
-    """A command that takes effect at `apply_ns`; commands are sorted by all fields but the message."""
+    """A command that takes effect at `apply_ns`; commands are sorted by all fields except the message."""
 
     apply_ns: int
     priority: int
     source: str
     seq: int
-    drone: int  # drone and kind stand last only to make the order independent of arrival
+    drone: int  # drone and kind make the order independent of arrival
     kind: str
     message: Any
 
 
 class Commander(NamedTuple):
-    """The source that flies a drone."""
+    """The source that commands a drone."""
 
     source: str
     priority: int
 
 
 class CommandQueue:
-    """Commands that are yet to take effect, and the commander of each of the named drones."""
+    """Pending commands, and the commander of each of the named drones."""
 
     SAVED: ClassVar[Saved] = {
         "_commanders": list[Commander | None],
@@ -293,7 +293,7 @@ class CommandQueue:
         self._recent: dict[tuple[int, str, int, str, int], Any] = {}  # messages by those fields that compare quickly
 
     def restored(self) -> None:
-        """Convert the messages, which the state holds as maps, to their types."""
+        """Convert the messages, which a saved state holds as maps, to their types."""
         for t_ns, queued in self._queued.items():
             self._queued[t_ns] = [each._replace(message=_command(each.kind, each.message)) for each in queued]
         self._recent = {mark: _command(mark[1], message) for mark, message in self._recent.items()}
@@ -312,7 +312,7 @@ class CommandQueue:
         return True
 
     def pop(self, t_ns: int, drones: Container[int] | None = None) -> list[QueuedCommand]:
-        """Return the commands that take effect up to t_ns, of all drones or of some, in the order in which they do."""
+        """Remove and return the commands of all or some drones that take effect up to t_ns, in order of effect."""
         instants = sorted([instant for instant in self._queued if instant <= t_ns])
         due = [command for instant in instants for command in sorted(self._queued.pop(instant), key=_order)]
         if drones is None:
@@ -344,7 +344,7 @@ class CommandQueue:
         return True
 
     def acquire(self, drone: int, source: str, priority: int) -> Refusal | None:
-        """Make the source the commander; return the refusal if another one has no lower priority."""
+        """Make the source the commander; return the refusal if the present one has at least its priority."""
         commander = self._commanders[drone]
         if commander is not None and commander.source != source and priority <= commander.priority:
             state = f"flown by {commander.source!r} with priority {commander.priority}"
@@ -366,7 +366,7 @@ class CommandQueue:
         return None
 
     def remove_source(self, source: str) -> list[int]:
-        """Remove a source that has left as commander and its priorities; return the drones that it commanded."""
+        """Remove a source that has left, with its priorities; return the indices of the drones that it commanded."""
         drones = [i for i, commander in enumerate(self._commanders) if commander and commander.source == source]
         for drone in drones:
             self._commanders[drone] = None
@@ -376,7 +376,7 @@ class CommandQueue:
         return drones
 
     def _drop_setpoints(self, source: str, drones: Container[int]) -> None:
-        """Remove the queued setpoints of a source; a mode that was requested is still entered."""
+        """Remove the queued setpoints of a source; requested modes are still entered."""
         for instant, queued in self._queued.items():
             kept = [c for c in queued if c.kind == "mode" or c.source != source or c.drone not in drones]
             self._queued[instant] = kept
@@ -386,4 +386,4 @@ def _command(kind: str, fields: Any) -> Any:
     return msgspec.convert(fields, messages.type_of(keys.command("any", kind)))
 
 
-_order = itemgetter(slice(6))  # all of a QueuedCommand but the message
+_order = itemgetter(slice(6))  # all fields of a QueuedCommand except the message

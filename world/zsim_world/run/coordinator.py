@@ -1,8 +1,8 @@
-"""What a flight (World) and a replay (Playback) have in common: participants, requests, and what time waits for.
+"""The part common to a flight (World) and a replay (Playback): participants, requests and the advance of time.
 
-How processes join, report, leave and get lost, and what each means for the run. No session, no clock: a runner passes
-on what arrives, asks whether it may go on (`may_advance`), lets it go on (`advance`), and publishes its outbox. Wall
-times are passed in, monotonic.
+It handles processes that join, report, leave or die. No session, no clock: the caller passes in every input, asks
+whether the next gate may come (`may_advance`), advances (`advance`) and publishes the outbox. Wall times are passed in,
+monotonic.
 """
 
 import math
@@ -27,29 +27,29 @@ from zsim_world.run.outbox import STRANGERS_MAX, Budgets, KeyedMessage, Refusal,
 from zsim_world.run.run_clock import Operation, RunClock, RunStatistics, number
 
 RECORDER = "recorder"  # name and role
-START_TIMEOUT_S = 60.0  # wall; chosen, for processes that a launched run expects and does not start itself
-START_TIMEOUT_OWN_S = 600.0  # wall; chosen, for those that its launcher starts: the first start may compile for minutes
-FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # that change a flight
-ARGS_BYTES_MAX = 4000  # of arguments that an event repeats as they are; any operation needs far fewer
+START_TIMEOUT_S = 60.0  # wall; chosen, for expected processes that the launcher does not start
+START_TIMEOUT_OWN_S = 600.0  # wall; chosen, for processes that the launcher starts: compiling may take minutes
+FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # requests that change a flight
+ARGS_BYTES_MAX = 4000  # up to which an event repeats arguments unchanged; any operation needs far fewer
 
 
 class Coordinator(ABC):
-    """One run, as its participants see it.
+    """A run from its participants' point of view.
 
     Args:
         rate: simulated per wall seconds to pace at; 0 = as fast as possible.
-        run_id: given by a launcher, and by tests that compare records.
-        expected: names of the processes without which the run does not start.
+        run_id: set by a launcher, and by tests that compare records.
+        expected: names of the processes required at the start.
 
     Attributes:
-        needs_participants: whether it matters to the run who leaves or dies; not to a replay.
-        refused_queries: keys beside `world/control` on which requests are answered, all with a refusal.
-        external: names of the drones of which drivers publish sensors, truth and status.
-        unpaced: names of the processes that step when a driver publishes, and not at every gate.
-        is_launched: whether a launcher has started it and its processes, and not people one after the other.
-        failure: what is to be raised once the end is published, None for a run that ended well.
-        left_early: a line for each process that the run needed and that left it before the end.
-        requests: on `world/control`, all of them counted.
+        needs_participants: whether the loss of a participant affects the run; False for a replay.
+        refused_queries: keys beside `world/control` on which every request is refused.
+        external: names of the drones whose drivers publish sensors, truth and status.
+        unpaced: names of the processes that step when a driver publishes, not at every gate.
+        is_launched: whether a launcher started the run, rather than users starting each process.
+        failure: the error to raise once the end is published; None for a run that ended well.
+        left_early: a line for each process that the run needed and that left before the end.
+        requests: number of requests on `world/control`.
     """
 
     needs_participants = True
@@ -94,7 +94,7 @@ class Coordinator(ABC):
 
     @abstractmethod
     def views(self, seq: int) -> Sequence[Output]:
-        """Return the messages of `view/**` as of this gate."""
+        """Return the messages of `view/**` at the newest gate."""
 
     @abstractmethod
     def result(self) -> dict[str, Any]:
@@ -102,31 +102,31 @@ class Coordinator(ABC):
 
     @abstractmethod
     def _handle_command(self, drone: str, kind: str, message: Any) -> bool:
-        """Take a command to a drone; return False for a duplicate."""
+        """Handle a command to a drone; return False for a duplicate."""
 
     def take_of_driver(self, drone: str, message: Any) -> str | None:
-        """Take a message of an external drone's driver; return why it is refused. A replay has no drivers."""
+        """Handle a message of an external drone's driver; return why it is refused. A replay has no drivers."""
         return None
 
     def release_drones(self, name: str) -> None:  # noqa: B027 - a replay has none
-        """Release the drones commanded by a process that is gone."""
+        """Release the drones commanded by a process that has left or died."""
 
     def refusal_at(self, key: str) -> str | None:
-        """Return why requests on one of `refused_queries` are refused; None where another process answers there."""
+        """Return why requests on one of `refused_queries` are refused, None if another process answers there."""
         return f"{key}: is not answered here"
 
     @property
     def now_ns(self) -> int:
-        """Return the newest gate; 0 before the start too."""
+        """Return the newest gate; also 0 before the start."""
         return self.clock.now_ns
 
     @property
     def ended(self) -> str | None:
-        """Return why the run is over, None while it goes on."""
+        """Return why the run has ended, None while it continues."""
         return self.clock.ended
 
     def fail(self, reason: str) -> None:
-        """End the run before its time."""
+        """End the run with a failure."""
         if self.clock.ended is None:
             self.failure = RunFailedError(reason)
         self.clock.stop(reason)
@@ -134,7 +134,7 @@ class Coordinator(ABC):
     # What participants publish
 
     def handle(self, key: str, message: Any, wall_ns: int) -> None:
-        """Take one message that a participant or anyone else published."""
+        """Handle a message of a participant or any other process."""
         kind, name, what = keys.parts(key)
         if kind == "drone" and what.startswith("cmd/"):
             self.barrier.count_output(message.source)
@@ -155,14 +155,14 @@ class Coordinator(ABC):
         self.barrier.count_output(source)
 
     def give_up_outputs(self, name: str) -> None:
-        """Stop waiting for the outputs of a participant that are lost."""
+        """Stop waiting for the lost outputs of a participant."""
         missing = self.barrier.participants[name].reset_counts()
         if missing:
             text = f"{name}: {missing} of its outputs did not come"
             self.outbox.notice("outputs_missing", name, text, {"missing": missing})
 
     def join(self, name: str, message: Join, wall_ns: int) -> None:
-        """Take a process in, or refuse it; one that blocks the clock may join however often it has."""
+        """Admit or refuse a process; no budget limits the joins of one that blocks the clock."""
         barrier, outbox, counted = self.barrier, self.outbox, f"process/{name}"
         changes, strangers = self.budgets.changes, self.budgets.strangers
         former, replaced = barrier.participants.get(name), barrier.replaced(name, message)
@@ -204,7 +204,7 @@ class Coordinator(ABC):
             outbox.event("doubled", name, text, {"other": other})
 
     def _take_bye(self, name: str, message: Bye, wall_ns: int) -> None:
-        """Let a participant go; a bye without incarnation counts once its token is lost as well."""
+        """Remove a participant that says bye; a bye without incarnation takes effect once its token is lost."""
         participant = self.barrier.participants.get(name)
         if participant is None:
             return
@@ -214,14 +214,14 @@ class Coordinator(ABC):
         is_named = UNSET not in (message.run_id, message.incarnation)
         if is_named or not participant.alive or self.clock.ended is not None:
             self._leave(participant, message, wall_ns)
-        else:  # of contract 1.0, or somebody else's
+        else:  # of contract 1.0, or from another process
             participant.farewell = message
 
     def _leave(self, participant: Participant, bye: Bye, wall_ns: int) -> None:
-        """Remove a participant that has said bye, or that cannot continue.
+        """Remove a participant that has said bye or cannot continue.
 
-        The run fails if the scenario needs it and nobody else does its work. A program of somebody's own leaves when it
-        is through; the leave of a recorder ends the run.
+        The run fails if the scenario needs it and no other process does its work. A user's own program may leave when
+        it has finished; a recorder that leaves ends the run.
         """
         name, role, barrier = participant.name, participant.join.role, self.barrier
         if bye.failed is True and self.clock.ended is None:
@@ -249,7 +249,7 @@ class Coordinator(ABC):
             self.clock.stop(f"the recorder left: {bye.reason}")
 
     def _cannot_continue(self, participant: Participant, reason: str, wall_ns: int) -> None:
-        """Handle the leave of a process that failed; started again, it would fail again."""
+        """Handle the bye of a process that failed; a restart would fail again."""
         name, action = participant.name, self._on_death(participant)
         action = "end" if action == "restart" else action
         self.outbox.event("failure", name, reason, {**participant.place, "on_death": action}, name)
@@ -264,16 +264,16 @@ class Coordinator(ABC):
             self.fail(reason)
 
     def _expect_again(self, participant: Participant) -> None:
-        """Wait at the start again for the processes whose work a lost one was to do."""
+        """Before the start, expect again the processes whose work a lost participant was to do."""
         if self.clock.state == "waiting":
             for each in self._expected:
                 if each in participant.served_names:
                     self.barrier.expect(each)
 
-    # Who is lost
+    # Losses
 
     def died(self, name: str, wall_ns: int) -> None:
-        """Handle the loss of a token: its process has died, or left where it has said bye."""
+        """Handle the loss of a token: its process has died, or has left if it said bye."""
         if self._has_left(name, wall_ns):
             return
         participant = self.barrier.mark_dead(name, wall_ns)
@@ -291,7 +291,7 @@ class Coordinator(ABC):
             self.fail(f"{name} died")
 
     def _has_left(self, name: str, wall_ns: int) -> bool:
-        """Let a process go whose bye waits for the loss of its token; return whether there is such a bye."""
+        """Remove a process whose bye awaited the loss of its token; return whether there was such a bye."""
         participant = self.barrier.participants.get(name)
         if participant is None or participant.farewell is None:
             return False
@@ -299,13 +299,13 @@ class Coordinator(ABC):
         return True
 
     def _on_death(self, participant: Participant) -> OnDeath:
-        """Return what the death of a participant means."""
+        """Return what happens when a participant dies."""
         if not self.needs_participants:
             return "drop"
         return roles.on_death(self.scenario.processes.on_death, participant.name, participant.join.role)
 
     def _may_return(self, participant: Participant) -> bool:
-        """Tell whether the run waits for a process that died."""
+        """Tell whether the run waits for the return of a process that died."""
         return self._on_death(participant) in ("restart", "wait")
 
     def _drop(self, name: str, is_news: bool = True) -> None:
@@ -317,7 +317,7 @@ class Coordinator(ABC):
             self.outbox.event("drop", name, f"{name} is waited for no longer", data)
 
     def overdue(self, wall_ns: int) -> str | None:
-        """Return a process that has had its time to join, or to come back since it is dead or silent; None if none."""
+        """Return a process whose time to join, or to return after its death or silence, is over; None if none."""
         if self.clock.state == "waiting":
             waited_s = (wall_ns - self.start_wall_ns) / 1e9
             for name in self.barrier.absent():
@@ -335,7 +335,7 @@ class Coordinator(ABC):
         return None
 
     def _start_timeout_s(self, name: str) -> float:
-        """Return how long a run waits at its start for a process that is expected [s, wall]."""
+        """Return how long a run waits at its start for an expected process [s, wall]."""
         program = self.scenario.own_programs.get(name)
         for section in (program, self.scenario.processes):
             if section is not None and section.start_timeout_s is not UNSET:
@@ -346,12 +346,12 @@ class Coordinator(ABC):
         return START_TIMEOUT_OWN_S if is_started else START_TIMEOUT_S
 
     def expired(self, name: str) -> None:
-        """End the run for a process that has not come, or not come back, in its time, or continue without it."""
+        """End the run, or continue without the process, after a process has not joined or returned in time."""
         processes = self.scenario.processes
         participant = self.barrier.participants.get(name)
         if participant is not None:
             place, action = participant.place, self._on_death(participant)
-            if action not in ("drop", "end"):  # these hold for one that is silent as for one that is dead
+            if action not in ("drop", "end"):  # on_death applies to silent processes as well
                 role, gating = participant.join.role, processes.gating or ()
                 action = roles.on_overdue(processes.on_overdue or {}, name, role, gating)
             text = f"{name} has not come back within {processes.return_s:g} s"
@@ -367,7 +367,7 @@ class Coordinator(ABC):
             self.fail(text)
 
     def silence_changed(self, name: str, since_wall_ns: int | None) -> None:
-        """Note that a process publishes its health no longer, since its last; or does again (None)."""
+        """Note that a process has been silent since its last health message, or publishes health again (None)."""
         participant = self.barrier.participants.get(name)
         if participant is None or not participant.alive:
             return
@@ -379,14 +379,14 @@ class Coordinator(ABC):
             self.outbox.event("silent", name, text, participant.place)
 
     def reader_closed(self, text: str, data: dict[str, Any]) -> None:
-        """Report a reader that took nothing, so that its link was closed; nobody waits for it."""
+        """Report a reader whose link was closed because it took nothing; the run does not wait for it."""
         if self.budgets.strangers.spend("slow_reader"):
             self.outbox.event("slow_reader", data["address"], text, data)
 
     def falsely_joined(self, name: str, join: Join, fault: str) -> None:
-        """Report a withheld join without a process behind it: whoever has that place keeps it.
+        """Report a withheld join without a process behind it; a present participant of that name stays.
 
-        It is counted like a refusal, and is an event as long as there have not been too many.
+        It counts as a refusal, and becomes an event within the budget.
         """
         if not self.budgets.strangers.spend("no_show"):
             self.outbox.refusals.count += 1
@@ -397,7 +397,7 @@ class Coordinator(ABC):
         self.outbox.event("no_show", name, text, data)
 
     def not_shown(self, name: str, fault: str, wall_ns: int) -> None:
-        """Undo the join of a participant that has given no sign of being there."""
+        """Undo the join of a participant that has shown no sign of existence."""
         participant = self.barrier.participants.get(name)
         if participant is None or not participant.alive or self._has_left(name, wall_ns):
             return
@@ -409,10 +409,10 @@ class Coordinator(ABC):
         self._expect_again(participant)
 
     def await_return(self, wall_ns: int, all_died: bool) -> None:
-        """Let time stand, in a world that was started again, until the participants are back or dead.
+        """In a restarted world, stop time until the participants have rejoined or died.
 
         Args:
-            all_died: whether they have to be started again, too.
+            all_died: whether the participants must be restarted as well.
         """
         self.statistics.rate.stand_still(wall_ns)
         self.barrier.await_return(wall_ns, all_died)
@@ -420,10 +420,10 @@ class Coordinator(ABC):
     # Requests
 
     def control(self, request: ControlRequest) -> ControlAnswer:
-        """Answer a request on `world/control`; it is an event, unless its source has made too many of its kind.
+        """Answer a request on `world/control` and publish it as an event, within the budget of its source.
 
-        A request that changes the flight is always an event, since a rerun repeats it: beyond the budget it is refused.
-        The event repeats the arguments as they are, for the rerun, or shortened if too long.
+        A request that changes the flight is refused beyond the budget rather than left out of the events, since a rerun
+        repeats it from its event. The event has the arguments, shortened if too long.
         """
         self.requests += 1
         op, source = request.op[:40], request.source if keys.PROCESS_NAME.fullmatch(request.source) else ""
@@ -444,7 +444,7 @@ class Coordinator(ABC):
         return answer
 
     def _answer(self, request: ControlRequest) -> ControlAnswer:
-        """Do what a request asks for."""
+        """Carry out a request."""
         operation = self._operations.get(request.op)
         result: Refusal | ControlAnswer | None
         if request.source and not keys.PROCESS_NAME.fullmatch(request.source):
@@ -461,7 +461,7 @@ class Coordinator(ABC):
     # Time
 
     def may_advance(self) -> bool:
-        """Tell whether the next gate may come, but for pacing."""
+        """Tell whether the next gate may come, pacing apart."""
         clock = self.clock
         if clock.is_halted or self.barrier.away():
             return False
@@ -470,36 +470,36 @@ class Coordinator(ABC):
         return clock.mode == "realtime" or not self.barrier.blocking(clock.required_ns)
 
     def blocking(self, ahead_ns: int = 0) -> list[Participant]:
-        """Return the participants whose dones are missing for the next gate, or for one so much later."""
+        """Return the participants whose dones are missing for the next gate, or for the gate `ahead_ns` after it."""
         return self.barrier.blocking(self.clock.required_ns + ahead_ns)
 
     def blocking_clock(self) -> list[Participant]:
-        """Return the participants blocking the clock in lockstep, which would run otherwise."""
+        """Return the participants that alone keep the clock from running in lockstep."""
         clock = self.clock
         waits = clock.mode == "lockstep" and clock.state == "running" and not clock.is_halted
         return self.blocking() if waits else []
 
     def must_wait_for(self, participant: Participant) -> bool:
-        """Tell whether the scenario needs a participant, so that it is waited for however long its first step takes."""
+        """Tell whether the scenario needs a participant, whose first step may then take any time."""
         if participant.served_names <= self.unpaced:
             return True
         return not participant.successor and not participant.served_names.isdisjoint(self._expected)
 
     def waiting_for(self, wall_ns: int) -> tuple[Waiting, ...]:
-        """Return whom the world waits for now."""
+        """Return the processes that the world waits for now."""
         if self.clock.mode == "realtime" and self.clock.state != "waiting":
             return self.missed(wall_ns)
         return self.barrier.waiting_for(self.clock.required_ns, wall_ns, self.start_wall_ns, self._data_flow.feeds)
 
     def missed(self, wall_ns: int) -> tuple[Waiting, ...]:
-        """Return the participants that are dead, silent or not back yet in realtime, where nobody is waited for."""
+        """Return the dead, silent and away participants in realtime, where the world waits for no process."""
         if self.clock.mode != "realtime":
             return ()
         missed = (p for p in self.barrier.participants.values() if p.is_missed)
         return tuple(p.waiting(wall_ns, since_ns=p.silent_wall_ns if p.alive else None) for p in missed)
 
     def waiting_to_leave(self, since_end_ns: int = 0) -> tuple[Waiting, ...]:
-        """Return the participants that have yet to leave, and a dead recorder that is to write the rest."""
+        """Return the participants that have not left, and a dead recorder that is to return and write the rest."""
         participants = self.barrier.participants.values()
         waited = [p for p in participants if p.alive or (p.join.slack_ns > 0 and self._may_return(p))]
         return tuple(Waiting(p.name, p.join.host, since_end_ns / 1e9) for p in waited)
@@ -530,13 +530,13 @@ class Coordinator(ABC):
         self.outbox.put(keys.CLOCK, self.clock_message())
 
     def take_outbox(self) -> list[KeyedMessage]:
-        """Return what is to be published, in order, and forget it."""
+        """Return the messages to publish, in order, and clear the outbox."""
         pending, self.outbox.pending = self.outbox.pending, []
         return pending
 
 
 class DataFlow:
-    """Which processes read whose outputs, by the rights of their roles; nothing is known of an unknown role."""
+    """Which processes read whose outputs, by the rights of their roles; unknown roles read nothing."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
@@ -544,7 +544,7 @@ class DataFlow:
         self._known: dict[tuple[str, str], bool] = {}
 
     def feeds(self, writer: str, reader: str) -> bool:
-        """Tell whether one process publishes what another one reads, and not the other way round as well."""
+        """Tell whether the reader reads outputs of the writer, but not the writer outputs of the reader."""
         return self._writes_for(writer, reader) and not self._writes_for(reader, writer)
 
     def _writes_for(self, writer: str, reader: str) -> bool:
@@ -554,6 +554,6 @@ class DataFlow:
                 if name not in self._rights:
                     self._rights[name] = roles.rights_for(name, self._scenario)
             reads, writes = self._rights[reader], self._rights[writer]
-            read = {*reads.reads} - {*reads.writes}  # but for its own last value
+            read = {*reads.reads} - {*reads.writes}  # without its own last values
             self._known[pair] = any(roles.permits(read, key) for key in writes.writes if "*" not in key)
         return self._known[pair]

@@ -1,4 +1,4 @@
-"""The injected faults of a run: planned by the scenario or by requests, begun and ended at their gates, published."""
+"""The injected faults of a run: planned by scenario or request, begun and ended at their gates, published."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -21,15 +21,15 @@ from zsim_world.run.outbox import Refusal
 from zsim_world.run.run_clock import Operation
 from zsim_world.run_state import PART, Saved
 
-NEVER_NS = 2**63 - 1  # a gate that does not come
+NEVER_NS = 2**63 - 1  # a gate that is never reached
 SELECTORS = ("id", "target", "kind")
 
 
 class FaultInjector:
-    """The faults of a run, applied to its fleet by `effects`.
+    """The faults of a run, which `effects` applies to the fleet.
 
-    A fault that is requested begins with the gate that is integrated next: nobody can have worked on that yet, so a run
-    with the same faults at the same instants gives the same bits.
+    A requested fault begins with the next gate to be integrated, on which no process can have worked yet: so a run with
+    the same faults at the same instants gives the same bits.
     """
 
     SAVED: ClassVar[Saved] = {
@@ -48,7 +48,7 @@ class FaultInjector:
         self._kinds = fault_kinds.kinds_of(declarations(run.scenario.drones))
         self._faults: dict[int, Fault] = {}
         self._begun: set[int] = set()
-        self._over: set[int] = set()  # ended or cleared, kept for those who still work on gates in which it acted
+        self._over: set[int] = set()  # ended or cleared, kept for processes still working on gates in which they acted
         self._count = self._seq = 0
         self._of_links: tuple[Fault, ...] = ()
         self._of_links_at: dict[int, tuple[Fault, ...]] = {}  # by gate, since the last change or integrated gate
@@ -59,11 +59,11 @@ class FaultInjector:
 
     @property
     def all(self) -> tuple[Fault, ...]:
-        """Return the faults that are planned, act, or have just ended, in order of their ids."""
+        """Return the planned, acting and just ended faults in order of their ids."""
         return tuple(self._faults[number] for number in sorted(self._faults))
 
     def of_links(self, gate_ns: int) -> tuple[Fault, ...]:
-        """Return the faults of links and radios that act in a gate; used for every command."""
+        """Return the link and radio faults that act in a gate; called for every command."""
         if not self._of_links:
             return ()
         acting = self._of_links_at.get(gate_ns)
@@ -75,7 +75,7 @@ class FaultInjector:
     # Time
 
     def apply(self, now_ns: int) -> None:
-        """Begin and end what does so at now_ns, before the gate after it is integrated."""
+        """Begin and end the faults that are due at now_ns, before the next gate is integrated."""
         next_ns = now_ns + self._clock.gate_ns
         self._of_links_at.clear()
         if now_ns >= self._next_ns:
@@ -84,10 +84,10 @@ class FaultInjector:
         self._effects.blow(now_ns, next_ns)
 
     def _begin_and_end(self, now_ns: int) -> None:
-        """Begin and end faults, and remove what ended before any gate that a process may still work on."""
+        """Begin and end faults, and remove those that ended before any gate that a process may still work on."""
         for fault in self.all:
             kind = fault_kinds.KINDS.get(fault.kind)
-            is_instant = kind is not None and kind.lasts == "once"  # over as soon as it has begun
+            is_instant = kind is not None and kind.lasts == "once"  # ends when it begins
             if fault.id not in self._begun and fault.from_ns <= now_ns:
                 self._begun.add(fault.id)
                 text = "begins"
@@ -110,16 +110,16 @@ class FaultInjector:
         self._next_ns = self._next_change_ns()
 
     def _immunity(self, process: str) -> str | None:
-        """Return why a process that takes part cannot be killed by a fault; None if it can."""
+        """Return why a fault cannot kill a process, None if it can."""
         participant = self._barrier.participants.get(process)
         if participant is None:
-            return None  # one that is not here yet, or whose work another does
+            return None  # it has not joined yet, or another process does its work
         if not participant.gating:
             return "takes no part in the lockstep"
         return None if participant.join.fingerprint else "does not run on zsim.runtime.runner"
 
     def _late_ns(self) -> int:
-        """Return how far behind the newest gate a process may still work: the command delay and one period."""
+        """Return how far behind the newest gate a process may work: the command delay and one period."""
         periods = (p.join.period_ns for p in self._barrier.participants.values())
         return self._clock.delay_ns + max(periods, default=0)
 
@@ -134,7 +134,7 @@ class FaultInjector:
     # Requests
 
     def operations(self) -> dict[str, Operation]:
-        """Return what each `op` on `world/control` that is about faults does."""
+        """Return the handlers of the `op` values on `world/control` that concern faults."""
         return {"fault_add": self._add, "fault_clear": self._clear}
 
     def _add(self, request: ControlRequest) -> ControlAnswer:
@@ -147,7 +147,7 @@ class FaultInjector:
         return ControlAnswer(True, result={"id": fault.id, "from_ns": fault.from_ns, "until_ns": fault.until_ns})
 
     def _refusal(self, args: Mapping[str, Any]) -> Refusal | str | None:
-        """Return the first reason against a fault."""
+        """Return why a requested fault is refused, None if it is accepted."""
         scenario = self._scenario
         drones = tuple(drone.name for drone in scenario.drones)
         clusters = tuple(cluster.name for cluster in scenario.clusters)
@@ -182,7 +182,7 @@ class FaultInjector:
         return fault
 
     def _clear(self, request: ControlRequest) -> ControlAnswer | Refusal:
-        """End the faults of an id, a target or a kind, or all."""
+        """End the faults with a given id, target or kind, or all faults."""
         args = {name: value for name, value in request.args.items() if value is not None}
         if unknown := [name for name in args if name not in SELECTORS]:
             return Refusal(unknown[0][:40], "not known", f"allowed: {', '.join(SELECTORS)}, or nothing")
@@ -209,9 +209,9 @@ class FaultInjector:
     # Publication
 
     def _publish(self) -> None:
-        """Publish the list, before the next gate.
+        """Publish the list of faults before the next gate.
 
-        Faults that are equal but for their end, and have not begun, are numbered: they begin together.
+        Faults that have not begun and differ only in their end begin together; their rank numbers them.
         """
         equal: Counter[tuple[str, str, int]] = Counter()
         for fault in self.all:
@@ -226,7 +226,7 @@ class FaultInjector:
         self._seq += 1
 
     def restored(self) -> None:
-        """Note which faults are of links."""
+        """Select the link faults."""
         self._of_links = tuple(fault for fault in self.all if fault.kind in LINK_KINDS)
         self._of_links_at.clear()
 

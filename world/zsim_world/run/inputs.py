@@ -1,8 +1,8 @@
-"""All inputs of a world, as entries of its journal: applied in the same order, they give the same world to the bit.
+"""All inputs of a world as journal entries: applied in the same order, they give the same world to the bit.
 
-`Run.enter` is the only way in while a world runs: it applies an entry and notes it in the journal. A world that is
-started again applies the entries that it finds there. The messages of others are checked, kept, counted for their
-senders, and passed to the world where it acts on them.
+While a world runs, every input passes through `Run.enter`, which applies the entry and notes it in the journal. A
+restarted world applies the entries in the journal. Messages of other processes are checked, kept, counted for their
+senders, and passed to the world if it acts on them.
 """
 
 from collections import Counter, deque
@@ -23,9 +23,9 @@ from zsim.scenario import roles
 from zsim.schema.message import Count
 from zsim_world.run.coordinator import Coordinator
 
-PHASE_EVERY = 10  # states of a cluster between two of which the phase is read for the display
-OF_CAMERAS = (flight_messages.CameraInfo, flight_messages.Sightings)  # relayed too, from every process with a camera
-OF_DRIVERS = ("truth", "link")  # what they publish of an external drone beside its sensors
+PHASE_EVERY = 10  # cluster states per reading of the phase for the display
+OF_CAMERAS = (flight_messages.CameraInfo, flight_messages.Sightings)  # relayed from every process with a camera
+OF_DRIVERS = ("truth", "link")  # published by the driver of an external drone, beside its sensors
 
 ProgressCallback = Callable[[str, Any, str], None]
 """Called with ("clock" or "event", message, phase of the clusters), ("health", message, process), every tenth ("state",
@@ -34,8 +34,8 @@ message, cluster), ("link", message, drone), and ("resumed", simulated time in n
 Sample = tuple[str, bytes]  # key and payload
 
 Handler = Callable[[Sample, int], None]
-"""Handles a message that arrived at a monotonic wall time [ns]; raises a DecodeError where it is refused."""
-CALLS: dict[str, Any] = {  # the world's methods that are inputs, with the types of their arguments
+"""Handles a message that arrived at a monotonic wall time [ns]; raises a DecodeError if it is refused."""
+CALLS: dict[str, Any] = {  # methods of the world that are inputs, with the types of their arguments
     "await_return": tuple[int, bool],
     "control": tuple[ControlRequest],
     "died": tuple[str, int],
@@ -48,19 +48,19 @@ CALLS: dict[str, Any] = {  # the world's methods that are inputs, with the types
     "silence_changed": tuple[str, int | None],
 }
 encode = msgspec.msgpack.Encoder().encode
-KEEP_NS = 5_000_000_000  # simulated time that a replay reaches back
-KEEP_BYTES = 500_000_000  # payloads kept at most: those of 1000 drones are about 300 MB in KEEP_NS
-FOREIGN_BYTES = 50_000_000  # of these, of messages that are none of the contract
-LAST_MAX = 200_000  # keys of which the last value is kept: 1000 drones have about 12 000
-PAGE_BYTES = 8_000_000  # payloads of one answer; who lacks more requests the next page
+KEEP_NS = 5_000_000_000  # simulated time kept for replays
+KEEP_BYTES = 500_000_000  # limit of the payloads kept: 1000 drones have about 300 MB in KEEP_NS
+FOREIGN_BYTES = 50_000_000  # of these, for messages outside the contract
+LAST_MAX = 200_000  # keys whose last value is kept: 1000 drones have about 12 000
+PAGE_BYTES = 8_000_000  # payloads of one answer
 EXPRESSIONS_MAX = 1000  # of one replay; a controller of hundreds of drones reads two keys of each
 _Entry = tuple[int, int, Pairs, int, bool]
-"""Messages that passed together: the world's clock then, their stamp, keys and payloads, bytes of the latter, and
-whether they are of strangers."""
+"""Messages kept together: the world's time at arrival, their stamp, keys and payloads, the size of the payloads
+[bytes], and whether they are outside the contract."""
 
 
 class _Head(msgspec.Struct):
-    """What the world reads of messages that it only relays."""
+    """The fields that the world reads of messages that it only relays."""
 
     t_ns: int
     seq: int
@@ -79,18 +79,18 @@ def _head(key: str, payload: bytes) -> _Head:
 
 
 class Run:
-    """A world with its inputs, and the messages that are kept of it.
+    """A world with its inputs and its message history.
 
     Args:
         world: a flight, or a replay.
         health: counts what is received and refused.
-        note: takes every entry that a world which continues from the journal has to apply again.
+        note: called with every entry that belongs in the journal.
 
     Attributes:
-        on_done: called with name, incarnation and wall time of a done before the world has it.
+        on_done: called with name, incarnation and wall time of a done before the world handles it.
         on_health: called with the name of a process that has published its health.
-        phase: of the cluster whose state was read last.
-        handlers: of the keys that have come.
+        phase: phase of the cluster whose state was read last.
+        handlers: message handlers by key, for the keys seen so far.
     """
 
     def __init__(
@@ -109,10 +109,10 @@ class Run:
         self._states: Counter[str] = Counter()
 
     def enter(self, entry: "Entry") -> Any:
-        """Apply an input, and note it in the journal; return the answer to a request.
+        """Apply an input and note it in the journal; return the answer to a request.
 
-        What ends the run before its time, and what comes after that, is not noted: `zsim run --continue` takes such an
-        end back. After its last gate the world's own messages are noted as well, since they are numbered on.
+        An input that ends the run early is not noted, nor is any later one: `zsim run --continue` undoes such an end.
+        After the last gate only the world's own messages are noted, since their numbering continues.
         """
         answer = entry.apply(self)
         clock = self._clock
@@ -125,15 +125,15 @@ class Run:
         """Call one of the world's methods in CALLS as an input."""
         return self.enter(Called(method, args))
 
-    # Messages of others
+    # Messages of other processes
 
     def learn_handler(self, key: str) -> Handler:
-        """Return the handler of a key's messages, and remember it: the same keys come at every gate."""
+        """Return the handler of a key's messages and cache it: the same keys recur at every gate."""
         kind, (place, name, what) = messages.type_of(key), keys.parts(key)
         if messages.is_relayed(kind) or (kind in OF_CAMERAS and not keys.is_sensor(key)):
             handler = self._relay
         elif place == "drone" and name in self.world.external and (what in OF_DRIVERS or what.startswith("sensor/")):
-            handler = self._take_of_driver  # and not the world's
+            handler = self._take_of_driver
         elif key.startswith("process/") or keys.is_command(key):
             handler = self._hand_over
         else:
@@ -147,12 +147,12 @@ class Run:
         raise DecodeError(f"{sample[0]}: only the world publishes here")
 
     def _keep_foreign(self, sample: Sample, wall_ns: int) -> None:
-        """Keep a message on a key outside of the contract."""
+        """Keep a message on a key outside the contract."""
         self.history.passed.append(sample)
         self.history.add_foreign(*sample)
 
     def _hand_over(self, sample: Sample, wall_ns: int) -> None:
-        """Pass the world a message that it acts on; a join has to be admitted first."""
+        """Pass the world a message that it acts on; joins are admitted separately."""
         self.history.passed.append(sample)
         key, payload = sample
         message = messages.decode(key, payload)
@@ -167,7 +167,7 @@ class Run:
             self.progress("health", message, keys.thing(key))
 
     def _relay(self, sample: Sample, wall_ns: int) -> None:
-        """Keep an output that the world does not act on, and count it for the done of its sender."""
+        """Keep an output that the world does not act on, and count it for its sender."""
         self.history.passed.append(sample)
         key, payload = sample
         kind = messages.type_of(key)
@@ -188,7 +188,7 @@ class Run:
         self.world.count_output(source)
 
     def _take_of_driver(self, sample: Sample, wall_ns: int) -> None:
-        """Keep what a driver publishes of its drone, unless the world refuses it."""
+        """Keep a message of a driver about its drone, unless the world refuses it."""
         self.history.passed.append(sample)
         key, payload = sample
         drone = keys.thing(key)
@@ -205,24 +205,24 @@ class Run:
             self.refuse(f"driver.{drone}", key, error)
 
     def refuse(self, source: str, key: str, error: DecodeError) -> None:
-        """Count a message that cannot be read, and publish why."""
+        """Count a refused message, and publish the reason."""
         self.health.refused += 1
         self.world.outbox.refuse(source, key[:80], messages.fault_at(key, error))
 
 
-# The entries; their wall times are monotonic
+# The entries; wall times are monotonic
 
 
 class Entry(msgspec.Struct, array_like=True, tag_field="kind", tag=True):
     """One input."""
 
     def apply(self, run: Run) -> Any:
-        """Let the world take it; a request is answered."""
+        """Apply it to the world; return the answer to a request."""
         raise NotImplementedError
 
 
 class Taken(Entry, tag=0):
-    """A message that somebody else published."""
+    """A message of another process."""
 
     wall_ns: int
     sample: Sample
@@ -236,13 +236,13 @@ class Taken(Entry, tag=0):
         except DecodeError as error:
             run.history.add_foreign(key, payload)
             run.refuse("somebody", key, error)
-            with suppress(DecodeError):  # counted for its sender, if known, whose done would be short of an output
+            with suppress(DecodeError):  # counted for a known sender, whose done counts it too
                 head = _head(key, payload)
                 run.world.count_output(head.controller or head.source)
 
 
 class Advanced(Entry, tag=1):
-    """Permission to advance by a gate, and whether it came too late."""
+    """An advance by one gate, and whether it came too late."""
 
     wall_ns: int
     late: bool
@@ -253,7 +253,7 @@ class Advanced(Entry, tag=1):
 
 
 class Published(Entry, tag=2):
-    """A message of the world's own that does not follow from other inputs, such as its clock while time stands."""
+    """A message of the world that does not follow from other inputs, such as its clock while time stands still."""
 
     key: str
     seq: int
@@ -266,7 +266,7 @@ class Published(Entry, tag=2):
 
 
 class Called(Entry, tag=3):
-    """A call of one of the world's methods."""
+    """A call of one of the world's methods in CALLS."""
 
     method: str
     args: tuple[Any, ...]
@@ -279,7 +279,7 @@ decode = msgspec.msgpack.Decoder(list[Taken | Advanced | Published | Called]).de
 
 
 class _ReplayArgs(msgspec.Struct):
-    """The arguments of a replay; `page` is the field `more` of the answer before."""
+    """The arguments of a replay; `page` is the field `more` of the previous answer."""
 
     from_ns: int
     keys: Annotated[list[str], msgspec.Meta(max_length=EXPRESSIONS_MAX)]
@@ -287,17 +287,17 @@ class _ReplayArgs(msgspec.Struct):
 
 
 class MessageHistory:
-    """Payloads as on the wire, by key: last values for queries, and the last seconds for processes that catch up.
+    """Payloads by key: last values for queries, and the last seconds for processes that catch up.
 
-    It keeps the world's own messages and those of the participants, those of dead ones too.
+    It keeps the messages of the world and of all participants, dead ones included.
 
     Args:
         keep_bytes: limit of the payloads kept for replays.
-        page_bytes: limit of the payloads on one page.
+        page_bytes: limit of the payloads of one page.
 
     Attributes:
-        passed: messages that recorders have not been sent yet, in order.
-        last_values: of every key.
+        passed: messages not yet sent to recorders, in order.
+        last_values: last payload of every key.
     """
 
     def __init__(self, keep_bytes: int = KEEP_BYTES, page_bytes: int = PAGE_BYTES) -> None:
@@ -313,7 +313,7 @@ class MessageHistory:
     def add(self, key: str, payload: bytes, t_ns: int) -> None:
         """Keep a message; t_ns is its stamp.
 
-        Its age is judged by the world's clock at its arrival: a sender's stamp may be anything.
+        Its age counts from the world's clock at its arrival: a sender's stamp may be wrong.
         """
         if key == keys.CLOCK:
             self._now_ns = t_ns
@@ -322,16 +322,16 @@ class MessageHistory:
         self._keep(t_ns, [(key, payload)], len(payload))
 
     def add_foreign(self, key: str, payload: bytes) -> None:
-        """Keep, for recorders, a message outside of the contract or a refused one; it is not a last value.
+        """Keep, for recorders, a refused message or one outside the contract; it does not become a last value.
 
-        Beyond FOREIGN_BYTES nothing is kept, so that strangers push out nothing that a participant may lack.
+        FOREIGN_BYTES limits these, so that they do not displace messages that a participant may need.
         """
         if self._foreign_bytes + len(payload) <= FOREIGN_BYTES:
             self._foreign_bytes += len(payload)
             self._keep(self._now_ns, [(key, payload)], len(payload), foreign=True)
 
     def add_all(self, published: Pairs, t_ns: int) -> None:
-        """Keep what the world itself publishes, all stamped t_ns, its newest gate."""
+        """Keep messages of the world, all stamped t_ns, its newest gate."""
         self._now_ns = t_ns
         self.last_values.update(published)
         self._keep(t_ns, published, sum([len(payload) for _, payload in published]))
@@ -358,13 +358,13 @@ class MessageHistory:
                 yield t_ns, key, payload
 
     def page(self, from_ns: int, wanted: Callable[[str], bool], start: int = 0) -> tuple[Pairs, int | None]:
-        """Return a page of the messages stamped after from_ns on keys that are wanted.
+        """Return a page of the messages stamped after from_ns on wanted keys.
 
         Args:
-            start: 0, or where the page before ended.
+            start: 0, or the position returned with the previous page.
 
         Returns:
-            (key, payload) in order of arrival, and where the next page begins, None after the last one.
+            (key, payload) in order of arrival, and the position of the next page, None after the last page.
         """
         passed: list[tuple[str, bytes]] = []
         known: dict[str, bool] = {}
@@ -386,8 +386,8 @@ class MessageHistory:
         """Answer a request for a replay with a page of the history.
 
         Args:
-            args: of the request: from_ns, keys and page.
-            readable: expressions of the keys that the requesting process may read.
+            args: arguments of the request: from_ns, keys and page.
+            readable: key expressions that the requesting process may read.
         """
         try:
             replay = msgspec.convert(args, _ReplayArgs)
@@ -401,16 +401,16 @@ class MessageHistory:
         return ControlAnswer(True, result=passed, more=more)
 
     def lost_outputs(self, kept: Any, done_ns: int) -> Pairs:
-        """Return the outputs kept by a participant that have not arrived, each once, as after a cut link.
+        """Return the outputs kept by a participant that have not arrived, for example after a cut link, each once.
 
-        Those of gates later than its newest done are left out: they are on their way, or its done will count them.
+        Outputs of gates after its newest done are left out: they are on their way, or its next done will count them.
 
         Args:
-            kept: the result of its answer.
-            done_ns: newest gate that it has completed.
+            kept: result of the participant's answer.
+            done_ns: newest gate that the participant has completed.
 
         Raises:
-            DecodeError: the result is no list of [key, payload].
+            DecodeError: the result is not a list of [key, payload].
         """
         outputs: dict[Any, tuple[str, bytes]] = {}
         for key, payload in pairs_of(kept):
@@ -425,7 +425,7 @@ class MessageHistory:
 
 
 def _identity(key: str, payload: bytes) -> tuple[str, int, int, str] | None:
-    """Return (key, t_ns, seq, source), which identify an output; None for messages that no done counts."""
+    """Return (key, t_ns, seq, source), which identifies an output; None for messages that no done counts."""
     kind = messages.type_of(key)
     if kind is None or not issubclass(kind, (Command, *messages.RELAYED)):
         return None

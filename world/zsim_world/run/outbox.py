@@ -1,7 +1,6 @@
-"""What a run publishes, in order: messages, events and refusals, which are events too; and limits of these.
+"""The messages and events that a run publishes, in order, and the limits of events, refusals and changes.
 
-Limits count in simulated time, so that a run that is flown again from its record, or continues from its journal, allows
-the same.
+Limits count simulated time, so that a rerun from a record and a continuation from the journal apply the same ones.
 """
 
 import re
@@ -14,28 +13,28 @@ from zsim.scenario.roles import WORLD
 from zsim_world.run_state import PART, Saved
 
 KeyedMessage = tuple[str, Any]  # key and message; or keys.GATE and GateMessages at a gate
-CHANGES_MAX = 1000  # of a source at once, as many as there may be faults; then 50 a simulated second at gates of 20 ms
-UNJOINED = 10  # sources that have not joined may together do as much as so many that have: anybody can invent names
-STRANGERS_MAX = 100  # newcomers of all names, and other reports about strangers, at once; then one a simulated second
+CHANGES_MAX = 1000  # of a source at once, as many as there may be faults; then one per gate
+UNJOINED = 10  # all sources that have not joined may together do as much as this number of joined sources
+STRANGERS_MAX = 100  # newcomers, and reports about unknown processes, at once; then one per simulated second
 SECOND_NS = 1_000_000_000
-EVENTS_MAX = 20  # events per source, subject and reason; further refusals are counted only
-REASONS_MAX = 10  # of a source and subject that are kept apart; all further ones count as one
-REFUSED_MAX = 1000  # events of all sources at once, whose names can be invented; then one a simulated second
+EVENTS_MAX = 20  # events per source, subject and reason; further refusals are only counted
+REASONS_MAX = 10  # distinct reasons of a source and subject; all further ones count as one
+REFUSED_MAX = 1000  # events of all sources at once, since names can be invented; then one per simulated second
 
 _FIGURE = re.compile(r"\d[\d.e+-]*")
 
 
 class RunOutbox:
-    """Messages of the world that are to be published.
+    """Messages of the world waiting to be published.
 
     Args:
-        now_ns: returns the newest gate, with which events are stamped.
+        now_ns: returns the newest gate, the stamp of events.
 
     Attributes:
         pending: keys and messages in order.
-        numbers: the `seq` of the next message on each key.
-        refusals, refused_requests: of messages, and of requests on `world/control`; all of them, not only the events.
-        left_out: number of events that were not published because there had been enough like them.
+        numbers: `seq` of the next message by key.
+        refusals, refused_requests: all refused messages, and all refused requests on `world/control`.
+        left_out: number of events that exceeded the limit of their kind and were not published.
     """
 
     SAVED: ClassVar[Saved] = {
@@ -56,13 +55,13 @@ class RunOutbox:
         self._notices = ChangeBudget(now_ns, SECOND_NS)
 
     def restored(self) -> None:
-        self.pending = []  # the former world has published it
+        self.pending = []  # published by the former world
 
     def put(self, key: str, message: Any) -> None:
         self.pending.append((key, message))
 
     def next_seq(self, key: str) -> int:
-        """Return the number of the next message on a key, and count it."""
+        """Return the sequence number of the next message on a key, and advance it."""
         seq = self.numbers.get(key, 0)
         self.numbers[key] = seq + 1
         return seq
@@ -76,21 +75,21 @@ class RunOutbox:
     def notice(
         self, kind: str, subject: str, text: str, data: Mapping[str, Any] | None = None, source: str = WORLD
     ) -> None:
-        """Add an event on which nobody acts, unless there have been too many of this kind, subject and source."""
+        """Add an event that is for information only, within the limit of its kind, subject and source."""
         if self._notices.spend(f"{kind} {subject} {source}"):
             self.event(kind, subject, text, data, source)
         else:
             self.left_out += 1
 
     def refuse(self, source: str, subject: str, reason: "Refusal | str") -> None:
-        """Count a refusal, and add an event of it unless there have been too many like it."""
+        """Count a refusal, and add its event within the limits."""
         text = self.refusals.add(source, subject, str(reason))
         if text is not None:
             self.event("refused", subject, text, {"reason": str(reason)}, source)
 
 
 class Refusal(NamedTuple):
-    """Why something is refused, in one line: the field or thing at fault, its value or state, what is allowed."""
+    """Why something is refused, in one line: the field or object at fault, its value or state, what is allowed."""
 
     where: str
     actual: str
@@ -101,12 +100,12 @@ class Refusal(NamedTuple):
 
 
 def too_many(source: str) -> Refusal:
-    """Return the refusal of what a source does too often."""
+    """Return the refusal of a source that exceeds its budget."""
     return Refusal(source or "source", f"beyond {CHANGES_MAX} changes at once", "must wait: one is allowed each gate")
 
 
 class RefusalLog:
-    """Counts refusals, and limits how many of them become events: of each source, and of all together."""
+    """Counts refusals, and limits how many become events, per source and in total."""
 
     SAVED: ClassVar[Saved] = {"count": int, "_counts": dict[tuple[str, str], dict[str, int]], "_total": PART}
 
@@ -116,9 +115,9 @@ class RefusalLog:
         self._counts: dict[tuple[str, str], dict[str, int]] = {}
 
     def add(self, source: str, subject: str, reason: str) -> str | None:
-        """Count a refusal; return the text of its event, None where there have been enough.
+        """Count a refusal; return the text of its event, None beyond the limits.
 
-        Reasons that differ in figures only, such as an age, are one.
+        Reasons that differ only in figures, such as an age, count as one.
         """
         self.count += 1
         if len(self._counts) > SUBJECTS_MAX:
@@ -136,7 +135,7 @@ class RefusalLog:
 
 
 class ChangeBudget(RateLimit):
-    """Limits what each source may change: so much at once, and one more with every period of simulated time."""
+    """Limits the changes of each source: a number at once, then one per period of simulated time."""
 
     SAVED: ClassVar[Saved] = {"_spent": dict[str, tuple[float, int]]}
 
@@ -148,9 +147,9 @@ class Budgets:
     """The change budgets of a run.
 
     Attributes:
-        changes: of each source.
-        unjoined: of all sources together that have not joined, by what they do.
-        strangers: of reports about processes that nobody expects, by kind.
+        changes: budget of each source.
+        unjoined: shared budget of the sources that have not joined, by kind of change.
+        strangers: budget of reports about unexpected processes, by kind of report.
     """
 
     SAVED: ClassVar[Saved] = {"changes": PART, "unjoined": PART, "strangers": PART}
@@ -161,11 +160,11 @@ class Budgets:
         self.strangers = ChangeBudget(now_ns, SECOND_NS, STRANGERS_MAX)
 
     def allows(self, source: str, what: str, has_joined: bool) -> bool:
-        """Return whether a source may do something once more."""
+        """Return whether a source may make one more change."""
         return self.changes.allows(f"{what}{source}") and (has_joined or self.unjoined.allows(what))
 
     def spend(self, source: str, what: str, has_joined: bool) -> bool:
-        """Count what a source does; return False where there was nothing left."""
+        """Count a change of a source; return False if its budget is exhausted."""
         if not self.allows(source, what, has_joined):
             return False
         return self.changes.spend(f"{what}{source}") and (has_joined or self.unjoined.spend(what))

@@ -1,7 +1,7 @@
-"""A replay: plays the record of a run onto its keys in place of a world.
+"""A replay: publishes the record of a run on its keys in place of a world.
 
-It does everything else that a world does: it keeps time, waits for its participants, answers for the last values,
-and can be paused, stepped and stopped. No drone can be flown.
+Otherwise it behaves as a world: it keeps time, waits for its participants, answers queries for last values, and can be
+paused, stepped and stopped. No drone can be flown.
 """
 
 from __future__ import annotations
@@ -35,46 +35,45 @@ from zsim_world.run.run_clock import number, refused_argument
 RECORD_OVER = "the record is over"  # why a replay of the whole record ended
 
 NOT_FLYABLE = "a replay: nobody can be flown"
-SEEK_MAX_S = 1e9  # beyond it, nanoseconds are no int64
+SEEK_MAX_S = 1e9  # so that nanoseconds fit an int64
 VIEWED_MAX = 10_000  # drones times instants in one answer to `views`: 2 MB
-VIEWED_MAX_S = 60.0  # simulated, in one answer to `views`; chosen: the replay stands while it reads them
-BEFORE_NS = 1_000_000_000  # in which each key that views are made of is published once
-OF_CAMERAS = {CameraImage: "camera", CameraInfo: "camera", Sightings: "detector"}  # roles that publish these
+VIEWED_MAX_S = 60.0  # simulated, in one answer to `views`; chosen: the replay stands still while it reads them
+BEFORE_NS = 1_000_000_000  # within which every source of a view is published at least once
+OF_CAMERAS = {CameraImage: "camera", CameraInfo: "camera", Sightings: "detector"}  # roles that publish them
 MARKS_MAX = 400  # on a timeline; more would be narrower than a pixel
-LEFT_OUT = frozenset({"command", "end"})  # kinds of events: too many commands to be marked
+LEFT_OUT = frozenset({"command", "end"})  # kinds of events without a mark; commands are too many
 TEXT_MAX = 120  # characters
-SOURCED = (flight_messages.Command, CameraImage, CameraInfo, Sightings)  # say who published them
+SOURCED = (flight_messages.Command, CameraImage, CameraInfo, Sightings)  # messages that name their publisher
 
 
 class PlaybackRange(NamedTuple):
-    """What is played of a record."""
+    """The part of a record that is played."""
 
     from_ns: int = 0  # first gate
     to_ns: int | None = None  # last gate, None for the end
-    keys: tuple[str, ...] = ("**",)  # expressions; what matches none is not played
+    keys: tuple[str, ...] = ("**",)  # expressions; keys that match none are not played
     paused: bool = False  # stand still after the first gate
-    holds: bool = False  # stand still after the last one, so that one can go back, rather than end
+    holds: bool = False  # pause after the last gate instead of ending, so that users can seek back
 
 
 class _Live(NamedTuple):
-    """The processes that take part at a gate, whose outputs are not played, by all names whose work they do."""
+    """The names of all processes whose work participants do at a gate, so that their outputs are not played."""
 
     names: set[str]
-    by_name: set[str]  # of those that declare no camera and no detector of a drone
+    by_name: set[str]  # names of participants that declare no camera and no detector of a drone
 
 
 class Playback(Coordinator):
     """Plays a record.
 
-    Outputs that a participant publishes itself (recognised by its name, `estimator.drone1`) are not played. A camera or
-    detector is recognised by the drones that it declares, whatever its name is; one that declares none, as a program of
-    the user's own may, by its name.
+    Outputs that a participant publishes itself are not played. A participant is recognised by its name
+    (`estimator.drone1`); a camera or detector by the drones that it declares, or by its name if it declares none.
 
     Args:
-        reader: of the record; it stays open.
-        scenario, info: the ones on record.
+        reader: reader of the record; it stays open.
+        scenario, info: those on record.
         rate: simulated per wall seconds; 0 = as fast as possible.
-        run_id: given by tests that compare.
+        run_id: set by tests that compare records.
 
     Raises:
         RecordError: there is nothing to play.
@@ -113,7 +112,7 @@ class Playback(Coordinator):
         self._viewed = self._view_sources & wanted
         self._recounts = any(keys.is_sensor(key) and key not in wanted for key in topics)
         self._reader = reader
-        # published only when they change, so that the last ones before the first gate are played with it
+        # published only on change: the last ones before the first gate are played with it
         self._standing = {key for key in wanted if key == keys.FAULTS or messages.type_of(key) is CameraInfo}
         gate_keys = wanted | ({keys.VIEW_DRONES} & topics.keys())
         self._recorded_gates = RecordedGates(reader, self.clock.gate_ns, self.clock.delay_ns, gate_keys)
@@ -124,7 +123,7 @@ class Playback(Coordinator):
             raise RecordError(f"{reader.path}: holds no gate {window}; nothing can be played")
 
     def info(self) -> messages.Info:
-        """Return the `world/info` on record, as that of a replay."""
+        """Return the `world/info` on record, adapted to the replay."""
         return msgspec.structs.replace(
             self._recorded,
             federation=self.scenario.federation,
@@ -137,7 +136,7 @@ class Playback(Coordinator):
     # Time
 
     def advance(self, wall_ns: int) -> None:
-        """Play the next gate, if there is one; stand still or end after the last one."""
+        """Play the next gate, if there is one; pause or end after the last one."""
         gate = self._coming
         if gate is not None and not self._over():
             if self.clock.state == "waiting":
@@ -153,7 +152,7 @@ class Playback(Coordinator):
                 self.clock.stop(over)
 
     def _over(self) -> str:
-        """Return why there is nothing more to play; empty while there is something."""
+        """Return why nothing remains to be played; empty while something does."""
         to_ns = self._played.to_ns
         if self._coming is None:
             return RECORD_OVER
@@ -202,7 +201,7 @@ class Playback(Coordinator):
         self._pending = []
         self._last.update((m.key, m.payload) for m in gate.messages if m.key in self._view_sources)
         for recorded in played:
-            if recorded.key == keys.FAULTS:  # they are known before the gate
+            if recorded.key == keys.FAULTS:  # known before the gate
                 self._publish(recorded)
         if of_drones := [m for m in gate.messages if m.key in self._place]:
             self.outbox.put(keys.GATE, self._gate_messages(gate.t_ns, of_drones))
@@ -214,7 +213,7 @@ class Playback(Coordinator):
             self._publish(recorded)
 
     def _publish(self, recorded: Recorded) -> None:
-        """Publish a message again, byte by byte, except events, which are numbered anew, and kills of processes."""
+        """Publish a recorded message unchanged, except for events, which are renumbered, and kills of processes."""
         key, payload = recorded.key, recorded.payload
         if key == keys.EVENT:
             with suppress(DecodeError):
@@ -227,9 +226,9 @@ class Playback(Coordinator):
             self.outbox.put(key, msgspec.Raw(payload))
 
     def _gate_messages(self, t_ns: int, of_drones: list[Recorded]) -> GateMessages:
-        """Return the world's messages about its drones as the world published them: drone by drone, status last.
+        """Return the world's messages about its drones in the order of publication: drone by drone, status last.
 
-        Each status counts the sensor messages that are played; agents would wait for the others.
+        The count of each status is corrected to the sensor messages played: agents would wait for the others.
         """
         of_drones.sort(key=lambda m: self._place[m.key] // self._kinds)
         which = np.array([self._place[m.key] for m in of_drones])
@@ -248,14 +247,14 @@ class Playback(Coordinator):
         return GateMessages.of(t_ns, t_ns // self.clock.gate_ns, self._table, pairs, stamps, first)
 
     def views(self, seq: int) -> Sequence[Output]:
-        """Return the views but those that a participant publishes itself."""
+        """Return the views, except those that a participant publishes itself."""
         live = self._live().names
         own = {keys.estimates_view(name) for name in live}
         own |= {keys.cluster_view(name.removeprefix("controller.")) for name in live if name.startswith("controller.")}
         return [output for output in self._made_views(self._last, self.now_ns, seq) if output.key not in own]
 
     def _made_views(self, last: Mapping[str, bytes], t_ns: int, seq: int) -> Iterator[Output]:
-        """Yield the views of the gate t_ns, as far as the last values of their sources go."""
+        """Yield the views at the gate t_ns for which the last values of the sources are known."""
         drones = []
         estimates: defaultdict[str, list[flight_messages.EstimateView]] = defaultdict(list)
         for drone in self.names:
@@ -295,14 +294,14 @@ class Playback(Coordinator):
         return None if f"controller.{keys.thing(key)}" in self._live().names else NOT_FLYABLE
 
     def control(self, request: ControlRequest) -> ControlAnswer:
-        """Answer a request; `views` are asked for again and again, and are no event."""
+        """Answer a request; `views` is requested repeatedly and does not become an event."""
         return self._answer(request) if request.op == "views" else super().control(request)
 
     def _answer(self, request: ControlRequest) -> ControlAnswer:
         return ControlAnswer(False, NOT_FLYABLE) if request.op in FLIGHT_REQUESTS else super()._answer(request)
 
     def _seek(self, request: ControlRequest) -> Refusal | None:
-        """Continue from another gate. Refused while anybody is waited for, who would miss what lies between."""
+        """Continue from another gate. Refused while a participant gates: it would miss the gates between."""
         t_s = number(request.args.get("t_s"))
         if t_s is None or not 0 <= t_s < SEEK_MAX_S:
             return refused_argument(request, "t_s", "a time on record [s]")
@@ -323,7 +322,7 @@ class Playback(Coordinator):
         return None
 
     def _timeline(self, _: ControlRequest) -> ControlAnswer:
-        """Answer which time the record covers [s], and its events but for commands; of many, evenly thinned out."""
+        """Answer the time range of the record [s] and its events except commands, thinned out evenly if many."""
         last = self._reader.last(keys.CLOCK)
         first = next(self._reader.messages([keys.CLOCK]), last)
         span = {"from_s": first.t_ns / 1e9, "to_s": last.t_ns / 1e9} if first and last else {}
@@ -337,7 +336,7 @@ class Playback(Coordinator):
         return ControlAnswer(True, result={**span, "marks": marks[:: -(-len(marks) // MARKS_MAX) or 1]})
 
     def _views_of_past(self, request: ControlRequest) -> Refusal | ControlAnswer:
-        """Answer the views of instants on record, `every_s` apart, for curves and trails."""
+        """Answer the views at instants on record, `every_s` apart, for curves and trails."""
         from_s, to_s, every_s = (number(request.args.get(name)) for name in ("from_s", "to_s", "every_s"))
         if from_s is None or not 0.0 <= from_s < SEEK_MAX_S:
             return refused_argument(request, "from_s", "a time on record [s]")
@@ -351,13 +350,13 @@ class Playback(Coordinator):
         found: list[tuple[str, bytes]] = []
         for seq, (t_ns, passed) in enumerate(self._recorded_gates.before(instants, self._viewed, BEFORE_NS)):
             last |= passed
-            if any(key.endswith("/truth") for key in passed):  # else the record has a gap there, or has ended
+            if any(key.endswith("/truth") for key in passed):  # else a gap in the record, or its end
                 found += [(key, messages.encode(message)) for key, message in self._made_views(last, t_ns, seq)]
         return ControlAnswer(True, result=found)
 
 
 class Gate(NamedTuple):
-    """The messages of a gate: stamped after the gate before, up to this one; in order of writing."""
+    """The messages stamped after the previous gate and up to this one, in order of writing."""
 
     t_ns: int
     messages: list[Recorded]
@@ -376,15 +375,15 @@ _decode_sourced = msgspec.msgpack.Decoder(_Sourced).decode
 
 
 class RecordedGates:
-    """Reads a record from any gate on.
+    """Reads a record gate by gate, starting anywhere.
 
-    An answer to a gate is written a few gates later, since the world runs ahead of the agents; it is played with the
-    gate of its stamp. A message whose stamp is further from where it was written (of a program that stamps nothing, or
-    in realtime) is played where it was written.
+    An answer to a gate is written a few gates later, since the world runs ahead of the agents; it is played at the gate
+    of its stamp. A message whose stamp is further from its place in the record (from a program that does not stamp, or
+    in realtime) is played at its place.
 
     Args:
-        delay_ns: of the run's commands, by which the world may be ahead.
-        wanted: keys.
+        delay_ns: command delay of the run, by which the world may be ahead [ns].
+        wanted: keys to read.
     """
 
     def __init__(self, reader: RecordReader, gate_ns: int, delay_ns: int, wanted: Collection[str]) -> None:
@@ -394,7 +393,7 @@ class RecordedGates:
         self._keys = {*wanted, keys.CLOCK}
 
     def gates(self, from_ns: int = 0) -> Iterator[Gate]:
-        """Yield the gates from the first one at or after `from_ns` on; a gate that the record lacks is left out."""
+        """Yield the recorded gates at or after `from_ns`."""
         for gate in self._all(from_ns):
             if gate.t_ns >= from_ns:
                 yield gate
@@ -405,11 +404,11 @@ class RecordedGates:
         newest = None
 
         def take(t_ns: int) -> Gate:
-            """Return a gate, with the messages of gates before it that the record lacks."""
+            """Return a gate, with the messages of earlier gates that the record lacks."""
             due = sorted(gate_ns for gate_ns in held if gate_ns <= t_ns)
             return Gate(t_ns, [recorded for gate_ns in due for recorded in held.pop(gate_ns)])
 
-        # What answers the first gate, or was sampled for it, may stand in a chunk that begins before it.
+        # Answers to the first gate and samples for it may be in a chunk that begins before it.
         for recorded in self._reader.messages(self._keys, by_time=False, from_ns=max(0, from_ns - self._slack_ns)):
             if recorded.key != keys.CLOCK:
                 due_ns = -(-recorded.t_ns // self._gate_ns) * self._gate_ns
@@ -428,12 +427,12 @@ class RecordedGates:
     def before(
         self, instants_ns: Sequence[int], wanted: Collection[str], back_ns: int
     ) -> Iterator[tuple[int, dict[str, bytes]]]:
-        """Yield each instant with the last payload by key since the instant before; for the first one since back_ns.
+        """Yield each instant with the last payload by key since the previous instant.
 
         Args:
             instants_ns: ascending.
-            wanted: keys.
-            back_ns: how far before the first instant is looked.
+            wanted: keys to read.
+            back_ns: time before the first instant from which to read [ns].
         """
         first_ns, last_ns = instants_ns[0] - back_ns, instants_ns[-1]
         newest: list[dict[str, Recorded]] = [{} for _ in instants_ns]
@@ -450,17 +449,17 @@ class RecordedGates:
 
 
 def _is_gate(payload: bytes) -> bool:
-    """Tell whether a clock belongs to a gate: while a run waits for its start, it does not."""
+    """Tell whether a clock message belongs to a gate; those published before the start do not."""
     try:
         return _decode_clock(payload).state != "waiting"
     except REFUSALS:
-        return False  # not the world's
+        return False  # not published by the world
 
 
 def _is_played(key: str) -> bool:
     """Tell whether the messages of a key may be played.
 
-    A replay publishes its own info, clock and views; what is about the processes on record is left out.
+    A replay publishes its own info, clock and views, and omits messages about the recorded processes.
     """
     views = (ViewDrones, flight_messages.ViewCluster, ViewEstimates)
     anew = key in (keys.INFO, keys.CLOCK) or messages.type_of(key) in views
@@ -468,7 +467,7 @@ def _is_played(key: str) -> bool:
 
 
 def _author(recorded: Recorded) -> str:
-    """Return the process that published a message, empty for the world and for unknown roles."""
+    """Return the name of the process that published a message, empty for the world and unknown roles."""
     kind = messages.type_of(recorded.key)
     if kind is flight_messages.Estimate:
         return f"estimator.{keys.thing(recorded.key)}"
@@ -485,7 +484,7 @@ def _author(recorded: Recorded) -> str:
 
 
 def _without_kills(payload: bytes) -> bytes:
-    """Return a list of faults without those that kill a process: the participants of a replay are others."""
+    """Return a list of faults without those that kill a process, which must not kill participants of the replay."""
     try:
         listed: run_messages.Faults = messages.decode(keys.FAULTS, payload)
     except DecodeError:
@@ -495,7 +494,7 @@ def _without_kills(payload: bytes) -> bytes:
 
 
 def _read(last: Mapping[str, bytes], key: str) -> Any:
-    """Return the last message on a key, None where there is none that can be read."""
+    """Return the last message on a key, None if there is none or it cannot be decoded."""
     payload = last.get(key)
     try:
         return messages.decode(key, payload) if payload is not None else None

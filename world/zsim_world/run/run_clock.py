@@ -1,6 +1,6 @@
-"""Simulated time of a run: its gates, whether and how fast it passes, the requests that change this, and statistics.
+"""Simulated time of a run: gates, pausing and rate, the requests that change these, and statistics.
 
-Statistics: real-time factor, age of commands, deadline misses, least distance between drones.
+Statistics: real-time factor, age of commands, deadline misses, smallest distance between drones.
 """
 
 import math
@@ -17,26 +17,26 @@ from zsim_world.run.outbox import Refusal
 from zsim_world.run_state import PART, Saved
 
 Operation = Callable[[ControlRequest], Refusal | ControlAnswer | None]
-"""Does what a request asks for; returns why it is refused, an answer with a result, or None when done."""
-GATES_KEPT = 256  # gates whose publication time is remembered for the age of commands; 5 s, older ones are refused
+"""Carries out a request; returns why it is refused, an answer with a result, or None when done."""
+GATES_KEPT = 256  # gates whose publication time is kept for the age of commands; 5 s, older ones are refused
 AGES_KEPT = 1_000_000  # for the percentiles; 8 MB
-MARK_NS = 10_000_000  # wall time between two marks of the rate, which looks back over a second
+MARK_NS = 10_000_000  # wall time between two marks of the rate, which covers the last second
 
 
 class RunClock:
-    """Simulated time, and whether it may pass.
+    """Simulated time and its state.
 
     Attributes:
         rate: simulated per wall seconds to pace at; 0 = as fast as possible.
-        delay_ns: of commands.
-        ahead_ns: by how much the world may be ahead of the agents.
-        now_ns: the newest gate; 0 before the start too.
-        next_ns: the gate after it, from which a newcomer is waited for.
+        delay_ns: command delay [ns].
+        ahead_ns: how far the world may be ahead of the agents [ns].
+        now_ns: the newest gate; also 0 before the start.
+        next_ns: the next gate, from which the world waits for a newcomer.
         state: as in the message `clock`.
         steps_allowed: gates that may still come while the run is paused.
-        jumps: how often time was moved otherwise than gate by gate.
-        ended: why the run is over, None while it goes on.
-        is_complete: whether it is over by itself, so that nothing of it can be continued.
+        jumps: number of jumps of time to another gate.
+        ended: why the run has ended, None while it continues.
+        is_complete: whether it reached its regular end, so that it cannot be continued.
     """
 
     SAVED: ClassVar[Saved] = {  # of a run that has not ended
@@ -66,11 +66,11 @@ class RunClock:
 
     @property
     def is_halted(self) -> bool:
-        """Tell whether time stands whatever dones arrive: the run has ended or is paused."""
+        """Tell whether time stands still regardless of dones: the run has ended or is paused."""
         return self.ended is not None or (self.state == "paused" and self.steps_allowed == 0)
 
     def start(self, t_ns: int, paused: bool = False) -> None:
-        """Begin with the first gate, and stand still after it if `paused`."""
+        """Begin with the first gate, and pause after it if `paused`."""
         self.state = "paused" if paused else "running"
         self.advance(t_ns)
 
@@ -85,18 +85,18 @@ class RunClock:
         self.stop(reason)
 
     def stop(self, reason: str) -> None:
-        """End the run after the present gate; of several reasons the first is kept."""
+        """End the run after the present gate; the first reason is kept."""
         if self.ended is None:
             self.ended = reason
 
     def hold(self) -> None:
-        """Stand still until a request lets time go on."""
+        """Pause until a request resumes or steps."""
         self.state, self.steps_allowed = "paused", 0
 
     # Requests
 
     def operations(self) -> dict[str, Operation]:
-        """Return what each `op` on `world/control` that is about time does."""
+        """Return the handlers of the `op` values on `world/control` that concern time."""
         pausing = dict.fromkeys(("pause", "resume", "step"), self._pause_or_continue)
         return {**pausing, "rate": self._set_rate, "stop": self._stop}
 
@@ -130,12 +130,12 @@ class RunClock:
 
 
 def refused_argument(request: ControlRequest, name: str, allowed: str) -> Refusal:
-    """Return the refusal of a request for one of its arguments."""
+    """Return the refusal of a request because of one of its arguments."""
     return Refusal(name, repr(request.args.get(name))[:40], f"must be {allowed}")
 
 
 def number(value: Any) -> float | None:
-    """Return a number, None for anything that is none; NaN is none."""
+    """Return the value if it is a number other than NaN, else None."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and value == value
     return value if is_number else None
 
@@ -148,7 +148,7 @@ class CommandAges:
     def __init__(self) -> None:
         self._published: dict[int, int] = {}
         self._ages_ns = array("q")
-        self._oldest = 0  # index of the oldest age once so many are kept
+        self._oldest = 0  # index of the oldest age once AGES_KEPT are kept
 
     @property
     def ages(self) -> bytes:
@@ -165,7 +165,7 @@ class CommandAges:
             del self._published[next(iter(self._published))]
 
     def command(self, t_ns: int, wall_ns: int) -> None:
-        """Note when a command stamped t_ns arrived; its age is unknown where no gate of that stamp is remembered."""
+        """Note when a command stamped t_ns arrived; it has no age if no gate of that stamp is kept."""
         published_wall_ns = self._published.get(t_ns)
         if published_wall_ns is None:
             return
@@ -177,7 +177,7 @@ class CommandAges:
             self._oldest = (self._oldest + 1) % AGES_KEPT
 
     def summary_ms(self) -> dict[str, float] | None:
-        """Return p50, p99 and max in milliseconds, None when no command came."""
+        """Return p50, p99 and max in milliseconds, None without commands."""
         if not self._ages_ns:
             return None
         ages = np.array(self._ages_ns) / 1e6
@@ -222,14 +222,14 @@ class RealTimeFactor:
             marks.append(self._last)
 
     def stand_still(self, wall_ns: int) -> None:
-        """Exclude from the run's wall time what has passed since the last gate, until wall_ns."""
+        """Exclude the time from the last gate to wall_ns from the run's wall time."""
         if self._start_wall_ns is not None:
             self._start_wall_ns += wall_ns - self._last[1]
             self._last = (self._last[0], wall_ns)
             self._marks = [self._last]
 
     def jump(self) -> None:
-        """Note that simulated time jumps to the next gate rather than passing."""
+        """Note that simulated time jumps to the next gate."""
         self._marks.clear()
 
     def now(self) -> float:
@@ -239,11 +239,11 @@ class RealTimeFactor:
 
 
 class RunStatistics:
-    """All figures of a run that its event `end` gives.
+    """The figures of a run in its event `end`.
 
     Attributes:
-        world_misses: gates that the world itself published too late.
-        closest_m: least distance between two drones so far, standing ones too [m]; inf for a single one.
+        world_misses: gates that the world published too late.
+        closest_m: smallest distance between two drones so far, landed ones included [m]; inf for a single drone.
     """
 
     SAVED: ClassVar[Saved] = {
@@ -274,7 +274,7 @@ class RunStatistics:
                 participant.deadline_misses += participant.blocks(need_ns)
 
     def result(self, participants: Iterable[Participant]) -> dict[str, Any]:
-        """Return the figures of the run as far as it got."""
+        """Return the figures of the run so far."""
         by_name = {p.name: p.deadline_misses for p in participants if p.gating}
         sim_s, wall_s = self.rate.sim_ns / 1e9, self.rate.wall_s
         return {

@@ -1,6 +1,6 @@
 """The world of a flight: integrates all drones, owns simulated time, applies commands and faults. No session, no clock.
 
-Participants and requests, which a replay has as well, are in `zsim_world.run.coordinator`.
+Participants and requests, which flights and replays share, are in `zsim_world.run.coordinator`.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -40,17 +40,17 @@ class World(Coordinator):
     Args:
         mode: "lockstep" or "realtime".
         rate: simulated per wall seconds to pace at; 0 = as fast as possible.
-        run_id: given by a launcher, and by tests that compare records.
-        changed: texts `a.b.c=value` by which the scenario was changed against its file, None: not known.
+        run_id: set by a launcher, and by tests that compare records.
+        changed: overrides of the scenario file as `a.b.c=value`, None if unknown.
 
     Raises:
-        ScenarioError: it has external drones, and the mode is "lockstep".
+        ScenarioError: the scenario has external drones and the mode is "lockstep".
 
     Attributes:
-        drivers: what is published of the external drones.
-        queue: of the commands, with the commander of each drone.
-        faults: that are injected.
-        truth_hash: of the instants so far.
+        drivers: drivers of the external drones.
+        queue: pending commands and the commander of each drone.
+        faults: injected faults.
+        truth_hash: hash of the true states so far.
     """
 
     SAVED: ClassVar[Saved] = {
@@ -135,18 +135,18 @@ class World(Coordinator):
     # State
 
     def checkpoint(self) -> State:
-        """Return all from which the run continues to the same bits, but the hash of its truth.
+        """Return the state from which the run continues to the same bits, without the hash of its truth.
 
-        Nothing may be pending in the outbox.
+        The outbox must be empty.
         """
         self.truth_hash.flush()
         return saved_state(self)
 
     def keep_truth(self, copy: Callable[[memoryview], object], hashed: Iterable[bytes] = ()) -> None:
-        """Copy the bytes of the truth hash to `copy` from now on; those before were `hashed`."""
+        """Copy the input of the truth hash to `copy` from now on; `hashed` is its input before."""
         self.truth_hash.resume(hashed, copy)
 
-    # What arrives
+    # Inputs
 
     def _handle_command(self, drone: str, kind: str, message: Any) -> bool:
         return self._intake.accept(drone, kind, message)
@@ -166,8 +166,8 @@ class World(Coordinator):
     def advance(self, wall_ns: int) -> None:
         """Go to the next gate (or publish gate 0) and put all its messages into the outbox.
 
-        What has arrived is applied before the fleet is integrated. A state that is no longer finite, or a user's sensor
-        that fails, ends the run at the gate before; see `failure`.
+        Commands and faults are applied before the fleet is integrated. A state that is no longer finite, or a failing
+        user's sensor, ends the run at the previous gate; see `failure`.
         """
         clock, fleet, statistics, now_ns = self.clock, self.fleet, self.statistics, self.clock.now_ns
         is_first = clock.state == "waiting"
@@ -199,7 +199,7 @@ class World(Coordinator):
             self._publish_incidents()
         state = fleet.bodies.state
         self.truth_hash.add(clock.now_ns, state[self._simulated] if self.external else state)
-        if self._radio is not None:  # before the gate, which lets agents go on
+        if self._radio is not None:  # before the gate, on which agents start to work
             position_m, seq = state[:, STATE.p_WB : STATE.p_WB + 3], self.outbox.next_seq(keys.RADIO)
             acting = self.faults.of_links(clock.now_ns)
             self.outbox.put(keys.RADIO, self._radio.links(clock.now_ns, seq, position_m, acting))

@@ -1,1 +1,1 @@
-"""The world as a process on Zenoh: its loop, inputs and outputs, deaths, journal, pacing. Imports run."""
+"""The world as a process on Zenoh: loop, inputs and outputs, liveliness, journal, pacing. Imports run."""

@@ -1,6 +1,6 @@
-"""Which processes have died, have fallen silent, or take nothing from their links; and which are admitted.
+"""Which processes have died, are silent, or do not read from their links; and which are admitted.
 
-A lost liveliness token is checked again before it is believed.
+The loss of a liveliness token is verified before it counts as a death.
 """
 
 import time
@@ -19,39 +19,39 @@ from zsim.transport.session import Session
 from zsim_world.run.barrier import Participant
 from zsim_world.run.inputs import Run
 
-BYE_NS = 100_000_000  # wall time by which a bye may come after the loss of its process's token
-RETURN_NS = 5_000_000_000  # wall time in which a process is back at a world that was started again; 1 s measured
-START_NS = 60_000_000_000  # wall time in which one that has to be started again is there; a small computer needs 20 s
+BYE_NS = 100_000_000  # wall time by which a bye may follow the loss of its process's token
+RETURN_NS = 5_000_000_000  # wall time in which a process rejoins a restarted world; 1 s measured
+START_NS = 60_000_000_000  # wall time in which a restarted process joins; a small computer needs 20 s
 NEW_TOKEN_NS = 1_500_000_000  # wall time within which a router knows a new token; up to 1 s measured
-TOKENS_S = 1.0  # a router answers which tokens it knows within milliseconds
-SILENT_S = 10  # seconds of health in a row that one that only reads may leave out; its link is given up after as many
-SILENT_NS = 1_800_000_000  # wall time without health, which comes once a second; so a stop is named within 2 s
-STALL_NS = 300_000_000  # wall time between two checks from which on the world itself, or its machine, was stopped
-SHOWN = 5  # expressions of one that subscribes to many
+TOKENS_S = 1.0  # timeout of a token query, which a router answers within milliseconds
+SILENT_S = 10  # seconds without health after which a process that only reads is dead, as its link is closed by then
+SILENT_NS = 1_800_000_000  # wall time without health, which comes once a second; so silence is reported within 2 s
+STALL_NS = 300_000_000  # wall time between two checks beyond which the world itself, or its machine, was stopped
+SHOWN = 5  # expressions shown of a process that subscribes to many
 _decode_health = msgspec.msgpack.Decoder(Health).decode
-TOKEN_NS = 3_000_000_000  # wall time by which a token is there; the hub knows one behind routers within 1 s (measured)
-SHOWN_NS = 10_000_000_000  # wall time by which one whose token is not its own publishes a done; first steps take 1 s
-HELD_NS = 1_000_000_000  # wall time that time has to stand for a living process before another may replace it
-DONE_NS = 10_000_000_000  # wall time that time may stand for one that never published a done; first steps take 1 s
-LOOK_NS = 200_000_000  # wall time between two checks of those that still have to prove that they exist
-WITHHELD_MAX = 1000  # joins of strangers that wait for their tokens
+TOKEN_NS = 3_000_000_000  # wall time limit for a token to appear; behind routers it takes up to 1 s (measured)
+SHOWN_NS = 10_000_000_000  # wall time limit for a first done as proof; first steps take 1 s
+HELD_NS = 1_000_000_000  # wall time that a living process must block the clock before another may replace it
+DONE_NS = 10_000_000_000  # wall time that a process without any done may block the clock; first steps take 1 s
+LOOK_NS = 200_000_000  # wall time between two checks of unproven processes
+WITHHELD_MAX = 1000  # joins of unknown processes that may await their tokens
 NO_TOKEN = "has no liveliness token"
 NO_DONE = "has never published a done"
 
 
 class _Check(NamedTuple):
-    """When to check a process whose token seems lost, and whether once more after that."""
+    """When to check a process whose token seems lost, and whether to check again later."""
 
     due_ns: int
     again: bool = True
 
 
 class LivelinessMonitor:
-    """Finds out which participants of a run have died.
+    """Detects which participants of a run have died.
 
     Args:
         link: the listening session.
-        take_in: reads what has arrived; a bye may be among it.
+        take_in: enters the messages that have arrived, possibly with a bye.
     """
 
     def __init__(self, link: Session, run: Run, take_in: Callable[[], None]) -> None:
@@ -59,13 +59,13 @@ class LivelinessMonitor:
         self._run = run
         self._barrier = run.world.barrier
         self._take_in = take_in
-        self._lost: deque[str] = deque()  # reported by other threads: whose token seems lost
+        self._lost: deque[str] = deque()  # names whose token seems lost, reported by other threads
         self._checks: dict[str, _Check] = {}
         self._health = HealthWatch(lambda name, since_ns: run.call("silence_changed", name, since_ns))
-        self._silent_s: dict[str, int] = {}  # of those that publish their health
+        self._silent_s: dict[str, int] = {}  # by process that publishes its health
 
     def token_lost(self, name: str) -> None:
-        """Note, from any thread, that a token is gone: its process is not dead yet, its bye may come after it."""
+        """Note, from any thread, the loss of a token; the bye of its process may still follow."""
         self._lost.append(name)
 
     def health_received(self, name: str) -> None:
@@ -73,11 +73,10 @@ class LivelinessMonitor:
         self._health.received(name, time.monotonic_ns())
 
     def count_second(self) -> None:
-        """Count a second in which the world itself ran.
+        """Count a second during which the world itself ran.
 
-        A process that only reads is dead if it publishes no health for long: it may be stopped, and Zenoh does not
-        always notice that it has closed the full link of one that takes nothing. For one that gates, time stands, and
-        `clock` names it.
+        A process that only reads counts as dead after a long time without health: Zenoh does not always report that it
+        has closed the full link of a stopped process. A gating process blocks the clock instead, and `clock` names it.
         """
         for name in list(self._silent_s):
             participant = self._barrier.participants.get(name)
@@ -89,14 +88,14 @@ class LivelinessMonitor:
                 self._report_death(name)
 
     def check_all(self) -> None:
-        """Check, after the time that it takes to come back, everybody who took part before the world was restarted."""
+        """Schedule a check of all former participants of a restarted world, after the time that a rejoin takes."""
         for name, participant in self._barrier.participants.items():
             wait_ns = RETURN_NS if participant.alive else START_NS
             if participant.away or participant.alive:
                 self._checks[name] = _Check(time.monotonic_ns() + wait_ns, again=False)
 
     def before_join(self, name: str, join: Join) -> None:
-        """Prepare for a join: another process of that name whose token is lost has died before."""
+        """Prepare for a join: report the death of a former process of that name whose token is lost."""
         self._take_lost()
         former = self._barrier.participants.get(name)
         if name in self._checks and former and former.alive and not former.is_process_of(join):
@@ -104,10 +103,10 @@ class LivelinessMonitor:
             self._report_death(name)
 
     def check_due(self) -> None:
-        """Check the processes that are due.
+        """Check the processes whose check is due.
 
-        A process without a token is dead, unless it is so new that its token may not be known yet. That one is checked
-        again, and so is one that has a token.
+        A process without a token is dead, unless its token may be too new to be known. Such a process is checked again,
+        and so is one that has a token.
         """
         self._take_lost()
         now_ns = time.monotonic_ns()
@@ -119,13 +118,13 @@ class LivelinessMonitor:
             self._take_in()
             participant = self._barrier.participants.get(name)
             check = self._checks.pop(name, None)
-            if participant is None or check is None:  # a join that was taken in settles it
+            if participant is None or check is None:  # settled by a join that was taken in
                 continue
-            participant.away = False  # from here on it is dead, or one that does not join again
+            participant.away = False  # it is dead, or alive without a rejoin
             if keys.token(name) in self._link.tokens(keys.token(name), timeout_s=TOKENS_S):
-                if check.again:  # a successor's, or one that Zenoh has not forgotten yet
+                if check.again:  # of a successor, or not yet forgotten by Zenoh
                     self._checks[name] = _Check(now_ns + NEW_TOKEN_NS, again=False)
-            elif now_ns - participant.joined_wall_ns < NEW_TOKEN_NS:  # a new token is not always found at once
+            elif now_ns - participant.joined_wall_ns < NEW_TOKEN_NS:  # a new token may not be known yet
                 self._checks[name] = _Check(participant.joined_wall_ns + NEW_TOKEN_NS, check.again)
             else:
                 self._report_death(name)
@@ -142,11 +141,11 @@ class LivelinessMonitor:
 
 
 class HealthWatch:
-    """Notes when each process has last published its health.
+    """Tracks when each process last published its health.
 
     Args:
-        handle_silence: called with name and wall time of its last health when a process falls silent, and with None
-            for that when its health comes again.
+        handle_silence: called with the name and the wall time of the last health when a process falls silent, and with
+            the name and None when its health resumes.
     """
 
     def __init__(self, handle_silence: Callable[[str, int | None], object]) -> None:
@@ -162,15 +161,15 @@ class HealthWatch:
             self._handle_silence(name, None)
 
     def forget(self, name: str) -> None:
-        """Expect nothing of a process any more: it has left, or is dead."""
+        """Stop expecting the health of a process that has left or died."""
         self._last_wall_ns.pop(name, None)
         self._silent.discard(name)
 
     def look(self, wall_ns: int) -> list[str]:
-        """Report who has fallen silent; return the processes whose health is expected. To be called all the time."""
+        """Report silent processes; return the processes whose health is expected. Must be called frequently."""
         stall_ns = wall_ns - self._look_wall_ns
         self._look_wall_ns = wall_ns
-        if stall_ns > STALL_NS:  # what came meanwhile was not read
+        if stall_ns > STALL_NS:  # messages that arrived meanwhile were not read
             self._last_wall_ns = {name: last_ns + stall_ns for name, last_ns in self._last_wall_ns.items()}
         for name, last_ns in list(self._last_wall_ns.items()):
             if name not in self._silent and wall_ns - last_ns >= SILENT_NS:
@@ -180,12 +179,12 @@ class HealthWatch:
 
 
 class SlowReaders:
-    """Reports closed links: an event names the reader that took nothing, the terminal the one that blocks the world.
+    """Reports closed links in events, and the link that blocks the world in the terminal.
 
     Args:
         link: the listening session.
-        tokens: of all processes.
-        run: whose readers they were; its history has the health of those that publish it.
+        tokens: tokens of all processes.
+        run: the run; its history has the health of the readers that publish it.
 
     Attributes:
         watch: closes the links.
@@ -197,12 +196,12 @@ class SlowReaders:
         self.watch = LinkWatch(link, tokens, self._awaited)
 
     def _awaited(self) -> list[Awaited]:
-        """Return those that must not lose any message; called by another thread."""
+        """Return the processes that must not lose any message; called by another thread."""
         participants = list(self._run.world.barrier.participants.values())
         return [Awaited((p.name, *p.join.serves), p.join.pid) for p in participants if p.is_waited_for]
 
     def report(self) -> None:
-        """Report the links that were closed since the last time, with what their processes read by their health."""
+        """Report the links closed since the last call, with the keys that their processes read by their health."""
         while self.watch.closed:
             closed = self.watch.closed.popleft()
             host = self._own_host if closed.process else closed.address.rpartition(":")[0].strip("[]")
@@ -220,14 +219,14 @@ class SlowReaders:
             self._run.call("reader_closed", text, {**closed._asdict(), "host": host, "reads": reads})
 
     def stuck(self) -> str:
-        """Return which link takes nothing, as text."""
+        """Return a text that names the blocked link."""
         named = self.watch.stuck()
         return f"the link takes nothing of {named[0]}" if named else "no link is known to be full"
 
 
 @dataclass
 class _Withheld:
-    """A join that waits for a proof; since when the name has one, and whether a done has followed it."""
+    """A join that awaits a proof; when the name first had one, and whether a done has followed."""
 
     join: Join
     since_ns: int
@@ -235,16 +234,16 @@ class _Withheld:
 
 
 class Admission:
-    """Passes joins to a world, and reports those without a process behind them.
+    """Passes joins to a world, and reports joins without a process behind them.
 
-    Who replaces a living process has to prove that it exists, and so has every newcomer: a join is only a message,
-    which anybody can publish under any name. A process proves it by a liveliness token of its own session, or, if it is
-    a program without one, by the done that follows its join. Time never waits for a stranger without a token: somebody
-    who joins under ever new names could stop it for good.
+    A newcomer, or a process that replaces a living one, must prove that it exists, since any program can publish a join
+    under any name. The proof is a liveliness token of its own session or, for a program without one, the done that
+    follows its join. Time never waits for an unknown process without a token: joins under ever new names could stop it
+    for good.
 
     Args:
-        tokens: of all processes.
-        trusts: whether access control lets nobody join in another's name.
+        tokens: tokens of all processes.
+        trusts: whether access control prevents joins under another process's name.
     """
 
     def __init__(self, tokens: SessionTokens, run: Run, trusts: bool) -> None:
@@ -253,13 +252,13 @@ class Admission:
         self._world = run.world
         self._barrier = run.world.barrier
         self._trusts = trusts
-        self._sessions: dict[str, Sessions] = {}  # by whose tokens a process takes part, or did
+        self._sessions: dict[str, Sessions] = {}  # sessions whose tokens have proved a process
         self._withheld: dict[str, _Withheld] = {}
-        self._standing_ns: dict[str, int] = {}  # of those without a token or a done so far: how long time stood for it
+        self._standing_ns: dict[str, int] = {}  # how long each process without token or done has blocked the clock
         self._look_wall_ns = 0
 
     def take(self, name: str, join: Join, wall_ns: int) -> None:
-        """Admit a join, or withhold it until it is clear that a process is behind it."""
+        """Admit a join, or withhold it until a process behind it is proved."""
         if self._needs_no_proof(name, join):
             self._admit(name, join, wall_ns)
             return
@@ -271,21 +270,21 @@ class Admission:
         self._check(name, wall_ns)
 
     def done_received(self, name: str, incarnation: int, wall_ns: int) -> None:
-        """Note that a process has published a done, before the world has it."""
+        """Note a done of a process, before the world handles it."""
         withheld = self._withheld.get(name)
         if withheld is not None and withheld.join.incarnation == incarnation:
             withheld.has_done = True
             self._check(name, wall_ns)
 
     def check_due(self, wall_ns: int) -> None:
-        """Check those that still have to prove that they exist."""
+        """Check the processes that have not proved their existence."""
         passed_ns = wall_ns - self._look_wall_ns
         if passed_ns < LOOK_NS or not (self._withheld or self._standing_ns):
             return
         self._look_wall_ns = wall_ns
         for name in list(self._withheld):
             self._check(name, wall_ns)
-        for name in list(self._standing_ns):  # forget who has proved to exist, report who never had a token
+        for name in list(self._standing_ns):  # forget proved processes, report those that never had a token
             participant = self._barrier.participants.get(name)
             if participant is None or not participant.alive:
                 del self._standing_ns[name]
@@ -299,11 +298,11 @@ class Admission:
         self._count_standing(min(passed_ns, 2 * LOOK_NS), wall_ns)
 
     def _needs_no_proof(self, name: str, join: Join) -> bool:
-        """Tell whether to admit a join without proof: it replaces no process, and time does not wait for it."""
-        return not (self._barrier.takes_place(name, join) or self._is_stranger(name, join))
+        """Tell whether a join needs no proof: it replaces no process, and time does not wait for it."""
+        return not (self._barrier.would_replace(name, join) or self._is_stranger(name, join))
 
     def _is_stranger(self, name: str, join: Join) -> bool:
-        """Tell whether time would wait for a newcomer without a token that the start does not wait for."""
+        """Tell whether time would wait for an unexpected newcomer without a token."""
         stands = (join.period_ns > 0 or join.slack_ns > 0) and not self._barrier.join_refusal(name, join)
         if not stands or name in self._barrier.participants:
             return False
@@ -321,10 +320,10 @@ class Admission:
             self._standing_ns[name] = 0
 
     def _check(self, name: str, wall_ns: int) -> None:
-        """Admit a join that was withheld, once it may be, or reject it after its time."""
+        """Admit a withheld join once it is proved, or reject it after its time limit."""
         withheld = self._withheld[name]
         join = withheld.join
-        if self._needs_no_proof(name, join) or self._may_take_place(name, withheld, wall_ns):
+        if self._needs_no_proof(name, join) or self._may_replace(name, withheld, wall_ns):
             self._admit(name, join, wall_ns)
             return
         reason = NO_DONE if self._tokens.is_alive(name) else NO_TOKEN
@@ -332,8 +331,8 @@ class Admission:
             del self._withheld[name]
             self._run.call("falsely_joined", name, join, reason)
 
-    def _may_take_place(self, name: str, withheld: _Withheld, wall_ns: int) -> bool:
-        """Tell whether a process is behind a join in the place of another, or the other is not there any more."""
+    def _may_replace(self, name: str, withheld: _Withheld, wall_ns: int) -> bool:
+        """Tell whether a process is proved to be behind a join that replaces another, or the other is gone."""
         if self._is_stranger(name, withheld.join):
             return False
         if self._trusts or withheld.has_done or self._tokens.sessions(name) - self._sessions.get(name, Sessions()):
@@ -345,10 +344,10 @@ class Admission:
         return held_up or former.silent_wall_ns is not None
 
     def _count_standing(self, passed_ns: int, wall_ns: int) -> None:
-        """Count how long participants have owed their first done, and report those that never publish one.
+        """Count how long participants have owed their first done, and report those beyond the limit.
 
-        In lockstep only while time waits for nobody else, since those others may be why it has not come; in realtime,
-        where time waits for nobody, whenever it is due and time runs.
+        In lockstep only while time waits for no other process, which may be the cause; in realtime whenever a done is
+        due and time runs.
         """
         clock = self._world.clock
         if clock.mode == "realtime":

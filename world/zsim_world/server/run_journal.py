@@ -1,12 +1,12 @@
-"""The journal of a run on disk: all inputs of its world, in order, and checkpoints of its whole state.
+"""The journal of a run on disk: all inputs of its world, in order, and checkpoints of its state.
 
-A world is a function of its scenario and its inputs. So one that is started again continues to the same bits, from a
-checkpoint and the inputs since. An entry is in the file, though not on the disk, before anything that follows from it
-is published; killing the process loses none.
+A world is a function of its scenario and its inputs, so a restarted world continues to the same bits from a checkpoint
+and the inputs since. An entry is written to the file (not synced to disk) before any message that follows from it is
+published; killing the process loses none.
 
-A folder has, with n counting from 0: `n.entries`, frames of entries; `n.checkpoint`, the state at their beginning, none
-for 0; `truth`, the bytes of the truth hash. A frame: length and CRC-32 of the content (little-endian, 32 bit each),
-then the content in msgpack.
+The folder has, with n counting from 0: `n.entries`, frames of entries; `n.checkpoint`, the state before them, absent
+for 0; `truth`, the input of the truth hash. A frame is the length and CRC-32 of the content (little-endian, 32 bit
+each), then the content in msgpack.
 """
 
 import os
@@ -27,11 +27,11 @@ from zsim.output_folder import take_lock
 from zsim_world.run import inputs
 from zsim_world.run.inputs import Entry
 
-VERSION = 4  # of the files, and of the states in them
-CHECKPOINT_NS = 5_000_000_000  # simulated time between two; the history that a replay refills reaches back as far
-CHECKPOINT_WALL_NS = 1_000_000_000  # wall time between two at least: a checkpoint of 1000 drones has 20 MB
-CHECKPOINTS_KEPT = 3  # the newest may not be on disk yet, and the one before it is younger than the history
-HASHED_BYTES = 1 << 20  # of the truth in one go
+VERSION = 4  # of the files and the states in them
+CHECKPOINT_NS = 5_000_000_000  # simulated time between checkpoints, as long as the message history
+CHECKPOINT_WALL_NS = 1_000_000_000  # shortest wall time between checkpoints, which have 20 MB for 1000 drones
+CHECKPOINTS_KEPT = 3  # the newest may not be on disk yet, and the second is younger than the message history
+HASHED_BYTES = 1 << 20  # of the truth per read
 _FRAME = struct.Struct("<II")
 
 
@@ -57,9 +57,9 @@ class RunJournal:
     """Reads and writes the journal of one run, or nothing without a folder.
 
     Args:
-        folder: of this run alone; it is made.
-        say: shows a line if the journal cannot be written any more.
-        all_died: whether all participants of a run that is continued have to be started again.
+        folder: for this run alone; created if missing.
+        say: shows a line if the journal can no longer be written.
+        all_died: whether all participants of a continued run must be restarted.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class RunJournal:
             self._entries.append(entry)
 
     def commit(self) -> None:
-        """Write the entries to the file; to be called before anything is published that follows from them."""
+        """Write the entries to the file; must be called before any message that follows from them is published."""
         if self._entries:
             entries, self._entries = self._entries, []
             self._guarded(lambda: _write(self._file, _framed(inputs.encode(entries))))
@@ -100,7 +100,7 @@ class RunJournal:
             self._guarded(lambda: _write(self._truth, data))
 
     def is_due(self, now_ns: int, wall_ns: int) -> bool:
-        """Tell whether it is time for a checkpoint, by simulated time and a monotonic clock."""
+        """Tell whether a checkpoint is due by simulated and monotonic wall time."""
         due = now_ns >= self._due_ns and wall_ns >= self._due_wall_ns and self._is_kept
         return due and (self._written is None or self._written.done())
 
@@ -119,7 +119,7 @@ class RunJournal:
         self._guarded(begin)
 
     def _write_checkpoint(self, number: int, content: bytes, former: int) -> None:
-        """Put a checkpoint on disk after the files that it needs, and remove those that are no longer needed."""
+        """Write a checkpoint to disk after the files that it needs, and remove obsolete files."""
         place = self._folder / f"{number}.checkpoint"
         os.fsync(former)
         os.close(former)
@@ -142,7 +142,7 @@ class RunJournal:
         return file
 
     def _guarded(self, write: Callable[[], None]) -> None:
-        """Continue the run without a journal if it cannot be written."""
+        """Call `write`; if it fails, continue the run without a journal."""
         try:
             write()
         except OSError as error:
@@ -162,7 +162,7 @@ class RunJournal:
         self._file = self._truth = -1
 
     def remove(self) -> None:
-        """Remove a journal that is closed and whose run is over."""
+        """Remove the closed journal of a completed run."""
         if self._is_kept:
             with suppress(OSError):
                 for place in self._folder.iterdir():
@@ -172,12 +172,12 @@ class RunJournal:
     # Reading
 
     def open(self) -> Checkpoint | None:
-        """Begin a journal, or open the one that is there; return the checkpoint to continue from, None for a start.
+        """Create or open the journal; return the checkpoint to continue from, None for a new run.
 
-        That is the newest but one: the history is refilled from there. `entries` are the inputs since then.
+        It is the second newest checkpoint, so that the inputs since it (`entries`) refill the message history.
 
         Raises:
-            RunError: the journal there is of another run, or cannot be read.
+            RunError: the journal belongs to another run, or cannot be read.
         """
         found = None
         if not self._is_kept:
@@ -201,7 +201,7 @@ class RunJournal:
         return found
 
     def _checkpoint(self, number: int) -> Checkpoint | None:
-        """Return a checkpoint, None if it is not whole."""
+        """Return a checkpoint, None if it is incomplete."""
         with suppress(OSError, DecodeError):
             frames = list(self._frames(self._folder / f"{number}.checkpoint"))
             if frames:
@@ -210,23 +210,23 @@ class RunJournal:
         return None
 
     def entries(self) -> Iterator[Entry]:
-        """Yield the inputs since the checkpoint; nothing that follows from a broken end was ever published."""
+        """Yield the inputs since the checkpoint; no message that follows from an incomplete entry was published."""
         for number in range(self._first, self._number + 1):
             for frame in self._frames(self._folder / f"{number}.entries"):
                 yield from inputs.decode(frame)
 
     def truth(self, size: int) -> Iterator[bytes]:
-        """Yield the first bytes of the truth hash, and drop the others, which the world appends again."""
+        """Yield the first `size` bytes of the truth hash's input, and drop the rest, which the world appends again."""
         os.ftruncate(self._truth, size)
         os.lseek(self._truth, 0, os.SEEK_SET)
         while data := os.read(self._truth, HASHED_BYTES):
             yield data
 
     def _frames(self, place: Path) -> Iterator[bytes]:
-        """Yield the frames of a file behind its head as far as they are whole, and cut off the rest.
+        """Yield the complete frames after the head of a file, and cut off the rest.
 
         Raises:
-            RunError: the file is of another run.
+            RunError: the file belongs to another run.
         """
         data, whole = place.read_bytes(), 0
         for content, end in _whole_frames(data):
@@ -236,7 +236,7 @@ class RunJournal:
                 try:
                     head = msgspec.msgpack.decode(content, type=_Head)
                 except REFUSALS as error:
-                    raise RunError(f"{place}: is no journal of a run ({error}); name another folder") from error
+                    raise RunError(f"{place}: is not the journal of a run ({error}); name another folder") from error
                 if head != self._head:
                     raise RunError(f"{place}: is of {head}; must be of {self._head}; name another folder")
             whole = end
@@ -245,7 +245,7 @@ class RunJournal:
 
 
 def _whole_frames(data: bytes) -> Iterator[tuple[bytes, int]]:
-    """Yield content and end of the frames at the beginning of a file that are whole."""
+    """Yield content and end offset of the complete frames at the beginning of a file."""
     at = 0
     while len(data) - at >= _FRAME.size:
         size, check = _FRAME.unpack_from(data, at)
@@ -256,7 +256,7 @@ def _whole_frames(data: bytes) -> Iterator[tuple[bytes, int]]:
 
 
 def journaled_run(folder: Path) -> str | None:
-    """Return the run of which a folder has the journal, None if it has none."""
+    """Return the id of the run whose journal is in a folder, None if it has none."""
     for place in sorted(folder.glob("*.entries")):
         with suppress(OSError, *REFUSALS):
             return msgspec.msgpack.decode(next(_whole_frames(place.read_bytes()))[0], type=_Head).run_id

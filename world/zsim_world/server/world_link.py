@@ -1,4 +1,4 @@
-"""The world's end of its links: subscriptions and lost outputs, and what it publishes in one go."""
+"""The world's side of its links: subscriptions, recovery of lost outputs, and publication in batches."""
 
 import threading
 import time
@@ -16,21 +16,21 @@ from zsim.transport.session import ReceivedSample, Session, Subscription
 from zsim_world.run.inputs import Published, Run, Taken
 from zsim_world.server.run_journal import RunJournal
 
-TICK_S = 0.1  # how often a world that waits looks at the wall clock
-RECOVERY_S = 1.0  # a publisher that lives answers a get for its outputs within milliseconds
-REJOINED_NS = 10_000_000_000  # wall time after a rejoin in which it may take until a process can be asked
-PROCESSES, VIEWS = "process/", "view/"  # the world does not read the last
+TICK_S = 0.1  # interval at which a waiting world checks the wall clock
+RECOVERY_S = 1.0  # timeout of a request for outputs, which a living publisher answers within milliseconds
+REJOINED_NS = 10_000_000_000  # wall time after a rejoin within which a process may not answer requests yet
+PROCESSES, VIEWS = "process/", "view/"  # the world does not read views
 
 
 class DirectInputs:
-    """Reads on the loop's own thread, waiting for the last subscription: fastest without a wall clock."""
+    """Reads on the loop's own thread, waiting on the last subscription: fastest without pacing."""
 
     def __init__(self, subscriptions: Sequence[Subscription]) -> None:
         self._subscriptions = subscriptions
         self._received: list[ReceivedSample] = []
 
     def wait(self, timeout_s: float | None) -> None:
-        """Return when something has arrived, or after timeout_s; without a limit, now and then to look at the clock."""
+        """Return when something has arrived, or after timeout_s; without a limit, return occasionally."""
         if timeout_s is not None and timeout_s < TICK_S:
             time.sleep(timeout_s)
             return
@@ -39,7 +39,7 @@ class DirectInputs:
             self._received.append(sample)
 
     def wait_for(self, wanted: set[str]) -> None:
-        """Wait until something has arrived on each of the wanted keys, or anything that is not a done."""
+        """Wait until something has arrived on each wanted key, or anything other than a done."""
         while True:
             sample = self._subscriptions[-1].receive()
             if sample is None:
@@ -50,7 +50,7 @@ class DirectInputs:
                 return
 
     def drain(self) -> Iterator[tuple[int, ReceivedSample]]:
-        """Yield what has arrived, with the monotonic wall time of its arrival [ns]."""
+        """Yield the received samples with the monotonic wall time of their arrival [ns]."""
         last, self._received = [*self._received, *self._subscriptions[-1].drain()], []
         wall_ns = time.monotonic_ns()
         for subscription in self._subscriptions[:-1]:
@@ -67,7 +67,7 @@ class DirectInputs:
 
 
 class TimedInputs:
-    """Reads on threads of their own, so that arrivals are stamped while the loop waits for its next gate."""
+    """Reads on separate threads, so that arrivals are stamped while the loop waits for its next gate."""
 
     def __init__(self, subscriptions: Sequence[Subscription]) -> None:
         self._fresh = threading.Event()
@@ -110,16 +110,16 @@ class TimedInputs:
 
 
 def open_inputs(link: Session, realtime: bool) -> DirectInputs | TimedInputs:
-    """Subscribe to what others publish.
+    """Subscribe to the messages of other processes.
 
-    Outputs are drained first, dones last: who publishes a done has published its outputs before, on the same link.
+    Outputs are drained first, dones last: a process publishes its outputs before its done, on the same link.
     """
     subscriptions = [link.subscribe_remote((PROCESSES, VIEWS)), link.subscribe(f"{PROCESSES}**")]
     return TimedInputs(subscriptions) if realtime else DirectInputs(subscriptions)
 
 
 def recover_lost(link: Session, run: Run) -> None:
-    """Request outputs again that a participant counted and that have not arrived, as after a cut link."""
+    """Request outputs that a participant counted and that have not arrived, for example after a cut link."""
     world = run.world
     for participant in world.barrier.incomplete():
         if participant.away:
@@ -138,18 +138,18 @@ def recover_lost(link: Session, run: Run) -> None:
             lost = []
         age_ns = time.monotonic_ns() - participant.joined_wall_ns
         if lost is None and participant.rejoined and age_ns < REJOINED_NS:
-            continue  # it cannot be asked yet
+            continue  # it may not answer requests yet
         for sample in lost or ():
             run.enter(Taken(time.monotonic_ns(), sample))
         run.call("give_up_outputs", participant.name)
 
 
 class WorldOutputs:
-    """Publishes the outbox of a world on its link.
+    """Publishes the outbox of a world.
 
     Args:
-        on_message: called with every key and message beside those of drones.
-        journal: is written before anything is published.
+        on_message: called with every key and message except the messages of a gate.
+        journal: written before anything is published.
     """
 
     def __init__(self, link: Session, run: Run, on_message: Callable[[str, Any], None], journal: RunJournal) -> None:
@@ -161,7 +161,7 @@ class WorldOutputs:
         self._gate_keys = [keys.gate(name) for name in run.world.names]
 
     def gather(self) -> None:
-        """Encode the outbox and keep it; a gate as one message, as one for each drone, if read, and singly."""
+        """Encode the outbox for `send`; a gate as a whole and per drone, if subscribed, and as single messages."""
         outbox = self._run.world.take_outbox()
         if not outbox:
             return
@@ -179,7 +179,7 @@ class WorldOutputs:
                 encoded += message.pairs
             else:
                 pair = (key, messages.encode(message))
-                if keys.is_picture(key):  # of a replay: whoever wants pictures reads their keys
+                if keys.is_picture(key):  # of a replay; not kept or batched, since pictures are large
                     self._unsent.append(pair)
                     continue
                 encoded.append(pair)
@@ -191,7 +191,7 @@ class WorldOutputs:
                 self._on_message(key, message)
 
     def send(self) -> None:
-        """Put what was gathered in one go: readers wake once, and the transport sends few packets."""
+        """Publish the gathered messages together: readers wake once, and the transport sends few packets."""
         self._journal.commit()
         unsent, self._unsent = self._unsent, []
         self._link.put_all(unsent)
@@ -202,7 +202,7 @@ class WorldOutputs:
         self.send()
 
     def publish(self, output: Output) -> None:
-        """Publish one message beside the outbox."""
+        """Publish one message without the outbox."""
         message: Any = output.message
         payload = messages.encode(message)
         self._run.enter(Published(output.key, message.seq, payload))
@@ -212,7 +212,7 @@ class WorldOutputs:
         self._on_message(output.key, message)
 
     def put_batch(self) -> None:
-        """Send the recorders, if there are any, all messages since the last time."""
+        """Send all messages since the last call to the recorders, if any."""
         history = self._run.history
         passed, history.passed = history.passed, []
         if self._link.has_subscribers(keys.BATCH):
@@ -220,5 +220,5 @@ class WorldOutputs:
                 self._link.put_raw(keys.BATCH, encode_batch(passed[first : first + BATCH_MAX]))
 
     def forget(self) -> None:
-        """Drop what was gathered: the former process of the world has published it."""
+        """Drop the gathered messages, which the former world process has published."""
         self._unsent, self._run.history.passed = [], []

@@ -1,7 +1,7 @@
-"""The world as a process on Zenoh: one loop that paces and gates simulated time.
+"""The world as a process on Zenoh: a loop that paces and gates simulated time.
 
-Order of this file: `run`, `WorldProcess` (continuing a former world's run, the loop, queries, other threads), pacing,
-and the watch over a loop that does not return.
+Order of this file: `run`, `WorldProcess` (continuing a run, the loop, queries, other threads), pacing, and the watch
+over a loop that is stuck.
 """
 
 import threading
@@ -33,17 +33,17 @@ from zsim_world.server.liveliness import Admission, LivelinessMonitor, SlowReade
 from zsim_world.server.run_journal import RunJournal
 from zsim_world.server.world_link import TICK_S, WorldOutputs, open_inputs, recover_lost
 
-CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
+CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once per wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
 HEALTH, OWN = keys.process(WORLD, "health"), keys.process(WORLD, "")
 BYE_S = 5.0  # contract: the world waits 5 s at most for byes
-SERVE_NS = 5_000_000  # wall time after which a world that never waits looks at requests and losses
-LAG_GATES = 2  # that the slowest agent may still have before it when a series of gates begins
-GATES_SENT = 3  # at once; more keep agents waiting that could work
-DELAY_MAX_NS = 50_000_000  # wall time that a gate is delayed at most; a slow agent then has all the gates that it may
-STOOD_STILL_NS = 1_000_000_000  # wall time by which a gate is late where time stood still rather than being slow
-STUCK_NS = 2_000_000_000  # wall time in one turn from which on it is reported; a turn takes milliseconds
-STOPPED_NS = 1_000_000_000  # between two looks, ten times as long as it takes: the process was stopped, or its host
+SERVE_NS = 5_000_000  # wall time after which a world that never waits handles requests and losses
+LAG_GATES = 2  # unfinished gates that the slowest agent may have when a series of gates begins
+GATES_SENT = 3  # gates sent together; more would leave agents idle
+DELAY_MAX_NS = 50_000_000  # longest delay of a gate [wall]; a slow agent then has all the gates that it may have
+STOOD_STILL_NS = 1_000_000_000  # lateness of a gate [wall] that indicates a standstill rather than slowness
+STUCK_NS = 2_000_000_000  # wall time after which a turn of the loop is reported as stuck; a turn takes milliseconds
+STOPPED_NS = 1_000_000_000  # wall time between two checks, ten times the usual, that indicates a stopped process
 
 
 def run(
@@ -55,10 +55,10 @@ def run(
     identity: Identity | None = None,
     journal: RunJournal | None = None,
 ) -> None:
-    """Listen on the endpoints, call `ready`, and run the world to its end, from where its journal ends.
+    """Listen on the endpoints, call `ready`, and run the world to its end, continuing its journal if it has one.
 
     Raises:
-        SessionError: an endpoint is taken, or the identity is of no use.
+        SessionError: an endpoint is in use, or the identity is unusable.
     """
     mode: Mode = "lockstep" if world.clock.mode == "lockstep" else "realtime"
     with connection.listen(endpoints, world.scenario.federation, mode, identity) as link:
@@ -71,9 +71,9 @@ class WorldProcess:
 
     Args:
         link: a listening session.
-        stopped: asked at every gate, and every TICK_S; a text ends the run with it as the reason.
-        journal: of the run; this world continues from the one that a former world has left.
-        health: of this process.
+        stopped: called at every gate and every TICK_S; a text that it returns ends the run for that reason.
+        journal: journal of the run, possibly left by a former world process, which this one continues.
+        health: health of this process.
     """
 
     def __init__(
@@ -104,8 +104,8 @@ class WorldProcess:
         self._queries: deque[Query] = deque()
         self._over = threading.Event()
         self._clock_wall_ns = 0
-        self._turn_wall_ns = 0  # when the present turn began; 0 when there is none
-        self._served_wall_ns = 0  # when others than participants were served last; 0 once the world has waited
+        self._turn_wall_ns = 0  # when the present turn began; 0 outside a turn
+        self._served_wall_ns = 0  # when requests and losses were last handled; 0 once the world has waited
         self._view_wall_ns = 0
         self._view_seq = 0
 
@@ -113,14 +113,14 @@ class WorldProcess:
         """Run to the end: wait for the participants, integrate, publish the end.
 
         Raises:
-            RunError: a failure has ended the run; the end has been published before.
+            RunError: a failure has ended the run, after its end was published.
         """
         self._inputs = open_inputs(self._link, self._clock.mode == "realtime")
         self._continue()
         if not self._history.last(keys.INFO):
             self._outputs.publish(Output(keys.INFO, self._world.info()))
         answered = [*roles.LAST_VALUES, keys.CONTROL, keys.replay("*"), *self._world.refused_queries]
-        answered.append(answered.pop(answered.index(keys.INFO)))  # who gets an answer there gets one everywhere
+        answered.append(answered.pop(answered.index(keys.INFO)))  # an answer there means that all are declared
         for expression in answered:
             self._link.declare_queryable(expression, self._on_query)
         self._tokens.watch()
@@ -144,10 +144,10 @@ class WorldProcess:
             raise self._world.failure
 
     def _continue(self) -> None:
-        """Apply what is in the journal, without publishing anything again, then wait for all who took part.
+        """Apply the journal without publishing anything again, then wait for the former participants.
 
         Raises:
-            RunError: the journal is of another run, or its state does not fit the scenario.
+            RunError: the journal belongs to another run, or its state does not fit the scenario.
         """
         checkpoint, world = self._journal.open(), self._world
         is_continued = isinstance(world, World) and checkpoint is not None
@@ -177,7 +177,7 @@ class WorldProcess:
 
     def _turn(self) -> None:
         former_wall_ns, self._turn_wall_ns = self._turn_wall_ns, time.monotonic_ns()
-        if former_wall_ns and self._turn_wall_ns - former_wall_ns > STOOD_STILL_NS:  # the ticker begins ten a second
+        if former_wall_ns and self._turn_wall_ns - former_wall_ns > STOOD_STILL_NS:  # usually TICK_S
             self._report_standstill(self._turn_wall_ns - former_wall_ns)
         self._take_in()
         if reason := self._stopped():
@@ -199,7 +199,7 @@ class WorldProcess:
             self._stand_still(wall_ns)
 
     def _report_standstill(self, stood_ns: int) -> None:
-        """In realtime, restart the pace after a standstill instead of catching up with the wall clock in a burst."""
+        """In realtime, restart the pacing after a standstill instead of catching up with the wall clock in a burst."""
         if self._clock.mode == "realtime" and self._clock.state == "running":
             self._pacer.restart()
             why = "this process or its machine was stopped, or nothing could be published"
@@ -209,21 +209,21 @@ class WorldProcess:
             self._outputs.publish(Output(keys.EVENT, event))
 
     def _take_in(self) -> None:
-        """Enter what has arrived; a join has to be admitted as well."""
+        """Enter the messages that have arrived, and check joins for admission."""
         for wall_ns, sample in self._inputs.drain():
             key = sample.key
-            if key.startswith(OWN):  # the world's own health, kept when it was published
+            if key.startswith(OWN):  # the world's own health, kept at its publication
                 continue
             self._run.enter(Taken(wall_ns, sample))
             if key.endswith("/join"):
-                with suppress(DecodeError):  # refused already
+                with suppress(DecodeError):  # already refused
                     join = messages.decode(key, sample.payload)
                     if isinstance(join, run_messages.Join):
                         self._liveliness.before_join(keys.thing(key), join)
                         self._admission.take(keys.thing(key), join, wall_ns)
 
     def _advance(self, wall_ns: int, late_ns: int) -> None:
-        """Go to the next gate; publish it, the views now and then, and put checkpoints into the journal."""
+        """Advance to the next gate; publish it and the views that are due, and journal a checkpoint if due."""
         world = self._world
         late = self._clock.mode == "realtime" and late_ns > self._clock.gate_ns / self._clock.rate
         self._run.enter(Advanced(wall_ns, late))
@@ -252,7 +252,7 @@ class WorldProcess:
         self._served_wall_ns = 0
 
     def _publish_clock(self, wall_ns: int, waiting_for: Callable[[int], tuple[run_messages.Waiting, ...]]) -> None:
-        """Publish once a second whom the world waits for."""
+        """Publish the processes that the world waits for once a second."""
         if wall_ns - self._clock_wall_ns >= CLOCK_STANDING_NS:
             self._outputs.publish(Output(keys.CLOCK, self._world.clock_message(waiting_for(wall_ns))))
 
@@ -264,9 +264,9 @@ class WorldProcess:
             self._run.progress("event", message, self._run.phase)
 
     def _end(self) -> None:
-        """Publish the end, then wait until nobody has to be waited for any more, BYE_S at most.
+        """Publish the end, then wait until all participants have left, BYE_S at most.
 
-        A world that was started again after the end of its run first waits for all who have yet to come back.
+        A world restarted after the end of its run first waits until the former participants have rejoined.
         """
         world, away = self._world, self._world.barrier.away
         while away() and self._stopped() is None:
@@ -284,7 +284,7 @@ class WorldProcess:
         self._turn_wall_ns = 0
 
     def _wait_at_end(self) -> None:
-        """Take inputs although time passes no more; a put that does not return is reported as before."""
+        """Take in messages and serve requests after the last gate."""
         self._inputs.wait(TICK_S)
         self._turn_wall_ns = time.monotonic_ns()
         self._take_in()
@@ -308,9 +308,9 @@ class WorldProcess:
             self._run.progress("health", health, WORLD)
 
     def _serve(self, query: Query) -> None:
-        """Answer a query: with last values, a part of the history, or as a request.
+        """Answer a query with last values, a page of the history, or the answer to a request.
 
-        A request comes on `world/control`, or for a replay on the process's own key, by which access control knows it.
+        Requests arrive on `world/control`; replays also on the process's own key, which access control can restrict.
         """
         expression = query.expression
         process = keys.thing(expression) if keys.matches(keys.replay("*"), expression) else None
@@ -341,7 +341,7 @@ class WorldProcess:
                 query.reply(key, payload)
             query.end()
 
-    # What other threads bring
+    # Called by other threads
 
     def _on_query(self, query: Query) -> None:
         self._queries.append(query)
@@ -353,7 +353,7 @@ class WorldProcess:
             self._inputs.wake()
 
     def _tick(self) -> None:
-        """Wake the loop, and show that a put does not return; `clock` cannot, since it would be stuck as well."""
+        """Wake the loop, and show a stuck put in the terminal, since no message could be published."""
         watch = TurnWatch(time.monotonic_ns())
         while not self._over.wait(TICK_S):
             self._inputs.wake()
@@ -369,12 +369,12 @@ class Pacer:
 
     def __init__(self, clock: RunClock) -> None:
         self._clock = clock
-        self._pace = (0.0, 0)  # rate, and jumps of time before it; its start by either clock:
+        self._pace = (0.0, 0)  # rate and number of jumps of time; the next two are its start
         self._start_wall_ns = 0
         self._start_sim_ns = 0
 
     def due_ns(self, wall_ns: int) -> int:
-        """Return the wall time of the next gate; the pace restarts when the rate changes or time stood still."""
+        """Return the wall time of the next gate [ns]; the pace restarts after a change of rate or a standstill."""
         clock = self._clock
         if clock.rate <= 0 or clock.state != "running":
             self._pace = (0.0, 0)
@@ -388,16 +388,16 @@ class Pacer:
         return due_ns
 
     def restart(self) -> None:
-        """Restart the pace with the next gate, which is due at once."""
+        """Restart the pace at the next gate, which is due immediately."""
         self._pace = (0.0, 0)
 
 
 class Pipelining:
-    """Decides when to delay a gate so that several come at once: each process then wakes up less often.
+    """Delays gates so that several are sent together and processes wake up less often.
 
-    Where agents may lag several gates behind, time is delayed until the slowest agent has nearly caught up; then gates
-    follow one another until its done is required again. No agent idles meanwhile: the first of these gates comes while
-    agents still work on the last ones before it. Only a world in lockstep that goes as fast as it can is delayed.
+    If agents may lag several gates behind, time is delayed until the slowest agent has nearly caught up; then gates
+    follow one another until its done is required again. No agent idles meanwhile: the first of these gates arrives
+    while agents still work on earlier ones. Only a world in lockstep without pacing is delayed.
     """
 
     def __init__(self, world: Coordinator) -> None:
@@ -410,11 +410,11 @@ class Pipelining:
 
     @property
     def _enabled(self) -> bool:
-        """Tell whether agents may lag, and no wall clock paces the gates."""
+        """Tell whether agents may lag and gates are not paced."""
         return self._ahead_ns > 0 and self._clock.mode == "lockstep" and self._clock.rate <= 0
 
     def delays(self, wall_ns: int) -> bool:
-        """Tell whether to wait although the next gate may come."""
+        """Tell whether to delay the next gate although it may come."""
         if self._continues or not self._enabled:
             return False
         late = wall_ns - self._delayed_wall_ns > DELAY_MAX_NS
@@ -422,7 +422,7 @@ class Pipelining:
         return not self._continues
 
     def continues(self) -> bool:
-        """Tell, after a gate, whether the next one comes at once, so that both can be sent together."""
+        """Tell, after a gate, whether the next one follows immediately, so that both can be sent together."""
         self._gates = (self._gates + 1) % GATES_SENT
         return self._gates > 0 and self._continues and self._enabled and self._world.may_advance()
 
@@ -437,9 +437,9 @@ class Pipelining:
 
 
 class TurnWatch:
-    """Tells a turn of the loop that does not end (a put that does not return) from a process that was stopped.
+    """Distinguishes a stuck turn of the loop (a put that does not return) from a stopped process.
 
-    It is asked on a thread of its own, which a put does not block. Its times are monotonic.
+    It is called on a separate thread, which a put does not block. Times are monotonic.
     """
 
     def __init__(self, now_ns: int) -> None:
@@ -448,10 +448,10 @@ class TurnWatch:
         self._reported_ns = 0
 
     def stuck_s(self, now_ns: int, turn_ns: int) -> float | None:
-        """Return for how long a turn has been stuck, once every STUCK_NS; None where there is nothing to report.
+        """Return how long a turn has been stuck [s], at most once every STUCK_NS; None if there is nothing to report.
 
         Args:
-            turn_ns: when the turn began, 0 when there is none.
+            turn_ns: when the turn began, 0 outside a turn.
         """
         if now_ns - self._looked_ns > STOPPED_NS:
             self._stopped_until_ns = now_ns

@@ -78,14 +78,14 @@ def test_a_join_again_changes_nothing_and_a_newcomer_of_a_known_name_replaces():
     made = barrier("estimator.d1")
     first = made.participants["estimator.d1"]
     first.away = True
-    assert not made.takes_place("estimator.d1", join())
+    assert not made.would_replace("estimator.d1", join())
     assert made.join("estimator.d1", join(), 10 * GATE_NS, WALL_NS) is None
     assert made.participants["estimator.d1"] is first
     assert (first.away, first.rejoined) == (False, False)
 
-    assert made.takes_place("estimator.d1", join(2, pid=43))
-    assert not made.takes_place("estimator.d1", join(2, pid=43, run_id="run2"))
-    assert not made.takes_place("estimator.d2", join(2, pid=43))
+    assert made.would_replace("estimator.d1", join(2, pid=43))
+    assert not made.would_replace("estimator.d1", join(2, pid=43, run_id="run2"))
+    assert not made.would_replace("estimator.d2", join(2, pid=43))
     assert made.join("estimator.d1", join(2), 10 * GATE_NS, WALL_NS) is None
     assert made.participants["estimator.d1"].rejoined
 

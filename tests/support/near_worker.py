@@ -1,0 +1,39 @@
+"""A sweep whose runs are flown in the process of the test: a worker of its own imports everything for a second."""
+
+import sys
+
+import pytest
+
+from zsim.schema import plugin
+from zsim_analysis.sweep import process_pool
+from zsim_analysis.sweep.process_pool import READY
+from zsim_analysis.sweep.sweep_run import Row, Task, fly
+
+
+class NearWorker:
+    """A worker without a process of its own."""
+
+    def __init__(self) -> None:
+        self.link, self._far = process_pool.multiprocessing.Pipe()
+        self.ready = False
+        self.task: Task | None = None
+        self._far.send(READY)
+
+    def send(self, task: Task) -> None:
+        self.task = task
+        self._far.send(fly(task))
+
+    def receive(self) -> Row:
+        return self.link.recv()
+
+    def stop(self) -> None:
+        self._far.close()
+        self.link.close()
+
+
+@pytest.fixture
+def near(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fly the runs in this process."""
+    monkeypatch.setattr(process_pool, "WorkerProcess", NearWorker)
+    monkeypatch.setenv(plugin.FOLDERS, "")
+    monkeypatch.setattr(sys, "path", [*sys.path])
