@@ -1,6 +1,6 @@
-"""zsim from Python: what users call as `zsim.run`, `zsim.Simulation` and so on; see docs/python.md.
+"""The Python API: `zsim.run`, `zsim.Simulation` and so on; see docs/python.md.
 
-Each name is imported from its module when it is first asked for, so an onboard computer needs only what it uses.
+Each name is imported from its module on first use, so that an onboard computer needs only the packages that it uses.
 """
 
 import importlib

@@ -1,4 +1,4 @@
-"""A flight under test: real processes, and a user's own programs beside them, while a test looks on and intervenes.
+"""A flight under test: real processes and a user's own programs, which a test observes and intervenes in.
 
     with zsim.Federation("step.yaml", duration=40, programs=["python my_controller.py --connect {endpoint}"]) as flight:
         flight.wait_until("engaged")
@@ -6,8 +6,9 @@
         flight.kill("estimator.drone2")
         flight.assert_errors(p=0.3, window=(20, 40))
 
-The test takes part in the lockstep as `test.federation`: simulated time stands still unless it waits for something, so
-what it does acts at the same gate each time. The fixture `federation` of the pytest plugin gives these.
+The test takes part in the lockstep as `test.federation`: simulated time stands still unless the test waits for
+something, so its actions take effect at the same gate each time. The fixture `federation` of the pytest plugin makes
+these objects.
 """
 
 import os
@@ -49,19 +50,19 @@ if TYPE_CHECKING:
 
 PROCESS = "test.federation"
 PATIENCE_S = 300.0  # wall time; the first run on a machine compiles for one to three minutes, more on a busy one
-PROGRAM_END_S = 5.0  # wall time that programs have to see that the run is over
-KILL = getattr(signal, "SIGKILL", signal.SIGTERM)  # Windows has no other
-HARMLESS = {getattr(signal, name, None) for name in ("SIGSTOP", "SIGCONT")}  # signals that end no process
-LAST_LINES = 40  # of a log that tells of a failure
-ENDED = re.compile(r"^(\S+)(?: \(pid \d+\))? ended: ", re.MULTILINE)  # as the launcher says of a process
+PROGRAM_END_S = 5.0  # wall time for programs to notice the end of the run
+KILL = getattr(signal, "SIGKILL", signal.SIGTERM)  # Windows has no SIGKILL
+HARMLESS = {getattr(signal, name, None) for name in ("SIGSTOP", "SIGCONT")}  # signals that do not end a process
+LAST_LINES = 40  # shown of a log with a failure
+ENDED = re.compile(r"^(\S+)(?: \(pid \d+\))? ended: ", re.MULTILINE)  # in the launcher's log
 
 
 class Moment(NamedTuple):
-    """What a condition of `wait_until` is told of a gate.
+    """The state of a flight at a gate, passed to a condition of `wait_until`.
 
     Attributes:
         t_s: simulated time.
-        states: the states of the clusters by name, as far as they have come: two gates old.
+        states: the received states of the clusters by name: two gates old.
         truth: the true motion of the drones by name; without external ones.
         events: those since the last `wait_until`.
     """
@@ -76,22 +77,22 @@ Condition = Callable[[Moment], Any]
 
 
 class Federation(Assertions):
-    """A flight as processes: `zsim run`, on a free port and under a federation's name of its own, and programs.
+    """A flight as processes: `zsim run`, on a free port and in a federation of its own, and programs.
 
     Args:
         scenario: path, `zsim.Scenario`, or a mapping as in YAML.
         duration: simulated time of the flight [s]; None: that of the scenario.
-        seed, set, law, estimator, out: as of `zsim.run`; `out` may be replaced.
-        agents: of your own, as of `zsim.run`, or as words of `zsim run --agent`, "MODULE:CLASS NAME=VALUE".
+        seed, set, law, estimator, out: as in `zsim.run`; an earlier run in `out` is replaced.
+        agents: your own, as in `zsim.run`, or as words of `zsim run --agent`, "MODULE:CLASS NAME=VALUE".
         programs: command lines of your own programs, in any language, as text or as words. `{endpoint}`,
             `{federation}` and `{folder}` are replaced, and the environment has ZSIM_CONNECT and ZSIM_FEDERATION. Time
-            does not begin before a program has joined that is named, as in "ground.main=python ground.py". One that
-            ends with another code than 0 fails the flight.
+            does not begin before a named program has joined, as in "ground.main=python ground.py". A program that ends
+            with a code other than 0 fails the flight.
         options: of `zsim run`, such as "--hosted", or "--rate" and "1".
-        modules: folders in which classes that are named are looked for, beside those of the scenario.
+        modules: further folders with the modules of named classes, beside those of the scenario.
 
     Attributes:
-        endpoint, name: where its world listens; the federation's name.
+        endpoint, name: the endpoint of its world; the name of the federation.
         folder: of the run, with the record and the logs.
 
     Raises:
@@ -114,7 +115,7 @@ class Federation(Assertions):
         modules: Sequence[str | Path] = (),
     ) -> None:
         if not hasattr(os, "killpg"):
-            raise RunError("Federation: needs signals of POSIX; use Linux, macOS or WSL, or zsim.run in one process")
+            raise RunError("Federation: needs POSIX signals; use Linux, macOS or WSL, or zsim.run in one process")
         self._port = _reserved_port()
         self.endpoint = f"tcp/127.0.0.1:{self._port.getsockname()[1]}"
         self.name = str((set or {}).get("federation", f"test-{os.getpid()}-{self._port.getsockname()[1]}"))
@@ -139,7 +140,7 @@ class Federation(Assertions):
             raise
         self._watch = _Watch()
         self._known = {*expected, WORLD, RECORDER}
-        self._has_others = bool(named or options) or any(not name for name, _ in started)  # of names of their own
+        self._has_others = bool(named or options) or any(not name for name, _ in started)  # with unknown names
         self._clock: Clock | None = None
         self._pids: dict[str, int] = {}
         self._killed: dict[int, str] = {}
@@ -174,17 +175,17 @@ class Federation(Assertions):
 
     @property
     def t_s(self) -> float:
-        """Simulated time at which it stands, or which it has come to [s]; 0 before it begins."""
+        """Current simulated time [s]; 0 before the flight begins."""
         moment = self._watch.moment
         return moment.t_s if moment else 0.0
 
     def wait_until(self, what: str | float | Condition, within_s: float = PATIENCE_S) -> Moment:
-        """Let time pass until something is the case, and stand there. In realtime it goes on.
+        """Let time pass until a condition is met, and stop it there; in realtime it continues.
 
         Args:
-            what: a phase in which every cluster is, such as "engaged", and is already after a `kill` if it was before;
-                the kind of an event, such as "collision" or "restart", that has happened since the last call; a
-                simulated time [s]; or a function of a `Moment`.
+            what: a phase that every cluster must be in, such as "engaged" (met at once if it is already so, even just
+                after a `kill`); a kind of event, such as "collision" or "restart", since the last call; a simulated
+                time [s]; or a function of a `Moment`.
             within_s: wall time.
 
         Returns:
@@ -192,8 +193,8 @@ class Federation(Assertions):
 
         Raises:
             RunError: there is no such phase or kind of event.
-            RunFailedError: the run has ended before, or a program has failed, or it takes longer.
-            Exception: what the function has raised.
+            RunFailedError: the run ended before, or a program failed, or it takes longer.
+            Exception: raised by the function.
         """
         __tracebackhide__ = True
         condition, text = _condition(what)
@@ -208,9 +209,9 @@ class Federation(Assertions):
                 raise watch.raised
             if not waited and watch.moment is not None:
                 return watch.moment
-        if self._watch.left:  # the launcher knows why
+        if self._watch.left:  # the launcher's log tells why
             self._launcher.wait(max(0.0, until_s - time.monotonic()))
-        fault = self._fault or f"it has not come within {within_s:g} s of wall time"
+        fault = self._fault or f"not reached within {within_s:g} s of wall time"
         raise RunFailedError(f"{self.folder.name}: waiting for {text} from {self.t_s:.2f} s on: {fault}")
 
     def run(self, within_s: float = PATIENCE_S) -> "Run":
@@ -220,7 +221,7 @@ class Federation(Assertions):
             within_s: wall time.
 
         Raises:
-            RunFailedError: a failure ended the run, or a program ended with another code than 0, or it takes longer.
+            RunFailedError: a failure ended the run, or a program ended with a code other than 0, or it takes longer.
         """
         if self._run is None:
             self._watch.finish()
@@ -257,14 +258,14 @@ class Federation(Assertions):
         return result_of(self._session(within_s).request(key, op, PROCESS, args))
 
     def drone(self, name: str) -> PilotedDrone:
-        """Return a drone that can be asked to fly somewhere, where the scenario has a `reference` of it."""
+        """Return a drone that can be asked to fly somewhere, if it has a `reference` in the scenario."""
         return PilotedDrone(name, self.ask)
 
     def inject(self, fault: Mapping[str, Any]) -> Any:
         """Inject a fault, as in a scenario's `faults`; see docs/faults.md.
 
-        In lockstep, one without `at_s` acts from the first gate to which the world cannot have run ahead, the same in
-        each run: one more than `time.command_delay_gates` after `t_s`.
+        In lockstep, a fault without `at_s` acts from the first gate that the world cannot have computed yet, the same
+        in each run: one more than `time.command_delay_gates` after `t_s`.
 
         Returns:
             `id`, `from_ns` and `until_ns`.
@@ -281,11 +282,11 @@ class Federation(Assertions):
 
         Args:
             process: name, such as "estimator.drone2", "world", or that of a program of yours, "ground.main".
-            number: of the signal, such as SIGSTOP, after which it does nothing until SIGCONT.
-            within_s: wall time to wait for its joining.
+            number: of the signal, such as SIGSTOP, which stops it until SIGCONT.
+            within_s: wall time to wait until it has joined.
 
         Raises:
-            RunError: nobody has that name, nor is to have it.
+            RunError: no process of the run has that name.
             RunFailedError: it has not joined.
         """
         until_s = time.monotonic() + within_s
@@ -303,30 +304,30 @@ class Federation(Assertions):
         return pid
 
     def start(self, program: str) -> None:
-        """Start a program of yours again that has ended or was killed, by the name that it was given.
+        """Restart a program of yours that has ended or was killed, by its name.
 
         Raises:
-            RunError: there is no such program, or it runs.
+            RunError: there is no such program, or it is still running.
         """
         former = self._programs.get(program)
         if former is None:
             known = ", ".join(self._programs) or "there are none"
             raise RunError(f"start: program is {program!r}; must be one of {known}")
         if former.wait(PROGRAM_END_S if former.asked else 0.0) is None:
-            raise RunError(f"start: {program} runs; must have ended")
+            raise RunError(f"start: {program} is running; must have ended")
         former.close()
         self._start(program, former.words)
 
     def _check_name(self, process: str, within_s: float) -> None:
-        """Raise RunError for a name that nobody has, nor is to have."""
+        """Raise RunError for a name that no process of the run has or is expected to have."""
         if process in self._known:
             return
         watch = self._watch
         with watch.news:
-            if self._has_others:  # by the first gate all that the run waits for have joined
+            if self._has_others:  # all expected processes have joined by the first gate
                 watch.news.wait_for(lambda: watch.moment is not None or self._fault is not None, within_s)
             link = self._link
-        for sample in link.get(keys.process("*", "join")) if link else ():  # those of before this test's
+        for sample in link.get(keys.process("*", "join")) if link else ():  # joined before this test
             self._take_process(sample)
         allowed = sorted({*self._known, *self._pids} - {PROCESS})
         if process not in allowed:
@@ -345,7 +346,7 @@ class Federation(Assertions):
     # Its end
 
     def close(self) -> None:
-        """End whatever of it runs; its record holds all until then."""
+        """End all its processes; the record contains everything up to then."""
         self._over = True
         self._watch.finish()
         self._launcher.close()
@@ -362,9 +363,9 @@ class Federation(Assertions):
         self.close()
 
     def diagnosis(self) -> str:
-        """Return for people how far it has come, who waits for whom, and the last lines of the logs.
+        """Describe the progress of the run, the processes that are waited for, and the last lines of the logs.
 
-        First come those of processes that have failed or are waited for, then the launcher's; of the others one line.
+        The logs of failed and awaited processes come first, then the launcher's; then one line of each other log.
         """
         clock = self._newest_clock()
         waiting = [each for each in clock.waiting_for if each.name != PROCESS] if clock else []
@@ -387,15 +388,15 @@ class Federation(Assertions):
 
     def _standing(self, clock: Clock | None, waiting: Sequence[Waiting]) -> str:
         if clock is None:
-            return "no clock of a world has come"
+            return "no clock of a world was received"
         lines = []
         for each in holding_up(clock.state, waiting) or waiting:
             on = f" on {each.host}" if each.host else ""
             held = f", held by {', '.join(each.held_by)}" if each.held_by else ""
             lines.append(f"  {each.name}{on} since {each.since_wall_s:.1f} s{held}")
         if not self._watch.left and self._watch.wanted is None:
-            lines.append(f"  {PROCESS}, this test, which waits for nothing at the moment")
-        lines.insert(0, f"t = {clock.t_ns / 1e9:.2f} s, {clock.state}; waiting_for:{'' if lines else ' nobody'}")
+            lines.append(f"  {PROCESS}, this test, which is not waiting for anything at the moment")
+        lines.insert(0, f"t = {clock.t_ns / 1e9:.2f} s, {clock.state}; waiting_for:{'' if lines else ' none'}")
         return "\n".join(lines)
 
     def _newest_clock(self) -> Clock | None:
@@ -405,25 +406,25 @@ class Federation(Assertions):
                 self._take_clock(sample.payload)
         return self._clock
 
-    # In threads of its own
+    # Background threads
 
     @property
     def _fault(self) -> str | None:
-        """Why nothing more comes of it, None while it goes on."""
+        """Why the run is over, None while it continues."""
         if fault := self._program_fault():
             return fault
         if (code := self._launcher.code) is not None:
             log = self.folder / run_folder.LOGS / f"{LAUNCHER}.log"
             lines = log.read_text(errors="replace").splitlines()
-            return f"the run has ended with code {code}: {lines[-1] if lines else 'it has said nothing'}"
+            return f"the run has ended with code {code}: {lines[-1] if lines else 'it printed nothing'}"
         return "the run has ended" if self._watch.left else None
 
     def _program_fault(self) -> str:
         for name, program in self._programs.items():
             if program.code and not program.asked:
                 lines = (self.folder / run_folder.LOGS / f"{name}.log").read_text(errors="replace").splitlines()
-                said = lines[-1] if lines else "it has said nothing"
-                return f"{name} ({shlex.join(program.words)}) ended with code {program.code}: {said}"
+                last = lines[-1] if lines else "it printed nothing"
+                return f"{name} ({shlex.join(program.words)}) ended with code {program.code}: {last}"
         return ""
 
     def _await_end(self, program: Program) -> None:
@@ -432,7 +433,7 @@ class Federation(Assertions):
             self._watch.news.notify_all()
 
     def _take_part(self) -> None:
-        """Look on from before the run begins to its end; the world waits for this."""
+        """Observe the run from its start to its end; the world waits for this."""
 
         def is_over() -> bool:
             return self._over or self._launcher.code is not None
@@ -470,19 +471,19 @@ class Federation(Assertions):
 
 
 class _Watch(Agent):
-    """The test's part in the lockstep: it is done with a gate once the test has let time pass.
+    """The test's participant in the lockstep: it is done with a gate once the test lets time pass.
 
     Attributes:
-        news: guards all of this, and tells of changes.
-        wanted: what the test waits for; None while time is to stand.
+        news: guards the other attributes, and signals changes.
+        wanted: the condition that the test waits for; None while time stands still.
         moment: the newest gate; None before the first.
         raised: by the condition.
-        left: whether it takes part no longer.
-        ahead_s: how far after the newest gate the world cannot be yet [s]; None in realtime.
+        left: whether it has left the run.
+        ahead_s: time after the newest gate that the world cannot have computed yet [s]; None in realtime.
     """
 
     name = PROCESS
-    uncounted = (keys.EVENT,)  # the end of a process is stamped with a gate that has been taken
+    uncounted = (keys.EVENT,)  # the end of a process is stamped with a gate that has already been received
 
     def __init__(self) -> None:
         super().__init__()
@@ -499,7 +500,7 @@ class _Watch(Agent):
         self._events: list[Event] = []
 
     def watch(self, info: Info) -> None:
-        """Prepare for the run of `world/info`; in realtime, time goes on by itself."""
+        """Prepare for the run of `world/info`; in realtime, time does not wait."""
         simulated = [drone.name for drone in info.drones if drone.body is UNSET]
         truth = [keys.truth(drone) for drone in simulated]
         self.gate_keys = (*(keys.status(drone.name) for drone in info.drones), *truth)
@@ -509,7 +510,7 @@ class _Watch(Agent):
         self.ahead_s = (info.command_delay_ns + info.gate_ns) / 1e9 if self._holds else None
 
     def begin(self, condition: Condition) -> None:
-        """Let time pass until a condition; to be called with `news` held."""
+        """Let time pass until a condition is met; `news` must be held."""
         self._events = [event for event in self._events if event.t_ns >= self._now_ns]
         self.moment = self.moment and self.moment._replace(events=())
         self.raised, self.wanted = None, condition
@@ -531,7 +532,7 @@ class _Watch(Agent):
     def step(self, t_ns: int) -> Sequence[Output]:
         with self.news:
             self._now_ns = t_ns
-            events = tuple(event for event in self._events if event.t_ns < t_ns)  # of this gate, some are on their way
+            events = tuple(event for event in self._events if event.t_ns < t_ns)  # those of this gate may be incomplete
             self.moment = Moment(t_ns / 1e9, dict(self._states), dict(self._truth), events)
             while True:
                 wanted = self.wanted
@@ -539,7 +540,7 @@ class _Watch(Agent):
                     try:
                         if not wanted(self.moment):
                             return []
-                    except BaseException as error:  # the test's: it is raised there
+                    except BaseException as error:  # raised again in the test's thread
                         self.raised = error
                     self.wanted = None
                 self.news.notify_all()
@@ -549,7 +550,7 @@ class _Watch(Agent):
 
 
 def _condition(what: str | float | Condition) -> tuple[Condition, str]:
-    """Return what a test waits for as a function of a moment, and as a text."""
+    """Return the argument of `wait_until` as a function of a moment, and as a text."""
     if callable(what):
         return what, getattr(what, "__name__", repr(what))
     phases = get_args(Phase)
@@ -582,8 +583,8 @@ def _named(program: str | Sequence[str]) -> tuple[str, list[str]]:
 
 
 def _reserved_port() -> socket.socket:
-    """Return a socket that keeps a free port of this machine from others, and on which a world can listen."""
+    """Return a socket that reserves a free port, on which a world can listen nevertheless."""
     kept = socket.socket()
     kept.bind(("127.0.0.1", 0))
-    kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # after: another that asks for any port gets another
+    kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # after bind, so that the port is not given to others
     return kept

@@ -1,13 +1,13 @@
-"""Runs a program, and ends it and all that it has started when whoever asked for it is gone, also by kill -9.
+"""Runs a program, and ends it with its descendants when its caller is gone, even by kill -9.
 
     python -I -S keeper.py GRACE_S WORD...
 
-Standard input is a pipe from the caller, which ends with it: then the program is asked to end (SIGTERM), and killed if
-it has not within the grace. Signals are passed on to its process group; SIGUSR1 kills it, and all that it has started.
-What a program leaves behind it has the same grace, and is killed. The exit code is the program's; 128 + N for a signal,
-as in shells, and 127 where it cannot start.
+Standard input is a pipe from the caller, which closes when the caller ends: then the program receives SIGTERM, and is
+killed if it has not ended within the grace period. Signals are forwarded to its process group; SIGUSR1 kills it and its
+descendants. Descendants that outlive the program are killed after the same grace period. The exit code is the
+program's; 128 + N for a signal, as in shells, and 127 if it cannot be started.
 
-This file is run by its path and imports the standard library alone, so that it costs some milliseconds.
+This file is run by its path and imports only the standard library, so that it starts within milliseconds.
 """
 
 import ctypes
@@ -22,7 +22,7 @@ from pathlib import Path
 
 PR_SET_CHILD_SUBREAPER = 36  # linux/prctl.h
 NOT_STARTED = 127
-AGAIN_S = 0.02  # between two looks for what the killed have left
+AGAIN_S = 0.02  # between two rounds of killing
 
 
 def main(grace_s: float, words: list[str]) -> int:
@@ -46,7 +46,7 @@ def main(grace_s: float, words: list[str]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, forward)
     signal.signal(signal.SIGUSR1, lambda *_: threading.Thread(target=_kill_children, daemon=True).start())
-    if sys.platform == "linux":  # whatever a program detaches becomes a child of this process
+    if sys.platform == "linux":  # detached descendants become children of this process
         ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     try:
         program = subprocess.Popen(words, stdin=subprocess.DEVNULL, process_group=0)
@@ -68,17 +68,12 @@ def main(grace_s: float, words: list[str]) -> int:
 
 
 def _kill_children() -> None:
-    """Kill the children, and theirs, which become children of this process in turn, until none is left."""
-    while children := _children():
+    """Kill all children (known on Linux only), and theirs, which become children of this process in turn."""
+    while children := [pid for path in Path("/proc/self/task").glob("*/children") for pid in path.read_text().split()]:
         for pid in children:
             with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+                os.kill(int(pid), signal.SIGKILL)
         time.sleep(AGAIN_S)
-
-
-def _children() -> list[int]:
-    """Return the children of all threads; only Linux tells."""
-    return [int(pid) for path in Path("/proc/self/task").glob("*/children") for pid in path.read_text().split()]
 
 
 if __name__ == "__main__":

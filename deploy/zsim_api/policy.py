@@ -1,4 +1,4 @@
-"""What a policy sees and does: observations and commands, the same in an environment and in a process of its own.
+"""Observations and actions of policies, the same in a training environment and in a process of a flight.
 
 class Trained(zsim.PolicyAgent):
     observe, action, step_s = "estimate", "velocity", 0.1
@@ -36,13 +36,12 @@ from zsim_api.simulation import Estimates, Samples, Truth, estimates_of
 Observe = Literal["truth", "estimate", "sensors"]
 Action = Literal["velocity", "attitude", "rotors", "cluster"]
 Floats = NDArray[np.float32]
-FARTHEST = 1e6  # bound of an observation, m and so on: beyond all that flies
+FARTHEST = 1e6  # bound of an observation, in its unit: beyond any flight
 AIRBORNE = ("hovering", "flying")
-STAMPS = ("t_ns", "seq", "t_sample_ns")  # of a sample, no readings
 
 
 class Flown(Protocol):
-    """What is known of a flight at a gate: `zsim.Simulation`, or the messages that an agent has received."""
+    """The state of a flight at a gate: a `zsim.Simulation`, or the messages that an agent has received."""
 
     @property
     def names(self) -> Sequence[str]: ...
@@ -110,7 +109,7 @@ class Interface:
         return own * (13 if self.observe == "truth" else 10) + 6 * others
 
     def bounds(self, agent: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return what an action of -1 and of 1 commands (A,), in the units above."""
+        """Return the commands (A,) of an action of -1 and of 1, in the units above."""
         low: list[float] = []
         high: list[float] = []
         for drone in (self._drones[name] for name in self._members[agent]):
@@ -136,7 +135,7 @@ class Interface:
         return np.array(low), np.array(high)
 
     def observations(self, flown: Flown) -> dict[str, Floats]:
-        """Return what every agent sees."""
+        """Return the observation of every agent."""
         if self.observe == "sensors":
             seen = {drone: self._samples(flown, drone) for drone in self.names}
             return {agent: np.concatenate([seen[name] for name in self._members[agent]]) for agent in self.agents}
@@ -151,8 +150,8 @@ class Interface:
 
     @cached_property
     def _layout(self) -> tuple[NDArray[np.intp], NDArray[np.intp], list[int]]:
-        """Return the layout of all observations in a row: numbers of the drones' rows by place, the places of those
-        from which they are measured (-1 for none), and where one agent's observation ends.
+        """Return the layout of all observations in a row: indices into the drones' flattened rows, indices of the
+        values that are subtracted (-1 for none), and the ends of the agents' observations.
         """
         width = 13 if self.observe == "truth" else 10
         picked: list[int] = []
@@ -167,17 +166,17 @@ class Interface:
         return np.array(picked), np.array(origins), ends[:-1]
 
     def begin(self, flown: Flown) -> dict[str, Command] | None:
-        """Return the commands that bring the drones into the air; None once all are, and a policy may begin."""
+        """Return the commands that take the drones off; None once all are in the air and a policy may begin."""
         states = {name: flown.state(name) for name in self.names}
         if all(state in AIRBORNE for state in states.values()):
             return None
         return {name: takeoff() for name, state in states.items() if state == "landed"}
 
     def commands(self, flown: Flown, actions: Mapping[str, ArrayLike], by: str = "step") -> dict[str, Command]:
-        """Return the commands to the drones by the actions of agents; those without an action get none.
+        """Return the commands to the drones for the actions of agents; an agent without an action sends none.
 
         Raises:
-            UserCodeError: an action is of another shape, or not finite; `by` says whose it is.
+            UserCodeError: an action has the wrong shape, or is not finite; `by` names its source.
         """
         commands: dict[str, Command] = {}
         for agent, given in actions.items():
@@ -207,10 +206,10 @@ class Interface:
             return velocity(*action.tolist())
         roll, pitch, thrust_n, yaw_rate = action.tolist()
         (sr, sp), (cr, cp) = np.sin([roll / 2, pitch / 2]), np.cos([roll / 2, pitch / 2])
-        return attitude((cr * cp, sr * cp, cr * sp, -sr * sp), thrust_n, yaw_rate)  # first pitch, then roll
+        return attitude((cr * cp, sr * cp, cr * sp, -sr * sp), thrust_n, yaw_rate)  # pitch, then roll
 
     def _of_cluster(self, cluster: str, flown: Flown, c_dot: NDArray[np.float64]) -> dict[str, Command]:
-        """Return velocities of the drones of a cluster; rest where its shape is singular."""
+        """Return velocities of the drones of a cluster; zero if its shape is singular."""
         of = flown.truth if self.observe == "truth" else flown.estimates
         places, space = self._places[cluster], self._spaces[cluster]
         w, x, y, z = of.orientation_wxyz[places].T
@@ -250,7 +249,7 @@ def _readings(drone: Drone) -> list[tuple[str, str, int]]:
 
 
 def _bounded(numbers: NDArray[np.float64]) -> Floats:
-    """Return numbers within the bounds of an observation; 0 for what is not known yet."""
+    """Clip numbers to the bounds of an observation; unknown ones become 0."""
     within = np.minimum(np.maximum(numbers, -FARTHEST), FARTHEST)
     within[np.isnan(within)] = 0.0
     return within.astype(np.float32)
@@ -268,11 +267,11 @@ class PolicyAgent(Agent):
     step_s: float | None = None
 
     def policy(self, observations: dict[str, Floats]) -> Mapping[str, ArrayLike]:
-        """Return the action of every agent by its observation; see `zsim.Interface` for both."""
+        """Return an action for each agent's observation; see `zsim.Interface` for both."""
         raise NotImplementedError
 
     def bind(self, info: Info, name: str = "", radio: Radio | None = None) -> None:
-        """Get ready for the run of `world/info`."""
+        """Prepare for the run of `world/info`."""
         scenario = scenario_file.from_text(info.scenario)
         self.interface = Interface(scenario, self.observe, self.action, self.step_s)
         drones = self.interface.names
@@ -289,7 +288,7 @@ class PolicyAgent(Agent):
         super().bind(info, name, radio)
 
     def receive(self, key: str, message: Any) -> None:
-        """Take what the observations are made of."""
+        """Store a message for the observations."""
         self._flown.put(key, message)
 
     def step(self, t_ns: int) -> list[Output]:
@@ -306,7 +305,7 @@ class PolicyAgent(Agent):
 
 
 class _Received:
-    """A flight by the messages that an agent has received."""
+    """A flight as known from the messages that an agent has received."""
 
     def __init__(self, names: Sequence[str], rotors_max: int) -> None:
         self.names = names

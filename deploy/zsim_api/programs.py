@@ -1,7 +1,7 @@
-"""Programs that this process starts beside itself, and that never outlive it: `zsim run`, and a user's own.
+"""Child programs that never outlive this process: `zsim run`, and a user's own.
 
-Each has a keeper (keeper.py) in a session of its own between it and this process. So Ctrl-C in a terminal reaches a
-program from here alone, and nothing is left running when this process is killed.
+Each is run by a keeper (keeper.py) in a session of its own. So Ctrl-C in a terminal reaches a program only through this
+process, and nothing is left running when this process is killed.
 """
 
 import os
@@ -16,18 +16,18 @@ from pathlib import Path
 from zsim_api import keeper
 
 PIPE = subprocess.PIPE
-GRACE_S = 10.0  # wall time that a program has to end, once it is asked to; `zsim run` ends within 3 s
+GRACE_S = 10.0  # wall time for a program to end after SIGTERM; `zsim run` ends within 3 s
 KEEPER = (sys.executable, "-I", "-S", keeper.__file__)
 
 
 class Program:
-    """A program that has been started.
+    """A running program.
 
     Args:
         words: its command line.
-        environment: variables that differ from those of this process.
-        output: file that takes its output; None for this process's own; PIPE for `lines`.
-        folder: in which it runs; None: the current one.
+        environment: variables in addition to those of this process.
+        output: file for its output; None: that of this process; PIPE for `lines`.
+        folder: its working folder; None: the current one.
     """
 
     def __init__(
@@ -38,11 +38,11 @@ class Program:
         folder: Path | None = None,
     ) -> None:
         self.words = tuple(words)
-        self.asked = False  # whether it has been asked to end from here
+        self.asked = False  # whether this process has asked it to end
         self._lock = threading.Lock()
         environment = {**os.environ, **(environment or {})}
         if output is not None:
-            environment.pop("FORCE_COLOR", None)  # which a notebook's kernel sets: neither of them is a terminal
+            environment.pop("FORCE_COLOR", None)  # set by notebook kernels; the output is not a terminal
         with open(output if isinstance(output, Path) else os.devnull, "ab") as log:
             goes_to = log if isinstance(output, Path) else output
             self._keeper = subprocess.Popen(
@@ -57,36 +57,36 @@ class Program:
 
     @property
     def code(self) -> int | None:
-        """Its exit code, None while it runs; 128 + N for a signal, 127 where it could not be started."""
+        """Its exit code, None while it runs; 128 + N for a signal, 127 if it could not be started."""
         return self._keeper.poll()
 
     def lines(self) -> Iterator[str]:
-        """Yield the lines of its output until there are no more; may be called again after an interrupt."""
+        """Yield the lines of its output to the end; may be called again after an interrupt."""
         assert self._keeper.stdout is not None
         for line in self._keeper.stdout:
             yield line.decode(errors="replace")
 
     def wait(self, timeout_s: float | None = None) -> int | None:
-        """Wait for its end, and that of all that it has started; return its exit code, None if it runs still."""
+        """Wait until it and its descendants have ended; return its exit code, None if it is still running."""
         with suppress(subprocess.TimeoutExpired):
             return self._keeper.wait(timeout_s)
         return None
 
     def interrupt(self) -> None:
-        """Send it what Ctrl-C sends."""
+        """Send it SIGINT, as Ctrl-C does."""
         self._keeper.send_signal(signal.SIGINT)
 
     def kill(self) -> None:
-        """Kill it, and all that it has started, at once."""
+        """Kill it and its descendants at once."""
         self._keeper.send_signal(signal.SIGUSR1)
 
     @property
     def pid(self) -> int:
-        """Of the keeper, which lives as long as the program."""
+        """Process id of the keeper, which lives as long as the program."""
         return self._keeper.pid
 
     def close(self) -> int:
-        """Ask it to end if it runs, kill what has not ended within GRACE_S, and return its exit code."""
+        """Ask it to end, kill it if it has not within GRACE_S, and return its exit code."""
         with self._lock:
             self.asked = self.asked or self.code is None
             assert self._keeper.stdin is not None
@@ -96,19 +96,19 @@ class Program:
 
 
 def filled(words: Sequence[str], values: Mapping[str, str]) -> list[str]:
-    """Return a command line with the values in place of their names: `{endpoint}` and so on."""
+    """Replace `{endpoint}` and so on in a command line by their values."""
     for name, value in values.items():
         words = [word.replace(f"{{{name}}}", value) for word in words]
     return [*words]
 
 
 def environment_of(endpoint: str, federation: str) -> dict[str, str]:
-    """Return the variables with which a program finds a run; `python` and `zsim` are those that run this process."""
+    """Return the environment variables for programs of a run; `python` and `zsim` are those of this process."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
     return {"ZSIM_CONNECT": endpoint, "ZSIM_FEDERATION": federation, "PATH": path}
 
 
 def search_path(folders: Sequence[str | Path]) -> str:
-    """Return a PYTHONPATH of folders, before those that it has."""
+    """Return PYTHONPATH with further folders in front."""
     former = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     return os.pathsep.join(dict.fromkeys([*map(str, folders), *filter(None, former)]))

@@ -1,12 +1,12 @@
-"""A run on record, read from Python.
+"""A recorded run, read from Python.
 
     run = zsim.load("runs/step")
     run.truth("drone1").position_m_z.plot()
     run.errors(window=(20, 40))
     run.figure("shape")
 
-It reads what it is asked for when it is asked for it, each key once, and keeps that. Records of runs in one process, of
-processes on any hosts, of runs that were cut, and of replays are the same to it.
+Each key is read on first use, once, and kept. Records of runs in one process, of processes on any hosts, of interrupted
+runs and of replays are all treated the same.
 """
 
 import html
@@ -43,33 +43,33 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 SHOWN = 12  # names in an error
-ROWS_MAX = 200_000  # of several drones, read at once; of estimates 100 MB
-NOTES = 3  # shortfalls where a notebook shows a run
+ROWS_MAX = 200_000  # of several drones, read at once; estimates of that size take 100 MB
+NOTES = 3  # shortfalls in a notebook's display of a run
 ERROR_COLUMNS = ("position_m_x", "position_m_y", "position_m_z", "yaw_rad")  # as those of estimates
 Window = tuple[float, float]
 
 
 def load(place: str | Path, trust: bool = False) -> "Run":
-    """Return a run on record, of any kind: in one process, as processes, on several hosts, or interrupted.
+    """Open a recorded run of any kind: in one process, as processes, on several hosts, or interrupted.
 
     Args:
         place: the folder of a run, or its `run.mcap`.
-        trust: whether a cluster space of the scenario's own may be imported, which runs code that came with the record.
-            Without, clusters with such a space have no errors; everything else is read in any case.
+        trust: whether the scenario's own cluster spaces may be imported, which runs code that came with the record.
+            Without it, clusters with such a space have no errors; everything else can be read.
 
     Raises:
         RunError: there is no record.
-        RecordError: the file is no record of zsim's.
+        RecordError: the file is not a record of zsim.
     """
     return Run(place, trust)
 
 
 class Run:
-    """A run on record.
+    """A recorded run.
 
     Tables are pandas frames with simulated time in seconds as index, `t_s`, and units in the names of their columns,
     which are those of `zsim export`; docs/records.md lists them. Without pandas they are dicts of numpy arrays by
-    column. Runs of the same bits have equal tables, but for `source`, which names processes.
+    column. Runs with the same bits have equal tables, except for `source`, which names processes.
 
     Attributes:
         record: the file.
@@ -91,7 +91,7 @@ class Run:
 
     @property
     def folder(self) -> Path:
-        """Where the record is."""
+        """The folder of the record."""
         return self.record.parent
 
     # Tables
@@ -105,7 +105,7 @@ class Run:
         return self._of("drone", drone, "estimate")
 
     def sensor(self, drone: str, sensor: str) -> "DataFrame":
-        """Return the samples of a sensor: imu, gps, mag, baro, sonar, flow, or one of your own; RunError without any.
+        """Return the samples of a sensor: imu, gps, mag, baro, sonar, flow, or your own; RunError without any.
 
         `t_sample_ns` is when a sample was taken, the index when it was delivered.
         """
@@ -116,7 +116,7 @@ class Run:
         return self._of("drone", drone, "sensor/status")
 
     def commands(self, drone: str, kind: str = "velocity") -> "DataFrame":
-        """Return the commands that anybody has sent to a drone; `source` says who; RunError without any.
+        """Return all commands sent to a drone, with their `source`; RunError without any.
 
         Args:
             drone: name.
@@ -158,9 +158,9 @@ class Run:
     def formation(self, cluster: str | None = None) -> "DataFrame":
         """Return the variables of a formation over time, its `phase`, and errors, angles within ±π.
 
-        For a variable p: `desired_p_m`, `estimate_p_m`, `truth_p_m`; `estimate_error_p_m`, which is estimate − desired,
-        what the controller saw; and `truth_error_p_m`, truth − desired, what the drones did. NaN where unknown. Until
-        the phase is engaged, the desired value is the estimate.
+        For a variable p: `desired_p_m`, `estimate_p_m`, `truth_p_m`; `estimate_error_p_m` is estimate − desired, as the
+        controller saw it; `truth_error_p_m` is truth − desired, as the drones flew. NaN where unknown. Before the phase
+        is engaged, the desired value is the estimate.
 
         Args:
             cluster: name; None: the first.
@@ -182,10 +182,10 @@ class Run:
         return frame(table)
 
     def estimate_errors(self, drone: str) -> "DataFrame":
-        """Return estimate − truth of a drone over time: position in W and heading, σ of each as the estimator states
-        it (`sigma_position_m_x`), and `nees`, 6 on average where it states the truth.
+        """Return estimate − truth of a drone over time: position in W and heading, the σ of each as stated by the
+        estimator (`sigma_position_m_x`), and `nees`, which is 6 on average for a consistent estimator.
 
-        Of more than 200 000 estimates of all drones, every n-th is compared.
+        If there are more than 200 000 estimates of all drones, only every n-th is compared.
 
         Raises:
             RunError: no such drone, or truth and estimate are not both on record.
@@ -202,17 +202,17 @@ class Run:
     ) -> "DataFrame":
         """Return statistics of errors, a row for each variable with its unit; the report's table.
 
-        Of formations, by cluster and variable, over the instants of the window at which it was engaged: `est_…` is
-        estimate − desired, what the controller saw, `true_…` truth − desired, what the drones did. Of estimates, by
+        For formations, by cluster and variable, over the instants of the window at which it was engaged: `est_…` is
+        estimate − desired, as the controller saw it, `true_…` truth − desired, as the drones flew. For estimates, by
         drone and variable: `std`, `rms` and `mean` of estimate − truth, and `inside`, the share of errors within two
-        stated standard deviations. NaN where there is no such instant.
+        stated standard deviations. NaN without such instants.
 
         Args:
             window: from and to [s]; None: the report's, `run.summary.window_s`.
             of: formations, or estimates.
 
         Raises:
-            RunError: the window has no end after its start.
+            RunError: the window's end is not after its start.
             RecordError: there is no truth on record.
         """
         window = self.summary.window_s if window is None else _checked(window)
@@ -246,11 +246,11 @@ class Run:
                 parts.append(pandas.concat(once, names=["drone"]).to_xarray().reindex(drone=known))
         return xarray.merge(parts, join="outer", compat="no_conflicts")
 
-    # How it was flown
+    # The flight
 
     @cached_property
     def scenario(self) -> Scenario:
-        """The scenario, with all defaults and changes, to be looked at or flown again.
+        """The scenario with all defaults and changes; it can be flown again.
 
         RunError without `world/info` on record.
         """
@@ -290,7 +290,7 @@ class Run:
         """Whether every message of the world and the end are on record; `summary.record.state` says what is missing."""
         try:
             return self.summary.record.complete
-        except RecordError:  # it holds no truth
+        except RecordError:  # it contains no truth
             return False
 
     @property
@@ -300,20 +300,20 @@ class Run:
 
     @property
     def shortfalls(self) -> list[Shortfall]:
-        """The deviations from its plan, as the report has them."""
+        """The deviations from its plan, as in the report."""
         return self.summary.shortfalls
 
-    # Shown
+    # Display
 
     def figure(self, name: str) -> "Figure":
-        """Return a figure of the report, drawn anew.
+        """Draw a figure of the report.
 
         Args:
-            name: errors, position, orientation, shape, plan_view, distances, drones, estimates or velocities; of
+            name: errors, position, orientation, shape, plan_view, distances, drones, estimates or velocities; for
                 further clusters with the cluster's name, `shape_side`.
 
         Raises:
-            RunError: the record has no such figure; with those that it has.
+            RunError: the record has no such figure.
         """
         with what_is_missing():
             from zsim_analysis.report.make_report import marked, planned_figures
@@ -326,7 +326,7 @@ class Run:
                 known.append(stem.split("_", 2)[2] if stem.startswith("figure_") else stem)  # figure_8_shape
                 if name in (known[-1], stem):
                     drawing = marked(each, summary).drawing
-                    # a figure without pyplot is shown by a notebook only if it has this
+                    # a notebook displays a figure without pyplot only if it has this
                     setattr(drawing, "_repr_png_", _png_of(drawing))  # noqa: B010
                     return drawing
         raise RunError(f"{self.record}: has no figure {name!r}; {_there(name, known)}")
@@ -335,7 +335,7 @@ class Run:
         """Write the report into the run's folder, as `zsim report` does; return its page.
 
         Args:
-            formats: of figures beside PNG: "pdf", "svg".
+            formats: further formats of the figures: "pdf", "svg".
 
         Raises:
             RunError: the record is not in the folder of a run.
@@ -396,20 +396,20 @@ class Run:
         if key not in self._tables:
             fleet = self._of_all_drones(key)
             missing = [each for each in fleet if each not in self._tables]
-            # who asks for a second drone will ask for all, and a pass over the record takes longer than one's messages
+            # a second drone is usually followed by all, and a pass over the record takes longer than decoding one key
             is_second = len(fleet) - len(missing) > 0
             at_once = is_second and sum(self.keys[each] for each in missing) <= ROWS_MAX
             self._read(missing if at_once else [key])
         return self._tables[key]
 
     def _of_all_drones(self, key: str) -> list[str]:
-        """Return the keys of all drones that carry the same as one drone's; any other key alone."""
+        """Return the same key of all drones; any other key alone."""
         kind, _, what = keys.parts(key)
         alike = [f"drone/{drone}/{what}" for drone in self.drones] if kind == "drone" else [key]
         return [each for each in alike if each in self.keys]
 
     def _read(self, wanted: Sequence[str]) -> None:
-        """Read keys that are not known yet, in one pass."""
+        """Read keys in one pass."""
         if not wanted:
             return
         with plugin.names_only(not self._trust, looked_up=False):
@@ -439,7 +439,7 @@ class Run:
         return name
 
     def _named(self, kind: str) -> list[str]:
-        """Return the drones, or clusters, of which there are messages."""
+        """Return the drones or clusters that have messages on record."""
         return list(dict.fromkeys(keys.thing(key) for key in self.keys if key.startswith(f"{kind}/")))
 
     def _cluster(self, name: str | None) -> str:
@@ -452,10 +452,10 @@ class Run:
         scenario = None if self._trust else self._judged[0].scenario
         own = cluster_of(scenario, cluster)
         names = [each.space for each in (own, *own.groups) if each.space and ":" in each.space] if own else []
-        return f"; its space {names[0]} is imported by zsim.load(…, trust=True) only" if names else ""
+        return f"; its space {names[0]} is imported only by zsim.load(…, trust=True)" if names else ""
 
     def judged_formation(self, cluster: str | None = None) -> Formation:
-        """Return what `formation` shows of a cluster, as arrays; errors as there."""
+        """Return the content of `formation` as arrays; errors as there."""
         name = self._cluster(cluster)
         found = next((each for each in self._judged[1] if each.name == name), None)
         if found is None:
@@ -490,7 +490,7 @@ def _moments(errors: EstimateErrors, window: Window) -> dict[str, tuple[Any, ...
 def _statistics(
     of: str, rows: Mapping[str, Mapping[str, tuple[Any, ...]]], fields: Sequence[str] = ("std", "rms", "mean", "inside")
 ) -> "DataFrame":
-    """Return a frame of a row for each variable of each cluster or drone: its unit, and numbers, None for unknown."""
+    """Return a frame with a row for each variable of each cluster or drone: its unit, and numbers or None."""
     flat = [(name, variable, *values) for name, variables in rows.items() for variable, values in variables.items()]
     names = (of, "variable", "unit", *fields)
     texts = 3
@@ -501,7 +501,7 @@ def _statistics(
 
 
 def _there(given: str, names: Iterable[str]) -> str:
-    """Return what there is in place of what was asked for, after the most alike."""
+    """Return a hint at the most similar name, and the names that there are."""
     names = list(names)
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     return f"{suggestion(given, names)}there are {', '.join(names[:SHOWN])}{more}" if names else "there are none"

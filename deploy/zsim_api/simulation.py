@@ -6,7 +6,7 @@
         sim.step({"drone1": zsim.velocity(0.5, 0, 0)})
     print(sim.truth.position_m[0])
 
-It is the flight of `zsim run --in-process`, to the same bits, with one participant more: the caller.
+It is the flight of `zsim run --in-process`, to the same bits, with the caller as one more participant.
 """
 
 import copy
@@ -37,7 +37,7 @@ from zsim_api.scenarios import AnyScenario, scenario_of
 from zsim_world.physics.fleet_arrays import STATE
 
 Array = NDArray[np.float64]
-GATES_HELD = 64  # of sensor messages that are not looked at; chosen: 0.3 MB of three drones
+GATES_HELD = 64  # gates of sensor messages that are kept undecoded; chosen: 0.3 MB for three drones
 
 
 class Truth(NamedTuple):
@@ -52,7 +52,7 @@ class Truth(NamedTuple):
 
 
 class Estimates(NamedTuple):
-    """The newest estimates of N drones; NaN before the first one, or where nobody estimates a drone."""
+    """The newest estimates of N drones; NaN before the first one, or for a drone without an estimator."""
 
     position_m: Array  # (N, 3), W
     velocity_m_s: Array  # (N, 3), W
@@ -76,20 +76,20 @@ def estimates_of(names: Sequence[str], by_drone: Mapping[str, Estimate]) -> Esti
 class Simulation:
     """World and agents of a scenario, stepped gate by gate.
 
-    What acts when: the commands of a `step` carry the stamp of the gate that the caller has just seen, at `t_s`, as
-    those of an agent do. They act from `t_s + command_delay_s` on, so with the scenario's usual delay of one gate the
-    state after this step does not show them yet, and the state after the next one does.
+    Timing: the commands of a `step` carry the stamp of the gate that the caller has just seen, at `t_s`, as those of an
+    agent do. They act from `t_s + command_delay_s` on. With the usual delay of one gate, their effect is not visible in
+    the state after this step, but after the next one.
 
     Args:
         scenario: path of a YAML file, `zsim.Scenario`, or a mapping as in YAML.
         seed, duration_s, set: replace those of the scenario; `set` by paths, `{"environment.wind.gust_m_s": 1.0}`.
-        agents: "stock" flies the scenario's estimators and controllers, None nobody; a sequence of agents of your own,
-            classes or objects, flies them beside the stock ones; `stock=False` without these.
+        agents: "stock": the scenario's estimators and controllers; None: none; or a sequence of your own agents,
+            classes or objects, which fly beside the stock ones, or alone with `stock=False`.
         law, estimator: classes that replace those of all clusters and drones.
         record: folder for the record, which `zsim.load` reads; None for none.
 
     Raises:
-        ScenarioError: with every fault of the scenario, a line each.
+        ScenarioError: with one line for every fault of the scenario.
         RunError: it cannot be flown in one process, or the folder of the record is not empty.
 
     Attributes:
@@ -124,9 +124,9 @@ class Simulation:
         self.reset()
 
     def reset(self, seed: int | None = None, set: Mapping[str, Any] | None = None) -> Truth:
-        """Begin a flight from the start.
+        """Begin a new flight.
 
-        Agents that were given as objects begin with the attributes that they had then.
+        Agents given as objects begin with the attributes that they had initially.
 
         Args:
             seed: of this flight and those after it; None: as before.
@@ -176,12 +176,12 @@ class Simulation:
 
     @property
     def ended(self) -> str | None:
-        """Why the flight is over, None while it goes on."""
+        """Why the flight is over, None while it continues."""
         return self._flight.world.ended
 
     @property
     def truth_sha256(self) -> str:
-        """The hash of the truth of all gates so far, as of `zsim report`."""
+        """The hash of the truth of all gates so far, as in `zsim report`."""
         return self._flight.world.truth_hash.hexdigest()
 
     @property
@@ -199,12 +199,12 @@ class Simulation:
         """Fly one gate.
 
         Args:
-            commands: by drone, one or several, by `zsim.velocity` and so on; see above what acts when. A drone without
-                one keeps the last one for `silence.hover_s`, then it hovers.
+            commands: by drone, one or several, made by `zsim.velocity` and so on; see above for their timing. A drone
+                without a command keeps its last one for `silence.hover_s`, then it hovers.
 
         Raises:
-            RunError: the flight is over, or no drone has that name; before anything is sent.
-            Exception: what a class of yours raised, after a line on stderr that says where; the flight is over.
+            RunError: the flight is over, or no drone has that name; nothing was sent.
+            Exception: raised by a class of yours, after a line on stderr that says where; the flight is over.
         """
         world = self._flight.world
         if world.ended is not None:
@@ -220,7 +220,7 @@ class Simulation:
         return self.truth
 
     def run(self, until_s: float | None = None) -> str | None:
-        """Fly on without commands until a simulated time [s], or to the end; return `ended`."""
+        """Continue without commands until a simulated time [s], or to the end; return `ended`."""
         until_ns = np.inf if until_s is None else round(until_s * 1e9)
         while self.ended is None and self._flight.world.now_ns < until_ns:
             self.step()
@@ -229,7 +229,7 @@ class Simulation:
     def ask(self, key: str, op: str, **args: Any) -> dict[str, Any]:
         """Ask the world or a controller, as `zsim ask` does: `sim.ask("cluster/main/control", "target", values={…})`.
 
-        It is done between this gate and the next.
+        It takes effect between this gate and the next.
 
         Raises:
             RequestRefusedError: with the reason.
@@ -240,7 +240,7 @@ class Simulation:
         return answer.result or {}
 
     def drone(self, name: str) -> PilotedDrone:
-        """Return a drone that can be asked to fly somewhere, where the scenario has a `reference` of it.
+        """Return a drone that can be asked to fly somewhere, if it has a `reference` in the scenario.
 
         Raises:
             RunError: no drone has that name.
@@ -259,11 +259,11 @@ class Simulation:
             RunError: an agent of yours has no `snapshot`, or the flight is over.
         """
         if self.ended is not None:
-            raise RunError(f"snapshot: the flight is over ({self.ended}); must be taken while it goes on")
+            raise RunError(f"snapshot: the flight is over ({self.ended}); must be taken before its end")
         return (self.source, self._flight.snapshot(), dict(self._last_estimates), dict(self.clusters))
 
     def restore(self, snapshot: Any) -> Truth:
-        """Go on from a snapshot, to the same bits. A flight that is recorded cannot go back."""
+        """Continue from a snapshot, to the same bits. A recorded flight cannot go back."""
         source, flight, estimates, clusters = snapshot
         if self._writer is not None:
             raise RunError(
@@ -279,7 +279,7 @@ class Simulation:
         return self.truth
 
     def close(self) -> None:
-        """End the flight, and finish its record."""
+        """End the flight and finish its record."""
         if self._is_closed:
             return
         self._flight.world.clock.stop("closed")
@@ -317,10 +317,10 @@ class Simulation:
             raise RunError(f"no drone is named {drone!r}; {hint}must be one of {', '.join(self.names)}")
         return place
 
-    # As an observer of the flight
+    # Observer of the flight
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
-        """Take a message of the flight, which calls this."""
+        """Take a message; called by the flight."""
         kind = type(message)
         if kind is Estimate:
             self._last_estimates[keys.thing(key)] = message
@@ -330,12 +330,12 @@ class Simulation:
             self.events.append(message)
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
-        """Take the world's messages of a gate of the flight, which calls this."""
+        """Take the world's messages of a gate; called by the flight."""
         self.sensors.add(gate)
 
 
 class Sensors(Mapping[str, "Samples"]):
-    """The newest samples of all drones by sensor: "imu", "gps", "mag", "baro", "sonar", "flow", or of your own."""
+    """The newest samples of all drones by sensor: "imu", "gps", "mag", "baro", "sonar", "flow", or your own."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = names
@@ -376,8 +376,8 @@ class Sensors(Mapping[str, "Samples"]):
         self._update()
         if sensor not in self._samples:
             hint = suggestion(sensor, [*self._samples])
-            known = ", ".join(self._samples) or "none has come yet"
-            raise RunError(f"no sample of {sensor!r} has come; {hint}there are {known}")
+            known = ", ".join(self._samples) or "none yet"
+            raise RunError(f"no sample of {sensor!r} was received; {hint}there are {known}")
         return self._samples[sensor]
 
     def __iter__(self) -> Iterator[str]:
@@ -392,7 +392,7 @@ class Sensors(Mapping[str, "Samples"]):
 class Samples:
     """The newest sample of one sensor of N drones: an attribute (N, …) for each field of its message, in its units.
 
-    `t_sample_ns`, `t_ns` and `seq` are -1, all else is NaN, where a drone has had no sample.
+    For a drone without a sample, `t_sample_ns`, `t_ns` and `seq` are -1, and all other fields NaN.
     """
 
     def __init__(self, kind: type[Struct], drones: int) -> None:

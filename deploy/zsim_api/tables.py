@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 
 Table = dict[str, NDArray[Any]]  # columns of equal length (K,), in order of simulated time
 INDEX = "t_s"
-STAMPS = ("t_ns", "seq", "wall_ns")  # columns about a message, not about what it says
+STAMPS = ("t_ns", "seq", "wall_ns")  # metadata columns of a message
 
 
 def read_tables(record: Path, wanted: Collection[str]) -> dict[str, Table]:
     """Return all messages of some keys, by key, in one pass over the record.
 
-    A column of the export each, without `name`, which is the same in all rows. Messages of a key that is not of the
-    contract, and pictures, have a column for each field, and those of a list of numbers one for each of these.
+    Columns are those of the export, without `name`, which is the same in all rows. Messages of a key outside the
+    contract, and pictures, have a column for each field, or for each element of a field that is a list of numbers.
 
     Args:
         record: file.
@@ -106,7 +106,7 @@ def _is_vector(value: Any, width: int) -> bool:
 
 
 def _kind(values: Sequence[Any]) -> Kind:
-    """Return the kind of column that holds all of these values; texts hold anything."""
+    """Return the kind of column that can hold all of these values; a text column holds anything."""
     if values and all(isinstance(value, bool) for value in values):
         return "flag"
     if values and all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):

@@ -61,8 +61,8 @@ class Fleet:
         self.client: Client = federation.client()
         self.commands = self.client.subscribe("drone/*/cmd/*")
         self._programs: list[Program] = []
-        ports = [str(self.px4.api + i) for i in range(2)]
-        self.mavsdk = self.keep(programs.python("mavsdk_square.py", *ports))  # side by side: they take their time
+        ports = [str(self.px4.api + i) for i in range(2)]  # beside the other programs: they take their time
+        self.mavsdk = self.keep(programs.python("mavsdk_square.py", *ports))
         self.dronekit = self.keep(programs.python("dronekit_goto.py", f"udp:127.0.0.1:{self.ardupilot.api + 2}"))
 
     def keep(self, program: Program) -> Program:
@@ -98,25 +98,12 @@ def fleet(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Iterator[
             fleet.close()
 
 
-def test_mavsdk_flies_two_vehicles_at_once_offboard(fleet: Fleet) -> None:
-    flights = fleet.mavsdk.result()
-    assert [flight["system"] for flight in flights] == [1, 2]
-    for drone, flight in zip(("drone1", "drone2"), flights, strict=True):
-        assert flight["corners"] == 4
-        assert flight["top_m"] > 4.0
-        x, y, z = fleet.truth(drone)["position_m"]
-        assert abs(z) < 0.2
-        assert abs(y) < 1.5
-        assert abs(x - (0.0 if drone == "drone1" else 12.0)) < 1.5
-
-
-def test_dronekit_goes_somewhere_and_flies_a_mission(fleet: Fleet) -> None:
-    flight = fleet.dronekit.result()
-    assert flight["parameters"] == {"SYSID_THISMAV": 3.0, "WPNAV_SPEED": 500.0}
-    assert abs(flight["north_m"] - 4.4) < 0.8
-    assert flight["items"] == 2
-    assert flight["east"]
-    assert abs(fleet.truth("drone3")["position_m"][2]) < 0.2
+def test_node_mavlink_arms_takes_off_and_lands(fleet: Fleet) -> None:
+    seen = fleet.keep(programs.node("node_takeoff.cjs", str(fleet.px4.api + 4), "5")).result()
+    assert seen["acks"] == [[400, 0], [22, 0], [21, 0]]
+    assert seen["height_m"] > 2.0
+    assert seen["texts"] == ["Armed", "Landed; disarmed"]
+    assert {"HEARTBEAT", "ATTITUDE", "GLOBAL_POSITION_INT", "SYS_STATUS"} <= set(seen["messages"])
 
 
 def test_mavproxy_flies_by_what_a_pilot_types(fleet: Fleet, tmp_path: Path) -> None:
@@ -136,12 +123,25 @@ def test_mavproxy_flies_by_what_a_pilot_types(fleet: Fleet, tmp_path: Path) -> N
     assert "Refused" not in pilot.text()
 
 
-def test_node_mavlink_arms_takes_off_and_lands(fleet: Fleet) -> None:
-    seen = fleet.keep(programs.node("node_takeoff.cjs", str(fleet.px4.api + 4), "5")).result()
-    assert seen["acks"] == [[400, 0], [22, 0], [21, 0]]
-    assert seen["height_m"] > 2.0
-    assert seen["texts"] == ["Armed", "Landed; disarmed"]
-    assert {"HEARTBEAT", "ATTITUDE", "GLOBAL_POSITION_INT", "SYS_STATUS"} <= set(seen["messages"])
+def test_mavsdk_flies_two_vehicles_at_once_offboard(fleet: Fleet) -> None:
+    flights = fleet.mavsdk.result()
+    assert [flight["system"] for flight in flights] == [1, 2]
+    for drone, flight in zip(("drone1", "drone2"), flights, strict=True):
+        assert flight["corners"] == 4
+        assert flight["top_m"] > 4.0
+        x, y, z = fleet.truth(drone)["position_m"]
+        assert abs(z) < 0.2
+        assert abs(y) < 1.5
+        assert abs(x - (0.0 if drone == "drone1" else 12.0)) < 1.5
+
+
+def test_dronekit_goes_somewhere_and_flies_a_mission(fleet: Fleet) -> None:
+    flight = fleet.dronekit.result()
+    assert flight["parameters"] == {"SYSID_THISMAV": 3.0, "WPNAV_SPEED": 500.0}
+    assert abs(flight["north_m"] - 4.4) < 0.8
+    assert flight["items"] == 2
+    assert flight["east"]
+    assert abs(fleet.truth("drone3")["position_m"][2]) < 0.2
 
 
 def malformed(rng: random.Random, link: Link) -> bytes:

@@ -1,13 +1,13 @@
-"""Flies a hunt into its folder: what is drawn and what must hold in; the first violation, as small as it gets, out.
+"""Flies a hunt into its folder: a space of flights and requirements in; the first violation, shrunk, out.
 
 The folder of a hunt:
 
-    hunt.json            what was hunted, and with which seed
+    hunt.json            the request, with its seed
     flights.csv          a row for each flight, in order: faults, values, margins
     summary.json, report.html, figures/
-    violation.yaml       the scenario with the causes that are left
+    violation.yaml       the scenario with the remaining causes
     violation/           its flight: record, report, figures
-    violation.zsim       the same as one file
+    violation.zsim       the same in one file
 """
 
 import csv
@@ -45,39 +45,37 @@ PLAN, TABLE, SCENARIO, VIOLATION = "hunt.json", "flights.csv", "violation.yaml",
 BUNDLE = "violation.zsim"
 OWN_FILES = (PLAN, TABLE, SCENARIO, VIOLATION, BUNDLE, "summary.json", "report.html", "figures", ".lock")
 SEARCH, CAUSE, RECORD = "search", "each cause", "record"  # stages, beside those of `shrink`
-SAME_BITS = "same_bits"  # figure: truth is the same to the bit as in the flight in which no process dies
-MISSES_MAX = 100  # draws one after the other that cannot be flown, chosen: then what varies is wrong
+SAME_BITS = "same_bits"  # figure: truth is identical to the bit with the flight in which no process dies
+MISSES_MAX = 100  # successive draws that cannot be flown, chosen: then --vary is wrong
 DECIMALS = 6  # of margins in the table
 
 
 class HuntRequest(Struct, frozen=True):
-    """What to hunt, where to, and how long.
+    """A hunt to fly: scenario, requirements, folder and limits.
 
-    `flights` and `budget_s` bound the search; what is found is then shrunk, in some hundred flights.
+    `flights` and `budget_s` bound the search; a violation is then shrunk, in some hundred flights.
     """
 
     document: dict[str, Any]  # of the scenario, with the overrides of the command line
     source: str  # name of its file, for messages
-    requirements: tuple[str, ...]  # comparisons, or `module:function` of a user's own
+    requirements: tuple[str, ...]  # comparisons, or `module:function` of the user's own
     out: Path
-    seed: int = 1  # of what is drawn
+    seed: int = 1  # of the draws
     flights: int | None = None
     budget_s: float | None = None
     faults: tuple[str, ...] = ()  # texts of `--fault`; none: all kinds
     without: tuple[str, ...] = ()  # kinds that are not drawn
     vary: tuple[str, ...] = (WIND,)
-    changed: tuple[str, ...] = ()  # texts `a.b.c=value` by which the document differs from its file
+    changed: tuple[str, ...] = ()  # overrides `a.b.c=value` already applied to the document
     most: int = 3  # faults of one flight
     workers: int | None = None  # None: one per core
     force: bool = False  # whether the folder may hold other files
     console: Console | None = None  # where progress is shown, None: stderr
-    open_run: Callable[[Path], Any] | None = None  # as of a task
-    processes: Callable[[Scenario, Path], None] | None = None  # as of a task: flies what processes die in
+    open_run: Callable[[Path], Any] | None = None  # see Task
+    processes: Callable[[Scenario, Path], None] | None = None  # see Task; for flights in which processes die
 
 
 class HuntFlight(Struct, frozen=True):
-    """A flight of a hunt."""
-
     number: int
     stage: str
     case: Case
@@ -96,7 +94,7 @@ class HuntFlight(Struct, frozen=True):
 
 
 class Stage(Struct, frozen=True):
-    """What a part of a hunt cost."""
+    """The cost of a part of a hunt."""
 
     name: str
     flights: int
@@ -112,21 +110,21 @@ class CauseFound(Struct, frozen=True):
 
 
 class Violation(Struct, frozen=True):
-    """What broke a requirement."""
+    """A violation of a requirement."""
 
     requirement: str
     number: int  # of the flight in which it was found
     found: Case
     shrunk: Case
-    margin: float | None  # of the shrunk flight; None where a figure is unknown
+    margin: float | None  # of the shrunk flight; None if a figure is unknown
     unknown: str  # that figure, or why the flight failed
     causes: list[CauseFound]
-    options: list[str]  # of `zsim run` with the scenario: the shrunk flight
+    options: list[str]  # of `zsim run` with the scenario, for the shrunk flight
     truth_sha256: str | None
 
 
 class Tried(Struct, frozen=True):
-    """How many combinations of so many kinds of faults were flown together."""
+    """How many combinations of `together` kinds of faults were flown."""
 
     together: int
     tried: int
@@ -140,7 +138,7 @@ class HuntSummary(Struct, frozen=True, kw_only=True):
     requirements: tuple[str, ...]
     seed: int
     version: str = __version__
-    verdict: str  # "violated", "not violated" or, where neither is known, "interrupted"
+    verdict: str  # "violated", "not violated" or, if neither is known, "interrupted"
     interrupted: bool = False  # by Ctrl-C
     flights: int
     wall_s: float
@@ -151,7 +149,7 @@ class HuntSummary(Struct, frozen=True, kw_only=True):
 
 
 class Hunted(Struct, frozen=True):
-    """A hunt that is over."""
+    """A finished hunt."""
 
     request: HuntRequest
     space: HuntSpace
@@ -160,30 +158,25 @@ class Hunted(Struct, frozen=True):
 
 
 def hunt(request: HuntRequest) -> Hunted:
-    """Hunt until a requirement is broken or the budget is spent; return what was found, also after Ctrl-C.
+    """Hunt until a requirement is broken or the budget is spent; return the results, also after Ctrl-C.
 
     Raises:
-        ScenarioError: a requirement, a fault, a field or the scenario is wrong; a line each.
+        ScenarioError: a requirement, a fault, a field or the scenario is wrong; one line each.
         RunError: the folder holds something else, or cannot be written; workers cannot start.
     """
     texts, document = _with_functions(request.requirements, request.document)
     requirements = _requirements(texts)
     space = HuntSpace(document, request.source, request.faults, request.without, request.vary, request.most)
     if (request.out / PLAN).exists() and not request.force:
-        raise RunError(f"{request.out}: holds a hunt already; --force replaces it, or give --out another folder")
-    with held_folder(request.out, PLAN, OWN_FILES, request.force, "hunt into", "another hunt is at work"):
-        _forget(request.out)
-        under_way = _Hunt(request, space, texts, requirements)
-        hunted = Hunted(request, space, under_way.run(), under_way.flown)
+        raise RunError(f"{request.out}: already holds a hunt; --force replaces it, or give --out another folder")
+    with held_folder(request.out, PLAN, OWN_FILES, request.force, "hunt into", "another hunt is running"):
+        rmtree(request.out / VIOLATION, ignore_errors=True)  # the results of an earlier hunt
+        for name in (SCENARIO, BUNDLE):
+            (request.out / name).unlink(missing_ok=True)
+        current = _Hunt(request, space, texts, requirements)
+        hunted = Hunted(request, space, current.run(), current.flown)
         write(hunted)
     return hunted
-
-
-def _forget(folder: Path) -> None:
-    """Remove what an earlier hunt has found."""
-    rmtree(folder / VIOLATION, ignore_errors=True)
-    for name in (SCENARIO, BUNDLE):
-        (folder / name).unlink(missing_ok=True)
 
 
 def _with_functions(given: Sequence[str], document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, Any]]:
@@ -210,52 +203,38 @@ def _requirements(texts: Sequence[str]) -> list[Requirement]:
         except ScenarioError as error:
             faults += error.faults
     if faults or not made:
-        raise ScenarioError(faults or ["--require is missing; must be what has to hold, as 'min_separation_m > 1.5'"])
+        raise ScenarioError(faults or ["--require is missing; must be a condition, as 'min_separation_m > 1.5'"])
     return made
 
 
-@lru_cache(maxsize=64)
-def _requirement(text: str) -> Requirement:
-    return Requirement(text)
+_requirement = lru_cache(maxsize=64)(Requirement)
 
 
 def judged(requirements: Sequence[str], twin: Scenario | None, summary: RunSummary, row: Row) -> dict[str, Any]:
-    """Return the margins of a flight, in the process that flew it; or why they cannot be had.
+    """Return the margins of a flight in the process that flew it, or why they cannot be computed.
 
-    `twin` is the same flight without the death of processes, with which its bits are compared; None: it has none.
+    `twin` is the same flight without deaths of processes, with which its bits are compared; None: it has none.
     """
-    columns = {
-        name: value
-        for name, value in row.items()
-        if name in FIXED or name.startswith((METRIC, "clusters."))
-    }  # fmt: skip
+    columns = {name: row[name] for name in row if name in FIXED or name.startswith((METRIC, "clusters."))}
     figures = {**columns, **dict(figures_of(msgspec.to_builtins(summary)))}
     made = [_requirement(text) for text in requirements]
-    if any(SAME_BITS in each.names for each in made):
-        figures[SAME_BITS] = twin is None or _truth_sha256(twin) == summary.truth_sha256
-    faults = [fault for each in made for fault in each.faults(_known(each, figures, row))]
+    names = [name for each in made for name in each.names]
+    if SAME_BITS in names:
+        same = twin is None
+        if twin is not None:
+            flown, diverged = fly_scenario(twin)
+            same = not diverged and summarise(flown, [], Path()).truth_sha256 == summary.truth_sha256
+        figures[SAME_BITS] = same
+    if row.get("metrics_failure"):  # missing metrics are unknown, not wrong
+        figures = {**{name: None for name in names if name.startswith(METRIC)}, **figures}
+    faults = [fault for each in made for fault in each.faults(figures)]
     try:
         return {"faults": faults, "margins": [] if faults else [tuple(each.margin(figures)) for each in made]}
     except ScenarioError as error:
         return {"faults": error.faults, "margins": []}
 
 
-def _truth_sha256(scenario: Scenario) -> str | None:
-    flown, diverged = fly_scenario(scenario)
-    return None if diverged else summarise(flown, [], Path()).truth_sha256
-
-
-def _known(requirement: Requirement, figures: dict[str, Any], row: Row) -> dict[str, Any]:
-    """Return the figures, in which metrics that a flight does not have are unknown instead of wrong."""
-    for name in requirement.names:
-        if name.startswith(METRIC) and row.get("metrics_failure"):
-            figures.setdefault(name, None)
-    return figures
-
-
 class _Hunt:
-    """One hunt under way."""
-
     def __init__(
         self, request: HuntRequest, space: HuntSpace, texts: Sequence[str], requirements: Sequence[Requirement]
     ) -> None:
@@ -327,7 +306,7 @@ class _Hunt:
             yield self._waiting.popleft() if self._waiting else None
 
     def _submit(self, case: Case, stage: str, record: Path | None = None) -> int:
-        """Let a case be flown; return its number. ScenarioError if it cannot be flown."""
+        """Queue the flight of a case; return its number. ScenarioError if it cannot be flown."""
         scenario, number = self._space.scenario(case), len(self._cases)
         self._cases.append((case, stage))
         deadly = [fault for fault in case.faults if fault["kind"] == PROCESS_KILL]
@@ -347,7 +326,7 @@ class _Hunt:
         return number
 
     def _result(self, number: int) -> HuntFlight:
-        """Wait for a flight, and take it into the table."""
+        """Wait for a flight, and add it to the table."""
         while number not in self._rows:
             row = next(self._flying)
             self._rows[row["run"]] = row
@@ -370,7 +349,7 @@ class _Hunt:
         return flown
 
     def _fly(self, cases: Sequence[Case], stage: str) -> list[HuntFlight | None]:
-        """Fly cases together; None for one that cannot be flown."""
+        """Fly cases in parallel; None for one that cannot be flown."""
         numbers: list[int | None] = []
         for case in cases:
             try:
@@ -382,7 +361,7 @@ class _Hunt:
     # Stages
 
     def _search(self) -> HuntFlight | None:
-        """Return the first flight, in their order, that breaks a requirement; None within the budget."""
+        """Return the first flight that breaks a requirement, in order; None if the budget is spent first."""
         flights, budget_s = self._request.flights, self._request.budget_s
         until_s = None if budget_s is None else time.monotonic() + budget_s
         pending: deque[int] = deque()
@@ -393,14 +372,14 @@ class _Hunt:
                     drawn += 1
                     try:
                         pending.append(self._submit(self._strategy.draw(), SEARCH))
-                    except ScenarioError:  # as of a normal number that its field does not allow
+                    except ScenarioError:  # for instance a normally distributed value beyond its field's limits
                         misses += 1
                         if misses == MISSES_MAX:
                             raise
                         continue
                     misses = 0
                     if drawn == 1:
-                        break  # the flight without faults shows whether the figures are there
+                        break  # the flight without faults shows whether all figures exist
                 if not pending or (until_s is not None and time.monotonic() >= until_s):
                     return None
                 flown = self._result(pending.popleft())
@@ -415,7 +394,7 @@ class _Hunt:
         which = found.margins.index(found.worst)
         is_unknown, failed = bool(found.worst.unknown), found.failure is not None
 
-        known: dict[bytes, bool] = {}  # of what was flown already
+        known: dict[bytes, bool] = {}  # results of the cases flown so far
 
         def breaks(cases: Sequence[Case], stage: str) -> list[bool]:
             self._screen.stage = stage
@@ -452,7 +431,7 @@ class _Hunt:
         )
 
     def _recorded(self, found: HuntFlight, case: Case) -> Violation:
-        """Fly the shrunk flight for its record, and others that show what each cause does."""
+        """Fly the shrunk flight for its record, and others that show the effect of each cause."""
         which, causes = found.margins.index(found.worst), causes_of(case)
         self._screen.stage = RECORD
         place = self._request.out / VIOLATION
@@ -467,13 +446,13 @@ class _Hunt:
 
 
 def cause_text(case: Case, cause: tuple[str, int | str]) -> str:
-    """Return a cause as it is typed in a terminal."""
+    """Format a cause as in a command line."""
     kind, which = cause
     return f"{which}={text_of(case.values[str(which)])}" if kind == "value" else fault_text(case.faults[int(which)])
 
 
 def fault_text(fault: Mapping[str, Any]) -> str:
-    """Return a fault as `zsim fault add` takes it."""
+    """Format a fault as the arguments of `zsim fault add`."""
     words = [str(fault["target"]), str(fault["kind"])]
     words += [f"{name}={text_of(v)}" for name, v in fault.items() if name not in ("kind", "target", "at_s", "for_s")]
     words += [f"--for {fault['for_s']:g}s"] if "for_s" in fault else []
@@ -503,7 +482,7 @@ def write(hunted: Hunted) -> None:
 
 
 def table(hunted: Hunted) -> str:
-    """Return flights.csv: faults as they are typed, and a margin for each requirement."""
+    """Return the text of flights.csv."""
     text, paths = io.StringIO(), list(hunted.space.fields)
     writer = csv.writer(text, lineterminator="\n")
     margins = [f"margin of {each}" for each in hunted.summary.requirements]
@@ -521,11 +500,7 @@ def table(hunted: Hunted) -> str:
 
 
 class HuntScreen(SweepScreen):
-    """Shows the progress of a hunt: flights, combinations tried, the least margin, the budget that is left."""
-
-    def __enter__(self) -> "HuntScreen":
-        super().__enter__()
-        return self
+    """Shows the progress of a hunt: flights, combinations tried, least margin, remaining budget."""
 
     def __init__(self, request: HuntRequest, strategy: Strategy) -> None:
         self._request, self._coverage = request, strategy.coverage

@@ -1,4 +1,4 @@
-"""Makes the page of a hunt: the violation with its causes, margins over flights, what was tried; and its figures."""
+"""Makes the report of a hunt: the violation with its causes, margins over flights, combinations tried; and figures."""
 
 import shlex
 from collections.abc import Callable, Iterator, Sequence
@@ -40,16 +40,17 @@ from zsim_analysis.report.figure_style import (
 )
 from zsim_analysis.report.make_report import Picture, make_report, sources, template, write_report
 
-QUARTERS = 4  # parts of a range of which it is told how often each was tried
-KINDS_DRAWN = 24  # of the matrix of pairs
+QUARTERS = 4  # parts of a range whose number of trials is shown
+KINDS_DRAWN = 24  # greatest size of the matrix of pairs
 
 
 def make_hunt_report(
     hunted: Hunted, progress: Callable[[str], None] = lambda _: None, formats: Sequence[str] = ()
 ) -> list[str]:
-    """Write summary.json, figures and report.html of a hunt, and report and bundle of the flight that broke it.
+    """Write summary.json, figures and report.html of a hunt, and report and bundle of the violation.
 
-    Returns lines on what the bundle lacks, or why there is none.
+    Returns:
+        Notes on parts that the bundle lacks, or why there is no bundle.
 
     Raises:
         ReportError: the folder cannot be written.
@@ -94,8 +95,8 @@ def _margins(summary: HuntSummary, searched: Sequence[HuntFlight]) -> ReportFigu
         axes.set_title(text, fontsize=PAPER_PT, color=DARK, loc="left")
     panels[-1].set_xlabel("flight", fontsize=PAPER_PT)
     caption = (
-        "How far each flight of the search was from breaking a requirement, in the unit of its figures; below 0, and "
-        "crossed, it is broken. Line: the least so far. Vertical: a figure is unknown."
+        "Margin of each flight of the search to breaking a requirement, in the unit of its figures; crosses below 0 "
+        "are violations. Line: the least margin so far. Vertical line: a figure is unknown."
     )
     return ReportFigure("margins.png", "Margins over the flights", caption, figure)
 
@@ -124,7 +125,7 @@ def _pairs(kinds: Sequence[str], searched: Sequence[HuntFlight]) -> ReportFigure
     bar.ax.tick_params(labelsize=PAPER_PT - 1)
     caption = (
         "Least margin of the flights with both kinds, as a share of that of the flight without faults, and their "
-        "number; on the diagonal of all flights with a kind. Empty: not tried."
+        "number; on the diagonal those of all flights with a kind. Empty: not tried."
     )
     return ReportFigure("pairs.png", "Kinds of faults flown together", caption, figure)
 
@@ -162,7 +163,7 @@ def facts(request: HuntRequest, summary: HuntSummary) -> list[tuple[str, str]]:
 
 
 def kind_row(space: KindSpace, searched: Sequence[HuntFlight]) -> list[str]:
-    """Return how often a kind was flown, its least margin, and in which quarters of the ranges of its numbers."""
+    """Return how often a kind was flown, its least margin, and the counts by quarter of each range."""
     flown = [(each, fault) for each in searched for fault in each.case.faults if fault["kind"] == space.name]
     least = min((each.worst.share for each, _ in flown), default=None)
     targets = {fault["target"] for _, fault in flown}
@@ -180,14 +181,14 @@ def number(value: float | None) -> str:
 
 
 def command(hunted: Hunted) -> str:
-    """Return the command that flies the violation again; empty if there is none."""
+    """Return the command that repeats the violation; empty if there is none."""
     request, found = hunted.request, hunted.summary.violation
     sets = [word for change in request.changed for word in ("--set", change)]
     return shlex.join(["zsim", "run", request.source, *sets, *found.options, "--in-process"]) if found else ""
 
 
 def terminal_text(hunted: Hunted) -> Group:
-    """Return the violation with its causes, and what was tried, for the terminal."""
+    """Return the violation with its causes, and the combinations tried, for the terminal."""
     summary = hunted.summary
     names = {1: "kinds", 2: "pairs", 3: "triples"}
     tried = ", ".join(f"{each.tried} of {each.possible} {names[each.together]}" for each in summary.coverage)

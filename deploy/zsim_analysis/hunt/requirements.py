@@ -1,12 +1,12 @@
-"""What must hold of a flight: comparisons of the figures of its summary, `min_separation_m > 1.5 and not crashed`.
+"""Requirements on flights: comparisons of figures of the summary, `min_separation_m > 1.5 and not crashed`.
 
 A requirement has numbers, texts, names, comparisons, `and`, `or`, `not`, + - * / and abs, min, max. Names are paths in
 `summary.json` and columns of a sweep: `errors.p.true_rms`, `clusters.main.engaged_share`, `collisions`,
-`metrics.NAME`. Nothing else is read, and nothing is executed.
+`metrics.NAME`. Nothing else is accepted, and nothing is executed.
 
-Its margin is how far it is from being broken: the difference of the two sides of a comparison, the least of an `and`,
-the greatest of an `or`; the robustness of Fainekos and Pappas (Theoretical Computer Science 410, 2009) without time. To
-compare margins of different units, each is also given as a share of the larger side.
+Its margin is the distance from violation: the difference of the two sides of a comparison, the least of an `and`, the
+greatest of an `or`; the robustness of Fainekos and Pappas (Theoretical Computer Science 410, 2009) without time. To
+compare margins with different units, each is also given as a share of the larger side.
 """
 
 import ast
@@ -21,7 +21,7 @@ OPTION = "--require"
 SYNTAX = "comparisons of figures and numbers, as in 'min_separation_m > 1.5 and not crashed'"
 LENGTH_MAX = 1000  # characters of a requirement
 NAMES_SHOWN = 12
-TINY = 1e-12  # side of a comparison of which no share is taken
+TINY = 1e-12  # least denominator of a share
 _COMPARES = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 _ARITHMETIC: dict[type, Callable[[float, float], float]] = {
     ast.Add: lambda a, b: a + b,
@@ -33,28 +33,28 @@ _EXTREMES: dict[str, Callable[[list[float]], float]] = {"min": min, "max": max}
 
 
 class Margin(NamedTuple):
-    """How a requirement stands in a flight."""
+    """The margin of a requirement in a flight."""
 
     holds: bool
-    # the margin over the larger side of its comparison, from -2 to 2; in a hunt over that of the flight without faults
+    # relative to the larger side of its comparison, from -2 to 2; in a hunt relative to the flight without faults
     share: float
-    value: float | None  # the margin in the unit of its figures; None where a figure is unknown
+    value: float | None  # in the unit of its figures; None if a figure is unknown
     unknown: str = ""  # the first figure that the flight does not have
 
     def __invert__(self) -> "Margin":
         if self.unknown:
-            return self  # what is not known holds in neither way
+            return self  # an unknown requirement holds neither negated
         return Margin(not self.holds, -self.share, None if self.value is None else -self.value)
 
 
-BROKEN = -2.0  # share of a flight of which a figure is unknown, or that failed
+BROKEN = -2.0  # share for a flight that failed or has an unknown figure
 
 
 class Requirement:
-    """A requirement, read once.
+    """A parsed requirement.
 
     Raises:
-        ScenarioError: it cannot be read; where, what was found, what is allowed.
+        ScenarioError: it cannot be parsed.
     """
 
     def __init__(self, text: str) -> None:
@@ -70,25 +70,25 @@ class Requirement:
         self.names = tuple(dict.fromkeys(self._names(self._tree)))
 
     def margin(self, figures: Mapping[str, Any]) -> Margin:
-        """Return its margin in a flight, of figures by path.
+        """Return its margin in a flight with these figures by path.
 
         Raises:
-            ScenarioError: it names what no flight has, or compares a text with a number.
+            ScenarioError: it names a figure that no flight has, or compares a text with a number.
         """
         return self._margin(self._tree, figures)
 
     def faults(self, figures: Mapping[str, Any]) -> list[str]:
-        """Return a line for each name that is not among the figures of a flight, with the nearest one."""
+        """Return a line for each name that is not among the figures of a flight, with the most similar one."""
         unknown = [self._unknown(name, figures) for name in self.names if name not in figures]
         return [fault for text in unknown for fault in self._fault(text).faults]
 
-    # Reading it
+    # Parsing
 
     def _fault(self, text: str) -> ScenarioError:
         return ScenarioError([f"{OPTION} {show(self.text)}: {text}"])
 
     def _check(self, node: ast.AST, as_truth: bool) -> None:
-        """Refuse what is not of the syntax; `as_truth`: where something holds or not, else where a figure stands."""
+        """Raise ScenarioError on unsupported syntax; `as_truth`: where a truth value is expected, else a figure."""
         parts: list[tuple[ast.AST, bool]] = []
         if as_truth and isinstance(node, ast.BoolOp):
             parts = [(each, True) for each in node.values]
@@ -99,7 +99,7 @@ class Requirement:
         elif path_of(node):
             pass
         elif as_truth:
-            raise self._fault(f"has {show(ast.unparse(node))}, which neither holds nor not; must be {SYNTAX}")
+            raise self._fault(f"has {show(ast.unparse(node))}, which is not a truth value; must be {SYNTAX}")
         elif isinstance(node, ast.Constant) and isinstance(node.value, int | float | str):
             pass
         elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
@@ -159,7 +159,7 @@ class Requirement:
         value = left - right if op in (">", ">=") else right - left if op in ("<", "<=") else -abs(left - right)
         value = -value if op == "!=" else value
         if math.isnan(value):
-            return Margin(False, BROKEN, None, "a figure, which is no number")
+            return Margin(False, BROKEN, None, "a figure that is not a number")
         holds = value > 0 or (value == 0 and op in (">=", "<=", "=="))
         return Margin(holds, value / max(abs(left), abs(right), TINY), value)
 
@@ -192,7 +192,7 @@ class Requirement:
 
 
 class Unknown(NamedTuple):
-    """In place of a figure that a flight does not have."""
+    """Stands for a figure that a flight does not have."""
 
     name: str
 
@@ -207,7 +207,7 @@ def _operands(node: ast.AST) -> list[ast.expr]:
 
 
 def path_of(node: ast.AST) -> str:
-    """Return the dotted path that a node is, empty if it is none."""
+    """Return the dotted path of a name or attribute node, empty for others."""
     if isinstance(node, ast.Name):
         return node.id
     if isinstance(node, ast.Attribute):
@@ -216,7 +216,7 @@ def path_of(node: ast.AST) -> str:
 
 
 def figures_of(document: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield path and value of every number, text, truth value and None of a summary; no lists."""
+    """Yield path and value of every number, text, truth value and None of a summary, except in lists."""
     if isinstance(document, Mapping):
         for name, value in document.items():
             yield from figures_of(value, f"{prefix}.{name}" if prefix else str(name))
@@ -225,5 +225,5 @@ def figures_of(document: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def worst(margins: list[Margin]) -> Margin:
-    """Return the margin of what is nearest to being broken, or most broken."""
+    """Return the worst margin: the least, or that of a broken requirement."""
     return min(margins, key=lambda margin: (margin.holds, margin.share))

@@ -1,10 +1,10 @@
-"""The least flight that still breaks a requirement: fewest causes, then smallest values, then the shortest flight.
+"""Shrinks a flight that breaks a requirement: fewest causes, then smallest values, then the shortest flight.
 
-Causes are faults, and fields that differ from the scenario. Sets of them are flown from the smallest on, so that no
-smaller set breaks it; where there are more than SUBSETS_MAX causes, single ones are left out first (delta debugging of
-Zeller and Hildebrandt, IEEE Transactions on Software Engineering 28, 2002, at its finest grain). Every number is then
-bisected between what broke it and what has no effect. Candidates of a step are flown together, and the first one in
-their order is taken: the result does not depend on which of them is finished first.
+Causes are faults, and fields that differ from the scenario. Sets of causes are flown in order of size, so that the
+result is minimal; if there are more than SUBSETS_MAX causes, single ones are removed first (delta debugging of Zeller
+and Hildebrandt, IEEE Transactions on Software Engineering 28, 2002, at its finest granularity). Every number is then
+bisected between its value and one without effect. The candidates of a step are flown in parallel, and the first one in
+order that breaks the requirement is taken: the result does not depend on which finishes first.
 """
 
 import math
@@ -19,31 +19,25 @@ from msgspec.structs import replace
 from zsim.scenario.scenario_file import steps_of
 from zsim_analysis.hunt.space import Case, HuntSpace
 
-SUBSETS_MAX = 6  # causes of which all sets are flown: 62 flights
-ROUNDS = 3  # each leaves a quarter of what is between
-PASSES = 2  # over all numbers, since smaller ones of one may allow smaller ones of another
+SUBSETS_MAX = 6  # causes of which all subsets are flown: 62 flights
+ROUNDS = 3  # each reduces the interval to a quarter
+PASSES = 2  # over all numbers, since a smaller one may allow another to be smaller
 SHARES = (0.25, 0.5, 0.75)
-RATIO = 30.0  # of two numbers from which on those between them are taken by decades
-SHORTEST_S = 1.0  # of a flight, chosen
+RATIO = 30.0  # ratio of two numbers from which they are interpolated logarithmically
+SHORTEST_S = 1.0  # duration of a flight, chosen
 CAUSES, NUMBERS, DURATION = "fewest causes", "smallest values", "shortest flight"  # stages
 
 Breaks = Callable[[Sequence[Case], str], list[bool]]
-"""Flies cases at a stage; tells of each whether it breaks the requirement. One that cannot be flown does not."""
+"""Flies cases at a stage; returns whether each breaks the requirement, False if it cannot be flown."""
 
-Cause = tuple[str, int | str]  # ("fault", its place) or ("value", path)
+Cause = tuple[str, int | str]  # ("fault", its index) or ("value", path)
 
 
 class Shrinker:
-    """Makes a case that breaks a requirement smaller.
+    """Shrinks a case that breaks a requirement; `breaks` flies candidates."""
 
-    Args:
-        space: from which it was drawn.
-        breaks: flies candidates.
-        say: called with a line about each stage.
-    """
-
-    def __init__(self, space: HuntSpace, breaks: Breaks, say: Callable[[str], None] = lambda _: None) -> None:
-        self._space, self._breaks, self._say = space, breaks, say
+    def __init__(self, space: HuntSpace, breaks: Breaks) -> None:
+        self._space, self._breaks = space, breaks
 
     def shrink(self, case: Case) -> Iterator[Case]:
         """Yield the case after each stage."""
@@ -75,7 +69,7 @@ class Shrinker:
     # Numbers
 
     def smallest(self, case: Case) -> Case:
-        """Return the case with each number as near to having no effect as it still breaks."""
+        """Return the case with each number as small in effect as still breaks the requirement."""
         for _ in range(PASSES):
             before = case
             for place in range(len(case.faults)):
@@ -100,7 +94,8 @@ class Shrinker:
                 vector = np.array(case.faults[place][name], float)
                 size = float(np.linalg.norm(vector))
                 if size > 0:
-                    case = self._bisected(lambda x: _set(case, place, name, _scaled(vector, x / size)), size, 0.0, case)  # noqa: B023
+                    scaled = lambda x: [_round(float(each)) for each in vector * (x / size)]  # noqa: E731, B023
+                    case = self._bisected(lambda x: _set(case, place, name, scaled(x)), size, 0.0, case)  # noqa: B023
             elif isinstance(value, int | float) and _is_number(value):
                 case = self._bisected(
                     lambda x, case=case, name=name: _set(case, place, name, x), value, mildest.get(name, 0.0), case
@@ -108,7 +103,7 @@ class Shrinker:
         return case
 
     def _fewest_axes(self, case: Case, place: int, name: str) -> Case:
-        """Return the case with as many numbers of a vector at 0 as it still breaks, the smallest first."""
+        """Return the case with as many components of a vector at 0 as possible, the smallest first."""
         while True:
             vector = case.faults[place][name]
             axes = sorted((abs(x), axis) for axis, x in enumerate(vector) if x)
@@ -121,7 +116,7 @@ class Shrinker:
             case = tried[broken.index(True)]
 
     def _bisected(self, made: Callable[[float], Case], value: float, mildest: float, case: Case) -> Case:
-        """Return the case with the number nearest to the mildest one that still breaks, in few digits."""
+        """Return the case with the number closest to the mildest one that still breaks, with few digits."""
         low, high = 0.0, 1.0  # shares of the way from the mildest number to the one that breaks
         for _ in range(ROUNDS):
             shares = [low + share * (high - low) for share in SHARES]
@@ -135,7 +130,7 @@ class Shrinker:
         return short[broken.index(True)] if any(broken) else found
 
     def _space_value(self, path: str) -> Any:
-        """Return the scenario's own value of a field, None where it has none."""
+        """Return the scenario's value of a field, None if it has none."""
         value: Any = msgspec.to_builtins(self._space.base)
         for step in steps_of(path, self._space.document):
             if isinstance(value, list):
@@ -148,7 +143,7 @@ class Shrinker:
     # Duration
 
     def shortest(self, case: Case) -> Case:
-        """Return the case in the shortest flight that breaks, while the same without its causes does not."""
+        """Return the case with the shortest flight that breaks the requirement, but not without its causes."""
         if not case.faults:
             return case
         length = case.duration_s or self._space.base.duration_s
@@ -159,7 +154,7 @@ class Shrinker:
         length = case.duration_s or length
         late = case
 
-        def earlier(by_s: float) -> Case:  # the same, so much earlier
+        def earlier(by_s: float) -> Case:  # the same case with all faults earlier
             faults = tuple({**each, "at_s": _round(each["at_s"] - by_s)} for each in late.faults)
             return replace(late, faults=faults, duration_s=_round(length - by_s))
 
@@ -187,7 +182,7 @@ def causes_of(case: Case) -> list[Cause]:
 
 
 def only(case: Case, causes: Sequence[Cause]) -> Case:
-    """Return a case with these of its causes; other fields are the scenario's own."""
+    """Return a case with only these causes."""
     faults = tuple(fault for place, fault in enumerate(case.faults) if ("fault", place) in causes)
     return replace(case, faults=faults, values={p: v for p, v in case.values.items() if ("value", p) in causes})
 
@@ -204,16 +199,12 @@ def _between(mildest: float, value: float, share: float) -> float:
     return _round(mildest + share * (value - mildest))
 
 
-def _scaled(vector: Any, factor: float) -> list[float]:
-    return [_round(float(x)) for x in vector * factor]
-
-
 def _round(x: float, digits: int = 4) -> float:
     return float(f"{x:.{digits}g}")
 
 
 def _outward(number: float, mildest: float, value: float, digits: int) -> float | None:
-    """Return a number of few digits, away from the mildest one; None if that is beyond what broke first."""
+    """Round a number to few digits, away from the mildest one; None if that is beyond the original value."""
     if number == 0:
         return None
     unit = 10.0 ** (math.floor(math.log10(abs(number))) - digits + 1)

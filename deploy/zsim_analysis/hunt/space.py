@@ -1,18 +1,17 @@
-"""What a hunt draws from: kinds of faults with their targets, times and magnitudes, fields of the scenario, and seeds.
+"""The space that a hunt draws flights from, and the strategy by which it draws them.
 
-Ranges follow from the declarations of the kinds (`zsim.scenario.faults`). Limits there are of what can be simulated,
-far beyond what is flown: of a limit above LARGE, magnitudes are drawn from SMALL_SHARE to LARGE_SHARE of it (GPS bias:
-1 to 1000 m; link delay: 0.6 to 600 ms), of a lower one above 1 from its hundredth part on (gust: 1 to 100 m/s), each
-decade equally often; of a share or probability all, evenly. Rules narrow that: `gust velocity_m_s=1..6 for_s=2..8`.
+The space has kinds of faults with their targets, times and magnitudes, fields of the scenario, and seeds. Ranges follow
+from the declarations of the kinds (`zsim.scenario.faults`), whose limits are those of the simulation, far beyond normal
+flight. For a limit of LARGE and more, magnitudes are drawn from SMALL_SHARE to LARGE_SHARE of it (GPS bias: 1 to
+1000 m; link delay: 0.6 to 600 ms), for a lower one above 1 from its hundredth part on (gust: 1 to 100 m/s), each decade
+equally often; shares and probabilities are drawn uniformly. Rules narrow ranges: `gust velocity_m_s=1..6 for_s=2..8`.
 
-How the flights of a hunt are drawn: so that all few kinds of faults are tried together, and where margins are low.
-
-Every second flight has kinds of which a pair, or else a triple, has not been tried together (Kuhn, Wallace and Gallo,
-IEEE Transactions on Software Engineering 30, 2004: failures of software need few conditions at once). The others are
-neighbours of the flights with the lowest margins, the best one of each set of kinds being kept (MAP-Elites of Mouret
-and Clune, arXiv 1504.04909): numbers moved a little, a fault replaced, or one taken over from another of the best. Both
-are drawn from the seed, the number of the flight and the margins of flights LAG and more before it, so that neither the
-number of processes nor their speed has an effect.
+The strategy covers all small combinations of kinds, and exploits low margins. Every second flight has kinds of which a
+pair, or else a triple, has not been tried together (Kuhn, Wallace and Gallo, IEEE Transactions on Software Engineering
+30, 2004: software failures need few simultaneous conditions). The others are neighbours of the flights with the lowest
+margins, of which the best of each set of kinds is kept (MAP-Elites of Mouret and Clune, arXiv 1504.04909): numbers
+moved slightly, a fault replaced, or one taken from another elite. Draws depend on the seed, the number of the flight
+and the margins of flights at least LAG before it, but not on the number of processes or their speed.
 """
 
 import copy
@@ -42,42 +41,42 @@ from zsim_analysis.sweep.design import SEED, SEEDS, Draw, Grid, Seeds, parse, te
 
 OPTION = "--fault"
 SYNTAX = "a kind and NAME=LOW..HIGH or NAME=VALUE, as in 'gust velocity_m_s=1..6 for_s=2..8'"
-WIND = "environment.wind.gust_m_s=uniform(0, 2)"  # what varies besides, where nothing is said; chosen
+WIND = "environment.wind.gust_m_s=uniform(0, 2)"  # default of --vary, chosen
 LARGE, SMALL_SHARE, LARGE_SHARE = 1000.0, 1e-5, 1e-2  # see above, chosen
-LEAST_S = 0.5  # of a fault, chosen: shorter ones are a few samples
-DECADES = 30.0  # ratio of the ends of a range from which on every decade is drawn equally often
+LEAST_S = 0.5  # duration of a fault, chosen: shorter ones are a few samples
+DECADES = 30.0  # ratio of the ends of a range from which every decade is drawn equally often
 ONE_WAY_SHARE = 1 / 3  # chosen
-DIGITS = 4  # significant ones of what is drawn, so that a text repeats it
+DIGITS = 4  # significant digits of drawn numbers, so that their texts are exact
 _RANGE = re.compile(r"\s*([-+0-9.eE]+?)\.\.([-+0-9.eE]+)\s*")
-LAG = 32  # flights under way at most, chosen: more processes than a machine has
-TRIES = 24  # sets of kinds of which the one with the most untried combinations is flown
-STEPS = (0.3, 0.1, 0.03)  # of the ranges, chosen
-AGAIN = 0.25  # share of flights drawn anew once all combinations have been tried
+LAG = 32  # greatest number of pending flights, chosen: more than the processes of a machine
+TRIES = 24  # random sets of kinds, of which the one with the most untried combinations is flown
+STEPS = (0.3, 0.1, 0.03)  # shares of a range, chosen
+AGAIN = 0.25  # share of new random flights once all combinations have been tried
 
 
 class Case(Struct, frozen=True):
-    """What one flight is flown with."""
+    """The conditions of one flight."""
 
     seed: int
-    values: dict[str, Any] = {}  # of fields of the scenario, by path
+    values: dict[str, Any] = {}  # of scenario fields, by path
     faults: tuple[dict[str, Any], ...] = ()  # as in a scenario
     duration_s: float | None = None  # None: the scenario's
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Its kinds of faults, each once, sorted."""
+        """Its distinct kinds of faults, sorted."""
         return tuple(sorted({fault["kind"] for fault in self.faults}))
 
 
 class Knob(Struct, frozen=True):
-    """One number of a fault, or one of several values, and where it is drawn from."""
+    """A parameter of a fault with the range or the values that it is drawn from."""
 
     name: str
-    low: float = 0.0  # of the number, or of the magnitude of a vector or of a number of either sign
+    low: float = 0.0  # of the number, or of the magnitude of a vector or signed number
     high: float = 0.0
-    shape: str = "number"  # "number", "signed", "vector", or "choice" of the values
+    shape: str = "number"  # "number", "signed", "vector", or "choice"
     choices: tuple[Any, ...] = ()
-    weights: tuple[float, ...] = ()  # of the choices; none: all alike
+    weights: tuple[float, ...] = ()  # of the choices; empty: equal
 
     @property
     def by_decades(self) -> bool:
@@ -89,11 +88,11 @@ class Knob(Struct, frozen=True):
         return self._of(self._magnitude(rng.uniform()), _direction(rng, self.shape))
 
     def near(self, value: Any, rng: Generator, step: float) -> Any:
-        """Return another value at a normal distance of `step` of the range; of choices, any."""
+        """Return a value at a normally distributed distance, with std `step` of the range; a random choice."""
         if self.shape == "choice" or value is None:
             return self.draw(rng)
         place = self.place(value) + step * rng.normal()
-        place = abs(place) if place < 1 else 2 - place  # thrown back at the ends
+        place = abs(place) if place < 1 else 2 - place  # reflected at the ends
         size = float(np.linalg.norm(value))
         direction = np.asarray(value, float) / size if size > 0 else _direction(rng, self.shape)
         if self.shape == "vector":
@@ -104,7 +103,7 @@ class Knob(Struct, frozen=True):
         return self._of(self._magnitude(float(np.clip(place, 0.0, 1.0))), direction)
 
     def place(self, value: Any) -> float:
-        """Return where in its range a value is, from 0 to 1."""
+        """Return the position of a value in its range, from 0 to 1."""
         size = float(np.linalg.norm(value)) if self.shape != "number" else float(value)
         if self.high <= self.low:
             return 0.0
@@ -140,7 +139,7 @@ def _rounded(x: float, digits: int = DIGITS) -> float:
 
 
 class KindSpace(Struct, frozen=True):
-    """Faults of one kind."""
+    """The space of faults of one kind."""
 
     name: str
     kind: FaultKind
@@ -150,7 +149,7 @@ class KindSpace(Struct, frozen=True):
         return _clean({"kind": self.name, **{name: knob.draw(rng) for name, knob in self.knobs.items()}})
 
     def near(self, fault: Mapping[str, Any], rng: Generator, step: float) -> dict[str, Any]:
-        """Return a fault of which one or two numbers are others."""
+        """Return a fault with one or two values changed."""
         count = min(len(self.knobs), 1 + int(rng.integers(2)))
         moved = {str(each) for each in rng.choice(list(self.knobs), count, replace=False)}
         values = {
@@ -165,16 +164,18 @@ def _clean(fault: dict[str, Any]) -> dict[str, Any]:
 
 
 class HuntSpace:
-    """What is drawn for a scenario, whose raw document is given.
+    """The space of flights of a scenario.
 
     Args:
-        rules: texts of `--fault`, each a kind with what narrows it; none: all kinds but the death of processes.
+        document: raw document of the scenario.
+        source: name of its file, for messages.
+        rules: texts of `--fault`, each a kind with narrower ranges; none: all kinds except deaths of processes.
         without: kinds that are not drawn.
         vary: texts of `--vary`; seeds are always drawn.
-        most: of faults in one flight.
+        most: greatest number of faults in one flight.
 
     Raises:
-        ScenarioError: with every fault of these and of the scenario, a line each.
+        ScenarioError: with one line for every fault of these and of the scenario.
     """
 
     def __init__(
@@ -217,7 +218,7 @@ class HuntSpace:
         return document
 
     def options(self, case: Case) -> list[str]:
-        """Return how a flight differs from the scenario, as options of `zsim run`."""
+        """Return the differences of a flight from the scenario, as options of `zsim run`."""
         words = ["--seed", str(case.seed)]
         if case.duration_s is not None:
             words += ["--duration", f"{case.duration_s:g}"]
@@ -252,7 +253,7 @@ class HuntSpace:
         return int(rng.integers(SEEDS))
 
     def targets_of(self, kind: FaultKind) -> tuple[str, ...]:
-        """Return what faults of a kind may strike."""
+        """Return the possible targets of a kind of fault."""
         scenario = self.base
         if kind.strikes == "drone":
             simulated = [drone for drone in scenario.drones if not drone.is_external]
@@ -308,7 +309,7 @@ class HuntSpace:
         return {knob.name: knob for knob in knobs}
 
     def _check_ends(self, rules: Sequence[str]) -> None:
-        """Refuse what no scenario may have: both ends of every range, and each of several values."""
+        """Refuse invalid values: check both ends of every range, and each listed value."""
         for path, axis in self.fields.items():
             both = (axis.first, axis.second) if isinstance(axis, Draw) else axis.values
             for value in both if isinstance(axis, Grid) or axis.kind == "uniform" else both[:1]:
@@ -338,11 +339,11 @@ class HuntSpace:
 
 
 def unknown_kind(kind: str, known: Mapping[str, FaultKind]) -> str:
-    return f"{show(kind)} is no kind of fault; {allowed_kinds(kind, known)}"
+    return f"{show(kind)} is not a kind of fault; {allowed_kinds(kind, known)}"
 
 
 def _given(name: str, text: str, kind: FaultKind) -> Knob:
-    """Return what a rule says of a parameter; ValueError if it cannot be read."""
+    """Parse the range or value that a rule gives for a parameter; ValueError if it cannot be read."""
     parameter = next((p for p in kind.parameters if p.name == name), None)
     if (ends := _RANGE.fullmatch(text)) is None:
         return Knob(name, shape="choice", choices=(yaml_file.value(text),))
@@ -363,7 +364,7 @@ def _given(name: str, text: str, kind: FaultKind) -> Knob:
 
 
 def _knob_of(p: FaultParameter) -> Knob | None:
-    """Return where a parameter is drawn from, None if it is left out."""
+    """Return the default range or values of a parameter, None if it is not drawn."""
     if p.shape == "choice":
         return Knob(p.name, shape="choice", choices=p.choices)
     if p.shape == "flag":
@@ -398,7 +399,7 @@ class Elite(NamedTuple):
 
 
 class Coverage:
-    """Which kinds of faults have been flown together."""
+    """The combinations of kinds of faults that have been flown."""
 
     def __init__(self, kinds: Sequence[str], most: int) -> None:
         self.kinds = sorted(kinds)
@@ -414,7 +415,7 @@ class Coverage:
         return len(self.possible[size]) - len(self.untried[size])
 
     def next(self, rng: Generator, most: int) -> tuple[str, ...] | None:
-        """Return kinds for a flight, with untried combinations; None if there are none."""
+        """Return kinds with untried combinations for a flight; None if all have been tried."""
         size = next((size for size in self.untried if self.untried[size]), None)
         if size is None:
             return None
@@ -433,7 +434,7 @@ class Coverage:
 
 
 class Strategy:
-    """Draws the flights of a hunt, in order; `learn` has to follow in the same order."""
+    """Draws the flights of a hunt; `learn` must be called in the same order."""
 
     def __init__(self, space: HuntSpace, seed: int) -> None:
         self.space, self.seed = space, seed
@@ -443,7 +444,7 @@ class Strategy:
         self._drawn = 0
 
     def draw(self) -> Case:
-        """Return the next flight; the first one has no fault."""
+        """Return the next flight; the first one has no faults."""
         rng = stream(self.seed, f"hunt/{self._drawn}")
         explores = self._drawn % 2 == 1 or not self.elites
         first, self._drawn = self._drawn == 0, self._drawn + 1
@@ -462,7 +463,7 @@ class Strategy:
         return case
 
     def learn(self, case: Case, margin: Margin) -> None:
-        """Take note of the margin of a flight."""
+        """Record the margin of a flight."""
         self.coverage.add(case.kinds)
         known = self.elites.get(case.kinds)
         if case.faults and (known is None or (margin.share < known.margin.share)):
@@ -474,12 +475,12 @@ class Strategy:
         return Case(self.space.draw_seed(rng), values, faults)
 
     def _near(self, rng: Generator) -> Case:
-        """Return a neighbour of one of the best flights, the better ones more often."""
+        """Return a neighbour of one of the best flights, preferring the better ones."""
         ranked = sorted(self.elites.values(), key=lambda elite: (elite.margin.share, elite.case.kinds))
         parent = self._pick(ranked, rng)
         faults, kinds = list(parent.faults), self.space.kinds
         place, how = int(rng.integers(len(faults))), rng.uniform()
-        if how < 0.25 and len(ranked) > 1:  # a fault of another of the best, instead of one or beside them
+        if how < 0.25 and len(ranked) > 1:  # add a fault of another elite, replacing one if there are too many
             other = self._pick(ranked, rng)
             fault = other.faults[int(rng.integers(len(other.faults)))]
             faults = faults if len(faults) < self.space.most else [*faults[:place], *faults[place + 1 :]]

@@ -1,7 +1,7 @@
-"""Hashes of what a flight has published, by which two flights are compared.
+"""Hashes of the messages of a flight, by which two flights are compared.
 
-OutputHashes    a hash of all outputs of agents on a key: whether the flights are the same
-GateDigests     a check sum of each key at each gate, in place of a record: where they differ first
+OutputHashes    a hash of all outputs of agents on a key: whether the flights are identical
+GateDigests     a checksum of each key at each gate, instead of a record: where they first differ
 """
 
 import csv
@@ -22,7 +22,7 @@ CAUSES = ("truth", "estimate")
 
 
 def content_of(message: Any) -> bytes:
-    """Return an agent's output as on the wire, but without the process that it was in: an agent may share one."""
+    """Return an agent's output as on the wire, but without its process, which agents may share."""
     return messages.encode(replace(message, **{"controller" if isinstance(message, ClusterRequest) else "source": ""}))
 
 
@@ -30,7 +30,7 @@ class OutputHashes:
     """SHA-256 of the outputs of agents up to an instant, by key.
 
     Args:
-        until_ns: the last instant whose outputs count; what is answered to later gates may not be on record.
+        until_ns: the last instant whose outputs count; outputs for later gates may be missing on record.
     """
 
     def __init__(self, until_ns: int) -> None:
@@ -38,7 +38,7 @@ class OutputHashes:
         self._of: dict[str, hashlib._Hash] = {}
 
     def add(self, key: str, t_ns: int, content: bytes) -> None:
-        """Add an output, as `content_of` gives it; those of a key in the order in which they were published."""
+        """Add an output, as `content_of` returns it, in the order of publication for each key."""
         if t_ns <= self._until_ns:
             self._of.setdefault(key, hashlib.sha256()).update(len(content).to_bytes(4, "little") + content)
 
@@ -47,10 +47,7 @@ class OutputHashes:
 
 
 class GateDigests:
-    """A check sum of what was published on each key at each gate: where two flights differ, without their records.
-
-    `until_ns` as of OutputHashes.
-    """
+    """A checksum of the messages on each key at each gate. `until_ns` as in OutputHashes."""
 
     def __init__(self, until_ns: int) -> None:
         self._until_ns = until_ns
@@ -62,7 +59,7 @@ class GateDigests:
             at[key] = at.get(key, 0) + zlib.crc32(payload) & ALL
 
     def csv(self) -> bytes:
-        """Return them as a table: `t_ns`, then a column for each key, 8 hex digits or nothing."""
+        """Return a table: `t_ns`, then a column for each key, with 8 hex digits or empty."""
         names = sorted({key for at in self._sums.values() for key in at})
         file = io.StringIO()
         writer = csv.writer(file, lineterminator="\n")
@@ -75,10 +72,10 @@ class GateDigests:
 def first_difference(expected: bytes, found: bytes) -> tuple[int, str] | None:
     """Return the first instant [ns] and key at which two tables of `GateDigests.csv` differ; None if they are equal.
 
-    Of the keys of an instant that is the first one in the order of cause: truth, estimates, what follows from them.
+    Among the keys of an instant, the first is chosen in the order of cause: truth, estimates, others.
 
     Raises:
-        ValueError: one is no such table.
+        ValueError: one is not such a table.
     """
     rows = zip_longest(_rows(expected), _rows(found), fillvalue=(0, dict[str, str]()))
     for (t_ns, a), (other_ns, b) in rows:
@@ -92,4 +89,4 @@ def _rows(table: bytes) -> Iterator[tuple[int, dict[str, str]]]:
         for row in csv.DictReader(io.StringIO(table.decode()), strict=True):
             yield int(row.pop("t_ns")), {key: digits for key, digits in row.items() if digits}
     except (csv.Error, KeyError, TypeError) as error:
-        raise ValueError(f"no table of digests: {error}") from error
+        raise ValueError(f"not a table of digests: {error}") from error

@@ -1,4 +1,4 @@
-"""Who heard whom during a flight, of the world's `RadioLinks`."""
+"""Which drones heard which during a flight, from the world's `RadioLinks`."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -11,27 +11,27 @@ from scipy.sparse.csgraph import connected_components
 
 from zsim.contract.run_messages import RadioLinks
 
-CONNECTS = 0.5  # probability from which on a link counts for the connection of all; the range is where it is so much
+CONNECTS = 0.5  # probability from which a link counts as connected; it defines the range
 
 
 class RadioSummary(Struct, frozen=True):
-    """How well drones heard each other, on average over the instants of a window."""
+    """The reception of drones, averaged over the instants of a window."""
 
-    heard_mean: float  # drones whose messages arrive at a drone, as far as they do: 4 that lose a half are 2
-    connected_share: float  # of the instants: every drone's messages could reach all, over others too
+    heard_mean: float  # expected number of drones heard by a drone: 4 with a loss of one half count as 2
+    connected_share: float  # share of instants at which every drone can reach all others, also via relays
 
 
 class RadioHistory:
-    """The links of N drones at K instants, reduced to what is drawn; a ground station's are left out.
+    """The links of N drones at K instants, without those of a ground station.
 
     Attributes:
         t_ns: instants, ascending.
-        heard: sum of the probabilities with which a message of each other drone arrives, (K, N).
-        connected: whether the graph of the links above CONNECTS, before the loss, was strongly connected, (K,).
-        share: probability with which a message of drone j arrives at drone i, mean over the instants, (N, N).
+        heard: expected number of other drones whose messages arrive, (K, N).
+        connected: whether the graph of links of at least CONNECTS, before loss, was strongly connected, (K,).
+        share: probability that a message of drone j arrives at drone i, mean over the instants, (N, N).
 
     Args:
-        loss: of the radio, whatever the distance.
+        loss: share of messages lost at any distance.
     """
 
     def __init__(self, links: Sequence[RadioLinks], drones: int, loss: float = 0.0) -> None:
@@ -53,11 +53,11 @@ class RadioHistory:
         return RadioSummary(float(self.heard[within].mean()), float(self.connected[within].mean()))
 
 
-@lru_cache(maxsize=1024)  # links change rarely where reception does not depend on the distance
+@lru_cache(maxsize=1024)  # links change rarely if reception does not depend on the distance
 def _graph(
     hears: tuple[tuple[int, ...], ...], reception: tuple[tuple[float, ...], ...], drones: int
 ) -> tuple[NDArray[np.float64], bool]:
-    """Return the reception of drone j at drone i, (N, N), and whether all reach all."""
+    """Return the reception of drone j at drone i, (N, N), and whether the graph is strongly connected."""
     matrix = np.zeros((drones, drones))
     chances = reception or [(1.0,) * len(heard) for heard in hears]
     for i, row in enumerate(zip(hears[:drones], chances[:drones], strict=False)):

@@ -1,6 +1,6 @@
-"""The verdict on a flight: which steps of its plan it did not fly, and the incidents of its drones. Pure but `verdict`.
+"""The verdict on a flight: deviations from its plan, and incidents of its drones. Pure except `verdict`.
 
-Order of this file: shortfalls, the window of the statistics, and how both are written; then drones, then formations.
+Order of this file: shortfalls, the window of the statistics, and their texts; then drones, then formations.
 """
 
 from collections import Counter
@@ -29,35 +29,34 @@ from zsim_analysis.reading.recorded_flight import Array, ClusterStates, Recorded
 
 NOT_AS_PLANNED = "NOT AS PLANNED"
 ENGAGES_S = 20.0  # chosen: a formation engages 4 to 12 s after its take-off; a run may end before
-MOVES_NS, MOVES_MIN = 500_000_000, 1e-3  # chosen: half a second; m or rad by which a reference at rest never moves
-HELD_MAX_S = 2.0  # chosen: four times the wait after a fault; a formation held for longer has left its plan
-LATE_MAX_S = 1.0  # chosen: two attempts at a step of the plan; if more of a reference is missing, it is reported
-SAMPLE_NS = 100_000_000  # of a reference that is compared with the plan's
-STRAYED_M, STRAYED_S = 5.0, 3  # chosen: twice the least distance of drones, and successive seconds so far away
-SETTLED_S = 10.0  # chosen: time from its engagement that a formation has until its drones are in their places
-SAME = 1e-3  # m or rad within which the reference is the plan's: both are computed by the same formulas
-CONTROLLER, CONSOLE = ("controller.", f"{PILOT}."), "console"  # prefixes of names: who flies by plan, and operators
+MOVES_NS, MOVES_MIN = 500_000_000, 1e-3  # chosen: half a second; m or rad, below which a reference is at rest
+HELD_MAX_S = 2.0  # chosen: four times the wait after a fault; a longer hold is a deviation from the plan
+LATE_MAX_S = 1.0  # chosen: two attempts at a step of the plan; a longer missing part of a reference is reported
+SAMPLE_NS = 100_000_000  # sampling interval of a reference that is compared with the plan's
+STRAYED_M, STRAYED_S = 5.0, 3  # chosen: twice the least distance of drones, for so many successive seconds
+SETTLED_S = 10.0  # chosen: time from the engagement until drones must be in their places
+SAME = 1e-3  # m or rad; tolerance of the reference against the plan's, which is computed by the same formulas
+CONTROLLER, CONSOLE = ("controller.", f"{PILOT}."), "console"  # name prefixes of planned controllers, and operators
 INCIDENTS = ("emergency", "flip", "impact", "touchdown", "battery", "landing")  # events of drones
 CRASHES = ("emergency", "flip", "impact", "touchdown")  # incidents by which a drone comes down
-ONE_HIT_NS = 500_000_000  # chosen: a touchdown within this time of an impact is part of it
+ONE_HIT_NS = 500_000_000  # chosen: a touchdown within this time of an impact belongs to it
 REFUSED_NS = 5_000_000_000  # chosen: a command refused within this time before a landing explains it
-LEADS = ("hold", "land", "target", "trajectory", "assemble")  # requests by which a formation leaves its plan
+LEADS = ("hold", "land", "target", "trajectory", "assemble")  # requests that make a formation leave its plan
 
 
 class Shortfall(Struct, frozen=True):
     """A deviation of a flight from its plan, or an incident."""
 
-    # of a drone: emergency, flip, impact, touchdown, battery, landing (its first incident), mission (not flown to its
-    # end), strayed (far from its place or reference), reference (never
-    # taken off by it), override (flown by others); of a cluster: plan (a step refused to the end,
-    # or flown in part), engagement (never), held (for long), request (led by others), early (the run ended before it
-    # was due), window (contains instants at which a cluster was not engaged); collision; process (an expected one
-    # died, failed, or never joined); record (incomplete)
+    # of a drone: emergency, flip, impact, touchdown, battery, landing (its first incident), mission (incomplete),
+    # strayed (far from its place or reference), reference (no take-off), override (flown by others); of a cluster:
+    # plan (a step refused to the end, or flown in part), engagement (never), held (for long), request (led by others),
+    # early (the run ended before a step was due), window (contains instants without engagement); collision; process
+    # (an expected one died, failed, or never joined); record (incomplete)
     kind: str
-    subject: str  # the cluster, the drone, the process, or "record"; of a collision both, as "drone1, drone2"
+    subject: str  # the cluster, drone, process, or "record"; for a collision both, as "drone1, drone2"
     t_s: float  # its beginning, simulated time
     text: str
-    fails: bool  # the flight is no example of its plan; the command ends with code 1
+    fails: bool  # the flight did not follow its plan; the command ends with code 1
 
 
 class Verdict(Struct, frozen=True):
@@ -68,17 +67,17 @@ class Verdict(Struct, frozen=True):
 
 
 def verdict(record: Path) -> Verdict:
-    """Return the verdict on the flight of a record, the same as in its report, without reading all of its motion.
+    """Return the verdict on the flight of a record as in its report, without reading all of its motion.
 
     Raises:
-        RecordError: no such record.
+        RecordError: there is no such record.
     """
     flight = read_flight(record, motion=False)
     return Verdict(flight.completeness, shortfalls(flight, window_of(flight)[0]))
 
 
 def shortfalls(flight: RecordedFlight, window_s: tuple[float, float]) -> list[Shortfall]:
-    """Return the shortfalls of a flight, failures first; empty for one that flew its plan."""
+    """Return the shortfalls of a flight, failures first; empty if it followed its plan."""
     lines = [*_incidents(flight), *_collisions_and_missions(flight)]
     lines += [line for states in flight.clusters for line in _of_cluster(states, flight, window_s)]
     lines += [line for drone in flight.references for line in _of_reference(drone, flight)]
@@ -90,19 +89,19 @@ def shortfalls(flight: RecordedFlight, window_s: tuple[float, float]) -> list[Sh
 
 
 def marks_of(lines: Sequence[Shortfall]) -> list[tuple[str, bool]]:
-    """Return a line for each shortfall, and whether the flight fails by it."""
+    """Return a line for each shortfall, and whether it is a failure."""
     return [(f"{NOT_AS_PLANNED if each.fails else 'note'}: {each.text}", each.fails) for each in lines]
 
 
 def window_of(flight: RecordedFlight) -> tuple[tuple[float, float], str]:
-    """Return the window of a flight's statistics [s], and a note if it is not the one of the scenario."""
+    """Return the window of a flight's statistics [s], and a note if it is not the scenario's."""
     return window(flight.scenario.report.window_s if flight.scenario else None, flight.last_ns / 1e9)
 
 
 def window(wanted_s: tuple[float, float] | None, length_s: float) -> tuple[tuple[float, float], str]:
-    """Return the window of the statistics [s] of a run, and a note if it is not the one of the scenario.
+    """Return the window of a run's statistics [s], and a note if it is not the scenario's.
 
-    Without one in the scenario: the last two thirds of the run.
+    The default without one in the scenario is the last two thirds of the run.
     """
     default = (length_s / 3, length_s)
     if wanted_s is None:
@@ -119,13 +118,13 @@ def window(wanted_s: tuple[float, float] | None, length_s: float) -> tuple[tuple
 
 
 def phase_shares(t_s: Array, phases: list[str], window_s: tuple[float, float]) -> dict[str, float]:
-    """Return the shares of a window's instants at which a formation was in each phase, the greatest first."""
+    """Return the share of each phase of a formation in a window's instants, the greatest first."""
     rows = np.flatnonzero((t_s >= window_s[0]) & (t_s <= window_s[1])).tolist()
     return {phase: count / len(rows) for phase, count in Counter(phases[row] for row in rows).most_common()}
 
 
 def seconds_text(t_s: float) -> str:
-    """Return a time [s] with two decimals at most."""
+    """Format a time [s] with at most two decimals."""
     return f"{t_s:.2f}".rstrip("0").rstrip(".")
 
 
@@ -134,13 +133,13 @@ def span_text(span_s: tuple[float, float]) -> str:
 
 
 def percent_text(share: float) -> str:
-    """Return a share in percent, rounded to 100 or 0 only if it is exactly that."""
+    """Format a share in percent; only exact shares are shown as 100 or 0."""
     percent = 100 * share if share in (0.0, 1.0) else min(max(100 * share, 0.1), 99.9)
     return f"{percent:.3g}"
 
 
 def _processes(flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield the expected processes that were lost for good, unless the scenario says drop."""
+    """Yield the expected processes that were lost permanently, unless the scenario allows dropping them."""
     scenario = flight.scenario
     expected = {*expected_processes(scenario), *agent_names(scenario), WORLD} if scenario else set()
     actions = scenario.processes if scenario else Processes()
@@ -152,7 +151,7 @@ def _processes(flight: RecordedFlight) -> Iterator[Shortfall]:
             continue
         on_death = event.data.get("on_death")
         is_death = event.kind == "death" and (on_death == "end" or event.subject in dropped)
-        # a process that was to come back is dropped once it is overdue
+        # a process that was expected to return is dropped once it is overdue
         is_overdue = event.kind == "overdue" or (event.kind == "death" and on_death in ("wait", "restart"))
         allowed = event.kind != "overdue" and lets_drop(actions.on_death, event.subject)
         allowed = allowed or (is_overdue and lets_drop(actions.on_overdue or {}, event.subject))
@@ -168,7 +167,7 @@ def _processes(flight: RecordedFlight) -> Iterator[Shortfall]:
 
 
 def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield a line for each drone that had incidents, with the first one of each kind by time."""
+    """Yield a line for each drone with incidents: the first of each kind, by time."""
     by_drone: dict[str, list[Event]] = {}
     for event in flight.events:
         if event.kind in INCIDENTS:
@@ -181,7 +180,7 @@ def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
         in_order = sorted(first.values(), key=lambda event: (event.t_ns, event.seq))
         parts = [_incident_text(event, _refusal_before(event, flight)) for event in in_order]
         text = f"{drone}: {', '.join(parts)}{_active_faults(drone, (events[0].t_ns, events[0].seq), flight)}"
-        fails = not all(  # a landing because a program other than a controller stopped sending commands
+        fails = not all(  # a landing after a program other than a controller stopped sending is not a failure
             event.kind == "landing"
             and event.data.get("cause") == "silence"
             and not str(event.data.get("commander") or "").startswith(CONTROLLER)
@@ -196,9 +195,9 @@ def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
 
 
 def _refusal_before(event: Event, flight: RecordedFlight) -> str:
-    """Return why the newest refused command of a drone was refused, if that may explain an event; else empty.
+    """Return the reason of a drone's latest refused command, if that may explain an event; else empty.
 
-    Of many refusals alike only the first are events; the last of these says that further ones are only counted.
+    Only the first of many equal refusals are events; the last of them says that further ones are only counted.
     """
     commands = f"drone/{event.subject}/cmd/"
     for each in reversed(flight.events):
@@ -232,7 +231,7 @@ def _incident_text(event: Event, refused: str) -> str:
 
 
 def _active_faults(drone: str, at: tuple[int, int], flight: RecordedFlight) -> str:
-    """Return the injected faults of a drone, or of all, that were active at an instant: (t_ns, number of the event)."""
+    """Return the faults of a drone or the world that were active at an instant: (t_ns, number of the event)."""
     active: dict[object, str] = {}
     for each in flight.events:
         if (each.t_ns, each.seq) > at:
@@ -248,9 +247,9 @@ def _active_faults(drone: str, at: tuple[int, int], flight: RecordedFlight) -> s
 
 
 def _collisions_and_missions(flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield each pair of drones, or of a drone and an obstacle, that touched, and the missions not flown to their end.
+    """Yield each pair of drones, or of a drone and an obstacle, that collided, and incomplete missions.
 
-    Of the missions that a bridge reported, the newest one of each drone counts.
+    Of the missions that a bridge reported, the latest one of each drone counts.
     """
     pairs: dict[frozenset[object], list[Event]] = {}
     for event in flight.events:
@@ -270,7 +269,7 @@ def _collisions_and_missions(flight: RecordedFlight) -> Iterator[Shortfall]:
 
 
 def _overrides(flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield each drone of a planned cluster that others than its controller flew, or landed."""
+    """Yield each drone of a planned cluster that was flown or landed by someone other than its controller."""
     members = {
         drone for states in flight.clusters for drone in states.drones if cluster_of(flight.scenario, states.name)
     }
@@ -281,19 +280,18 @@ def _overrides(flight: RecordedFlight) -> Iterator[Shortfall]:
 
 
 class _Intervention(NamedTuple):
-    """A time [ns] in which others than its controller flew a drone, or landed it."""
+    """An interval [ns] in which a drone was flown or landed by someone other than its controller."""
 
     from_ns: int
     until_ns: int
     text: str
 
     def covers(self, t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which instants it covers."""
         return (self.from_ns <= t_ns) & (t_ns <= self.until_ns)
 
 
 def _interventions(drone: str, flight: RecordedFlight) -> Iterator[_Intervention]:
-    """Yield the interventions of others than its controller in the flight of a drone, by time."""
+    """Yield the interventions in the flight of a drone, by time."""
     own = [event for event in flight.events if event.subject == drone]
     for place, event in enumerate(own):
         if event.source.startswith(CONTROLLER):
@@ -323,7 +321,7 @@ def _of_reference(drone: str, flight: RecordedFlight) -> Iterator[Shortfall]:
         return
     if track is None or track.external:
         return
-    _, rows = np.unique(own.t_ns // SECOND_NS, return_index=True)  # the same where only one a second is read
+    _, rows = np.unique(own.t_ns // SECOND_NS, return_index=True)  # one per second, as `verdict` reads them
     rows = rows[flown[rows]]
     t_ns, at, mine = np.intersect1d(own.t_ns[rows], track.t_ns, assume_unique=True, return_indices=True)
     away_m = np.linalg.norm(track.p_W[mine] - own.place[rows][at, :3], axis=1)
@@ -402,9 +400,9 @@ def _refused(states: ClusterStates) -> Iterator[Shortfall]:
 def _strayed(
     states: ClusterStates, flight: RecordedFlight, scenario: Scenario, cluster: Cluster
 ) -> Iterator[Shortfall]:
-    """Yield the drones that truly were far from their places in the engaged formation, and for how long.
+    """Yield the drones whose true positions were far from their places in the engaged formation, and for how long.
 
-    Their estimates, which the controller relies on, may say otherwise. Interventions of others do not count.
+    The estimates that the controller uses may differ. Interventions are excluded.
     """
     engaged = np.array([phase == "engaged" for phase in states.phases], bool)
     settled = states.t_ns >= states.t_ns[engaged][0] + round(SETTLED_S * 1e9)
@@ -427,7 +425,7 @@ def _strayed(
 
 
 def _far(drone: str, t_ns: NDArray[np.int64], away_m: Array, what: str, flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield that a drone was far from where it was to be, by its distances once a second, if it was for long."""
+    """Yield a shortfall if a drone was far from its place for STRAYED_S; `away_m` are its distances once a second."""
     stretches = np.split(np.arange(len(t_ns)), np.flatnonzero(np.diff(away_m > STRAYED_M)) + 1)
     long = [each for each in stretches if len(each) >= STRAYED_S and away_m[each[0]] > STRAYED_M]
     if long:
@@ -437,9 +435,9 @@ def _far(drone: str, t_ns: NDArray[np.int64], away_m: Array, what: str, flight: 
 
 
 def _held(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield for how long, in all, a formation was held after its engagement, other than on request.
+    """Yield the total time that a formation was held after its engagement, except on request.
 
-    Holds during interventions of others in the flight of its drones are reported, and do not fail.
+    Holds during interventions in the flight of its drones are reported, but are not failures.
     """
     phases = np.array(states.phases)
     rows = np.flatnonzero(phases == "held")
@@ -460,7 +458,7 @@ def _held(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
 
 
 def _moves(states: ClusterStates) -> bool:
-    """Return whether the reference moves at the end, and not due to a hold or because the guard separates drones."""
+    """Return whether the reference moves at the end, without a hold or the separation guard being active."""
     last = states.t_ns > states.t_ns[-1] - MOVES_NS
     phases = {phase for phase, row in zip(states.phases, last, strict=True) if row}
     moved = float(np.ptp(states.desired[last], axis=0).max())
@@ -476,7 +474,7 @@ class PlannedReference(NamedTuple):
     entries: NDArray[np.intp]
 
     def flown(self, states: ClusterStates, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return at which of these rows of its states an engaged formation was led along it."""
+        """Return at which rows of `states` the engaged formation followed it."""
         on = np.zeros(len(rows), bool)
         for i, row in enumerate(rows.tolist()):
             if states.phases[row] == "engaged":
@@ -487,13 +485,13 @@ class PlannedReference(NamedTuple):
 
 
 def _planned(states: ClusterStates, scenario: Scenario, cluster: Cluster, takeoff_s: float) -> PlannedReference | None:
-    """Return the trajectory of a cluster's plan, else its target; None without one, or if it was refused."""
+    """Return the trajectory or else the target of a cluster's plan; None without one, or if it was refused."""
     steps = [each.request for each in plan_of(cluster) if isinstance(each.request, MoveTo | Follow)]
     try:
         space = scenario_space(scenario, cluster)
         if space.names != states.names or not steps:
             return None
-        base = states.desired[states.phases.index("engaged")].copy()  # a formation is engaged where it is
+        base = states.desired[states.phases.index("engaged")].copy()  # a formation engages at its current place
         base[space.neutral] = 0.0
         names, reference, start_s = dict[str, None](), None, takeoff_s
         for step in steps:
@@ -512,12 +510,12 @@ def _planned(states: ClusterStates, scenario: Scenario, cluster: Cluster, takeof
 
 
 def _trajectory_flown(states: ClusterStates, planned: PlannedReference, plan: ClusterPlan) -> Iterator[Shortfall]:
-    """Yield which part of the plan's trajectory was not flown."""
+    """Yield a shortfall if a part of the plan's trajectory was not flown."""
     t_s, whole_s = states.t_ns / 1e9 - planned.start_s, planned.reference.duration_s
     run_s, land_s = float(t_s[-1]), np.inf if plan.land_s is None else plan.land_s - planned.start_s
     due_s = min(np.inf if whole_s is None else whole_s, land_s, run_s)
     if due_s <= 0.0:
-        return  # the run ended before it, see `_not_begun`, or its landing is planned before it
+        return  # the run ended before it, which is reported as early, or its landing is planned before it
     if whole_s is not None and run_s < min(whole_s, land_s):
         text = f"the run ended at {seconds_text(run_s)} of {seconds_text(whole_s)} s of its trajectory"
         yield _line(states, "early", run_s + planned.start_s, text)
@@ -526,7 +524,7 @@ def _trajectory_flown(states: ClusterStates, planned: PlannedReference, plan: Cl
     refusals = _waits(states, "trajectory", planned.start_s)
     begin_s = 0.0
     if whole_s is None and on.any() and not refusals:
-        begin_s = float(at_s[on][0])  # one without an end is joined in motion whenever the formation gets there
+        begin_s = float(at_s[on][0])  # an endless one is joined in motion once the formation reaches it
     flown_s = float(np.diff(np.r_[at_s, due_s])[on].sum())
     if due_s - begin_s - flown_s <= LATE_MAX_S:
         return
@@ -545,7 +543,7 @@ def _trajectory_flown(states: ClusterStates, planned: PlannedReference, plan: Cl
 
 
 def _target_reached(states: ClusterStates, planned: PlannedReference, plan: ClusterPlan) -> Iterator[Shortfall]:
-    """Yield that the reference reached the plan's target late, or landed before."""
+    """Yield a shortfall if the reference reached the plan's target late, or the formation landed before."""
     engaged_ns = states.t_ns[states.phases.index("engaged")]
     rows = _sampled(states, np.flatnonzero(states.t_ns >= engaged_ns))
     on = planned.flown(states, rows)
@@ -568,7 +566,7 @@ def _sampled(states: ClusterStates, rows: NDArray[np.intp], every_ns: int = SAMP
 
 
 def _waits(states: ClusterStates, op: str, from_s: float) -> str:
-    """Return in words when, and why at first, a step of the plan was refused after from_s; empty if it was not."""
+    """Describe when, and why at first, a step of the plan was refused after from_s; empty if it was not."""
     rows = np.flatnonzero(states.t_ns / 1e9 >= from_s).tolist()
     steps = [(row, waiting_step(states.reasons[row])) for row in rows if states.phases[row] == "engaged"]
     found = [(row, step[1]) for row, step in steps if step and step[0] == op]
@@ -579,7 +577,7 @@ def _waits(states: ClusterStates, op: str, from_s: float) -> str:
 
 
 def _outside(states: ClusterStates, window_s: tuple[float, float]) -> Iterator[Shortfall]:
-    """Yield the phases of the window in which the formation was not engaged."""
+    """Yield the phases of the window other than engaged."""
     t_s = states.t_ns / 1e9
     shares = phase_shares(t_s, states.phases, window_s)
     others = {phase: share for phase, share in shares.items() if phase != "engaged"}

@@ -1,4 +1,4 @@
-"""Several runs side by side: how their scenarios and results differ, and the page that shows it."""
+"""The comparison of several runs: the differences of their scenarios and results, and their page."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -18,10 +18,10 @@ from zsim_analysis.report.make_report import Picture, facts, sources, template, 
 from zsim_analysis.report.summary import STATISTICS, judge
 
 ABSENT = "–"
-RUNS_PER_TABLE = 2  # beside each other with all their statistics: as many as fit the page
-THERE = "there"  # cell of an item with a name, such as a drone, that another run does not have
+RUNS_PER_TABLE = 2  # side by side with all their statistics: as many as fit the page
+THERE = "there"  # cell of a named item, such as a drone, that another run does not have
 NAMED, NAMES_MAX = 3, 100  # runs in the page's file name, and characters of their names
-MARK, MARK_WITHIN = b": comparison</title>", 4_000  # of a page of ours, within its first bytes
+MARK, MARK_WITHIN = b": comparison</title>", 4_000  # identifies our pages, within their first bytes
 
 
 def compare(
@@ -33,7 +33,7 @@ def compare(
     """Read the records of several runs and write the page that compares them; arguments as of `write_page`.
 
     Raises:
-        RecordError: one of them has no record, or no drone moves on it.
+        RecordError: one of them has no record, or no truth of any drone on it.
         ReportError: a run is given twice, or the page cannot be written, or would replace something else.
     """
     places = [directory.resolve() for directory in directories]
@@ -41,7 +41,7 @@ def compare(
         if places[number] in places[:number]:
             raise ReportError(f"{directory}: is given twice; a run is compared with others")
     if out.exists() and MARK not in _head(out):
-        raise ReportError(f"{out}: exists and is no comparison of runs; give --out another place")
+        raise ReportError(f"{out}: exists and is not a comparison of runs; give --out another path")
     runs = []
     for name, directory in zip(run_names(directories), directories, strict=True):
         judged = judge(directory / RECORD, lambda text, name=name: progress(f"{name}: {text}"))
@@ -51,7 +51,7 @@ def compare(
 
 
 def comparison_path(directories: Sequence[Path]) -> Path:
-    """Return the default place of the comparison of runs: beside the first, under a name that no other one has."""
+    """Return the default path of a comparison: beside the first run, with a unique name."""
     names = [name.replace("/", "-") for name in run_names(directories)]
     more = f"-and-{len(names) - NAMED}-more" if len(names) > NAMED else ""
     stem = f"compare-{'-'.join(names[:NAMED])[:NAMES_MAX]}{more}"
@@ -64,7 +64,7 @@ def comparison_path(directories: Sequence[Path]) -> Path:
 
 
 def _head(page: Path) -> bytes:
-    """Return the beginning of a file, empty if there is none."""
+    """Return the first bytes of a file, empty if it does not exist."""
     if not page.is_file():
         return b""
     with page.open("rb") as file:
@@ -72,7 +72,7 @@ def _head(page: Path) -> bytes:
 
 
 def run_names(directories: Sequence[Path]) -> list[str]:
-    """Return short unique names: the folders' own, with as many parents as are needed, then a number.
+    """Return short unique names: folder names with as many parents as needed, or else with a number.
 
     Bytes that are not UTF-8 become question marks, since matplotlib cannot draw them.
     """
@@ -86,7 +86,7 @@ def run_names(directories: Sequence[Path]) -> list[str]:
 
 
 def runs_id(directories: Sequence[Path]) -> str:
-    """Return an identifier of these runs in this order, which does not change if their folders are moved together."""
+    """Return an identifier of these runs in this order; it does not change if their folders are moved together."""
     paths = [directory.resolve() for directory in directories]
     places = "\0".join(relpath(path, paths[0].parent) for path in paths)
     return sha256(places.encode(errors="surrogateescape")).hexdigest()[:16]
@@ -109,7 +109,7 @@ def comparison_page(runs: Sequence[ComparedRun], pictures: Sequence[Picture]) ->
 
 
 class ComparisonRow(NamedTuple):
-    """A line of a table with a cell per run."""
+    """A row of a table with a cell per run."""
 
     name: str
     cells: tuple[str, ...]
@@ -120,7 +120,7 @@ class ComparisonRow(NamedTuple):
 
 
 def fact_rows(runs: Sequence[ComparedRun]) -> list[ComparisonRow]:
-    """Return the facts of each run's own page, and more in which runs differ, a line for each label."""
+    """Return the facts of each run's page, and further ones that may differ, a row for each label."""
     columns = [
         dict(facts(run.summary))
         | {
@@ -136,7 +136,7 @@ def fact_rows(runs: Sequence[ComparedRun]) -> list[ComparisonRow]:
 
 
 def statistics_rows(runs: Sequence[ComparedRun], cluster: str) -> list[ComparisonRow]:
-    """Return a line per variable of a cluster, with a cell for each of the STATISTICS of each run."""
+    """Return a row per variable of a cluster, with a cell for each of the STATISTICS of each run."""
     rows = []
     for name in parameters(runs, cluster):
         judged = [run.summary.clusters.get(cluster) for run in runs]
@@ -148,9 +148,9 @@ def statistics_rows(runs: Sequence[ComparedRun], cluster: str) -> list[Compariso
 
 
 def scenario_rows(runs: Sequence[ComparedRun]) -> list[ComparisonRow]:
-    """Return the fields in which the resolved scenarios differ, by path; fields that a run does not have are absent.
+    """Return the fields in which the resolved scenarios differ, by path; a field missing in a run is ABSENT there.
 
-    Named items, such as drones, that some runs do not have are listed without their fields.
+    Named items that some runs lack, such as drones, are listed without their fields.
     """
     flat = [dict(flattened(msgspec.to_builtins(run.flight.scenario))) if run.flight.scenario else {} for run in runs]
     paths = dict.fromkeys(path for each in flat for path in each)
@@ -165,10 +165,9 @@ def scenario_rows(runs: Sequence[ComparedRun]) -> list[ComparisonRow]:
 
 
 def flattened(value: Any, path: str = "") -> Iterable[tuple[str, Any]]:
-    """Yield path and value of every leaf; named items are identified by their names, whatever their order.
+    """Yield path and value of every leaf; named items are identified by their names, independent of order.
 
-    Items without names are identified by their numbers, each with all its fields as one value; empty lists are left
-    out.
+    Items without names are identified by their numbers, each with all its fields as one value; empty lists are omitted.
     """
     if isinstance(value, Mapping):
         for name, item in value.items():
@@ -193,7 +192,7 @@ def _text(value: Any) -> str:
 
 
 def notes(runs: Sequence[ComparedRun]) -> list[str]:
-    """Return what a reader should know: shortfalls, identical flights, what only some runs have, notes of each run."""
+    """Return remarks: shortfalls, identical flights, drones and clusters of only some runs, notes of each run."""
     lines = [
         f"{run.name}: {'not as planned: ' * each.fails}{each.text}" for run in runs for each in run.summary.shortfalls
     ]
@@ -213,7 +212,7 @@ def notes(runs: Sequence[ComparedRun]) -> list[str]:
 
 
 def _missing(what: str, there: Mapping[str, Sequence[str]]) -> list[str]:
-    """Return a line for the drones or clusters that the same runs have and the others do not."""
+    """Return a line for each set of drones or clusters that only some runs have."""
     groups: dict[tuple[str, ...], list[str]] = {}
     for name in dict.fromkeys(name for names in there.values() for name in names):
         having = tuple(run for run, names in there.items() if name in names)

@@ -1,4 +1,4 @@
-"""Figures of several runs: over each other where lines are distinct, otherwise side by side."""
+"""Figures of several runs: overlaid where lines remain distinguishable, otherwise side by side."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ from zsim_analysis.report.formation_figures import curves, draw_error, numbered,
 from zsim_analysis.report.paper import flies_paper_test
 from zsim_analysis.report.summary import RunSummary
 
-UNPLANNED = "†"  # behind the name of a run that was not flown as planned
-COLUMNS = 3  # runs beside each other in a row of a figure, at most
-ROOM = 0.03  # share of the greatest RMS beyond it, so that its mark is whole
+UNPLANNED = "†"  # after the name of a run that was not flown as planned
+COLUMNS = 3  # greatest number of runs in a row of a figure
+ROOM = 0.03  # margin beyond the greatest RMS, so that its mark is not cut
 ROWS_MAX = 24  # parameters in one figure; 6 drones
 DESIRED: dict[str, Any] = {"color": style.BLACK, "lw": 1.0, "ls": (0, (1, 2)), "zorder": 6}
 LANE_IN = 0.24  # height of a run's lane of marks
@@ -34,8 +34,6 @@ NAME_MAX = 20  # characters of a run's name beside its lane
 
 @dataclass
 class ComparedRun:
-    """One of several runs."""
-
     name: str  # unique among the runs
     directory: Path
     flight: RecordedFlight
@@ -44,7 +42,7 @@ class ComparedRun:
 
     @property
     def label(self) -> str:
-        """Its name for tables and figures, with a mark unless it was flown as planned."""
+        """Its name in tables and figures, marked unless it was flown as planned."""
         return self.name if self.summary.as_planned else f"{self.name} {UNPLANNED}"
 
     def formation(self, cluster: str) -> Formation | None:
@@ -53,7 +51,7 @@ class ComparedRun:
 
 
 def clusters(runs: Iterable[ComparedRun]) -> list[str]:
-    """Return the clusters of all runs, in the order of their first run."""
+    """Return the names of the clusters of all runs."""
     return list(dict.fromkeys(formation.name for run in runs for formation in run.formations))
 
 
@@ -64,7 +62,7 @@ def parameters(runs: Iterable[ComparedRun], cluster: str) -> list[str]:
 
 
 class RunStyle(NamedTuple):
-    """Colour, dashes and marker of a run, distinct in black and white as well."""
+    """Colour, dashes and marker of a run, distinguishable in black and white as well."""
 
     color: str
     dashes: Any
@@ -82,7 +80,7 @@ STYLES = (
 
 
 def run_style(index: int) -> RunStyle:
-    """Return the style of a run; from the seventh on colours repeat with other dashes."""
+    """Return the style of a run; from the seventh run on, colours repeat with other dashes."""
     repeats, place = divmod(index, len(STYLES))
     return STYLES[place]._replace(dashes=STYLES[(index + repeats) % len(STYLES)].dashes)
 
@@ -107,7 +105,7 @@ def comparison_figures(runs: Sequence[ComparedRun]) -> Iterator[style.ReportFigu
 
 
 def _across(runs: Sequence[ComparedRun]) -> int:
-    """Return how many runs stand beside each other: rows as full as can be."""
+    """Return the number of runs in a row, balanced over the rows."""
     rows = -(-len(runs) // COLUMNS)
     return -(-len(runs) // rows)
 
@@ -146,7 +144,7 @@ def _of_cluster(runs: Sequence[ComparedRun], cluster: str) -> Iterator[style.Rep
 
 
 def _draw_rms(runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -> Figure:
-    """Return the RMS errors, with a panel for metres and one for radians."""
+    """Draw the RMS errors, with a panel for metres and one for radians."""
     groups = {each: [name for name in names if unit(name) == each] for each in dict.fromkeys(map(unit, names))}
     figure = style.new_figure(style.PAGE_IN, 1.0 + len(groups) * 0.4 + 0.16 * (len(runs) + 1) * len(names))
     heights = [len(group) for group in groups.values()]
@@ -181,7 +179,7 @@ def _draw_rms(runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -
 def _draw_errors(
     some: Sequence[ComparedRun], runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]
 ) -> Figure:
-    """Return the errors of a few runs side by side; the scale of a row is that of all runs."""
+    """Draw the errors of a few runs side by side; all runs determine the scale of a row."""
     figure = style.new_figure(style.PAGE_IN, 0.9 + 0.7 * len(names))
     grid = figure.subplots(len(names), len(some), squeeze=False, sharex=True, sharey="row")
     for run, column in zip(some, grid.T, strict=True):
@@ -195,13 +193,8 @@ def _draw_errors(
                 style.draw_marks([axes], style.time_marks(run.flight, formation))
             else:
                 style.dress(axes)
-                look: dict[str, Any] = {
-                    "ha": "center",
-                    "va": "center",
-                    "fontsize": style.PAPER_PT - 1,
-                    "color": "#57606a",
-                }
-                axes.text(0.5, 0.5, "not in this run", transform=axes.transAxes, **look)
+                look: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": style.PAPER_PT - 1}
+                axes.text(0.5, 0.5, "not in this run", transform=axes.transAxes, color="#57606a", **look)
     style.letter_panels(grid[0])
     for name, axes in zip(names, grid[:, 0], strict=True):
         axes.set_ylabel(style.label(name), fontsize=style.PAPER_PT)
@@ -220,7 +213,7 @@ def _draw_errors(
 
 
 def _draw_parameters(runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -> Figure:
-    """Return variables over time: true on the left, measured on the right, the runs over each other."""
+    """Draw variables over time: true on the left, measured on the right, with the runs overlaid."""
     lanes_in, marks = LANE_IN * len(runs), []
     for run in runs:
         times = style.time_marks(run.flight, run.formation(cluster))
@@ -274,7 +267,7 @@ def _draw_parameters(runs: Sequence[ComparedRun], cluster: str, names: Sequence[
 
 
 class RunMarks(NamedTuple):
-    """The marks of a run: bands, and kind and time [s] of what happened at one instant."""
+    """The marks of a run: bands, and kind and time [s] of instantaneous events."""
 
     name: str
     marks: style.TimeMarks
@@ -282,7 +275,7 @@ class RunMarks(NamedTuple):
 
 
 def _draw_lanes(lanes: Axes, marks: Sequence[RunMarks], named: bool) -> None:
-    """Draw a lane for each run, the first one uppermost: bars for bands, markers for instants."""
+    """Draw a lane for each run, the first at the top: bars for bands, markers for instants."""
     for place, run in enumerate(marks):
         colour = run_style(place).color
         lanes.axhline(place, color=EMPTY, lw=1.0, zorder=1)
@@ -303,7 +296,7 @@ def _draw_lanes(lanes: Axes, marks: Sequence[RunMarks], named: bool) -> None:
 
 
 def _draw_plans(runs: Sequence[ComparedRun]) -> Figure:
-    """Return the true paths from above, a plan per run, all on one scale."""
+    """Draw the true paths from above, a plan per run, all on one scale."""
     across, colours = _across(runs), _drone_colours(runs)
     rows = -(-len(runs) // across)
     figure = style.new_figure(style.PAGE_IN, 0.8 + rows * style.PAGE_IN / across)
@@ -332,7 +325,7 @@ def _draw_plans(runs: Sequence[ComparedRun]) -> Figure:
 
 
 def _draw_drones(runs: Sequence[ComparedRun]) -> Figure:
-    """Return true altitude, state and battery of every drone, a column per run."""
+    """Draw true altitude, state and battery of every drone, a column per run."""
     heights = drones.drone_panel_heights(max(len(run.flight.tracks) for run in runs))
     across, colours = _across(runs), _drone_colours(runs)
     rows = -(-len(runs) // across)
@@ -362,12 +355,12 @@ def _draw_drones(runs: Sequence[ComparedRun]) -> Figure:
 
 
 def _drone_colours(runs: Sequence[ComparedRun]) -> dict[str, str]:
-    """Return a colour for each drone of all runs: one of a name has one colour."""
+    """Return a colour for each drone name of all runs."""
     return colours_of(list(dict.fromkeys(track.name for run in runs for track in run.flight.tracks)))
 
 
 def _name_drones(figure: Figure, axes: Axes, colours: Mapping[str, str]) -> None:
-    """Name the drones in the legend, of many the first and the last."""
+    """Add the drones to the legend; of many only the first and the last."""
     named = list(colours.items())
     for name, colour in named if len(named) <= drones.NAMED_MAX else (named[0], named[-1]):
         axes.plot([], [], color=colour, lw=1.1, label=name)

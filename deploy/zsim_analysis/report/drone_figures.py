@@ -1,6 +1,6 @@
 """Figures of drones: plan view; altitude, state and battery; errors of estimates; velocities; distances; radio.
 
-Few drones have a line, or a column, each; many are drawn as their spread.
+Few drones have a line or a column each; many are drawn as their spread.
 """
 
 import math
@@ -36,14 +36,14 @@ SMALL_PT = style.PAPER_PT - 1.5
 
 # Plan view
 
-ROOM = 0.06  # share of the plan's range at each end, so that marks at its edge are whole
-OUTLINES = 7  # formations in the plan, few enough to be distinct
-APART = 0.6  # of the formation's own size: nearer outlines would cover each other
-RING_MAX = 4  # drones whose outline passes through them in their order; of more it is their hull
+ROOM = 0.06  # margin at each end of the plan's range, so that marks at its edge are not cut
+OUTLINES = 7  # formations in the plan, few enough to be distinguishable
+APART = 0.6  # of the formation's size: nearer outlines would overlap
+RING_MAX = 4  # drones whose outline connects them in order; for more it is their hull
 
 
 def draw_plan(flight: RecordedFlight, formations: Sequence[Formation]) -> Figure:
-    """Return the true paths from above with the outlines of the formations at some instants."""
+    """Draw the true paths from above, with the outlines of the formations at some instants."""
     figure = style.new_figure(style.COLUMN_IN, 1.15 * style.COLUMN_IN)
     axes = figure.subplots()
     style.dress(axes, "north y (m)")
@@ -113,7 +113,7 @@ def draw_path(axes: Axes, track: Track, colour: str, named: bool) -> None:
 
 
 def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) -> None:
-    """Draw the outlines of a formation with their times, at instants at which they do not cover each other."""
+    """Draw the outlines of a formation with their times, at instants at which they do not overlap."""
     members = [track for name in formation.drones for track in tracks if track.name == name]
     t_ns, places = common_instants(members)
     if not len(t_ns):
@@ -142,8 +142,8 @@ def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) ->
 
 # Altitude, state and battery
 
-LANES_IN = 5.0  # height of all states, half of it on the page; more drones share it
-LANES_NAMED = 12  # drones named beside their states, at most
+LANES_IN = 5.0  # greatest height of all states, half of it on the page
+LANES_NAMED = 12  # greatest number of drones named beside their states
 DRONE_PANELS = ("true altitude (m)", "state", "battery (%)")
 STATES = {
     "landed": style.GREY,
@@ -156,7 +156,7 @@ STATES = {
 
 
 def draw_drones(flight: RecordedFlight, marks: style.TimeMarks) -> Figure:
-    """Return altitude, state and battery of every drone over the run."""
+    """Draw altitude, state and battery of every drone over the run."""
     count = len(flight.tracks)
     heights = drone_panel_heights(count)
     figure = style.new_figure(style.COLUMN_IN, 1.6 + 0.5 * sum(heights))
@@ -179,12 +179,12 @@ def draw_drones(flight: RecordedFlight, marks: style.TimeMarks) -> Figure:
 
 
 def drone_panel_heights(count: int) -> tuple[float, float, float]:
-    """Return the heights of DRONE_PANELS for so many drones."""
+    """Return the heights of DRONE_PANELS for a number of drones."""
     return 3.0, 0.5 + min(0.28 * count, LANES_IN), 2.0
 
 
 def draw_drone_panels(panels: Sequence[Axes], tracks: Sequence[Track], colours: Mapping[str, str], named: int) -> None:
-    """Draw drones into the axes of DRONE_PANELS, in the given colours; the legend names the first `named`."""
+    """Draw drones into the axes of DRONE_PANELS; the legend names the first `named`."""
     altitude, state, battery = panels
     for lane, track in enumerate(tracks):
         look = {"color": colours[track.name], "lw": 0.9, "label": track.name if lane < named else None}
@@ -205,7 +205,7 @@ def draw_drone_panels(panels: Sequence[Axes], tracks: Sequence[Track], colours: 
 
 
 def name_states(figure: Figure, tracks: Sequence[Track]) -> None:
-    """Put a legend of the states that occur below the axes of a figure."""
+    """Add a legend of the states that occur, below the axes of a figure."""
     occur = [name for name in STATES if any(name in track.states for track in tracks)]
     handles = [Patch(color=STATES[name], label=name.replace("_", " ")) for name in occur]
     if handles:
@@ -218,8 +218,8 @@ def name_states(figure: Figure, tracks: Sequence[Track]) -> None:
 
 ERRORS = ("x (m)", "y (m)", "z (m)", "yaw (rad)")
 INSIDE = 0.9545  # share of a normal error within SIGMAS standard deviations
-CONSISTENT = "95 % of χ²"  # range of NEES that holds nineteen of twenty if the stated covariance is true
-BAND_GREY = "#9aa5b1"  # different from the colours of all marks of time
+CONSISTENT = "95 % of χ²"  # range of NEES that contains 95 % of the samples of a consistent estimator
+BAND_GREY = "#9aa5b1"  # different from the colours of all time marks
 FLOOR = 0.1  # of NEES on its logarithmic axis
 
 
@@ -229,7 +229,7 @@ def draw_estimates(
     window_s: tuple[float, float],
     marks: style.TimeMarks,
 ) -> Figure:
-    """Return estimate − truth with its band, and NEES, of every drone; of many their spread."""
+    """Draw estimate − truth with its band, and NEES, of every drone; for many drones their spread."""
     if len(errors) > EACH_MAX:
         return _draw_many_estimates(errors, colours, window_s, marks)
     figure = style.new_figure(style.PAGE_IN, 0.8 + 0.95 * (len(ERRORS) + 1))
@@ -249,7 +249,7 @@ def draw_estimates(
         notes = [f"{100 * share:.0f} % in {drone_errors.SIGMAS:g}σ" for share in inside]
         notes.append(f"mean {known.mean():.3g}, of {drone_errors.DEGREES}" if len(known) else "P is singular")
         column[0].set_title(name, loc="left", fontsize=style.PAPER_PT)
-        for axes, note in zip(column, notes, strict=True):  # above the axes, where it covers no curve
+        for axes, note in zip(column, notes, strict=True):  # above the axes, where it covers no data
             axes.set_title(note, loc="right", fontsize=SMALL_PT, pad=2.0)
         style.draw_marks(column, marks)
     since_s = -np.inf if marks.engaged_s is None else marks.engaged_s  # the large sigmas of the start leave the axes
@@ -274,7 +274,7 @@ def _rows(errors: drone_errors.EstimateErrors, window_s: tuple[float, float]) ->
 
 
 def _draw_nees(axes: Axes, t_s: Array, nees: Array, colour: str, of: int = 1) -> None:
-    """Draw NEES, or its mean over `of` drones, with the range that holds nineteen of twenty consistent ones."""
+    """Draw NEES, or its mean over `of` drones, with the 95 % range of a consistent estimator."""
     style.dress(axes)
     low, high = (float(chdtri(of * drone_errors.DEGREES, share)) / of for share in (0.975, 0.025))
     axes.axhspan(low, high, zorder=0.6, label=CONSISTENT, fc="none", ec=BAND_GREY, hatch="////", lw=0.0)
@@ -289,8 +289,8 @@ def _draw_many_estimates(
     window_s: tuple[float, float],
     marks: style.TimeMarks,
 ) -> Figure:
-    """Return position error and mean NEES over time, and the statistics of each drone within the window."""
-    t_s = reduce(np.intersect1d, (each.t_s for each in errors.values()))  # at which all drones have estimates
+    """Draw position error and mean NEES over time, and the statistics of each drone within the window."""
+    t_s = reduce(np.intersect1d, (each.t_s for each in errors.values()))  # instants with estimates of all drones
     places = [np.searchsorted(each.t_s, t_s) for each in errors.values()]
     pairs = list(zip(errors.values(), places, strict=True))
     distance = np.column_stack(
@@ -339,13 +339,13 @@ def _draw_many_estimates(
 # Velocities and distances
 
 VELOCITIES = ("forward (m/s)", "left (m/s)", "up (m/s)", "yaw rate (rad/s)")
-GAP_S = 0.5  # a drone without commands for longer is not flown by velocity, and its lines break
+GAP_S = 0.5  # lines break where a drone has no velocity commands for longer
 
 
 def draw_velocities(
     responses: Mapping[str, drone_errors.VelocityResponse], colours: Mapping[str, str], marks: style.TimeMarks
 ) -> Figure:
-    """Return commanded and flown velocity of every drone; of many the spread of their difference."""
+    """Draw commanded and flown velocity of every drone; for many drones the spread of their difference."""
     if len(responses) > EACH_MAX:
         return _draw_many_velocities(responses, marks)
     figure = style.new_figure(style.PAGE_IN, 0.8 + 0.85 * len(VELOCITIES))
@@ -364,7 +364,7 @@ def draw_velocities(
 
 
 def _draw_many_velocities(responses: Mapping[str, drone_errors.VelocityResponse], marks: style.TimeMarks) -> Figure:
-    """Return the spread of flown − commanded over all drones."""
+    """Draw the spread of flown − commanded over all drones."""
     t_s = reduce(np.union1d, (each.t_s for each in responses.values()))
     panels = ("horizontal (m/s)", "up (m/s)", "yaw rate (rad/s)")
     values = np.full((len(panels), len(t_s), len(responses)), np.nan)
@@ -389,7 +389,7 @@ OFF = ("east (m)", "north (m)", "up (m)", "heading (deg)")  # of truth − refer
 def draw_references(
     errors: Mapping[str, drone_errors.ReferenceErrors], colours: Mapping[str, str], marks: style.TimeMarks
 ) -> Figure:
-    """Return truth − reference of every drone that flies by itself; of many their spread."""
+    """Draw truth − reference of every drone that flies by itself; for many drones their spread."""
     figure = style.new_figure(style.COLUMN_IN, 0.9 + 0.85 * len(OFF))
     grid = figure.subplots(len(OFF), 1, squeeze=False, sharex=True)
     t_s = reduce(np.union1d, (each.t_s for each in errors.values()))
@@ -420,7 +420,7 @@ def draw_distances(
     colours: Mapping[str, str],
     marks: style.TimeMarks,
 ) -> Figure:
-    """Return the distances of every pair in the colours of both, and their limits; of many those to the nearest."""
+    """Draw the distance of every pair in both colours, and the limits; for many drones that to the nearest one."""
     figure = style.new_figure(style.COLUMN_IN, 2.5)
     axes = figure.subplots()
     if distances.pairs:
@@ -449,12 +449,12 @@ def draw_distances(
 
 # Radio
 
-CELLS_MAX = 6  # drones whose cells have room for a number
-DARK_SHARE = 0.6  # from which on a cell is dark
+CELLS_MAX = 6  # drones for which cells have room for a number
+DARK_SHARE = 0.6  # from which a cell is dark
 
 
 def draw_radio(radio: RadioHistory, names: Sequence[str], marks: style.TimeMarks) -> Figure:
-    """Return who hears whom how often, and how many others each drone hears over time."""
+    """Draw the share of messages received on each link, and how many drones each drone hears over time."""
     figure = style.new_figure(style.PAGE_IN, 2.6)
     matrix, axes = figure.subplots(1, 2, width_ratios=(1, 2))
     style.dress(matrix, "receiver")

@@ -1,4 +1,4 @@
-"""What all figures share: colours, axes, lines, legends, spreads of many lines, and marks of time on their axes."""
+"""Common style of all figures: colours, axes, lines, legends, spreads of many lines, and time marks."""
 
 import io
 from collections.abc import Iterable, Iterator
@@ -21,11 +21,11 @@ from zsim_analysis.reading.recorded_flight import Array, RecordedFlight
 COLUMN_IN, PAGE_IN = 3.5, 7.16  # widths of a column and of a page of IEEE's conference papers
 DPI = 200  # of PNG files
 PAPER_PT = 8.0  # text size: that of a paper's captions
-LETTER_EMS, ENTRY_EMS = 0.6, 3.4  # width of a letter, and of an entry of a legend without its name, in text sizes
+LETTER_EMS, ENTRY_EMS = 0.6, 3.4  # width of a letter, and of a legend entry without its name, in text sizes
 LETTER_PAD_PT = 3.0  # between the letter of a panel and its axes
 MARK_EMS, LINE_EMS = 0.75, 1.25  # width of a bold letter and height of a line, in text sizes
-MARK_LINES, MARK_PAD_IN = 4, 0.05  # greatest number of lines of a mark's reason, and room above a mark
-FONTS: Any = {"pdf.fonttype": 42, "svg.hashsalt": "zsim"}  # TrueType: IEEE takes no Type 3
+MARK_LINES, MARK_PAD_IN = 4, 0.05  # greatest number of lines of a mark's reason, and margin above a mark
+FONTS: Any = {"pdf.fonttype": 42, "svg.hashsalt": "zsim"}  # TrueType: IEEE does not accept Type 3
 POINTS = 2000  # per line: more than a page has pixels
 # Okabe and Ito's colours, distinct with every kind of colour vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
@@ -33,7 +33,7 @@ BLUE, VERMILION, PURPLE = "#0072b2", "#d55e00", "#cc79a7"
 GREY, DARK, GRID = "#8c959f", "#444c56", "#c9d1d9"
 AMBER = "#9a6a00"  # an orange that is legible as small print on white
 DESIRED: dict[str, Any] = {"color": BLACK, "lw": 1.0, "ls": (0, (5, 3)), "zorder": 4}
-MEASURED: dict[str, Any] = {"color": ORANGE, "lw": 1.1, "zorder": 2}  # seen on both sides of truth where they agree
+MEASURED: dict[str, Any] = {"color": ORANGE, "lw": 1.1, "zorder": 2}  # wide enough to be visible behind the truth
 TRUE: dict[str, Any] = {"color": BLUE, "lw": 0.6, "zorder": 3}
 SPREAD = (5.0, 50.0, 95.0)  # percentiles
 SPREAD_INSTANTS = 1000  # at which percentiles are computed
@@ -51,7 +51,7 @@ class ReportFigure(Struct, frozen=True):
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """Width and height of its PNG file, by which a browser lays out the page before it has loaded it."""
+        """Width and height of its PNG file, for a browser's layout before the image is loaded."""
         width, height = self.drawing.get_size_inches() * self.drawing.dpi
         return round(width), round(height)
 
@@ -61,14 +61,14 @@ class ReportFigure(Struct, frozen=True):
         return self.drawing.get_size_inches()[0] <= COLUMN_IN
 
     def png(self) -> bytes:
-        """Return the figure as a PNG file; this lays it out for all its files."""
+        """Return the figure as a PNG file; this fixes the layout for all its files."""
         file = io.BytesIO()
         self.drawing.savefig(file, format="png")
         self.drawing.set_layout_engine("none")
         return file.getvalue()
 
     def vector(self, form: str) -> bytes:
-        """Return the figure as a file of one of `zsim_analysis.report.FORMATS`, the same bytes each time."""
+        """Return the figure as a file in one of `zsim_analysis.report.FORMATS`, the same bytes each time."""
         file = io.BytesIO()
         stamp = "CreationDate" if form == "pdf" else "Date"
         with rc_context(FONTS):
@@ -82,7 +82,7 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def dress(axes: Axes, label: str = "") -> None:
-    """Set the grid, spines and text size of axes, and the label of their y axis."""
+    """Set the grid, spines and text size of axes, and their y label."""
     axes.grid(True, color=GRID, lw=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -105,13 +105,13 @@ def label(name: str) -> str:
 
 
 def scale(axes: Axes, *values: Array, pad: float = 0.06) -> None:
-    """Set the range of a y axis to that of some values, not of all that is drawn, if they have any width."""
+    """Set the range of a y axis to that of `values`, unless that is empty or has no width."""
     if limits := padded_range(np.concatenate(values), pad):
         axes.set_ylim(limits)
 
 
 def padded_range(samples: Array, share: float) -> tuple[float, float] | None:
-    """Return the range of the finite samples, padded at each end by a share of it; None if it has no width."""
+    """Return the range of the finite samples, padded at each end by a share of it; None if it is empty."""
     known = samples[np.isfinite(samples)]
     if not len(known) or known.max() <= known.min():
         return None
@@ -120,12 +120,12 @@ def padded_range(samples: Array, share: float) -> tuple[float, float] | None:
 
 
 def line(axes: Axes, x: Array, y: Array, **style: Any) -> None:
-    """Draw a line with no more points than are visible."""
+    """Draw a line with at most POINTS points."""
     axes.plot(*thinned(x, y), **style)
 
 
 def thinned(x: Array, y: Array) -> tuple[Array, Array]:
-    """Return a line of at most POINTS points: minimum and maximum of each bin, so that no extreme is lost."""
+    """Reduce a line to at most POINTS points: minimum and maximum of each bin, which keeps all extremes."""
     if len(x) <= POINTS:
         return x, y
     size = -(-len(x) // (POINTS // 2))
@@ -139,7 +139,7 @@ def thinned(x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def draw_spread(axes: Axes, t_s: Array, values: Array, colour: str) -> None:
-    """Draw many lines as their median, the band that holds nine of ten, and their extremes, none of which is lost.
+    """Draw many lines as their median, the band from 5 to 95 %, and their extremes, which are all kept.
 
     t_s is (K,) simulated time, values (K, N), NaN where unknown.
     """
@@ -159,7 +159,7 @@ def draw_spread(axes: Axes, t_s: Array, values: Array, colour: str) -> None:
 
 
 def letter_panels(panels: Iterable[Axes]) -> None:
-    """Letter panels with their titles, in reading order, (a), (b) and so on; a single one gets no letter."""
+    """Letter panels in reading order, (a), (b) and so on; a single one gets no letter."""
     panels = list(panels)
     for number, axes in enumerate(panels if len(panels) > 1 else ()):
         letters = chr(ord("a") + number % 26) * (1 + number // 26)
@@ -169,11 +169,11 @@ def letter_panels(panels: Iterable[Axes]) -> None:
         if title:
             axes.set_title(f"({letters}) {title}", loc=place, **look)
         else:
-            axes.set_title(f"({letters})", loc=place, ha="right", **look)  # beside all that stands above axes
+            axes.set_title(f"({letters})", loc=place, ha="right", **look)  # left of other text above the axes
 
 
 def finish(figure: Figure, lettered: Iterable[Axes], grid: Any, legend_columns: int) -> None:
-    """Letter some panels of a grid over time, label its time axes, align its labels, and put the legend above it."""
+    """Finish a grid of panels over time: letters, time labels, aligned labels, and the legend above it."""
     letter_panels(lettered)
     label_time(grid[-1])
     figure.align_ylabels(grid[:, 0])
@@ -181,7 +181,7 @@ def finish(figure: Figure, lettered: Iterable[Axes], grid: Any, legend_columns: 
 
 
 def legend_above(figure: Figure, axes: Axes, columns: int = 8) -> None:
-    """Put the legend of all axes above a figure, where it covers no data: each name once, those of `axes` first."""
+    """Put the legend of all axes above a figure: each name once, those of `axes` first."""
     named: dict[str, Any] = {}
     for each in (axes, *figure.axes):
         for handle, name in zip(*each.get_legend_handles_labels(), strict=True):
@@ -194,7 +194,7 @@ def legend_above(figure: Figure, axes: Axes, columns: int = 8) -> None:
 
 
 def mark_figure(figure: Figure, head: str, reason: str, colour: str) -> None:
-    """Write a warning about its flight above a complete figure, which grows by the height of the mark.
+    """Write a warning about the flight above a complete figure, and enlarge the figure by its height.
 
     `head` is the first line; `reason` is wrapped below it, and cut after MARK_LINES lines.
     """
@@ -211,24 +211,24 @@ def mark_figure(figure: Figure, head: str, reason: str, colour: str) -> None:
         if box.y0 > figure.bbox.height / 2:  # not one below the axes
             room_px = max(room_px, box.height + figure.dpi * PAPER_PT / 72)
             legend.set_bbox_to_anchor((0.0, 0.0, 1.0, top), figure.transFigure)
-    if isinstance(engine := figure.get_layout_engine(), ConstrainedLayoutEngine):  # which ignores an anchored legend
+    if isinstance(engine := figure.get_layout_engine(), ConstrainedLayoutEngine):  # it ignores an anchored legend
         engine.set(rect=(0.0, 0.0, 1.0, top - room_px / figure.bbox.height))
 
 
-# Marks of time
+# Time marks
 
 FAULT, TAKE_OVER = "fault", "taken over"
 COLOURS = {"assembly": SKY, "held": ORANGE, "landing": GREEN, FAULT: VERMILION, TAKE_OVER: PURPLE}
 ALPHA = 0.22
-SHORT, HAIRLINE_PT = 0.005, 0.8  # bands shorter than this share of their axis are drawn as a line of this width
+SHORT, HAIRLINE_PT = 0.005, 0.8  # bands shorter than this share of the axis are drawn as a line of this width
 WINDOW = "window of the statistics"
-WINDOW_GREY = "#e7ebf0"  # between white and the grid lines upon it
+WINDOW_GREY = "#e7ebf0"  # lighter than the grid lines
 ASSEMBLY = {"taking_off": "assembly", "assembling": "assembly"}
 RETURNS = ("restart", "superseded", "join")  # events of a process that takes part again
 
 
 class Band(Struct, frozen=True):
-    """Something that lasted, from and to simulated time."""
+    """An interval of simulated time."""
 
     kind: str
     from_s: float
@@ -236,12 +236,12 @@ class Band(Struct, frozen=True):
 
 
 class TimeMarks(Struct, frozen=True):
-    """Marks on the time axes of a flight; times [s], None where it never happened."""
+    """Marks on the time axes of a flight; times [s], None for events that did not occur."""
 
     takeoff_s: float | None = None  # of the first drone
     engaged_s: float | None = None  # of the formation
     bands: tuple[Band, ...] = ()  # phases, faults and take-overs
-    span_s: tuple[float, float] | None = None  # the run, which every time axis shows whole; None: only what is drawn
+    span_s: tuple[float, float] | None = None  # the whole run, shown on every time axis; None: the range of the data
 
     def has(self, kind: str) -> bool:
         return any(band.kind == kind for band in self.bands)
@@ -250,7 +250,7 @@ class TimeMarks(Struct, frozen=True):
 def time_marks(flight: RecordedFlight, formation: Formation | None = None) -> TimeMarks:
     """Return the marks of a flight, with the phases and the engagement of a formation."""
     bands = [*_faults(flight), *_take_overs(flight)]
-    if formation and formation.phases:  # those other than idle and engaged
+    if formation and formation.phases:  # all except idle and engaged
         phases = np.array(formation.phases)
         starts = np.flatnonzero(np.r_[True, phases[1:] != phases[:-1]])
         ends = np.r_[formation.t_s[starts[1:]], formation.t_s[-1]]
@@ -263,7 +263,7 @@ def time_marks(flight: RecordedFlight, formation: Formation | None = None) -> Ti
     start_s = flight.first_ns / 1e9 if flight.replay_of else 0.0  # a replay may begin anywhere
     engaged_s = formation.engaged_s if formation else None
     kinds = list(dict.fromkeys(band.kind for band in bands))
-    united: list[Band] = []  # those of a kind that overlap or touch, such as of several drones, are one
+    united: list[Band] = []  # overlapping or adjacent bands of a kind, such as of several drones, are merged
     for band in sorted(bands, key=lambda band: (kinds.index(band.kind), band.from_s)):
         if united and united[-1].kind == band.kind and band.from_s <= united[-1].to_s:
             united[-1] = Band(band.kind, united[-1].from_s, max(united[-1].to_s, band.to_s))
@@ -273,7 +273,7 @@ def time_marks(flight: RecordedFlight, formation: Formation | None = None) -> Ti
 
 
 def _faults(flight: RecordedFlight) -> Iterator[Band]:
-    """Yield the injected faults, up to the end of the flight unless something ends them."""
+    """Yield the injected faults; those that are not ended last until the end of the flight."""
     ends = {event.data.get("id"): event.t_ns for event in flight.events if event.kind in ("fault_end", "fault_clear")}
     for place, event in enumerate(flight.events):
         if event.kind == "fault":
@@ -288,7 +288,7 @@ def _faults(flight: RecordedFlight) -> Iterator[Band]:
 
 
 def _take_overs(flight: RecordedFlight) -> Iterator[Band]:
-    """Yield the times in which others than the scenario's agents flew a drone: from acquisition or first command on."""
+    """Yield the times when someone other than the scenario's agents flew a drone, from acquisition or first command."""
     since_ns: dict[str, int] = {}
     planned = {"controller", PILOT, *(flight.scenario.own_agents if flight.scenario else ())}
     for event in flight.events:
@@ -307,7 +307,7 @@ def _take_overs(flight: RecordedFlight) -> Iterator[Band]:
 
 
 def draw_marks(axes: Iterable[Axes], marks: TimeMarks, whole: bool = True) -> None:
-    """Draw marks into axes of time that already hold their lines; `whole` extends them to the whole run."""
+    """Draw marks into time axes that already contain their data; `whole` extends them to the whole run."""
     for each in axes:
         if whole and marks.span_s:
             each.update_datalim([(t_s, 0.0) for t_s in marks.span_s], updatey=False)

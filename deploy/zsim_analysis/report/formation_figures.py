@@ -1,4 +1,4 @@
-"""The paper's figures of a formation: errors (5), position (6), orientation (7) and shape (8), sized for its page."""
+"""The paper's figures of a formation: errors (5), position (6), orientation (7) and shape (8), sized for a page."""
 
 from collections.abc import Iterable, Sequence
 
@@ -21,7 +21,7 @@ MOVED_MAX = 3  # parameters of a large formation that are drawn individually
 
 
 def parameter_groups(names: Sequence[str]) -> list[tuple[str, int, str, list[str]]]:
-    """Return the paper's figures of parameters over time: file, number, title, and the names that each shows."""
+    """Return the paper's figures of parameters over time: file, number, title and parameter names."""
     position, orientation = ([name for name in group if name in names] for group in (POSITION, ORIENTATION))
     shape = [name for name in names if name not in POSITION + ORIENTATION and "phi" not in name]
     return [
@@ -39,9 +39,9 @@ def numbered(number: int, paper: bool) -> str:
 def draw_errors(
     formation: Formation, window_s: tuple[float, float], marks: style.TimeMarks, goal: GoalErrors | None = None
 ) -> Figure:
-    """Return Figure 5: a row per parameter, errors against the final goal, the reference, and within the window.
+    """Draw Figure 5: a row per parameter, errors against the final goal, the reference, and within the window.
 
-    A large formation has rows for position and orientation, and one for all others of each unit.
+    A large formation has rows for position and orientation, and one for all other parameters of each unit.
     """
     names = list(formation.names)
     if len(names) > ROWS_MAX:
@@ -89,7 +89,7 @@ def _by_unit(names: Iterable[str]) -> dict[str, list[str]]:
 
 
 def draw_error(axes: Axes, formation: Formation, name: str, rows: np.ndarray) -> None:
-    """Draw the errors of a parameter, estimated and true, at some instants."""
+    """Draw the estimated and true errors of a parameter at the instants `rows`."""
     i, since = formation.column(name), formation.since_engaged[rows]
     _draw_error(axes, formation.t_s[rows], formation.true_error[rows, i], formation.est_error[rows, i])
     style.scale(axes, formation.true_error[rows, i][since], formation.est_error[rows, i][since])
@@ -112,7 +112,7 @@ def _draw_no_goal(axes: Axes) -> None:
 
 
 def _draw_others(axes: Axes, formation: Formation, members: Sequence[str], rows: np.ndarray) -> None:
-    """Draw the true errors of many parameters at some instants as their spread."""
+    """Draw the spread of the true errors of many parameters at the instants `rows`."""
     style.dress(axes)
     axes.axhline(0, color=style.BLACK, lw=0.5, zorder=1)
     errors = formation.true_error[:, [formation.column(name) for name in members]]
@@ -131,9 +131,9 @@ def _write_statistics(axes: Axes, formation: Formation, i: int, rows: np.ndarray
 
 
 def draw_parameters(formation: Formation, names: Sequence[str], marks: style.TimeMarks) -> Figure:
-    """Return Figure 6, 7 or 8: desired, measured and true values of some parameters over the run.
+    """Draw Figure 6, 7 or 8: desired, measured and true values of some parameters over the run.
 
-    If there are more than fit, the figure shows those whose desired value moves most, and the true errors of all.
+    If there are too many, the figure shows those whose desired value moves most, and the true errors of all.
     """
     shown, others, since = list(names), dict[str, list[str]](), formation.since_engaged
     if len(names) > ROWS_MAX:
@@ -166,8 +166,8 @@ def draw_parameters(formation: Formation, names: Sequence[str], marks: style.Tim
 def curves(formation: Formation, name: str) -> tuple[Array, Array, Array]:
     """Return desired, measured and true values of a parameter, angles without jumps at ±π.
 
-    Angles are unwrapped from the engagement on: before it the desired value is the estimate, whose noise may turn it by
-    whole revolutions; each is brought within half a turn of the first desired value.
+    Angles are unwrapped from the engagement on. Before it, the desired value is the noisy estimate, which may wind up
+    by whole revolutions; there each value is brought within half a turn of the first desired one.
     """
     i = formation.column(name)
     desired = formation.desired[:, i].copy()

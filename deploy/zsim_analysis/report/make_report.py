@@ -1,7 +1,7 @@
 """Makes the report of a run: record in; summary.json, figures/*.png and report.html out.
 
-A page contains everything, figures included; it loads nothing from the network. What writes it serves comparisons and
-sweeps as well.
+A page is self-contained, figures included; it loads nothing from the network. Comparisons and sweeps are written by
+the same functions.
 """
 
 import base64
@@ -50,10 +50,10 @@ Picture = tuple[ReportFigure, bytes]  # a figure and its PNG file
 def make_report(
     directory: Path, progress: Callable[[str], None] = lambda _: None, formats: Sequence[str] = ()
 ) -> RunSummary:
-    """Read DIR/run.mcap, write DIR/summary.json, DIR/figures/*.png and DIR/report.html, as `write_report`.
+    """Read DIR/run.mcap, and write DIR/summary.json, DIR/figures/*.png and DIR/report.html, as `write_report` does.
 
     Raises:
-        RecordError: there is no record, or it holds no truth of any drone.
+        RecordError: there is no record, or it contains no truth of any drone.
         ReportError: the directory cannot be written.
     """
     flight, formations, summary = judge(directory / RECORD, progress, answers=True)
@@ -94,7 +94,7 @@ def planned_figures(
     flight: RecordedFlight, formations: Sequence[Formation], window_s: tuple[float, float]
 ) -> Iterator[PlannedFigure]:
     """Yield the figures for which the record has data."""
-    for i, formation in enumerate(formations):  # the first cluster's have names without the cluster's
+    for i, formation in enumerate(formations):  # figures of the first cluster have no suffix
         yield from _of_cluster(flight, formation, window_s, f"_{formation.name}" if i else "")
     marks = time_marks(flight, formations[0] if formations else None)
     colours = colours_of([track.name for track in flight.tracks])
@@ -200,7 +200,7 @@ def page(summary: RunSummary, pictures: Sequence[Picture]) -> str:
 
 
 def facts(summary: RunSummary) -> list[tuple[str, str]]:
-    """Return the lines at the head of the page: pairs of a label and its value."""
+    """Return the lines at the top of the page: label and value."""
     age = summary.command_age_ms
     ages = f"p50 {age['p50']:.2f} ms, p99 {age['p99']:.2f} ms, max {age['max']:.2f} ms" if age else "not known"
     factor = "not known" if summary.real_time_factor is None else f"{summary.real_time_factor:.1f}"
@@ -243,12 +243,12 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
 
 
 def changed_text(changed: Sequence[str] | None) -> str:
-    """Return the differences of a scenario from its file in words."""
+    """Describe the differences of a scenario from its file."""
     return "not known" if changed is None else ", ".join(changed) or "nothing: as in its file"
 
 
 def obstacle_text(distances_m: Mapping[str, float]) -> str:
-    """Return the least of all drones' distances from obstacles, and whose it is."""
+    """Describe the least distance of any drone from obstacles."""
     nearest = min(distances_m, key=lambda drone: distances_m[drone])
     return f"at least {distances_m[nearest]:.2f} m in truth, of {nearest}, from its centre to a surface"
 
@@ -259,12 +259,12 @@ def radio_text(radio: RadioSummary) -> str:
 
 
 def date_text(date: str | None) -> str:
-    """Return a date of ISO 8601 to the minute, for readers."""
+    """Format an ISO 8601 date to the minute."""
     return f"{date[:16].replace('T', ' ')} UTC" if date else "not known"
 
 
 def template(name: str, package: str = "zsim_analysis.report") -> Template:
-    """Return a page's template, which may include others from its own package and from this one."""
+    """Return a page's template; it may include templates of its own package and of this one."""
     return Environment(
         loader=ChoiceLoader([PackageLoader(package, "."), PackageLoader("zsim_analysis.report", ".")]),
         autoescape=True,
@@ -274,7 +274,7 @@ def template(name: str, package: str = "zsim_analysis.report") -> Template:
 
 
 def sources(pictures: Iterable[Picture]) -> list[tuple[ReportFigure, str]]:
-    """Return each figure with its PNG file as a data URI, so that the page needs no other file."""
+    """Return each figure with its PNG file as a data URI."""
     return [(figure, "data:image/png;base64," + base64.b64encode(png).decode()) for figure, png in pictures]
 
 
@@ -291,7 +291,7 @@ def write_report(
 ) -> None:
     """Write DIR/summary.json, DIR/figures/*.png and DIR/report.html, all or none of them.
 
-    Files of these figures in other formats, from an earlier report, are removed: they show another drawing.
+    Files of these figures in other formats, from an earlier report, are removed because they are outdated.
 
     Args:
         directory: of the run or the sweep.
@@ -299,7 +299,7 @@ def write_report(
         figures: drawn one by one.
         page: makes the page from the pictures.
         progress: called with a text at each step.
-        formats: of `zsim_analysis.report.FORMATS`, in which figures are written beside their PNG files.
+        formats: further formats of the figures beside PNG, of `zsim_analysis.report.FORMATS`.
 
     Raises:
         ReportError: the directory cannot be written.
@@ -356,10 +356,10 @@ def _remove_others(pictures: Iterable[Picture], folder: Path, formats: Sequence[
 
 @contextmanager
 def _put_in_place(directory: Path, report: Path, figures: Path) -> Iterator[Path]:
-    """Yield a folder whose files are moved into a directory when all are complete: a full disk or Ctrl-C leaves none.
+    """Yield a folder whose files are moved into a directory when all are complete, none on a full disk or Ctrl-C.
 
     Raises:
-        ReportError: the directory cannot be written, and the line begins with `report`; or `figures` in it is a link,
+        ReportError: the directory cannot be written (the error names `report`), or `figures` in it is a symbolic link,
             through which files elsewhere would be written and removed.
     """
     if figures.is_symlink():

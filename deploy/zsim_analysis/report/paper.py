@@ -1,4 +1,4 @@
-"""Results printed in the paper, and which flights are comparable with them: by what they flew, not by a name. Pure.
+"""Results printed in the paper, and which flights are comparable with them, judged by their scenarios. Pure.
 
 I. Mas, S. Curi, R. Sanchez Pena, Open-source Multi-UAV Simulator for the ROS Environment.
 """
@@ -66,7 +66,7 @@ def paper_table_of(flight: RecordedFlight, formation: Formation, window_s: tuple
 
 
 def paper_table(scenario: Scenario, cluster: str) -> Mapping[str, float]:
-    """Return Table I for a cluster whose scenario is Test 1, and lasts long enough; empty for any other one."""
+    """Return Table I for a cluster whose scenario is Test 1 and lasts long enough; empty for any other."""
     own, window_s = cluster_of(scenario, cluster), scenario.report.window_s
     if own is None or window_s is None or own.plan.takeoff_s is None:
         return {}
@@ -78,7 +78,7 @@ def paper_table(scenario: Scenario, cluster: str) -> Mapping[str, float]:
 
 
 def flies_paper_test(flight: RecordedFlight, cluster: str) -> bool:
-    """Return whether a cluster flew one of the paper's tests, for any time, and whatever the window."""
+    """Return whether a cluster flew one of the paper's tests, regardless of duration and window."""
     scenario = flight.scenario
     if scenario is None or any(event.kind == "fault" for event in flight.events):
         return False
@@ -95,7 +95,7 @@ def _is_set_up(scenario: Scenario, cluster: Cluster) -> bool:
 
 
 def _is_along_equation_4(plan: ClusterPlan) -> bool:
-    """Return whether a plan's trajectory equals equation (4), however it is written."""
+    """Return whether a plan's trajectory is equivalent to equation (4)."""
     trajectory = plan.trajectory
     if trajectory is None or trajectory.waypoints or set(trajectory.expressions) != set(TEST_2_REFERENCE):
         return False

@@ -1,4 +1,4 @@
-"""summary.json: what was flown, and how well; and its tables of errors, for the page and the terminal."""
+"""summary.json: the facts and the errors of a flight; and its tables of errors, for the page and the terminal."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -37,7 +37,7 @@ from zsim_analysis.reading.shortfall import (
 from zsim_analysis.report.paper import PAPER_TABLE_1, paper_table_of
 
 STATISTICS = {"est. std": "est_std", "true std": "true_std", "true RMS": "true_rms", "true mean": "true_mean"}
-EVENTS_PER_KIND = 100  # so that many refusals do not push a restart out of the list
+EVENTS_PER_KIND = 100  # so that many refusals do not displace a restart
 EVENTS_MAX = 1000
 
 
@@ -52,18 +52,18 @@ class EventLine(Struct, frozen=True):
 
 
 class ClusterErrors(Struct, frozen=True):
-    """How one cluster flew within the window."""
+    """The errors of one cluster within the window."""
 
     drones: tuple[str, ...]  # of the cluster
     # over the instants of the window at which it was engaged; None each if it never was
     errors: dict[str, ParameterErrors]
-    paper_std: dict[str, float] = {}  # Table I beside a flight of Test 1, otherwise empty
+    paper_std: dict[str, float] = {}  # Table I for a flight of Test 1, otherwise empty
     engaged_share: float | None = None  # share of the window's instants at which it was engaged; None without any
     phases: dict[str, float] = {}  # shares of the window's instants by phase
 
     @property
     def part(self) -> str:
-        """Describe the part of the window over which the errors are; empty if it is all of it."""
+        """Describe the part of the window that the errors cover; empty if it is all of it."""
         if self.engaged_share in (None, 1.0):
             return ""
         if not self.engaged_share:
@@ -75,16 +75,16 @@ class RecordFacts(Struct, frozen=True):
     """The record from which the report was made."""
 
     messages: int
-    complete: bool  # nothing that the world published is missing, nor the end of the run
-    state: str  # that, and what is missing, in words
+    complete: bool  # no message of the world is missing, nor the end of the run
+    state: str  # the same in words, with what is missing
     gates: int  # on record
-    gates_missing: int  # by the clocks
-    gaps: list[dict[str, float]]  # runs of missing gates: their number, and the first and the last of them
-    messages_missing: int  # of the world, by their sequence numbers
-    undecoded: int  # messages that are not of the type of their key
+    gates_missing: int  # according to the clocks
+    gaps: list[dict[str, float]]  # sequences of missing gates: their number, and the first and the last gate
+    messages_missing: int  # of the world, according to sequence numbers
+    undecoded: int  # messages that do not match the type of their key
     truth_instants: int  # truth messages in the hash: those of simulated drones
-    truth_missing: int  # truth messages that a complete run of this length would have in addition
-    truth_sha256: str  # as TruthHash of all truth messages, by time, then in the order of the drones
+    truth_missing: int  # further truth messages that a complete run of this length would have
+    truth_sha256: str  # TruthHash of all truth messages, by time, then in the order of the drones
 
 
 class RunSummary(Struct, frozen=True):
@@ -95,14 +95,14 @@ class RunSummary(Struct, frozen=True):
     mode: str | None
     run_id: str | None
     date: str | None  # when it was flown, to the second in UTC (ISO 8601)
-    changed: list[str] | None  # texts `a.b.c=value` by which the scenario differs from its file
+    changed: list[str] | None  # overrides `a.b.c=value` of the scenario's file
     versions: dict[str, str]
     fingerprint: str | None
     real_time_factor: float | None
     wall_s: float
     sim_s: float
     ended: str
-    as_planned: bool  # the flight followed its plan, as far as the run went; `shortfalls` has the deviations
+    as_planned: bool  # the flight followed its plan until the end of the run; `shortfalls` has the deviations
     shortfalls: list[Shortfall]
     deadlines: int | None
     deadline_misses: int | None
@@ -115,8 +115,8 @@ class RunSummary(Struct, frozen=True):
     clusters: dict[str, ClusterErrors]
     min_separation_m: float | None
     obstacle_distance_m: dict[str, float]  # least, from each drone's centre to obstacles and surfaces; empty without
-    tracking: dict[str, Tracking]  # against the references of single drones, of the window
-    radio: RadioSummary | None  # of the window; None where the scenario has none
+    tracking: dict[str, Tracking]  # against the references of single drones, within the window
+    radio: RadioSummary | None  # within the window; None if the scenario has none
     paper_table_1: dict[str, float]
     events: list[EventLine]
     events_left_out: dict[str, int]
@@ -137,12 +137,12 @@ def judge(
     With `answers` it includes the drones' estimates and velocity commands. `progress` receives a text at each step.
 
     Raises:
-        RecordError: there is no record, or it holds no truth of any drone.
+        RecordError: there is no record, or it contains no truth of any drone.
     """
     progress("reading the record")
     flight = read_flight(record, answers)
     if all(len(track.t_ns) == 0 for track in flight.tracks):
-        content = f"holds {flight.messages} messages and no truth" if flight.messages else "holds no message"
+        content = f"contains {flight.messages} messages but no truth" if flight.messages else "contains no messages"
         raise RecordError(f"{record}: {content} ({flight.completeness}); there is nothing to report")
     progress("computing the formation's errors")
     formations = formations_of(flight)
@@ -150,7 +150,7 @@ def judge(
 
 
 def summarise(flight: RecordedFlight, formations: list[Formation], record: Path) -> RunSummary:
-    """Return the summary of a flight; figures that the world did not report at its end are computed from the record."""
+    """Return the summary of a flight; values that the world did not report at its end are computed from the record."""
     end, info = flight.end or {}, flight.info
     facts = _record_facts(flight, end.get("last_ns", flight.last_ns))
     window_s, window_note = window_of(flight)
@@ -224,7 +224,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
 
 
 def obstacle_distances_m(flight: RecordedFlight) -> dict[str, float]:
-    """Return by drone the least true distance [m] of its centre from obstacles and surfaces, below 0 in an obstacle."""
+    """Return each drone's least true distance [m] from obstacles and surfaces to its centre, < 0 inside an obstacle."""
     if flight.scenario is None:
         return {}
     around = Surroundings(flight.scenario.environment)
@@ -241,7 +241,7 @@ def _record_facts(flight: RecordedFlight, last_ns: int) -> RecordFacts:
     order, truth = np.lexsort((drone, t_ns)), TruthHash(len(t_ns))
     truth.add(t_ns[order], states[order])
     gate_ns, missing = flight.info.gate_ns if flight.info else None, 0
-    if gate_ns and len(t_ns):  # a flight has truth from 0 or the first gate on, a replay from where it was begun
+    if gate_ns and len(t_ns):  # a flight has truth from 0 or the first gate on, a replay from its start
         first_ns = flight.first_ns if flight.replay_of else min(flight.first_ns, gate_ns)
         missing = max(0, len(tracks) * ((last_ns - first_ns) // gate_ns + 1) - len(t_ns))
     return RecordFacts(
@@ -262,11 +262,11 @@ def _record_facts(flight: RecordedFlight, last_ns: int) -> RecordFacts:
 def _notes(
     flight: RecordedFlight, record: RecordFacts, formations: list[Formation], window_s: tuple[float, float], note: str
 ) -> Iterator[str]:
-    """Yield what a reader should know about the figures."""
+    """Yield remarks for readers of the figures."""
     if flight.replay_of:
-        yield f"This is a replay of run {flight.replay_of}, no flight of its own."
+        yield f"This is a replay of run {flight.replay_of}, not a flight of its own."
     if flight.end is None:
-        yield "The world did not report the run's end; times and command age are worked out from the record."
+        yield "The world did not report the run's end; times and command age are computed from the record."
     if not flight.completeness.complete:
         yield f"The record is {flight.completeness}."
     if flight.undecoded:
@@ -288,9 +288,9 @@ def _notes(
     for cluster in flight.clusters:
         if own := [drone for drone in cluster.drones if drone in external]:
             are = f"{', '.join(own)}, whose {'body is' if len(own) == 1 else 'bodies are'} external"
-            yield f"Cluster {cluster.name} has {are}: nobody knows its truth, and no figure is against it."
+            yield f"Cluster {cluster.name} has {are}: its truth is not known, so it has no true errors."
         if cluster.name not in judged:
-            yield f"Cluster {cluster.name} published no state that can be judged: no table of it."
+            yield f"Cluster {cluster.name} published no state that can be judged; it has no table."
     for formation in formations:
         if not formation.within(window_s).any():
             yield f"Cluster {formation.name} published no state inside the window."
@@ -298,14 +298,14 @@ def _notes(
         yield "The scenario has no cluster: there is no table of errors."
     own = flight.info.fingerprint if flight.info else ""
     if others := [p.name for p in flight.processes if own and p.fingerprint and p.fingerprint != own]:
-        text = "computed with other code than the world (fingerprint); the same bits are not promised."
+        text = "computed with other code than the world (fingerprint); the same bits are not guaranteed."
         yield f"{', '.join(others)} {text}"
 
 
-# Tables of errors, of a large formation first by groups of parameters
+# Tables of errors; a large formation first has a table of groups of parameters
 
 PAPER_COLUMN = "paper std"
-COLUMNS = {  # by their names on the page: as on the terminal, and the statistic
+COLUMNS = {  # by name on the page: column on the terminal, and statistic
     "parameter": (Column("parameter", "name"), ""),
     PAPER_COLUMN: (Column("paper\nstd", worth=4, right=True), ""),
     "est. std": (Column("est.\nstd", worth=3, right=True), "est_std"),
@@ -322,12 +322,12 @@ GROUP_COLUMNS = {
     "worst": (Column("worst", worth=3, right=True), ""),
     "of": (Column("of", "name"), ""),
 }
-SINGLY_MAX = 24  # parameters of a formation that need no table by groups: of 6 drones
+SINGLY_MAX = 24  # more parameters are shown in groups; 6 drones have 24
 FRAME = {"x_c": "position", "y_c": "position", "z_c": "position"} | dict.fromkeys(("roll", "pitch", "yaw"), "attitude")
 
 
 class ErrorTable(Struct, frozen=True):
-    """Columns and rows of text; `rest` has every parameter if the rows are of groups."""
+    """Columns and rows of text; `rest` has every parameter if the rows are groups."""
 
     columns: list[str]
     rows: list[list[str]]
@@ -336,7 +336,7 @@ class ErrorTable(Struct, frozen=True):
 
 def error_table(cluster: ClusterErrors) -> ErrorTable:
     """Return a cluster's errors: a row per parameter, or per group of them if there are many."""
-    columns = [column for column in COLUMNS if column != PAPER_COLUMN or cluster.paper_std]  # beside Test 1 only
+    columns = [column for column in COLUMNS if column != PAPER_COLUMN or cluster.paper_std]
     rows = []
     for name, errors in cluster.errors.items():
         printed = cluster.paper_std.get(name)
@@ -346,7 +346,7 @@ def error_table(cluster: ClusterErrors) -> ErrorTable:
     single = ErrorTable(columns, rows)
     if len(cluster.errors) <= SINGLY_MAX:
         return single
-    # of each group its size, the root of its mean square errors, and the parameter with the largest RMS
+    # for each group its size, its root mean square errors, and the parameter with the largest RMS
     rows = []
     groups: dict[tuple[str, str], list[str]] = {}
     for name in cluster.errors:
@@ -371,7 +371,7 @@ TRACKING_COLUMNS = {  # by their names on the page
 
 
 def tracking_table(summary: RunSummary) -> ErrorTable:
-    """Return the errors of single drones against their references, a row each; of many the worst."""
+    """Return the errors of single drones against their references, a row each; only the worst if there are many."""
     ranked = sorted(summary.tracking.items(), key=lambda item: -(item[1].true_rms_m or 0.0))
     shown = dict(ranked[:SINGLY_MAX])
     rows = [
@@ -387,7 +387,7 @@ def _number(value: float | None) -> str:
 
 
 def terminal_text(summary: RunSummary) -> Group:
-    """Return the shortfalls of a flight, and a table of errors for each cluster, for the terminal."""
+    """Return the shortfalls of a flight and a table of errors for each cluster, for the terminal."""
     notes = [(f"note: {summary.window_note}", False)] if summary.window_note else []
     marks = [*marks_of(summary.shortfalls), *notes]
     lines = [Text(printable(mark), style="bold red" if fails else "yellow") for mark, fails in marks]
@@ -402,7 +402,7 @@ def terminal_text(summary: RunSummary) -> Group:
 
 
 def table(summary: RunSummary, cluster: str) -> FittedTable:
-    """Return the errors of one cluster, beside the paper's Table I for Test 1, for the terminal."""
+    """Return the errors of one cluster, with the paper's Table I for Test 1, for the terminal."""
     judged = summary.clusters[cluster]
     content = error_table(judged)
     title = f"Formation errors of {cluster} from {span_text(summary.window_s)}"

@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import msgspec
 import pyarrow as pa
@@ -143,7 +143,7 @@ class SweepScreen:
             console=self.console, get_renderable=lambda: cell(self.line()), refresh_per_second=5, transient=True
         )
 
-    def __enter__(self) -> "SweepScreen":
+    def __enter__(self) -> Self:
         self._start_s = self._now_s()
         if self.console.is_terminal:
             self._live.start()
