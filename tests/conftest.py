@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from xdist.scheduler import LoadGroupScheduling
 
+from zsim.math.compiled import Part
 from zsim_deploy.roles.stop_channel import lower_priority
 
 PURE = ("tests/authority/", "tests/contract/", "tests/unit/")
@@ -65,6 +66,12 @@ def pytest_collection_finish() -> None:
     commands: Any = sys.modules.get("forked_commands")
     if commands is not None:
         commands.FIRST = commands.inherited()
+
+
+@pytest.fixture
+def interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run parts of kernels that a test calls as Python, to the same bits; compiling one for that takes seconds."""
+    monkeypatch.setattr(Part, "__call__", lambda part, *arguments: part.py_func(*arguments))
 
 
 def pytest_configure(config: pytest.Config) -> None:

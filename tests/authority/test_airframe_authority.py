@@ -21,7 +21,7 @@ from zsim_world.physics.fleet_arrays import STATE, VEHICLE, Bodies
 from zsim_world.sensors.noise import NoiseTable
 from zsim_world.sensors.sensor_set import fleet_sensors
 
-pytestmark = pytest.mark.xdist_group("airframes")  # so that no worker waits for another that compiles the same
+pytestmark = pytest.mark.usefixtures("interpreted")
 
 ROTORS = slice(STATE.size, STATE.size + 4)  # of drone a: with the Iris there is a column more
 FAR_IRIS = {"name": "b", "position_m": [100, 0, 0], "model": "iris", "aerodynamics": {"rotor_drag_n_s2_m": 1e-4}}

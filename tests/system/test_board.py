@@ -21,11 +21,10 @@ class Hover(Pilot):
 
 
 def test_a_board_of_three_laws_is_flown_and_gone_on_with(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compiled: None
+    near: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "hovering.py").write_text(OWN)
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     laws, out = ["cluster_space", "consensus", "hovering:Hover"], tmp_path / "board"
     done = run_here("board", "--laws", ",".join(laws), "--scenarios", "drone_loss", "--seeds", "1", "-o", str(out))
     assert done.code == 0, done

@@ -92,8 +92,9 @@ def test_a_class_of_a_cell_flies_here_and_as_processes(notebook: Notebook) -> No
     assert sum(each["msg_type"] == "display_data" for each in said) == 1
     line = [each["content"]["data"]["text/plain"] for each in said if "data" in each["content"]][-1]
     assert " 12.0 / 12 s " in line
-    notebook.run("zsim.run('pair.yaml', duration_s=1, out='quiet', processes=True, progress=False)")
-    assert notebook.run("print(chr(27) in open('quiet/logs/zsim-run.log').read())") == "False\n"
+    notebook.run("from pathlib import Path; from zsim_api.programs import Program")
+    notebook.run("Program(['sh', '-c', 'echo ${FORCE_COLOR-none}'], output=Path('colours.log')).wait()")
+    assert notebook.run("print(Path('colours.log').read_text(), end='')") == "none\n"
     assert notebook.run("print(many.truth_sha256 == run.truth_sha256)") == "True\n"
 
 

@@ -14,9 +14,7 @@ import zsim
 import zsim_api
 
 DOCS = Path(__file__).parents[3] / "docs/api"
-
-pytest.importorskip("sphinx", reason="the extra `docs` is not installed")
-pytest.importorskip("furo", reason="the extra `docs` is not installed")
+pytestmark = pytest.mark.skipif(not importlib.util.find_spec("furo"), reason="the extra `docs` is not installed")
 
 
 def test_it_builds_without_warnings_and_has_every_name(tmp_path: Path) -> None:

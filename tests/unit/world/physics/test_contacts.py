@@ -12,6 +12,7 @@ from zsim_world.physics.air import JET_WIDTHS, downwash
 from zsim_world.physics.contacts import hull_force, meet_drones
 from zsim_world.physics.fleet_arrays import STATE, VEHICLE, NearPairs
 
+pytestmark = pytest.mark.usefixtures("interpreted")
 RADIUS = ARDRONE2.airframe.hull_radius_m
 
 

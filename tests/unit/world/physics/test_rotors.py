@@ -29,6 +29,7 @@ from zsim_world.physics.fleet_arrays import (
 )
 from zsim_world.physics.rigid_body import ground_effect, lagged
 
+pytestmark = pytest.mark.usefixtures("interpreted")
 LEVEL, STILL = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 HIGH = 1000.0  # m, out of ground effect
 ROW, ROTORS = one_drone()
