@@ -1,10 +1,10 @@
-"""Many messages in one payload: packed, unpacked, and read without decoding each one.
+"""Many messages in one payload: packing, unpacking, and access without decoding each one.
 
     @gate, @gate/{drone}   the world's messages about its drones at one gate           GateMessages
     @batch                 [key, payload] of everything that passed the hub, in order  encode_batch, decode_batch
 
-Sent one by one, each message of a gate would wake every reader and the hub. These keys are outside of the contract and
-begin with `@`, which no wildcard of Zenoh matches: a subscriber to `**` gets the messages themselves, and not these.
+Sent singly, each message of a gate would wake every reader and the hub. These keys are outside the contract and begin
+with `@`, which no wildcard of Zenoh matches: a subscriber to `**` receives only the single messages.
 """
 
 from collections.abc import Callable, Iterator, Sequence
