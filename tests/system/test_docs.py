@@ -33,6 +33,7 @@ from contextlib import chdir, suppress
 from functools import cache
 from itertools import groupby
 from pathlib import Path
+from runpy import run_path
 from typing import Any, NamedTuple
 from urllib.request import urlopen
 
@@ -164,11 +165,11 @@ def test_commands_run(page: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("page", pages_with("python run"))
-def test_python_runs(page: Path, tmp_path: Path) -> None:
-    with Checkout(tmp_path) as checkout:
-        script = tmp_path / f"{page.stem}_page.py"
-        script.write_text("\n\n".join(block.text for block in blocks(page) if block.kind == "python run"))
-        checkout.run(Block("bash run", f"python {script.name}", 1, 0), page)
+def test_python_runs(page: Path, tmp_path: Path, near: None) -> None:
+    script = tmp_path / f"{page.stem}_page.py"
+    script.write_text("\n\n".join(block.text for block in blocks(page) if block.kind == "python run"))
+    with Checkout(tmp_path), chdir(tmp_path):
+        run_path(str(script), run_name="__main__")
 
 
 @pytest.mark.parametrize("page", pages_with("python test", long=LONG))

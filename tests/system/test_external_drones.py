@@ -7,10 +7,9 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import forked_commands
 import pytest
 from federation import Federation, Role
-from forked_commands import ROOT, refusal
+from forked_commands import ROOT, USER_FAULT, refusal, run_here
 from refused import has_terms
 from wire import Client, Subscription
 
@@ -178,6 +177,6 @@ def test_lockstep_is_refused_before_anything_starts(federation: Federation, opti
 def test_a_world_and_a_sweep_refuse_lockstep(federation: Federation) -> None:
     path = federation.write(ALONE)
     assert has_terms(refusal("world", path, "--listen", federation.endpoint), DRONE, "external", "lockstep")
-    swept = forked_commands.run("sweep", path, "--runs", "2")
-    assert swept.code == forked_commands.USER_FAULT
+    swept = run_here("sweep", path, "--runs", "2")
+    assert swept.code == USER_FAULT
     assert has_terms(swept.stderr, DRONE, "external", "lockstep")

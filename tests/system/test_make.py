@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[2]
 MARKED = "tests/system/test_sweep.py"  # holds a group, soaks and others
 
 
-@pytest.mark.parametrize("target", ["test", "soak"])
+@pytest.mark.parametrize("target", ["test", pytest.param("soak", marks=pytest.mark.soak)])
 def test_its_tests_are_found(target: str) -> None:
     printed = subprocess.run(
         ["make", "-n", "--no-print-directory", target], cwd=ROOT, capture_output=True, text=True, check=True

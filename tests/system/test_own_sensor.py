@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from federation import PAIR, Federation, Record
-from forked_commands import ROOT
+from forked_commands import ROOT, refusal, run_here
 
 from zsim.record import RecordReader
 
@@ -100,8 +100,10 @@ def test_an_estimator_of_the_user_s_own_receives_it(federation: Federation) -> N
 def test_a_record_is_flown_again(federation: Federation) -> None:
     out = federation.folder / "one"
     path = federation.write(PAIR)
-    federation.start("run", path, *options(), "--in-process", "--no-report", "--out", str(out)).ends(with_code=0)
-    federation.start("rerun", str(out), "--trust").ends(with_code=0)
+    flown = run_here("run", path, *options(), "--in-process", "--no-report", "--out", str(out))
+    assert flown.code == 0, flown
+    again = run_here("rerun", str(out), "--trust")
+    assert again.code == 0, again
 
 
 @pytest.mark.parametrize(
@@ -113,7 +115,5 @@ def test_a_record_is_flown_again(federation: Federation) -> None:
 )
 @pytest.mark.usefixtures("examples")
 def test_a_faulty_one_is_a_line(federation: Federation, field: str, where: str) -> None:
-    run = federation.start("validate", "--trust", federation.write(PAIR, "pair.yaml"), *options(field)[2:])
-    run.ends(with_code=2)
-    (line,) = [line.text for line in run.lines if line.text.strip()]
+    line = refusal("validate", "--trust", federation.write(PAIR, "pair.yaml"), *options(field)[2:])
     assert f"pair.yaml: {where} is" in line

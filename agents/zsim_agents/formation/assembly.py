@@ -1,7 +1,7 @@
-"""How robots that stand anywhere become a formation: each flies to a place of it that is assigned to it, all at once.
+"""Assembly of robots at arbitrary positions into a formation: all fly simultaneously to assigned places.
 
-They fly straight, with one function of time for all, so that how near any two come is known before (see
-`assignment`). The time stands still while one of them is far behind its way.
+They fly straight with a common function of time, so that the minimum distance of any two is known in advance (see
+`assignment`). This time is stopped while a robot is far behind.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PLACE = ("x_c", "y_c", "z_c", "yaw")  # variables that any robots have, whatever
 
 
 class Assembly:
-    """Robots on straight ways from start_W to goal_W (n, 3) [m], the places of the formation c (4n,), over over_s."""
+    """Robots on straight paths from start_W to goal_W (n, 3) [m], the places of formation c (4n,), within over_s."""
 
     def __init__(self, start_W: Array, goal_W: Array, c: Array, over_s: float, gains: FormationGains) -> None:
         self.c, self.over_s = c, over_s
@@ -41,7 +41,7 @@ class Assembly:
         return self.over_s - self._flown_s
 
     def advance(self, p_W: Array, dt_s: float) -> None:
-        """Go on by dt_s, unless a robot at p_W (n, 3) is far behind."""
+        """Advance by dt_s, unless a robot at p_W (n, 3) is far behind."""
         if float(np.linalg.norm(self._way()[0] - p_W, axis=1).max()) <= BEHIND_M:
             self._flown_s = min(self._flown_s + dt_s, self.over_s)
 
@@ -55,7 +55,7 @@ class Assembly:
         return v_W
 
     def farthest(self, p_W: Array) -> tuple[int, float]:
-        """Return which robot is farthest from its place, and how far [m]."""
+        """Return the index of the robot farthest from its place, and the distance [m]."""
         away_m = np.linalg.norm(self._goal_W - p_W, axis=1)
         return int(np.argmax(away_m)), float(away_m.max())
 
@@ -63,7 +63,7 @@ class Assembly:
         return self.left_s <= 0.0 and self.farthest(p_W)[1] <= IN_PLACE_M
 
     def _way(self) -> tuple[Array, Array]:
-        """Return where the robots are to be, and their velocities, each (n, 3)."""
+        """Return the reference positions and velocities of the robots, each (n, 3)."""
         s = self._flown_s / self.over_s
         ways_W = self._goal_W - self._start_W
         share, rate = s * s * s * (10.0 - s * (15.0 - 6.0 * s)), 30.0 * s * s * (1.0 - s) * (1.0 - s) / self.over_s
@@ -83,15 +83,15 @@ class Assembly:
 def assembly_goal(
     space: ClusterSpace, values: Mapping[str, str | float], base: Array | None, p_W: Array, yaw: Array
 ) -> Array:
-    """Return the formation (4n,) to fly to: the base with values by name.
+    """Return the formation (4n,) to fly to: the base with values replaced by name.
 
     Args:
-        base: (4n,) of robots that are a formation. None: their centre and mean heading, in which nothing departs from a
-            template; all else must be named.
+        base: (4n,) of robots in a formation. None: their centre and mean heading, without departures from a template;
+            all other variables must be named.
         p_W, yaw: of the robots, (n, 3) [m] and (n,) [rad].
 
     Raises:
-        RefusalError: a variable lacks that has no value without a formation.
+        RefusalError: a variable without a value in the base is not named.
         TrajectoryError, ExpressionError: a value is not allowed.
     """
     if base is None:
@@ -110,15 +110,15 @@ def assembly_goal(
 def planned_assembly(
     space: ClusterSpace, c: Array, p_W: Array, gains: FormationGains, apart: float = 1.0
 ) -> tuple[Assembly, NDArray[np.intp]]:
-    """Return the ways of robots at p_W (n, 3) [m] to the places of c (4n,), and the new order of the robots.
+    """Return the paths of robots at p_W (n, 3) [m] to the places of c (4n,), and the new order of the robots.
 
-    Entry k of the order is the former number of robot k: of the one that flies to its place.
+    Entry k of the order is the former index of the robot that becomes robot k.
 
     Args:
-        apart: share of the least separation that the ways must keep.
+        apart: share of the minimum separation that the paths must keep.
 
     Raises:
-        RefusalError: c is no formation to be engaged in, or two robots would come too near to each other.
+        RefusalError: c cannot be engaged, or two robots would come too close to each other.
     """
     if fault := formation_fault(space, c, gains, SHAPE):
         raise RefusalError(fault)

@@ -1,7 +1,7 @@
-"""Goals of interchangeable drones: which drone flies to which, all at once. Pure.
+"""Simultaneous assignment of goals to interchangeable drones. Pure.
 
 CAPT: Turpin, Michael and Kumar, Int. J. Robotics Research 33 (2014) 98-112. Drones fly straight from start to goal with
-one function of time b for all, p_i = s_i + b (g_i - s_i). The assignment of least sum of squared distances has
+a common function of time b, p_i = s_i + b (g_i - s_i). The assignment with the least sum of squared distances has
 (s_i - s_j).(g_i - g_j) >= 0 for every pair; with starts a and goals b apart, no pair then comes nearer than
 a b / sqrt(a^2 + b^2), which is at least the smaller of them over sqrt 2. A sum of distances has no such bound.
 """
@@ -17,10 +17,10 @@ from zsim_agents.formation.spaces.cluster_space import Array
 
 
 def assign(starts_m: Array, goals_m: Array) -> NDArray[np.intp]:
-    """Return the goal (n,) of each of n starts (n, 3): that of the least sum of squared distances.
+    """Return the goal (n,) of each of n starts (n, 3), for the least sum of squared distances.
 
     Raises:
-        ValueError: there are not as many goals as starts, or they are not places.
+        ValueError: the numbers of goals and starts differ, or they are not finite places.
     """
     from scipy.optimize import linear_sum_assignment  # here, because scipy takes longer to load than all else
 
@@ -33,7 +33,7 @@ def assign(starts_m: Array, goals_m: Array) -> NDArray[np.intp]:
 
 
 def straight_separation(starts_m: Array, goals_m: Array) -> float:
-    """Return the least distance [m] of drones that fly straight from starts to goals (n, 3) with one b for all."""
+    """Return the least distance [m] of drones that fly straight from starts to goals (n, 3) with a common b."""
     i, j = np.triu_indices(len(starts_m), 1)
     if not len(i):
         return math.inf

@@ -1,7 +1,7 @@
 """Control laws of a formation, from the estimated robots and a reference to velocity commands.
 
-What all laws share (`law:` of a cluster may name a subclass of your own), the stock law, and compiled: the saturation
-of the robots' velocities, and the guard of the distances between them.
+The base class of all laws (`law:` of a cluster may name a subclass of your own), the stock law, and, compiled, the
+saturation of the robots' velocities and the guard of the distances between them.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ GUARD_SWEEPS = 4  # passes over all pairs; one settles two robots, three robots 
 
 @dataclass(frozen=True)
 class FormationGains:
-    """Parameters of the law; all are positive, validated with the scenario. For those not named here see `RobotLimits`.
+    """Parameters of the law; all positive, validated with the scenario. For those not listed here see `RobotLimits`.
 
     Attributes:
         k_1_s: proportional gain [1/s]; 0.5 to 0.8 is good, unstable from about 2 on a drone's velocity loop.
         integral_1_s2: integral gain [1/s^2]; removes the offset that wind causes, 0 switches it off.
         integral_max_m_s, integral_max_rad_s: clamp of the integral term for lengths and for angles.
-        separation_min_m: least distance between two robots of a reference, and where the guard acts.
+        separation_min_m: minimum distance between two robots of a reference, below which the guard acts.
     """
 
     k_1_s: float = 0.6
@@ -66,11 +66,11 @@ class FormationGains:
 
 
 class FormationCommand(Struct, eq=False):
-    """The commands of the law to the robots.
+    """The commands to the robots.
 
     Attributes:
         v_W: velocities (n, 3) [m/s, W]; yaw_rate: (n,) [rad/s].
-        factor: the common factor of the saturation, 1 where nothing is saturated.
+        factor: the common factor of the saturation, 1 without saturation.
         guarded: pairs of robot indices that the guard holds apart; alarmed: those nearer than the alarm threshold.
     """
 
@@ -82,18 +82,18 @@ class FormationCommand(Struct, eq=False):
 
 
 class ControlLaw(ABC):
-    """A control law, whose demands are saturated and guarded here, for all laws alike.
+    """A control law; its demands are saturated and guarded here in the same way for all laws.
 
     One factor for all robots keeps the direction in cluster space; the guard keeps the robots apart. A law of your own
     has `rates`, and where it has a state `reset`, `followed`, `snapshot` and `restore`.
 
     Args:
         space: cluster space of n robots.
-        gains: of the scenario; a law uses those that it needs.
+        gains: gains of the scenario; a law uses those that it needs.
 
     Attributes:
-        robots: their names in messages, in order.
-        grants: what it may read beside the estimates, by `samples`, `map` and `now_ns`.
+        robots: names of the robots in messages, in order.
+        grants: inputs beside the estimates, read by `samples`, `map` and `now_ns`.
     """
 
     _granted: Grants | None = None
@@ -116,12 +116,12 @@ class ControlLaw(ABC):
         """
 
     def samples(self, sensor: str, kind: type[Kind]) -> tuple[Kind | None, ...]:
-        """Return the newest sample of a sensor of each robot, in their order; None before its first.
+        """Return the newest sample of a sensor of each robot, in order; None before the first sample.
 
-        `t_ns` of a sample is the gate at which it was published, `t_sample_ns` the instant that was measured.
+        `t_ns` of a sample is the gate at which it was published, `t_sample_ns` the instant of measurement.
 
         Args:
-            sensor: by its name, one of `law_sensors` of the cluster.
+            sensor: name, one of `law_sensors` of the cluster.
             kind: class of its messages, e.g. zsim.sensors.scanner.Range for "range".
 
         Raises:
@@ -140,20 +140,20 @@ class ControlLaw(ABC):
         return self.grants.t_ns
 
     def reset(self) -> None:  # noqa: B027 - a law may have no state
-        """Forget all state: the formation is engaged, or goes on after it was held."""
+        """Clear all state: the formation is engaged, or continues after a hold."""
 
     def followed(self, dt_s: float) -> None:  # noqa: B027
-        """Advance by dt_s [s]: the robots get what `rates` returned, neither saturated nor held apart.
+        """Advance the state by dt_s [s] after a gate whose rates were neither saturated nor guarded.
 
-        Otherwise it is not called, so that an integral that grows here does not wind up.
+        It is not called after other gates, so that an integral that grows here does not wind up.
         """
 
     def snapshot(self) -> State | None:
-        """Return all state as plain values and arrays, {} where there is none, None where it cannot be transferred."""
+        """Return all state as plain values and arrays, {} without state, None if it cannot be transferred."""
         return {} if type(self).reset is ControlLaw.reset and type(self).followed is ControlLaw.followed else None
 
     def restore(self, state: State) -> None:  # noqa: B027
-        """Take over the `snapshot` of the law of another process, to continue with the same bits."""
+        """Take over the `snapshot` of another process's law, to continue with the same bits."""
 
     def command(
         self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array, dt_s: float
@@ -161,7 +161,7 @@ class ControlLaw(ABC):
         """Return the command of this gate; arguments as in `rates`, dt_s the time since the last command.
 
         Raises:
-            UserCodeError: `rates` of a user's law returned another number of rates, or one that is not finite.
+            UserCodeError: `rates` of a user's law returned a wrong number of rates, or a non-finite one.
         """
         n, order = self.space.n, self._order
         r_dot = self.rates(c, p_W, v_W, c_des, c_dot_des)
@@ -243,8 +243,8 @@ class RobotLimits(NamedTuple):
     """Limits of the saturation and of the guard, for compiled code.
 
     Attributes:
-        separation_min_m: least distance between two robots; separation_alarm_m: nearer ones are reported.
-        guard_horizon_s: how far ahead the guard looks.
+        separation_min_m: minimum distance between two robots; separation_alarm_m: closer pairs are reported.
+        guard_horizon_s: prediction horizon of the guard.
         response_s: lag of a drone's velocity loop, during which the guard expects it to keep its velocity.
     """
 
@@ -258,7 +258,7 @@ class RobotLimits(NamedTuple):
 
 
 def guard(p_W: Array, v_W: Array, v_cmd_W: Array, limits: RobotLimits) -> tuple[Array, Pairs, Pairs]:
-    """Return the velocities without dangerous approaches, the pairs concerned, and the pairs in alarm.
+    """Return the velocities limited against dangerous approaches, the guarded pairs, and the pairs in alarm.
 
     Two robots at distance d, d' = rate of the command along their line, are held to d' >= -(d_near - separation_min) /
     guard_horizon: the distance predicted over the horizon stays above the minimum, and below it the approach is
@@ -372,7 +372,7 @@ def note_alarms(p_W: Array, near: PairTable, separation_alarm_m: float, order: O
 
 @portable
 def part(p_W: Array, v_W: Array, v_cmd_W: Array, i: int, j: int, limits: RobotLimits) -> bool:
-    """Let robots i and j separate at their least rate, half of the change each; return whether they did not."""
+    """Make robots i and j separate at least at their required rate, half of the change each; return whether changed."""
     line_W = subtract(row(p_W, j), row(p_W, i))
     distance = norm(line_W)
     if distance >= reach(limits):
@@ -405,7 +405,7 @@ def along(u_W: Vector, v_W: Array, i: int, j: int) -> float:
 
 @portable
 def direction(line_W: Vector, distance: float) -> Vector:
-    """Return the unit vector of a line; east where robots coincide, so that they part at all."""
+    """Return the unit vector of a line; east if the robots coincide, so that they separate."""
     if distance < NEAR_M:
         return 1.0, 0.0, 0.0
     return line_W[0] / distance, line_W[1] / distance, line_W[2] / distance

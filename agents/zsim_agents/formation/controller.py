@@ -115,7 +115,7 @@ class Controller(Agent):
         return outputs
 
     def _seat(self, drones: Sequence[str]) -> None:
-        """Take the drones in the order of the robots, which an assembly changes."""
+        """Set the order of the drones to that of the robots, which an assembly changes."""
         if drones == self.drones:
             return
         places = [self.drones.index(drone) for drone in drones]
@@ -214,7 +214,7 @@ _UNKNOWN = flight_messages.Estimate(
 
 
 def _finite(values: np.ndarray) -> tuple[float, ...]:
-    """Return values for the wire, with zeros in place of those that are not finite."""
+    """Return values for the wire, with non-finite ones replaced by zeros."""
     numbers = values.tolist()
     if not math.isfinite(sum(numbers)):  # one of them is not, or the sum overflows
         numbers = [number if math.isfinite(number) else 0.0 for number in numbers]

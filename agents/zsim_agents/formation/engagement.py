@@ -1,7 +1,7 @@
 """The phases of a formation flight: take-off, assembly, engaged flight on references, hold, landing.
 
-A plain object: estimates in, commands out, once per gate; requests in between. Nothing is engaged, resumed or
-followed unchecked, every refusal has a reason, and every reference starts where the formation is.
+A plain object: estimates in, commands out, once per gate; requests in between. Every engagement, resumption and
+reference is checked, every refusal has a reason, and every reference starts at the present state of the formation.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ class Engagement:
     """The phase machine of one formation.
 
     Args:
-        drones: their names in the order of the robots.
-        plan: requests that the scenario makes by itself; a landing by request drops the rest of them.
+        drones: names in the order of the robots.
+        plan: requests of the scenario; a requested landing drops the remaining ones.
 
     Raises:
         ValueError: the plan can never be flown (see `FlightPlan`), or the number of names is not n.
@@ -137,7 +137,7 @@ class Engagement:
         return self._output(gate, self.check.state_fault(gate, DOWN | {"landing"}) or "", modes=modes)
 
     def request(self, request: FlightRequest) -> str | None:
-        """Grant a request and return None, or return why it is refused; then nothing has changed."""
+        """Grant a request and return None, or return why it is refused without changing anything."""
         refusal = self._try(request)
         if refusal is None and request is Order.LAND:
             self.plan.clear()
@@ -148,10 +148,10 @@ class Engagement:
     def warm_start(self, phase: str, desired: Array, plan_step: int = 0, drones: Sequence[str] = ()) -> None:
         """Continue in the phase and at the reference (4n,) of a former process of this formation.
 
-        `drones`: in the order of its robots, where that is not the scenario's.
+        `drones`: names in the order of its robots, if that is not the scenario's.
 
-        Its plan continues after the completed steps, as in the former `GateOutput.plan_step`; what it flew by the plan
-        (a target, a trajectory) is requested again, from that reference.
+        Its plan continues after the completed steps, by the former `GateOutput.plan_step`; a target or trajectory of
+        the plan that was being flown is requested again from that reference.
         """
         self._phase = "engaged" if phase == "held" else phase
         self._name(drones or self.drones)
@@ -182,7 +182,7 @@ class Engagement:
         }
 
     def restore(self, state: State, gate: GateInput | None) -> None:
-        """Take over the snapshot of another process, and the gate that it stepped last."""
+        """Take over the snapshot of another process and the last gate that it stepped."""
         self._phase, self._landing_s = state["phase"], state["landing_s"]
         self._name(state["drones"])
         self._assembly = state["assembly"] and Assembly.restored(state["assembly"], self.gains)
@@ -263,7 +263,7 @@ class Engagement:
         self._phase = "engaged"
 
     def _grant_assembly(self, request: Assemble, gate: GateInput) -> None:
-        """Assign the drones to the places of a formation, and let them fly there."""
+        """Assign the drones to the places of a formation, and start their flight there."""
         if self._phase not in ("assembling", "engaged") or self._fault:
             raise RefusalError(self._fault or f"phase is {self.phase}; possible when assembling or engaged")
         if fault := self._way_left(gate) or self.check.assembly_fault(gate):
@@ -280,11 +280,11 @@ class Engagement:
         self.check.observe(self._gate)
 
     def _name(self, drones: Sequence[str]) -> None:
-        """Take the drones in the order of the robots."""
+        """Set the order of the drones to that of the robots."""
         self.drones = self.law.robots = self.check.drones = tuple(drones)
 
     def _way_left(self, gate: GateInput) -> str | None:
-        """Return what is left of the drones' ways to their places."""
+        """Return a text on the remaining flight of the drones to their places."""
         if self._assembly is None or self._assembly.arrived(gate.p_W):
             return None
         i, away_m = self._assembly.farthest(gate.p_W)
@@ -307,7 +307,7 @@ class Engagement:
         return tuple(due)
 
     def _climb(self, gate: GateInput) -> GateOutput:
-        """Lead the drones that fly straight up to the assembly height, each by its own velocity loop."""
+        """Lead the flying drones vertically to the assembly height, each by its own velocity loop."""
         modes: tuple[ModeCommand, ...] = ()
         reason = self.check.state_fault(gate, AIRBORNE) if self._phase == "taking_off" else None
         if reason:
@@ -320,7 +320,7 @@ class Engagement:
         return self._output(gate, reason, modes=modes, command=self._upright(gate, climb_m_s, self.gains.limits))
 
     def _assemble(self, gate: GateInput, assembly: Assembly) -> GateOutput:
-        """Lead the drones on their ways, without turning; they stand where one cannot be flown."""
+        """Lead the drones to their places without turning; all stop if one cannot be flown."""
         if fault := self._unflyable(gate):
             return self._output(gate, fault, command=self._upright(gate, 0.0, self.gains.limits))
         assembly.advance(gate.p_W, self._dt_s)
@@ -330,7 +330,7 @@ class Engagement:
         return self._output(gate, reason, command=command)
 
     def _judge(self, gate: GateInput) -> None:
-        """Set the fault of an engaged formation, or clear it when all has been well for a while."""
+        """Set the fault of an engaged formation, or clear it after a time without faults."""
         fault = self._way_fault(gate) or self.check.flight_fault(gate)
         if not fault and not self._fault:  # the checks before the flight cover a limited time of the reference
             try:
@@ -356,7 +356,7 @@ class Engagement:
                 self.law.reset()
 
     def _way_fault(self, gate: GateInput) -> str | None:
-        """Return which drone is not in its place yet, while they are led; a drone that cannot be flown ends that."""
+        """Return which led drone has not reached its place; stop leading the drones if one is unflyable."""
         if self._places is None:
             return None
         if self._unflyable(gate):
@@ -377,7 +377,7 @@ class Engagement:
         return self._output(gate, reason, command=command, reference=(self._wrapped[1], c_dot_des))
 
     def _hold(self, gate: GateInput) -> GateOutput:
-        """Keep the drones of a held formation in place, or lead them to their places, without turning."""
+        """Keep the drones of a held formation in place, or lead them to their places without turning."""
         if self._places is None:
             command = self._upright(gate, 0.0, self._held_limits)
         else:
@@ -386,7 +386,7 @@ class Engagement:
         return self._output(gate, self._fault, command=command)
 
     def _upright(self, gate: GateInput, climb_m_s: Array | float, limits: RobotLimits) -> FormationCommand:
-        """Return a guarded climb (n,) without turning; rest where the estimates cannot be flown on."""
+        """Return guarded climb rates (n,) without turning; zero if the estimates are not flyable."""
         v_W = np.zeros((self.space.n, 3))
         alarmed: Pairs = ()
         if self.check.estimate_fault(gate) is None:
@@ -403,7 +403,7 @@ class Engagement:
         command: FormationCommand | None = None,
         reference: tuple[Array, Array] | None = None,
     ) -> GateOutput:
-        """Return the output of a gate; without a reference the present value is the desired one."""
+        """Return the output of a gate; without a reference the desired value is the present one."""
         if command and command.alarmed:
             near = f"nearer than {self.gains.separation_alarm_m:g} m: {self._pairs(command.alarmed)}"
             reason = f"{TOO_NEAR}, {near}; {reason}"
@@ -425,7 +425,7 @@ class Engagement:
         )
 
     def _is_led(self) -> bool:
-        """Tell whether the drones fly what a step of the plan has begun."""
+        """Tell whether the drones fly a reference begun by a step of the plan."""
         return self._assembly is not None or (self._phase == "engaged" and not self.guidance.paused)
 
     def _pairs(self, pairs: Pairs) -> str:

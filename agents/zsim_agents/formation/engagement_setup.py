@@ -1,9 +1,9 @@
-"""The engagement that a scenario's cluster asks for: its space, gains, law and plan, rehearsed before the flight.
+"""The engagement of a scenario's cluster: space, gains, law and plan, rehearsed before the flight.
 
-A plan is judged before the flight from where the drones stand. One that is certain to be refused to its end in flight,
-or is over before any formation could begin it, is refused here, with the factor by which its time has to be stretched.
-Limits are a little wider than in flight, as the formation is never exactly where it was set down: cases between the two
-are left to the flight, in which the guidance refuses them, twice a second anew, and the formation hovers meanwhile.
+A plan is checked before the flight from the drones' start positions. A plan that the guidance would certainly refuse
+throughout the flight, or that ends before any formation could begin it, is refused here, with the factor by which its
+time must be stretched. Limits are slightly wider than in flight, since the formation is never exactly at its start
+position: cases in between are left to the guidance, which checks them again twice a second while the formation hovers.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ STEP_S, STEPS_MIN, STEPS_MAX = 0.1, 41, 3001  # of a reference that is sampled
 
 
 def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
-    """Return the phase machine of a cluster; raises RunError where its plan can never be flown."""
+    """Return the phase machine of a cluster; raises RunError if its plan can never be flown."""
     with _refusals_of(scenario, cluster):
         space, gains = scenario_space(scenario, cluster), gains_of(cluster.gains)
         name = cluster.law or "proportional"
@@ -90,7 +90,7 @@ def check_plan(scenario: Scenario, cluster: Cluster) -> None:
 
 
 class PlannedMotion(NamedTuple):
-    """The last reference of a plan: where it leads, from when it is flown at the earliest, until its landing."""
+    """The last reference of a plan, its earliest start, and its landing."""
 
     space: ClusterSpace
     reference: Reference
@@ -99,15 +99,15 @@ class PlannedMotion(NamedTuple):
     path: str  # in the cluster's section
 
     def places(self, t_s: float) -> Array:
-        """Return where its robots are to be, (n, 3) [m; W]."""
+        """Return the reference positions of its robots, (n, 3) [m; W]."""
         return self.space.inverse(self.reference.value(t_s)[0])[0]
 
 
 def planned_motion(scenario: Scenario, cluster: Cluster) -> PlannedMotion | None:
-    """Return the target or trajectory of a plan that can be flown, None without one.
+    """Return the target or trajectory of a flyable plan, None without one.
 
     Raises:
-        RunError: as of `check_plan`.
+        RunError: as in `check_plan`.
     """
     plan, motion = cluster.plan, None
     with _refusals_of(scenario, cluster):
@@ -139,7 +139,7 @@ def planned_motion(scenario: Scenario, cluster: Cluster) -> PlannedMotion | None
 
 
 def _hovers(scenario: Scenario, cluster: Cluster) -> tuple[Array, Array]:
-    """Return where the drones are after their climb (n, 3) [m], and their headings (n,) [rad]."""
+    """Return the positions of the drones after their climb (n, 3) [m; W], and their headings (n,) [rad]."""
     drones = [scenario.drone(name) for name in cluster.drones]
     p_W = np.array([drone.position_m for drone in drones], float)
     p_W[:, 2] += ASSEMBLY_HEIGHT_M
@@ -148,7 +148,7 @@ def _hovers(scenario: Scenario, cluster: Cluster) -> tuple[Array, Array]:
 
 @contextmanager
 def _refusals_of(scenario: Scenario, cluster: Cluster) -> Iterator[None]:
-    """Raise every fault of a cluster as a RunError that names it, a fault of its plan with the path in the scenario."""
+    """Raise faults of a cluster as a RunError that names it, a fault of its plan with its path in the scenario."""
     try:
         yield
     except PlanError as error:
@@ -172,7 +172,7 @@ def _rehearse(
     gains: FormationGains,
     law: Callable[[ClusterSpace, FormationGains], ControlLaw],
 ) -> None:
-    """Fly a gate of another formation: code is compiled, or loaded, here and not in flight."""
+    """Step a gate of another formation, so that code is compiled or loaded before the flight."""
     p_W, yaw = space.inverse(space.specimen(max(gains.separation_min_m, APART_M)))
     c, none, still = space.forward(p_W, yaw), np.zeros((space.n, 3)), np.zeros(space.n)
     rehearsal = Engagement(space, drones, gains, law=law)
@@ -198,7 +198,7 @@ def gains_of(gains: Gains) -> FormationGains:
 
 
 def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, gains: FormationGains) -> None:
-    """Raise PlanError for a plan that these drones cannot fly; from no valid formation, it is not judged."""
+    """Raise PlanError for a plan that these drones cannot fly; it is not checked without a valid start formation."""
     plan = cluster.plan
     assembles = plan.assemblies is not UNSET
     if plan.takeoff_s is None or not (plan.target or plan.trajectory or assembles):
@@ -236,7 +236,7 @@ def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, ga
 
 
 def _formation_at(space: ClusterSpace, p_W: Array, yaw: Array) -> Array | None:
-    """Return the formation (4n,) of robots, None where they are none to be engaged in."""
+    """Return the formation (4n,) of robots, None if it cannot be engaged."""
     try:
         c = space.forward(p_W, yaw)
         return None if shape_fault(space, c, SHAPE) else c
@@ -245,7 +245,7 @@ def _formation_at(space: ClusterSpace, p_W: Array, yaw: Array) -> Array | None:
 
 
 class _Rehearsal:
-    """Checks the ways of a plan against the limits of formation, controller and drones."""
+    """Checks the paths of a plan against the limits of formation, controller and drones."""
 
     def __init__(self, scenario: Scenario, cluster: Cluster, space: ClusterSpace, gains: FormationGains) -> None:
         self._space, self._share = space, SHAPE.share
@@ -262,7 +262,7 @@ class _Rehearsal:
         self._planner = RampPlanner(space, gains, SHAPE)
 
     def check_target(self, start: Array, goal: Array, over_s: float | None) -> None:
-        """Refuse a target that is not allowed, or too far for its time; TrajectoryError: it is out of reach."""
+        """Refuse a target that is not allowed or too far for its time; TrajectoryError: it is out of reach."""
         if fault := self._fault_at(goal):
             raise PlanError(f"plan.target: {fault}")
         home, rest = Hold(goal), np.zeros_like(start)
@@ -278,7 +278,7 @@ class _Rehearsal:
             )
 
     def check_trajectory(self, start: Array, trajectory: Reference, start_s: float, ready_s: float) -> None:
-        """Refuse a trajectory that is too fast, leads through a place that is not allowed, or is over too soon."""
+        """Refuse a trajectory that is too fast, leads through a state that is not allowed, or ends too soon."""
         length_s = trajectory.duration_s
         end_s = start_s + (math.inf if length_s is None else length_s)
         if end_s <= ready_s:
@@ -303,7 +303,7 @@ class _Rehearsal:
             raise PlanError(f"plan.trajectory is over at {end_s:g} s; must start later: {reason}")
 
     def _peak(self, reference: Reference, from_s: float, to_s: float) -> tuple[float, float]:
-        """Return the greatest share of its limits at which a robot moves along a reference, and when [s]."""
+        """Return the largest share of its limits that a robot uses along a reference, and when [s]."""
         return max(
             (load(*robot_rates(self._space, *reference.value(t_s)), self._limits), t_s)
             for t_s in _instants(from_s, to_s)

@@ -1,7 +1,7 @@
 """An expression of t as text, with its exact derivative.
 
-The text is parsed by Python's own grammar, only whitelisted nodes are converted into a tree of closures, and the tree
-is evaluated on dual numbers (value, rate): nothing of the text is ever executed.
+The text is parsed with Python's grammar, whitelisted nodes are converted into a tree of closures, and the tree is
+evaluated on dual numbers (value, rate): the text is never executed.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class ExpressionError(ValueError):
 
 
 class Expression:
-    """A function of t with its exact first derivative, by the name of the variable that it describes.
+    """A function of t with its exact first derivative, for a named variable.
 
     The text is for example "5*cos(2*pi*f*t)", with user constants such as {"f": 0.01}.
 
@@ -142,7 +142,7 @@ def checked_constants(constants: Mapping[str, float]) -> dict[str, float]:
 
 
 def finite_number(value: object) -> float | None:
-    """Return the value as a float, or None where it is no finite number (a bool is none)."""
+    """Return the value as a float, None if it is not a finite number (a bool is not a number)."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:

@@ -1,6 +1,6 @@
-"""Whether a formation may take off, be engaged, flown on, and where it may be led: every fault in words.
+"""Checks whether a formation may take off, be engaged or continue, and where it may be led; faults are texts.
 
-The data of a gate are Structs, which take a fifth of the time of a named tuple or dataclass.
+The data of a gate are Structs, which cost a fifth of the time of a named tuple or dataclass.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ REJOINING = "rejoining"
 
 @dataclass(frozen=True)
 class ShapeLimits:
-    """Where a formation may be engaged, and where a reference may lead it.
+    """Limits of the shape in which a formation may be engaged, and to which a reference may lead it.
 
     Attributes:
-        spread_min_m: least height of the shape.
-        tilt_max_rad: greatest roll and pitch of the formation.
-        condition_max: greatest condition number of J^-1.
-        height_min_m: least height of a robot's reference over the ground, z_W = 0.
-        share: share of the robots' speed limits that a reference may use; the law keeps the rest.
+        spread_min_m: minimum height of the shape.
+        tilt_max_rad: maximum roll and pitch of the formation.
+        condition_max: maximum condition number of J^-1.
+        height_min_m: minimum height of a robot's reference over the ground, z_W = 0.
+        share: share of the robots' speed limits that a reference may use; the rest is for the law.
     """
 
     spread_min_m: float = 1.0  # chosen: five sigma of a side's estimate keep robots out of one line
@@ -70,7 +70,7 @@ RESEND_S = 1.0  # after which a mode command without effect is sent again: ten t
 
 @dataclass(frozen=True)
 class EngagementLimits:
-    """Greatest standard deviations for take-off and engagement."""
+    """Maximum standard deviations for take-off and engagement."""
 
     sigma_max_m: float = 1.0  # half of the least separation of 2 m
     yaw_sigma_max_rad: float = math.radians(15.0)  # half of the 30 deg at which three sigma turn a velocity by 90 deg
@@ -80,7 +80,7 @@ class GateInput(Struct, eq=False):
     """The newest estimates of n drones at a gate; its arrays may be overwritten for the next.
 
     Attributes:
-        p_W, v_W: (n, 3) [m, m/s]; yaw: (n,) [rad]; non-finite where nothing is known.
+        p_W, v_W: (n, 3) [m, m/s]; yaw: (n,) [rad]; non-finite where unknown.
         sigma_m: (n, 3) standard deviations of position; yaw_sigma: (n,) of the heading [rad].
         age_s: (n,) ages of the estimates; infinite where there is none.
         states: (n,) `state` of each drone's sensor/status.
@@ -96,7 +96,7 @@ class GateInput(Struct, eq=False):
     states: tuple[str, ...]
 
     def of(self, order: NDArray[np.intp]) -> GateInput:
-        """Return the gate with the robots in another order, (n,) of their present numbers."""
+        """Return the gate with the robots in another order, given as (n,) present indices."""
         motion = self.p_W[order], self.yaw[order], self.v_W[order]
         known = self.sigma_m[order], self.yaw_sigma[order], self.age_s[order]
         return GateInput(self.t_s, *motion, *known, tuple(self.states[k] for k in order.tolist()))
@@ -119,7 +119,7 @@ class Setpoint(Struct, eq=False):
 
 
 def setpoints(gate: GateInput, v_W: Array, yaw_rate: Array) -> tuple[Setpoint | None, ...]:
-    """Return the setpoints of velocities (n, 3) and yaw rates (n,), None for a drone that does not follow one."""
+    """Return setpoints from velocities (n, 3) and yaw rates (n,), None for a drone that does not follow setpoints."""
     every = map(Setpoint, v_W.tolist(), yaw_rate.tolist())
     if AIRBORNE.issuperset(gate.states):
         return tuple(every)
@@ -133,7 +133,7 @@ class GateOutput(Struct, eq=False):
         setpoints: (n,) velocity commands, None for no command.
         phase, value, desired, desired_rate, trajectory_t_s, margin, reason, plan_step: as in the message; value and
             desired with wrapped angles.
-        factor: common factor of the saturation, 1 where nothing is saturated.
+        factor: common factor of the saturation, 1 without saturation.
     """
 
     modes: tuple[ModeCommand, ...]
@@ -184,9 +184,9 @@ class FlightCheck:
             self._no_frame = str(error)
 
     def take_off_fault(self, gate: GateInput, assembles: bool = False) -> str | None:
-        """Return why the drones may not take off; drones that fly already need not stand well.
+        """Return why the drones may not take off; the positions of drones already in flight do not matter.
 
-        `assembles`: whether they are led to places of a formation, so that they may stand in any other.
+        `assembles`: whether they will be led to assigned places, so that they may start in any shape.
         """
         fault = self._start_fault(gate, AIRBORNE | {"landed"})
         if fault or "landed" not in gate.states:
@@ -215,7 +215,7 @@ class FlightCheck:
         return shape_fault(self.space, self.value, SHAPE_IN_FLIGHT, self._spread)
 
     def formation_fault(self, gate: GateInput) -> str | None:
-        """Return why the robots, where they are, are no formation to start from."""
+        """Return why the robots' present positions do not form a valid formation to start from."""
         fault = self._no_frame or shape_fault(self.space, self.value, SHAPE, self._spread)
         return fault or self.distance_fault(gate)
 
@@ -227,16 +227,16 @@ class FlightCheck:
         return f"{pair} are {distance:.2f} m apart; allowed: {self.gains.separation_min_m:g} m or more"
 
     def formation(self) -> Array | None:
-        """Return the cluster (4n,) of the observed gate, None where the robots are in no formation to be flown."""
+        """Return the cluster (4n,) of the observed gate, None if the robots are not in a flyable formation."""
         is_one = self._no_frame is None and shape_fault(self.space, self.value, SHAPE_IN_FLIGHT, self._spread) is None
         return self.value if is_one else None
 
     def estimate_fault(self, gate: GateInput) -> str | None:
-        """Return why the estimates of drones in flight, at the observed gate, cannot be flown on."""
+        """Return why the flight cannot continue on the estimates of the observed gate."""
         return self._flaw_text(gate, self._flaw, IN_FLIGHT_FACTOR)
 
     def state_fault(self, gate: GateInput, allowed: frozenset[str]) -> str | None:
-        """Return which drone is in another state than those allowed."""
+        """Return the fault of the first drone whose state is not allowed."""
         if allowed.issuperset(gate.states):
             return None
         drone, state = next(pair for pair in zip(self.drones, gate.states, strict=True) if pair[1] not in allowed)
@@ -311,9 +311,9 @@ def estimate_flaw(
 
 
 def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits, spread: float | None = None) -> str | None:
-    """Return why c is no shape to engage in or to lead to (quantity, value and limit), or None.
+    """Return why c is not a shape to engage in or to lead to (quantity, value and limit), or None.
 
-    `spread` is that of c, where it is known already.
+    `spread` is that of c, if already known.
     """
     outside = first_outside(c, space.bounds)
     if outside >= 0:
@@ -346,7 +346,7 @@ def bounds_of(space: ClusterSpace, limits: ShapeLimits) -> Array:
 
 @portable
 def first_outside(c: Array, bounds: Array) -> int:
-    """Return the place of the first variable of c that is beyond FAR or its open bounds (4n, 2), or -1."""
+    """Return the index of the first variable of c beyond FAR or outside its open bounds (4n, 2), or -1."""
     for k in range(c.size):
         if not (abs(c[k]) < FAR and bounds[k, 0] < c[k] < bounds[k, 1]):  # also true for NaN
             return k
@@ -354,12 +354,12 @@ def first_outside(c: Array, bounds: Array) -> int:
 
 
 def formation_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
-    """Return why the formation may not be led to c, by its shape or the places of its robots, or None."""
+    """Return why the formation may not be led to c, because of its shape or its robots' places, or None."""
     return shape_fault(space, c, limits) or place_fault(space, c, gains, limits)
 
 
 def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
-    """Return why the robots may not be where c puts them: too near to each other, or too low."""
+    """Return why the robots' places in c are not allowed (too close to each other, or too low), or None."""
     p_W, _ = space.inverse(c)
     if well_placed(p_W, gains.separation_min_m, limits.height_min_m):
         return None

@@ -28,7 +28,7 @@ WAITS = " of the plan waits: "  # in the note of a plan, between the step and th
 
 
 class RefusalError(ValueError):
-    """A request cannot be granted in the present state; the message is the reason."""
+    """A request cannot be granted in the present state; the message gives the reason."""
 
 
 class PlanError(ValueError):
@@ -68,13 +68,13 @@ class MoveTo:
 
 @dataclass(frozen=True)
 class Follow:
-    """Bring the formation to the start of a trajectory, then follow it; `trajectory` on the wire.
+    """Move the formation to the start of a trajectory, then follow it; `trajectory` on the wire.
 
     Attributes:
         expressions, constants, duration_s: see `ExpressionTrajectory`; or
         waypoints: see `WaypointTrajectory`.
-        start_s: simulated time of the trajectory's t = 0; None: when the formation has got there. A formation that gets
-            there later joins the trajectory in motion.
+        start_s: simulated time of the trajectory's t = 0; None: the arrival of the formation. A formation that arrives
+            later joins the moving trajectory.
     """
 
     expressions: Mapping[str, str | float] = field(default_factory=dict)
@@ -97,9 +97,9 @@ class Follow:
 
 @dataclass(frozen=True)
 class Assemble:
-    """Let each drone fly to a place of a formation that is assigned to it; `assemble` on the wire.
+    """Move each drone to an assigned place of a formation; `assemble` on the wire.
 
-    The formation has values by name; what is not named stays, as of `MoveTo`. It is engaged by a further request.
+    The formation is given by names and values, as in `MoveTo`. A further request engages it.
     """
 
     values: Mapping[str, str | float] = field(default_factory=dict)
@@ -110,7 +110,7 @@ FlightRequest = Order | MoveTo | Follow | Assemble
 
 @dataclass(frozen=True)
 class Scheduled:
-    """A request that is due at at_s of simulated time and repeated until it is granted.
+    """A request due at simulated time at_s, and repeated until it is granted.
 
     `path` is its place in the cluster's section of the scenario.
     """
@@ -121,15 +121,15 @@ class Scheduled:
 
 
 class FlightPlan:
-    """Requests in their order; each waits for those before it, except Order.LAND, which drops them.
+    """Requests in order; each waits for the previous ones, except Order.LAND, which drops them.
 
-    A restarted controller begins it where `resume_at` of the former one was.
+    A restarted controller continues at `resume_at` of the former one.
 
     Attributes:
-        note: why the plan waits, empty where it does not.
+        note: why the plan waits, empty if it does not.
 
     Raises:
-        PlanError: a request can never be granted (unknown name, bad expression), or times run backwards.
+        PlanError: a request can never be granted (unknown name, bad expression), or times decrease.
     """
 
     def __init__(self, space: ClusterSpace, steps: Sequence[Scheduled] = ()) -> None:
@@ -163,7 +163,7 @@ class FlightPlan:
         self.note = ""
 
     def run(self, t_s: float, request: Callable[[FlightRequest], str | None]) -> None:
-        """Make the requests that are due at t_s."""
+        """Submit the requests due at t_s."""
         for place in range(len(self._steps) - 1, self._next, -1):
             step = self._steps[place]
             if step.at_s <= t_s and step.request is Order.LAND:
@@ -181,15 +181,15 @@ class FlightPlan:
 
     @property
     def assembles(self) -> bool:
-        """Tell whether drones are still to be assigned to places, so that they may start anywhere."""
+        """Tell whether an assembly is still ahead, so that the drones may start anywhere."""
         return any(isinstance(step.request, Assemble) for step in self._steps[self._next :])
 
     def resume_at(self, flying: bool) -> int:
-        """Return how many steps a restart skips: all completed ones, but in flight those flown now."""
+        """Return the number of steps that a restart skips: the completed ones, without those flown now."""
         return self._flown if flying else self._next
 
     def start_at(self, step: int) -> None:
-        """Skip so many steps: they were completed before a restart."""
+        """Skip the steps completed before a restart."""
         self._go_to(min(step, len(self._steps)))
 
     def snapshot(self) -> State:
@@ -200,11 +200,11 @@ class FlightPlan:
         self._try_s, self.note = state["try_s"], state["note"]
 
     def overrule(self) -> None:
-        """Note that the reference flown from now on is not the plan's."""
+        """Note that the reference no longer follows the plan."""
         self._flown = self._next
 
     def clear(self) -> None:
-        """Drop everything that is not completed."""
+        """Drop all uncompleted steps."""
         self._go_to(len(self._steps))
 
     def _go_to(self, step: int, flown: int | None = None) -> None:
@@ -213,13 +213,13 @@ class FlightPlan:
 
 
 def waiting_step(reason: str) -> tuple[str, str] | None:
-    """Return the plan's waiting step and its reason from the reason of a cluster's state; None if none waits."""
+    """Return the waiting step of the plan and its reason, read from a cluster state's reason; None if none waits."""
     before, waits, why = reason.rpartition(WAITS)
     return (before.rpartition("; ")[2], why) if waits else None
 
 
 def plan_of(cluster: Cluster) -> list[Scheduled]:
-    """Return the steps of a cluster's plan in their order."""
+    """Return the steps of a cluster's plan in order."""
     plan, steps = cluster.plan, []
     if plan.takeoff_s is not None:
         steps += [Scheduled(plan.takeoff_s, each, "plan.takeoff_s") for each in (Order.TAKE_OFF, Order.ENGAGE)]

@@ -1,4 +1,4 @@
-"""What the scenario grants a cluster's law beside the estimates: samples of its drones' sensors, and the map."""
+"""The inputs that the scenario grants to a cluster's law beside the estimates: sensor samples and the map."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ Kind = TypeVar("Kind", bound=Sample)
 
 
 class Map(NamedTuple):
-    """Obstacles and surfaces of the scenario, also those of its forest, corridor and cloud, in W."""
+    """Obstacles and surfaces of the scenario in W, including those of its forest, corridor and cloud."""
 
     obstacles: Sequence[Obstacle]
     surfaces: Sequence[Surface]
 
 
 class Grants:
-    """The inputs of one law: the newest sample of each granted sensor of each drone, and the map where it is granted.
+    """The inputs of one law: the newest sample of each granted sensor of each drone, and the map if granted.
 
     Attributes:
-        t_ns: the gate that is stepped.
-        keys: of the sensors, which the law's process has to read.
+        t_ns: the present gate [ns].
+        keys: keys of the granted sensors, which the law's process must read.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Grants:
         return {keys.sensor(drone, name): (name, i) for name in self._newest for i, drone in enumerate(self._drones)}
 
     def seat(self, drones: Sequence[str]) -> None:
-        """Take the drones in another order, of the robots."""
+        """Set the order of the drones to that of the robots."""
         if not self.keys:
             return
         order = [self._drones.index(drone) for drone in drones]
@@ -63,7 +63,7 @@ class Grants:
             self._newest[name][place] = sample
 
     def samples(self, law: type, sensor: str, kind: type[Kind]) -> tuple[Kind | None, ...]:
-        """Return what `ControlLaw.samples` does; UserCodeError as there, with the name of the law's class."""
+        """Implement `ControlLaw.samples`; a UserCodeError names the law's class."""
         if sensor not in self._newest:
             listed = ", ".join([*self._newest, sensor])
             raise self._not_granted(law, f"sensor {sensor!r:.40}", "law_sensors", f"law_sensors: [{listed}]")
@@ -97,7 +97,7 @@ class Grants:
 
 
 def _is_declared_as(received: Any, kind: Any) -> bool:
-    """Tell whether a class of messages, made of its declaration, stands for a user's class."""
+    """Tell whether a message class made from its declaration corresponds to a user's class."""
     names = [(getattr(each, "__name__", None), getattr(each, "__struct_fields__", None)) for each in (received, kind)]
     return names[0] == names[1]
 
@@ -109,6 +109,6 @@ def grants_of(cluster: Cluster, environment: Environment) -> Grants:
 
 
 def granted(law: Any, grants: Grants) -> Any:
-    """Return a class of laws whose instances have these grants once the constructor of `ControlLaw` has run."""
+    """Return a subclass of a law's class whose instances receive these grants in the constructor of `ControlLaw`."""
     own = {"_granted": grants, "__module__": law.__module__, "__qualname__": law.__qualname__, "__doc__": law.__doc__}
     return type(law.__name__, (law,), own)

@@ -1,4 +1,4 @@
-"""Where a formation is to be at every instant: the reference, and the ramps by which requests change it smoothly."""
+"""The reference of a formation over time, and the ramps by which requests change it smoothly."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ IN_PLACE_M = 1.0  # from its place, where a robot joins the formation; chosen: h
 class Guidance:
     """The reference of an engaged formation, a function of simulated time.
 
-    The purpose of the formation (a target or a trajectory, its home) is kept apart from what is flown now (a ramp onto
-    it). A variable that a request does not name keeps its goal: the last value that a request gave it; before any, its
-    value at engagement, and zero for the neutral ones (roll, pitch, phi_i, w_k).
+    The formation's home (its target or trajectory) is kept separately from what is flown now (a ramp onto it). A
+    variable that a request does not name keeps its goal: the value of the last request that named it; initially its
+    value at engagement, or zero for the neutral ones (roll, pitch, phi_i, w_k).
 
-    Methods that change the reference raise TrajectoryError, ExpressionError or SingularClusterError where the way is
-    not allowed, and change nothing then.
+    Methods that change the reference raise TrajectoryError, ExpressionError or SingularClusterError if the path is not
+    allowed, and then change nothing.
     """
 
     def __init__(self, space: ClusterSpace, gains: FormationGains) -> None:
@@ -55,13 +55,13 @@ class Guidance:
         self._known: tuple[Reference, float, tuple[Array, Array]] | None = None  # the last result of `value`
 
     def value(self, t_s: float) -> tuple[Array, Array]:
-        """Return c_des and its rate, each (4n,); computed once a gate."""
+        """Return c_des and its rate, each (4n,); computed once per gate."""
         if self._known is None or self._known[0] is not self._flown or self._known[1] != t_s:
             self._known = (self._flown, t_s, self._flown.value(t_s))
         return self._known[2]
 
     def trajectory_t_s(self, t_s: float) -> float | None:
-        """Return the trajectory's own time, or None where none runs."""
+        """Return the trajectory's own time [s], None without a running trajectory."""
         if not isinstance(self._home, Shifted) or self.paused:
             return None
         own_s, end_s = t_s - self._home.start_s, self._home.of.duration_s
@@ -75,7 +75,7 @@ class Guidance:
         self.paused = False
 
     def engage_at(self, c: Array, goal: Array, t_s: float) -> None:
-        """Start at the estimate c (4n,), at rest, and go to the goal (4n,) near it, where it was to be."""
+        """Start at rest at the estimate c (4n,), and move to the goal (4n,) near it."""
         home = Hold(goal)
         self._flown = self._planner.ramp((c, np.zeros_like(c)), home, t_s)
         self._home, self._goal, self.paused = home, goal.copy(), False
@@ -98,7 +98,7 @@ class Guidance:
         self._home, self.paused = home, False
 
     def pause(self, t_s: float) -> None:
-        """Come to rest at the present reference; at once where there is no room to do so smoothly."""
+        """Come to rest near the present reference; immediately if there is no room for a ramp."""
         c, c_dot = self.value(t_s)
         try:
             self._flown = self._planner.ramp((c, c_dot), Hold(c), t_s)
@@ -107,14 +107,14 @@ class Guidance:
         self.paused = True
 
     def resume(self, t_s: float) -> None:
-        """Go on after a pause to the home."""
+        """Continue to the home after a pause."""
         self._flown = self._planner.ramp(self.value(t_s), self._home, t_s)
         self.paused = False
 
     def rejoin(self, c: Array, t_s: float) -> None:
-        """Go on after a fault from the estimate c (4n,), at rest; a paused formation stays there.
+        """Continue after a fault from rest at the estimate c (4n,); a paused formation stays there.
 
-        The way back keeps the limits in flight: a formation recovers from where it may just be flown.
+        The path back is checked by the limits in flight, which a formation at the edge of those limits satisfies.
         """
         home = Hold(c) if self.paused else self._home
         start = (c, np.zeros_like(c))
@@ -133,23 +133,23 @@ class Guidance:
         self._goal, self.paused = state["goal"], state["paused"]
 
     def base(self, t_s: float) -> Array:
-        """Return what variables (4n,) keep that a request does not name."""
+        """Return the values (4n,) of the variables that a request does not name."""
         return self._home.value(t_s)[0] if isinstance(self._home, Shifted) else self._goal
 
 
 class RampPlanner:
-    """Plans the ways of a formation within limits of its shape and of its robots."""
+    """Plans the ramps of a formation within the limits of its shape and its robots."""
 
     def __init__(self, space: ClusterSpace, gains: FormationGains, limits: ShapeLimits) -> None:
         self._space, self._gains, self._limits = space, gains, limits
 
     def ramp(self, start: tuple[Array, Array], onto: Reference, start_s: float, over_s: float | None = None) -> Ramp:
-        """Return the ramp from start (c, c_dot) onto a reference; without over_s as fast as the limits let it.
+        """Return the ramp from start (c, c_dot) onto a reference, within over_s or as fast as the limits allow.
 
-        The ramp and what follows it (600 s of it at most) are checked.
+        The ramp and up to 600 s of the reference after it are checked.
 
         Raises:
-            TrajectoryError: too fast, too far, or it leads through a place that is not allowed.
+            TrajectoryError: the ramp is too fast or too long, or leads through a state that is not allowed.
         """
         from_s = max(start_s, onto.start_s) if isinstance(onto, Shifted) else start_s
         end_s = min(math.inf if onto.duration_s is None else onto.duration_s, from_s + HORIZON_S)
@@ -173,7 +173,7 @@ class RampPlanner:
         return ramp
 
     def fastest(self, start: tuple[Array, Array], onto: Reference, start_s: float) -> Ramp:
-        """Return the ramp that uses the limits, its way unchecked; TrajectoryError: it would take over an hour."""
+        """Return the fastest ramp within speed limits, its path unchecked; TrajectoryError: it takes over an hour."""
         over_s = RAMP_MIN_S
         while over_s <= RAMP_MAX_S:
             ramp = ramp_onto(self._space, *start, onto, start_s, over_s)
@@ -206,10 +206,10 @@ class RampPlanner:
 
 
 class Places:
-    """The places p_W (n, 3) [m] of the robots of a held formation, and how each gets there by itself.
+    """The places p_W (n, 3) [m] of the robots of a held formation, and the motion of each robot to its place.
 
-    A robot that is far out of step (landed, and flown low again) makes a shape in which no formation can be led. It
-    first flies horizontally, at its height and so below or above the others, then straight up or down, with a share of
+    A robot far from its place (for example after landing and taking off again) makes a shape that cannot be led as a
+    formation. It first flies horizontally at its own height, below or above the others, then vertically, at a share of
     the robots' limits.
     """
 
@@ -228,6 +228,6 @@ class Places:
         return v_W
 
     def farthest(self, p_W: Array) -> tuple[int, float]:
-        """Return which robot is farthest from its place, and how far [m]."""
+        """Return the index of the robot farthest from its place, and the distance [m]."""
         away_m = np.linalg.norm(self.p_W - p_W, axis=1)
         return int(np.argmax(away_m)), float(away_m.max())

@@ -65,7 +65,7 @@ class Reference(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Hold:
-    """A reference that stands at c (4n,)."""
+    """A constant reference at c (4n,)."""
 
     c: Array
     duration_s: float | None = 0.0
@@ -76,7 +76,7 @@ class Hold:
 
 @dataclass(frozen=True, eq=False)
 class Shifted:
-    """A reference that starts at start_s of the time in which it is evaluated."""
+    """A reference delayed by start_s."""
 
     of: Reference
     start_s: float
@@ -91,7 +91,7 @@ class Shifted:
 
 
 class ExpressionTrajectory:
-    """Variables as expressions of t; those without one stay at base (4n,).
+    """Variables as expressions of t; variables without one stay at base (4n,).
 
     Args:
         expressions: text or a number by variable name, e.g. {"x_c": "5*cos(2*pi*f*t)", "p": 4, "yaw_deg": "6*t"}.
@@ -99,7 +99,7 @@ class ExpressionTrajectory:
         duration_s: end of the motion, None for none.
 
     Attributes:
-        arguments: of the constructor, by name, as plain values.
+        arguments: constructor arguments by name, as plain values.
 
     Raises:
         ExpressionError, TrajectoryError: an unknown name, an expression or duration not allowed.
@@ -203,7 +203,7 @@ class WaypointTrajectory:
 
 @dataclass(frozen=True, eq=False)
 class Ramp:
-    """A smooth move from a state of motion onto another reference, which may move meanwhile; see `ramp_onto`.
+    """A smooth transition from a state of motion onto another, possibly moving reference; see `ramp_onto`.
 
     c(t) = onto(t) + the offset of the start, which a quintic takes to zero with its first and second derivative. On a
     reference at rest, from rest, this is the minimum-jerk move. It runs in [start_s, start_s + over_s] of the time of
@@ -246,7 +246,7 @@ def put_ramped(
 
 
 def ramp_onto(space: ClusterSpace, c: Array, c_dot: Array, onto: Reference, start_s: float, over_s: float) -> Ramp:
-    """Return the ramp from c, moving at c_dot, at start_s onto a reference after over_s; angles by the shorter way."""
+    """Return the ramp from c, moving at c_dot, at start_s onto a reference within over_s; angles by the shorter way."""
     c_onto, c_dot_onto = onto.value(start_s)
     return Ramp(onto, start_s, over_s, space.difference(c, c_onto), c_dot - c_dot_onto)
 
@@ -261,7 +261,7 @@ _KINDS: dict[str, Any] = {
 
 
 def state_of(reference: Reference) -> State:
-    """Return a reference of this module as plain values; TypeError: it is another."""
+    """Return a reference of this module as plain values; TypeError: it is not of this module."""
     for kind, known in _KINDS.items():
         if type(reference) is known:
             arguments = getattr(reference, "arguments", None) or vars(reference)
@@ -271,7 +271,7 @@ def state_of(reference: Reference) -> State:
 
 
 def reference_of(space: ClusterSpace, state: State) -> Reference:
-    """Return the reference of a state; KeyError, TypeError, ValueError: it is none of `state_of`."""
+    """Return the reference of a state; KeyError, TypeError, ValueError: `state_of` did not return it."""
     own = ((name, value) for name, value in state.items() if name != "kind")
     arguments = {name: reference_of(space, value) if name in ("of", "onto") else value for name, value in own}
     kind = _KINDS[state["kind"]]
@@ -300,8 +300,8 @@ def named_values(space: Variables, values: object, where: str, base: Array, at: 
     """Return base (4n,) with values by name: numbers, or expressions without t.
 
     Raises:
-        TrajectoryError: no mapping, an unknown name or one given twice, no finite number, an angle beyond one turn.
-        ExpressionError: a text that is no expression.
+        TrajectoryError: not a mapping, an unknown or repeated name, not a finite number, an angle beyond one turn.
+        ExpressionError: a text that is not an expression.
     """
     if not isinstance(values, Mapping):
         raise TrajectoryError(f"found {str(values)[:40]!r}; allowed: numbers by name of variable", f"{where}:", at)
@@ -322,7 +322,7 @@ def named_values(space: Variables, values: object, where: str, base: Array, at: 
 
 
 def _refuse_twice(space: Variables, variable: Variable, given: set[int], place: tuple[str, str]) -> None:
-    """Refuse a variable that is given in two units; note that it is given now."""
+    """Refuse a variable given in two units, and record this one."""
     if variable.entry in given:
         name = space.names[variable.entry]
         raise TrajectoryError(f"is given beside the same variable; allowed: {name} or {name}{DEGREES}", *place)
@@ -330,7 +330,7 @@ def _refuse_twice(space: Variables, variable: Variable, given: set[int], place: 
 
 
 def _refuse_turns(space: Variables, variable: Variable, value: float, place: tuple[str, str]) -> None:
-    """Refuse a target angle beyond one turn: given in radians, it is meant in degrees."""
+    """Refuse a target angle beyond one turn: degrees were probably given as radians."""
     if not space.in_radians[variable.entry] or abs(value * variable.scale) <= ANGLE_MAX_RAD:
         return
     if variable.scale != 1.0:

@@ -1,7 +1,7 @@
-"""External drones, as their drivers publish them: pose, state, and which commands they accept. No clock.
+"""External drones as published by their drivers: pose, state and accepted commands. No clock.
 
-A driver publishes a pose for a gate now and then. Between two poses the drone moves on with its velocity, for as long
-as a pose is trusted; then it stands still.
+A driver publishes a pose from time to time. Between poses the drone is extrapolated with its velocity until the pose is
+too old; then it stands still.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -32,7 +32,7 @@ class Pose(NamedTuple):
 
 
 class ExternalDrones:
-    """The external drones of a fleet, which follow their poses; `i` counts them among all its drones."""
+    """The external drones of a fleet, which follow published poses; `i` is the index of a drone in the fleet."""
 
     SAVED: ClassVar[Saved] = {"_poses": dict[int, Pose], "_statuses": dict[int, Status]}
 
@@ -47,9 +47,9 @@ class ExternalDrones:
         return i in self._fleet.external
 
     def take(self, drone: str, message: Any, now_ns: int) -> str | None:
-        """Take a Truth or a Status of a driver; return why it is refused.
+        """Handle a Truth or Status of a driver; return why it is refused, or None.
 
-        `now_ns` is the newest gate. Of other messages only the stamp is judged.
+        `now_ns` is the newest gate. Of other messages only the stamp is checked.
         """
         i, t_ns = self._index[drone], message.t_ns
         former = self._poses.get(i) if isinstance(message, Truth) else self._statuses.get(i)
@@ -76,9 +76,9 @@ class ExternalDrones:
         return None
 
     def lead(self) -> None:
-        """Move every drone whose driver has published a pose to the present, before the fleet advances.
+        """Extrapolate every drone whose driver has published a pose to the present, before the fleet advances.
 
-        It is extrapolated at constant velocity, and at rest once the pose is too old.
+        The velocity is constant, and zero once the pose is too old.
         """
         p, v = slice(STATE.p_WB, STATE.p_WB + 3), slice(STATE.v_WB, STATE.v_WB + 3)
         for i, pose in self._poses.items():
@@ -95,7 +95,7 @@ class ExternalDrones:
     def command_refusal(self, i: int, kind: str, message: Any) -> str | None:
         """Return why a command is not passed on to the driver, None if it is.
 
-        A stop of the rotors always is; everything else depends on the state that the driver has published last.
+        Stopping the rotors is always passed on; other commands depend on the newest state published by the driver.
         """
         name, asked = self._fleet.names[i], message.mode if kind == "mode" else "setpoint"
         if asked == "emergency":

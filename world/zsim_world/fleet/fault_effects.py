@@ -1,4 +1,4 @@
-"""The effects of faults on the arrays of a fleet: sensors, rotors and wind. Without faults they are as at the start."""
+"""The effects of faults on the arrays of a fleet: sensors, rotors and wind. Without faults these are unchanged."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -26,9 +26,9 @@ class Impairment:
     """Applies faults to the drones of a fleet and to its wind.
 
     Args:
-        arrays: of the fleet, before its first gate.
-        drones, vehicles: their names and what they are, in scenario order.
-        scans: of their sensors that cast rays, None if no drone has one.
+        arrays: arrays of the fleet before its first gate.
+        drones, vehicles: names and vehicles of the drones, in scenario order.
+        scans: sampler of the sensors that cast rays, None if no drone has one.
 
     Attributes:
         rotors: names of the rotors of each drone.
@@ -57,7 +57,7 @@ class Impairment:
         self._calm = True
 
     def strike(self, acting: Sequence[Fault]) -> None:
-        """Let these faults act from now on, and no others; those that have acted before go on."""
+        """Make exactly these faults act from now on; those that acted already continue unchanged."""
         self._w.senses.config[:] = self._config
         self._w.boards.actuator[:] = self._sound
         if self._scans:
@@ -77,7 +77,7 @@ class Impairment:
         self._gusts = tuple(fault for fault in acting if fault.kind == "gust")
 
     def blow(self, from_ns: int, until_ns: int) -> None:
-        """Set the steady wind for what happens between two instants."""
+        """Set the steady wind between two instants."""
         if self._calm and not self._gusts:
             return
         at_ns = (from_ns + until_ns) // 2
@@ -139,7 +139,7 @@ def _impair_scanner(row: NDArray[np.float64], how: str, parameters: Mapping[str,
 
 
 def dropped(limit: float, probability: float) -> float:
-    """Return the standard normal number below which a sample is lost, where `limit` is that without the fault."""
+    """Return the standard normal number below which a sample is lost; `limit` is that without the fault."""
     if probability == 1.0:
         return math.inf
     return normal_quantile(1.0 - (1.0 - normal_probability(limit)) * (1.0 - probability))

@@ -1,7 +1,6 @@
-"""The fleet: all drones of a scenario, one gate at a time, from standing on the ground with their rotors still.
+"""The fleet: all drones of a scenario, advanced gate by gate, at first on the ground with stopped rotors.
 
-An external drone has a row as well, so that others collide with it and it blows on those below; its pose is set, not
-integrated.
+An external drone also has a row, for collisions and downwash; its pose is set, not integrated.
 
 Heights: `baro` altitude_m is the height over the origin of W (zeroed at the field, as the aircraft does at power-up),
 and pressure_pa is that of the standard atmosphere at `environment.height_m` + altitude_m.
@@ -103,21 +102,21 @@ _TAKES_SETPOINT = {mode for mode, state in enumerate(firmware.MODES) if state_re
 
 
 class Fleet:
-    """All drones of a scenario, stepped together gate by gate from t = 0, standing on the ground.
+    """All drones of a scenario, advanced together gate by gate from t = 0.
 
     Attributes:
-        names: in scenario order, in which drones are counted.
-        rotors: how many each has.
-        external: the drones that are not integrated, each with its place among them.
-        gps_sigma_m: of each drone's fixes.
-        impairment: what faults do to it.
-        bodies, boards: the arrays that the kernel works on; to be read only.
+        names: names of the drones in scenario order, the order of their indices.
+        rotors: number of rotors of each drone.
+        external: index of each external drone among the external ones, by its index in the fleet.
+        gps_sigma_m: standard deviation of each drone's fixes [m].
+        impairment: effects of faults.
+        bodies, boards: arrays of the kernel, read-only for callers.
         things: names of the obstacles, then of the surfaces.
-        beside: the sensors that see other drones and obstacles, behind all of `sensors`: sightings and scanners.
-        sampled: what fell due for publication in the last gate.
-        seen: what those sensors saw among it, by the row of `sampled`.
-        closest_m: least distance between two drones over the last gate; inf for a single one.
-        collisions: the pairs of drones whose hulls began to touch in the last gate.
+        beside: names of the sightings and scanners, numbered after all of `sensors`.
+        sampled: samples due for publication in the last gate.
+        seen: messages of sightings and scanners, by row of `sampled`.
+        closest_m: smallest distance between two drones during the last gate [m]; inf for a single drone.
+        collisions: pairs of drones whose hulls began to touch in the last gate.
         touching: whether a drone's hull touched another's in the last gate, (N,).
     """
 
@@ -136,11 +135,11 @@ class Fleet:
     collisions: list[tuple[int, int]]
 
     def __init__(self, scenario: Scenario) -> None:
-        """Place the drones and take the samples of t = 0.
+        """Place the drones and take the samples at t = 0.
 
         Raises:
             DivergedError: the scenario's numbers cannot be integrated.
-            DocumentError: the model of a drone is a module that is not installed here.
+            DocumentError: the module of a drone's model is not installed here.
         """
         self.names = [drone.name for drone in scenario.drones]
         vehicles = [vehicle_of(drone.model, f"drones[{i}].model") for i, drone in enumerate(scenario.drones)]
@@ -225,7 +224,7 @@ class Fleet:
                 self._insert_seen(seen)
 
     def _insert_seen(self, seen: list[PictureSightings | Scan]) -> None:
-        """Insert what was seen into the samples of the gate, after those of the same drone and time."""
+        """Insert sightings and scans into the samples of the gate, after those of the same drone and time."""
         number = {name: len(self.sensors.names) + place for place, name in enumerate(self.beside)}
         seen.sort(key=lambda each: (each.t_ns, each.drone, number[each.sensor], each.t_sample_ns, each.camera))
         rows = [(number[each.sensor], each.drone, each.t_ns, each.t_sample_ns) for each in seen]
@@ -233,7 +232,7 @@ class Fleet:
         self.sampled = Sampled(whose, values)
         self.seen = dict(zip(places.tolist(), seen, strict=True))
 
-    # What is the case
+    # State
 
     @property
     def t_ns(self) -> int:
@@ -241,11 +240,11 @@ class Fleet:
 
     @property
     def scene(self) -> Scene:
-        """Return what does not move: obstacles and surfaces."""
+        """Return the static scene: obstacles and surfaces."""
         return self._w.scene
 
     def rotor_info(self, i: int) -> tuple[RotorInfo, ...]:
-        """Return the rotors of a drone as `world/info` names them."""
+        """Return the rotors of a drone for `world/info`."""
         row, groups = self.bodies.vehicle[i], self.bodies.rotors[i].reshape(ROTOR.size, -1)
         unit, radius = row[VEHICLE.rotor_unit], float(row[VEHICLE.rotor_radius])
         x, y = (unit * groups[ROTOR.x]).tolist(), (unit * groups[ROTOR.y]).tolist()
@@ -255,7 +254,7 @@ class Fleet:
 
     @property
     def wind_m_s(self) -> NDArray[np.float64]:
-        """Wind at each drone in W, steady and gusts, without the downwash of others; (N, 3)."""
+        """Wind at each drone [m/s; W], steady wind and gusts without downwash, (N, 3)."""
         return self._w.gust + self._w.wind[WIND.steady : WIND.steady + 3]
 
     def truth(self) -> TrueState:
@@ -268,7 +267,7 @@ class Fleet:
         return firmware.MODES[self._mode(i)], charge, bool(self.touching[i])
 
     def bumps(self) -> list[tuple[int, int]]:
-        """Return the pairs of drone and thing, by its place in `things`, that began to touch in the last gate."""
+        """Return the pairs of a drone and an index in `things` that began to touch in the last gate."""
         if not self.bodies.bumped.size:
             return []
         return [(int(i), int(m)) for i, m in np.argwhere(self.bodies.bumped)]
@@ -279,7 +278,7 @@ class Fleet:
     # Commands
 
     def lead(self, i: int, pose: NDArray[np.float64]) -> None:
-        """Move an external drone to a pose, (STATE.size + its rotors,), from which it continues with its velocity."""
+        """Set the pose of an external drone, (STATE.size + its rotors,), from which its velocity moves it on."""
         self.bodies.pose[self.external[i], : len(pose)] = pose
         self.bodies.state[i, : len(pose)] = pose
 
@@ -306,12 +305,12 @@ class Fleet:
         return None
 
     def emergency(self, i: int) -> str | None:
-        """Stop the rotors at once; always accepted."""
+        """Stop the rotors immediately; always accepted."""
         self._enter(i, firmware.EMERGENCY)
         return None
 
     def reset(self, i: int) -> str | None:
-        """Leave the emergency; return None, or why that is refused."""
+        """Leave the emergency state; return None, or why that is refused."""
         if refusal := self._state_refusal(i, "reset"):
             return refusal
         self._enter(i, firmware.LANDED)
@@ -456,7 +455,7 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
 
 
 def _look(drone: Drone) -> tuple[float, float, float]:
-    """Return how a drone's sonar and flow look down, the row of `NearPairs.eye`."""
+    """Return the row of `NearPairs.eye` for a drone's downward sonar and flow sensor."""
     sonar, flow = drone.sensors.sonar, drone.sensors.flow
     away_m = max(el.length(sensor.mount.position_m) for sensor in (sonar, flow))
     return away_m, sonar.max_m, SONAR_COSINE_MIN
@@ -505,7 +504,7 @@ def _senses(scenario: Scenario, sensors: FleetSensors, noise: NoiseTable) -> Sen
 def _first_belief(drone: Drone, row: np.ndarray, calibration: np.ndarray, rotors: int) -> np.ndarray:
     """Return the belief at power-up: level, heading unknown until the first magnetometer sample.
 
-    Where the field gives none, the heading is the true one at the start.
+    If the magnetic field gives no heading, the true heading is used.
     """
     belief = np.zeros(BELIEF.size + rotors)
     belief[BELIEF.q_WB] = 1.0
@@ -518,7 +517,7 @@ def _first_belief(drone: Drone, row: np.ndarray, calibration: np.ndarray, rotors
 
 
 def _calibration(drone: Drone, scenario: Scenario) -> np.ndarray:
-    """Return the board's calibration: its mounts, and the bearing of the magnetic field where that gives a heading."""
+    """Return the board's calibration: its mounts, and the bearing of the magnetic field if that gives a heading."""
     board, field = np.zeros(CALIBRATION.size), scenario.environment.magnetic_field_ut
     imu, mag = drone.sensors.imu.mount, drone.sensors.mag.mount
     board[CALIBRATION.imu_turn : CALIBRATION.imu_turn + 4] = quaternion_from_rpy(np.radians(imu.rpy_deg))

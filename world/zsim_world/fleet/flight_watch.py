@@ -1,7 +1,7 @@
-"""Incidents of drones: one stops or lands by itself, flips, hits something, touches the ground, has no charge left.
+"""Incidents of drones: stopping or landing by themselves, flips, impacts, touchdowns, an empty battery.
 
-Found on the arrays of the fleet in every step of the firmware (5 ms), whatever the length of a gate, by a part of the
-kernel which reads and compares and changes nothing of the flight; incidents are described in words once a gate.
+The kernel detects them in every step of the firmware (5 ms), regardless of the gate interval, without influence on the
+flight; they are described in words once per gate.
 """
 
 import math
@@ -48,7 +48,7 @@ SEEN = columns(
 
 
 class Incident(NamedTuple):
-    """An incident of a drone, as an event: `data` has its cause or its figures."""
+    """An incident of a drone for an event; `data` has its cause or figures."""
 
     drone: int
     kind: str
@@ -66,7 +66,7 @@ class FlightWatch:
         self._others = ("", "the ground", *things, *drones)  # by what `SEEN.touched` holds
 
     def note_command(self, i: int, mode: int) -> None:
-        """Note a mode that was commanded: entering it is no incident."""
+        """Note a commanded mode: entering it is not an incident."""
         self._seen[i, SEEN.mode] = mode
 
     def incidents(self) -> list[Incident]:
@@ -85,12 +85,12 @@ class FlightWatch:
                 found.append(Incident(i, "impact", f"{name} hits {other} at {speed_m_s:.1f} m/s", data))
             if bits & TOUCHDOWN:
                 other = self._others[int(seen[SEEN.surface])]
-                text = f"{name} touches {other} in flight: nobody has commanded a landing"
+                text = f"{name} touches {other} in flight: no landing was commanded"
                 found.append(Incident(i, "touchdown", text, {"other": other}))
         return found
 
     def _own_mode(self, i: int, name: str) -> Incident:
-        """Return the mode that the firmware of a drone has entered by itself, with the reason."""
+        """Return the mode that the firmware of a drone has entered by itself, and the reason."""
         if self._boards.memory[i, MEMORY.mode] == EMERGENCY:
             tilt_deg = math.degrees(el.acos(self._boards.setting[i, SETTING.tilt_cut]))
             text = f"{name} stops its rotors: it finds itself tilted by more than {tilt_deg:.0f} deg"

@@ -1,8 +1,8 @@
-"""The kernel: one gate of all drones, a pure function of the arrays that it is given.
+"""The kernel: one gate of all drones, a pure function of its arrays.
 
-In every physics tick, in this order: the firmware (every 5 ms) reads the newest samples and commands the rotors; all
-drones are integrated, and external ones put where they are; gusts move on (every 5 ms); drones meet; sensors that are
-due sample the new state.
+In every physics tick, in this order: the firmware (every 5 ms) reads the newest samples and commands the rotors; the
+drones are integrated, and the poses of external ones set; gusts advance (every 5 ms); contacts and downwash between
+drones are computed; the sensors that are due sample the new state.
 """
 
 import math
@@ -82,7 +82,7 @@ def _gusts(wind: NDArray, gust: NDArray, state: NDArray, noise: NoiseRows) -> No
 
 @inlined
 def _meet(wind: NDArray, gust: NDArray, bodies: Bodies, sheet: Sheet) -> float:
-    """Set air and pushes for the next tick; return the least distance of two drones [m]."""
+    """Set air velocities and contact forces for the next tick; return the smallest distance of two drones [m]."""
     for i in range(gust.shape[0]):
         bodies.braced[i] = 0
         for k in range(3):
@@ -97,7 +97,7 @@ def _meet(wind: NDArray, gust: NDArray, bodies: Bodies, sheet: Sheet) -> float:
 
 @inlined
 def _ideal(s: int, x: BodyTruth, mounted: MountedSensor, site: Site) -> Values:
-    """Return the errorless values of stock sensor s: the only place that distinguishes them by their numbers."""
+    """Return the errorless values of stock sensor number s."""
     if s == ss.IMU:
         return imu(x, mounted, site)
     if s == ss.GPS:
@@ -156,7 +156,7 @@ def _sample(s: int, i: int, bodies: Bodies, noise: NoiseRows, senses: Senses, sc
 def _read_faulty(
     s: int, value: NDArray, config: NDArray, bias: NDArray, fault: NDArray, noise: NDArray, at: int, height: float
 ) -> bool:
-    """Do as `_read`, with the offset of a fault before and the hold of a stuck sensor after."""
+    """Do as `_read`, with the offset of a fault added before and the hold of a stuck sensor applied after."""
     displace(ss.CHANNELS[s], value, fault)
     kept = _read(s, value, config, bias, noise, at, height)
     if kept:
@@ -184,7 +184,7 @@ def _register(device: NDArray, s: int, value: NDArray) -> None:
 
 @inlined
 def _due(plan: NDArray, tick: int) -> bool:
-    """Return whether a sample is due, and plan the next one if so."""
+    """Return whether a sample is due, and schedule the next one if so."""
     if plan[SCHEDULE.due] > tick:
         return False
     plan[SCHEDULE.count] += 1
@@ -199,7 +199,7 @@ def _sense(
 ) -> int:
     """Take all samples that are due at this tick; return the length of the log.
 
-    The IMU samples in every step of the board; those that are due are published.
+    The IMU samples in every step of the board; only the samples that are due are published.
     """
     for i in range(bodies.state.shape[0]):
         if step:
@@ -219,7 +219,7 @@ def _sense(
 
 @inlined
 def _expose(s: int, i: int, tick: int, bodies: Bodies, senses: Senses) -> None:
-    """Log what a user's sensor is exposed to: its equation is applied after the gate."""
+    """Log the truth for a user's sensor, whose equation is applied after the gate."""
     place = senses.exposed_count[0]
     row = senses.exposed[place]
     _note(senses.exposed_whose[place], s, i, tick)
@@ -244,7 +244,7 @@ def _take(
     senses: Senses,
     scene: Scene,
 ) -> int:
-    """Sample sensor s of drone i, for the firmware and, if due, for the log; return the length of the log."""
+    """Sample sensor s of drone i for the firmware and, if due, for the log; return the length of the log."""
     value = senses.value[logged]
     kept = _sample(s, i, bodies, noise, senses, scene, value)
     if kept:
@@ -275,7 +275,7 @@ def _diverged(state: NDArray) -> int:
 
 @kernel(makes_arrays=False)
 def enter(memory: NDArray, belief: NDArray, mode: int) -> None:
-    """Put the firmware of a drone, by its rows of `boards`, into a mode."""
+    """Set the mode of a drone's firmware, given its rows of `boards`."""
     firmware.enter(memory, belief, mode)
 
 
@@ -287,7 +287,8 @@ def advance(held: Held, ticks: int) -> tuple[int, float, int, bool]:
         held: the arrays, by `zsim.math.compiled.hold`.
 
     Returns:
-        number of samples logged, least distance of two drones [m], diverged drone or -1, whether there was an incident.
+        number of samples logged, smallest distance of two drones [m], diverged drone or -1, whether there was an
+            incident.
     """
     return _advance(held.content, ticks)
 

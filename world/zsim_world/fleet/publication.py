@@ -1,6 +1,6 @@
-"""What leaves the fleet: the encoded messages of a gate, in the contract's order, and the fingerprint of a flight.
+"""The encoded messages of a gate, in the order of the contract.
 
-Per drone: its samples in time order, truth, and status last, which counts them.
+Per drone: its samples in time order, truth, and last the status, which counts them.
 """
 
 import math
@@ -62,7 +62,7 @@ class MessageRow(NamedTuple):
 
 
 class PublishedArrays(NamedTuple):
-    """The arrays of a fleet that messages are made of, see `zsim_world.physics.fleet_arrays`."""
+    """The arrays of a fleet that are published, see `zsim_world.physics.fleet_arrays`."""
 
     state: NDArray[np.float64]
     accel: NDArray[np.float64]
@@ -72,7 +72,7 @@ class PublishedArrays(NamedTuple):
 
 
 class PublishedState(NamedTuple):
-    """What messages of N drones are made of beside these arrays."""
+    """The other published values of N drones."""
 
     touching: NDArray[np.bool_]  # (N,), whether a hull touched another in this gate
     sigma_m: NDArray[np.float64]  # (N,), of each one's GPS
@@ -154,7 +154,7 @@ class GatePublication:
         return self._encoder.encoded(self._fleetwide.counts) if self._encoder else NO_PAYLOADS
 
     def _number(self, commander: str | None) -> int:
-        """Return the number of a word; a new one is added."""
+        """Return the number of a word, adding it if it is new."""
         if commander not in self._known:
             self._known[commander] = COMMANDER + len(self._known)
             self._words = encoding.words((*firmware.MODES, *self._known))

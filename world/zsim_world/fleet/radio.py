@@ -1,4 +1,4 @@
-"""Who hears whom at a gate: the topology of a scenario over its radio, by the true places of the drones."""
+"""Which drones receive which at a gate: the topology and radio of a scenario, by the true positions of the drones."""
 
 from collections.abc import Iterable
 

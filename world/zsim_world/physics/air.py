@@ -1,4 +1,4 @@
-"""The air: steady wind, gusts of the Dryden longitudinal form, alike but not equal at each drone, and downwash."""
+"""The air: steady wind, gusts of the Dryden longitudinal form, correlated between drones, and downwash."""
 
 import math
 
@@ -43,7 +43,7 @@ def blow(wind: Row, v_WB: Vector, gust: NDArray, common: Vector, own: Vector, dt
     """Advance the gust (3,) [m/s] at one drone by dt in place, by the exact discretisation of the filter.
 
     Args:
-        wind: the wind's parameters (WIND.size,); for many drones best loaded, then its roots are drawn once.
+        wind: the wind's parameters (WIND.size,); load them once for many drones, so that roots are computed once.
         v_WB: the drone's velocity [m/s].
         common: standard normal numbers that all drones share; own: of this drone.
     """

@@ -1,4 +1,4 @@
-"""Hulls of drones that touch each other, spheres to them, and the downwash on drones that fly below others."""
+"""Contact between hulls of drones, treated as spheres, and downwash on drones below others."""
 
 import math
 
@@ -13,7 +13,7 @@ from zsim_world.physics.surfaces import brace
 
 DISTANCE_MIN_M = 1e-9  # m, so that two drones in one place have a direction
 CLOSE = 1.0 + 1e-9  # of the square of a distance: more than rounding can make of it
-STRAY_M = 0.25  # m, by which each drone may move before near pairs are found anew: 0.4 s at 0.6 m/s
+STRAY_M = 0.25  # m, motion of a drone after which near pairs are found again: 0.4 s at 0.6 m/s
 APPROACH_M = 0.501  # m, by which a pair's distance may have changed by then: twice as much, and room for rounding
 
 
@@ -108,7 +108,7 @@ def _meet(bodies: Bodies, i: int, j: int) -> float:
 
 @inlined
 def _strayed(state: NDArray, origin: NDArray) -> bool:
-    """Return whether a drone has left the neighbourhood for which the near pairs were found."""
+    """Return whether a drone has moved too far for the near pairs to remain valid."""
     for i in range(state.shape[0]):
         square = 0.0
         for k in range(3):
@@ -163,9 +163,9 @@ def _find_near(vehicle: NDArray, state: NDArray, touching: NDArray, near: NearPa
 def meet_drones(bodies: Bodies) -> float:
     """Add downwash to `air`, the forces between hulls to `push`, and return the least distance [m].
 
-    Only near pairs are examined, in the order of all pairs: the result is that of all pairs, to the last bit. They are
-    updated when a drone has moved by STRAY_M since. `touching[i, j]` is 1 where i < j are in contact now; `touched` is
-    set to 1 where contact begins.
+    Only near pairs are examined, in the order of all pairs, which gives the same bits as all pairs. They are updated
+    when a drone has moved by STRAY_M. `touching[i, j]` is 1 where i < j are in contact now; `touched` is set to 1 where
+    contact begins.
     """
     near = bodies.near
     if _strayed(bodies.state, near.origin):

@@ -1,10 +1,10 @@
-"""The arrays that a fleet is made of: what the kernel reads and writes. N drones, a row each; R rotors.
+"""The arrays of a fleet, which the kernel reads and writes. N drones, a row each; R rotors.
 
-R is the largest number of rotors in the fleet. Numbers per rotor stand after the columns of a row, R for each group of
-them; a drone with fewer rotors has some that do not exist, whose speeds and limits are zero. `each`, a tuple of R
-numbers, gives compiled code their number: it is compiled for each R, and its loops over rotors are unrolled.
-R is four only where all are crosses of four, whose places and mixing are then constants of the code: with a vehicle
-whose four rotors stand elsewhere, R is five.
+R is the largest number of rotors in the fleet. Numbers per rotor follow the columns of a row, R for each group; for a
+drone with fewer rotors the speeds and limits of the missing ones are zero. `each`, a tuple of R numbers, gives compiled
+code their number: it is compiled for each R, with unrolled loops over rotors. R is four only if all vehicles are
+four-rotor crosses, whose positions and mixing are then constants of the code; with any other four-rotor layout, R is
+five.
 """
 
 import math
@@ -109,7 +109,7 @@ class KernelTime(NamedTuple):
 
 
 class NearPairs(NamedTuple):
-    """Pairs of drones that can affect each other, and the positions for which they were found (contacts.py)."""
+    """Pairs of drones that can affect each other, and the positions at which they were found (contacts.py)."""
 
     pair: NDArray  # int32 (N (N - 1) / 2, 2), i < j, ascending
     number: NDArray  # int64 (1,), how many pairs
@@ -186,7 +186,7 @@ class Senses(NamedTuple):
 
 
 class Watched(NamedTuple):
-    """What is kept of N drones to detect their incidents, see fleet/flight_watch.py."""
+    """The data for detecting incidents of N drones, see fleet/flight_watch.py."""
 
     seen: NDArray  # (N, flight_watch.SEEN.size)
     found: NDArray  # int64 (N,), bits of the incidents of each in the last gate

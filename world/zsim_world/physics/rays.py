@@ -1,9 +1,9 @@
-"""Where rays meet ground, obstacles, triangles and the hulls of drones: exact, compiled, the same bits everywhere.
+"""Intersection of rays with ground, obstacles, triangles and drone hulls: exact, compiled, the same bits everywhere.
 
-Every convex solid is an intersection of slabs, or a quadric between two of them, so a ray is inside of it from the
-last entry to the first exit (Kay and Kajiya, SIGGRAPH 1986). Triangles: Moeller and Trumbore, J. Graphics Tools 2
-(1997), from both sides. Obstacles and triangles are the leaves of one tree of boxes, walked from near to far, so that
-a ray through a forest looks at a few trunks. Drones move, and are few: a caster compares each ray with those in reach.
+Every convex solid is an intersection of slabs, or a quadric between two of them, so a ray is inside from the last entry
+to the first exit (Kay and Kajiya, SIGGRAPH 1986). Triangles: Moeller and Trumbore, J. Graphics Tools 2 (1997), both
+sides. Obstacles and triangles are the leaves of one bounding volume hierarchy, traversed from near to far. Drones move
+and are few: a caster tests each ray against those in reach.
 """
 
 import math
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 
 class Scene(NamedTuple):
-    """What does not move: M obstacles, T triangles, and the tree over both."""
+    """The static scene: M obstacles, T triangles, and the tree over both."""
 
     solid: NDArray  # (M, COLUMNS), rows of zsim.scenario.obstacle
     triangle: NDArray  # (T, TRIANGLE), m, in W
@@ -43,7 +43,7 @@ def scene(solid: Array, triangle: Array) -> Scene:
 
 
 def _bounds_of(row: Sequence[float]) -> tuple[list[float], list[float]]:
-    """Return the least and the greatest corner of an obstacle."""
+    """Return the minimum and maximum corner of an obstacle's bounding box."""
     half, c, s = row[HALF : HALF + 3], abs(row[COSINE]), abs(row[SINE])
     if row[SHAPE] == BOX:
         half = [c * half[0] + s * half[1], s * half[0] + c * half[1], half[2]]
@@ -83,7 +83,7 @@ def _quadric(a: float, b: float, c: float) -> tuple[float, float]:
 
 @inlined
 def _met(first: float, last: float, far: float) -> float:
-    """Return where a ray that is inside from `first` to `last` meets the solid, 0 if it begins there; else `far`."""
+    """Return the distance at which a ray between `first` and `last` enters the solid, 0 from inside, else `far`."""
     if first > last or last < 0.0:
         return far
     return min(max(first, 0.0), far)

@@ -89,12 +89,12 @@ def accelerations(
     I dw/dt = M - w × (I w)
 
     Args:
-        grounded: a constant where it is called. False leaves the ground out, and then the result holds only where
-            the ground is out of reach; so there is no branch in it, and several drones go at once (simd.py).
+        grounded: a compile-time constant. False omits the ground, which is valid only out of its reach; without the
+            branch several drones are computed at once (simd.py).
         row, rotors: parameters; anchor: of its contact points (surfaces.py).
         p_WB, v_WB, q_WB, w_WB_B: state; speeds, commands, decay: of the rotors, as for `wrench`.
         air_W: velocity of the air at the drone [m/s]; push_W: force of other drones [N].
-        touch: what it touches besides, None: nothing; aero: its aerodynamics, None: none but `drag`.
+        touch: its other contacts, None without any; aero: its aerodynamics, None with `drag` only.
     """
     ground = NOTHING, NOTHING
     if grounded:
@@ -134,7 +134,7 @@ def _flow(
     commands: PerRotor,
     decay: float | None,
 ) -> tuple[Vector, Vector]:
-    """Return the force in W [N] and the moment in B [N m] of the aerodynamics, u_W being the velocity in the air."""
+    """Return the aerodynamic force in W [N] and moment in B [N m] at the velocity u_W relative to the air [m/s]."""
     u = rot.rotate_back(q_WB, u_W)
     force, moment = in_flow(row, rotors, aero, u, w_WB_B, speeds, commands, decay)
     size, linear, quadratic = rot.norm(u), AERO.linear, AERO.quadratic
@@ -175,9 +175,9 @@ def step(
     touch: Touch | None = None,
     aero: Aero | None = None,
 ) -> None:
-    """Advance one drone's state (STATE.size + R,) by dt [s] in place, under a command (R,) [rad/s] to its rotors.
+    """Advance one drone's state (STATE.size + R,) by dt [s] in place under rotor commands (R,) [rad/s].
 
-    The rotors' lag is integrated exactly, also within the step; air and forces of others are held over it.
+    The rotors' lag is integrated exactly, also within the step; air velocity and forces of other drones are held.
     """
     decay = half_decay(row[VEHICLE.rotor_lag], dt)
     speeds, commands = PerRotor(state, STATE.size, 1, rotors.each), PerRotor(command, 0, 1, rotors.each)
@@ -201,7 +201,7 @@ def lag(speeds: PerRotor, commands: PerRotor, decay: float) -> None:
 
 @inlined
 def half_decay(lag_s: float, dt: float) -> float:
-    """Return the fraction of a rotor's distance to its commanded speed that is left after half a step."""
+    """Return the fraction of a rotor's speed error that remains after half a step."""
     return el.exp(-0.5 * dt / lag_s)
 
 
@@ -224,7 +224,7 @@ def stepped(
     touch: Touch | None = None,
     aero: Aero | None = None,
 ) -> tuple[Vector, Vector, Quaternion, Vector, bool]:
-    """Return p_WB, v_WB, q_WB, w_WB_B after dt [s], and whether the ground was out of reach; speeds stay.
+    """Return p_WB, v_WB, q_WB, w_WB_B after dt [s], and whether the ground was out of reach; speeds are unchanged.
 
     Args:
         grounded, row, rotors, anchor, air_W, push_W, touch, aero: as for `accelerations`.
@@ -274,7 +274,7 @@ def lagged(speed: float, command: float, decay: float) -> float:
 
 @inlined
 def ground_effect(height_m: float, radius_m: float) -> float:
-    """Return the thrust near the ground over that in free air: 1 / (1 - (R / 4z)^2).
+    """Return the ratio of the thrust near the ground to that in free air: 1 / (1 - (R / 4z)^2).
 
     Cheeseman and Bennett, ARC R&M 3021 (1955); z is the rotor's height, not taken below R/2 (factor 4/3).
     """
@@ -336,9 +336,9 @@ def in_flow(
     commands: PerRotor,
     decay: float | None,
 ) -> tuple[Vector, Vector]:
-    """Return force [N] and moment [N m] in B that a flow past the rotors adds (zsim.vehicles.vehicle.Aerodynamics).
+    """Return the force [N] and moment [N m] in B due to flow past the rotors (zsim.vehicles.vehicle.Aerodynamics).
 
-    Translational lift, stated for rotors that fly, goes with the square of a speed below the least one commanded.
+    Translational lift is given for flying rotors; below the lowest commanded speed it scales with the speed squared.
 
     Args:
         aero: (AERO.size,); u_B: velocity of the centre of mass against the air, in B [m/s].
@@ -374,7 +374,7 @@ def free_thrust(row: Row, speeds: PerRotor) -> float:
 def mix(row: Row, rotors: PerRotor, thrust_n: float, moment: Vector, speeds: PerRotor) -> None:
     """Set rotor speeds [rad/s] that give a thrust [N] and a moment in B [N m] within the rotors' limits.
 
-    What exceeds the limits is given up in this order: yaw first, then thrust, tilt last.
+    Demands beyond the limits are reduced in this order: yaw first, then thrust, tilt last.
     """
     thrust = row[VEHICLE.thrust]
     low = thrust * row[VEHICLE.rotor_min] * row[VEHICLE.rotor_min]
@@ -415,7 +415,7 @@ def power(row: NDArray, speeds: PerRotor) -> float:
 
 @inlined
 def drained(row: NDArray, energy_j: float, speeds: PerRotor, dt: float) -> float:
-    """Return the energy of the battery left [J] after dt [s], never below zero."""
+    """Return the remaining battery energy [J] after dt [s], never below zero."""
     return max(energy_j - power(row, speeds) * dt, 0.0)
 
 

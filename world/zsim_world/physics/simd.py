@@ -1,14 +1,13 @@
-"""Bodies in blocks of eight: one instruction of the processor works on eight drones at once.
+"""Bodies in blocks of eight drones, computed together by SIMD instructions.
 
-Modern processors add or multiply eight numbers with one instruction (SIMD: single instruction, multiple data) if the
-eight stand side by side in memory. So the drones are divided into blocks of LANES; a block is one array in which each
-column holds that column's number of all its drones, `block[LANES * column + lane]` being that of one of them. A loop
-over the lanes of a block, whose body has no branch, is turned into such instructions by the compiler: its length and
-its columns are constants, so that neither a check of overlaps nor a rest is needed. They are the operations of one
-drone in their order, so that the results are the same to the last bit, whatever the block.
+Processors operate on eight numbers with one instruction (single instruction, multiple data) if these are adjacent in
+memory. So the drones are divided into blocks of LANES; a block is an array with the values of a column adjacent for all
+its drones: `block[LANES * column + lane]`. The compiler vectorises a branch-free loop over the lanes of a block; its
+length and columns are constants, so that neither an overlap check nor a remainder loop is needed. The operations of
+each drone keep their order, so the results are the same to the last bit for any block.
 
-Equations that branch, as those of contact with the ground, are done for each drone by itself: a block is stepped as
-in free air, and drones that had the ground or an obstacle in reach, or touch another, take their step again with it.
+Equations with branches, such as ground contact, are computed per drone: a block is stepped as in free air, and drones
+with the ground or an obstacle in reach, or in contact with another drone, are stepped again with these.
 """
 
 from collections.abc import Iterable
@@ -50,8 +49,8 @@ def blocks(count: int, parts: Iterable[tuple[int, NDArray[np.float64]]]) -> NDAr
 
     Args:
         count: of a block's columns.
-        parts: first column, and numbers (N, any) from there on. Lanes without a drone get those of the last one, and
-            besides these constants an attitude at the start: they are computed too, and Python divides by no 0.
+        parts: first column, and numbers (N, any) from there on. Lanes without a drone, which are computed too, get
+            those of the last drone and an initial attitude, to avoid division by 0 in Python.
     """
     listed = list(parts)
     drones = len(listed[0][1])
@@ -154,14 +153,14 @@ def accelerate(bodies: Bodies) -> None:
 
 @inlined
 def line_up(bodies: Bodies) -> None:
-    """Copy the state of all drones into the blocks, which keep it from then on."""
+    """Copy the state of all drones into the blocks, which hold it from then on."""
     for i in range(bodies.state.shape[0]):
         _put_state(bodies.lanes[i // LANES], i % LANES, bodies.state[i], bodies.each)
 
 
 @inlined
 def lead(bodies: Bodies, dt: float) -> None:
-    """Move the external drones with their velocities over one tick of dt [s], whatever physics did to them in it."""
+    """Move the external drones with their velocities by one tick of dt [s], overriding the physics."""
     for e in range(bodies.external.shape[0]):
         i, pose = bodies.external[e], bodies.pose[e]
         for c in range(3):
@@ -184,7 +183,7 @@ def _load(bodies: Bodies, lanes: NDArray, first: int) -> bool:
     """Copy commands, air and forces into the lanes from `first` on; return whether any drone is above the ground's
     reach.
 
-    In a lane without a drone the numbers mean nothing and are never read.
+    Lanes without a drone hold arbitrary numbers, which are never read.
     """
     airborne, at = False, _group(BODY_ROTORS.command, bodies.each)
     for i in range(first, min(first + LANES, bodies.state.shape[0])):
@@ -206,7 +205,7 @@ def _pose(lanes: NDArray, k: int) -> tuple[Vector, Vector, Quaternion, Vector]:
 
 @inlined
 def _step_block(lanes: NDArray, each: tuple[int, ...], parts: tuple[int, ...], anchor: NDArray, dt: float) -> None:
-    """Take a step of dt [s] with all drones of the block, as in free air."""
+    """Step all drones of the block by dt [s], as in free air."""
     for k in range(LANES):
         p, v, q, w = _pose(lanes, k)
         rotors = lane_rotors(lanes, _group(BODY_ROTORS.known, each), k, each)
@@ -244,7 +243,7 @@ def _accelerate_block(lanes: NDArray, each: tuple[int, ...], parts: tuple[int, .
 
 @inlined
 def _accelerate_alone(bodies: Bodies, i: int, touch: Touch | None) -> None:
-    """Compute the accelerations of a drone near the ground, and of what else it touches."""
+    """Compute the accelerations of a drone near the ground or in contact with anything."""
     each, row, anchor = bodies.each, bodies.vehicle[i], bodies.anchor[i]
     p, v, q, w = body.pose(bodies.state[i])
     rotors, speeds = PerRotor(bodies.rotors[i], 0, 1, each), PerRotor(bodies.state[i], STATE.size, 1, each)
@@ -267,7 +266,7 @@ def _touch(bodies: Bodies, i: int) -> Touch:
 
 @noinline
 def _step_braced(bodies: Bodies, i: int, dt: float) -> None:
-    """Step a drone with everything that it touches."""
+    """Step a drone with all its contacts."""
     row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
     air, push = vector(bodies.air[i], 0), vector(bodies.push[i], 0)
     rotors = PerRotor(bodies.rotors[i], 0, 1, bodies.each)
@@ -277,7 +276,7 @@ def _step_braced(bodies: Bodies, i: int, dt: float) -> None:
 
 @inlined
 def _take_over(bodies: Bodies, lanes: NDArray, i: int, k: int, dt: float) -> None:
-    """Copy the result of lane k to drone i; where it was not in free air, step it again."""
+    """Copy the result of lane k to drone i; if it was not in free air, step it again."""
     row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
     if lanes[LANES * BODY_LANES.clear + k] > 0.0 and bodies.braced[i] == 0:
         for c in range(STATE.size):

@@ -1,10 +1,10 @@
-"""Where each ball of a drone touches surfaces, sheets of triangles: after every step a plane for it, held within one.
+"""Contact of each ball of a drone with surfaces (sheets of triangles): a plane, found after every step and then held.
 
 The plane is that of the nearest point, so that the force of surfaces.py is a smooth function of the state within a
-step. A sheet has no inside. A ball begins in front of it, and remembers on which side it is: it changes sides where its
-way from step to step crosses a triangle, and behind it is driven back, however deep it is. Beside a rim a ball is
-always free. A mesh that is closed is so hit from outside as a solid; a wall of it that is thinner than the dent of a
-collision is passed, as that of a box is.
+step. A sheet has no inside. A ball starts in front of it and its side is stored: it changes sides when its path from
+step to step crosses a triangle, and behind the sheet it is pushed back, however deep it is. Beside a rim a ball is
+always free. A closed mesh therefore acts from outside as a solid; like a box, it can be penetrated where a wall is
+thinner than the dent of a collision.
 """
 
 from numpy.typing import NDArray
@@ -25,9 +25,9 @@ from zsim_world.physics.surfaces import (
     reach_of,
 )
 
-LOST_M = 1.0  # m, chosen: a drone that has gone so far through a sheet is beyond it
-TINY_M = 1e-9  # m; nearer to an edge or corner a ball keeps the normal that it has
-ROOM_M = 1e-6  # m, more than rounding can make of a distance
+LOST_M = 1.0  # m, chosen: depth at which a drone is beyond the sheet
+TINY_M = 1e-9  # m; nearer to an edge or corner a ball keeps its normal
+ROOM_M = 1e-6  # m, above the rounding error of a distance
 
 
 @noinline
@@ -71,8 +71,8 @@ def _vector(row: NDArray, at: int) -> Vector:
 def _follow(row: Row, sheet: Sheet, plane: NDArray, k: int, p_WB: Vector, q_WB: Quaternion, away: float) -> None:
     """Find the plane of ball k of a drone whose centre is `away` [m] from the nearest surface, and move its anchor.
 
-    A ball that has none yet is in front of the surface, unless it is a little behind it as seen from the drone's
-    centre: that of a drone which starts upon it, whose feet give under the weight.
+    A ball without a plane starts in front of the surface, unless it is slightly behind it as seen from the drone's
+    centre, as the feet of a drone that stands on the surface are.
     """
     r_B, radius = ball(row, k)
     x = add(p_WB, rotate(q_WB, r_B))

@@ -1,14 +1,13 @@
 """Contact with ground (z = 0), obstacles and surfaces: spring and damper under every contact point, with dry friction.
 
 Friction is a spring to an anchor on the surface; where it would exceed the friction cone, the anchor is dragged along.
-The anchor is fixed within a step and moves after it, so that a step is a smooth function of the state.
+The anchor is fixed within a step and moved after it, so that a step is a smooth function of the state.
 
-At obstacles a drone is a rigid set of balls: the contact points of the ground, with no radius, then balls along its
-hull and one in its middle, so that neither a post nor an edge fits between the points. A ball is pushed along the
-surface normal by the same law. The distance to a convex solid is the depth of a potential, so springs and anchors
-return no more energy than they were given. A drone has slots for the solids within its reach, each with an anchor for
-every ball; they are updated after every step and do not change within one. On surfaces each ball has a plane, likewise
-(surface_contact.py).
+At obstacles a drone is a rigid set of balls: the ground contact points, with radius zero, then balls along its hull and
+one in its middle, so that neither a post nor an edge fits between them. A ball is pushed along the surface normal by
+the same law. The distance to a convex solid acts as a potential, so springs and anchors never return more energy than
+was put in. A drone has slots for the solids within its reach, each with an anchor per ball; they are updated after
+every step and held within it. On surfaces each ball has a plane instead (surface_contact.py).
 """
 
 import math
@@ -87,7 +86,7 @@ def contact(
 
 @inlined
 def drag_anchors(row: NDArray, anchor: NDArray, p_WB: Vector, q_WB: Quaternion) -> None:
-    """Move the anchors after a step: to the point itself in the air, along with it where it slides."""
+    """Move the anchors after a step: to the contact point in the air, along with it where it slides."""
     for k in range(POINTS):
         r_W = rotate(q_WB, contact_point(row, k))
         x, y = p_WB[0] + r_W[0], p_WB[1] + r_W[1]
@@ -128,7 +127,7 @@ PLANE = columns(  # of a ball: where it is nearest to a surface
 
 
 class Touch(NamedTuple):
-    """What acts on one drone besides air and ground."""
+    """The contacts of one drone beside the ground."""
 
     obstacle: NDArray  # (M, obstacle.COLUMNS)
     solid: NDArray  # int32 (K,), those in its reach by their places in `obstacle`; -1: none
@@ -168,7 +167,7 @@ def _across(a: Vector, n: Vector) -> Vector:
 def touched(
     row: Row, touch: Touch, p_WB: Vector, v_WB: Vector, q_WB: Quaternion, w_WB_B: Vector
 ) -> tuple[Vector, Vector]:
-    """Return force in W [N] and moment in B [N m] of the obstacles and of other hulls' twist on one drone.
+    """Return the force in W [N] and moment in B [N m] of obstacles, and the moment of other hulls, on one drone.
 
     Args:
         row: the drone's parameters; touch: what it touches.
@@ -222,16 +221,16 @@ def _pushed(row: Row, k: int, depth: float, n: Vector, gap: Vector, v: Vector) -
 
 @inlined
 def plane_depth(plane: NDArray, radius: float) -> float:
-    """Return how deep [m] a ball was in a surface when its plane was found; not above 0 if none is in its reach."""
+    """Return the depth [m] of a ball in a surface when its plane was found; at most 0 if no surface is in reach."""
     return radius - plane[PLANE.distance] if plane[PLANE.side] != 0.0 else 0.0
 
 
 @noinline
 def meet_obstacles(bodies: Bodies) -> None:
-    """Find the obstacles within reach of every drone, move its anchors, and note which hulls touch which.
+    """Find the obstacles within reach of every drone, move its anchors, and note contacts of hulls.
 
-    `braced[i]` is 1 where there are any; `bumping[i, m]` where more than its feet is in contact now; `bumped` is set to
-    1 where such contact begins.
+    `braced[i]` is 1 if there are any; `bumping[i, m]` is 1 where more than the feet is in contact now; `bumped` is set
+    to 1 where such contact begins.
     """
     p, v = STATE.p_WB, STATE.v_WB
     for i in range(bodies.state.shape[0]):
@@ -256,7 +255,7 @@ def meet_obstacles(bodies: Bodies) -> None:
 
 @inlined
 def reach_of(row: NDArray, v_WB: Vector) -> float:
-    """Return the distance [m] from a drone's centre within which something can touch it in the next steps."""
+    """Return the distance [m] from a drone's centre within which contact is possible in the next steps."""
     reach = max(row[VEHICLE.contact_reach], row[VEHICLE.hull_radius]) + ball(row, POINTS)[1]
     return reach + LOOK_S * norm(v_WB)
 
@@ -270,7 +269,7 @@ def note_bump(bodies: Bodies, i: int, thing: int, hit: bool) -> None:
 
 @inlined
 def brace(bodies: Bodies, i: int) -> None:
-    """Note that drone i is not in free air: it is stepped with everything that it touches."""
+    """Mark drone i as not in free air: it is stepped with all its contacts."""
     if bodies.braced[i] == 0:
         bodies.braced[i] = 1
         for k in range(3):

@@ -1,8 +1,8 @@
-"""What sonar and optical flow make of an obstacle or a drone below; over the bare ground their values stay. Compiled.
+"""The effect of an obstacle or a drone below on sonar and optical flow. Compiled.
 
-A flow camera measures how its picture moves, of which the board makes a velocity by the distance that the sonar
-measures. Which movement that is where a picture has two, ground and a drone that flies below: that of the larger part,
-as by the largest peak of a histogram of the movements of its blocks (PX4/Flow, src/modules/flow/flow.c).
+A flow camera measures the motion of its picture, from which the board computes a velocity with the distance measured by
+the sonar. A picture with two motions, of the ground and of a drone below, gives that of the larger part, as does the
+largest peak of a histogram of block motions (PX4/Flow, src/modules/flow/flow.c).
 """
 
 import math
@@ -53,9 +53,9 @@ def _hull(state: NDArray, vehicle: NDArray, i: int, o: Vector, d: Vector, far: f
 def sonar_over(
     x: BodyTruth, s: MountedSensor, value: Vector, scene: Scene, state: NDArray, vehicle: NDArray, i: int
 ) -> Vector:
-    """Return distance [m] and echo of a sonar, given those over the bare ground: of what is first in its beam.
+    """Return distance [m] and echo of a sonar from the first object in its beam, given those over the bare ground.
 
-    From a beam that is too far from the vertical there is no echo, as over the ground.
+    As over the ground, there is no echo if the beam is too far from the vertical.
 
     Args:
         state, vehicle: of all drones, as in Bodies; i: whose sonar it is.
@@ -80,9 +80,9 @@ def flow_over(
 ) -> Vector:
     """Return the velocity [m/s] that a flow sensor reports, given that over the bare ground.
 
-    It is that against the surface in its picture, times the distance that the sonar measures over that to the surface:
-    right where both look at one surface, high or low. The surface is the one in the middle of the picture; a drone's
-    hull only if it covers most of the picture, and its velocity is then that of the hull where the axis meets it.
+    It is the velocity relative to the surface in the picture, times the ratio of the distance measured by the sonar to
+    that of the surface: correct if both see the same surface. The surface is the one in the middle of the picture, a
+    drone's hull only if it covers most of the picture, with the velocity of the hull where the axis meets it.
 
     Args:
         ranging: the sonar; state, vehicle: of all drones, as in Bodies; i: whose sensor it is.
@@ -91,7 +91,7 @@ def flow_over(
     b, down = _beam(x, ranging)
     far = ranging.range_max
     if -d[2] < SONAR_COSINE_MIN or -down[2] < SONAR_COSINE_MIN:
-        return value  # the board has no distance, and goes on with the last one
+        return value  # without a distance the board keeps the last one
     seen = cast_parts(scene, o, d, far)
     measured, _ = _hull(state, vehicle, i, b, down, cast_parts(scene, b, down, far))
     covered, whose = _hull(state, vehicle, i, o, d, seen)
@@ -113,7 +113,7 @@ def flow_over(
 
 @inlined
 def _covers(x: BodyTruth, s: MountedSensor, scene: Scene, hull: NDArray, radius: float, o: Vector, far: float) -> bool:
-    """Tell whether a hull, that of a drone's state, which is in the middle of the picture, covers most of it."""
+    """Tell whether the hull of a drone in the middle of the picture covers most of it."""
     cells, share = 0, 2.0 / 3.0
     for k in range(len(CELLS)):
         ahead, aside = share * HALF_VIEW[0] * CELLS[k][0], share * HALF_VIEW[1] * CELLS[k][1]

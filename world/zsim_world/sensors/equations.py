@@ -1,4 +1,4 @@
-"""From the truth to a reading: the equations of the stock sensors, then errors and faults. All compiled.
+"""The measurement equations of the stock sensors, then errors and faults. All compiled.
 
 A sensor is at p_BS in the body, rotated by R_BS (q_BS: sensor components to body components). An equation is a function
 of body, mount and site, and returns two vectors of errorless values; unused places are zero. The error model works on
@@ -95,8 +95,7 @@ def baro(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
 def pressure(altitude_m: float) -> float:
     """Return the static pressure [Pa] of the standard atmosphere at an altitude above sea level (ISO 2533).
 
-    The law holds to 11 km, the limit of scenarios; a drone carried beyond by the wind gets the same law, and a vacuum
-    where that ends, at 44 km.
+    The law holds to 11 km, the limit of scenarios; beyond it is extrapolated, to vacuum at 44 km.
     """
     return SEA_LEVEL_PA * el.power(max(1.0 - LAPSE_1_M * altitude_m, 0.0), PRESSURE_EXPONENT)
 
@@ -130,7 +129,7 @@ def flow(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
 
 @inlined
 def rounded(value: float, bias: float, white: float, quantum: float) -> float:
-    """Return the converter's output: value + bias + white, rounded to the quantum (0: none)."""
+    """Return value + bias + white, rounded to the quantum of the converter (0: not rounded)."""
     x = value + bias + white
     return x if quantum == 0.0 else quantum * math.floor(x / quantum + 0.5)
 

@@ -1,4 +1,4 @@
-"""When sensors that are sampled after a gate take their samples, and the states of the fleet around these instants."""
+"""The sampling instants of sensors computed after a gate, and the states of the fleet around them."""
 
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
@@ -41,10 +41,10 @@ class Exposures:
         self._former_ns = 0
 
     def until(self, state: Array, now_ns: int) -> tuple[list[tuple[int, int]], Between | None]:
-        """Return instants and places of the sensors whose samples fall due by a gate, sorted, and the states.
+        """Return instants and indices of the sensors whose samples are due by a gate, sorted, and the states.
 
         Args:
-            state: of all drones at the gate, (N, STATE.size or more).
+            state: states of all drones at the gate, (N, STATE.size or more).
         """
         due, between = [], None
         if self._next_ns <= now_ns:

@@ -1,8 +1,8 @@
-"""Which hats a camera has in view, and where: of true poses, without pictures. Compiled, without time or chance.
+"""Which hats a camera has in view, and where, from true poses without pictures. Compiled and deterministic.
 
-A hat is a ball. It is in view where all of it falls on the picture and enough of its edge is visible: a detector knows
-its circle from that, the better the more it is. What hides are obstacles, surfaces, hulls, flat bodies of revolution
-about their drones' z axis, and from below the rim of the drone's own rotors.
+A hat is a ball. It is in view if it is entirely within the picture and enough of its edge is visible, to which a
+detector fits a circle. It can be hidden by obstacles, surfaces, hulls (flat bodies of revolution about their drones' z
+axis) and, from below, by the rim of the drone's own rotors.
 """
 
 import math
@@ -88,7 +88,7 @@ def poses_between(former: NDArray, former_ns: int, now: NDArray, now_ns: int, t_
     """Return the poses of all drones at an instant between two gates, (N, STATE.size).
 
     Args:
-        former, now: at the gates, (N, STATE.size or more), of which the rest is mixed.
+        former, now: states at the gates, (N, STATE.size or more), between which the other columns are interpolated.
     """
     if t_ns >= now_ns or now_ns <= former_ns:
         return now.copy()
@@ -109,7 +109,7 @@ def poses_between(former: NDArray, former_ns: int, now: NDArray, now_ns: int, t_
 
 @inlined
 def _hull_hides(eye: Vector, ray: Vector, far: float, p_WB: Vector, q_WB: Quaternion, radius: float) -> bool:
-    """Tell whether a hull stands on a ray (unit vector, W) nearer than `far` [m]: an ellipsoid, made a ball."""
+    """Tell whether a hull is on a ray (unit vector, W) nearer than `far` [m]: an ellipsoid, scaled to a ball."""
     o, d = rotate_back(q_WB, subtract(eye, p_WB)), rotate_back(q_WB, ray)
     stretch = 1.0 / HULL_FLATNESS
     o, d = (o[0], o[1], stretch * o[2]), (d[0], d[1], stretch * d[2])
@@ -123,7 +123,7 @@ def _hull_hides(eye: Vector, ray: Vector, far: float, p_WB: Vector, q_WB: Quater
 
 @inlined
 def _rim_hides(eye: Vector, ray: Vector, p_WB: Vector, q_WB: Quaternion, radius: float) -> bool:
-    """Tell whether a ray to a drone's own hat comes up through the disc of its rotors."""
+    """Tell whether a ray to a drone's own hat passes upwards through the disc of its rotors."""
     o, d = rotate_back(q_WB, subtract(eye, p_WB)), rotate_back(q_WB, ray)
     rise = RIM_HIGH * radius - o[2]
     if rise <= 0.0 or d[2] <= 0.0:
@@ -134,14 +134,14 @@ def _rim_hides(eye: Vector, ray: Vector, p_WB: Vector, q_WB: Quaternion, radius:
 
 @inlined
 def _drone_hides(eye: Vector, ray: Vector, away: float, i: int, m: int, pose: NDArray, radius: float) -> bool:
-    """Tell whether drone i stands on a ray to a ball, that of drone m or of none."""
+    """Tell whether drone i is on a ray to a ball, the hat of drone m or of no drone."""
     p, q = vector(pose, STATE.p_WB), four(pose, STATE.q_WB)
     return _rim_hides(eye, ray, p, q, radius) if i == m else _hull_hides(eye, ray, away, p, q, radius)
 
 
 @inlined
 def _passes(eye: Vector, ray: Vector, away: float, p: Vector, radius: float) -> bool:
-    """Tell whether a sphere is beside or beyond all rays to a ball."""
+    """Tell whether a sphere is beside or behind all rays to a ball."""
     to = subtract(p, eye)
     along = min(max(dot(to, ray), 0.0), away)
     off = axpy(to, -along, ray)
@@ -156,7 +156,7 @@ def _scale(lens: Lens, cosine: float) -> float:
 
 @inlined
 def _in_picture(lens: Lens, to_K: Vector, angle: float) -> bool:
-    """Tell whether all of a ball of an apparent diameter [rad] falls on the picture."""
+    """Tell whether a ball of an apparent diameter [rad] is entirely within the picture."""
     cosine = to_K[2] / norm(to_K)
     if cosine < AHEAD_MIN:
         return False
@@ -169,7 +169,7 @@ def _in_picture(lens: Lens, to_K: Vector, angle: float) -> bool:
 def _hidden(
     eye: Vector, ray: Vector, away: float, ball: float, own: int, m: int, poses: NDArray, hulls: NDArray, scene: Scene
 ) -> int:
-    """Return which points of a ball's edge are hidden, one bit each."""
+    """Return the hidden points of a ball's edge, one bit each."""
     e1 = (ray[1], -ray[0], 0.0) if abs(ray[2]) < LEVEL_COSINE else (0.0, ray[2], -ray[1])
     e1 = scaled(e1, 1.0 / norm(e1))
     e2 = cross(ray, e1)
@@ -194,7 +194,7 @@ def _hidden(
 
 @inlined
 def _write_outline(hidden: int, row: NDArray) -> None:
-    """Write what the points of its edge that are visible tell of a ball."""
+    """Write the accuracy with which the visible points of a ball's edge determine it."""
     row[VIEW.share], row[VIEW.centre], row[VIEW.radius] = 1.0, 1.0, 1.0
     if hidden == 0:
         return
@@ -223,17 +223,17 @@ def hats_in_view(
     scene: Scene,
     view: NDArray,
 ) -> None:
-    """Write what a camera has in view.
+    """Write the hats that a camera has in view.
 
     Args:
-        camera: of the drone `own`.
-        own: number of its drone.
+        camera: row of the camera.
+        own: index of its drone.
         poses: of N drones at the instant of the picture, (N, STATE.size).
         hulls: radius of each hull [m], (N,).
         hat_B: centre of a hat in the body of its drone [m].
         diameter: of a hat [m].
-        balls: centres of what only looks like a hat [m; W], (M, 3).
-        bare: of each drone, whether its hat can be seen at all, (N,).
+        balls: centres of balls that only look like hats [m; W], (M, 3).
+        bare: whether the hat of each drone is visible at all, (N,).
         scene: obstacles and surfaces.
         view: the result, (N + M, VIEW.size): drones, then balls.
     """

@@ -1,13 +1,13 @@
-"""The random numbers of a fleet: one stream per drone and sensor, one of wind per drone, one of wind for all.
+"""The random numbers of a fleet: one stream per drone and sensor, one wind stream per drone, one wind stream for all.
 
 The kernel takes rows of standard normal numbers from one table; `refill` moves the unused rows to the front and draws
 the rest. A stream does not depend on the size of the table, nor on the other drones.
 
-The numbers are those of numpy's default generator, compiled: PCG64 and the ziggurat, to the same bits (a test compares
-them). In one loop a number takes 2.7 ns; from numpy's generator, called by compiled code, 4 ns (docs/decisions/0017).
+The numbers are those of numpy's default generator (PCG64, ziggurat), compiled here, to the same bits (a test compares
+them): 2.7 ns per number in a loop, against 4 ns by calling numpy's generator from compiled code (docs/decisions/0017).
 The generator: M. O'Neill, HMC-CS-2014-0905 (2014), PCG XSL-RR 128/64. The ziggurat: G. Marsaglia and W. W. Tsang, J.
-Stat. Softw. 5 (2000), with numpy's use of the bits. Its tables follow from a recurrence whose rounding is numpy's own,
-so they are read from numpy's generator by setting its state to produce the word that asks for an entry.
+Stat. Softw. 5 (2000), with numpy's use of the bits. Its tables depend on numpy's rounding, so they are read from
+numpy's generator by setting its state to produce the word that selects an entry.
 """
 
 import math
@@ -60,7 +60,7 @@ class NoiseTable:
         self.refill()
 
     def refill(self) -> None:
-        """Draw as many rows as have been used."""
+        """Replace the used rows."""
         with np.errstate(over="ignore"):  # words wrap around, of which numpy warns where this is not compiled
             refill(self.table, self.at, self._rows, self.width, self.cursor, self.streams)
 
@@ -84,7 +84,7 @@ class NoiseTable:
 
 @kernel(makes_arrays=False)
 def refill(table: NDArray, at: NDArray, rows: NDArray, widths: NDArray, cursor: NDArray, streams: NDArray) -> None:
-    """Move what is left of every stream to the front of its place in the table, and draw the rest.
+    """Move the unused rows of every stream to its front in the table, and draw the rest.
 
     Args:
         table, at: as in NoiseRows; cursor: rows used of each stream, set to 0.
@@ -143,7 +143,7 @@ def _read_tables() -> Ziggurat:
 
 
 def _drawn(rng: np.random.Generator, layer: int, size: int) -> tuple[float, bool]:
-    """Return the number that numpy draws for a word, and whether it needed no other word."""
+    """Return the number that numpy draws for a word, and whether it used only this word."""
     bits, state = rng.bit_generator, layer | size << int(_SIZE_SHIFT)  # without high bits, the word is the low ones
     held = bits.state
     step = held["state"]["inc"]
@@ -160,7 +160,7 @@ def words(rng: np.random.Generator) -> list[int]:
     """Return the words of a stream, (WORDS.size,), at the present state of numpy's generator.
 
     Raises:
-        ValueError: it is not a PCG64.
+        ValueError: the generator is not a PCG64.
     """
     held = rng.bit_generator.state
     if held["bit_generator"] != "PCG64":

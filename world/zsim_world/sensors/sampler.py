@@ -1,4 +1,4 @@
-"""The samples of a fleet in a gate: rows of arrays, held back until their latency is over.
+"""The samples of a fleet in a gate: rows of arrays, held back until their latency has passed.
 
 Values in the contract's order of fields. imu: ax, ay, az [m/s^2], gx, gy, gz [rad/s]; gps: latitude, longitude [deg],
 altitude [m], e, n, u [m], ve, vn, vu [m/s]; mag: x, y, z [uT]; baro: pressure [Pa], altitude [m]; sonar: range [m],
@@ -43,7 +43,7 @@ NONE = Sampled(np.empty((0, WHOSE.size), dtype=np.int64), np.empty((0, VALUE_COL
 
 
 class SampledLog(NamedTuple):
-    """The log of the kernel, and what turns it into samples."""
+    """The log of the kernel, and the data that converts it to samples."""
 
     whose: NDArray[np.int64]  # (M, 3): sensor, drone, tick
     value: NDArray[np.float64]  # (M, CHANNELS_MAX)
@@ -53,7 +53,7 @@ class SampledLog(NamedTuple):
 
 
 class Sampler:
-    """Makes samples of the kernel's log, and holds back those that are delayed."""
+    """Converts the kernel's log to samples, and holds back delayed ones."""
 
     SAVED: ClassVar[Saved] = {"_later": Sampled, "_user_sensors": PART}
 
@@ -70,7 +70,7 @@ class Sampler:
         self._later = NONE
 
     def due(self, logged: int, now_ns: int) -> Sampled:
-        """Return the samples that are due up to now, of the log and of those held back.
+        """Return the samples due up to now, from the log and those held back.
 
         Raises:
             UserCodeError: the equation of a user's sensor fails.
@@ -117,7 +117,7 @@ def stamped(held: Held, count: int, tick_ns: int) -> tuple[NDArray, NDArray]:
 
 @inlined
 def _is_before(a: NDArray, b: NDArray) -> bool:
-    """Tell whether a measurement comes before or with another in the order of (t_ns, drone, sensor)."""
+    """Tell whether a measurement does not come after another in the order of (t_ns, drone, sensor)."""
     if a[WHOSE.t] != b[WHOSE.t]:
         return a[WHOSE.t] < b[WHOSE.t]
     if a[WHOSE.drone] != b[WHOSE.drone]:
@@ -127,7 +127,7 @@ def _is_before(a: NDArray, b: NDArray) -> bool:
 
 @kernel()
 def with_more(whose: NDArray, values: NDArray, more: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Return measurements with others inserted that have no numbers, and the rows of these.
+    """Return measurements with others, without numbers, inserted, and the rows of the inserted ones.
 
     Args:
         whose, values: of Sampled, in its order.
@@ -146,7 +146,7 @@ def with_more(whose: NDArray, values: NDArray, more: NDArray) -> tuple[NDArray, 
 
 
 class UserSensors:
-    """The users' sensors of a fleet. Each drone and sensor has a random stream, as the stock sensors have."""
+    """The users' sensors of a fleet. As with stock sensors, each drone and sensor has a random stream."""
 
     SAVED: ClassVar[Saved] = {"sensors": PART}
 
@@ -169,10 +169,10 @@ class UserSensors:
         return [*self._sensors.values()]
 
     def readings(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return whose (M, 3) and values (M, 6) of the exposures logged in a gate, without those that are lost.
+        """Return whose (M, 3) and values (M, 6) of the exposures logged in a gate, without lost ones.
 
         Raises:
-            UserCodeError: an equation fails, or returns what is not a reading.
+            UserCodeError: an equation fails, or does not return a reading.
         """
         senses, kept = self._senses, []
         count = int(senses.exposed_count[0])
@@ -189,7 +189,7 @@ class UserSensors:
 
 
 class _UserSensor:
-    """One sensor of one drone: settings, present bias and random stream."""
+    """A sensor of a drone: settings, present bias and random stream."""
 
     SAVED: ClassVar[Saved] = {"bias": IN_PLACE, "stream": list[int]}
 
@@ -217,7 +217,7 @@ class _UserSensor:
         place(self.rng, stream)
 
     def truth(self, row: NDArray[np.float64], t_s: float) -> SensorTruth:
-        """Return the truth that it is exposed to, from a row of EXPOSED."""
+        """Return the truth at its exposure, from a row of EXPOSED."""
         state, accel = row[EXPOSED.state : EXPOSED.accel].copy(), row[EXPOSED.accel : EXPOSED.air].copy()
         return SensorTruth(
             t_s=t_s,

@@ -1,8 +1,8 @@
-"""Distances along the rays of beams, lidars and depth cameras: of true poses, with errors. Compiled.
+"""Distances along the rays of beams, lidars and depth cameras, from true poses, with errors. Compiled.
 
-All rays of a message are of one instant, between two gates too. They meet ground, obstacles and the hulls of other
-drones (zsim_world.physics.rays), not that of their own. Each sensor has a random stream, from which every message takes
-the same number of numbers: two for each of its values, one for itself.
+All rays of a message are cast at one instant, possibly between two gates. They meet ground, obstacles and the hulls of
+other drones (zsim_world.physics.rays). Each sensor has a random stream, from which every message takes the same number
+of values: two for each distance, one for the message.
 """
 
 import math
@@ -107,7 +107,7 @@ class Mounted(NamedTuple):
 
 
 class ScanScene(NamedTuple):
-    """The W sensors and what they look at, for compiled code; N drones."""
+    """The W sensors and the objects in their surroundings, for compiled code; N drones."""
 
     scene: Scene
     hulls: NDArray[np.float64]  # (N,), radii [m]
@@ -117,7 +117,7 @@ class ScanScene(NamedTuple):
 
 
 class ScanSampler:
-    """Makes the scans of a fleet, gate by gate; `hulls`: radius of each drone's [m], (N,)."""
+    """Computes the scans of a fleet gate by gate; `hulls`: hull radius of each drone [m], (N,)."""
 
     SAVED: ClassVar[Saved] = {
         "_rows": IN_PLACE,
@@ -145,7 +145,7 @@ class ScanSampler:
         self._stuck: dict[int, bytes] = {}  # by place: the message that it gives again and again
 
     def recover(self) -> None:
-        """Let no fault act on any sensor."""
+        """Remove the effects of faults from all sensors."""
         self._rows[:] = self._sound
 
     def rows_of(self, drone: int, sensor: str) -> Iterator[Array]:
@@ -155,7 +155,7 @@ class ScanSampler:
                 yield row
 
     def due(self, state: Array, now_ns: int) -> list[Scan]:
-        """Return what is due by a gate, given the state of all drones there, (N, STATE.size or more)."""
+        """Return the scans due by a gate, given the states of all drones at it, (N, STATE.size or more)."""
         samples, between = self._exposures.until(state, now_ns)
         for at_ns, place in samples:
             self._scan(at_ns, place, between)
@@ -166,7 +166,7 @@ class ScanSampler:
         return due
 
     def _scan(self, at_ns: int, place: int, between: Between | None) -> None:
-        """Take a sample and keep it until it is due."""
+        """Take a sample and hold it until it is due."""
         assert between is not None  # where there are samples
         poses = poses_between(*between, at_ns)
         values = scan(self._held, place, poses, self._streams[place])
@@ -205,7 +205,7 @@ def _pose(mount: Mount) -> tuple[Array, Array]:
 
 
 def _turned(R: Array, vectors: Array) -> Array:
-    """Return R v for vectors (M, 3), summed in one order everywhere."""
+    """Return R v for vectors (M, 3), summed in a fixed order."""
     return (R * vectors[:, None, :]).sum(axis=2)
 
 
@@ -240,7 +240,7 @@ def _lidar(i: int, name: str, settings: LidarConfig, p_BS: Array, R_BS: Array) -
 
 
 def _depth(i: int, name: str, settings: DepthConfig, camera: str, of: Camera) -> Mounted:
-    """Return the rays through the middles of a depth image's pixels, which are the camera's in blocks."""
+    """Return the rays through the centres of a depth image's pixels, each a block of camera pixels."""
     pose, lens, rows, count = camera_pose(of), lens_of(of), settings.rows, settings.columns
     wide, high = lens.width / count, lens.height / rows  # of its pixels, in the camera's
     places: Any = np.meshgrid((np.arange(count) + 0.5) * wide - 0.5, (np.arange(rows) + 0.5) * high - 0.5)
@@ -255,7 +255,7 @@ def _depth(i: int, name: str, settings: DepthConfig, camera: str, of: Camera) ->
 
 
 def _fill_row(row: Array, mounted: Mounted, first: int, origin: int, rng: np.random.Generator) -> None:
-    """Write the row of a sensor; its bias is drawn first from its stream."""
+    """Write the row of a sensor; its bias is the first draw from its stream."""
     own, values = mounted.settings, mounted.values
     row[SCANNER.drone], row[SCANNER.first], row[SCANNER.origin] = mounted.drone, first, origin
     row[SCANNER.apart], row[SCANNER.values] = len(mounted.origins) > 1, values
@@ -268,13 +268,13 @@ def _fill_row(row: Array, mounted: Mounted, first: int, origin: int, rng: np.ran
 
 @kernel()
 def scan(held: Held, place: int, poses: NDArray, stream: NDArray) -> NDArray:
-    """Return the values of a message of one sensor [m], 0 where nothing came back; none if the message is lost.
+    """Return the values of a message of one sensor [m], 0 without an echo; no values if the message is lost.
 
     Args:
         held: a ScanScene, by `hold`.
-        place: of the sensor.
+        place: index of the sensor.
         poses: states of all drones, (N, STATE.size or more).
-        stream: words of its random stream, (WORDS.size,), moved on.
+        stream: words of its random stream, (WORDS.size,), advanced.
     """
     scene, hulls, scanners, origins, rays = held.content
     row = scanners[place]
@@ -314,7 +314,7 @@ def scan(held: Held, place: int, poses: NDArray, stream: NDArray) -> NDArray:
 
 @inlined
 def _measured(row: NDArray, distance: float, noise: float, chance: float) -> float:
-    """Return what a sensor says of a distance, given two standard normal numbers."""
+    """Return the measured value of a distance, given two standard normal numbers."""
     if distance == math.inf or chance < row[SCANNER.miss]:
         return 0.0
     share, square = row[SCANNER.share] * distance, row[SCANNER.square] * distance * distance

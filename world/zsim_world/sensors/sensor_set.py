@@ -58,7 +58,7 @@ DENOMINATOR_MAX = 1000  # of a rate in Hz: any is met within 0.05 %, and n * num
 
 
 class FleetSensors(NamedTuple):
-    """The sensors of all drones: stock ones, then the users' own by name."""
+    """The sensors of all drones: stock sensors, then users' sensors by name."""
 
     names: tuple[str, ...]
     types: tuple[SensorType, ...]
@@ -66,10 +66,10 @@ class FleetSensors(NamedTuple):
 
 
 def fleet_sensors(scenario: Scenario) -> FleetSensors:
-    """Return the sensors of a scenario's drones; an external one has none here.
+    """Return the sensors of a scenario's drones; external drones have none here.
 
     Raises:
-        DocumentError: a user's module is not there, or is not what the scenario was resolved with.
+        DocumentError: a user's module is missing, or differs from the one with which the scenario was resolved.
     """
     sections = [list(drone.sensors.sections()) for drone in scenario.drones]
     kinds = {name: kind for of_drone in sections for name, kind, _ in of_drone if name not in STOCK}
@@ -81,7 +81,7 @@ def fleet_sensors(scenario: Scenario) -> FleetSensors:
 
 
 def rate_of(sensor: Sensor, name: str) -> float:
-    """Return the rate [Hz] at which the device samples: the IMU always at the board's."""
+    """Return the rate [Hz] at which a device samples; the IMU samples at the rate of the board."""
     return BOARD_RATE_HZ if name == "imu" else sensor.rate_hz
 
 

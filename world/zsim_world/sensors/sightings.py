@@ -1,9 +1,9 @@
-"""Sightings of hats without pictures: exposures between two gates, and a detector's errors.
+"""Sightings of hats without pictures: exposures between two gates, with a detector's errors.
 
-Each camera has a random stream; everything that falls due in a gate is computed in one compiled call. The errors are
-those of the detector on rendered pictures (tests compare them): of a hat's centre and apparent diameter in pixels,
-larger for small hats, for motion during the exposure and in low light; misses and false alarms. The same number of
-random numbers is drawn for every picture of a camera.
+Each camera has a random stream; everything due in a gate is computed in one compiled call. The errors match those of
+the detector on rendered pictures (tests compare them): of a hat's centre and apparent diameter in pixels, larger for
+small hats, for motion during the exposure and in low light; misses and false alarms. Every picture of a camera takes
+the same number of random numbers.
 """
 
 import math
@@ -56,7 +56,7 @@ class PictureSightings(NamedTuple):
 
 
 class Surroundings(NamedTuple):
-    """The W cameras and what they look at, for compiled code; N drones."""
+    """The W cameras and the objects in their surroundings, for compiled code; N drones."""
 
     drones: NDArray[np.int64]  # (W,), whose each camera is
     cameras: Array  # (W, CAMERA.size)
@@ -70,7 +70,7 @@ class Surroundings(NamedTuple):
 
 
 class _Pictures(NamedTuple):
-    """Whose pictures a detector looks at, and the delay from an exposure to its sightings' publication."""
+    """The camera of a detector, and the delay from an exposure to the publication of its sightings."""
 
     drone: int
     name: str
@@ -78,7 +78,7 @@ class _Pictures(NamedTuple):
 
 
 class SightingSampler:
-    """Makes the sightings of a fleet, gate by gate; `hulls`: radius of each drone's [m], (N,)."""
+    """Computes the sightings of a fleet gate by gate; `hulls`: hull radius of each drone [m], (N,)."""
 
     SAVED: ClassVar[Saved] = {
         "_streams": IN_PLACE,
@@ -119,7 +119,7 @@ class SightingSampler:
         self._later: list[PictureSightings] = []
 
     def due(self, state: Array, now_ns: int) -> list[PictureSightings]:
-        """Return what is due by a gate, given the state of all drones there, (N, STATE.size or more)."""
+        """Return the sightings due by a gate, given the states of all drones at it, (N, STATE.size or more)."""
         pictures, between = self._exposures.until(state, now_ns)
         if between is not None:
             self._look(pictures, between)
@@ -130,7 +130,7 @@ class SightingSampler:
         return due
 
     def _look(self, pictures: list[tuple[int, int]], between: Between) -> None:
-        """Look at pictures, by instant and camera, and keep their sightings until they are due."""
+        """Compute the sightings of pictures, by instant and camera, and hold them until they are due."""
         which = np.array(pictures, dtype=np.int64)
         seen: list[list[Seen]] = [[] for _ in pictures]
         for picture, x, y, z, range_m, sigma, sigma_m in look(which, *between, self._held, self._streams).tolist():
@@ -151,7 +151,7 @@ def _watching(scenario: Scenario) -> Iterator[tuple[int, str, Camera, SightingMo
 
 
 def _detector(camera: Camera, model: SightingModel, hats: Hats, light: float, rng: np.random.Generator) -> Array:
-    """Return the row of a detector; its camera's misalignment is drawn first from its stream."""
+    """Return the row of a detector; its camera's misalignment is the first draw from its stream."""
     row = np.zeros(DETECTOR.size)
     misaligned_rad = math.radians(model.misalignment_deg)
     turn = rot.matrix(rot.from_rotation_vector(tuple((misaligned_rad * rng.standard_normal(3)).tolist())))
@@ -182,7 +182,7 @@ def look(
         pictures: instant [ns] and camera of each, by instant, (P, 2).
         former, now: states of all drones at two gates, (N, STATE.size).
         held: Surroundings, by `hold`.
-        streams: words of the cameras' random streams, (W, WORDS.size); moved on.
+        streams: words of the cameras' random streams, (W, WORDS.size); advanced.
     """
     own = held.content
     hats = len(now) + len(own.balls)
@@ -253,7 +253,7 @@ def _sigmas_px(model: NDArray, row: NDArray) -> tuple[float, float]:
 
 @inlined
 def _put(model: NDArray, to_K: Vector, range_m: float, sigma: float, sigma_m: float, out: NDArray) -> None:
-    """Write a sighting in a direction of K, of any length."""
+    """Write a sighting in the direction of a vector in the camera frame K, of any length."""
     length = math.sqrt(to_K[0] * to_K[0] + to_K[1] * to_K[1] + to_K[2] * to_K[2])
     for k in range(3):
         at = DETECTOR.R_BK + 3 * k
@@ -269,7 +269,7 @@ def _range_m(model: NDArray, angle: float) -> float:
 
 @inlined
 def _see(model: NDArray, row: NDArray, noise: NDArray, out: NDArray) -> bool:
-    """Write the sighting of a hat in view; False if it is missed by chance, or measured as too small."""
+    """Write the sighting of a hat in view; False if it is missed at random, or measured as too small."""
     centre_px, diameter_px = _sigmas_px(model, row)
     scale, angle = row[VIEW.scale], row[VIEW.angle]
     measured = angle + diameter_px / scale * noise[2]
@@ -289,7 +289,7 @@ def _see(model: NDArray, row: NDArray, noise: NDArray, out: NDArray) -> bool:
 
 @inlined
 def _see_nothing(model: NDArray, lens: Lens, noise: NDArray, out: NDArray) -> bool:
-    """Write a false alarm, a small blob anywhere in the picture; False if there is none in this one."""
+    """Write a false alarm, a small blob anywhere in the picture; False if this picture has none."""
     if _unit(noise[0]) >= model[DETECTOR.false]:
         return False
     x, y = undistorted(lens, _unit(noise[1]) * lens.width - 0.5, _unit(noise[2]) * lens.height - 0.5)
@@ -302,7 +302,7 @@ def _see_nothing(model: NDArray, lens: Lens, noise: NDArray, out: NDArray) -> bo
 
 @inlined
 def _sort(out: NDArray, first: int, end: int) -> None:
-    """Sort sightings from left to right, so that their order does not tell whose hats they are."""
+    """Sort sightings from left to right, so that their order does not reveal the identity of the hats."""
     for m in range(first + 1, end):
         for k in range(m, first, -1):
             a, b = out[k - 1], out[k]
@@ -316,13 +316,13 @@ def _sort(out: NDArray, first: int, end: int) -> None:
 
 @compiled
 def detect(model: NDArray, lens: Lens, view: NDArray, stream: NDArray, out: NDArray, first: int) -> int:
-    """Write a detector's sightings in a picture into rows of `out` from `first` on; return where they end.
+    """Write a detector's sightings in a picture into rows of `out` from `first` on; return the end row.
 
     Args:
         model: (DETECTOR.size,).
-        lens: of the camera.
-        view: of all that may be a hat, (M, VIEW.size).
-        stream: words of the camera's random stream (WORDS.size,), moved on.
+        lens: lens of the camera.
+        view: views of hats and similar balls, (M, VIEW.size).
+        stream: words of the camera's random stream (WORDS.size,), advanced.
         out: (first + M + 1 or more, SEEN.size).
     """
     drawn = np.empty(DRAWS * len(view) + FALSE_DRAWS)

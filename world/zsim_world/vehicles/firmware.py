@@ -1,13 +1,13 @@
-"""The firmware of one drone at 200 Hz: modes, velocity, attitude and rate loops, on its own belief alone.
+"""The firmware of one drone at 200 Hz: modes, velocity, attitude and rate loops, using only its own estimate.
 
 Loops from inside out, each about three times slower than the one it contains, with the AR.Drone's figures:
     rotors   overdriven so that their lag halves (15 ms)
     rate     dw/dt = 28 (w_des - w)
     tilt     w_des = 9 (z_B × z_des): closed loop about 0.12 s, inside the 0.143 s that tum_ardrone fitted
-    velocity a_des = 3 (v_des - v), vertically 4, disturbance and drag of the belief cancelled
+    velocity a_des = 3 (v_des - v), vertically 4, estimated disturbance and drag cancelled
     hold     v_des = 0.8 (p_hold - p), height 1.5
-A velocity in the heading frame is held towards its own instant: while the drone yaws at r, it lags by r v / 3 across.
-The gains follow from the rotors' lag and the design of `zsim.vehicles.vehicle.Firmware`, so that others fly too.
+A velocity in the heading frame is tracked in the instantaneous frame: while the drone yaws at r, it lags by r v / 3
+laterally. The gains follow from the rotors' lag and the design of `zsim.vehicles.vehicle.Firmware`, for any vehicle.
 """
 
 import math
@@ -48,7 +48,7 @@ def loop_gains(design: Firmware, rotor_lag_s: float) -> tuple[float, float, floa
 
 
 def lag_shares(design: Firmware, rotor_lag_s: float) -> tuple[float, float]:
-    """Return the fraction of a rotor's lag left after a step, and the overdrive that shortens that lag."""
+    """Return the fraction of a rotor's lag that remains after a step, and the overdrive that shortens it."""
     decay = el.exp(-STEP_S / rotor_lag_s)
     return decay, (1.0 - el.exp(-STEP_S / (design.lag_lead * rotor_lag_s))) / (1.0 - decay)
 
@@ -69,11 +69,11 @@ def drive(
 ) -> None:
     """Set rotor commands for a wanted direction of z_B (heading frame), thrust [N] and yaw rate [rad/s].
 
-    Without a branch, so that several drones go at once (simd_firmware.py).
+    Branch-free, so that several drones are computed at once (simd_firmware.py).
 
     Args:
         row, rotors: parameters; gains: its settings in DRIVE.
-        own: the heading frame in W; q_WB, w_WB_B, speeds: attitude, body rate and rotor speeds believed.
+        own: the heading frame in W; q_WB, w_WB_B, speeds: estimated attitude, body rate and rotor speeds.
         commands: [rad/s], to be set.
     """
     k_rate, k_tilt, overdrive, slope, yaw_share, body_rate_max = gains
@@ -103,7 +103,7 @@ def clipped(rotors: PerRotor, r: int, speed: float) -> float:
 
 @inlined
 def limited_tilt(z: Vector, slope: float) -> Vector:
-    """Return the unit vector along z, no farther from the vertical than the tilt of this tangent."""
+    """Return the unit vector along z, with its tilt from the vertical limited to this tangent."""
     across = math.sqrt(z[0] * z[0] + z[1] * z[1])
     most = max(z[2], 1e-3) * slope
     s = 1.0 if across <= most else most / across
@@ -218,14 +218,14 @@ def decide(
     land_s: float,
     charge_percent: float,
 ) -> Decision:
-    """Decide on the rotors of the next 5 ms: set commands [rad/s], or return the thrust and attitude wanted.
+    """Decide on the rotors for the next 5 ms: set commands [rad/s], or return the wanted thrust and attitude.
 
     Args:
-        commands: of the rotors, set where the drive need not find them.
-        memory: modes and holds, in place; belief: observer.py.
-        own: the heading frame in W of the attitude believed.
+        commands: rotor commands, set here if the drive need not compute them.
+        memory: modes and holds, in place; belief: estimate of observer.py.
+        own: the heading frame in W of the estimated attitude.
         row, rotors: parameters; setting: limits and gains; setpoint: the commander's, cleared on landing.
-        silence_s: time since the setpoint was sent; hover_s: hover after so much, and land land_s later.
+        silence_s: age of the setpoint; hover_s: age from which to hover, and land_s later to land.
         charge_percent: of the battery.
     """
     _change_mode(memory, belief, setting, setpoint, silence_s, hover_s, land_s, charge_percent)
@@ -240,14 +240,14 @@ def decide(
 
 @inlined
 def stands(memory: NDArray, setting: NDArray) -> bool:
-    """Return whether the firmware knows that it stands on the ground: landed, or spinning up."""
+    """Return whether the firmware takes the drone to stand on the ground: landed, or spinning up."""
     spinning_up = memory[MEMORY.mode] == TAKING_OFF and memory[MEMORY.steps] * STEP_S < setting[SETTING.spin_up]
     return memory[MEMORY.mode] == LANDED or spinning_up
 
 
 @inlined
 def enter(memory: NDArray, belief: NDArray, mode: int) -> None:
-    """Change the mode and forget the holds."""
+    """Change the mode and clear the holds."""
     memory[MEMORY.mode], memory[MEMORY.steps], memory[MEMORY.touch] = mode, 0.0, 0.0
     memory[MEMORY.holds_xy], memory[MEMORY.holds_z] = 0.0, 0.0
     if mode == LANDED:
@@ -292,7 +292,7 @@ def _change_mode(
 
 @inlined
 def _wanted(kind: int, silence_s: float, hover_s: float, land_s: float) -> int:
-    """Return the mode in the air for this kind of setpoint and the commander's silence."""
+    """Return the mode in the air for this kind and age of setpoint."""
     if kind == NONE:
         return HOVERING
     if silence_s >= hover_s + land_s:
@@ -321,7 +321,7 @@ def _fly(
     setting: NDArray,
     setpoint: NDArray,
 ) -> Decision:
-    """Decide on the rotors in the air, or on the way there."""
+    """Decide on the rotors in the air or during take-off."""
     kind = int(setpoint[SETPOINT.kind])
     if mode == FLYING and kind == ROTORS:
         for r in range(len(rotors.each)):
@@ -359,7 +359,7 @@ def _from_velocity(
     setpoint: NDArray,
     each: tuple[int, ...],
 ) -> tuple[Vector, float, float]:
-    """Return wanted z_B in the heading frame, thrust [N] and yaw rate of all modes that fly by velocity."""
+    """Return wanted z_B in the heading frame, thrust [N] and yaw rate of all velocity-controlled modes."""
     v = vector(belief, BELIEF.v_H)
     v_des, yaw_rate = (0.0, 0.0, 0.0), 0.0
     if mode == FLYING:
@@ -382,7 +382,7 @@ def _from_velocity(
 
 @inlined
 def _asked_velocity(kind: int, own: Quaternion, setting: NDArray, setpoint: NDArray) -> tuple[Vector, float]:
-    """Return the commander's velocity in the heading frame [m/s] and yaw rate [rad/s], within the limits."""
+    """Return the commanded velocity in the heading frame [m/s] and yaw rate [rad/s], within the limits."""
     if kind == ARDRONE:
         climb = setting[SETTING.climb] * _clip(setpoint[SETPOINT.value + 2], 1.0)
         return (0.0, 0.0, climb), setting[SETTING.yaw_rate] * _clip(setpoint[SETPOINT.value + 3], 1.0)
@@ -419,7 +419,7 @@ def _climb(
     setting: NDArray,
     each: tuple[int, ...],
 ) -> float:
-    """Return the wanted vertical velocity [m/s]: take-off, landing, height hold, or what is asked."""
+    """Return the wanted vertical velocity [m/s]: take-off, landing, height hold, or as commanded."""
     height = belief[BELIEF.height]
     if mode == LANDING:
         return -_descent(memory, belief, row, setting, each)
@@ -452,7 +452,7 @@ def _ascent(memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray) ->
 
 @inlined
 def _descent(memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray, each: tuple[int, ...]) -> float:
-    """Return the speed of descent [m/s], and count how long the ground has borne the weight."""
+    """Return the speed of descent [m/s], and count the steps for which the ground bears the weight."""
     weak = lift(belief, row, each) < setting[SETTING.touch_share] * row[VEHICLE.gravity]
     borne = weak and belief[BELIEF.v_H + 2] > -setting[SETTING.touch_speed]
     memory[MEMORY.touch] = memory[MEMORY.touch] + 1.0 if borne else 0.0

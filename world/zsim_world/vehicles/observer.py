@@ -1,7 +1,7 @@
 """The firmware's estimate of attitude, velocity, height and disturbance, from its own noisy sensors with fixed gains.
 
-The velocity is in the heading frame (x forward, y left, z up). Tilt is corrected by the velocity, not by taking the
-accelerometer for gravity: in flight a multirotor's specific force lies along its thrust whatever its tilt.
+The velocity is in the heading frame (x forward, y left, z up). Tilt is corrected from the velocity, not from the
+accelerometer as a gravity sensor: in flight a multirotor's specific force is along its thrust at any tilt.
 
 The gains are steady Kalman gains for the noises of the drone's sensors, computed once. The design model of one
 horizontal axis (heading frame), driven by white noise:
@@ -92,7 +92,7 @@ SONAR_AGE_MAX = 100.0  # steps, 0.5 s without echo: heights come from the barome
 
 @inlined
 def _face(belief: NDArray, q: Quaternion) -> Quaternion:
-    """Set the believed attitude; return its heading frame in W."""
+    """Set the estimated attitude; return its heading frame in W."""
     put_four(belief, BELIEF.q_WB, q)
     belief[BELIEF.heading] = rot.heading(q)
     return rot.about_z(belief[BELIEF.heading])
@@ -100,7 +100,7 @@ def _face(belief: NDArray, q: Quaternion) -> Quaternion:
 
 @inlined
 def _turn_by(belief: NDArray, own: Quaternion, r_H: Vector) -> Quaternion:
-    """Turn the believed attitude by a small rotation vector [rad] given in the heading frame; return the new frame."""
+    """Rotate the estimated attitude by a small rotation vector [rad; heading frame]; return the new frame."""
     turn = rot.from_rotation_vector(rot.rotate(own, r_H))
     return _face(belief, rot.normalised(rot.multiply(turn, four(belief, BELIEF.q_WB))))
 
@@ -114,7 +114,7 @@ def _take_bias(belief: NDArray, own: Quaternion, r_H: Vector) -> None:
 
 @inlined
 def body_rate(mount: Quaternion, gyro: Vector, bias: Vector) -> Vector:
-    """Return the body rate [rad/s] that a gyro of this mount shows, less its bias."""
+    """Return the body rate [rad/s] measured by a gyro in this mount, without its bias."""
     return axpy(rot.rotate(mount, gyro), -1.0, bias)
 
 
@@ -136,20 +136,20 @@ def observe(
     on_ground: bool,
     each: tuple[int, ...],
 ) -> Quaternion:
-    """Advance the belief by one step of 5 ms and take in what the devices have sampled since the last.
+    """Advance the estimate by one step of 5 ms and process the new samples of the devices.
 
     Body rate, attitude and heading are at the end of the step already, as the gyro has them (simd_firmware.py).
 
     Args:
         belief: (BELIEF.size + R,) in place.
-        own: the heading frame in W; turned: by how much it has turned in this step [rad].
+        own: the heading frame in W; turned: rotation of the body in this step [rad].
         row: the vehicle's nominal parameters; gain: (GAIN.size,), see `gain_row`.
-        device: (DEVICE.size,) newest samples; the marks of new ones are cleared.
+        device: (DEVICE.size,) newest samples; the flags of new samples are cleared.
         board: (CALIBRATION.size,).
-        on_ground: standing: velocity zero, gravity is all that the accelerometer feels.
+        on_ground: whether the drone stands: zero velocity, accelerometer measures gravity only.
 
     Returns:
-        the heading frame in W of the attitude now believed.
+        the heading frame in W of the new estimated attitude.
     """
     f_B = rot.rotate(four(board, CALIBRATION.imu_turn), vector(device, DEVICE.accel))
     if on_ground:
@@ -193,7 +193,7 @@ def _stand(belief: NDArray, row: NDArray, own: Quaternion, f_B: Vector, w: Vecto
 
 @inlined
 def standing_height(belief: NDArray, row: NDArray) -> float:
-    """Return the believed height [m] of a drone that stands, on the ground or on what it has landed on."""
+    """Return the estimated height [m] of a drone standing on the ground or on an obstacle."""
     return max(row[VEHICLE.stand_height], belief[BELIEF.stand_height])
 
 
@@ -207,7 +207,7 @@ def _fly(
     turned: float,
     each: tuple[int, ...],
 ) -> None:
-    """Predict velocity, height and odometry by one step and take in the accelerometer."""
+    """Predict velocity, height and odometry by one step with the accelerometer."""
     q_HB = rot.level(own, four(belief, BELIEF.q_WB))
     up = lift(belief, row, each)
     c = row[VEHICLE.drag] / row[VEHICLE.mass]
@@ -230,13 +230,13 @@ def _fly(
 
 @inlined
 def lift(belief: NDArray, row: NDArray, each: tuple[int, ...]) -> float:
-    """Return the modelled thrust over mass [m/s^2]."""
+    """Return the modelled thrust per mass [m/s^2]."""
     return free_thrust(row, PerRotor(belief, BELIEF.size, 1, each)) / row[VEHICLE.mass]
 
 
 @inlined
 def _correct(belief: NDArray, gain: NDArray, at: int, e: Vector) -> None:
-    """Correct horizontal velocity and disturbance by an innovation; the gains stand at `at`."""
+    """Correct horizontal velocity and disturbance by an innovation with the gains at `at`."""
     for k in range(2):
         belief[BELIEF.v_H + k] += gain[at] * e[k]
         belief[BELIEF.disturbance + k] += gain[at + 3] * e[k]
@@ -244,7 +244,7 @@ def _correct(belief: NDArray, gain: NDArray, at: int, e: Vector) -> None:
 
 @inlined
 def _correct_tilt(belief: NDArray, gain: NDArray, own: Quaternion, e: Vector) -> Quaternion:
-    """Correct tilt and gyro bias by an innovation of the flow; that of the accelerometer has no share in it."""
+    """Correct tilt and gyro bias by an innovation of the flow; the accelerometer does not correct them."""
     tilt, rate = gain[GAIN.flow_tilt], gain[GAIN.flow_rate]
     own = _turn_by(belief, own, (-tilt * e[1], tilt * e[0], 0.0))  # faster forward than believed: pitched farther so
     _take_bias(belief, own, (-rate * e[1], rate * e[0], 0.0))
@@ -253,7 +253,7 @@ def _correct_tilt(belief: NDArray, gain: NDArray, own: Quaternion, e: Vector) ->
 
 @inlined
 def _lift_by(belief: NDArray, gain: NDArray, at: int, e: float) -> None:
-    """Correct height, climb, vertical disturbance and accelerometer bias by an innovation; the gains stand at `at`."""
+    """Correct height, climb, vertical disturbance and accelerometer bias by an innovation with the gains at `at`."""
     belief[BELIEF.height] += gain[at] * e
     belief[BELIEF.v_H + 2] += gain[at + 1] * e
     belief[BELIEF.disturbance + 2] += gain[at + 2] * e
@@ -262,7 +262,7 @@ def _lift_by(belief: NDArray, gain: NDArray, at: int, e: float) -> None:
 
 @inlined
 def _see_flow(belief: NDArray, gain: NDArray, own: Quaternion, flow_H: Vector) -> Quaternion:
-    """Correct velocity, disturbance, tilt, bias and climb by a velocity seen; return the new heading frame."""
+    """Correct velocity, disturbance, tilt, bias and climb rate by a flow velocity; return the new heading frame."""
     e = axpy(flow_H, -1.0, vector(belief, BELIEF.v_H))
     _correct(belief, gain, GAIN.flow_v, e)
     own = _correct_tilt(belief, gain, own, e)
@@ -272,7 +272,7 @@ def _see_flow(belief: NDArray, gain: NDArray, own: Quaternion, flow_H: Vector) -
 
 @inlined
 def _measure_height(belief: NDArray, gain: NDArray, device: NDArray, sonar_min: float) -> None:
-    """Take the height from the sonar where it has an echo, else from the barometer."""
+    """Measure the height by the sonar if it has an echo, else by the barometer."""
     belief[BELIEF.sonar_age] += 1.0
     if device[DEVICE.new_sonar] > 0.0 and device[DEVICE.sonar_valid] > 0.0 and device[DEVICE.sonar] >= sonar_min:
         belief[BELIEF.sonar_age] = 0.0
@@ -284,7 +284,7 @@ def _measure_height(belief: NDArray, gain: NDArray, device: NDArray, sonar_min: 
 
 @inlined
 def _see_baro(belief: NDArray, gain: NDArray, altitude: float, on_ground: bool) -> None:
-    """Learn the barometer's reading at height zero: on the ground, and in the air while the sonar works."""
+    """Estimate the barometer's reading at height zero: on the ground, and in the air while the sonar has an echo."""
     if on_ground or belief[BELIEF.sonar_age] <= SONAR_AGE_MAX:
         n = belief[BELIEF.baro_samples] + 1.0
         belief[BELIEF.baro_samples] = n
@@ -319,8 +319,8 @@ Array = NDArray[np.float64]
 
 DEG = math.pi / 180.0  # rad
 
-# Least and largest standard deviation of a sample that the design counts with: none is trusted blindly, and beyond the
-# largest a meter is as good as none
+# Smallest and largest standard deviation of a sample in the design: none is trusted fully, and beyond the largest a
+# meter has practically no effect
 SIGMAS = {
     "accel": (0.02, 50.0),  # m/s^2
     "gyro": (1e-4, 1.0),  # rad/s
@@ -356,7 +356,7 @@ Meter = tuple[float, float]  # standard deviation of a sample, samples per secon
 
 
 class ObserverDesign(NamedTuple):
-    """The parameters that the gains of one drone follow from."""
+    """The parameters that determine the gains of a drone."""
 
     drag_1_s: float
     gravity_m_s2: float
@@ -394,7 +394,7 @@ def gain_row(vehicle: Vehicle, drone: Drone, environment: Environment) -> Array:
 
 
 def sample_rate(sensor: Sensor) -> float:
-    """Return the rate [Hz] of samples without those that drop out."""
+    """Return the rate [Hz] of samples that do not drop out."""
     return max(sensor.rate_hz * (1.0 - sensor.dropout), SAMPLE_RATE_MIN_HZ)
 
 
@@ -437,8 +437,8 @@ def _gains(d: ObserverDesign) -> Array:
 def steady_gains(a: Array, walks: Array, meters: list[tuple[list[float], float, float]]) -> Array:
     """Return the gain per sample of each meter in the steady state of a Kalman filter, shape (meters, states).
 
-    A meter slower than the board counts as one of 200 Hz with as much information; its gain per sample is then that
-    of the one covariance reached, P H^T / (H P H^T + sigma^2).
+    A meter slower than the board is treated as a 200 Hz meter with the same information; its gain per sample is then
+    P H^T / (H P H^T + sigma^2) with the resulting covariance.
 
     Args:
         a: dx/dt = a x; walks: white noise on each state [unit/sqrt(s)].

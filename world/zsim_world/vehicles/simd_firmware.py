@@ -1,6 +1,6 @@
-"""The boards' step: every drone's firmware sees and decides alone; what has no branch goes for eight drones at once.
+"""The step of the boards: observation and decision per drone; branch-free computations for eight drones at once.
 
-How blocks of eight work is in physics/simd.py.
+Blocks of eight are explained in physics/simd.py.
 """
 
 import numpy as np
@@ -73,7 +73,7 @@ FOLLOWS = -1.0  # rad/s, of a rotor that is not held
 
 
 def sound_actuators(drones: int, rotors: int) -> NDArray[np.float64]:
-    """Return the rows of drones whose rotors turn as commanded, (drones, ACTUATOR.size + 2 rotors)."""
+    """Return the rows of drones without rotor faults, (drones, ACTUATOR.size + 2 rotors)."""
     rows = np.ones((drones, ACTUATOR.size + 2 * rotors))
     rows[:, ACTUATOR.faulty], rows[:, ACTUATOR.size + rotors :] = 0.0, FOLLOWS
     return rows
@@ -114,7 +114,7 @@ def steer(time: KernelTime, bodies: Bodies, boards: Boards) -> None:
 
 @inlined
 def _line_up(boards: Boards, lanes: NDArray, i: int, k: int) -> None:
-    """Put into lane k what drone i's attitude follows from."""
+    """Copy the inputs of drone i's attitude update into lane k."""
     belief = boards.belief[i]
     put_lane_vector(lanes, BOARD_LANES.gyro, k, vector(boards.device[i], DEVICE.gyro))
     put_lane_vector(lanes, BOARD_LANES.bias, k, vector(belief, BELIEF.gyro_bias))
@@ -123,7 +123,7 @@ def _line_up(boards: Boards, lanes: NDArray, i: int, k: int) -> None:
 
 @inlined
 def _turn(lanes: NDArray, count: int) -> None:
-    """Turn the attitudes by what the gyros show; `count` lanes have a drone."""
+    """Rotate the attitudes by the gyro readings; `count` lanes have a drone."""
     for k in range(LANES):
         mount, gyro = lane_four(lanes, BOARD_LANES.mount, k), lane_vector(lanes, BOARD_LANES.gyro, k)
         bias = lane_vector(lanes, BOARD_LANES.bias, k)
@@ -147,7 +147,7 @@ def _turn(lanes: NDArray, count: int) -> None:
 
 @inlined
 def _decide(time: KernelTime, bodies: Bodies, boards: Boards, lanes: NDArray, i: int, k: int) -> bool:
-    """Let drone i see, and put what it wants into lane k; return whether the drive is to find its command."""
+    """Run observer and decision of drone i for lane k; return whether the drive must compute its command."""
     each, memory, belief, row = bodies.each, boards.memory[i], boards.belief[i], bodies.vehicle[i]
     setting, heading = boards.setting[i], lanes[LANES * BOARD_LANES.heading + k]
     own, turned = lane_four(lanes, BOARD_LANES.own, k), heading - belief[BELIEF.heading]
@@ -181,7 +181,7 @@ def _decide(time: KernelTime, bodies: Bodies, boards: Boards, lanes: NDArray, i:
 
 @inlined
 def _drive(lanes: NDArray, each: tuple[int, ...]) -> None:
-    """Find the commands of all drones of the block whose firmware has not set them itself."""
+    """Compute the commands of all drones of the block whose firmware has not set them itself."""
     for k in range(LANES):
         own, attitude = lane_four(lanes, BOARD_LANES.own, k), lane_four(lanes, BOARD_LANES.q_WB, k)
         rate, z = lane_vector(lanes, BOARD_LANES.w_WB_B, k), lane_vector(lanes, BOARD_LANES.z_H, k)
@@ -199,7 +199,7 @@ def _drive(lanes: NDArray, each: tuple[int, ...]) -> None:
 
 @inlined
 def _command(bodies: Bodies, boards: Boards, i: int, commands: PerRotor) -> None:
-    """Give the rotors of drone i their command, if there is charge for it, and let its firmware count on it."""
+    """Set the rotor commands of drone i, if its battery allows, and update its firmware's rotor model."""
     charged, command = bodies.energy[i] > 0.0, bodies.command[i]
     observer.model_rotors(boards.belief[i], boards.setting[i, SETTING.rotor_decay], commands)
     for r in range(len(commands.each)):
@@ -210,7 +210,7 @@ def _command(bodies: Bodies, boards: Boards, i: int, commands: PerRotor) -> None
 
 @noinline
 def _weaken(command: NDArray, actuator: NDArray) -> None:
-    """Make of a command to the rotors [rad/s] (R,), in place, what faulty ones do of it."""
+    """Apply rotor faults to a command [rad/s] (R,), in place."""
     count = command.shape[0]
     for r in range(count):
         held = actuator[ACTUATOR.size + count + r]

@@ -35,8 +35,8 @@ from zsim_analysis.export.columns import MessageSelection
 from zsim_analysis.export.make_export import export
 from zsim_analysis.report.summary import judge
 
-CUTS = 25
-FLIPS = 30
+CUTS = 8  # at any byte, besides those that hurt
+FLIPS = 15
 
 Content = tuple[bytes, int, int]  # payload, simulated and wall time [ns] of a message
 Made = tuple[int, list[str]]  # rows of what was made from a record, and what was said of it
