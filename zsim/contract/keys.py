@@ -41,7 +41,7 @@ class Topic(NamedTuple):
     message: Any  # type of its messages; None for a family of keys whose members declare theirs
     writers: tuple[str, ...]  # roles that publish it; "each" stands for every process, on the keys of its own name
     readers: tuple[str, ...]  # roles that subscribe to it, besides recorders and operators, who read everything
-    last: str  # who answers a get with the last message: "world", "writer", or nobody ("")
+    last: str  # the process that answers a get with the last message: "world", "writer", or none ("")
     is_output: bool  # whether the world counts its messages among those that a process announces with its done
 
 

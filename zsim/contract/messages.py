@@ -195,7 +195,7 @@ def register_sensors(sensors: Iterable[SensorInfo]) -> None:
 
 
 def register_messages(kinds: Iterable[type[AgentMessage]]) -> None:
-    """Register classes of users' messages, of which messages are read here instead of those that `world/info` declares.
+    """Register users' message classes, used here in place of the declarations in `world/info`.
 
     TypeError, ValueError as of `message_info`.
     """

@@ -14,7 +14,7 @@ from zsim.contract.framing import GateMessages, PerPattern
 from zsim.contract.messages import Info
 from zsim.errors import DecodeError
 
-GAP_MAX = 10  # gates lost in a row that are asked for again; the world runs ahead of nobody by more
+GAP_MAX = 10  # consecutive lost gates that are requested again; the world is never farther ahead of an agent
 ALWAYS_NS = -1  # before every gate
 NEVER_NS = 2**63 - 1  # after every gate
 KEYS_MAX = 200_000  # whose readers are remembered; 1000 drones have about 15 000, other processes may make up any

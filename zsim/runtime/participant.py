@@ -245,7 +245,7 @@ class AgentParticipant(Participant):
                     found = f"it is of version {snapshot.version}, and {age_ns / 1e9:.2f} s old"
                     raise DecodeError(f"{found}; must be of version {VERSION}, and 0 to {RESUME_NS / 1e9:g} s old")
                 self._agent.resume(self._info, unpack(snapshot.state))
-            except Exception as error:  # anybody may have written it, and a user's class reads it
+            except Exception as error:  # it may come from any program, and a user's class reads it
                 self._say(f"{self.name}: its former snapshot is of no use: {error or type(error).__name__}")
                 if fresh is not None:
                     self._agent.resume(self._info, fresh)  # not half of the former state
@@ -295,7 +295,7 @@ class AgentParticipant(Participant):
             self._fail_behind(f"the gates after its snapshot of t = {snapshot_ns / 1e9:.2f} s are")
 
     def _fail_behind(self, what: str) -> None:
-        self.failure = BehindError(f"{self.name}: {what} kept by nobody any more; this one ends, start it again")
+        self.failure = BehindError(f"{self.name}: {what} no longer kept; this one ends, start it again")
 
     # Taking part
 

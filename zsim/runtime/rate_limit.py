@@ -6,7 +6,7 @@ Its clock is a parameter: simulated time if a rerun or resumed world must behave
 import time
 from collections.abc import Callable
 
-SUBJECTS_MAX = 10_000  # remembered; whoever makes up names has no more than these cost
+SUBJECTS_MAX = 10_000  # remembered; limits the memory for invented names
 
 
 class RateLimit:

@@ -140,7 +140,7 @@ class Runner:
         self._lacks = False
         if t_ns is None or member.awaited:
             return None
-        if self._resumed_ns is not None:  # the gate that follows the snapshot is to be there: the world brings it again
+        if self._resumed_ns is not None:  # the gate after the snapshot must be there: the world replays it
             if member.is_fetching:
                 return None
             if not inbox.may_skip:

@@ -27,7 +27,7 @@ from zsim.vehicles import vehicle_catalogue
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.vehicle import Aerodynamics, Vehicle
 
-EXAMPLE = "scenarios/step.yaml"  # named to whoever gives no scenario
+EXAMPLE = "scenarios/step.yaml"  # named in errors
 SYNTAX = "a.b.c=value, e.g. drones.drone2.mass_kg=0.5 or environment.wind.gust_m_s=0.5"
 PATH_MAX = 1000  # characters; the longest of a scenario has a tenth of that
 NOTHING: Mapping[str, Any] = {}

@@ -16,7 +16,7 @@ from zsim.transport.tls import Identity
 
 LEASE_LOCKSTEP_MS = 3_600_000  # a stopped or debugged process must not lose its link in lockstep
 LEASE_REALTIME_MS = 1_000
-# Nobody waits for a process that only reads, so its loss need not be noticed within a second.
+# The run does not wait for a process that only reads, so its loss need not be noticed within a second.
 LEASE_READER_MS = 10_000
 CLOSE_AFTER_US = 3_600_000_000  # -1 means for ever and panics in 1.10.2
 # A stopped reader (a recorder, `zsim echo`) fills its link and then holds up the hub and everybody; it loses its link.

@@ -91,7 +91,7 @@ class Leg(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """Where a drone is to be at every simulated time [s]: a `Reference`.
+    """The reference of a drone at every simulated time [s]: a `Reference`.
 
     Before its first leg it is at `hover` (4,), to which the take-off leads; each leg holds its end until the next.
     """
