@@ -1,6 +1,6 @@
 """An FMU as an agent: inputs from the messages of a gate, one communication step, outputs as commands or an estimate.
 
-At a gate t the FMU is given what its inputs' messages said last, steps from t to t + period, and what it then gives is
+At a gate t the FMU receives the newest values of its inputs, steps from t to t + period, and its outputs are then
 published with the stamp t, as the answer of any agent to that gate.
 """
 
@@ -53,10 +53,10 @@ class Fmu:
         name: of the process (default `fmu.` and the drone, or `fmu.main`); that of a stock agent takes its place.
         period_s: communication step [s], a multiple of the gate; default what the FMU suggests, or the gate.
         param: start values of parameters and inputs, by variable.
-        takeoff_s: when the drones that it commands take off [s]; None where others see to that.
+        takeoff_s: when the drones that it commands take off [s]; None if others command that.
         frame: of velocity commands.
-        log: whether all that the FMU logs is printed, and not only warnings and errors.
-        say: takes lines on the FMU; by default they go to standard error.
+        log: whether to print the whole log of the FMU, not only warnings and errors.
+        say: receives lines about the FMU; by default they go to standard error.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Fmu:
         self.takeoff_s, self.log, self.say = takeoff_s, log, say
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what is pickled: another process finds the file whatever its folder is."""
+        """Return the pickled state; the path is absolute, so that a process in another folder finds the file."""
         return {**vars(self), "path": self.path.resolve()}
 
     def __call__(self, info: Info, scenario: Scenario) -> "FmuAgent":
@@ -241,7 +241,7 @@ class FmuAgent(Agent):
 
 
 class _Writer:
-    """Makes the messages of one key of what the FMU gives."""
+    """Makes the messages of one key from outputs of the FMU."""
 
     def __init__(self, key: str, links: Sequence[MappedVariable], frame: Frame) -> None:
         self.key, self.links = key, links

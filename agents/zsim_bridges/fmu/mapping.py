@@ -29,7 +29,7 @@ from zsim_bridges.fmu.model import FmuModel, Kind, Unit, Variable
 MODES = ("takeoff", "land", "emergency", "reset")
 NUMBERED = ("value", "desired", "desired_rate")  # fields of a cluster's state, one number for each of its variables
 FORMATION = {"c": False, "c_dot": True}  # of a cluster, and no messages; whether an FMU gives them
-OWN_FIELDS = ("t_ns", "seq", "source", "frame")  # that no FMU gives: the process does
+OWN_FIELDS = ("t_ns", "seq", "source", "frame")  # that no FMU gives: the process fills them in
 # What a field is in, by the end of its name: unit, exponents as BASE_UNITS, and what one is in SI units
 RAD, PER_S = (0, 0, 0, 0, 0, 0, 0, 1), (0, 0, -1, 0, 0, 0, 0, 1)
 UNITS = {
@@ -93,7 +93,7 @@ class MappedVariable(NamedTuple):
 
 
 class FmuMapping(NamedTuple):
-    """What an FMU takes and gives, and lines on units that differ."""
+    """The inputs and outputs of an FMU, and lines about differing units."""
 
     inputs: list[MappedVariable]
     outputs: list[MappedVariable]

@@ -6,7 +6,7 @@
     unit.step(0.0, 0.02)
     unit.read([variable])
 
-A file that is refused is a RunError; what a running FMU does amiss is a UserCodeError.
+A refused file raises a RunError; a fault of a running FMU raises a UserCodeError.
 """
 
 import math
@@ -92,7 +92,7 @@ class Variable(NamedTuple):
 
 
 class FmuModel:
-    """What the description of an FMU says.
+    """The description of an FMU.
 
     Attributes:
         path: of the file; its name begins the texts of all faults.
@@ -244,7 +244,7 @@ class FmuInstance:
         self._calling(self._restore, state)
 
     def close(self) -> None:
-        """Free it; nothing else may be called then."""
+        """Free it; no other method may be called afterwards."""
         self._end()
 
     def _write(self, inputs: Inputs) -> None:

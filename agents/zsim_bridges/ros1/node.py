@@ -164,7 +164,7 @@ class SlaveApi:
     def getBusStats(self, caller: str) -> Answer:
         """Answer for each topic the bytes sent, and for each connection its number, bytes, messages, whether it is up.
 
-        Of topics that are subscribed to, and of services, it tells nothing.
+        Subscribed topics and services are not included.
         """
         sent: list[Any] = []
         for topic, published in self._node.published.items():
@@ -189,7 +189,7 @@ class SlaveApi:
         return [ERROR, "not subscribed", 0]
 
     def shutdown(self, caller: str, reason: str = "") -> Answer:
-        """Stop, for `rosnode kill`, or a master that gives the name to another node."""
+        """Stop, at the request of `rosnode kill` or of a master that gives the name to another node."""
         self._node.request_shutdown(f"{str(caller)[:80]} asks us to stop: {str(reason)[:200]}".rstrip(": "))
         return [OK, "", 0]
 
@@ -228,7 +228,7 @@ class PublishedTopic:
 
 
 class SubscriberLink:
-    """The connection of one subscriber; a full queue loses the oldest message. Counts bytes sent and messages lost."""
+    """The connection of one subscriber; a full queue drops the oldest message. Counts bytes sent and messages lost."""
 
     def __init__(self, writer: StreamWriter, caller: str, queue_size: int) -> None:
         self._writer = writer
@@ -257,7 +257,7 @@ class SubscriberLink:
 
 
 class EmptyService:
-    """A service of type std_srvs/Empty; `act` returns why a request failed, None where it did not."""
+    """A service of type std_srvs/Empty; `act` returns why a request failed, None if it succeeded."""
 
     def __init__(self, topic_type: tcpros.TopicType, act: Callable[[], str | None]) -> None:
         self.topic_type = topic_type

@@ -128,7 +128,7 @@ class Ros1Bridge(VehicleServer):
         return [keys.camera(name, camera) for name, drone in self._drones.items() for camera in drone.cameras.wanted()]
 
     def forward(self, key: str, payload: bytes) -> None:
-        """Convert and publish a message that has passed the world."""
+        """Convert and publish a message that has passed through the world."""
         kind, thing, leaf = keys.parts(key)
         if key == keys.CLOCK:
             clock = self.observer.update_clock(payload)
@@ -254,7 +254,7 @@ class DriverCommands:
         self.send_mode("reset" if self._status is not None and self._status.state == "emergency" else "emergency")
 
     def trim_refusal(self) -> str | None:
-        """Return why the drone cannot be trimmed now; a landed one stands level, and nothing more is to be done."""
+        """Return why the drone cannot be trimmed now; a landed one is level, so trimming has no further effect."""
         state = self._status.state if self._status else "not there yet"
         return None if state == "landed" else f"the drone is {state}; must be landed"
 

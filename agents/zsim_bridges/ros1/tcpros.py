@@ -32,7 +32,7 @@ class TopicType(NamedTuple):
 
 
 class HeaderError(ValueError):
-    """Bytes that are no connection header."""
+    """Bytes that are not a connection header."""
 
 
 def frame(payload: bytes) -> bytes:
@@ -96,7 +96,7 @@ def service_header(topic_type: TopicType, caller: str) -> dict[str, str]:
 
 
 def mismatch(topic_type: TopicType, header: Mapping[str, str], caller: str) -> str | None:
-    """Return why the type of a header is not that of `caller`; None where it is."""
+    """Return why the type of a header differs from that of `caller`; None if they agree."""
     missing = [field for field in ("callerid", "md5sum") if field not in header]
     if missing:
         return f"missing required {missing[0]!r} field"

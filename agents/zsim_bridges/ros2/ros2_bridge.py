@@ -29,10 +29,10 @@ from zsim_bridges.ros2.topics import DRIVER, DroneCameras, RosNames, Topic
 from zsim_bridges.vehicle_links.drone_link import CommandSender
 
 NODE = "zsim"
-POLL_S = 0.1  # how often a stop is checked
-STATUS_S = 1.0  # how long a drone's state is waited for
+POLL_S = 0.1  # how often a stop is checked for
+STATUS_S = 1.0  # time limit for a drone's state
 ATTEMPT_S = 1.0  # of connecting to ROS's router
-LAST_S = 1.0  # how long a last value is waited for; the world answers within milliseconds
+LAST_S = 1.0  # time limit for a last value; the world answers within milliseconds
 SAMPLES_MAX = 2000  # of a key that wait to be converted: about a tenth of a second of work
 EMPTY, TRIGGER = "std_msgs/msg/Empty", "std_srvs/srv/Trigger"
 CLUSTER_SERVICES = ("takeoff", "engage", "hold", "rejoin", "land")
@@ -238,7 +238,7 @@ class RosCommands:
             self._senders[drone].mode(self._observer.now_ns, "land")
 
     def toggle_emergency(self, drone: str, _: Any) -> None:
-        """Stop the rotors at once, or, where that has happened, make ready to fly: the aircraft's emergency button.
+        """Stop the rotors at once, or reset a drone whose rotors were stopped: the aircraft's emergency button.
 
         Raises:
             ValueError: the drone's state is not known.
@@ -339,7 +339,7 @@ class SourceSubscriptions:
         if self._prompt and keys.leaf(key) in ("estimate", "state"):
             return SourceSubscription([], self._link.declare_subscriber(key, self._on_sample))
         subscription = self._link.subscribe(key)
-        if messages.type_of(key) is CameraInfo:  # said once, before anybody here read it
+        if messages.type_of(key) is CameraInfo:  # published once, before it was subscribed to
             for sample in self._link.get(key, timeout_s=LAST_S):
                 self._queue.add_sample(sample.key, sample.payload)
         return SourceSubscription([], subscription.undeclare, subscription)
