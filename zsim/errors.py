@@ -1,4 +1,4 @@
-"""The errors of zsim, each one line: where, what was found, what is allowed, what to do; and texts made of errors."""
+"""The errors of zsim, each one line (where, found, allowed, remedy), and texts derived from errors."""
 
 import os
 import re
@@ -14,10 +14,10 @@ PACKAGES = frozenset({"zsim", "zsim_world", "zsim_agents", "zsim_bridges", "zsim
 
 
 class ZsimError(Exception):
-    """Base of everything that a user can cause; the command line prints it without a traceback."""
+    """Base of all errors that a user can cause; the command line prints them without a traceback."""
 
     def _render_traceback_(self) -> list[str]:
-        """Return what IPython shows of it, which calls this: the way to zsim, without zsim's own, and the lines."""
+        """Return the traceback shown by IPython, which calls this: the user's frames only, and the lines."""
         from IPython import get_ipython  # pyright: ignore[reportPrivateImportUsage]
 
         frames = list(takewhile(lambda each: _package(each) not in PACKAGES, _entries(self.__traceback__)))
@@ -53,7 +53,7 @@ class DocumentError(ZsimError):
 
 
 class NotTrustedError(DocumentError):
-    """A document names code of its own, which this command was not told to import."""
+    """A document names its own code, which this command may not import."""
 
 
 class ScenarioError(DocumentError):
@@ -73,11 +73,11 @@ class BadNameError(ZsimError):
 
 
 class SessionError(ZsimError):
-    """No Zenoh session to be had."""
+    """A Zenoh session cannot be opened or used."""
 
 
 class NoWorldError(SessionError):
-    """Nobody answers `world/info` within the time allowed."""
+    """No world answers `world/info` within the time limit."""
 
 
 class RunError(ZsimError):
@@ -89,23 +89,23 @@ class SupersededError(RunError):
 
 
 class BehindError(RunError):
-    """A participant lacks what nobody keeps any more; a new incarnation of it can go on."""
+    """A participant needs messages that are no longer kept; a new incarnation of it can continue."""
 
 
 class RequestRefusedError(RunError):
-    """Whoever was asked has refused the request."""
+    """A request was refused."""
 
 
 class RunFailedError(RunError):
-    """A failure ended the run before its time."""
+    """A failure ended the run early."""
 
 
 class UserCodeError(RunFailedError):
-    """A class of a user's own raised, or returned what cannot be used.
+    """A user's class raised, or returned an invalid value.
 
     Args:
         text: class and method, and the line in the user's file or the value.
-        where: which process, at which simulated time; empty until that is known.
+        where: process and simulated time; empty until known.
     """
 
     def __init__(self, text: str, where: str = "") -> None:
@@ -146,7 +146,7 @@ CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u20
 
 
 def printable(text: str) -> str:
-    """Return a text for a terminal: what comes over the network may hold codes that a terminal acts on."""
+    """Return a text for a terminal, with control codes, which network data may contain, made visible."""
     return CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
@@ -155,13 +155,13 @@ REASON_MAX = 300  # characters of a reason
 
 
 def reason_of(error: BaseException) -> str:
-    """Return the message of an exception in one line, with the exception's type where it is none of zsim's."""
+    """Return the message of an exception in one line, with the type of an exception that is not zsim's."""
     text = " ".join(str(error).split())[:REASON_MAX]
     return text if isinstance(error, ZsimError) and text else f"{type(error).__name__}: {text}"
 
 
 def without_figures(text: str) -> str:
-    """Return a reason without its numbers, so that reasons that differ in a length alone are one; names keep theirs."""
+    """Return a reason without its numbers, so that reasons differing only in a figure are equal; names keep theirs."""
     return _FIGURE.sub("#", text)
 
 
@@ -196,7 +196,7 @@ EXTRA_OF = {
 
 
 def install_command(extras: Iterable[str]) -> str:
-    """Return the command that installs some extras of pyproject.toml from the checkout: zsim is on no package index."""
+    """Return the command that installs extras of pyproject.toml from the checkout; zsim is not on a package index."""
     names = ",".join(sorted(set(extras)))
     checkout = Path(__file__).parents[1]
     if not (checkout / "pyproject.toml").exists():

@@ -1,7 +1,7 @@
-"""Folders that commands write into, temporary ones, and the record in the folder of a run.
+"""Output folders of commands, temporary folders, and the record in the folder of a run.
 
-Files of somebody else in such a folder are not mixed with a command's own unasked. Two processes that write into one
-are kept apart by locks. Some file systems have none (Lustre, some of NFS, FUSE).
+A command does not write among foreign files without being told to. Locks prevent two processes from writing into one
+folder; some file systems have none (Lustre, some of NFS, FUSE).
 """
 
 import os
@@ -24,9 +24,9 @@ OTHERS_NAMED = 3  # in a refusal
 
 
 def take_lock(file: IO[Any] | int, shared: bool = False) -> bool:
-    """Lock an open file until it is closed, also by the end of the process; return False if another process holds it.
+    """Lock an open file until it is closed or the process ends; return False if another process holds the lock.
 
-    Where the file system has no locks nobody holds one, and True is returned; see `no_locks`.
+    On a file system without locks it returns True; see `no_locks`.
     """
     if fcntl is None:
         return True
@@ -40,7 +40,7 @@ def take_lock(file: IO[Any] | int, shared: bool = False) -> bool:
 
 
 def wait_for_lock(file: IO[Any]) -> None:
-    """Lock an open file until it is closed, once no other process holds it; not where the file system has no locks."""
+    """Wait for the lock of an open file and hold it until the file is closed; no effect without file system locks."""
     if fcntl is not None:
         with suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_EX)
@@ -60,14 +60,14 @@ def no_locks(folder: Path) -> str | None:
 
 @contextmanager
 def held_folder(folder: Path, mark: str, own: Collection[str], force: bool, use: str, others: str) -> Iterator[None]:
-    """Make a folder, and hold it as long as the block lasts against others that work there.
+    """Create a folder, and lock it against other processes for the duration of the block.
 
     Args:
-        mark: file of a folder in which the command has worked before; another one is taken as by `refuse_others`.
-        others: for the error, where it is held: "another hunt is at work".
+        mark: file that identifies a folder of this command; others are checked by `refuse_others`.
+        others: for the error if it is locked: "another hunt is at work".
 
     Raises:
-        RunError: it holds something else, is held, or cannot be made.
+        RunError: the folder has other content, is locked, or cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -87,12 +87,12 @@ def refuse_others(folder: Path, own: Collection[str], force: bool, use: str) -> 
 
     Args:
         own: names that the command may overwrite.
-        force: take it nevertheless; the files stay as they are.
-        use: what the command does with it, for the error: "fly into".
+        force: accept it nevertheless; the files are kept.
+        use: use of the folder, for the error: "fly into".
 
     Raises:
-        RunError: with what it holds.
-        OSError: it cannot be read.
+        RunError: there are other files, which it names.
+        OSError: the folder cannot be read.
     """
     others = sorted(each.name for each in folder.iterdir() if each.name not in own)
     if others and not force:
@@ -104,17 +104,17 @@ TEMPORARY = "zsim-temporary-"  # begins the names of folders that a process has 
 
 
 def temporary_folder(prefix: str) -> Path:
-    """Return a new folder that is removed when this process ends, or, where it is killed, by the next that makes one.
+    """Return a new folder, removed when this process ends, or, if it is killed, by the next process that calls this.
 
     Args:
-        prefix: with which its name begins.
+        prefix: beginning of its name.
     """
     return Path(mkdtemp(prefix=prefix, dir=_own_temporary(os.getpid())))
 
 
 @cache
 def _own_temporary(_pid: int) -> Path:
-    """Return the folder that holds those of this process; a child that was forked has one of its own."""
+    """Return the parent folder of this process's temporary folders; a forked child has its own."""
     from multiprocessing.util import Finalize  # also of a process that multiprocessing has started, unlike atexit
 
     _remove_left()
@@ -127,7 +127,7 @@ def _own_temporary(_pid: int) -> Path:
 
 
 def _remove_left() -> None:
-    """Remove temporary folders of processes that were killed: nobody holds their locks."""
+    """Remove temporary folders of killed processes, which are not locked."""
     place = Path(gettempdir())
     if fcntl is None or no_locks(place):
         return

@@ -1,6 +1,6 @@
-"""How tables and drones are shown: tables that fit a terminal, and a colour for each drone.
+"""Presentation of tables and drones: tables that fit a terminal, and a colour for each drone.
 
-A table leaves out columns where the terminal is narrow, instead of breaking names, units and figures. The colour of a
+On a narrow terminal a table omits columns instead of breaking names, units and figures. The colour of a
 drone is the same in reports, the console and exports, distinct with every kind of colour vision. Few drones have the
 colours of Okabe and Ito (2008); more have those of viridis (van der Walt, Smith 2015) from the first drone of the
 scenario to the last, without its yellow, which is hard to see on white paper.
@@ -31,10 +31,10 @@ class Column(NamedTuple):
     """A column of a table.
 
     Attributes:
-        header: above it, its lines never broken; a table of which all are empty has no head.
-        kind: of its cells: where room is short a name keeps its end, a text wraps between words, a figure stays whole.
-        worth: what is worth least is left out first where room is short; None: never left out.
-        right: whether cells stand at its right edge.
+        header: header, whose lines are never broken; a table with only empty headers has no head.
+        kind: of its cells: without room a name keeps its end, a text wraps between words, a figure stays whole.
+        worth: columns of least worth are omitted first without room; None: never omitted.
+        right: whether cells are right-aligned.
     """
 
     header: str
@@ -44,13 +44,13 @@ class Column(NamedTuple):
 
 
 class FittedTable:
-    """Rows of text under columns; codes that a terminal acts on are written out.
+    """Rows of text under columns; control codes are made visible.
 
     Args:
-        rows: of each, a cell for each column.
+        rows: rows with a cell for each column.
         title, caption: above and below the table.
-        one_line: a row is never more than one line; what does not fit is cut.
-        lines: around the cells.
+        one_line: limits a row to one line, truncating what does not fit.
+        lines: lines around the cells.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class FittedTable:
         self._one_line, self._lines = one_line, lines
 
     def left_out(self, width: int) -> list[str]:
-        """Return the headers that a terminal of so many columns has no room for."""
+        """Return the headers of the columns that do not fit a terminal of a width."""
         shown = self._shown(Console(width=width), width)
         return [" ".join(each.header.split()) for i, each in enumerate(self.columns) if i not in shown]
 
@@ -79,7 +79,7 @@ class FittedTable:
             yield Text(printable(self._caption), style="table.caption")
 
     def _shown(self, console: Console, width: int) -> list[int]:
-        """Return the places of the columns that a width has room for."""
+        """Return the indices of the columns that fit a width."""
         shown = list(range(len(self.columns)))
         wide = console.options.update(width=UNLIMITED)
         while True:
@@ -120,7 +120,7 @@ class FittedTable:
         return Table(box=self._lines, pad_edge=self._lines is not None, show_header=has_head)
 
     def _least(self, place: int) -> int:
-        """Return the width of a column below which others are left out."""
+        """Return the width of a column below which others are omitted."""
         column = self.columns[place]
         header = max(map(len, column.header.split("\n")))
         cells = [printable(row[place]) for row in self._rows]
@@ -139,12 +139,12 @@ def print_table(table: FittedTable) -> None:
 
 
 def shortened(name: str, width: int) -> str:
-    """Return a name of at most `width` characters; its beginning is left out."""
+    """Return a name of at most `width` characters, truncated at its beginning."""
     return name if len(name) <= width else f"…{name[len(name) - width + 1 :]}"
 
 
 class NameCell(NamedTuple):
-    """A cell with a name that may be wider than it: its end is kept, which tells `estimator.drone2` from its siblings.
+    """A cell with a name, truncated at the beginning: the end distinguishes names such as `estimator.drone2`.
 
     All characters of a name are one column wide.
     """
@@ -164,7 +164,7 @@ MANY = ("#440154", "#482475", "#414487", "#355f8d", "#2a788e", "#21918c", "#22a8
 
 @lru_cache
 def drone_colours(count: int) -> tuple[str, ...]:
-    """Return the colours `#rrggbb` of so many drones, in the order of the scenario."""
+    """Return the colours `#rrggbb` of `count` drones, in the order of the scenario."""
     if count <= len(FEW):
         return FEW[:count]
     colours = []

@@ -47,7 +47,7 @@ def agents_of(scenario: Scenario, patterns: Sequence[str] = ("*",)) -> list[str]
 
 
 def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> None:
-    """Check that the classes that a scenario names can be loaded here.
+    """Check that the classes named in a scenario can be loaded here.
 
     Args:
         source: name of the scenario's file, with which each fault begins.
@@ -90,7 +90,7 @@ def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> N
 
 
 def _check_agent(own: OwnAgent, where: str, scenario: Scenario) -> None:
-    """Check that the class of agents can be loaded, and what it says itself of its parameters by a method `flaws`."""
+    """Check that the class of agents can be loaded, and its parameters by its method `flaws`, if any."""
     kind: Any = plugin.load(own.named, f"{where}.class", Agent)
     flaws = getattr(kind, "flaws", None)
     if flaws and (found := [f"{where}.parameters.{path} {text}" for path, text in flaws(own.parameters, scenario)]):
@@ -98,7 +98,7 @@ def _check_agent(own: OwnAgent, where: str, scenario: Scenario) -> None:
 
 
 def check_plans(scenario: Scenario, source: str) -> None:
-    """Check the plans of a scenario as its controllers and pilots would: expressions, names, templates, references.
+    """Check the plans of a scenario as its controllers and pilots do: expressions, names, templates, references.
 
     A run as processes leaves this to these, which load the mathematics anyway.
 
@@ -124,7 +124,7 @@ def check_plans(scenario: Scenario, source: str) -> None:
 
 
 def hosted(info: Info, scenario: Scenario, patterns: Sequence[str]) -> Agent:
-    """Return the agents that match, of all roles, as one; RunError: none match, or the scenario cannot be flown."""
+    """Return the matching agents of all roles as one; RunError: none match, or the scenario cannot be flown."""
     split = [name.partition(".") for name in agents_of(scenario, patterns)]
     by_role = {role: [thing for each, _, thing in split if each == role] for role in agent_roles(scenario)}
     members = [agent for role, names in by_role.items() if names for agent in make_agents(role, info, scenario, names)]
@@ -132,7 +132,7 @@ def hosted(info: Info, scenario: Scenario, patterns: Sequence[str]) -> Agent:
 
 
 def make_agents(role: str, info: Info, scenario: Scenario, names: Sequence[str]) -> list[Agent]:
-    """Make the agents of one role for drones or clusters: one for all of them, if the role has joint agents."""
+    """Make the agents of one role for drones or clusters, or one joint agent if the role has these."""
     if own := scenario.own_agents.get(role):
         kind = plugin.load_any(own.named, f"agents.{role}.class", Agent)
         if own.map is False:
@@ -151,7 +151,7 @@ def make_agents(role: str, info: Info, scenario: Scenario, names: Sequence[str])
 
 
 class AgentSpec(NamedTuple):
-    """An agent of a user's, as a command line names it: `[NAME=]MODULE:CLASS [SETTING=VALUE]...`."""
+    """A user's agent on a command line: `[NAME=]MODULE:CLASS [SETTING=VALUE]...`."""
 
     named: str  # the class, a function that makes the agent, or the agent
     settings: dict[str, Any]  # arguments of the class
@@ -159,10 +159,10 @@ class AgentSpec(NamedTuple):
 
     @classmethod
     def parse(cls, words: Sequence[str], name: str = "") -> "AgentSpec":
-        """Return the agent of some words, the class loaded here.
+        """Return the agent given by words, after loading its class here.
 
         Raises:
-            RunError: a setting is malformed, or a name.
+            RunError: a setting or a name is malformed.
             DocumentError: there is no such class.
         """
         given, _, named = words[0].rpartition("=")
@@ -179,31 +179,31 @@ class AgentSpec(NamedTuple):
         return cls(named, settings, keys.name(name or given or process_name(made)))
 
     def words(self) -> list[str]:
-        """Return the words of which `parse` makes it."""
+        """Return the words from which `parse` makes it."""
         named = f"{self.name}={self.named}"
         return [named, *(f"{setting}={json.dumps(value)}" for setting, value in self.settings.items())]
 
     def make(self, info: Info, scenario: Scenario) -> Agent:
-        """Return the agent, ready to join; errors as of `own_agent`."""
+        """Return the agent, ready to join; errors as for `own_agent`."""
         return own_agent(plugin.load_any(self.named, "agent", Agent), info, scenario, self.settings, self.name)
 
 
 def process_name(made: Agent | Callable[..., Agent]) -> str:
-    """Return the name under which an agent of a user's takes part that has not been made yet."""
+    """Return the process name of a user's agent, or of one that a class or function will make."""
     name = getattr(made, "name", None)
     return name if isinstance(name, str) else default_name(type(made) if isinstance(made, Agent) else made)
 
 
 def without_map(info: Info, scenario: Scenario) -> tuple[Info, Scenario]:
-    """Return what an agent is given to which the scenario does not grant the map: no obstacles, no surfaces."""
+    """Return info and scenario without obstacles and surfaces, for an agent that is not granted the map."""
     bare = replace(scenario, environment=replace(scenario.environment, obstacles=[], surfaces=UNSET))
     return replace(info, scenario=to_text(bare)), bare
 
 
 def with_own_agents(scenario: Scenario, names: Sequence[str]) -> Scenario:
-    """Return a resolved scenario that waits for agents of a user's, and ends where one of them fails.
+    """Return a resolved scenario that waits for users' agents, and ends if one of them fails.
 
-    What it says of them itself in `processes.on_death` holds.
+    Its own entries for them in `processes.on_death` take precedence.
     """
     processes = scenario.processes
     expect = [*dict.fromkeys((*expected_processes(scenario), *names))]
@@ -219,18 +219,18 @@ def own_agent(
     name: str = "",
     per: str = "run",
 ) -> Agent:
-    """Return an agent of a user's that is ready to join.
+    """Return a user's agent, ready to join.
 
     Args:
-        made: the agent; or a class or function that makes it of `settings`, its parameters, and of `info`, `scenario`
-            and the name of the `drone` or `cluster` that it is of, where it takes arguments of these names.
-        name: of its process; empty for its own.
-        per: "drone" or "cluster" where the name is of an agent of one.
+        made: the agent; or a class or function that makes it from `settings`, its parameters, and from `info`,
+            `scenario` and the name of its `drone` or `cluster`, if it takes arguments of these names.
+        name: name of its process; empty for the agent's own.
+        per: "drone" or "cluster" if the name is that of an agent of one.
 
     Raises:
         UserCodeError: the class raised.
-        RunError: the settings are not those that it takes, or what it returns is no agent.
-        DocumentError: its parameters, or its messages, are not what is allowed.
+        RunError: the settings do not fit its arguments, or it does not return an agent.
+        DocumentError: its parameters or its messages are not allowed.
     """
     if not isinstance(made, Agent):
         if not callable(made):
@@ -266,5 +266,5 @@ def own_agent(
 
 
 def agent_class(role: str) -> Callable[..., Agent]:
-    """Return the class of a role's agents; its module is imported here, so that hosts of other roles need not."""
+    """Return the class of a role's agents; its module is imported only here, so that hosts of other roles need not."""
     return plugin.load(AGENTS[role].agent, role, Agent)

@@ -1,7 +1,7 @@
 """The recorder as a process: every message of every key into `run.mcap`.
 
-The run does not wait for it gate by gate, but the world is never farther ahead of what is on disk than its history
-reaches back: a recorder that comes back, or that replaces one that died, goes on without a gap.
+The run does not wait for it gate by gate, but the world is never farther ahead of the record on disk than its history
+reaches back: a recorder that rejoins, or replaces a dead one, continues without a gap.
 """
 
 import contextlib
@@ -29,16 +29,16 @@ from zsim.transport.session import ReceivedSample, Session
 from zsim.transport.traffic import Passed, Traffic, replay, samples
 
 NAME = "recorder"
-PAUSE_S = 0.01  # between two looks into the queue: nobody waits for the recorder, and waking up is what costs
-TICK_S = 0.1  # how often the open chunk's age and a stop are looked at
-JOIN_S = 1.0  # wall time after which a join that has brought no event is repeated: it may have met no world
-SLACK_NS = 4_000_000_000  # how far the world may be ahead of what is on disk; its history has 5 s
-DRAIN_S = 1.0  # after `stopped`, how long the byes of the others are waited for
-STOP_DRAIN_S = 0.5  # after a stop is requested, how long the end of the run is waited for: both may be stopped at once
-QUIET_S = 1.5  # a world whose time stands publishes its clock once a second
+PAUSE_S = 0.01  # between two reads of the queue, since each wake-up is costly
+TICK_S = 0.1  # interval of checking the open chunk's age and a requested stop
+JOIN_S = 1.0  # wall time after which a join without an event is repeated, since the world may have missed it
+SLACK_NS = 4_000_000_000  # how far the world may be ahead of the record on disk; its history has 5 s
+DRAIN_S = 1.0  # waiting time for the byes of other processes after `stopped`
+STOP_DRAIN_S = 0.5  # waiting time for the end of the run after a requested stop: both may be stopped together
+QUIET_S = 1.5  # a world whose time stands still publishes its clock once a second
 REPLAY_S = 5.0  # a hub answers within milliseconds
-FLUSH_NS = 1_000_000_000  # simulated time after which what was taken is put on disk
-REPEATED_NS = 1_000_000_000  # simulated, after catching up, in which others may repeat what they had published before
+FLUSH_NS = 1_000_000_000  # simulated time between writes to disk
+REPEATED_NS = 1_000_000_000  # simulated time after catching up in which other processes may repeat messages
 OUTPUTS = (Command, *messages.RELAYED)
 KNOWN_MAX = 2_000_000  # messages remembered: 7 s of 1000 drones
 TAIL_NS = 7_000_000_000  # simulated, at the end of a record; the world's history has 5 s
@@ -53,10 +53,10 @@ class Recorder:
     """Records a run until it ends.
 
     Args:
-        path: of the record, which may exist already.
-        stopped: tells whether the process is to end.
+        path: path of the record, which may exist.
+        stopped: tells whether the process must end.
         say: called with lines for the user.
-        deserted: asked at the end; True leaves without a bye, as a process that dies.
+        deserted: called at the end; True leaves without a bye, like a process that dies.
     """
 
     def __init__(
@@ -90,10 +90,10 @@ class Recorder:
         self._over = threading.Event()
         self._ended_s: float | None = None
         self._stopped_s: float | None = None
-        self._held: list[Passed] = []  # arrived, but not to be written before what was missed
-        self._is_back = False  # after a lost link in realtime, until it is known how much was missed
+        self._held: list[Passed] = []  # received, to be written after missed messages
+        self._is_back = False  # after a lost link in realtime, until the missed messages are known
         self._quiet_since_s: float | None = None  # since when no clock has come, after a lost link in realtime
-        self._on_disk_ns = 0  # when everything taken was put there last
+        self._on_disk_ns = 0  # simulated time of the last write to disk
         self._left_out = 0
 
     def run(self) -> str:
@@ -101,7 +101,7 @@ class Recorder:
 
         Raises:
             RunError: the world has begun another run; the record is complete as far as it goes.
-            RecordError: the disk is full or the file cannot be written; what was written before is readable.
+            RecordError: the disk is full or the file cannot be written; the record up to then is readable.
             SupersededError: another recorder of this name has taken over.
         """
         self._traffic = Traffic(self._link, run_key_table(self._info), self._on_refused)
@@ -113,7 +113,7 @@ class Recorder:
             if self._writer.has_former:
                 self._resume()
                 self._print(f"{NAME}: goes on with {self._writer.path} after t = {self._part.now_ns / 1e9:.2f} s")
-            else:  # which run this is, the newest faults, and how cameras see: a replay has them no longer
+            else:  # last values that a replay may no longer have
                 lasting = {keys.INFO: messages.encode(self._info)}
                 for key in (keys.INFO, keys.FAULTS, keys.camera_info("*", "*")):
                     lasting |= {sample.key: sample.payload for sample in self._link.get(key)}
@@ -148,11 +148,11 @@ class Recorder:
             arrived = self._traffic.receive()
             time.sleep(PAUSE_S)
             arrived += self._traffic.drain()
-            if self._is_another_run():  # before what has arrived: it may have passed after what was missed
+            if self._is_another_run():  # before the received messages, which may be later than missed ones
                 return ANOTHER_RUN
             self._write_arrived(arrived)
             if self._quiet_since_s is not None and time.monotonic() - self._quiet_since_s > QUIET_S:
-                # what nothing comes after, such as the end of the run, has passed before the link was back
+                # messages without a successor, such as the end of the run, passed before the link was restored
                 self._quiet_since_s, self._is_back = None, False
                 self._fetch_missed()
                 self._write_held()
@@ -161,7 +161,7 @@ class Recorder:
             self._writer.tick(time.monotonic_ns())
             if self._part.now_ns - self._on_disk_ns >= FLUSH_NS:
                 self._put_on_disk()
-            self.health.refused += self._writer.refused - self._left_out  # what the record has no room for
+            self.health.refused += self._writer.refused - self._left_out  # for lack of channels
             self._left_out = self._writer.refused
             if not self._part.admitted and time.monotonic() - self._joined_s > JOIN_S:
                 self._join()
@@ -180,7 +180,7 @@ class Recorder:
         self._part.done(t_ns)
 
     def _join(self, again: bool = False) -> None:
-        """Join; from then on the world runs ahead of what is on disk no farther than SLACK_NS."""
+        """Join; from then on the world is at most SLACK_NS ahead of the record on disk."""
         self._part.join(again)
         self._joined_s = time.monotonic()
         self._put_on_disk()
@@ -194,7 +194,7 @@ class Recorder:
         self.health.refused += 1
 
     def _resume(self) -> None:
-        """Learn what the record of a predecessor has at its end, which may be that of the run."""
+        """Continue from the end of a predecessor's record, which may be the end of the run."""
         if last := self._known.add_tail(self._writer.path):
             self._part.now_ns = last.t_ns
             clock = self._clock_in(last.payload)
@@ -203,9 +203,9 @@ class Recorder:
                 self._ended_s = time.monotonic()
 
     def _catch_up(self, before: Clock | None = None) -> None:
-        """Write what was published while this process was not there: the world keeps it for a while.
+        """Write the messages published in the absence of this process, from the world's history.
 
-        The world is asked until it has answered; a message that comes twice then is written once.
+        The request is repeated until the world answers; a message received twice is written once.
         """
         self._caught_up = False
         while True:
@@ -223,7 +223,7 @@ class Recorder:
             self._known.add(key, payload)
 
     def _replayed(self, before: Clock | None) -> Iterator[Message]:
-        """Yield what the world replays, up to a clock that has arrived: what came after that is on its way as well."""
+        """Yield the world's replay, up to a received clock: later messages are on their way as well."""
         held: list[Message] = []
         for entry in replay(self._link, NAME, -1, ["**"], REPLAY_S):
             held.append(entry)
@@ -236,18 +236,18 @@ class Recorder:
                 held.clear()
 
     def _fetch_missed(self, before: Clock | None = None) -> None:
-        """Write what passed since the newest message on record, or up to a clock, as far as the world still has it."""
+        """Write the messages since the newest one on record, or up to a clock, as far as the world still has them."""
         self._writer.flush()
         self._known.add_tail(self._writer.path)
         self._catch_up(before)
 
     def _pauses(self) -> bool:
-        """Wait a little; return False once nothing is to be waited for any more."""
+        """Wait for a tick; return False if the process must stop."""
         self._over.wait(TICK_S)
         return not self._stopped()
 
     def _world_info(self) -> messages.Info | None:
-        """Return the world's `world/info`, for which one that was just started again may need a while."""
+        """Return the world's `world/info`, waiting for a world that has just been restarted."""
         until_s = time.monotonic() + REPLAY_S
         while (info := read_info(self._link)) is None and time.monotonic() < until_s and self._pauses():
             pass
@@ -258,7 +258,7 @@ class Recorder:
         self._traffic.wake()
 
     def _is_another_run(self) -> bool:
-        """Tell whether a link that is back leads to another run; if not, fetch what was missed."""
+        """Tell whether a restored link leads to another run; if not, fetch the missed messages."""
         while self._links:
             up = self._links.popleft()
             if not up:
@@ -273,19 +273,19 @@ class Recorder:
             return True
         if self._info.mode == "lockstep":
             self._fetch_missed()
-        else:  # the world may be far ahead of what is on its way
+        else:  # the world may be far ahead of the messages on their way
             self._quiet_since_s = time.monotonic()
             self._is_back = True
-        if not self._part.superseded:  # as what was missed may have told
+        if not self._part.superseded:  # possibly by a missed message
             self._join(again=True)
         return False
 
     def _write_arrived(self, arrived: Iterable[Passed]) -> None:
-        """Write what has arrived; where clocks are missing before it, what the world still has since comes first.
+        """Write received messages; if clocks are missing before them, the world's history since then first.
 
-        What stands before a clock is held until that clock is looked at: it may have passed after what is missing.
-        After a lost link in realtime, where the world does not wait for this process, what is missing need not be a
-        clock: what was missed is then fetched at the first clock after the process's own join.
+        Messages before a clock are held until that clock is checked, since they may be later than missing ones. After a
+        lost link in realtime, where the world does not wait for this process, clocks need not be among the missed
+        messages: they are then fetched at the first clock after the process's own join.
         """
         for passed in arrived:
             self._held.append(passed)
@@ -340,11 +340,11 @@ class Recorder:
             self._note_process(key, payload)
 
     def _note_process(self, key: str, payload: bytes) -> None:
-        """Note which other processes have joined and not left."""
+        """Track the other processes that have joined and not left."""
         name, kind = keys.thing(key), messages.type_of(key)
         if name == NAME or kind not in (run_messages.Join, run_messages.Bye):
             return
-        with contextlib.suppress(DecodeError):  # garbage of somebody else; recorded as it came
+        with contextlib.suppress(DecodeError):  # invalid message of another process, recorded as received
             passed = messages.decode(key, payload)
             if isinstance(passed, run_messages.Join):
                 self._others[name] = passed.incarnation
@@ -352,7 +352,7 @@ class Recorder:
                 self._others.pop(name, None)
 
     def _clock_in(self, payload: bytes) -> Clock | None:
-        """Return the clock of this run; None for anything else that somebody published on `clock`."""
+        """Return the clock of this run; None for any other message on `clock`."""
         try:
             clock = self._clock.decode(payload)
         except messages.REFUSALS:
@@ -360,7 +360,7 @@ class Recorder:
         return clock if clock.run_id == self._info.run_id else None
 
     def _on_clock(self, payload: bytes) -> None:
-        """Count the gate of a clock, and tell at once which gates are missing before it."""
+        """Count the gate of a clock, and report the gates missing before it."""
         clock = self._clock_in(payload)
         if clock is None:
             return
@@ -373,11 +373,11 @@ class Recorder:
         elif self._caught_up and clock.t_ns > self._known_until_ns:
             self._known.clear()
         elif self._caught_up:
-            self._known.keep_outputs()  # whatever passed after a clock that was not replayed was not replayed either
+            self._known.keep_outputs()  # messages after a clock that was not replayed were not replayed either
 
 
 class KnownMessages:
-    """Messages that are written, so that none is written twice; the oldest are forgotten beyond KNOWN_MAX."""
+    """Written messages, so that none is written twice; beyond KNOWN_MAX the oldest are forgotten."""
 
     def __init__(self) -> None:
         self._known: dict[Message, None] = {}
@@ -396,7 +396,7 @@ class KnownMessages:
             del self._known[next(iter(self._known))]
 
     def add_tail(self, path: Path) -> Recorded | None:
-        """Remember what stands at the end of a record; return the newest clock there."""
+        """Add the messages at the end of a record; return the newest clock there."""
         with RecordReader(path) as reader:
             last = reader.last(keys.CLOCK)
             last_ns = last.t_ns if last else 0
@@ -405,7 +405,7 @@ class KnownMessages:
         return last
 
     def keep_outputs(self) -> None:
-        """Forget all but outputs of participants, who repeat them after a rejoin; anything else that comes is new."""
+        """Keep only outputs of participants, which repeat them after a rejoin; any other message is new."""
         if not self._outputs_only:
             self._known = {entry: None for entry in self._known if is_output(*entry)}
             self._outputs_only = True
@@ -423,7 +423,7 @@ def is_output(key: str, payload: bytes) -> bool:
 
 
 def is_of_run(path: Path, run_id: str) -> bool:
-    """Tell whether a file is the record of a run, or one that ends before it says of which run it is.
+    """Tell whether a file is the record of a run, or a record that ends before it names its run.
 
     Raises:
         RecordError: it is no record.

@@ -1,5 +1,5 @@
-"""Programs that show a run or translate it: console, gateway, ROS 1, ROS 2, MAVLink and AR.Drone, each by itself.
+"""Programs that show or translate a run: console, gateway, ROS 1, ROS 2, MAVLink and AR.Drone, all independent.
 
-The world waits for none of them. Imports zsim and the mathematics of zsim_agents; besides its own room each uses
+The world waits for none of them. They import zsim and the mathematics of zsim_agents; besides its own package each uses
 `vehicle_links` and `web`.
 """

@@ -1,11 +1,11 @@
-"""A federation's certificate authority: certificates for each process and host, and what each of them may do.
+"""A federation's certificate authority: certificates for each process and host, and their access rights.
 
-certs/ca.pem, certs/ca.key                                 the authority; the key stays where it was made
+certs/ca.pem, certs/ca.key                                 the authority; the key stays on the machine that made it
 certs/HOST/PROCESS/ca.pem, certificate.pem, key.pem        of one process on one host, the folder of --tls
-certs/HOST/PROCESS.access.json                             of a process that listens: who may do what there
+certs/HOST/PROCESS.access.json                             access control of a listening process
 
-Zenoh judges at the process that listens (the world, a router), by the common name in the certificate of the other
-side, both ways: what comes in from it and what goes out to it. An expression is allowed if a rule's includes it.
+Zenoh enforces access control at the listening process (the world, a router), by the common name in the peer's
+certificate, in both directions. A key expression is allowed if it is included in that of a rule.
 docs.rs/zenoh-config, AclConfig.
 """
 
@@ -36,11 +36,11 @@ from zsim_deploy.inventory import InventoryFile
 
 AUTHORITY_DAYS = 1825  # 5 years; its key never leaves the machine that made it
 AUTHORITY_KEY = "ca.key"
-BACK = timedelta(days=1)  # hosts in the field have clocks that are hours off
-EXPIRED = "expired on"  # a day
-OPERATORS = "operators"  # folder of the operators that are at no host of the inventory
+BACK = timedelta(days=1)  # back-dating, because clocks of hosts in the field are hours off
+EXPIRED = "expired on"  # followed by a date
+OPERATORS = "operators"  # folder of the operators without a host in the inventory
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
-SHOWN_MAX = 4  # names in a line; all of them are missing together as a rule
+SHOWN_MAX = 4  # names in a line; usually all are missing at once
 READABLE_BY_OTHERS = stat.S_IRGRP | stat.S_IROTH
 
 Root = x509.Certificate
@@ -48,7 +48,7 @@ Root = x509.Certificate
 
 
 class CertificateRequest(NamedTuple):
-    """A certificate that is to be there."""
+    """A required certificate."""
 
     host: str  # name in the inventory; a folder
     process: str  # its name; the common name
@@ -73,15 +73,15 @@ def folder_of(placed: InventoryFile) -> Path:
 
 
 def init_command(placed: InventoryFile, renew: bool = False) -> str:
-    """Return the command that makes an inventory's certificates, as a person types it."""
+    """Return the command that makes an inventory's certificates."""
     return f"zsim certs init {placed.word} --scenario FILE{' --renew' if renew else ''}"
 
 
 def authority(folder: Path, now: datetime, force: bool = False) -> Authority:
-    """Return the authority in a folder, made if there is none.
+    """Return the authority in a folder, which is made if there is none.
 
-    `force` makes another one, which invalidates every certificate made before. RunError if half of it is there, it has
-    expired, or it cannot be read or written.
+    `force` makes a new one, which invalidates all earlier certificates. RunError if it is incomplete, has expired, or
+    cannot be read or written.
     """
     place, key_place = folder / AUTHORITY, folder / AUTHORITY_KEY
     there = [path for path in (place, key_place) if path.exists()]
@@ -91,10 +91,10 @@ def authority(folder: Path, now: datetime, force: bool = False) -> Authority:
         missing = key_place if there == [place] else place
         raise RunError(f"{missing}: is missing beside {there[0].name}; bring it here, or --force makes a new authority")
     try:
-        with file_fault(key_place, "cannot be read", "it belongs to whoever made it"):
+        with file_fault(key_place, "cannot be read", "it belongs to the user who made it"):
             key = serialization.load_pem_private_key(key_place.read_bytes(), password=None)
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
-        raise RunError(f"{key_place}: is no private key; --force makes a new authority") from error
+        raise RunError(f"{key_place}: is not a private key; --force makes a new authority") from error
     if (
         not isinstance(key, ec.EllipticCurvePrivateKey)
         or (certificate := root(folder)).public_key() != key.public_key()
@@ -123,7 +123,7 @@ def _make_authority(folder: Path, now: datetime) -> Authority:
 
 
 def issue(folder: Path, signer: Authority, wanted: CertificateRequest, now: datetime, days: float = DAYS) -> Path:
-    """Make key and certificate of a process on a host; return the folder that they are in."""
+    """Make key and certificate of a process on a host; return their folder."""
     purposes = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]  # routers are both
     issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.key.public_key())
     key, builder = _key_and_builder(_name(wanted.process), signer.certificate.subject, now, days)
@@ -171,7 +171,7 @@ def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def write(path: Path, content: bytes) -> None:
-    """Put a file in its place at once and readable by its owner alone; half a key is no key."""
+    """Write a file atomically, readable by its owner alone."""
     fresh = path.with_name(f".{path.name}.new")
     with file_fault(path, "cannot be written", "give another folder"):
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -182,7 +182,7 @@ def write(path: Path, content: bytes) -> None:
 
 
 def root(folder: Path) -> Root:
-    """Return the certificate of the authority in a folder; its key need not be there."""
+    """Return the certificate of the authority in a folder; its key is not needed."""
     return _load(folder / AUTHORITY)
 
 
@@ -204,7 +204,7 @@ def operators(folder: Path, hosts: Iterable[str]) -> Iterator[str]:
 
 
 def renewal_reason(folder: Path, signer: Root, wanted: CertificateRequest, now: datetime) -> str | None:
-    """Return why a certificate has to be made, None if the one that is there will do, with its key."""
+    """Return why a certificate must be made, None if a valid one exists with its key."""
     place = folder / wanted.host / wanted.process
     if not all((place / name).exists() for name in CERTIFICATES):
         return "new"
@@ -219,7 +219,7 @@ def renewal_reason(folder: Path, signer: Root, wanted: CertificateRequest, now: 
 
 
 def _fault(place: Path, certificate: x509.Certificate, signer: Root, now: datetime) -> str | None:
-    """Return the fault of a certificate or of the files beside it; `certs init` may have been interrupted."""
+    """Return the fault of a certificate or its accompanying files, for instance of an interrupted `certs init`."""
     try:
         authority_there, key = (place / AUTHORITY).read_bytes(), (place / KEY).read_bytes()
         public = serialization.load_pem_private_key(key, password=None).public_key()
@@ -241,7 +241,7 @@ def _load(path: Path) -> x509.Certificate:
         with file_fault(path, "cannot be read", "zsim certs init makes it"):
             return x509.load_pem_x509_certificate(path.read_bytes())
     except ValueError as error:
-        raise RunError(f"{path}: is no certificate; zsim certs init makes it") from error
+        raise RunError(f"{path}: is not a certificate; zsim certs init makes it") from error
 
 
 def _addresses(certificate: x509.Certificate) -> tuple[str, ...]:
@@ -255,7 +255,7 @@ def _addresses(certificate: x509.Certificate) -> tuple[str, ...]:
 def certificate_faults(placed: InventoryFile, places: Mapping[str, str] | None, now: datetime) -> list[str]:
     """Return a line for each fault of a run's certificates and access control.
 
-    `places`: host of each process that is to be started, with or without its routers. None takes the world.
+    `places`: host of each process to be started, with or without routers; None: only the world.
     """
     if placed.inventory.security.insecure:
         return []
@@ -286,7 +286,7 @@ def certificate_faults(placed: InventoryFile, places: Mapping[str, str] | None, 
     except RunError as error:
         return [str(error)]
     except OSError as error:
-        return [f"{folder}: cannot be read ({error.strerror}); it belongs to whoever made it"]
+        return [f"{folder}: cannot be read ({error.strerror}); it belongs to the user who made it"]
     lines = []
     for fault, who in names.items():
         more = f" and {len(who) - SHOWN_MAX} more" if len(who) > SHOWN_MAX else ""
@@ -296,7 +296,7 @@ def certificate_faults(placed: InventoryFile, places: Mapping[str, str] | None, 
 
 
 def exposed_keys(placed: InventoryFile) -> str | None:
-    """Return a warning of private keys that others than their owner can read; None if there are none."""
+    """Return a warning about private keys that other users can read; None if there are none."""
     if placed.inventory.security.insecure:
         return None
     folder = folder_of(placed)
@@ -306,23 +306,24 @@ def exposed_keys(placed: InventoryFile) -> str | None:
             exposed += [path] if path.stat().st_mode & READABLE_BY_OTHERS else []
     if not exposed:
         return None
-    more = f" and {len(exposed) - 1} private keys more" if len(exposed) > 1 else ""
+    more = f" and {len(exposed) - 1} more private keys" if len(exposed) > 1 else ""
     return f"{min(exposed)}{more} can be read by others on this machine; chmod -R go= {shlex.quote(str(folder))}"
 
 
 def enrolment(
     placed: InventoryFile, scenario: Scenario, operators: Sequence[str] = ()
 ) -> tuple[list[CertificateRequest], list[tuple[str, str, dict[str, Any]]]]:
-    """Return the certificates, and host, process and access control of every process that listens.
+    """Return the required certificates, and host, process and access control of every listening process.
 
     A role has a certificate for every host, so that it can be moved there during a run.
 
     Args:
-        operators: people and programs that look and command, each NAME or NAME@HOST; at a host they come in as its
-            roles do, through its router if it has one, otherwise at the world. One may be at several places.
+        operators: people and programs that observe and command, each NAME or NAME@HOST; at a host they connect as its
+            roles do, through its router if it has one, otherwise to the world. One may be at several hosts.
 
-    InventoryError if a process has no place, or an operator is at no host; BadNameError if a name is none of the
-    contract.
+    Raises:
+        InventoryError: a process has no place, or the host of an operator is unknown.
+        BadNameError: a name is not allowed by the contract.
     """
     hosts, routers = placed.inventory.hosts, placed.inventory.routers
     places = inv.placement(placed, scenario)
@@ -333,7 +334,7 @@ def enrolment(
             known = f"must be one of hosts: {', '.join(hosts)}"
             raise InventoryError([f"{placed.source}: operator {name!r} is at {host!r}; {known}"])
         people[f"{OPERATOR}.{name}", host or None] = None
-    # Any host may run these: what the scenario names, and drivers, which it need not expect.
+    # Any host may run these: the processes of the scenario, and drivers, even if it does not expect them.
     movable = [name for name in places if name != WORLD]
     movable += [name for name in drivers_of(scenario) if name not in places]
     wanted = [(places[WORLD], WORLD), *((router.host, f"{ROUTER}.{name}") for name, router in routers.items())]
@@ -345,7 +346,7 @@ def enrolment(
         return list(dict.fromkeys(who for who, at in people if (hosts[at].router if at else None) == router))
 
     def clients_of(router: str) -> list[str]:
-        """Return the processes that may come to a router: every role, as any may be moved to a host of it."""
+        """Return the processes that may connect to a router: every role, since any may be moved to its hosts."""
         has_hosts = any(host.router == router for host in hosts.values())
         return [*(movable if has_hosts else []), *operators_at(router)]
 
@@ -368,7 +369,7 @@ def enrolment(
     return requests, access
 
 
-# (flow, messages, whose keys): what a right is on the wire, seen from the process that listens
+# rights on the wire, as seen from the listening process: (flow, messages, field of Rights with the keys)
 _WIRE: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("ingress", ("declare_subscriber",), "reads"),
     ("egress", ("put",), "reads"),
@@ -381,25 +382,25 @@ _WIRE: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("ingress", ("liveliness_query", "declare_liveliness_subscriber"), "watches"),
     ("egress", ("liveliness_token",), "watches"),
 )
-# Declarations go to all, for without them nothing is sent; they hold no payload.
+# Declarations are allowed for all, because nothing is sent without them; they have no payload.
 _DECLARATIONS = ("declare_subscriber", "declare_queryable", "liveliness_query", "declare_liveliness_subscriber")
 _MESSAGES = (*_DECLARATIONS, "put", "delete", "query", "reply", "liveliness_token")
-ANYONE = "anyone"  # with a certificate of the authority; a subject without conditions matches everybody
-# What anyone may do is to ask what it may do: zsim.transport.tls.
+ANYONE = "anyone"  # with a certificate of the authority; a subject without conditions matches all peers
+# Anyone may ask for its own rights: zsim.transport.tls.
 _ASKS_ACCESS = (("ingress", "query"), ("egress", "reply"))
 
 
 def access_control(
     scenario: Scenario, clients: Iterable[str], routers: Mapping[str, Iterable[str]], above: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """Return the `access_control` of a process that listens, as Zenoh's configuration has it.
+    """Return the `access_control` of a listening process for Zenoh's configuration.
 
-    Everything is denied that is not in it. A process that is not named may ask what it may do, and nothing else.
+    Everything else is denied. A process that is not named may only ask for its own rights.
 
     Args:
         clients: names of the processes that connect to it.
         routers: names of the routers that connect to it, with the processes behind each.
-        above: what it connects to itself, the world or another router.
+        above: names of the world or the router that it connects to itself.
     """
     granted = {name: rights.rights_for(name, scenario) for name in clients}
     for name, behind in routers.items():

@@ -1,6 +1,6 @@
-"""An inventory: which hosts there are, how to reach them, which role runs where, and by which command line.
+"""An inventory: the hosts, how to reach them, which role runs where, and the command lines of processes.
 
-Pure: reads a file and answers questions; nothing here opens a connection. docs/deployment.md explains the fields.
+Pure: reads a file, and opens no connection. docs/deployment.md explains the fields.
 """
 
 import fnmatch
@@ -33,18 +33,18 @@ from zsim_api.programs import filled
 from zsim_deploy import SAFE_PATH
 from zsim_deploy.arguments import REALTIME
 
-EXAMPLE = "examples/hosts.yaml"  # named where no inventory is given
-ZENOH_PORT = 7447  # Zenoh's own
+EXAMPLE = "examples/hosts.yaml"  # suggested if no inventory is given
+ZENOH_PORT = 7447  # Zenoh's default
 SSH_PORT = 22  # IANA
-HOSTS_MAX = DRONES_MAX  # with more, some have no drone
-ROLES_MAX = PROCESSES_MAX  # each a process at least
-ROUTER_PORT = 7448  # beside a world on the same host
-MODULE = (SAFE_PATH, "-m", "zsim_deploy.cli")  # after the interpreter
-NAMED = {name: ROLES[name].extra for name in (WORLD, RECORDER)}  # there is one of each; in the order of placement
-OF_CAMERAS = ("camera", "detector")  # roles that no run waits for, unless the scenario names them
+HOSTS_MAX = DRONES_MAX  # with more, some would have no drone
+ROLES_MAX = PROCESSES_MAX  # each entry is at least one process
+ROUTER_PORT = 7448  # differs from that of a world on the same host
+MODULE = (SAFE_PATH, "-m", "zsim_deploy.cli")  # arguments of the interpreter
+NAMED = {name: ROLES[name].extra for name in (WORLD, RECORDER)}  # one of each; in the order of placement
+OF_CAMERAS = ("camera", "detector")  # roles that a run waits for only if the scenario names them
 COMMANDS = {RECORDER: "record", "detector": "detect"}  # of roles whose command has another name
-KINDS = {f"{name}.": ROLES[name].extra for name in (*AGENTS, *OF_CAMERAS)}  # by the beginning of the process name
-MODULES = {  # what proves that an extra is whole, the installation without extras first
+KINDS = {f"{name}.": ROLES[name].extra for name in (*AGENTS, *OF_CAMERAS)}  # by prefix of the process name
+MODULES = {  # imported as a check of an extra, and of the installation without extras first
     "": "zsim.transport.session",
     "agents": "zsim_agents.estimation.estimator",
     "record": "zsim_agents.recorder",
@@ -63,19 +63,19 @@ class Host(Spec, frozen=True, kw_only=True):
     address: Address
     """How the other hosts reach it."""
     ssh: Address | None = None
-    """How the launcher reaches it, where that differs."""
+    """How the launcher reaches it, if that differs."""
     port: Port = SSH_PORT
     user: Text | None = None
     key: Text | None = None
-    """Private key file; None takes the agent's or ~/.ssh's."""
+    """Private key file; None: those of the agent and ~/.ssh."""
     known_hosts: Text | None = None
-    """File with its host key; None takes ~/.ssh/known_hosts."""
+    """File with its host key; None: ~/.ssh/known_hosts."""
     folder: Text = ".zsim"
-    """Where zsim is installed and keeps what it needs there; relative to the home."""
+    """Folder of zsim's installation and files; relative to the home."""
     python: Text | None = None
-    """Absolute path of the interpreter that has zsim; None takes the environment that `zsim push` makes."""
+    """Absolute path of an interpreter with zsim; None: the environment that `zsim push` makes."""
     router: Name | None = None
-    """Router through which its roles reach the world; None goes to the world directly."""
+    """Router through which its roles reach the world; None: they connect to the world directly."""
 
 
 class Router(Spec, frozen=True, kw_only=True):
@@ -84,11 +84,11 @@ class Router(Spec, frozen=True, kw_only=True):
     host: Name
     port: Port = ROUTER_PORT
     upstream: Name | None = None
-    """Router that it connects to; None is the world."""
+    """Router that it connects to; None: the world."""
 
 
 class Security(Spec, frozen=True, kw_only=True):
-    """Who may come in."""
+    """TLS and access control."""
 
     certificates: Text = "certs"
     """Folder of `zsim certs init`, relative to the inventory."""
@@ -99,15 +99,15 @@ class Security(Spec, frozen=True, kw_only=True):
 class Inventory(Spec, frozen=True, kw_only=True):
     hosts: Annotated[dict[Name, Host], Meta(max_length=HOSTS_MAX)]
     roles: Annotated[dict[Text, Name | Annotated[list[Name], Meta(max_length=HOSTS_MAX)]], Meta(max_length=ROLES_MAX)]
-    """Process name or pattern to a host, or to several over which what it matches is spread in order."""
+    """Process name or pattern to a host, or to several over which the matching processes are spread in order."""
     routers: Annotated[dict[Name, Router], Meta(max_length=HOSTS_MAX)] = msgspec.field(default_factory=dict)
     port: Port = ZENOH_PORT
-    """On which the world listens."""
+    """Port of the world."""
     security: Security = Security()
 
 
 class InventoryFile(NamedTuple):
-    """An inventory on disk: relative paths in it count from its folder."""
+    """An inventory on disk; relative paths in it refer to its folder."""
 
     inventory: Inventory
     folder: Path
@@ -120,7 +120,7 @@ class InventoryFile(NamedTuple):
 
 
 def load(path: Path) -> InventoryFile:
-    """Return the inventory of a YAML file; InventoryError with every fault, a line each."""
+    """Read an inventory from a YAML file; InventoryError with one line for every fault."""
     document = yaml_file.read(path, EXAMPLE, InventoryError)
     flaws = chain(faults(document, Inventory), _cross_faults(document))
     lines = first_lines(f"{path.name}: {where} {text}" for where, text in flaws)
@@ -136,10 +136,10 @@ def insecure(placed: InventoryFile) -> InventoryFile:
 
 
 def _cross_faults(document: dict[str, Any]) -> Iterator[Fault]:
-    """Yield the faults between fields: names that must be those of hosts and routers, and circles of routers."""
+    """Yield the faults between fields: unknown names of hosts and routers, and cycles of routers."""
 
     def entries(name: str) -> list[tuple[Any, Any]]:
-        """Return those of a map, none where it is no map or has too many: they are compared with each other."""
+        """Return the entries of a field; empty if it is not a map, or has too many entries to compare."""
         value = document.get(name)
         return list(value.items()) if isinstance(value, dict) and len(value) <= ROLES_MAX else []
 
@@ -152,7 +152,7 @@ def _cross_faults(document: dict[str, Any]) -> Iterator[Fault]:
         for name in wanted if isinstance(wanted, list) else [wanted]:
             yield from unknown(f"roles.{key}", name, hosts, "hosts")
         if wanted == []:
-            yield f"roles.{key}", "names no host; must name one at least"
+            yield f"roles.{key}", "names no host; must name at least one"
     upstream = {}
     for key, router in entries("routers"):
         if isinstance(router, dict):
@@ -162,11 +162,11 @@ def _cross_faults(document: dict[str, Any]) -> Iterator[Fault]:
                 upstream[key] = router["upstream"]
     for key, host in entries("hosts"):
         if key in (".", ".."):
-            yield f"hosts.{key}", "names a folder that is another's; must have a letter or a digit"
+            yield f"hosts.{key}", "is not usable as a folder name; must have a letter or a digit"
         if isinstance(host, dict):
             yield from unknown(f"hosts.{key}.router", host.get("router"), routers, "routers")
     if isinstance(document.get("hosts"), dict) and not hosts:
-        yield "hosts", "has 0 entries; must have 1 at least"
+        yield "hosts", "has 0 entries; must have at least 1"
     for start in upstream:
         seen, at = {start}, upstream[start]
         while at in upstream and at not in seen:
@@ -184,7 +184,7 @@ def roles(scenario: Scenario) -> list[str]:
 def placement(placed: InventoryFile, scenario: Scenario) -> dict[str, str]:
     """Return the host of every process, by `spread`; InventoryError if one has none, or a pattern matches nothing.
 
-    A program of the scenario may have none: it is started where `zsim up` is run.
+    A program of the scenario may have none: then `zsim up` starts it on the launcher's machine.
     """
     names, inventory = roles(scenario), placed.inventory
     entries = inventory.roles
@@ -209,10 +209,10 @@ def placement(placed: InventoryFile, scenario: Scenario) -> dict[str, str]:
 
 
 def spread(roles: Mapping[str, Name | list[Name]], names: Iterable[str]) -> dict[str, str]:
-    """Return the hosts of processes, without those that have no place; an entry's hosts take turns.
+    """Return the hosts of processes, without those that have no place; an entry's hosts are used in turn.
 
-    A name takes precedence over a pattern, a longer pattern over a shorter one. The recorder is at the world's host
-    unless it is placed.
+    A name takes precedence over a pattern, a longer pattern over a shorter one. The default host of the recorder is the
+    world's.
     """
     places: dict[str, str] = {}
     turns: Counter[str] = Counter()
@@ -230,19 +230,19 @@ def spread(roles: Mapping[str, Name | list[Name]], names: Iterable[str]) -> dict
 
 
 def endpoint(placed: InventoryFile, places: dict[str, str], host: str) -> str:
-    """Return where the roles of a host find the federation: their router, or the world."""
+    """Return the endpoint to which the roles of a host connect: that of their router, or the world."""
     return listening(placed, *_listener(placed.inventory, places, placed.inventory.hosts[host].router))
 
 
 def listening(placed: InventoryFile, host: str, port: int) -> str:
-    """Return the endpoint on which a process of a host listens: its own address, reached from outside."""
+    """Return the endpoint on which a process of a host listens, with the address that other hosts use."""
     address = placed.inventory.hosts[host].address
     shown = f"[{address}]" if ":" in address else address
     return f"{'tcp' if placed.inventory.security.insecure else 'tls'}/{shown}:{port}"
 
 
 def connections(placed: InventoryFile, places: dict[str, str]) -> dict[tuple[str, int], set[str]]:
-    """Return host and port of what listens, with the other hosts whose roles and routers connect to it."""
+    """Return host and port of each listening process, with the other hosts whose roles and routers connect to it."""
     inventory = placed.inventory
     ways = [(host, inventory.hosts[host].router) for name, host in places.items() if name != WORLD]
     ways += [(router.host, router.upstream) for router in inventory.routers.values()]
@@ -265,7 +265,7 @@ def below_home(path: str) -> str:
 
 
 def python(host: Host) -> str:
-    """Return the interpreter of a host that has zsim: as given, or the one that `zsim push` installs."""
+    """Return the interpreter of a host that has zsim: as given, or that of `zsim push`."""
     return host.python or f"{below_home(host.folder)}/venv/bin/python"
 
 
@@ -277,15 +277,15 @@ class PlannedProcess(NamedTuple):
 
     name: str  # `role.thing`
     host: str
-    words: tuple[str, ...]  # of the command, without what depends on where its files are, and without `thing`
-    thing: str | None  # name of a drone, a cluster or a router that it is given; None where it takes none
+    words: tuple[str, ...]  # of the command, without file paths and `thing`
+    thing: str | None  # argument: name of a drone, a cluster or a router; None: no argument
     port: int | None
     secure: bool
     on_death: OnDeath
 
     @property
     def is_restarted(self) -> bool:
-        """Whether its service is to start it again: not a world, which has no journal there."""
+        """Whether its service restarts it; never for a world, which has no journal there."""
         return self.on_death == "restart" and self.name != WORLD
 
     @property
@@ -298,7 +298,7 @@ class PlannedProcess(NamedTuple):
 
 
 class ProcessFiles(NamedTuple):
-    """Where a process finds its files, as its command line has them."""
+    """Paths of the files of a process, as in its command line."""
 
     scenario: str
     identity: str  # folder with ca.pem, certificate.pem and key.pem
@@ -350,27 +350,25 @@ def processes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (
 def own_programs(placed: InventoryFile, scenario: Scenario, host: str | None = None) -> list[str]:
     """Return a remark on each program of the user's own, with its command: those placed on one host, or all."""
     places = placement(placed, scenario)
+    own = [(name, at, f" on {at}") for name, at in places.items() if not _is_known(name, scenario)]
+    own += [(name, places[WORLD], "") for name in (programs_here(placed, scenario) if host is None else ())]
     remarks = []
-    for name, at in places.items():
-        if not _is_known(name, scenario) and host in (None, at):
-            where = endpoint(placed, places, at)
-            what = f"{name} on {at} is a program of your own: start it yourself, it connects to {where}"
-            remarks.append(what + _command_text(name, scenario, where))
-    for name in programs_here(placed, scenario) if host is None else ():
-        where = endpoint(placed, places, places[WORLD])
-        what = f"{name} is a program of your own: start it yourself, it connects to {where}"
-        remarks.append(what + _command_text(name, scenario, where))
+    for name, at, where in own:
+        if host in (None, at):
+            reach = endpoint(placed, places, at)
+            what = f"{name}{where} is a program of your own: start it yourself, it connects to {reach}"
+            remarks.append(what + _command_text(name, scenario, reach))
     return remarks
 
 
 def programs_here(placed: InventoryFile, scenario: Scenario) -> list[str]:
-    """Return the programs of a scenario that have no place: `zsim up` starts them itself."""
+    """Return the programs of a scenario that have no place: `zsim up` starts them on this machine."""
     places = placement(placed, scenario)
     return [name for name in programs(scenario) if name not in places]
 
 
 def _command_text(name: str, scenario: Scenario, endpoint: str) -> str:
-    """Return the command line of a program of the scenario; `{folder}`, that of the run, is the user's to choose."""
+    """Return the command line of a program of the scenario; `{folder}` of the run is left for the user to choose."""
     if name not in scenario.own_programs:
         return ""
     values = {"endpoint": endpoint, "federation": scenario.federation, "name": name, "folder": "{folder}"}
@@ -413,8 +411,8 @@ def extras(names: Sequence[str]) -> list[str]:
 def needed_extras(inventory: Inventory, more: Iterable[str] = ()) -> dict[str, frozenset[str]]:
     """Return the extras of every host, with those of `more`.
 
-    A pattern counts for everything that it can match, since the scenario is not known here. A router needs no extra,
-    nor does a program of the user's own.
+    A pattern counts for everything that it can match, since the scenario is not known here. Routers and programs of the
+    user's own need no extra.
     """
     extras_by_host: dict[str, set[str]] = {name: set(more) for name in inventory.hosts}
     for process, host in spread(inventory.roles, NAMED).items():
@@ -426,8 +424,8 @@ def needed_extras(inventory: Inventory, more: Iterable[str] = ()) -> dict[str, f
 
 
 def _can_match(pattern: str, kind: str) -> bool:
-    """Return whether a pattern can match a name that begins so."""
+    """Return whether a pattern can match a name with the prefix `kind`."""
     if kind.removesuffix(".") in OF_CAMERAS:
-        return pattern.startswith(kind)  # there are none unless they are named
+        return pattern.startswith(kind)  # these roles exist only if they are named
     literal = pattern[: min((pattern.find(sign) for sign in "*?[" if sign in pattern), default=len(pattern))]
     return literal.startswith(kind) or (literal != pattern and kind.startswith(literal))

@@ -1,8 +1,8 @@
 """`zsim render`: the processes of an inventory and a scenario as systemd units, compose files or Kubernetes manifests.
 
-templates/ has what is written, with `$name` where a value goes. YAML templates are filled as data and dumped again, so
-that every value is quoted as it has to be. Limits of restarts and exit codes are those of the supervisor: a role is
-started again where `zsim run` would start it again.
+Templates are in templates/, with `$name` for values. YAML templates are filled as data and dumped again, so that every
+value is quoted correctly. Restart limits and exit codes are those of the supervisor: a role is restarted in the same
+cases as by `zsim run`.
 
 Zenoh's endpoints and the certificates name the hosts of the inventory, so containers and Pods use the host's network.
 """
@@ -36,8 +36,8 @@ TEMPLATES = Path(__file__).with_name("templates")
 
 STATE = "/var/lib/zsim"  # StateDirectory=zsim
 CACHE = "/var/cache/zsim"  # CacheDirectory=zsim
-PATH_MAX = 4000  # bytes; Linux takes 4095, and what is in the folder has names too
-STOP_S = 15  # a world that is stopped waits 5 s for byes, and a recorder may have a disk to wait for
+PATH_MAX = 4000  # bytes; Linux allows 4095, including the names of the files in the folder
+STOP_S = 15  # a stopped world waits 5 s for byes, and a recorder may wait for its disk
 BASE = "python:3.11-slim"  # the oldest Python that zsim runs on
 WHEEL = f"zsim-{RELEASE}-py3-none-any.whl"
 IMAGE = f"zsim:{RELEASE}"
@@ -50,7 +50,7 @@ IN_A_CONTAINER = {
 }  # fmt: skip
 NAME_MAX = 63  # RFC 1123 label
 CONFIG_BYTES_MAX = 1_048_576  # of a ConfigMap; Kubernetes, "ConfigMaps"
-FINAL_CODES = [USER_FAULT, SUPERSEDED]  # a new start heals neither a wrong call nor a name that another has taken
+FINAL_CODES = [USER_FAULT, SUPERSEDED]  # a restart helps neither with a wrong call nor with a name taken by another
 
 
 # systemd: a folder per host with a unit per process, and `zsim.target`, which starts and stops them together
@@ -59,9 +59,9 @@ FINAL_CODES = [USER_FAULT, SUPERSEDED]  # a new start heals neither a wrong call
 def systemd(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
     """Return `HOST/zsim-PROCESS.service`, `HOST/zsim.target`, and the scenario for the world's host.
 
-    The options are those of systemd.exec(5) and systemd.service(5). Left out are MemoryDenyWriteExecute (numba
+    The options are those of systemd.exec(5) and systemd.service(5). Omitted are MemoryDenyWriteExecute (numba
     compiles) and ProcSubset (libraries read /proc/cpuinfo). `pace`: options of the world. InventoryError if a
-    process has no place, or a host has no user or no absolute path to its interpreter.
+    process has no place, or a host has no user or a relative path to its interpreter.
     """
     planned, hosts = inv.processes(placed, scenario, pace), placed.inventory.hosts
     _refuse(placed, [f"hosts.{name}.{text}" for name in inv.used_hosts(planned) for text in _lacks(hosts[name])])
@@ -83,15 +83,15 @@ def _lacks(host: Host) -> Iterator[str]:
         yield f"user is {show(host.user)}; must be letters, digits, `_`, `-` and `.`, at most 31"
     for name, path in (("folder", host.folder), ("python", host.python or "/")):
         if not path.isprintable():
-            yield f"{name} is {show(path)}; must be of printable characters, as each line of a unit is an option"
+            yield f"{name} is {show(path)}; must be printable, because each line of a unit is an option"
         if (size := len(path.encode(errors="replace"))) > PATH_MAX:
             yield f"{name} has {size} bytes; must have at most {PATH_MAX}"
     if host.python is not None and not host.python.startswith("/"):
-        yield f"python is {show(host.python)}; a unit needs an absolute path, or none given"
+        yield f"python is {show(host.python)}; must be an absolute path in a unit, or left out"
 
 
 def _home(user: str | None) -> str | None:
-    """Return the usual home of a user; None if it is no user's name (systemd: "User/Group Name Syntax", relaxed)."""
+    """Return the usual home of a user; None for an invalid name (systemd: "User/Group Name Syntax", relaxed)."""
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_.-]{0,30}", user or ""):
         return None
     return "/root" if user == "root" else f"/home/{user}"
@@ -102,7 +102,7 @@ def _absolute(host: Host, path: str) -> str:
 
 
 def _service(scenario: Scenario, process: PlannedProcess, host: Host, here: Sequence[PlannedProcess]) -> str:
-    """What is started later is stopped first: the world ends the run for all, and routers go last."""
+    """Return the unit of a process. Units stop in reverse order: the world ends the run, and routers stop last."""
     rank = {ROUTER: 0, WORLD: 2}
     earlier = [each.unit for each in here if rank.get(each.role, 1) < rank.get(process.role, 1)]
     folder = _absolute(host, host.folder)
@@ -112,13 +112,13 @@ def _service(scenario: Scenario, process: PlannedProcess, host: Host, here: Sequ
         access=f"{folder}/certs/{inv.access_file(process)}",
         out=f"{STATE}/runs/{scenario.name}-{RUN_ID}",
     )
-    # ":": no variables are put in. Doubled, a $ would stay one in the arguments and be two in the path of the program
+    # ":" disables variable substitution; "$$" would remain doubled in the path of the program
     words = (f":{_absolute(host, inv.python(host))}", *inv.command(process, files))
     remarks = []
     if not host.folder.startswith("/"):
-        remarks.append(f"folder {host.folder} is taken to be in {_home(host.user)}; else give an absolute folder")
+        remarks.append(f"folder {host.folder} is assumed to be in {_home(host.user)}; else give an absolute folder")
     if process.on_death == "wait":
-        remarks.append("on_death is wait: systemd does not start it again, time stands still until somebody does")
+        remarks.append("on_death is wait: systemd does not restart it; time stands still until it is started by hand")
     values = {
         "process": process.name,
         "scenario": scenario.name,
@@ -137,7 +137,7 @@ def _service(scenario: Scenario, process: PlannedProcess, host: Host, here: Sequ
 
 
 def _systemd_word(text: str) -> str:
-    """Return a word as ExecStart= takes it literally."""
+    """Quote a word for ExecStart=."""
     text = text.replace("%", "%%")
     if re.fullmatch(r"[^\s\"'\\;]+", text):
         return text
@@ -207,7 +207,7 @@ def _unused(placed: InventoryFile, host: str) -> list[str]:
 
 
 def _dockerfile(planned: Sequence[PlannedProcess]) -> str:
-    """Return the Dockerfile of an image with the extras of some processes; the wheel is to be beside it."""
+    """Return the Dockerfile of an image with the extras of some processes; it expects the wheel beside it."""
     extras = inv.extras([process.name for process in planned])
     wanted = f"[{','.join(extras)}]" if extras else ""
     return _text("Dockerfile", {**IN_A_CONTAINER, "wheel": WHEEL, "base": BASE, "extras": wanted})
@@ -219,8 +219,8 @@ def _dockerfile(planned: Sequence[PlannedProcess]) -> str:
 def kubernetes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (), image: str = IMAGE) -> Rendered:
     """Return `namespace.yaml`, `secrets.sh`, `zsim.yaml`, `records.yaml` and a Dockerfile.
 
-    The names of the hosts are those of the nodes, which find what the Dockerfile makes as `image`. InventoryError if a
-    process has no place, a name is none that Kubernetes takes, or the scenario is too large.
+    The names of the hosts must be those of the nodes, which must find the Dockerfile's image as `image`. InventoryError
+    if a process has no place, a name is not allowed by Kubernetes, or the scenario is too large.
     """
     planned, text = inv.processes(placed, scenario, pace), scenario_file.to_text(scenario)
     _refuse(placed, _kubernetes_faults(planned, text))
@@ -234,7 +234,7 @@ def kubernetes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = 
         *(_role_manifest(by_kind, shared, process) for process in planned),
     ]
     address = placed.inventory.hosts[world.host].address
-    certified = f"# The world's certificate is for {address}: over TLS that is its name, and not the Service's."
+    certified = f"# The world's certificate is for {address}: over TLS use this name, not that of the Service."
     remarks = [*head, *([certified] if world.secure else [])]
     remarks += [line for host in inv.used_hosts(planned) for line in _unused(placed, host)]
     remarks += [f"# {line}" for line in inv.own_programs(placed, scenario)]
@@ -244,7 +244,7 @@ def kubernetes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = 
         texts[name] = _dump(head, _filled(lasting, shared))
     texts["Dockerfile"] = _dockerfile(planned)
     if not placed.inventory.security.insecure:
-        puts = []  # lines that put certificates from where `zsim certs init` left them into the cluster
+        puts = []  # lines that copy the certificates of `zsim certs init` into the cluster
         for process in planned:
             files = [f'--from-file="$certs/{process.host}/{process.name}"']
             if process.port is not None:
@@ -256,7 +256,7 @@ def kubernetes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = 
 
 def _kubernetes_faults(planned: Sequence[PlannedProcess], text: str) -> list[str]:
     lines = [
-        f"hosts.{host} is no name of a node; must be letters, digits, - and ., as `kubectl get nodes` lists them"
+        f"hosts.{host} is not the name of a node; must be letters, digits, - and ., as `kubectl get nodes` lists them"
         for host in inv.used_hosts(planned)
         if not re.fullmatch(r"[a-z0-9]([a-z0-9.-]*[a-z0-9])?", host)
     ]
@@ -266,12 +266,12 @@ def _kubernetes_faults(planned: Sequence[PlannedProcess], text: str) -> list[str
         if other != process.name:
             lines.append(f"{process.name} and {other} have the same name in Kubernetes; rename a drone or cluster")
     if len(text.encode()) > CONFIG_BYTES_MAX:
-        lines.append(f"the scenario has {len(text.encode())} bytes; a ConfigMap takes {CONFIG_BYTES_MAX}")
+        lines.append(f"the scenario has {len(text.encode())} bytes; a ConfigMap must have at most {CONFIG_BYTES_MAX}")
     return lines
 
 
 def label(name: str) -> str:
-    """Return a name as Kubernetes takes it (RFC 1123 label)."""
+    """Convert a name to an RFC 1123 label, as Kubernetes requires."""
     return re.sub(r"[^a-z0-9]+", "-", name).strip("-")[:NAME_MAX].rstrip("-") or "zsim"
 
 
@@ -313,7 +313,7 @@ def _refuse(placed: InventoryFile, lines: Sequence[str]) -> None:
 
 
 def _template(name: str) -> tuple[list[str], str]:
-    """Return the comment lines at the head of a template, and what follows them."""
+    """Return the comment lines at the top of a template, and its body."""
     lines = (TEMPLATES / name).read_text(encoding="utf-8").splitlines(keepends=True)
     count = next(i for i, line in enumerate(lines) if not line.startswith("#"))
     return [line.rstrip("\n") for line in lines[:count]], "".join(lines[count:])
@@ -331,7 +331,7 @@ def _yaml_template(name: str) -> tuple[list[str], list[Any]]:
 
 
 def _filled(node: Any, values: Mapping[str, Any]) -> Any:
-    """Return a part of a template with values put in; a text that is `$name` alone becomes that value as it is."""
+    """Fill in the values of a part of a template; a text that is just `$name` becomes the value itself."""
     if isinstance(node, dict):
         return {key: _filled(value, values) for key, value in node.items()}
     if isinstance(node, list):
@@ -342,14 +342,14 @@ def _filled(node: Any, values: Mapping[str, Any]) -> Any:
 
 
 def _dump(remarks: Sequence[str], documents: Sequence[Any]) -> str:
-    """Return YAML documents in one text, remarks at its head; the same content gives the same text."""
+    """Return YAML documents as one text with remarks at the top; deterministic."""
     options: dict[str, Any] = {"sort_keys": False, "default_flow_style": False, "width": 1000}
     texts = [yaml.dump(plain, Dumper=_Dumper, **options) for plain in documents]
     return "".join(f"{line}\n" for line in remarks) + "---\n".join(texts)
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes texts of several lines as blocks, and equal lists in full rather than as aliases."""
+    """Writes multi-line texts as blocks, and no aliases."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -367,9 +367,9 @@ _Dumper.add_representer(str, _Dumper.represent_text)
 def write(out: Path, target: str, texts: Mapping[str, str], force: bool = False) -> list[str]:
     """Write the texts into a folder; return the files of an earlier rendering for this target that were removed.
 
-    A list beside the files holds their digests, as `sha256sum` prints them: a later rendering removes what an earlier
-    one for its target wrote, and never a file of another origin or one changed since. `force` overwrites these.
-    RunError if a file cannot be written, a path leads out of the folder, or a file in the way was not rendered.
+    A list beside the files has their digests, in the format of `sha256sum`: a later rendering removes the files of an
+    earlier one for its target, but never other files or changed ones; `force` overwrites those. RunError if a file
+    cannot be written, a path leads out of the folder, or an existing file was not rendered.
     """
     root, record = out.resolve(), out / f".zsim-render-{target}.sha256"
 
@@ -397,18 +397,18 @@ def write(out: Path, target: str, texts: Mapping[str, str], force: bool = False)
         for name, text in texts.items():
             path, known = root / name, (former.get(name, ""), digest(text.encode()))
             if path.exists() and not has_digest(path, known):
-                why = "no rendering wrote it, or it was changed since"
+                why = "it was not rendered, or was changed since"
                 raise RunError(f"{path}: {why}; give --out another folder, or --force to replace it")
     stale = [name for name in former if name not in texts and is_inside(name) and (root / name).is_file()]
     for name in stale:
         if not has_digest(root / name, (former[name],)):
-            why = "an earlier rendering wrote it and it was changed since"
+            why = "it was rendered earlier and changed since"
             raise RunError(f"{root / name}: {why}; remove it, or give --out another folder")
     for path in (root / name for name in stale):
         with file_fault(path, "cannot be removed", OTHER_OUT):
             path.unlink(missing_ok=True)
         if path.parent != root:
-            with contextlib.suppress(OSError):  # something else is in it
+            with contextlib.suppress(OSError):  # it is not empty
                 path.parent.rmdir()
     digests = "".join(f"{digest(text.encode())}  {name}\n" for name, text in texts.items())
     for path, text in {record: digests, **{root / name: text for name, text in texts.items()}}.items():

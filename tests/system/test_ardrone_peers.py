@@ -24,7 +24,7 @@ def test_a_stranger_flies_nothing_and_the_peer_does(lab: Lab, federation: Federa
     with lab.inside("h3"), PlainPilot(lab.address("h1")) as stranger:
         stranger.request()
         stranger.send(at_commands.ref(0, takes_off=True))
-        server.line(f"{lab.address('h3')} sends datagrams, and is no --peer")
+        server.line(f"{lab.address('h3')} sends datagrams and is not a --peer")
         for port in PORTS:
             assert _is_closed(lab.address("h1"), port)
     with lab.inside("h2"), PlainPilot(lab.address("h1")) as peer:

@@ -51,7 +51,7 @@ TRIES = 20  # orders of a round of which the one with the most untried successio
 ESTIMATORS = ("estimator.drone1", "estimator.drone2", "estimator.drone3")
 LAB_ROLES = (*ESTIMATORS, "controller.main", "recorder", "world")
 HOSTS, FAR_HOSTS = ("h1", "h2", "h3"), ("h2", "h3")  # the second: without the world
-BACK = {"world": "world: goes on at t = "}
+BACK = {"world": "world: continues at t = "}
 
 
 class Event(NamedTuple):

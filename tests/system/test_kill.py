@@ -310,7 +310,7 @@ def test_a_world_that_was_restarted_in_realtime_counts_only_its_own_time(federat
     run = federation.run(PAIR, "--realtime", "--rate", "2", "--duration", "16")
     federation.client().subscribe("clock").until(lambda m: m["t_ns"] >= ENGAGED_NS // 2)
     federation.kill("world")
-    run.line(r"world: goes on at t = ")
+    run.line(r"world: continues at t = ")
     run.ends(with_code=0)
     end = federation.record().end()
     assert end["sim_s"] == pytest.approx(end["last_ns"] / 1e9)
@@ -333,7 +333,7 @@ def test_in_realtime_the_formation_flies_on_as_without_the_deaths(
     for name, at_s in zip(("controller.main", "estimator.drone1", "world"), kills_s, strict=True):
         clock.until(lambda m, at_s=at_s: m["t_ns"] >= at_s * 1e9)
         federation.kill(name)
-    run.line("world: goes on at t = ")
+    run.line("world: continues at t = ")
     run.ends(with_code=0)
     assert {event["subject"] for event in federation.record().events("death")} >= {"controller.main"}
     undisturbed = msgspec.structs.replace(scenario_file.from_text(scenario), duration_s=end_s)
@@ -371,7 +371,7 @@ def test_an_interrupted_run_goes_on(federation: Federation, undisturbed: dict[st
         for name in ("recorder", "world", "controller.main", "estimator.drone1", "estimator.drone2"):
             federation.kill(name)
         if "when the world is back" in how:
-            flight.run.line("world: goes on at t = ")
+            flight.run.line("world: continues at t = ")
         flight.run.signal(signal.SIGKILL)
     federation.nobody_left()
     reached_ns = federation.record().all("clock")[-1]["t_ns"]

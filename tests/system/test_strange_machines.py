@@ -88,7 +88,7 @@ def test_a_full_output_is_a_line_on_the_other_stream() -> None:
     done = subprocess.run(
         f"{shlex.join(ZSIM)} --help >/dev/full", shell=True, capture_output=True, text=True, check=True
     )
-    assert done.stderr == f"standard output cannot be written ({os.strerror(errno.ENOSPC)}); what follows is lost\n"
+    assert done.stderr == f"standard output cannot be written ({os.strerror(errno.ENOSPC)}); further output is lost\n"
 
 
 ODD = os.fsdecode(b"lab:3 'a' \"b\" $HOME `x` [red]%s;&| \xc3\xbc\xe9\xa3\x9b \xff")  # the last is no UTF-8

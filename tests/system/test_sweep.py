@@ -132,7 +132,7 @@ def test_ctrl_c_then_kill_then_the_same_command(federation: Federation, undistur
     assert 1 <= len(kept) < RUNS
 
     role = sweep(federation, out, "--workers", "1", "--keep-records")
-    role.line(f"{len(kept)} of them (is|are) done already")
+    role.line(f"{len(kept)} of them (is|are) already done")
     role.line(rf" [{len(kept) + 1}-{RUNS}] / {RUNS} runs")
     flying = workers(role)
     role.signal(signal.SIGKILL)
@@ -143,7 +143,7 @@ def test_ctrl_c_then_kill_then_the_same_command(federation: Federation, undistur
 
     role = sweep(federation, out, "--workers", "1", "--keep-records")
     role.ends(with_code=0)
-    role.line(f"{done} of them are done already")
+    role.line(f"{done} of them are already done")
     assert without_wall(out) == without_wall(undisturbed_for_long)
     assert rows(out)[: len(kept)] == kept
     assert sorted(path.name for path in (out / "runs").iterdir()) == [f"{run:06d}" for run in range(RUNS)]

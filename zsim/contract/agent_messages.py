@@ -41,7 +41,7 @@ class AgentMessage(Struct, frozen=True, kw_only=True, gc=False):
         """Return the key of the messages of one drone's or cluster's agent; by default the expression of all keys.
 
         Raises:
-            ValueError: the class's key is none.
+            ValueError: the class's key is invalid.
         """
         parts = KEY.fullmatch(cls.key)
         if parts is None:
@@ -49,7 +49,7 @@ class AgentMessage(Struct, frozen=True, kw_only=True, gc=False):
         return f"{parts[1]}/{thing}/{parts[3]}"
 
     def fault(self) -> str | None:
-        """Return what is wrong with a message that has come; a class may declare its numbers as plain floats."""
+        """Return the fault of a received message; a class may declare its numbers as plain floats."""
         for name in self.__struct_fields__:
             value = getattr(self, name)
             if name in ("t_ns", "seq") and value < 0:
@@ -85,11 +85,11 @@ class MessageInfo(Struct, frozen=True, omit_defaults=True):
 
 
 def message_info(kind: type[AgentMessage]) -> MessageInfo:
-    """Return what others have to know about a class of messages.
+    """Return the declaration of a class of messages for other processes.
 
     Raises:
-        TypeError: a field is of a type that no message has.
-        ValueError: its key, or its name, is not what is allowed.
+        TypeError: a field has a type not allowed in messages.
+        ValueError: its key or its name is not allowed.
     """
     parts = KEY.fullmatch(kind.key)
     if not parts or parts[1] in CONTRACT_WORDS:
@@ -102,11 +102,11 @@ def message_info(kind: type[AgentMessage]) -> MessageInfo:
 
 
 def type_of_info(info: MessageInfo) -> type[AgentMessage]:
-    """Return the class of messages that are declared so, for processes that do not have the user's."""
+    """Return a class made from a declaration, for processes without the user's class."""
     return declared_type(info.message, info.fields, AgentMessage, (("key", info.key),))
 
 
 def about(kind: type[AgentMessage]) -> str:
-    """Return what the agents are of that publish a class: "drone", "cluster" or "run"."""
+    """Return the scope of the agents that publish a class: "drone", "cluster" or "run"."""
     parts = KEY.fullmatch(kind.key)
     return parts[2] if parts else ""

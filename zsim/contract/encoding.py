@@ -1,10 +1,10 @@
-"""Messages of one kind after another as msgpack, from rows of numbers: the bytes that `messages.encode` gives.
+"""Encodes messages from rows of numbers as msgpack, to the same bytes as `messages.encode`.
 
-A layout is what stands in every message of a kind: names, heads of arrays, and the places of its values.
+A layout is the constant part of the messages of a kind: names, array heads, and the places of the values.
 
     rows of numbers ── write ──▶ bytes ── read ──▶ rows of numbers
 
-`write` and `read` are plain source for whoever compiles them, to do without an object for every message.
+`write` and `read` are plain functions for compilation by their users, which avoids an object per message.
 """
 
 from collections.abc import Iterable
@@ -36,7 +36,7 @@ packed = msgspec.msgpack.Encoder().encode
 
 
 class Program(NamedTuple):
-    """The layouts of some kinds, as `write` reads them."""
+    """The layouts of some kinds in the form used by `write`."""
 
     ops: NDArray[np.int64]  # (K, 3): what, and its two arguments
     first: NDArray[np.int64]  # (kinds + 1,), where the layout of each kind begins
@@ -51,7 +51,7 @@ class TextTable(NamedTuple):
 
 
 class Layouts:
-    """How messages of some kinds are written.
+    """The layouts of messages of some kinds.
 
     A kind's whole numbers, truths and texts (by their number in Words) stand in one row, its floats in another, both
     in the order of its fields.
@@ -76,7 +76,7 @@ class Layouts:
         self.program = Program(ops, np.array(first), literals)
 
     def room(self, words: TextTable) -> int:
-        """Return the bytes that a message can have at most, with GAP."""
+        """Return the maximum size of a message, including GAP [bytes]."""
         longest = int(np.diff(words.ends, prepend=0).max(initial=0))
         fixed = sum(size for op, _, size in self._ops if op == LITERAL)
         return GAP + fixed + self.floats * FLOAT_BYTES + self.ints * max(INT_BYTES_MAX, longest)
@@ -123,12 +123,12 @@ def words(texts: Iterable[str | None]) -> TextTable:
 
 
 def write(program: Program, words: TextTable, kind: int, ints: NDArray, bits: NDArray, out: NDArray, start: int) -> int:
-    """Write one message into `out` from `start` on; return where it ends. To be compiled.
+    """Write one message into `out` from `start` on; return its end. To be compiled.
 
     Args:
         program, words: see Layouts.
         ints: its whole numbers (I,); bits: its floats (F,) as uint64.
-        out: uint8, with room enough.
+        out: uint8, large enough.
     """
     at = np.uint64(start)  # a place without a sign is not looked at for being negative: bytes become words
     for k in range(program.first[kind], program.first[kind + 1]):
@@ -169,7 +169,7 @@ def write(program: Program, words: TextTable, kind: int, ints: NDArray, bits: ND
 def read(program: Program, kind: int, data: NDArray, start: int, end: int, ints: NDArray, bits: NDArray) -> bool:
     """Read a message that `write` has written; return False for any other, which may still be valid.
 
-    It reads floats that are finite, truths, and whole numbers from zero on; no texts. To be compiled.
+    It reads finite floats, booleans and non-negative whole numbers, but no texts. To be compiled.
 
     Args:
         program: see Layouts.

@@ -1,9 +1,8 @@
-"""Same bits: the fingerprint of the code with which a process computes, stated in its join; the hash of a flight.
+"""Reproducibility: the fingerprint of a process's code, stated in its join, and the hash of a flight.
 
-What a flight depends on is computed with zsim.math.elementary, distributions and linear, the same on every processor
-and with every version of Python and of the numeric packages. So a fingerprint covers code and contract alone. What else
-differs between two machines is `machine`, for those who look for the cause of a difference: only classes of users, and
-cameras' pictures, may depend on it.
+A flight is computed with zsim.math.elementary, distributions and linear, which give the same bits on every processor
+and with every version of Python and the numeric packages. So a fingerprint covers only code and contract. Other
+differences between machines are in `machine`, for diagnosis: only users' classes and camera pictures may depend on it.
 """
 
 import hashlib
@@ -29,7 +28,7 @@ HELD_BYTES = 16_384  # hashed in one go, which takes as long as a few instants
 
 @cache
 def parts() -> dict[str, str]:
-    """Return what the bits of a flight depend on: zsim's version, the contract's, and a hash of the sources."""
+    """Return the determinants of a flight's bits: versions of zsim and the contract, and a hash of the sources."""
     return {"zsim": __version__, "contract": str(CONTRACT), "code": _code()}
 
 
@@ -42,7 +41,7 @@ def fingerprint() -> str:
 
 @cache
 def machine() -> dict[str, str]:
-    """Return what may differ between machines that compute the same: processor, libraries, versions."""
+    """Return the properties that may differ between machines with equal results: processor, libraries, versions."""
     versions = {package: _version(package) for package in PACKAGES}
     return {
         "python": platform.python_version(),
@@ -56,7 +55,7 @@ def machine() -> dict[str, str]:
 
 
 def _code() -> str:
-    """Return a hash of the sources of the packages in CODE, whatever their line ends and folder."""
+    """Return a hash of the sources of the packages in CODE, independent of line ends and folder."""
     found = hashlib.sha256()
     for package in CODE:
         spec = importlib.util.find_spec(package)
@@ -77,7 +76,7 @@ def _version(package: str) -> str:
 
 
 def _cpu() -> str:
-    """Return the processor's model and a hash of its feature flags, which libraries and compilers go by."""
+    """Return the processor's model and a hash of its feature flags, which libraries and compilers use."""
     found: dict[str, str] = {}
     try:
         with open("/proc/cpuinfo", encoding="ascii", errors="replace") as lines:
@@ -92,9 +91,9 @@ def _cpu() -> str:
 
 
 def _blas() -> str:
-    """Return the BLAS libraries of the system and of the numeric packages, with the processor that each computes for.
+    """Return the BLAS libraries of the system and the numeric packages, with the target processor of each.
 
-    OpenCV brings a BLAS of its own, with which nothing here computes, and which may choose another processor.
+    OpenCV has its own BLAS, which is not used here and may select another processor.
     """
     found = set()
     for each in threadpoolctl.threadpool_info():
@@ -128,14 +127,14 @@ class TruthHash:
         self._held = 0
 
     def resume(self, hashed: Iterable[bytes], copy: Callable[[memoryview], object]) -> None:
-        """Start again from the bytes that `copy` was given, and give it those that follow."""
+        """Restart from the bytes passed to a former `copy`, and pass further bytes to `copy`."""
         self._hash, self._held = hashlib.sha256(), 0
         for data in hashed:
             self._hash.update(data)
         self._copy = copy
 
     def snapshot(self) -> Any:
-        """Return what `restore` takes to go on from here."""
+        """Return the state for `restore`."""
         self.flush()
         return self._hash.copy()
 

@@ -35,8 +35,8 @@ SidePx = Annotated[int, Meta(ge=1, le=16_384)]
 class Status(Message, frozen=True):
     """The state of a drone, last in every gate.
 
-    `commander` is who flies it; `count` is how many messages on its `sensor/*` have come since the last status, this
-    one included.
+    `commander` is the source that commands it; `count` is the number of messages on its `sensor/*` since the last
+    status, including this one.
     """
 
     state: DroneState
@@ -61,7 +61,7 @@ class Truth(Message, frozen=True):
 @on("drone/*/cmd/*", writers="controller reference operator", is_output=True)
 @on("drone/*/accepted/*", writers="world", readers="driver")
 class Command(Message, frozen=True):
-    """Base of what is sent to a drone; `source` is the sender's process name."""
+    """Base of the commands to a drone; `source` is the sender's process name."""
 
     source: str
 
@@ -149,7 +149,7 @@ class LinkState(Message, frozen=True):
     is_output=True,
 )
 class Estimate(Message, frozen=True):
-    """Where an estimator believes its drone to be: position and velocity in W, attitude B to W.
+    """The estimated state of a drone: position and velocity in W, attitude B to W.
 
     `covariance` is that of position and velocity, 6 x 6, row-major, SI units; `gyro_bias_rad_s` is in B; `sensors` has
     by name how many readings were used and refused.
@@ -168,7 +168,7 @@ class Estimate(Message, frozen=True):
 
 @on("cluster/*/state", writers="controller", readers="controller", last="world", is_output=True)
 class ClusterState(Message, frozen=True):
-    """Where a formation is, by the estimates, and where it is to be.
+    """The estimated and the desired state of a formation.
 
     `drones` are in the order of the robots, which an assembly changes. `names` are the 4n cluster variables of n
     drones, in the order of `value`, `desired` [m, rad] and `desired_rate` [m/s, rad/s]. `trajectory_t_s` is the
@@ -195,7 +195,7 @@ class ClusterState(Message, frozen=True):
 
 @on("drone/*/reference", writers="reference", readers="reference", last="world", is_output=True)
 class Reference(Message, frozen=True):
-    """Where a drone that flies by itself is to be: position and velocity in W, heading.
+    """The reference of a drone with its own pilot: position and velocity in W, heading.
 
     `phase`: `waiting` on the ground, `approaching` the beginning of its path or a place, on the `path`, `holding` a
     place, `over` once it is to land. `path_t_s` is the path's own time, None where none is flown.
@@ -236,7 +236,7 @@ class CameraImage(Message, frozen=True, kw_only=True):
 @on("drone/*/camera/front/info", is_output=True)
 @on("drone/*/camera/bottom/info", is_output=True)
 class CameraInfo(Message, frozen=True, kw_only=True):
-    """What a camera's pixels mean; its last value is kept.
+    """The intrinsics and pose of a camera; its last value is kept.
 
     `K` is row-major; `D` k1, k2, p1, p2, k3. `position_m` is the camera's in B; `orientation_wxyz` turns K (x right, y
     down, z ahead) to B. `exposure_s` is the time of exposure, `gate_ns` the run's.
@@ -255,7 +255,7 @@ class CameraInfo(Message, frozen=True, kw_only=True):
 
 
 class Seen(Struct, frozen=True, gc=False):
-    """A hat that was seen, without the identity of its drone.
+    """A sighted hat, without the identity of its drone.
 
     `direction_B` is the unit vector from the camera to the hat's centre in B. The sigmas are standard deviations,
     that of the direction in each of the two axes across it.
@@ -282,7 +282,7 @@ class Sightings(Message, frozen=True, kw_only=True):
 
 
 class DroneView(Struct, frozen=True):
-    """A drone as it is displayed: position in W, attitude B to W."""
+    """A drone for displays: position in W, attitude B to W."""
 
     name: str
     position_m: Vector3
@@ -302,7 +302,7 @@ class ViewDrones(Message, frozen=True):
 
 
 class EstimateView(Struct, frozen=True):
-    """An estimate as it is displayed; fields as in Estimate.
+    """An estimate for displays; fields as in Estimate.
 
     `covariance_m2` is that of the position in W, the upper triangle row by row: xx, xy, xz, yy, yz, zz.
     """
@@ -318,14 +318,14 @@ class EstimateView(Struct, frozen=True):
 
 @on("view/estimates/*", writers="estimator")
 class ViewEstimates(Message, frozen=True):
-    """What an estimator believes of all its drones, for displays."""
+    """The estimates of all drones of an estimator, for displays."""
 
     estimates: tuple[EstimateView, ...]
 
 
 @on("view/cluster/*", writers="controller")
 class ViewCluster(Message, frozen=True):
-    """A formation as it is displayed; fields as in ClusterState."""
+    """A formation for displays; fields as in ClusterState."""
 
     phase: Phase
     names: tuple[str, ...]

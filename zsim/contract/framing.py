@@ -1,10 +1,10 @@
-"""Many messages in one payload: packed, unpacked, and read without decoding each one.
+"""Many messages in one payload: packing, unpacking, and access without decoding each one.
 
     @gate, @gate/{drone}   the world's messages about its drones at one gate           GateMessages
     @batch                 [key, payload] of everything that passed the hub, in order  encode_batch, decode_batch
 
-Sent one by one, each message of a gate would wake every reader and the hub. These keys are outside of the contract and
-begin with `@`, which no wildcard of Zenoh matches: a subscriber to `**` gets the messages themselves, and not these.
+Sent singly, each message of a gate would wake every reader and the hub. These keys are outside the contract and begin
+with `@`, which no wildcard of Zenoh matches: a subscriber to `**` receives only the single messages.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -105,7 +105,7 @@ class GateMessages:
 
     @classmethod
     def unpack(cls, payload: bytes, table: tuple[str, ...]) -> "GateMessages":
-        """Return what `pack` has packed; not checked yet; DecodeError if the payload is anything else."""
+        """Return the messages packed by `pack`, not yet checked; DecodeError if the payload is anything else."""
         try:
             p = _decode_gate(payload)
         except REFUSALS as error:
@@ -127,7 +127,7 @@ class GateMessages:
         return len(self.which)
 
     def check(self) -> None:
-        """Raise DecodeError for columns that point outside of table or buffer, and for stamps that are no times."""
+        """Raise DecodeError for columns that point outside table or buffer, and for negative stamps."""
         which, stamps, ends = self.which.tolist(), self.stamps.tolist(), self.ends.tolist()
         if not ends or ends[-1] != len(self.buffer) or min(map(sub, ends, [0, *ends])) < GAP:
             _refuse("its payloads are not one behind the other")
@@ -144,7 +144,7 @@ class GateMessages:
         return [(table[p], data[start + GAP : end]) for p, (start, end) in zip(places, bounds, strict=True)]
 
     def decoded(self) -> Iterator[tuple[str, Any]]:
-        """Yield keys and messages; DecodeError if one is no message of its key."""
+        """Yield keys and messages; DecodeError if a message does not fit its key."""
         for key, payload in self.pairs:
             yield key, messages.decode(key, payload)
 
@@ -154,7 +154,7 @@ class GateMessages:
 
 
 class PerPattern(Generic[T]):
-    """A cache of what a reader derives, by `learn`, from the keys of a gate: the same keys come again and again."""
+    """A cache of what a reader derives by `learn` from the keys of a gate, since the same keys recur."""
 
     def __init__(self, learn: Callable[[GateMessages], T]) -> None:
         self._learn = learn
@@ -183,7 +183,7 @@ def encode_batch(passed: Pairs) -> bytes:
 
 
 def decode_batch(payload: bytes) -> Pairs:
-    """Return the [key, payload] pairs of a batch; DecodeError if it is no batch."""
+    """Return the [key, payload] pairs of a batch; DecodeError if it is not a batch."""
     try:
         return _decode_batch(payload)
     except REFUSALS as error:

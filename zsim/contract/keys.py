@@ -1,4 +1,4 @@
-"""The keys of the contract: built, taken apart and matched here, and the table of what each of them carries.
+"""The keys of the contract: construction, parsing, matching, and the table of their messages.
 
 Keys inside a process are without the federation's prefix ("drone/drone1/truth"); the session adds it.
 A message class declares its keys with `on`; decoders, access rights and the last values that the world answers are
@@ -36,12 +36,12 @@ AnyMessage = TypeVar("AnyMessage", bound=type[Struct])
 
 
 class Topic(NamedTuple):
-    """What the contract says about a key."""
+    """The declaration of a key in the contract."""
 
     message: Any  # type of its messages; None for a family of keys whose members declare theirs
     writers: tuple[str, ...]  # roles that publish it; "each" stands for every process, on the keys of its own name
     readers: tuple[str, ...]  # roles that subscribe to it, besides recorders and operators, who read everything
-    last: str  # who answers a get with the last message: "world", "writer", or nobody ("")
+    last: str  # the process that answers a get with the last message: "world", "writer", or none ("")
     is_output: bool  # whether the world counts its messages among those that a process announces with its done
 
 
@@ -67,7 +67,7 @@ def on(
 
 
 def name(text: str, what: str = "name") -> str:
-    """Return `text` if it is a name of the contract; BadNameError with what was found and what is allowed."""
+    """Return `text` if it is a valid name; BadNameError with what was found and what is allowed."""
     if not isinstance(text, str) or not NAME.fullmatch(text):
         raise BadNameError(f"{what} is {text!r}; must be 1 to 32 of a-z 0-9 _ . -")
     return text
@@ -125,7 +125,7 @@ def drone_request(drone: str) -> str:
 
 
 def control_of(request_key: str) -> str:
-    """Return the key on which a request was made that is on record on another."""
+    """Return the control key of a recorded request."""
     return f"{request_key.rpartition('/')[0]}/control"
 
 
@@ -138,7 +138,7 @@ def camera_info(drone: str, name: str) -> str:
 
 
 def detections(drone: str) -> str:
-    """Return the key on which a detector publishes what it found in pictures of a drone's cameras."""
+    """Return the key on which a detector publishes its sightings in pictures of a drone's cameras."""
     return f"drone/{drone}/sightings"
 
 
@@ -172,12 +172,12 @@ def process(process_name: str, what: str) -> str:
 
 
 def replay(process_name: str) -> str:
-    """Return the key on which the world sends a process the messages that it missed and may read."""
+    """Return the key on which the world answers a process with the missed messages that it may read."""
     return process(process_name, "replay")
 
 
 def access(process_name: str) -> str:
-    """Return the key on which a listening process answers what the certificate of a process lets it do."""
+    """Return the key on which a listening process answers the permissions of a process's certificate."""
     return f"{ACCESS}/{process_name}"
 
 
@@ -186,7 +186,7 @@ def token(process: str) -> str:
 
 
 def session_token(process: str, session: str) -> str:
-    """Return the token by which a process says which Zenoh session is its own."""
+    """Return the token by which a process declares its Zenoh session."""
     return f"process/{process}/session/{session}"
 
 
@@ -200,7 +200,7 @@ def session_of(token_key: str) -> str:
 
 @lru_cache(maxsize=4096)
 def parts(key: str) -> tuple[str, str, str]:
-    """Return the parts of a key: `drone`, its name, `cmd/mode`; empty where the key is shorter."""
+    """Return the parts of a key: `drone`, its name, `cmd/mode`; missing parts are empty."""
     kind, whose, what, *_ = *key.split("/", 2), "", ""
     return kind, whose, what
 
@@ -250,8 +250,8 @@ def may_drop(key: str) -> bool:
 def matches(expression: str, key: str) -> bool:
     """Tell whether a key expression matches a key, as in Zenoh; for the in-process bus and the history.
 
-    `*` stands for one chunk, `**` for any number of them, `$*` for a part of one; a chunk that begins
-    with `@` is taken only by itself.
+    `*` matches one chunk, `**` any number of chunks, `$*` a part of one; a chunk that begins with `@` is matched only
+    literally.
     """
     return expression == key or _compiled(expression).fullmatch(f"{key}/") is not None
 

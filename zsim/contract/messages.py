@@ -1,7 +1,7 @@
-"""The contract's messages by their keys, version 1: the types, and how they are written and read.
+"""The contract's messages by key, version 1: types, encoding and decoding.
 
 Every message is a msgpack map with exactly these field names, SI units and radians, the unit in the name.
-`encode` and `decode` are the only way onto and off the wire; `decode` checks types, shapes and finite numbers.
+All messages are encoded by `encode` and decoded by `decode`, which checks types, shapes and finite numbers.
 """
 
 import re
@@ -179,7 +179,7 @@ def shape_of(key: str) -> str:
 
 @lru_cache(maxsize=KEYS_KEPT)
 def type_of(key: str) -> type[Struct] | None:
-    """Return the message type that the contract puts on a key, None for a key that it does not know."""
+    """Return the message type of a key in the contract, None for an unknown key."""
     shape = shape_of(key)
     return TOPICS[shape].message if shape in TOPICS else _OWN.get(shape)
 
@@ -187,7 +187,7 @@ def type_of(key: str) -> type[Struct] | None:
 def register_sensors(sensors: Iterable[SensorInfo]) -> None:
     """Register the messages of the users' sensors of a run, by the name of the sensor.
 
-    A sensor whose own name, or that of its message or a field, is invalid is left out: its messages stay unknown.
+    A sensor with an invalid name, message name or field name is omitted: its messages remain unknown.
     """
     for each in sensors:
         if all(map(_NAME.fullmatch, (each.name, each.message.lower(), *each.fields))):
@@ -195,7 +195,7 @@ def register_sensors(sensors: Iterable[SensorInfo]) -> None:
 
 
 def register_messages(kinds: Iterable[type[AgentMessage]]) -> None:
-    """Register classes of users' messages, of which messages are read here instead of those that `world/info` declares.
+    """Register users' message classes, used here in place of the declarations in `world/info`.
 
     TypeError, ValueError as of `message_info`.
     """
@@ -219,7 +219,7 @@ COMMANDS = {topic.message: shape for shape, topic in TOPICS.items() if topic.mes
 
 
 def command_key(drone: str, command: Struct) -> str:
-    """Return the key of a command to a drone, by the command's type; RunError if it is none."""
+    """Return the key of a command to a drone, by the command's type; RunError if it is not a command."""
     shape = COMMANDS.get(type(command))
     if shape is None:
         kinds = ", ".join(each.__name__ for each in COMMANDS)
@@ -235,18 +235,19 @@ def is_output(key: str) -> bool:
 
 
 def is_relayed(kind: type[Struct] | None) -> bool:
-    """Tell whether agents publish messages of a type for each other."""
+    """Tell whether agents publish messages of a type for other agents."""
     return kind is not None and issubclass(kind, RELAYED)
 
 
 def output_type(key: str) -> type[Struct]:
-    """Return the message that an agent may return on a key from a step; DecodeError if there is none."""
+    """Return the message type that an agent may return on a key from a step; DecodeError if there is none."""
     kind = type_of(key)
     if kind is None:
-        raise DecodeError(f"{key:.80}: is no key of the contract; see docs/protocol.md")
+        raise DecodeError(f"{key:.80}: is not a key of the contract; see docs/protocol.md")
     if not is_output(key):
         todo = "return it from `views`" if key.startswith("view/") else "only who this is about writes there"
-        raise DecodeError(f"{key:.80}: is no key of an agent's outputs (commands, estimates, states, messages); {todo}")
+        what = "is not a key of an agent's outputs (commands, estimates, states, messages)"
+        raise DecodeError(f"{key:.80}: {what}; {todo}")
     return kind
 
 
@@ -261,10 +262,10 @@ def encoding(key: str) -> str:
 
 
 def decode(key: str, payload: bytes) -> Any:
-    """Return the message on `key`, checked for type, shape and finiteness; DecodeError says what was found where."""
+    """Return the message on `key`, checked for type, shape and finiteness; DecodeError names the fault."""
     kind, read = _reader_of(key)
     if kind is None:
-        raise DecodeError(f"{key:.80}: is no key of the contract; see docs/protocol.md")
+        raise DecodeError(f"{key:.80}: is not a key of the contract; see docs/protocol.md")
     try:
         return read(payload) if len(payload) <= PAYLOAD_MAX else _too_long(payload)
     except REFUSALS as error:
@@ -272,7 +273,7 @@ def decode(key: str, payload: bytes) -> Any:
 
 
 def decode_as(kind: type[Struct], payload: bytes, where: str) -> Any:
-    """Return `payload` as a `kind`; `where` opens the text of the DecodeError."""
+    """Return `payload` as a `kind`; `where` begins the text of the DecodeError."""
     try:
         return _reader(kind)(payload) if len(payload) <= PAYLOAD_MAX else _too_long(payload)
     except REFUSALS as error:
@@ -280,7 +281,7 @@ def decode_as(kind: type[Struct], payload: bytes, where: str) -> Any:
 
 
 def fault_at(key: str, error: Exception) -> str:
-    """Return the text of a refusal without the key with which it opens."""
+    """Return the text of a refusal without its leading key."""
     text, where = str(error), key if len(key) <= 80 or str(error).startswith(key) else _shown(key)
     return text.removeprefix(f"{where}: ")
 
@@ -300,7 +301,7 @@ def _reader_of(key: str) -> tuple[type[Struct] | None, _Reader]:
 
 @cache
 def _reader(kind: type[Struct]) -> _Reader:
-    """Return the decoder of a `kind`: msgspec's own where its types express every check."""
+    """Return the decoder of a `kind`: msgspec's own if its types express every check."""
     decode_bare = msgspec.msgpack.Decoder(kind).decode
     fault_of = getattr(kind, "fault", None)
     if fault_of is None:
@@ -321,7 +322,7 @@ def _too_long(payload: bytes) -> NoReturn:
 
 
 def _refusal(kind: type[Struct], payload: bytes, where: str, error: Exception) -> DecodeError:
-    """Return a refusal that names key, field, what was found and what is allowed."""
+    """Return a refusal that names key, field, finding and what is allowed."""
     where = _shown(where)
     if not isinstance(error, msgspec.MsgspecError):
         return DecodeError(f"{where}: {str(error) or type(error).__name__}")
@@ -334,7 +335,7 @@ def _refusal(kind: type[Struct], payload: bytes, where: str, error: Exception) -
 
 
 class NoData(Struct, frozen=True):
-    """Data that is not used."""
+    """Unused data."""
 
 
 class RunEnd(Struct, frozen=True):
@@ -355,7 +356,7 @@ class ProcessEntry(Struct, frozen=True):
 
 
 class WorldEvent(NamedTuple):
-    """An event of a kind that processes act on."""
+    """An event on which processes act."""
 
     kind: str
     subject: str
@@ -373,9 +374,9 @@ _EVENT_DATA: dict[str, type[Struct]] = {
 
 
 def read_event(payload: bytes) -> WorldEvent | None:
-    """Return an event of a kind that processes act on, its data checked; None for an event of another kind.
+    """Return an event on which processes act, with checked data; None for an event of another kind.
 
-    DecodeError if it is no event, or its data is not what its kind has.
+    DecodeError if it is not an event, or its data does not fit its kind.
     """
     event: run_messages.Event = decode(keys.EVENT, payload)
     kind = _EVENT_DATA.get(event.kind)

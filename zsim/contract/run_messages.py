@@ -28,9 +28,9 @@ class Waiting(Struct, frozen=True):
 
 
 def holding_up(state: str, waiting: Sequence[Waiting]) -> Sequence[Waiting]:
-    """Return the processes that hold up a run whose clock is in `state`: of those waited for, the causes if known.
+    """Return the processes that hold up a run whose clock is in `state`: of the awaited ones, the causes if known.
 
-    While it runs, it often waits for up to SOON_S, which holds up nothing.
+    Waits of up to SOON_S are normal while it runs, and do not count.
     """
     late = [each for each in waiting if state == "waiting" or each.since_wall_s > SOON_S]
     return [each for each in late if not each.held_by] or late
@@ -58,12 +58,11 @@ EVENT_KINDS = (
 
 @on("world/radio", writers="world", readers="each", last="world")
 class RadioLinks(Message, frozen=True):
-    """Who hears whom at a gate, among the agents of drones that exchange messages; where the scenario has a radio.
+    """The connectivity at a gate between the agents of drones that exchange messages, if the scenario has a radio.
 
-    Drones are known by their places in `world/info`; the place after the last one is that of the ground station, whose
-    agents are of clusters or of the run, where the radio's `station_m` says that it has one. `hears` has, for each
-    place, those whose messages come through, in rising order; `reception` the probability of each, before the radio's
-    `loss`, and is empty where all are 1.
+    Drones are given by their indices in `world/info`; the index after the last one is the ground station of the agents
+    of clusters and of the run, if the radio has a `station_m`. `hears` has, for each index, those whose messages are
+    received, ascending; `reception` has the probability of each, before the radio's `loss`, and is empty if all are 1.
     """
 
     hears: tuple[tuple[Count, ...], ...]
@@ -72,7 +71,7 @@ class RadioLinks(Message, frozen=True):
 
 @on("world/event", writers="world", readers="each")
 class Event(Message, frozen=True):
-    """Something that happened once: what (one of EVENT_KINDS), by whom, about whom, in words, and in figures."""
+    """An event: kind (one of EVENT_KINDS), source, subject, text and data."""
 
     kind: str
     source: str
@@ -86,11 +85,11 @@ class Event(Message, frozen=True):
 
 @on("process/*/join", writers="each")
 class Join(Message, frozen=True):
-    """A process takes part from now on; the newest of several random incarnations counts.
+    """A process takes part from now on; of several incarnations, which are random, the newest counts.
 
-    `period_ns` is how often it publishes done: a multiple of the gate, 0 for never. `serves` names processes that need
-    not join, since this one does what they would. `slack_ns` is by how much the world may be ahead of the dones of one
-    that has no period, 0 for any.
+    `period_ns` is the interval of its dones: a multiple of the gate, 0 for never. `serves` names processes that need
+    not join, since this one does their work. `slack_ns` is how far the world may be ahead of the dones of a process
+    without a period, 0 for any.
     """
 
     run_id: str
@@ -107,7 +106,7 @@ class Join(Message, frozen=True):
 
 @on("process/*/done", writers="each")
 class Done(Message, frozen=True):
-    """Everything stamped up to `done_ns` is handled and answered; `sent` outputs were sent since the last done."""
+    """Everything stamped up to `done_ns` is processed and answered; `sent` outputs were sent since the last done."""
 
     run_id: str
     incarnation: int
@@ -117,9 +116,9 @@ class Done(Message, frozen=True):
 
 @on("process/*/snapshot", writers="each", last="world")
 class Snapshot(Message, frozen=True):
-    """The whole state of a participant after the gate `t_ns`, by which another incarnation of it can go on.
+    """The state of a participant after the gate `t_ns`, from which another incarnation of it can continue.
 
-    `version` is that of the layout of `state`, which only programs of its kind read.
+    `version` is that of the layout of `state`, which is specific to the program.
     """
 
     source: str
@@ -129,10 +128,10 @@ class Snapshot(Message, frozen=True):
 
 @on("process/*/bye", writers="each")
 class Bye(Message, frozen=True):
-    """A process leaves of its own will; `failed`: since it cannot go on, and would fail again if it were restarted.
+    """A process leaves voluntarily; `failed`: it cannot continue, and would fail again after a restart.
 
     `run_id` and `incarnation` are those of the join that it ends. Clients of contract 1.0 name neither: their byes
-    count once the liveliness token is gone as well, or the run is over.
+    take effect once the liveliness token is lost as well, or the run is over.
     """
 
     reason: str
@@ -141,7 +140,7 @@ class Bye(Message, frozen=True):
     incarnation: int | UnsetType = UNSET
 
 
-RUN_ENDED = "the run ended"  # reason of whoever leaves because the run is over
+RUN_ENDED = "the run ended"  # reason of a bye at the end of a run
 
 
 @on("process/*/health", writers="each")
@@ -161,8 +160,8 @@ class Health(Message, frozen=True):
 class Fault(Struct, frozen=True):
     """An injected fault: a kind and parameters of docs/faults.md, a drone, link, cluster or process as its target.
 
-    It acts in the gates after `from_ns` up to `until_ns`, or until it is cleared. `source` is "scenario", or who asked.
-    `rank` counts those of the same kind, target and start before it: each of them has a stream of its own.
+    It acts in the gates after `from_ns` up to `until_ns`, or until it is cleared. `source` is "scenario" or the process
+    that requested it. `rank` counts earlier ones of the same kind, target and start: each has its own random stream.
     """
 
     id: Count
@@ -177,13 +176,13 @@ class Fault(Struct, frozen=True):
 
 @on("world/faults", writers="world", readers="each", last="world")
 class Faults(Message, frozen=True):
-    """The faults that are planned or act, in the order of their ids; published before the gate that a change is in."""
+    """The planned and acting faults in order of their ids; published before the gate in which they change."""
 
     faults: tuple[Fault, ...] = ()
 
 
 class ControlRequest(Struct, frozen=True):
-    """What is asked of `world/control`, `cluster/{c}/control` and `drone/{d}/control`."""
+    """A request on `world/control`, `cluster/{c}/control` or `drone/{d}/control`."""
 
     op: str
     args: dict[str, Any] = {}
@@ -194,7 +193,7 @@ class ControlRequest(Struct, frozen=True):
 
 
 class ControlAnswer(Struct, frozen=True):
-    """Whether a request was done; if not, why; and what it asked for."""
+    """The answer to a request: whether it was carried out, the error if not, and the result."""
 
     ok: bool
     error: str = ""
@@ -208,9 +207,9 @@ class ControlAnswer(Struct, frozen=True):
 @on("cluster/*/request", writers="controller", is_output=True)
 @on("drone/*/request", writers="reference", is_output=True)
 class ClusterRequest(Message, frozen=True):
-    """A request on `cluster/{c}/control` or `drone/{d}/control` as it was taken, before the outputs of the gate `t_ns`.
+    """A request accepted on `cluster/{c}/control` or `drone/{d}/control` before the outputs of the gate `t_ns`.
 
-    `source` is who asked; `error` is why it is refused. `controller` is the process that answered.
+    `source` is the requesting process; `error` is why it is refused. `controller` is the process that answered.
     """
 
     op: str

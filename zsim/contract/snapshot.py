@@ -1,4 +1,4 @@
-"""The state of an agent as bytes: maps, lists, texts, numbers and plain arrays; reading it runs no code of its own."""
+"""The state of an agent as bytes: maps, lists, texts, numbers and plain arrays; reading it runs no foreign code."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -26,12 +26,12 @@ class _Array(msgspec.Struct, array_like=True):
 
 
 def pack(state: State) -> bytes:
-    """Return a state as bytes; the same for the same state; TypeError if it holds something else than a State may."""
+    """Return a state as bytes, equal for equal states; TypeError if it contains values that a State may not."""
     return _ENCODER.encode(state)
 
 
 def unpack(payload: bytes) -> State:
-    """Return the state that was packed; DecodeError if the payload is not one that `pack` writes."""
+    """Return a packed state; DecodeError if the payload was not written by `pack`."""
     try:
         return _DECODER.decode(payload)
     except REFUSALS as error:
@@ -39,10 +39,10 @@ def unpack(payload: bytes) -> State:
 
 
 def checked(state: Any, owner: type) -> State | None:
-    """Return what the `snapshot` of a user's class returned, a state or None.
+    """Return the checked result of a user's `snapshot`, a state or None.
 
     Raises:
-        UserCodeError: it is none; the line names the class, the first value that is not plain, and where it is.
+        UserCodeError: it is not a state; the line names the class, the first value that is not plain, and its path.
     """
     if state is None:
         return None
@@ -61,7 +61,7 @@ def checked(state: Any, owner: type) -> State | None:
 
 
 def _flaws(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
-    """Yield path and text of what cannot be packed in a state."""
+    """Yield path and text of the values of a state that cannot be packed."""
     if isinstance(value, dict):
         for name, each in value.items():
             yield from _flaws(each, f"{path}.{name}" if path else str(name))

@@ -1,4 +1,4 @@
-"""The record of a run: every message of every key, in one MCAP file. Plain I/O, no session.
+"""The record of a run: every message of every key in one MCAP file. Plain I/O, no session.
 
     RecordWriter(path).add(key, payload, encoding, t_ns, wall_ns)   tick(wall_ns)   close()
     RecordReader(path).messages()   topics()   last(key)

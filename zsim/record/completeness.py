@@ -1,6 +1,6 @@
-"""Whether a record is complete: every gate, every sequence number of the world's keys, and the end of the run.
+"""Completeness of a record: every gate, every sequence number of the world's keys, and the end of the run.
 
-The world numbers its messages without gaps, so the record itself shows which are missing. Messages of others are not
+The world numbers its messages without gaps, so the record shows which are missing. Messages of other processes are not
 counted: one that never reached the world is not missing from the record.
 """
 
@@ -44,9 +44,9 @@ class GateCount:
         self._step, self._seq = (after.step, after.seq) if after else (-1, -1)
 
     def add(self, clock: run_messages.Clock) -> GateGap | None:
-        """Count the gate of a clock; return the gates that are missing between the last one and this.
+        """Count the gate of a clock message; return the gates missing between the last one and this one.
 
-        Nothing is missing before a clock with the next number, however far a replay has moved the time.
+        None are missing before a clock with the next number, even if a replay has moved the time.
         """
         gap, missing = None, clock.step - self._step - 1
         if missing > 0 and clock.seq != self._seq + 1:
@@ -63,7 +63,7 @@ class GateCount:
 
 
 class Completeness(Struct, frozen=True):
-    """What a record contains, and what is missing."""
+    """The contents of a record, and its gaps."""
 
     gates: int = 0  # on record
     gaps: tuple[GateGap, ...] = ()  # gates that are missing
@@ -115,7 +115,7 @@ _LOOKED_AT = 1 << 5  # bytes from the beginning of a message in which both of it
 
 
 def sequence_numbers(spans: MessageSpans) -> NDArray[np.int64]:
-    """Return `seq` of each message (M,), that begins with `t_ns` and `seq`; UNREAD of any other."""
+    """Return `seq` of each message (M,) that begins with `t_ns` and `seq`; UNREAD for any other."""
     data = np.frombuffer(spans.content + bytes(_LOOKED_AT), np.uint8)
     start = spans.start
     first = start + np.where(data[start] == _MAP_16, 3, 1)
@@ -153,7 +153,7 @@ class _Numbers:
         self._numbers.append(read[rows])
 
     def missing(self) -> int:
-        """Return how many numbers are missing below the highest one of each channel."""
+        """Return the count of missing numbers below the highest one of each channel."""
         if not self._numbers:
             return 0
         channel, number = np.concatenate(self._channels), np.concatenate(self._numbers)
@@ -173,7 +173,7 @@ def completeness(
     # called with key and payload of each of these, in the order in which they were written
     take: Callable[[str, bytes], None] = lambda key, payload: None,
 ) -> Completeness:
-    """Return what is missing from a record; all of it is read, and every checksum compared."""
+    """Return the gaps of a record; it is read entirely, and every checksum is verified."""
     info: messages.Info | None = None
     with suppress(DecodeError):
         info = messages.decode(keys.INFO, last.payload) if (last := reader.last(keys.INFO)) else None
@@ -212,7 +212,7 @@ def completeness(
 
 
 def _one_each_second(spans: MessageSpans, channels: set[int]) -> NDArray[np.bool_]:
-    """Return which messages (M,) are the first of a channel in a second, or its first or last here."""
+    """Return which messages (M,) are the first of their channel in a second, or its first or last here."""
     second, last = spans.t_ns // SECOND_NS, len(spans.channel) - 1
     changes = np.ones(last + 2, bool)  # before each message, and behind all
     changes[1:-1] = spans.channel[1:] != spans.channel[:-1]
@@ -222,13 +222,13 @@ def _one_each_second(spans: MessageSpans, channels: set[int]) -> NDArray[np.bool
 
 
 def record_completeness(path: Path) -> Completeness:
-    """Return what is missing from the record at a path; RecordError if there is none, or it cannot be read."""
+    """Return the gaps of the record at a path; RecordError if there is none, or it cannot be read."""
     with RecordReader(path) as reader:
         return completeness(reader)
 
 
 def _is_numbered(key: str, external: Container[str]) -> bool:
-    """Tell whether only the world publishes on a key, in one run of numbers: not on those of external drones."""
+    """Tell whether only the world publishes on a key, numbered without gaps; keys of external drones are excluded."""
     group, drone, what = keys.parts(key)
     if group != "drone":
         return key == keys.EVENT

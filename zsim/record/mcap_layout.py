@@ -1,9 +1,9 @@
-"""How a record lies in its file, as bytes: https://mcap.dev/spec.
+"""The layout of a record in its file: https://mcap.dev/spec.
 
     magic  header  { schemas and channels new in the next chunk   chunk   its message indexes }*
     data end  summary  footer  magic                             (absent where the writer died)
 
-The mcap library packs and unpacks every record but messages and chunks, of which there are too many for it.
+The mcap library packs and unpacks all records except messages and chunks, for which it is too slow.
 """
 
 import struct
@@ -63,7 +63,7 @@ _ANY_SIZE = frozenset({Opcode.MESSAGE, Opcode.ATTACHMENT})  # of other tools, ou
 
 
 class _Zstd(threading.local):
-    """Each thread has its own: zstandard's objects crash when two threads use one at a time."""
+    """Compressor per thread: zstandard's objects crash when used by two threads at once."""
 
     def __init__(self) -> None:
         self.compress = zstandard.ZstdCompressor(level=-1).compress
@@ -74,7 +74,7 @@ _zstd = _Zstd()
 
 
 class RecordSpan(NamedTuple):
-    """Where a whole record stands in the file, its head included."""
+    """The position of a whole record in the file, including its head."""
 
     opcode: int
     start: int
@@ -105,7 +105,7 @@ class Index(NamedTuple):
 
 
 class RecordGroup(NamedTuple):
-    """A record of the data section that matters, a chunk together with its message indexes."""
+    """A relevant record of the data section; a chunk with its message indexes."""
 
     place: RecordSpan
     indexes: tuple[Index, ...]
@@ -146,9 +146,9 @@ def places(source: Source) -> Iterator[RecordSpan]:
 
 
 def is_cut(source: Source, at: int) -> bool:
-    """Tell whether the bytes behind the last whole record are the beginning of another one.
+    """Tell whether the bytes after the last whole record are the beginning of another one.
 
-    Otherwise they are damaged: a wrong length hides everything that follows.
+    Otherwise they are damaged: a wrong length makes everything after it unreadable.
     """
     left = len(source) - at - HEAD.size
     if left < 0:
@@ -170,7 +170,7 @@ def is_cut(source: Source, at: int) -> bool:
 def groups(source: Source, found: Iterator[RecordSpan] | None = None) -> Iterator[RecordGroup]:
     """Yield schemas, channels and chunks of the data section in order.
 
-    `found`: the places of the records, if the caller iterates over them already.
+    `found`: positions of the records, if already known.
     """
     last: RecordSpan | None = None  # whose message indexes may follow
     indexes: list[Index] = []
@@ -211,9 +211,9 @@ def chunk_head(source: Source, place: RecordSpan) -> ChunkHead:
 
 
 def content_of(source: Source, place: RecordSpan) -> bytes | None:
-    """Return the message records inside the chunk at a place, None if it is damaged, or larger than any of ours.
+    """Return the message records of the chunk at a position, None if it is damaged or larger than any of ours.
 
-    RecordError if it is compressed in a way that is not ours.
+    RecordError if its compression is not supported.
     """
     head = chunk_head(source, place)
     if head.content > place.end or head.size > CHUNK_MAX:
@@ -233,7 +233,7 @@ def content_of(source: Source, place: RecordSpan) -> bytes | None:
 
 
 def write_all(file: FileIO, data: bytes) -> None:
-    """Write all of it; an unbuffered file may take it in parts when the disk is nearly full."""
+    """Write all data; an unbuffered file may write it in parts when the disk is nearly full."""
     view = memoryview(data)
     while view:
         view = view[file.write(view) or 0 :]
@@ -249,7 +249,7 @@ def crc_until(source: Source, end: int) -> int:
 
 
 def unmap(source: Source) -> None:
-    """Release the pages of a mapped file that were read; they are read again when needed."""
+    """Release the pages of a mapped file that were read; they are reloaded when needed."""
     if isinstance(source, mmap) and hasattr(source, "madvise"):  # Windows has none
         from mmap import MADV_DONTNEED
 
@@ -257,12 +257,12 @@ def unmap(source: Source) -> None:
 
 
 def is_ours(source: Source) -> bool:
-    """Tell whether zsim has written a record, of which the first bytes are given; zsim gives every chunk a checksum."""
+    """Tell whether zsim wrote a record, given its first bytes; zsim gives every chunk a checksum."""
     return source[LIBRARY : LIBRARY + len(OURS)] == OURS
 
 
 def indexes_of(content: bytes) -> dict[int, list[int]]:
-    """Return for every channel of a chunk the log times and places of its messages, one after the other."""
+    """Return the log times and positions of the messages of each channel of a chunk, one after the other."""
     indexes: dict[int, list[int]] = defaultdict(list)
     at, end, unpack = 0, len(content) - MESSAGE.size, MESSAGE.unpack_from
     while at <= end:
@@ -274,18 +274,18 @@ def indexes_of(content: bytes) -> dict[int, list[int]]:
 
 
 def heads_at(content: bytes, places: NDArray[np.int64]) -> NDArray:
-    """Return the heads of the messages at some places of a chunk's content, as MESSAGE_HEAD."""
+    """Return the heads of the messages at positions of a chunk's content, as MESSAGE_HEAD."""
     return np.ndarray(max(0, len(content) - MESSAGE.size + 1), MESSAGE_HEAD, content, strides=(1,))[places]
 
 
 def index_record(channel: int, entries: bytes) -> bytes:
-    """Return a message index record; its entries are log times and places."""
+    """Return a message index record; its entries are log times and positions."""
     size = len(entries)
     return HEAD.pack(Opcode.MESSAGE_INDEX, INDEX_HEAD.size + size) + INDEX_HEAD.pack(channel, size) + entries
 
 
 def check_magic(source: Source, path: Path) -> None:
-    """Raise RecordError for what is not the beginning of an MCAP file."""
+    """Raise RecordError if bytes are not the beginning of an MCAP file."""
     beginning = source[: len(MAGIC)]
     if not MAGIC.startswith(beginning):
-        raise RecordError(f"{path}: begins with {beginning!r}; is no MCAP record")
+        raise RecordError(f"{path}: begins with {beginning!r}; is not an MCAP record")

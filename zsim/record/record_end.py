@@ -1,7 +1,7 @@
-"""The end of a record: data end, summary and footer, all derived from the file itself.
+"""The end of a record: data end, summary and footer, all derived from the file.
 
-The same code closes a record at the end of a run and repairs one whose writer died, so the writer keeps no index in
-memory, however long the run.
+The same code closes a record at the end of a run and repairs one whose writer died, so the writer needs no index in
+memory.
 """
 
 import struct
@@ -24,7 +24,7 @@ _FOOTER_LENGTH = 20
 
 
 def finish(file: FileIO) -> None:
-    """Write summary and footer at the end of a file opened to read and write, unbuffered; OSError if it has no room."""
+    """Write summary and footer at the end of a file opened for unbuffered reading and writing; OSError without room."""
     with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
         summary = _summary(source)
         data_end = layout.packed(DataEnd(layout.crc_until(source, len(source))))
@@ -41,7 +41,7 @@ def finish(file: FileIO) -> None:
 
 
 def _summary(source: layout.Source) -> dict[Opcode, bytes]:
-    """Return the records of the summary of a data section, by their kind, in the order in which they stand there."""
+    """Return the records of the summary of a data section, by kind, in the order of the file."""
     schemas, channels, chunks = RecordBuilder(), RecordBuilder(), RecordBuilder()
     numbers: Counter[Opcode] = Counter()
     messages: Counter[int] = Counter()
@@ -91,19 +91,19 @@ def _summary(source: layout.Source) -> dict[Opcode, bytes]:
 
 
 def finish_bare(file: FileIO) -> None:
-    """Write the shortest end that MCAP allows, 50 bytes without a summary; OSError if there is no room."""
+    """Write the shortest end that MCAP allows, 50 bytes without a summary; OSError without room."""
     file.seek(0, 2)
     layout.write_all(file, layout.packed(DataEnd(0)) + layout.packed(Footer(0, 0, 0)) + layout.MAGIC)
 
 
 def repair(path: str | Path) -> bool:
-    """Finish a record whose writer died, in place; return whether there was anything to do.
+    """Finish a record whose writer died, in place; return whether it was unfinished.
 
-    The record is kept up to its last whole chunk. Nobody may be writing it. Being interrupted does no harm:
-    the file is then an unfinished record as before.
+    The record is kept up to its last whole chunk. No process may be writing it. An interruption does no harm: the file
+    is then an unfinished record as before.
 
     Raises:
-        RecordError: no record, or it cannot be written.
+        RecordError: the file is not a record, or cannot be written.
     """
     path = Path(path)
     try:
@@ -120,9 +120,9 @@ def repair(path: str | Path) -> bool:
 
 
 def cut_off(file: FileIO, path: Path) -> None:
-    """Cut a record behind its last whole chunk, or else its header, so that it can be continued from there.
+    """Truncate a record after its last whole chunk, or else its header, so that it can be continued from there.
 
-    RecordError if it is no record; OSError if it cannot be written.
+    RecordError if the file is not a record; OSError if it cannot be written.
     """
     end, tail = 0, layout.opening()
     if file.seek(0, 2):

@@ -1,4 +1,4 @@
-"""Reads a record, whole or cut at any byte, from a file or the folder of a run."""
+"""Reads a record, complete or truncated at any byte, from a file or the folder of a run."""
 
 import struct
 from collections import Counter
@@ -22,7 +22,7 @@ OVERLAP_NS = 1_000_000_000  # simulated time; a chunk begins less than that befo
 
 
 class Recorded(NamedTuple):
-    """One message of a record, not decoded."""
+    """A message of a record, not decoded."""
 
     key: str
     payload: bytes
@@ -52,19 +52,19 @@ _Held = tuple[int, int, Recorded]  # simulated time, number of its chunk, messag
 
 
 class RecordReader:
-    """A record as it is on disk when it is opened; a writer may be appending to it.
+    """A record as on disk at the time of opening; a writer may be appending to it.
 
-    Reading raises RecordError for chunks that another tool has compressed in a way that is not ours.
+    Reading raises RecordError for chunks of other tools with an unsupported compression.
 
     Attributes:
-        damaged: what was skipped so far, each with its place: chunks whose checksum differs, and, as one, everything
-            behind an invalid length.
+        damaged: skipped parts with their positions: chunks whose checksum differs, and, as one entry, everything after
+            an invalid length.
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Open a record and look through its chunks, without decompressing them.
+        """Open a record and scan its chunks, without decompressing them.
 
-        RecordError if there is no such file, it is no MCAP file, or the name of a channel is damaged.
+        RecordError if the file does not exist, is not an MCAP file, or the name of a channel is damaged.
         """
         self.path = Path(path)
         self._counts: Counter[int] = Counter()
@@ -83,7 +83,7 @@ class RecordReader:
         self._chunks = list(self._scan())
 
     def topics(self) -> dict[str, int]:
-        """Return the keys on record with the number of their messages, in the order of their first one."""
+        """Return the recorded keys with their message counts, in order of their first message."""
         return {key: self._counts[number] for number, key in self._keys.items() if self._counts[number]}
 
     def messages(
@@ -109,7 +109,7 @@ class RecordReader:
         return dict(self._keys)
 
     def spans(self, wanted: Collection[int]) -> Iterator[MessageSpans]:
-        """Yield where the payloads of some channels are, a chunk at a time: for reading many messages as arrays."""
+        """Yield the payload positions of some channels, chunk by chunk, for reading many messages as arrays."""
         mapped = 0
         for chunk in self._chunks:
             if chunk.channels.isdisjoint(wanted):
@@ -131,7 +131,7 @@ class RecordReader:
             yield MessageSpans(content, channel[rows], starts + layout.MESSAGE.size, ends, times)
 
     def _indexed(self, chunk: _Chunk, content: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return channel and place of every message of a chunk: by its indexes, if they lead to all of its content."""
+        """Return channel and position of every message of a chunk, by its indexes if these cover all its content."""
         head = layout.HEAD.size + layout.INDEX_HEAD.size
         at = [(index.start + head, layout.INDEX_ENTRY * index.messages) for index in chunk.indexes]
         data = b"".join([self._source[start : start + size] for start, size in at])
@@ -150,16 +150,16 @@ class RecordReader:
 
     @property
     def damaged(self) -> tuple[str, ...]:
-        """Return the damage found so far; everything behind unreadable records is one entry."""
+        """Return the damage found so far; everything after unreadable records is one entry."""
         heads = [(place.start, layout.chunk_head(self._source, place)) for place in sorted(self._damaged)]
         span = "the chunk at byte {}, {:.2f} to {:.2f} s"
         chunks = [span.format(at, head.first_ns / 1e9, head.last_ns / 1e9) for at, head in heads]
         return tuple(chunks if self._rest is None else [*chunks, f"everything from byte {self._rest} on"])
 
     def differs(self) -> bool:
-        """Tell whether a closed record was changed since its writer closed it; the whole file is read.
+        """Tell whether a closed record was changed after its writer closed it; the whole file is read.
 
-        Names of keys, and indexes, have no check sum of their own.
+        Names of keys and indexes have no checksum of their own.
         """
         if not self.complete or self._data_end is None:
             return False
@@ -167,7 +167,7 @@ class RecordReader:
         return stated not in (0, layout.crc_until(self._source, self._data_end.start))
 
     def last(self, key: str) -> Recorded | None:
-        """Return the message of a key that was written last, None if there is none."""
+        """Return the last written message of a key, None if there is none."""
         for number in (number for number, name in self._keys.items() if name == key):
             for chunk in reversed(self._chunks):
                 if number in chunk.channels and (recorded := list(self._as_written([chunk], {number: key}))):
@@ -175,7 +175,7 @@ class RecordReader:
         return None
 
     def last_chunk(self, key: str, is_it: Callable[[bytes], bool]) -> tuple[int, list[Recorded]] | None:
-        """Return where the chunk with the last message of a key begins, and what stands in it before that message.
+        """Return the start of the chunk with the last message of a key, and its content before that message.
 
         `is_it`: tells by the payload whether it is the wanted one.
         """
@@ -198,7 +198,7 @@ class RecordReader:
         self.close()
 
     def _places(self) -> Iterator[layout.RecordSpan]:
-        """Yield all records, and note the channels, which may be in the summary only, and where the data ends."""
+        """Yield all records, and note the channels (possibly only in the summary) and the end of the data."""
         opcode, end = 0, len(layout.MAGIC)
         for place in layout.places(self._source):
             opcode, end = place.opcode, place.end
@@ -266,10 +266,10 @@ class RecordReader:
         yield from (message for _, _, message in held)
 
     def _stragglers(self, chunks: list[_Chunk], wanted: dict[int, str]) -> tuple[list[_Held], dict[int, int]]:
-        """Return messages that are stamped long before the rest of their chunk, and when that rest begins, by chunk.
+        """Return messages stamped long before the rest of their chunk, and the first time of that rest, by chunk.
 
-        A program that stamps nothing gives every chunk a message of time 0. In the order of their oldest messages,
-        all chunks would be read and held at the beginning.
+        A program that does not stamp gives every chunk a message of time 0. By their oldest messages, all chunks would
+        be read and held at the beginning.
         """
         strays: list[_Held] = []
         floors: dict[int, int] = {}
@@ -288,7 +288,7 @@ class RecordReader:
 
 
 def record_notes(reader: RecordReader) -> list[str]:
-    """Return warnings about a record that was cut or damaged, one line each."""
+    """Return warnings about a truncated or damaged record, one line each."""
     notes = []
     if not reader.complete:
         notes.append("the record was cut: its writer did not close it; everything up to the cut was read")

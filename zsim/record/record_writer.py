@@ -1,4 +1,4 @@
-"""Writes a record while a run goes on."""
+"""Writes a record during a run."""
 
 from array import array
 from collections import Counter
@@ -43,15 +43,15 @@ _encode = messages.encode
 
 
 class RecordWriter:
-    """Appends messages to a record; for one thread.
+    """Appends messages to a record; for use by one thread.
 
-    The file is readable at any moment, whatever happens to this process: a chunk and its indexes are one write. Memory
-    holds the open chunk and the names of the keys, however long the run. When the disk is full or gone, every method
-    raises RecordError; the file was closed at its last whole chunk.
+    The file is readable at any time, even if this process dies: a chunk and its indexes are one write. Memory holds
+    only the open chunk and the names of the keys. If the disk is full or gone, every method raises RecordError; the
+    file is closed at its last whole chunk.
     """
 
     def __init__(self, path: str | Path, goes_on: bool = False) -> None:
-        """Create the file, or continue one whose writer died behind its last whole chunk; none is overwritten.
+        """Create the file, or continue one whose writer died, after its last whole chunk; no file is overwritten.
 
         RecordError if the file exists, cannot be continued, or cannot be written.
         """
@@ -80,7 +80,7 @@ class RecordWriter:
             raise
 
     def _take_up(self) -> None:
-        """Learn the channels and schemas of the file as far as it is whole."""
+        """Read the channels and schemas of the file as far as it is whole."""
         cut_off(self._file, self.path)
         counts: Counter[int] = Counter()
         self._end = self._file.seek(0, 2)
@@ -99,12 +99,12 @@ class RecordWriter:
         self._open = OpenChunk(CHUNK_BYTES + CHUNK_BYTES // 4, counted)
 
     def add(self, key: str, payload: bytes, encoding: str, t_ns: int, wall_ns: int) -> None:
-        """Take one message.
+        """Add a message.
 
         Args:
             key: without the federation's prefix.
             payload: as on the wire.
-            encoding: Zenoh's, e.g. `application/msgpack;Truth`; the first one of a key holds for all of it.
+            encoding: Zenoh's, e.g. `application/msgpack;Truth`; the first one of a key applies to all its messages.
             t_ns: simulated time.
             wall_ns: wall clock of the recorder.
         """
@@ -116,7 +116,7 @@ class RecordWriter:
         self._end_if_full(wall_ns)
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
-        """Take one message of this process, encoded as for the wire."""
+        """Add a message of this process, encoded as on the wire."""
         channel = self._channels.get(key) or self._register(key, messages.encoding(key))
         if not channel:
             self.refused += 1
@@ -126,7 +126,7 @@ class RecordWriter:
             self._end_chunk()
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
-        """Take the messages of a gate, whose columns have been checked."""
+        """Add the messages of a gate, whose columns have been checked."""
         channels = self._gate_channels.of(gate)
         if channels:
             self._open.add_gate(channels, gate, wall_ns)
@@ -140,13 +140,13 @@ class RecordWriter:
             self._end_chunk()
 
     def _channels_of(self, gate: GateMessages) -> bytes:
-        """Return the channel of each message, int64; nothing if there is none left for one."""
+        """Return the channel of each message, int64; empty if channels are exhausted."""
         names = [gate.table[place] for place in gate.which.tolist()]
         channels = [self._channels.get(key) or self._register(key, messages.encoding(key)) for key in names]
         return np.array(channels, dtype=np.int64).tobytes() if all(channels) else b""
 
     def tick(self, wall_ns: int) -> None:
-        """Put the open chunk on disk when it is old; call it every 0.1 s, also while nothing arrives.
+        """Write the open chunk to disk when it is old; call it every 0.1 s, even if no message arrives.
 
         `wall_ns` is of a monotonic clock; only its own earlier values are compared with it.
         """
@@ -161,7 +161,7 @@ class RecordWriter:
             self._end_chunk()
 
     def close(self) -> None:
-        """Finish the file; closing twice does nothing."""
+        """Finish the file; closing again has no effect."""
         if self._file.closed:
             return
         self.flush()
@@ -178,7 +178,7 @@ class RecordWriter:
         self.close()
 
     def _register(self, key: str, encoding: str) -> int:
-        """Return the number of a new channel, 0 if there is none left."""
+        """Return the number of a new channel, 0 if channels are exhausted."""
         if len(self._channels) >= CHANNELS_MAX:
             return 0
         self._channels[key] = number = len(self._channels) + 1
@@ -188,7 +188,7 @@ class RecordWriter:
         return number
 
     def _schema(self, key: str, name: str) -> int:
-        """Return the number of the schema of a key's messages, 0 when nothing names them."""
+        """Return the number of the schema of a key's messages, 0 without a schema."""
         kind = messages.type_of(key)
         name = name or (kind.__name__ if kind else "")
         if name and name not in self._schemas:
@@ -214,7 +214,7 @@ class RecordWriter:
         self._end += len(data)
 
     def _give_up(self, error: OSError) -> NoReturn:
-        """Close the file at its last whole chunk, with as much of a summary as there is room for."""
+        """Close the file at its last whole chunk, with as much of a summary as fits on the disk."""
         for ending in (finish, finish_bare, None) if self._end else (None,):
             try:
                 self._file.truncate(self._end)
@@ -233,7 +233,7 @@ class RecordWriter:
 
 
 def _opened(path: Path, mode: str) -> FileIO:
-    """Open a record for this process alone; the lock goes with the process, whatever ends it."""
+    """Open a record exclusively; the lock ends with the process."""
     try:
         file = FileIO(path, mode)
     except FileExistsError as error:
@@ -255,7 +255,7 @@ def is_being_written(path: Path) -> bool:
 
 
 def _time(value: int) -> int:
-    """Return a time that MCAP can hold."""
+    """Return a time representable in MCAP."""
     return value if type(value) is int and 0 <= value <= _TIME_MAX else min(max(int(value), 0), _TIME_MAX)
 
 
@@ -263,13 +263,13 @@ _SEQUENCE_MASK = 2**32 - 1  # MCAP counts messages of a channel in 32 bits
 
 
 class OpenChunk:
-    """The messages that are not on disk yet: payloads in a buffer, their heads as columns, written all at once.
+    """The messages not yet on disk: payloads in a buffer and heads as columns, written together.
 
-    Channels are counted from 1. The memory is kept from chunk to chunk: allocating new pages would take longer than
-    everything done here.
+    Channels are counted from 1. The memory is reused for each chunk: allocating new pages would take longer than
+    everything else here.
 
     Args:
-        room: bytes that a chunk commonly has, with its last message.
+        room: usual size of a chunk with its last message [bytes].
         counted: messages that each channel had in earlier chunks.
 
     Attributes:
@@ -304,7 +304,7 @@ class OpenChunk:
         self._published.append(wall_ns)
 
     def add_gate(self, channels: bytes, gate: GateMessages, wall_ns: int) -> None:
-        """Take the messages of a gate, in whose buffer there is room before each for its head.
+        """Add the messages of a gate, whose buffer has room for a head before each message.
 
         `channels`: number of each message's, int64.
         """
@@ -323,7 +323,7 @@ class OpenChunk:
         self._data = self._data + bytes(max(size - len(self._data), self._room))
 
     def take(self) -> "Content":
-        """Return the messages so far, and begin a new chunk; the content is valid until the next message."""
+        """Return the messages so far and begin a new chunk; the content is valid until the next message."""
         columns = map(_column, (self._channels, self._ends, self._log, self._published))
         content = Content(memoryview(self._data)[: self.size], *columns)
         self._counted = content.write_heads(self._counted)
@@ -342,7 +342,7 @@ class Content:
         self._order = np.argsort(channels, kind="stable")  # channel by channel, each in the order of arrival
 
     def write_heads(self, counted: NDArray) -> NDArray:
-        """Write the head of each message; return how many messages each channel has had by now.
+        """Write the head of each message; return the number of messages of each channel so far.
 
         `counted`: messages that channels have had before.
         """
@@ -375,7 +375,7 @@ def _column(values: array) -> NDArray:
 
 
 def cut_at_last(path: Path, key: str, is_it: Callable[[bytes], bool]) -> bool:
-    """Cut a record before the last message of a key, so that its run can be resumed; return whether there was one.
+    """Truncate a record before the last message of a key, to resume its run; return whether there was one.
 
     Args:
         is_it: tells by the payload whether it is the wanted one.

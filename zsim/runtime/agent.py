@@ -1,10 +1,10 @@
-"""An agent, alone or in a group: a plain object, inputs in, outputs out, without Zenoh and wall clock.
+"""An agent, alone or in a group: a plain object with inputs and outputs, without Zenoh and wall clock.
 
     runner ──receive(key, message)──▶ agent          every input of a gate, in canonical order
     runner ──step(t_ns)────────────▶ agent ──▶ [(key, message), …]
 
-`zsim.runtime.runner` drives it as a process on Zenoh, `zsim.runtime.bus` on an in-memory bus. Both hand over the same
-inputs in the same order, so that the outputs are the same to the bit.
+`zsim.runtime.runner` runs it as a process on Zenoh, `zsim.runtime.bus` on an in-memory bus. Both pass the same inputs
+in the same order, so that the outputs are the same to the bit.
 """
 
 import math
@@ -39,14 +39,14 @@ _FILLED = ("name", "period_ns", "reads", "gate_keys")  # by `Agent.bind`, where 
 
 
 class Output(NamedTuple):
-    """A message on its way out; the key is without the federation's prefix."""
+    """An outgoing message; the key is without the federation's prefix."""
 
     key: str
     message: Struct
 
 
 class Agent(ABC):
-    """Base class of everything that takes part in the lockstep."""
+    """Base class of all agents in the lockstep."""
 
     name: str  # process name `role.thing`, e.g. `estimator.drone1`
     period_ns: int  # how often it publishes done; a multiple of the gate
@@ -73,15 +73,15 @@ class Agent(ABC):
         self._process = ""  # of the group that it is a member of, under whose name it publishes
 
     def bind(self, info: Info, name: str = "", radio: Radio | None = None) -> None:
-        """Fill in what a class of a user's leaves out, before its agent joins the run of `world/info`.
+        """Fill in the defaults of a user's class before its agent joins the run of `world/info`.
 
         The name: `agent.` and the class's name; `period_ns`: every gate; `gate_keys`: the status of every drone, or of
-        its own where it is of a drone, and what `reads` has of the estimates and cluster states, which are published at
-        every gate. In `reads`, `{drone}` and `{cluster}` stand for the name of what it is of.
+        its own drone, and the estimates and cluster states in `reads`, which are published at every gate. In `reads`,
+        `{drone}` and `{cluster}` stand for the name of the agent's drone or cluster.
 
         Args:
-            name: of the process, in place of the agent's own.
-            radio: over which it exchanges messages with other agents of users; None: they hear each other always.
+            name: name of the process, in place of the agent's own.
+            radio: radio for messages between users' agents; None: all are delivered.
         """
         if not hasattr(self, "_process"):  # a class whose constructor does not call this one's
             Agent.__init__(self)
@@ -117,7 +117,7 @@ class Agent(ABC):
 
     @property
     def role(self) -> str:
-        """The first part of the name, `estimator` of `estimator.drone1`."""
+        """The first part of the name: `estimator` of `estimator.drone1`."""
         return self.name.split(".", 1)[0]
 
     @property
@@ -127,23 +127,23 @@ class Agent(ABC):
 
     @property
     def overhears(self) -> bool:
-        """Tell whether it may read outputs of others that close none of its gates."""
+        """Tell whether it may read outputs of other agents that close none of its gates."""
         return any(not keys.is_sensor(key) and key not in self.gate_keys for key in self.reads)
 
     def update_faults(self, info: Info, faults: Faults) -> None:
-        """Take the faults injected into the run; called before the first gate in which one of them acts."""
+        """Receive the injected faults of the run; called before the first gate in which one of them acts."""
         if self._links is None and faults.faults:
             self._links = Links(info, (self.name, *self.serves))
         if self._links is not None:
             self._links.update(faults)
 
     def answer(self, t_ns: int, inputs: Sequence[Input]) -> Sequence[Output] | None:
-        """Take the inputs of a gate; return its outputs, None at a gate at which it does not step.
+        """Process the inputs of a gate; return its outputs, None at a gate at which it does not step.
 
-        The outputs of a user's class are as others get them over Zenoh: of the contract, finite, of Python's types.
+        Outputs of a user's class are converted as over Zenoh: types of the contract, finite, Python's own.
 
         Raises:
-            UserCodeError: a user's class raised, or returned what cannot be used.
+            UserCodeError: a user's class raised, or returned an invalid value.
         """
         try:
             self._answered_ns = t_ns
@@ -165,7 +165,7 @@ class Agent(ABC):
 
     @staticmethod
     def held_by(frame: FrameType | None) -> str:
-        """Return which agent has not answered, and at what line it is, of a frame of the thread that waits; or ""."""
+        """Return which agent has not answered, and its current line, given a frame of the waiting thread; or ""."""
         line = plugin.innermost_line(frame)
         while frame and frame.f_code is not Agent.answer.__code__:
             frame = frame.f_back
@@ -175,7 +175,7 @@ class Agent(ABC):
         return f"; {agent.name} has not returned at {agent._answered_ns / 1e9:.2f} s{line}"
 
     def failure(self, error: BaseException, t_ns: int) -> UserCodeError | None:
-        """Return what a user's code raised in this agent with the agent's name and the gate; None for other errors."""
+        """Return an error raised by a user's code with the agent's name and the gate; None for other errors."""
         return plugin.user_code_error(error, f"{self.name} at {t_ns / 1e9:.2f} s")
 
     @cached_property
@@ -183,9 +183,9 @@ class Agent(ABC):
         return plugin.is_own(type(self))
 
     def _checked(self, t_ns: int, output: Any) -> Output:
-        """Return an output of a user's class as it would be received, with its sender.
+        """Return an output of a user's class as it would be received, with its source.
 
-        A message of the class's own may stand for itself, and lack stamp and number.
+        A message of the class's own types may be returned without key, stamp and number.
         """
         try:
             if isinstance(output, AgentMessage):
@@ -217,7 +217,7 @@ class Agent(ABC):
             raise UserCodeError(f"{plugin.full_name(type(self))}.step returns {error}") from error
 
     def deliver(self, t_ns: int, inputs: Sequence[Input]) -> None:
-        """Take the inputs of a gate in canonical order, as far as faults of the links bring them."""
+        """Receive the inputs of a gate in canonical order, after the effect of its links."""
         if self._links is not None and self._links.act_at(t_ns):
             inputs = self._links.delivered(t_ns, self._router.one_by_one(inputs))
         elif not self.takes_gates and not self._process:
@@ -234,10 +234,10 @@ class Agent(ABC):
 
     @abstractmethod
     def receive(self, key: str, message: Any) -> None:
-        """Take one input; called in order of (t_ns, key, seq) just before `step`."""
+        """Receive one input; called in order of (t_ns, key, seq) just before `step`."""
 
     def receive_gate(self, gate: GateMessages) -> None:
-        """Take the world's messages of a gate before its other inputs; only where it `takes_gates`."""
+        """Receive the world's messages of a gate before its other inputs; only called if it `takes_gates`."""
         for _, key, message in self._router.split(gate):
             self.receive(key, message)
 
@@ -246,15 +246,15 @@ class Agent(ABC):
         """Return the outputs of the gate t_ns."""
 
     def views(self, t_ns: int) -> Sequence[Output]:
-        """Return what is to be displayed, on `view/**`, as of the gate t_ns, the last that it stepped.
+        """Return the messages on `view/**` for displays at the gate t_ns, the last one stepped.
 
-        Called after some gates only, as often as people can follow, and never where the agents share a process with
-        the world: nothing may depend on it.
+        Called only after some gates, at display rate, and never in the same process as the world: nothing may depend
+        on it.
         """
         return ()
 
     def rehearse(self) -> None:
-        """Load and compile what the first step needs; called before joining, so that no gate waits for it."""
+        """Load and compile the code of the first step; called before joining, so that no gate waits for it."""
         return
 
     def control_keys(self) -> tuple[str, ...]:
@@ -273,20 +273,20 @@ class Agent(ABC):
         """Take over the last value that the predecessor published."""
 
     def snapshot(self) -> State | None:
-        """Return the whole state after the gate that it stepped last, as plain values; None if that is not supported.
+        """Return the state after the gate stepped last as plain values; None if that is not supported.
 
-        A new agent that is given this state by `restore` goes on with the same outputs to the bit.
+        A new agent that takes it over by `restore` continues with the same outputs to the bit.
         """
         return None
 
     def restore(self, state: State) -> None:  # noqa: B027 - an agent without a snapshot is never asked to
-        """Take over the state that a predecessor returned by `snapshot`; if this raises anything, it starts afresh."""
+        """Take over the state that a predecessor returned by `snapshot`; after an error the agent starts anew."""
 
     def repeat(self, key: str, message: Any) -> None:  # noqa: B027 - most agents answer no requests
-        """Do again, before the gate of the message, what the predecessor published on a key of `repeats`."""
+        """Repeat, before the gate of the message, a request that the predecessor published on a key of `repeats`."""
 
     def checkpoint(self) -> State | None:
-        """Return the snapshot with what every agent has beside it: sequence numbers, and what its links hold back."""
+        """Return the snapshot with the common state of all agents: sequence numbers and messages held by links."""
         own = self.snapshot()
         if self._is_own:
             try:
@@ -303,7 +303,7 @@ class Agent(ABC):
         }
 
     def resume(self, info: Info, checkpoint: State) -> None:
-        """Take over a checkpoint; one of another version of this agent may raise anything."""
+        """Take over a checkpoint; that of another version of this agent may raise any error."""
         self.restore(checkpoint["own"])
         self._seq = defaultdict(int, checkpoint["seq"])
         if checkpoint["links"] is not None:
@@ -313,17 +313,17 @@ class Agent(ABC):
             self._transmitter.restore(checkpoint["transmitter"])
 
     def command(self, t_ns: int, drone: str, command: Struct) -> Output:
-        """Return an output of the gate t_ns that commands a drone; stamp, number and source are filled in.
+        """Return a command to a drone as an output of the gate t_ns; stamp, number and source are filled in.
 
         Args:
-            command: by `zsim.velocity` and so on.
+            command: made by `zsim.velocity` and so on.
         """
         key = messages.command_key(drone, command)
         stamp = {"t_ns": t_ns, "seq": self.next_seq(key), "source": self.source}
         return Output(key, replace(command, **stamp))
 
     def message(self, t_ns: int, message: AgentMessage) -> Output:
-        """Return an output of the gate t_ns that others read a gate later; stamp, number and source are filled in."""
+        """Return a message to agents, which read it a gate later, as an output; stamp, number, source are filled in."""
         key = message.of(self.thing)  # its source is the agent, whatever process it shares: its reader may go by it
         return Output(key, replace(message, t_ns=t_ns, seq=self.next_seq(key), source=self.name))
 
@@ -334,12 +334,12 @@ class Agent(ABC):
         return count
 
     def resume_seq(self, key: str, last: int) -> None:
-        """Go on counting after `last`, so that after a restart it is clear what is new."""
+        """Continue numbering after `last`, so that new messages are distinguishable after a restart."""
         self._seq[key] = last + 1
 
 
 def default_name(made: Any) -> str:
-    """Return the process name of an agent without one, by its class, or by the function that makes it."""
+    """Return the process name of an agent without one, from its class or factory function."""
     letters = re.sub(r"[^a-z0-9_.-]", "", getattr(made, "__name__", type(made).__name__).lower())
     return f"agent.{letters or 'main'}"[:32]
 
@@ -349,19 +349,18 @@ class AgentGroup(Agent):
 
         AgentGroup([estimators, controller], output_hold_ns(info))     sensors in, estimates and commands out
 
-    A process costs more than the agents in it; three estimators and a controller in one are about twice as fast.
+    A process costs more than its agents; three estimators and a controller in one process are about twice as fast.
 
-    A member receives each message at the gate at which a process of its own would: outputs of others on keys that
-    close its gate (`writes` of theirs, `gate_keys` of its own) at once, all others as the transport brings them back to
-    the group, `hold_ns` after their stamp. The group has the name of its last member, which is also the source of all
-    that its members publish.
+    A member receives each message at the gate at which a separate process would: outputs of other members that close
+    its gate (in their `writes` and its `gate_keys`) immediately, all others through the transport, `hold_ns` after
+    their stamp. The group has the name of its last member, which is also the source of all its messages.
 
     Args:
         members: in any order; each steps at the gates of its own period.
         hold_ns: `output_hold_ns` of the run.
 
     Raises:
-        RunError: there are none, or they wait for each other's outputs.
+        RunError: there are no members, or they wait for each other's outputs.
     """
 
     def __init__(self, members: Sequence[Agent], hold_ns: int) -> None:
@@ -488,7 +487,7 @@ def _joined(parts: Any) -> tuple[str, ...]:
 
 
 def _in_order(members: Sequence[Agent]) -> tuple[Agent, ...]:
-    """Return the members so that each comes after those whose outputs close its gate, if they can be a group."""
+    """Return the members, each after those whose outputs close its gate; RunError if there is no such order."""
     if not members:
         raise RunError("a group has no members; must have one at least")
     writers = {key: place for place, member in enumerate(members) for key in member.writes}

@@ -1,9 +1,9 @@
-"""The radio between the agents of drones: what a transmitter sends at a gate, and when a receiver gets it. Pure.
+"""The radio between the agents of drones: what a transmitter sends at a gate, and when it is received. Pure.
 
     agent ──messages──▶ Transmitter ──as many as its bandwidth lets out──▶ … ──▶ Receiver ──now, later, never──▶ agent
 
-The world says at every gate who hears whom (`RadioLinks`). Whether a message is lost, and how late it comes, is drawn
-from what it is and who receives it, so neither the order of arrival nor a restart changes a draw.
+The world publishes the connectivity at every gate (`RadioLinks`). Loss and delay are drawn from the identity of the
+message and its receiver, so neither the order of arrival nor a restart changes a draw.
 """
 
 import math
@@ -27,7 +27,7 @@ ENVELOPE = frozenset(AgentMessage.__struct_fields__)  # which a real radio would
 
 
 class Receiver:
-    """Decides which messages of others' agents reach one, and when.
+    """Decides which messages of other agents reach one agent, and when.
 
     Args:
         process: name of the receiver.
@@ -40,7 +40,7 @@ class Receiver:
         self._lists: deque[RadioLinks] = deque(maxlen=LISTS_KEPT)
 
     def _place_of(self, thing: str) -> int | None:
-        """Return the place of a drone, or of the ground station; None where the agent is wired to all."""
+        """Return the index of a drone or the ground station; None if the agent is wired to all."""
         station = None if self._radio.station_m is None else len(self._places)
         return self._places.get(thing, station)
 
@@ -48,7 +48,7 @@ class Receiver:
         self._lists.append(links)
 
     def delay_ns(self, key: str, message: AgentMessage) -> int | None:
-        """Return how much later than it was sent a message comes [ns]; NEVER if it is lost."""
+        """Return the delay of a message [ns]; NEVER if it is lost."""
         sender, radio = self._place_of(keys.thing(key)), self._radio
         if sender == self._place or sender is None or self._place is None:
             return 0
@@ -78,10 +78,10 @@ def _reception(links: RadioLinks, receiver: int, sender: int) -> float:
 
 
 class Transmitter:
-    """Sends the messages of an agent one after the other, as its bandwidth allows.
+    """Sends the messages of an agent one after the other, within its bandwidth.
 
-    A message that begins to be sent before the next gate is published at this one. Others wait, and are published at
-    a later gate, stamped with it; of more than `queue_max` the oldest is lost.
+    A message whose transmission begins before the next gate is published at this one. Others wait for a later gate,
+    whose stamp they get; beyond `queue_max` the oldest is lost.
     """
 
     def __init__(self, radio: Radio, gate_ns: int) -> None:
@@ -91,7 +91,7 @@ class Transmitter:
         self._free_ns = 0  # when the last message has been sent
 
     def send(self, t_ns: int, outputs: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
-        """Return what is published at a gate of an agent's outputs, all but its messages at once."""
+        """Return the outputs of an agent to publish at a gate; outputs other than messages do not wait."""
         if not self._ns_per_byte:
             return [*outputs]
         published = []
@@ -109,7 +109,7 @@ class Transmitter:
         return published
 
     def size_bytes(self, message: AgentMessage) -> int:
-        """Return what is sent of a message: a header, and the values of its fields in msgpack."""
+        """Return the transmitted size of a message [bytes]: a header, and the values of its fields in msgpack."""
         values = [getattr(message, name) for name in messages.fields(type(message)) if name not in ENVELOPE]
         return self._header_bytes + len(msgspec.msgpack.encode(values))
 

@@ -1,6 +1,6 @@
 """Runs a world and its agents in one process on an in-memory bus.
 
-The agents get the same inputs in the same order as on Zenoh, and so give the same bits.
+The agents receive the same inputs in the same order as on Zenoh, and therefore give the same bits.
 """
 
 import copy
@@ -43,7 +43,7 @@ class _Route(NamedTuple):
 
 
 class Bus:
-    """The keys of one process: every message goes to the sink, the world and the inboxes that read it."""
+    """The bus of one process: every message goes to the sink, the world and the inboxes that read it."""
 
     def __init__(
         self,
@@ -73,7 +73,7 @@ class Bus:
         self._failures: dict[str, UserCodeError] = {}  # by the agent that cannot go on, the first one first
 
     def join(self) -> None:
-        """Let every agent get ready and join the run."""
+        """Rehearse every agent and join the run."""
         for agent, _ in self._agents:
             agent.rehearse()
             self._to_world(keys.process(agent.name, "join"), self._memberships[agent.name].join())
@@ -83,10 +83,9 @@ class Bus:
                 inbox.hold_ns = hold_ns
 
     def turn(self, gates_max: int = GATES_MAX) -> bool:
-        """Let the world go as far as it may, and every agent answer; return whether the run goes on.
+        """Advance the world as far as possible, and step every agent; return whether the run continues.
 
-        Several gates in a row of the world, of each agent, and of their outputs, keep the code of each in the
-        processor's caches.
+        Stepping several gates in a row of the world and of each agent keeps the code of each in the processor's caches.
 
         Raises:
             RunError: the world waits for a process that is not on this bus.
@@ -106,7 +105,7 @@ class Bus:
         return True
 
     def _round(self) -> bool:
-        """Let every agent take all its complete gates, then publish its outputs; return whether any had one."""
+        """Step every agent through its complete gates and publish the outputs; return whether there was any."""
         stepped = False
         for agent, inbox in self._agents:
             steps = []
@@ -134,7 +133,7 @@ class Bus:
         self._to_world(keys.process(agent.name, "bye"), bye)
 
     def snapshot(self) -> list[Inbox]:
-        """Return copies of what the agents have not taken yet, for `restore`; to be called between turns."""
+        """Return copies of the inputs that the agents have not taken, for `restore`; call it between turns."""
         return [copy.deepcopy(inbox) for _, inbox in self._agents]
 
     def restore(self, inboxes: Sequence[Inbox]) -> None:
@@ -143,9 +142,9 @@ class Bus:
         self._routes, self._gate_route, self._failures = {}, ((), ()), {}
 
     def end(self) -> None:
-        """Let every agent leave, and publish the world's last messages.
+        """Publish the byes of the agents and the world's last messages.
 
-        UserCodeError if a user's class failed before the end; everything has been published nevertheless.
+        UserCodeError if a user's class failed before the end, after everything was published.
         """
         self._coordinator.publish_end()
         self._spread()
@@ -190,7 +189,7 @@ class Bus:
             agent.update_faults(info, faults)
 
     def publish(self, agent: Agent, t_ns: int, outputs: Sequence[Output]) -> None:
-        """Publish an agent's outputs of a gate, and that it is done with it."""
+        """Publish an agent's outputs of a gate, and its done."""
         sent, world, routes = 0, self._coordinator, self._routes
         for key, message in outputs:
             inboxes, is_counted, is_relayed = routes.get(key) or self._route(key)

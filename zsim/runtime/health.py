@@ -1,4 +1,4 @@
-"""The health of a process: counters, published once a wall second, and a garbage collector that disturbs no gate."""
+"""The health of a process: counters, published once per wall second, and garbage collection without delaying gates."""
 
 import gc
 import os
@@ -46,7 +46,7 @@ class HealthMeter:
         self._steps_us.append(duration_ns / 1000)
 
     def due(self) -> bool:
-        """Tell, once a wall second, that it is time to publish."""
+        """Tell whether health is due, once per wall second."""
         return self._limit.spend()
 
     def message(self, t_ns: int, seq: int) -> Health:
@@ -68,7 +68,7 @@ class HealthMeter:
 
 
 def resident_bytes() -> int:
-    """Return the resident memory of this process; 0 where the system does not tell."""
+    """Return the resident memory of this process [bytes]; 0 if the system does not report it."""
     if sys.platform == "linux":
         with suppress(OSError), open("/proc/self/statm", encoding="ascii") as statm:  # no file may be left to open
             return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
@@ -77,9 +77,9 @@ def resident_bytes() -> int:
 
 @contextmanager
 def rare_collections() -> Iterator[None]:
-    """Collect garbage rarely, and never look through what was there before.
+    """Collect garbage rarely, and never examine the objects that already exist.
 
-    By default Python collects after 700 allocations, every few gates, and now and then looks through all objects.
+    By default Python collects after 700 allocations, every few gates, and occasionally examines all objects.
     """
     gc.collect()
     gc.freeze()

@@ -1,8 +1,7 @@
-"""What an agent reads: its inputs sorted by gate (`Inbox`), and which reader reads which key (`RoutingTable`).
+"""The inputs of an agent sorted by gate (`Inbox`), and the readers of each key (`RoutingTable`).
 
-Arrival order is never trusted: a gate is complete when each of its closing keys has a message stamped with it
-and every counted sensor message is there. A gate of which nothing has come is known by the gap that it leaves in
-the numbers of a status.
+The order of arrival is irrelevant: a gate is complete when each of its closing keys has a message stamped with it and
+every counted sensor message has arrived. A gate of which nothing arrived shows as a gap in the numbers of a status.
 """
 
 from bisect import bisect_right, insort
@@ -15,7 +14,7 @@ from zsim.contract.framing import GateMessages, PerPattern
 from zsim.contract.messages import Info
 from zsim.errors import DecodeError
 
-GAP_MAX = 10  # gates lost in a row that are asked for again; the world runs ahead of nobody by more
+GAP_MAX = 10  # consecutive lost gates that are requested again; the world is never farther ahead of an agent
 ALWAYS_NS = -1  # before every gate
 NEVER_NS = 2**63 - 1  # after every gate
 KEYS_MAX = 200_000  # whose readers are remembered; 1000 drones have about 15 000, other processes may make up any
@@ -24,10 +23,10 @@ Input = tuple[str, Any]
 
 
 def output_hold_ns(info: Info) -> int:
-    """Return how long after its stamp an output that closes no gate of its reader is handed out: see `Inbox.hold_ns`.
+    """Return how long after its stamp an output that closes no gate is delivered to its reader; see `Inbox.hold_ns`.
 
-    By then all have published theirs: the world is ahead of them by the command delay, or by nothing where agents
-    exchange messages. In realtime outputs are handed out as they come.
+    By then all agents have published theirs: the world is ahead of them by the command delay, or not at all if agents
+    exchange messages. In realtime outputs are delivered on arrival.
     """
     if info.mode == "realtime":
         return 0
@@ -35,7 +34,7 @@ def output_hold_ns(info: Info) -> int:
 
 
 def is_held(key: str, gate_keys: Container[str], uncounted: Container[str]) -> bool:
-    """Tell whether a key is one of others' outputs that its reader receives after the hold."""
+    """Tell whether messages of a key are outputs of other agents that are delivered after the hold."""
     return key not in gate_keys and key not in uncounted and messages.is_output(key)
 
 
@@ -45,7 +44,7 @@ def canonical(entry: Input) -> tuple[int, str, int]:
 
 
 class Inbox:
-    """Collects messages until the gate that they belong to is complete."""
+    """Collects messages until their gate is complete."""
 
     def __init__(
         self,
@@ -146,7 +145,7 @@ class Inbox:
     # What is complete, and what is missing
 
     def next_gate_ns(self) -> int | None:
-        """Return the earliest gate that is not taken, by the closing messages and the gaps in the pulse's numbers."""
+        """Return the earliest gate not taken, by the closing messages and the gaps in the pulse's numbers."""
         if not self._gates:
             return None
         t_ns = self._gates[0]
@@ -172,9 +171,9 @@ class Inbox:
         return None
 
     def last_missing(self) -> str | None:
-        """Return the last of the closing keys that the next gate waits for: a thread that waits for it wakes up once.
+        """Return the last closing key that the next gate waits for, so that a waiting thread wakes up only once.
 
-        A message that a status counts is named where no closing key is missing; None where nothing is waited for.
+        If no closing key is missing, it is the key of a counted message; None if nothing is missing.
         """
         next_ns = self.next_gate_ns()
         t_ns = self.taken_ns + 1 if next_ns is None else next_ns
@@ -184,7 +183,7 @@ class Inbox:
         return self.missing(t_ns) if next_ns is not None else None
 
     def lost(self, t_ns: int) -> str | None:
-        """Return a missing key whose message will not come any more: its publisher has gone on without it."""
+        """Return a missing key whose message will not arrive, since its publisher has published a later one."""
         key = self.missing(t_ns)
         if key is None or key not in self._lacking.get(t_ns, self._closing):
             return key
@@ -201,13 +200,13 @@ class Inbox:
         return newest_ns >= self.taken_ns and former_ns >= self._former_ns
 
     def expect(self, key: str, from_ns: int) -> None:
-        """Wait for a key from the gate `from_ns` on; NEVER_NS for one whose publisher is dropped from the run."""
+        """Wait for a key from the gate `from_ns` on; NEVER_NS if its publisher is dropped from the run."""
         self._expected_from_ns[key] = from_ns
 
-    # What is handed out
+    # Delivery
 
     def take(self, t_ns: int) -> list[Input]:
-        """Return all inputs stamped up to t_ns in order of (t_ns, key, seq), and forget them."""
+        """Remove and return all inputs stamped up to t_ns, in order of (t_ns, key, seq)."""
         ready: list[Input] = []
         for stamp in _cut(self._stamps, t_ns):
             stamped = self._waiting.pop(stamp)
@@ -230,7 +229,7 @@ class Inbox:
         return _once(ready) if len(ready) > 1 else ready
 
     def start_after(self, t_ns: int) -> None:
-        """Ignore everything up to and including t_ns; the next gate is counted in full."""
+        """Ignore everything up to and including t_ns; the next gate must be complete."""
         self.take(t_ns)
 
 
@@ -244,10 +243,10 @@ def _once(ready: list[Input]) -> list[Input]:
 
 
 class _Meter:
-    """Compares what has come of a drone's sensors with what its status counts.
+    """Compares the sensor messages received of a drone with the count in its status.
 
-    The first gate of a late joiner is not compared, since it began before the joiner was there; a status with
-    seq 0 counts from the beginning.
+    The first gate of a late joiner is not compared, since it began before the join; a status with seq 0 counts from the
+    beginning.
     """
 
     def __init__(self) -> None:
@@ -262,7 +261,7 @@ class _Meter:
             self.partial = False
 
     def short(self, t_ns: int) -> bool:
-        """Tell whether sensor messages of the gates up to t_ns are still to come."""
+        """Tell whether sensor messages of the gates up to t_ns are missing."""
         if self.partial:
             return False
         return bisect_right(self.came, t_ns) < sum(count for gate_ns, count in self.counts if gate_ns <= t_ns)
@@ -274,7 +273,7 @@ class _Meter:
 
 
 def _insert(stamps: list[int], t_ns: int) -> None:
-    """Put a stamp into a sorted list; nearly always it is the latest."""
+    """Insert a stamp into a sorted list; it is nearly always the latest."""
     if not stamps or t_ns >= stamps[-1]:
         stamps.append(t_ns)
     else:
@@ -282,7 +281,7 @@ def _insert(stamps: list[int], t_ns: int) -> None:
 
 
 def _cut(stamps: list[int], t_ns: int) -> list[int]:
-    """Take the stamps up to t_ns off a sorted list and return them."""
+    """Remove the stamps up to t_ns from a sorted list and return them."""
     place = bisect_right(stamps, t_ns)
     taken = stamps[:place]
     del stamps[:place]
@@ -295,12 +294,12 @@ class RoutingTable:
         routes = RoutingTable([["drone/*/truth"], ["drone/drone1/sensor/imu", "**"]])
         routes.readers("drone/drone1/truth")      (0, 1)
 
-    Comparing every expression with every key takes readers times keys, which is what a process of 1000 drones would do
-    most of its time. Here an expression is filed under its own text: those with wildcards for whole chunks are found
-    by putting the wildcards into the key, and only those with `**` or `$*` are compared one by one.
+    Comparing every expression with every key would dominate the time of a process of 1000 drones. Here expressions with
+    wildcards for whole chunks are looked up by placing the wildcards in the key, and only those with `**` or `$*` are
+    compared one by one.
 
     Args:
-        expressions: key expressions of each reader; a reader is known by its place.
+        expressions: key expressions of each reader; readers are identified by their index.
     """
 
     def __init__(self, expressions: Sequence[Sequence[str]]) -> None:
@@ -340,14 +339,14 @@ class RoutingTable:
 
 
 class GateRouter:
-    """Takes apart the messages of gates: of each only what somebody reads, decoded once for all its readers."""
+    """Splits the messages of gates: only messages that are read are decoded, once for all readers."""
 
     def __init__(self, routes: RoutingTable) -> None:
         self._routes = routes
         self._read = PerPattern(self._read_of)
 
     def _read_of(self, gate: GateMessages) -> list[tuple[tuple[int, ...], str, int]]:
-        """Return, of each message that is read, its readers, its key, and its place in the gate."""
+        """Return readers, key and index in the gate of each message that is read."""
         which, readers_of = gate.which.tolist(), self._routes.readers
         if not which or min(which) < 0 or max(which) >= len(gate.table):
             return []
@@ -355,9 +354,9 @@ class GateRouter:
         return [(readers, key, place) for place, key in enumerate(keys_of) if (readers := readers_of(key))]
 
     def split(self, gate: GateMessages) -> Iterator[tuple[tuple[int, ...], str, Any]]:
-        """Yield the readers, key and message of what is read, in order of publication.
+        """Yield readers, key and message of each message that is read, in order of publication.
 
-        A message that is not of its key's type is left out, and so is a gate whose columns lead outside of its table.
+        A message that is not of its key's type is omitted, and so is a gate whose columns point outside its table.
         """
         for readers, key, place in self._read.of(gate):
             try:
@@ -367,7 +366,7 @@ class GateRouter:
             yield readers, key, message
 
     def one_by_one(self, inputs: Sequence[Input]) -> Sequence[Input]:
-        """Return inputs with the messages of gates one by one, as far as they are read, in canonical order."""
+        """Return inputs with the messages of gates split, as far as they are read, in canonical order."""
         if not any(type(message) is GateMessages for _, message in inputs):
             return inputs
         single: list[Input] = []

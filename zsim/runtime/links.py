@@ -1,12 +1,12 @@
-"""What the links do to the messages of a gate, in their receiver: now, later, or never. Pure.
+"""The effect of links on the messages of a gate at the receiver: delivery, delay or loss. Pure.
 
     inbox ──all messages of a gate──▶ Links ──▶ agent
 
-Of messages between users' agents, the radio; of all, the faults that are injected into links.
+The radio acts on messages between users' agents, injected link faults on all messages.
 
-The barrier has seen the messages; only the agent does not, or sees them later. Whether a message is lost, and how
-late it comes, is drawn from the stream of its link by what the message is (key, t_ns, seq), so that neither the order
-of arrival nor a restart of the receiver changes a draw.
+The barrier counts the messages regardless; only the agent receives them late or never. Loss and delay of a message are
+drawn from the stream of its link by the identity of the message (key, t_ns, seq), so that neither the order of arrival
+nor a restart of the receiver changes a draw.
 """
 
 import math
@@ -35,7 +35,7 @@ Point = Sequence[float]
 def senders(key: str, message: Any, roles: Mapping[str, str] = {}) -> tuple[str, ...]:
     """Return the names of the processes that count as the sender of a message.
 
-    Agents may share a process, under one name: they are named after the thing of the key.
+    Agents may share a process under one name: they are named after the drone or cluster in the key.
 
     Args:
         roles: of users' agents, by the shape of the keys of their messages.
@@ -59,7 +59,7 @@ def senders(key: str, message: Any, roles: Mapping[str, str] = {}) -> tuple[str,
 
 
 def joins(fault: Fault, froms: Sequence[str], to: str) -> bool:
-    """Tell whether a fault concerns the link from one of some senders to a receiver."""
+    """Tell whether a fault concerns the link from one of the senders to a receiver."""
     first, _, second = fault.target.partition("/")
     if second == to and first in froms:
         return True
@@ -67,7 +67,7 @@ def joins(fault: Fault, froms: Sequence[str], to: str) -> bool:
 
 
 def drone_of(process: str, drones: Container[str]) -> str | None:
-    """Return the drone on whose board a process is: one of a role that has one for each drone, also of a user's."""
+    """Return the drone that carries a process, for roles (also of users) with one process per drone."""
     role, _, thing = process.partition(".")
     about = ROLES[role].about if role in ROLES else "drone"
     return thing if about == "drone" and thing in drones else None
@@ -76,9 +76,9 @@ def drone_of(process: str, drones: Container[str]) -> str | None:
 def place_of(
     process: str, places: Mapping[str, Any], drones: Container[str], where: Callable[[str], Point | None]
 ) -> Point | None:
-    """Return where a process is [m; W]: where `places` has it, on its drone, or at the origin.
+    """Return the position of a process [m; W]: from `places`, that of its drone, or the origin.
 
-    `where`: returns where a drone is in W [m], None where that is not known.
+    `where`: returns the position of a drone [m; W], None if unknown.
     """
     place = places.get(process, drone_of(process, drones) or fault_kinds.ORIGIN)
     return where(place) if isinstance(place, str) else place
@@ -93,9 +93,9 @@ def total_delay_ns(
     # returns that between sender and receiver for a radio, None where it is not known
     distance_m: Callable[[Fault], float | None] = lambda fault: None,
 ) -> int | None:
-    """Return how much later a message comes because of several faults [ns]; NEVER if one of them loses it.
+    """Return the total delay of a message by several faults [ns]; NEVER if one of them loses it.
 
-    A message comes over a radio with the probability 1 / (1 + exp((d - range) / spread)).
+    A radio delivers a message with the probability 1 / (1 + exp((d - range) / spread)).
     """
     total_ns = 0
     for fault in faults:
@@ -124,11 +124,11 @@ def distance_between(a: Point | None, b: Point | None) -> float | None:
 
 
 class Links:
-    """Holds back, of the messages of a gate for one receiver, what its links deliver later or never.
+    """Delays and drops the messages of a gate for one receiver, as its links do.
 
     Args:
-        names: of the receiver; an estimator of several drones has the name of each one's.
-        radio: over which users' agents exchange messages; None where all of them hear all.
+        names: names of the receiver; an estimator of several drones has one per drone.
+        radio: receiver of the radio between users' agents; None if all of them receive all messages.
     """
 
     def __init__(self, info: Info, names: Sequence[str], radio: Radio | None = None) -> None:
@@ -154,13 +154,13 @@ class Links:
         self._faults = [fault for fault in faults.faults if fault.kind in KINDS and concerned(fault)]
 
     def act_at(self, t_ns: int) -> bool:
-        """Tell whether the inputs of a gate may differ from those that have come."""
+        """Tell whether links may change the inputs of a gate."""
         return bool(self._radio or self._later) or any(fault_kinds.acts(fault, t_ns) for fault in self._faults)
 
     def delivered(self, t_ns: int, inputs: Sequence[Input]) -> list[Input]:
-        """Return what the receiver is handed at the gate t_ns, in canonical order.
+        """Return the messages delivered at the gate t_ns, in canonical order.
 
-        `inputs`: the messages that have come for that gate, one by one.
+        `inputs`: the single messages received for that gate.
         """
         acting = [fault for fault in self._faults if fault_kinds.acts(fault, t_ns)]
         if acting:
@@ -183,9 +183,9 @@ class Links:
         return sorted(handed, key=canonical)
 
     def _delay_ns(self, key: str, message: Any, acting: Sequence[Fault]) -> int | None:
-        """Return how much later a message comes [ns]; of several estimators, that of the drone of the key receives it.
+        """Return the delay of a message [ns]; of several estimators, that of the drone in the key receives it.
 
-        A radio carries what one of its drones sends to a process that is not on that drone.
+        A radio carries messages of its drones to processes that are not on the same drone.
         """
         over_radio_ns = self._radio.delay_ns(key, message) if self._radio and isinstance(message, AgentMessage) else 0
         if over_radio_ns is None:

@@ -1,4 +1,4 @@
-"""What a process says of itself in a run, on Zenoh or on an in-memory bus, which imports no Zenoh."""
+"""The join, done and bye messages of a process, for Zenoh and the in-memory bus."""
 
 import os
 from collections.abc import Callable
@@ -42,7 +42,7 @@ class Membership:
         )
 
     def done(self, t_ns: int, sent: int) -> Done:
-        """Return what says that a gate is done, and how many outputs were sent since the last."""
+        """Return the done of a gate, with the number of outputs sent since the last one."""
         return Done(t_ns, self.next_seq("done"), self.run_id, self.incarnation, t_ns, sent)
 
     def bye(self, t_ns: int, reason: str, failed: bool = False) -> Bye:

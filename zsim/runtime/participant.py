@@ -1,12 +1,12 @@
-"""A process's part in a run: join, done, health and bye; being superseded, and rejoining after a lost link.
+"""The participation of a process in a run: join, done, health, bye, supersession, and rejoining after a lost link.
 
     participant = Participant(link, info, "console.1")
     participant.announce()              join; the world admits it by an event on `world/event`
     participant.tick()                  health once a second, and a new join after a lost link
     participant.leave("closed")         bye
 
-Of several processes of one name the last that the world admits takes part. `AgentParticipant` is for a process that
-runs an agent: it also takes over the state of its predecessor and fetches what it has missed.
+Of several processes of one name the last one admitted by the world takes part. `AgentParticipant`, for a process that
+runs an agent, also takes over the state of its predecessor and fetches missed messages.
 """
 
 import os
@@ -96,7 +96,7 @@ class Participant:
     # What it publishes
 
     def announce(self) -> None:
-        """Join the run, and follow the events and the link that decide whether to join again."""
+        """Join the run, and follow the events and the link state that may require another join."""
 
         def follow_link(up: bool) -> None:
             self.must_rejoin = up and self._was_link_lost
@@ -113,7 +113,7 @@ class Participant:
         self.publish("join", self._membership.join(self.now_ns))
 
     def done(self, t_ns: int) -> None:
-        """Report, if the world waits for this process, that everything up to a gate is done."""
+        """Publish that everything up to a gate is done, if the world waits for this process."""
         if self.gates:
             self.done_ns = max(self.done_ns, t_ns)
             self.publish("done", self._membership.done(t_ns, 0))
@@ -125,7 +125,7 @@ class Participant:
             self.publish("bye", self._membership.bye(self.now_ns, reason, failed))
 
     def tick(self) -> None:
-        """Rejoin where that is needed, and publish health once a wall second; to be called more often."""
+        """Rejoin if necessary, and publish health once per wall second; must be called more often than that."""
         if self.must_rejoin:
             self.must_rejoin = False
             self.join(again=True)
@@ -141,10 +141,10 @@ class Participant:
     def publish(self, kind: str, message: Struct) -> None:
         self._link.put(keys.process(self.name, kind), message)
 
-    # What it is told
+    # Inputs
 
     def update_clock(self, payload: bytes) -> run_messages.Clock | None:
-        """Follow the run by a message on `clock`; return it, None where it cannot be decoded."""
+        """Follow the run by a message on `clock`; return it, None if it cannot be decoded."""
         try:
             clock: run_messages.Clock = messages.decode(keys.CLOCK, payload)
         except DecodeError:
@@ -163,7 +163,7 @@ class Participant:
             self.take_entry(entry)
 
     def entry_in(self, payload: bytes) -> ProcessEntry | None:
-        """Return the entry of a process of this name that an event reports, None if it reports none."""
+        """Return the admission of a process of this name reported by an event, None if there is none."""
         try:
             event = messages.read_event(payload)
         except DecodeError:
@@ -173,9 +173,9 @@ class Participant:
         return event.data
 
     def take_entry(self, entry: ProcessEntry) -> None:
-        """Take the news that the world has admitted a process of this name: this one, or one that replaces it.
+        """Handle the admission of a process of this name: this one, or one that replaces it.
 
-        What replaces an incarnation that is not admitted yet was admitted before it, and is itself replaced.
+        While this incarnation is not admitted, another admitted one came before it and will be replaced by it.
         """
         if self.is_own(entry):
             self.admitted = True
@@ -194,7 +194,7 @@ class Participant:
 class AgentParticipant(Participant):
     """The process of an agent in one run.
 
-    Whatever the world does not answer is asked for again, until it does (`settle`).
+    Unanswered requests to the world are repeated (`settle`).
     """
 
     def __init__(
@@ -231,9 +231,9 @@ class AgentParticipant(Participant):
     # Taking over from a predecessor
 
     def resume(self) -> int | None:
-        """Hand the agent the newest snapshot of its predecessor; return its time, None if none can be used.
+        """Restore the agent from the newest snapshot of its predecessor; return its time, None if unusable.
 
-        The world's history must reach back to it: what came since is fetched and stepped through again.
+        The world's history must reach back to it: the messages since are fetched and stepped through again.
         """
         for sample in self._last_values(keys.process(self.name, "snapshot")):
             fresh = self._agent.checkpoint()
@@ -245,7 +245,7 @@ class AgentParticipant(Participant):
                     found = f"it is of version {snapshot.version}, and {age_ns / 1e9:.2f} s old"
                     raise DecodeError(f"{found}; must be of version {VERSION}, and 0 to {RESUME_NS / 1e9:g} s old")
                 self._agent.resume(self._info, unpack(snapshot.state))
-            except Exception as error:  # anybody may have written it, and a user's class reads it
+            except Exception as error:  # it may come from any program, and a user's class reads it
                 self._say(f"{self.name}: its former snapshot is of no use: {error or type(error).__name__}")
                 if fresh is not None:
                     self._agent.resume(self._info, fresh)  # not half of the former state
@@ -257,7 +257,7 @@ class AgentParticipant(Participant):
         return None
 
     def warm_start(self) -> int | None:
-        """Hand the agent what its predecessor published last; return the time of it, None if there was none."""
+        """Pass the agent the last values of its predecessor; return their time, None without any."""
         for key in self._agent.warm_start_keys():
             for sample in self._last_values(key):
                 try:
@@ -274,9 +274,9 @@ class AgentParticipant(Participant):
         return self.done_ns
 
     def _last_values(self, key: str) -> list[ReceivedSample]:
-        """Return what the world has as the last value of a key, once there is a world that answers.
+        """Return the world's last values of a key, waiting for a world that answers.
 
-        A world that has died is started again, and an agent that did not wait for it would lose its former state.
+        A dead world is restarted, and an agent that did not wait for it would lose its former state.
         """
         while not self._stopped():
             found = self._link.get_surely(key)
@@ -290,17 +290,17 @@ class AgentParticipant(Participant):
         return []
 
     def check_reach(self, t_ns: int, snapshot_ns: int) -> None:
-        """Fail if the first gate that the world brings again is not the one after a snapshot."""
+        """Raise if the first gate replayed by the world is not the one after a snapshot."""
         if t_ns > snapshot_ns + self._info.gate_ns:
             self._fail_behind(f"the gates after its snapshot of t = {snapshot_ns / 1e9:.2f} s are")
 
     def _fail_behind(self, what: str) -> None:
-        self.failure = BehindError(f"{self.name}: {what} kept by nobody any more; this one ends, start it again")
+        self.failure = BehindError(f"{self.name}: {what} no longer kept; this one ends, start it again")
 
     # Taking part
 
     def enter(self) -> None:
-        """Join; the join is repeated, and no gate is stepped, until the world has admitted this process."""
+        """Join; repeat the join and step no gate until the world has admitted this process."""
         self.awaited = True
         self.join()
         self._retry_s = self._wall_s() + RETRY_S
@@ -316,9 +316,9 @@ class AgentParticipant(Participant):
         self._unsent.append((self._done_key, messages.encode(done)))
 
     def publish_snapshot(self, t_ns: int) -> None:
-        """Encode the whole state of the agent after a gate, for `send`, if it offers one.
+        """Encode the state of the agent after a gate, for `send`, if it offers one.
 
-        UserCodeError: a user's class returned one that is not of plain values.
+        UserCodeError: a user's class returned a state that is not of plain values.
         """
         state = self._agent.checkpoint()
         if state is None:
@@ -327,17 +327,17 @@ class AgentParticipant(Participant):
         self._unsent.append((keys.process(self.name, "snapshot"), messages.encode(snapshot)))
 
     def send(self) -> None:
-        """Publish everything encoded since the last call in one go: many messages at once cost fewer wake-ups."""
+        """Publish everything encoded since the last call at once, which wakes readers less often."""
         if self._unsent:
             unsent, self._unsent = self._unsent, []
             self._link.put_all(unsent)
 
     def outputs(self) -> list[list[object]]:
-        """Return [key, payload] of the outputs of the last gates, for a world that lost them with a link."""
+        """Return [key, payload] of the outputs of the last gates, for a world that lost them."""
         return [[key, messages.encode(message)] for _, outputs in self._kept for key, message in outputs]
 
     def take_entry(self, entry: ProcessEntry) -> None:
-        """Take the news of an admission; once it is this process's, fetch what came since the state taken over."""
+        """Handle an admission; if it is this process's, fetch the messages since the restored state."""
         is_rejoining = self.must_rejoin
         super().take_entry(entry)
         if self.is_own(entry):
@@ -364,16 +364,16 @@ class AgentParticipant(Participant):
 
     @property
     def owes(self) -> bool:
-        """Tell whether something was asked of the world that it has not answered yet."""
+        """Tell whether a request to the world is unanswered."""
         return self.must_rejoin or self._unproved > 0 or self.is_fetching
 
     @property
     def is_fetching(self) -> bool:
-        """Tell whether what came since a snapshot is still to be fetched."""
+        """Tell whether messages since a snapshot remain to be fetched."""
         return self.awaited or self._missed_since_ns is not None
 
     def ask_again(self, t_ns: int, missing: str) -> None:
-        """Fetch the rest of a gate of which messages did not come, as after a link that was cut."""
+        """Fetch the missing messages of a gate, for example after a cut link."""
         if t_ns != self._asked_ns:
             self._asked_ns, self._asked, self._retry_s = t_ns, 0, 0.0
             self._say(f"{self.name}: {missing} of t = {t_ns / 1e9:.2f} s did not come; asking for it again")
@@ -384,7 +384,7 @@ class AgentParticipant(Participant):
         self.settle()
 
     def come_back(self) -> None:
-        """Take part again as a new incarnation, now that the link is back."""
+        """Rejoin as a new incarnation after the link is restored."""
         self._renew_incarnation()
         self.must_rejoin = True
         self._retry_s = 0.0
@@ -396,7 +396,7 @@ class AgentParticipant(Participant):
         self.settle()
 
     def settle(self) -> None:
-        """Ask again for what the world has not answered, unless it was asked a moment ago."""
+        """Repeat unanswered requests to the world, unless made a moment ago."""
         if not self.owes or self._wall_s() < self._retry_s:
             return
         if self.must_rejoin:

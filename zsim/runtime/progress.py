@@ -1,6 +1,6 @@
-"""Progress of a run on a terminal: one live line, and a line for each event.
+"""Progress of a run on a terminal: a live line, and a line for each event.
 
-A world that a launcher started writes it as JSON lines (`JsonProgress`); otherwise it is shown on a `Screen`.
+A world started by a launcher writes JSON lines (`JsonProgress`); otherwise a `Screen` shows the progress.
 """
 
 import json
@@ -29,12 +29,12 @@ QUIET = frozenset({"join", "leave", "command", "control", "mode", "commander", "
 
 
 def cell(text: str) -> Text:
-    """Return a text for rich: its brackets are not markup, and control codes are written out."""
+    """Return a text escaped for rich: brackets are not markup, and control codes are visible."""
     return Text(printable(text))
 
 
 class NotebookLine:
-    """A line below a notebook's cell that changes in its place; rich needs ipywidgets for that."""
+    """A line below a notebook's cell that is updated in place, for which rich needs ipywidgets."""
 
     def __init__(self) -> None:
         self._handle: Any = None
@@ -59,7 +59,7 @@ class ProgressSink(Protocol):
 
 
 class SlowStart:
-    """Shows a line, from a thread of its own, when a start takes long: nearly always something is being compiled."""
+    """Shows a line, from a separate thread, when a start takes long: usually code is being compiled."""
 
     def __init__(self, say: Callable[[str], None], text: str = SLOW_NOTICE) -> None:
         self._timer = threading.Timer(SLOW_S, say, args=(text,))
@@ -78,7 +78,7 @@ class HoldReasons:
         self._shown: set[tuple[str, str]] = set()
 
     def line(self, cluster: str, state: ClusterState) -> str | None:
-        """Return a line with the reason of a state if it has been the same, but for its numbers, for REASON_NS."""
+        """Return a line with the reason of a state if that has been the same, numbers apart, for REASON_NS."""
         shape = without_figures(state.reason)
         former, since_ns = self._since.get(cluster, ("", 0))
         if shape != former:
@@ -91,7 +91,7 @@ class HoldReasons:
 
 
 class RepeatedEvents:
-    """Events that repeat: the first is shown at once, equal ones follow as one line with their count."""
+    """Repeated events: the first is shown immediately, equal ones follow as one line with their count."""
 
     def __init__(self) -> None:
         # by kind and text: simulated times [s] of the first and the last, and their number
@@ -104,7 +104,7 @@ class RepeatedEvents:
         return lines if first else [*lines, f"  {t_s:8.2f} s  {kind}: {text}"]
 
     def over(self, t_s: float) -> list[str]:
-        """Return the lines of those that have been counted for REPEATED_S."""
+        """Return the lines of events that have been counted for REPEATED_S."""
         ended = [key for key, (first_s, _, _) in self._counted.items() if t_s - first_s >= REPEATED_S]
         counted = [(*key, *self._counted.pop(key)) for key in ended]
         return [
@@ -115,11 +115,11 @@ class RepeatedEvents:
 
 
 class JsonProgress:
-    """Writes progress as JSON lines for a launcher, or for whoever has started that."""
+    """Writes progress as JSON lines for a launcher or its parent process."""
 
     @staticmethod
     def read(text: str) -> tuple[str, Any]:
-        """Return kind and content of a line, as its methods have written it; no kind where a library has printed it."""
+        """Return kind and content of a line written by the methods; no kind if a library printed it."""
         try:
             line = json.loads(text)
         except ValueError:
@@ -141,7 +141,7 @@ class JsonProgress:
         self._write("say", text)
 
     def hang_up(self) -> None:
-        """Do nothing: whoever reads the lines tells of what has become of its terminal."""
+        """Do nothing: the reader of the lines handles the loss of its terminal."""
 
     def _write(self, kind: str, content: Any) -> None:
         try:
@@ -152,19 +152,19 @@ class JsonProgress:
 
 
 class PipedConsole(Console):
-    """A console whose reader may go away: what nobody reads is dropped, and nothing fails because of it."""
+    """A console whose reader may disappear: unread output is dropped without an error."""
 
     def on_broken_pipe(self) -> None:
         self.quiet = True
 
 
 class Screen:
-    """Shows progress live on a terminal; elsewhere, as a line every ten simulated seconds and events.
+    """Shows progress live on a terminal; elsewhere, events and a line every ten simulated seconds.
 
     Args:
         duration_s: simulated time of the end.
-        console: where it is shown; None for stderr.
-        from_s: simulated time of the beginning, which a replay may have within the record.
+        console: console to write to; None for stderr.
+        from_s: simulated time of the beginning, which for a replay may be within the record.
     """
 
     def __init__(self, duration_s: float, console: Console | None = None, from_s: float = 0.0) -> None:
@@ -194,7 +194,7 @@ class Screen:
         self.console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
 
     def hang_up(self) -> None:
-        """Show only lines from now on, as the terminal is gone; draws nothing, so a signal handler may call it."""
+        """Show only lines from now on, since the terminal is gone; draws nothing, so a signal handler may call it."""
         self._is_live = False
         self.console.quiet = True
 
@@ -218,7 +218,7 @@ class Screen:
                 self.say(text)
 
     def health(self, line: dict[str, Any]) -> None:
-        """The one live line has no room for it; `zsim up` has a table."""
+        """Show nothing: the live line has no room for health; `zsim up` has a table."""
 
 
 def describe(line: dict[str, Any], duration_s: float, from_s: float = 0.0) -> str:

@@ -1,20 +1,20 @@
-"""One rate limiter for everything that repeats: requests, refusals, joins, lines on a terminal.
+"""The rate limiter for requests, refusals, joins and lines on a terminal.
 
-Its clock is a parameter: simulated time where a rerun or a resumed world must allow the same, wall time elsewhere.
+Its clock is a parameter: simulated time if a rerun or resumed world must behave the same, else wall time.
 """
 
 import time
 from collections.abc import Callable
 
-SUBJECTS_MAX = 10_000  # remembered; whoever makes up names has no more than these cost
+SUBJECTS_MAX = 10_000  # remembered; limits the memory for invented names
 
 
 class RateLimit:
-    """Allows each subject `burst` at once, and then one more each `period`: a token bucket.
+    """A token bucket per subject: `burst` at once, then one per `period`.
 
     Args:
-        period: in which one more is allowed, in the clock's unit.
-        burst: allowed at once.
+        period: interval at which one more is allowed, in the clock's unit.
+        burst: number allowed at once.
         now: the clock; by default monotonic wall time [s].
     """
 
@@ -31,7 +31,7 @@ class RateLimit:
         return self._counted(subject) <= self._burst - 1
 
     def spend(self, subject: str = "") -> bool:
-        """Spend one; return False where none was left."""
+        """Spend one; return False if none was left."""
         now = self._now()  # not by `_counted`: some call this at each gate
         spent, at = self._spent.get(subject, (0.0, 0))
         counted = max(0.0, spent - (now - at) / self.period)
@@ -43,7 +43,7 @@ class RateLimit:
         return True
 
     def wait(self, subject: str = "") -> float:
-        """Return how long a subject has to wait until it may spend one more; 0 if it may now."""
+        """Return the time until a subject may spend one more; 0 if it may now."""
         return max(0.0, self._counted(subject) - (self._burst - 1)) * self.period
 
     def _counted(self, subject: str) -> float:

@@ -1,7 +1,7 @@
 """Runs an agent as a process on Zenoh: joins the run, feeds the agent gate by gate, publishes done, leaves.
 
-Lockstep and realtime are one loop: in lockstep an incomplete gate is waited for, in realtime it is given up when
-the next one is there.
+Lockstep and realtime share one loop: lockstep waits for an incomplete gate, realtime gives it up when the next one
+arrives.
 """
 
 import contextlib
@@ -73,13 +73,13 @@ class Runner:
         self.killed = False  # whether a fault has ended it, without a bye; its process is to die as well
 
     def run(self) -> str:
-        """Take part until the run ends; return why it left.
+        """Take part until the run ends; return the reason for leaving.
 
         Raises:
             SupersededError: another process of the same name has taken over.
             RunError: the world has begun another run.
-            BehindError: it lacks what the world does not keep any more.
-            UserCodeError: a user's class raised, or returned what cannot be used; the world has been told.
+            BehindError: it needs messages that the world no longer keeps.
+            UserCodeError: a user's class raised, or returned an invalid value; the world has been informed.
         """
         self._agent.rehearse()
         self._inputs.subscribe()
@@ -113,7 +113,7 @@ class Runner:
         return self._leave
 
     def _turn(self) -> None:
-        """Take in what has arrived, step through every gate that is complete, and wait if there was none."""
+        """Take in messages, step through every complete gate, and wait if there was none."""
         self._serve_rare()
         self._inputs.take_in_all()
         stepped = False
@@ -134,13 +134,13 @@ class Runner:
                 self._leave = self._leave or "session closed"
 
     def _ready_gate(self) -> int | None:
-        """Return the gate to step now, None if it must be waited for."""
+        """Return the gate to step now, None if the agent must wait."""
         inbox, member = self._inbox, self._member
         t_ns = inbox.next_gate_ns()
         self._lacks = False
         if t_ns is None or member.awaited:
             return None
-        if self._resumed_ns is not None:  # the gate that follows the snapshot is to be there: the world brings it again
+        if self._resumed_ns is not None:  # the gate after the snapshot must be there: the world replays it
             if member.is_fetching:
                 return None
             if not inbox.may_skip:
@@ -193,10 +193,10 @@ class Runner:
         self.health.lag_ns = newest_ns - t_ns if newest_ns is not None else 0
 
     def _update_kills(self, faults: run_messages.Faults) -> None:
-        """Take the faults that kill this process from a list.
+        """Update the faults that kill this process from a published list.
 
-        A list may have forgotten a kill that a late process has still to die of; one that has not begun when a list
-        is published, and is not on it, has been cleared.
+        A kill that has begun remains although newer lists omit it, since a late process has yet to reach it; a kill
+        that has not begun and is not on the list was cleared.
         """
         if faults.seq > self._list_seq:
             self._list_seq = faults.seq
@@ -206,7 +206,7 @@ class Runner:
             listed = {f.id: f for f in faults.faults if f.kind == PROCESS_KILL and f.target in names}
             self._kills = begun | listed
 
-    # What arrives rarely
+    # Rare inputs
 
     def _tick(self) -> None:
         while not self._over.wait(TICK_S):
@@ -256,7 +256,7 @@ class Runner:
 
 
 class RunnerInputs:
-    """The subscriptions of one agent, sorted into its inbox, and what other threads of Zenoh bring."""
+    """The subscriptions of one agent, sorted into its inbox, and inputs from Zenoh's threads."""
 
     def __init__(
         self, link: Session, info: messages.Info, agent: Agent, health: HealthMeter, say: Callable[[str], None]
@@ -290,7 +290,7 @@ class RunnerInputs:
         self._repeated: dict[int, dict[tuple[str, int], Any]] = {}  # by gate, then by key and number
 
     def subscribe(self) -> None:
-        """Subscribe to all that the agent reads, answer its requests, and show that the process lives."""
+        """Subscribe to the agent's keys, declare its request keys and its liveliness token."""
         closing = [self._agent.reads[place] for place in self._expressions.readers_of_any(self._agent.gate_keys)]
         for expression in dict.fromkeys([*closing, *self._agent.reads]):
             of_world = keys.is_sensor(expression) and keys.thing(expression) not in self._external
@@ -307,7 +307,7 @@ class RunnerInputs:
         self._link.declare_process(self._agent.name)
 
     def wait(self) -> None:
-        """Wait for what completes the next gate, or until woken; SessionError if the session was closed meanwhile."""
+        """Wait for a message that may complete the next gate, or until woken; SessionError if the session is closed."""
         wanted = self.inbox.last_missing() or self._agent.gate_keys[-1]
         expression = self._agent.reads[self._expressions.readers(wanted)[0]]
         self._blocking = self._subscriptions[expression if expression in self._subscriptions else self._gate_key]
@@ -321,7 +321,7 @@ class RunnerInputs:
             subscription.wake()
 
     def take_in_all(self) -> None:
-        """Take in what has arrived: first what closes a gate, so that what came before it is found too."""
+        """Take in messages, gate-closing ones first, so that messages received before them are found too."""
         for subscription in self._subscriptions.values():
             for sample in subscription.drain():
                 self._open(sample)
@@ -364,7 +364,7 @@ class RunnerInputs:
             self._say(str(error))
 
     def fault_lists_before(self, t_ns: int) -> list[run_messages.Faults]:
-        """Return the lists of faults that were published before a gate, and forget them; an older one is of no use."""
+        """Remove and return the lists of faults published before a gate."""
         if not self._fault_lists:
             return []
         lists = [self._fault_lists.popleft() for _ in range(len(self._fault_lists))]
@@ -372,13 +372,13 @@ class RunnerInputs:
         return sorted((faults for faults in lists if faults.t_ns < t_ns), key=lambda faults: faults.seq)
 
     def repeated(self, t_ns: int) -> Iterator[tuple[str, Any]]:
-        """Yield, and forget, the requests that the predecessor took before a gate."""
+        """Remove and yield the requests that the predecessor took before a gate."""
         if self._repeated:
             for (key, _), request in sorted(self._repeated.pop(t_ns, {}).items(), key=itemgetter(0)):
                 yield key, request
 
     def ignore_estimates(self, process: str) -> None:
-        """Wait no longer for the estimates of a process: those that it published last, or has the name for."""
+        """Stop waiting for the estimates of a process: those that it published last, or those of its name."""
         for key, stock in self._stock.items():
             if process == (self._estimated_by.get(key) or stock):
                 self.inbox.expect(key, NEVER_NS)
@@ -401,7 +401,7 @@ class RunnerInputs:
             self._on_rare(read)
 
     def _on_clock(self, sample: RawSample) -> None:
-        """In realtime, end a wait for a gate that the world has left behind: what it lacks may never come."""
+        """In realtime, stop waiting for a gate that the world has passed: its missing messages may never arrive."""
         blocking = self._blocking
         if blocking is None:
             return

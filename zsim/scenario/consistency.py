@@ -1,6 +1,6 @@
-"""Checks between the fields of a scenario: names that must agree, distances, times that must divide, units.
+"""Checks between fields of a scenario: consistent names, distances, divisible times, units.
 
-They work on the sound parts of a document (`checker.sound`): a check whose fields are missing or faulty is left out.
+They use the sound parts of a document (`checker.sound`): checks of missing or faulty fields are skipped.
 """
 
 import math
@@ -66,7 +66,7 @@ def cross_faults(
     vehicles: Mapping[str, Vehicle],  # by model; what depends on a vehicle that is not among them is left out
     unread: Collection[str] = (),  # names of sensors that it lacks, since their modules could not be read
 ) -> Iterator[Fault]:
-    """Yield every fault between fields of a scenario, or of the parts of one that `checker.sound` gives."""
+    """Yield every fault between fields of a scenario, or of its parts returned by `checker.sound`."""
     drones, clusters = _entries(scenario.drones), _entries(scenario.clusters)
     yield from _name_faults("drones", drones)
     yield from _name_faults("clusters", clusters)
@@ -101,9 +101,9 @@ def cross_faults(
 
 
 def unflown_plans(scenario: Scenario) -> list[str]:
-    """Return a line for each cluster of a resolved scenario whose plan begins, or goes on, after the end of the run.
+    """Return a line for each cluster of a resolved scenario whose plan begins or continues after the end of the run.
 
-    No fault: a run may be cut short, and somebody else may fly the drones.
+    This is not a fault: a run may be shortened, and another program may fly the drones.
     """
     lines = []
     for index, cluster in enumerate(scenario.clusters):
@@ -164,7 +164,7 @@ def _time_faults(time: Any) -> Iterator[Fault]:
 
 
 def _clearance_m(drone: Any, vehicles: Mapping[str, Vehicle]) -> float:
-    """Return the free space that a drone needs about its centre at the start; 0 for one of an unknown vehicle."""
+    """Return the free space that a drone needs around its centre at the start [m]; 0 for an unknown vehicle."""
     vehicle = vehicles.get(drone.model) if drone.model else None
     return vehicle.airframe.clearance_m if vehicle else 0.0
 
@@ -192,7 +192,7 @@ _SIZES = {"box": ("size_m",), "cylinder": ("radius_m", "height_m"), "sphere": ("
 
 
 def _obstacle_faults(obstacles: _Entries, drones: _Entries, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
-    """Yield what is wrong with obstacles: names, sizes, and drones that start in one or too near, not on top of it."""
+    """Yield the faults of obstacles: names, sizes, and drones that start inside or too close, other than on top."""
     yield from _name_faults("environment.obstacles", obstacles)
     names = _names(drones)
     placed = [(index, drone) for index, drone in drones if drone.position_m is not None]
@@ -228,7 +228,7 @@ def _obstacle_faults(obstacles: _Entries, drones: _Entries, vehicles: Mapping[st
 def _surface_faults(
     surfaces: _Entries, obstacles: Collection[str], drones: _Entries, vehicles: Mapping[str, Vehicle]
 ) -> Iterator[Fault]:
-    """Yield what is wrong with surfaces: names, and drones that start too near to one, not on top of it."""
+    """Yield the faults of surfaces: names, and drones that start too close, other than on top."""
     yield from _name_faults("environment.surfaces", surfaces)
     names = _names(drones)
     for index, surface in surfaces:
@@ -292,9 +292,9 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
 
 
 def _drag_faults(drone: Any, rotors: int) -> Iterator[Fault]:
-    """Yield the drag coefficients in a wrong unit: slow air alone would push as hard as the weight.
+    """Yield drag coefficients in a wrong unit, by which slow air would push as hard as the weight.
 
-    One that is too small is not to be told from one that is left out.
+    One that is too small cannot be distinguished from an omitted one.
     """
     weight, v = drone.mass_kg * G_M_S2, AIR_M_S
     of_rotors = rotors * math.sqrt(weight / (rotors * drone.thrust_n_s2))  # rad/s, the speeds of all in a hover
@@ -320,7 +320,7 @@ def _drag_faults(drone: Any, rotors: int) -> Iterator[Fault]:
 
 
 def _hover_faults(drone: Any, vehicle: Vehicle, environment: Any) -> Iterator[Fault]:
-    """Yield what a hover shows of mass, rotors and battery: numbers in a wrong unit are far from all that flies."""
+    """Yield implausible values of mass, rotors and battery in a hover, which indicate a wrong unit."""
     count, shares = len(vehicle.rotors), lift_shares(vehicle)
     thrust, torque = drone.thrust_n_s2, drone.torque_nm_s2
     low, high = drone.rotor_min_rad_s, drone.rotor_max_rad_s
@@ -438,7 +438,7 @@ def _shape_faults(cluster: Any, drones: _Entries) -> Iterator[Fault]:
 
 
 def _template_faults(spec: Any, starts: list[Any], robots: int) -> Iterator[Fault]:
-    """Yield the faults of a formation of so many robots, and of their places at the start."""
+    """Yield the faults of a formation's template for a number of robots at given start positions."""
     template = spec.template_m
     if template is None or robots < 2:
         return
@@ -460,7 +460,7 @@ def _template_faults(spec: Any, starts: list[Any], robots: int) -> Iterator[Faul
 
 
 def _in_line(places: list[Any]) -> bool:
-    """Return whether places (n, 3) are within a line, in the root mean square."""
+    """Return whether places (n, 3) are collinear, by the root mean square deviation."""
     p = np.array(places, dtype=float)
     widths = singular_values(p - p.mean(axis=0)) / np.sqrt(len(p))
     return el.length(widths[1:].tolist()) < TEMPLATE_WIDTH_MIN_M
@@ -483,7 +483,7 @@ def _plan_faults(cluster: Any) -> Iterator[Fault]:
 
 
 def _reference_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
-    """Yield what cannot go together of drones' references and exchanges, and of who else flies them."""
+    """Yield conflicts between drones' references, exchanges and clusters."""
     flown_by = {name: f"cluster {c.name!r}" for _, c in clusters for _, name in _entries(c.drones)}
     for index, drone in drones:
         if not drone.reference:
@@ -520,7 +520,7 @@ def _reference_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> It
 
 
 def _path_faults(reference: Any) -> Iterator[Fault]:
-    """Yield what is wrong between the fields of one drone's reference."""
+    """Yield the faults between the fields of one drone's reference."""
     given = [name for name in PATHS if getattr(reference, name)]
     if len(given) > 1:
         yield given[1], f"is given beside {given[0]}; must be one of {', '.join(PATHS)}"
@@ -549,7 +549,7 @@ def _landing_faults(piloted: Any, from_s: float | None) -> Iterator[Fault]:
 
 
 def _piloted(scenario: Any, drones: _Entries) -> _Entries:
-    """Return the drones that fly by a reference of their own, or change places."""
+    """Return the drones with a reference, or in an exchange."""
     exchanges = _entries(scenario.exchanges if isinstance(scenario.exchanges, list) else [])
     exchanged = {name for _, exchange in exchanges for _, name in _entries(exchange.drones)}
     return [(index, drone) for index, drone in drones if drone.reference or drone.name in exchanged]
@@ -585,7 +585,7 @@ def _program_faults(programs: Mapping[str, Any], roles: Sequence[str]) -> Iterat
 
 
 def _graph_faults(topology: Any, drones: list[str]) -> Iterator[Fault]:
-    """Yield what a graph of drones names that is none of them."""
+    """Yield the names in a graph of drones that are not drones."""
     graph = getattr(topology, "graph", None)
     for hearer, heard in graph.items() if isinstance(graph, dict) else ():
         where = f"topology.graph.{hearer}"
@@ -623,7 +623,7 @@ def _injected_faults(
 
 
 def _sighting_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
-    """Yield what cannot go together of cameras, sightings, hats, and estimators that use them."""
+    """Yield conflicts between cameras, sightings, hats and the estimators that use them."""
     for index, drone in drones:
         if drone.sensors is not None:
             yield from _under(f"drones[{index}].sensors", _camera_faults(drone.sensors))
@@ -676,7 +676,7 @@ def _camera_faults(sensors: Any) -> Iterator[Fault]:
 
 
 def _scanner_faults(sensors: Any) -> Iterator[Fault]:
-    """Yield what cannot go together of the settings of a drone's beams, lidar and depth images."""
+    """Yield conflicts between the settings of a drone's beams, lidar and depth images."""
     for name in SCANNERS:
         own = getattr(sensors, name)
         if not own:

@@ -1,4 +1,4 @@
-"""The faults that can be injected into a run: their kinds, how a description of one is checked, and how it is typed.
+"""The faults that can be injected into a run: their kinds, the checks of a description, and the typed form.
 
 A fault is given as a map: `kind`, `target`, `at_s`, `for_s`, and the parameters of its kind; scenarios, requests and
 commands are checked by the same tables. In a terminal and in the console it is typed:
@@ -35,7 +35,7 @@ COMMON = ("kind", "target", "at_s", "for_s")  # what every fault may have; the r
 
 
 class FaultParameter(NamedTuple):
-    """One number, vector, word or map of a kind."""
+    """A parameter of a kind of fault: a number, vector, word or map."""
 
     name: str
     shape: Shape
@@ -84,7 +84,7 @@ _RADIO = (
 
 
 class SensorPart(NamedTuple):
-    """Numbers of a sensor that a fault strikes together."""
+    """Values of a sensor that a fault affects together."""
 
     sensor: str  # its name
     label: str  # what the part is called
@@ -190,7 +190,7 @@ def expected(p: FaultParameter) -> str:
 
 
 def unstated(kind: FaultKind, parameters: Mapping[str, Any]) -> list[FaultParameter]:
-    """Return the magnitudes of a kind that a fault does not state, including those with a default."""
+    """Return the magnitudes of a kind that a fault omits, including those with a default."""
     return [
         p
         for p in kind.parameters
@@ -208,10 +208,10 @@ def planned(
     gate_ns: int,
     kinds: Mapping[str, FaultKind] = KINDS,
 ) -> Fault:
-    """Return the fault that a sound description asks for, in whole gates and with every parameter.
+    """Return the fault given by a sound description, in whole gates and with every parameter.
 
-    It acts in the gates after `from_ns` up to `until_ns`: on what happens between these instants, and on messages that
-    belong to those gates.
+    It acts in the gates after `from_ns` up to `until_ns`: on the motion between these instants, and on the messages of
+    those gates.
     """
     kind, at_s, for_s = kinds[description["kind"]], description.get("at_s"), description.get("for_s")
     from_ns = now_ns if at_s is None else round(at_s * 1e9 / gate_ns) * gate_ns
@@ -223,7 +223,7 @@ def planned(
 
 
 def _plain(value: Any, p: FaultParameter) -> Any:
-    """Return a value as it is on the wire: numbers as floats, so that equal faults have equal texts."""
+    """Return a value as on the wire: numbers as floats, so that equal faults have equal texts."""
     if value is None:
         return p.default
     if p.shape == "number":
@@ -240,7 +240,7 @@ def acts(fault: Fault, gate_ns: int) -> bool:
     return fault.from_ns < gate_ns and (fault.until_ns is None or gate_ns <= fault.until_ns)
 
 
-# What is wrong with a description
+# Checks of a description
 
 
 class Known(NamedTuple):
@@ -269,7 +269,7 @@ class Known(NamedTuple):
 
 
 def flaws(fault: Any, known: Known) -> Iterator[Flaw]:
-    """Yield path and text of every flaw of a fault as it stands in a scenario or request; nothing where it is sound."""
+    """Yield path and text of every flaw of a fault in a scenario or request."""
     if not isinstance(fault, Mapping):
         yield "", f"is {show(fault)}; must be a map with kind and target"
         return
@@ -342,7 +342,7 @@ def _link_flaws(actual: str, target: Any, one_way: bool, known: Known) -> Iterat
 
 
 def _allowed_instead(name: str, known: Known) -> str | None:
-    """Return what a process's name must be, None for an acceptable one: most names may be of a user's process."""
+    """Return what a process's name must be, None if it is acceptable: a user's process may have most names."""
     if not keys.PROCESS_NAME.fullmatch(name):
         return "1 to 48 of a-z 0-9 _ . -"
     if name in known.processes:
@@ -400,7 +400,7 @@ def _is_vector(value: Any, least: float, most: float) -> bool:
 
 
 def _within(value: Any, least: float, most: float, above: bool = False) -> bool:
-    """Tell whether a value is a number between limits; a comparison takes integers of any size, and no NaN."""
+    """Tell whether a value is a number between limits; integers may be of any size, NaN is not within."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
     return number and least <= value <= most and not (above and value == least)
 
@@ -413,7 +413,7 @@ _OPTIONS = {"--for": "for_s", "--at": "at_s"}
 
 
 def typed_duration_s(text: str) -> float:
-    """Return the duration in a text such as 10s, 500ms or 2min; ValueError if it is none."""
+    """Return the duration in a text such as 10s, 500ms or 2min; ValueError if it is not a duration."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(ms|s|min|)", text.strip())
     if not match:
         raise ValueError(f"is {text[:40]!r}; must be a duration such as 10s, 500ms or 2min")
@@ -421,7 +421,7 @@ def typed_duration_s(text: str) -> float:
 
 
 def typed_parameters(words: Sequence[str]) -> dict[str, Any]:
-    """Return the parameters in words NAME=VALUE; values are YAML.
+    """Return the parameters given by words NAME=VALUE; values are YAML.
 
     ValueError if one is no such word, is given twice, or is given by an argument or option instead.
     """
@@ -481,5 +481,5 @@ def _words(text: str) -> list[str]:
 
 
 def allowed_kinds(found: Any, known: Collection[str]) -> str:
-    """Return what is allowed in place of an unknown kind of fault; there are some fifty."""
+    """Return the text on allowed kinds for an unknown kind of fault."""
     return f"{suggestion(found, known)}must be one of the {len(known)} that `zsim fault kinds SCENARIO` lists"

@@ -1,8 +1,8 @@
-"""Obstacles that a seed places, a forest of trunks and the walls of a winding corridor; and what files have.
+"""Obstacles generated from a seed (forest, corridor) or read from files (point clouds, surfaces).
 
-They become entries of `environment.obstacles` where a scenario is resolved, so that the record, and all who read it,
-have each of them; a surface has its triangles then in place of its file. The same seed gives the same obstacles,
-rounded to a millimetre, on every machine.
+They become entries of `environment.obstacles` when a scenario is resolved, so that the record contains each of them;
+surfaces get their triangles in place of the file. The same seed gives the same obstacles, rounded to a millimetre, on
+every machine.
 """
 
 import math
@@ -64,7 +64,7 @@ def with_generated(document: dict[str, Any]) -> tuple[dict[str, Any], list[Fault
 def _forest(
     own: Forest, rng: np.random.Generator, starts: Sequence[Position], where: str
 ) -> tuple[list[Entry], Fault | None]:
-    """Return trunks at random places, one after the other, each clear of those before and of where drones start."""
+    """Return trunks at random places, each clear of the previous ones and of the drones' start positions."""
     for name in ("radius_m", "height_m"):
         low, high = getattr(own, name)
         if low > high:
@@ -99,7 +99,7 @@ def _forest(
 def _corridor(
     own: Corridor, rng: np.random.Generator, starts: Sequence[Position], where: str
 ) -> tuple[list[Entry], Fault | None]:
-    """Return the walls on both sides of a line that turns by a random angle after each segment, joined at its bends."""
+    """Return the walls on both sides of a line with a random turn after each segment, joined at the bends."""
     turns = [0.0, *np.radians(rng.uniform(-own.turn_deg, own.turn_deg, own.segments - 1)).tolist()]
     headings = (math.radians(own.heading_deg) + np.cumsum(turns)).tolist()
     middles = [own.start_m]
@@ -126,7 +126,7 @@ def _corridor(
 
 
 def _boxes(own: Cloud, where: str) -> tuple[list[Entry], Fault | None]:
-    """Return boxes for the occupied cells of a cloud of points: in runs up, then along x."""
+    """Return boxes for the occupied cells of a point cloud, merged along z, then along x."""
     try:
         points = points_of(plugin.beside(own.file), f"{where}.file")
     except DocumentError as error:
@@ -164,7 +164,7 @@ def _boxes(own: Cloud, where: str) -> tuple[list[Entry], Fault | None]:
 
 
 def _read_surfaces(given: list[Any]) -> tuple[list[Any], list[Fault]]:
-    """Return the entries of `surfaces:` with their triangles in place of their files, and what is wrong with these."""
+    """Return the entries of `surfaces:` with triangles in place of files, and the faults of the files."""
     surfaces, wrong, count = [], [], 0
     for index, entry in enumerate(given):
         where, triangles = f"environment.surfaces[{index}]", None

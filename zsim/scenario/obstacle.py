@@ -1,4 +1,4 @@
-"""Obstacles as solids: how far a point is from one, and in which direction it is farther. Pure; the world compiles it.
+"""Obstacles as solids: signed distance of a point and its direction. Pure; the world compiles it.
 
 An obstacle is a row: its shape, centre in W, cosine and sine of its yaw, and half of its size along its own axes (of a
 cylinder: radius, nothing, half of the height; of a sphere: radius).
@@ -23,7 +23,7 @@ WIDE = 1e9  # m, half of the side that a cylinder does not have
 
 
 def row_of(obstacle: Any) -> list[float]:
-    """Return the row of an obstacle of a scenario, whose place is the middle of its foot, of a sphere its centre."""
+    """Return the row of an obstacle of a scenario, whose position is that of its base, or the centre of a sphere."""
     x, y, z = obstacle.position_m
     if obstacle.shape == "box":
         half = [0.5 * side for side in obstacle.size_m]
@@ -36,7 +36,7 @@ def row_of(obstacle: Any) -> list[float]:
 
 
 def nearest(row: Sequence[float], x: float, y: float, z: float) -> tuple[float, float, float, float]:
-    """Return the distance of a point from the surface [m], below 0 inside, and the unit vector away from it; in W."""
+    """Return the distance of a point from the surface [m], below 0 inside, and the outward unit vector in W."""
     dx, dy, qz = x - row[CENTRE], y - row[CENTRE + 1], z - row[CENTRE + 2]
     c, s = row[COSINE], row[SINE]
     qx, qy = c * dx + s * dy, c * dy - s * dx

@@ -1,6 +1,6 @@
-"""Users' classes in a scenario: their parameters and messages, filled in where the scenario is read.
+"""Users' classes in a scenario: their parameters and messages, filled in when the scenario is read.
 
-Whoever reads `world/info` finds all parameters and messages there, and imports nothing that it names.
+Readers of `world/info` find all parameters and messages there, without importing the classes.
 """
 
 import re
@@ -21,7 +21,7 @@ OF_THE_RUN = ("info", "scenario", "drone", "cluster")  # arguments of an agent's
 
 
 class AgentMethods:
-    """What the class of an agent must have: those of zsim.Agent, which is not loaded here."""
+    """The methods required of an agent's class: those of zsim.Agent, which is not loaded here."""
 
     def receive(self, key: str, message: Any) -> None: ...
 
@@ -29,10 +29,10 @@ class AgentMethods:
 
 
 def with_agents(section: Any, imports: bool) -> tuple[Any, list[Fault]]:
-    """Return the `agents:` of a scenario with all parameters and messages of their classes, and what is wrong in it.
+    """Return the `agents:` of a scenario with all parameters and messages of their classes, and its faults.
 
     Args:
-        imports: whether classes may be imported; else the section must have been filled in, by whoever could.
+        imports: whether classes may be imported; else the section must be filled in already.
     """
     if not isinstance(section, dict):
         return section, []
@@ -69,7 +69,7 @@ def _declared(entry: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def with_parameters(document: dict[str, Any]) -> list[Fault]:
-    """Fill in the parameters of users' spaces, laws and estimator in a raw document; return what is wrong with them.
+    """Fill in the parameters of users' spaces, laws and estimator in a raw document; return their faults.
 
     A class that cannot be imported here is left to the processes that need it.
     """
@@ -98,11 +98,11 @@ def with_parameters(document: dict[str, Any]) -> list[Fault]:
 
 
 def law_faults(cluster: Any, drones: Mapping[str, Any], unread: Collection[str]) -> Iterator[Fault]:
-    """Yield what a cluster grants its law that nobody reads, or none of its drones has.
+    """Yield the grants of a cluster to its law that the law does not read, or that none of its drones has.
 
     Args:
-        drones: by name, as far as they are sound.
-        unread: names of sensors that these lack, since their modules could not be read.
+        drones: sound drones by name.
+        unread: names of sensors missing in these because their modules could not be read.
     """
     given = [name for name in ("law_sensors", "law_map") if getattr(cluster, name)]
     if given and cluster.law in (UNSET, "proportional"):
@@ -122,7 +122,7 @@ def law_faults(cluster: Any, drones: Mapping[str, Any], unread: Collection[str])
 
 
 def messages_of(kind: Any, where: str) -> tuple[type[AgentMessage], ...]:
-    """Return the classes of the messages that a class of agents publishes; DocumentError if they are none."""
+    """Return the message classes published by a class of agents; DocumentError if they are invalid."""
     classes = getattr(kind, "messages", ())
     try:
         for each in classes:
@@ -135,11 +135,11 @@ def messages_of(kind: Any, where: str) -> tuple[type[AgentMessage], ...]:
 
 
 def agent_faults(agents: Any, roles: Any, clusters: bool) -> Iterator[Fault]:
-    """Yield what cannot go together of the agents of a scenario.
+    """Yield conflicts between the agents of a scenario.
 
     Args:
-        agents: by role, as far as they are sound.
-        roles: of zsim, which are no names of a user's.
+        agents: sound agents by role.
+        roles: roles of zsim, which users may not use.
         clusters: whether the scenario has any.
     """
     writers: dict[str, str] = {}

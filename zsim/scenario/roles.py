@@ -1,8 +1,8 @@
-"""The roles of a federation: what a process of each is named after, made of and needs, and what it may do on the keys.
+"""The roles of a federation: naming, agent class, requirements and key rights of their processes.
 
-Launchers, the world and access control read the table. Rights are the least that a role needs. They follow from the
-writers and readers that the messages of the contract declare (`zsim.contract.messages.TOPICS`): Zenoh's access control
-is made of them, and the world answers replays by them.
+Launchers, the world and access control use the table. Rights are the minimum that a role needs. They follow from the
+writers and readers declared by the messages of the contract (`zsim.contract.messages.TOPICS`); Zenoh's access control
+and the world's replays apply them.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -53,7 +53,7 @@ AGENTS = {name: role for name, role in ROLES.items() if role.about}
 
 
 def agent_roles(scenario: Scenario) -> dict[str, Role]:
-    """Return the roles of a scenario's agents: the stock ones, and those of users' classes."""
+    """Return the roles of a scenario's agents: stock roles, and those of users' classes."""
     own = {name: Role("agents", "restart", each.per, each.named) for name, each in scenario.own_agents.items()}
     return AGENTS | own
 
@@ -70,7 +70,7 @@ def agent_names(scenario: Scenario) -> list[str]:
 
 
 def expected_processes(scenario: Scenario) -> list[str]:
-    """Return the names of the processes without which a run does not start."""
+    """Return the names of the processes required at the start of a run."""
     if scenario.processes.expect is not None:
         return list(scenario.processes.expect)
     cameras = [drone.name for drone in scenario.drones if scenario.gates("camera") and drone.sensors.cameras()]
@@ -79,17 +79,17 @@ def expected_processes(scenario: Scenario) -> list[str]:
 
 
 def programs(scenario: Scenario) -> list[str]:
-    """Return the names of the users' programs that are started with a run."""
+    """Return the names of the users' programs started with a run."""
     expected = expected_processes(scenario)
     return [name for name, each in scenario.own_programs.items() if name in expected or not each.joins]
 
 
 def on_death(actions: Mapping[str, OnDeath], name: str, role: str | None = None) -> OnDeath:
-    """Return what is to be done when a process dies: what the scenario has for it, else for its role, else the default.
+    """Return the action on the death of a process: the scenario's for it, else for its role, else the default.
 
     Args:
-        actions: of the scenario, by process name or role.
-        role: as the process stated it; by default the beginning of its name.
+        actions: actions of the scenario by process name or role.
+        role: role in the process's join; by default the beginning of its name.
     """
     role = role or name.partition(".")[0]
     default = ROLES[role].on_death if role in ROLES else "drop"
@@ -99,9 +99,9 @@ def on_death(actions: Mapping[str, OnDeath], name: str, role: str | None = None)
 def on_overdue(
     actions: Mapping[str, OnOverdue], name: str, role: str | None = None, gating: Collection[str] = ()
 ) -> OnOverdue:
-    """Return what is to be done when a process has not come back in its time; arguments as of `on_death`.
+    """Return the action on a process that has not returned in time; arguments as for `on_death`.
 
-    `gating`: roles for which the run waits beside the agents.
+    `gating`: roles other than agents for which the run waits.
     """
     role = role or name.partition(".")[0]
     default = ROLES[role].on_overdue if role in ROLES and role not in gating else "end"
@@ -109,18 +109,18 @@ def on_overdue(
 
 
 def lets_drop(actions: Mapping[str, str], name: str) -> bool:
-    """Tell whether `on_death` or `on_overdue` explicitly lets a run go on without a process: that is no failure."""
+    """Tell whether `on_death` or `on_overdue` explicitly lets a run continue without a process, without a failure."""
     return (actions.get(name) or actions.get(name.partition(".")[0])) == "drop"
 
 
 def is_needed(name: str) -> bool:
-    """Tell whether a run cannot go on without a process, by its role, unless the scenario says so."""
+    """Tell whether a run needs a process of a role, unless the scenario says otherwise."""
     role = ROLES.get(name.partition(".")[0])
     return role is not None and role.on_overdue == "end"
 
 
 def check_pace(scenario: Scenario, mode: str) -> None:
-    """Raise ScenarioError for external drones, which fly in wall time, in any mode but realtime."""
+    """Raise ScenarioError for external drones, which fly in wall time, in any mode other than realtime."""
     external = scenario.external()
     if external and mode != "realtime":
         who = f"{listed(external)} {'is' if len(external) == 1 else 'are'} external"
@@ -129,7 +129,7 @@ def check_pace(scenario: Scenario, mode: str) -> None:
 
 
 def check_alone(scenario: Scenario) -> None:
-    """Raise ScenarioError for what a run in one process cannot have: every field, a line each."""
+    """Raise ScenarioError, with a line per field, for settings that a run in one process cannot have."""
     lines = []
     if scenario.gates("camera"):
         lines.append(
@@ -150,7 +150,7 @@ def drivers_of(scenario: Scenario) -> list[str]:
 
 
 def driver_lines(scenario: Scenario, endpoint: str) -> list[str]:
-    """Return a line on the drivers that have to be started beside a run; none without external drones."""
+    """Return a line on the drivers to start beside a run; none without external drones."""
     drivers, awaited_names = drivers_of(scenario), expected_processes(scenario)
     awaited, others = (listed([d for d in drivers if (d in awaited_names) is wanted]) for wanted in (True, False))
     waits = [f"the run waits for {awaited}"] if awaited else []
@@ -181,9 +181,9 @@ _READER = Rights(reads=("**", keys.BATCH), asks=LAST_VALUES, watches=(keys.token
 def rights_for(process: str, scenario: Scenario) -> Rights:
     """Return the rights of a process by its name, role.thing; there is one world and one recorder, without a thing.
 
-    A camera, or a detector, that is not named after a drone is for all that have cameras.
-    A role that is not zsim's and is about a drone may do what the estimator of that drone may, one that is about a
-    cluster what its controller may: it takes their place. One about neither takes part, and reads what all read.
+    A camera or detector that is not named after a drone serves all drones with cameras. A user's role named after a
+    drone has the rights of its estimator, one named after a cluster those of its controller, which it may replace. Any
+    other role takes part, and reads the keys that all may read.
     """
     role, _, thing = process.partition(".")
     if process == WORLD:
@@ -231,7 +231,7 @@ def rights_for(process: str, scenario: Scenario) -> Rights:
 
 
 def _granted_own(agent: OwnAgent, thing: str, scenario: Scenario) -> Rights:
-    """Return what an agent of a user's class may do: read all but the truth, and command the drones that it is of."""
+    """Return the rights of an agent of a user's class: reading all but the truth, and commanding its own drones."""
     drones = [drone.name for drone in scenario.drones]
     of = {"drone": [thing], "run": drones}
     own = of.get(agent.per) or scenario.cluster(thing).drones
@@ -243,9 +243,9 @@ def _granted_own(agent: OwnAgent, thing: str, scenario: Scenario) -> Rights:
 
 
 def _granted(role: str, **names: Sequence[str]) -> Rights:
-    """Return what the messages of the contract let a role do on the keys of some drones, clusters or processes.
+    """Return the rights of a role, by the messages of the contract, on the keys of some drones, clusters or processes.
 
-    `names`: of `drone`, `cluster`, `process`, and of the process itself as `estimates`.
+    `names`: names of `drone`, `cluster`, `process`, and of the process itself as `estimates`.
     """
     reads, writes, asks, answers = [], [], [], []
     for key, topic in TOPICS.items():
@@ -268,7 +268,7 @@ def watched_drones(thing: str, scenario: Scenario) -> list[str]:
 
 
 def combined(many: Iterable[Rights]) -> Rights:
-    """Return what any of several may do, as a router needs that carries them."""
+    """Return the union of several rights, as needed by a router that forwards for all of them."""
     columns = zip(Rights(), *many, strict=True)
     return Rights(*(tuple(dict.fromkeys(key for keys_ in column for key in keys_)) for column in columns))
 

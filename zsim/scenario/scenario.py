@@ -113,7 +113,7 @@ class FigureEight(Spec, frozen=True, kw_only=True):
 
 
 class DroneReference(Piloted, frozen=True, kw_only=True):
-    """Where one drone is to be; without a path, it takes off and waits for requests."""
+    """The reference of a drone; without a path, it takes off and waits for requests."""
 
     start_s: NonNegative | None = None
     waypoints: Points = []

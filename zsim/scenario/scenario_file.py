@@ -1,4 +1,4 @@
-"""Scenario files: read, override, resolve, check, and write out again as the text of `world/info`."""
+"""Scenario files: reading, overrides, resolution, checks, and the text of `world/info`."""
 
 import copy
 import csv
@@ -27,7 +27,7 @@ from zsim.vehicles import vehicle_catalogue
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.vehicle import Aerodynamics, Vehicle
 
-EXAMPLE = "scenarios/step.yaml"  # named to whoever gives no scenario
+EXAMPLE = "scenarios/step.yaml"  # named in errors
 SYNTAX = "a.b.c=value, e.g. drones.drone2.mass_kg=0.5 or environment.wind.gust_m_s=0.5"
 PATH_MAX = 1000  # characters; the longest of a scenario has a tenth of that
 NOTHING: Mapping[str, Any] = {}
@@ -47,13 +47,13 @@ def load(
     imports: bool = True,
     **values: Any,
 ) -> Scenario:
-    """Return the resolved scenario of a YAML file; classes that it names may stand in modules beside it.
+    """Return the resolved scenario of a YAML file; its classes may be in modules beside it.
 
     Args:
         overrides: texts `a.b.c=value` as given to `--set`, applied in order.
-        modules: further folders in which the modules may stand.
-        imports: whether what it names is imported; not needed of a file that is resolved already.
-        values: top-level fields that replace the file's, None being ignored (`seed=3`).
+        modules: further folders of modules.
+        imports: whether to import the named modules; not needed for a resolved file.
+        values: top-level fields that replace the file's (`seed=3`); None is ignored.
 
     Raises:
         ScenarioError: with every fault found, a line each.
@@ -67,12 +67,12 @@ def load(
 
 
 def resolve(document: dict[str, Any], source: str = "scenario") -> Scenario:
-    """Return the scenario of a raw document: presets expanded, everything checked. Errors as of `load`."""
+    """Return the scenario of a raw document, with presets expanded and everything checked. Errors as for `load`."""
     return _resolve(document, source, [])
 
 
 def from_text(text: str) -> Scenario:
-    """Return the scenario that `world/info` carries; nothing that it names is imported. Errors as of `load`."""
+    """Return the scenario in `world/info`, without importing anything that it names. Errors as for `load`."""
     source = "world/info"
     return _resolve(yaml_file.parse(text, source, EXAMPLE, ScenarioError), source, [], imports=False)
 
@@ -90,7 +90,7 @@ def sha256(text: str) -> str:
 
 
 def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: bool = True) -> Scenario:
-    """Return the scenario of a raw document; `lines` are faults that were found before.
+    """Return the scenario of a raw document; `lines` are faults found before.
 
     Later ones take precedence. For a drone: the numbers of its model, the document's `vehicle:`, its own fields; for
     its sensors: the preset, the document's `sensors:`, its own. Faulty parts of the shared sections are not handed on
@@ -173,7 +173,7 @@ def with_defaults(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 
 
 def _in_channel_units(sensors: Any, where: str, misread: list[Fault]) -> Any:
-    """Return a `sensors:` section whose error models are in the units of their channels."""
+    """Return a `sensors:` section with error models converted to the units of their channels."""
     if not isinstance(sensors, dict):
         return sensors
     read, wrong = in_channel_units(sensors, where)
@@ -203,7 +203,7 @@ def _separated(section: Any, where: str, unsound: list[Fault], unread: set[str],
 
 
 def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
-    """Return a drone's reference with the pieces of the file that it names, beside the scenario or in this folder."""
+    """Return a drone's reference with the pieces of its file, which is beside the scenario or in this folder."""
     name = reference.get("file") if isinstance(reference, dict) else None
     if not isinstance(name, str):
         return reference
@@ -219,7 +219,7 @@ def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
 
 
 def _is_graph(topology: Any) -> bool:
-    """Tell whether a `topology:` section is a graph alone, by name or as lists of those that each drone hears."""
+    """Tell whether a `topology:` section is only a graph, by name or as lists of the drones that each one hears."""
     if isinstance(topology, dict):
         named = any(isinstance(heard, list) for heard in topology.values())
         return named and not topology.keys() & set(Topology.__struct_fields__)
@@ -227,7 +227,7 @@ def _is_graph(topology: Any) -> bool:
 
 
 def _with_deaths(processes: Any, own: Any, action: str) -> Any:
-    """Return a `processes:` section with what the death of users' roles or programs means, where it does not say so."""
+    """Return a `processes:` section with the default `on_death` of users' roles and programs."""
     if not (isinstance(processes, dict) and isinstance(own, dict)):
         return processes
     given = processes.get("on_death", {})
@@ -239,8 +239,8 @@ def _vehicle_of(
 ) -> Vehicle:
     """Return the vehicle of a drone's model, the AR.Drone for an unknown model.
 
-    A drone with all its numbers, as in a resolved scenario, needs no module of a user's: whoever reads `world/info`
-    imports nothing that it names. A vehicle that must not be imported is left out.
+    A drone with all its numbers, as in a resolved scenario, needs no user's module: readers of `world/info` import
+    nothing. A vehicle that must not be imported is left out.
     """
     model = drone.get("model", vehicle_catalogue.DEFAULT)
     if not isinstance(model, str):
@@ -273,12 +273,12 @@ def _whose(document: dict[str, Any], path: str) -> str:
 
 
 def apply_override(document: dict[str, Any], text: str, parse: Callable[[str], Any]) -> str | None:
-    """Apply one override to a raw document; return the fault if there is one, and then nothing has changed.
+    """Apply one override to a raw document; return the fault, without a change, if there is one.
 
     Args:
         document: changed in place.
         text: as given, e.g. "drones[2].yaw_deg=90".
-        parse: turns the text of a value into the value; its ValueError says what is wrong.
+        parse: converts the text of a value; the text of its ValueError is the fault.
     """
     path, equals, value_text = text.partition("=")
     fault: object = None
@@ -296,22 +296,22 @@ def apply_override(document: dict[str, Any], text: str, parse: Callable[[str], A
 
 
 def steps_of(path: str, document: Mapping[str, Any] = NOTHING) -> list[str]:
-    """Return the steps of a path from the top of a scenario: fields, and entries by place or by name.
+    """Return the steps of a path from the top of a scenario: fields, and entries by index or name.
 
-    Arguments and errors as `whole_path`.
+    Arguments and errors as for `whole_path`.
     """
     return [word or bracket for word, bracket in _STEP.findall(whole_path(path, document))]
 
 
 def whole_path(path: str, document: Mapping[str, Any] = NOTHING) -> str:
-    """Return the path of a field from the top of a scenario, whose raw document is given.
+    """Return the full path of a field in a raw document.
 
     The name of a section may be left out where only one section has such a field: wind.gust_m_s stands for
     environment.wind.gust_m_s. Of a list of sections it may be left out where the list has one entry:
     gains.proportional_1_s stands for clusters.main.gains.proportional_1_s.
 
     Raises:
-        ValueError: the field is one of a list of sections, of which the document has several.
+        ValueError: the field belongs to a list of sections of which the document has several.
     """
     first = _FIRST.match(path)
     sections = {field.name: field.type for field in _fields(Document)}
@@ -338,13 +338,13 @@ def whole_path(path: str, document: Mapping[str, Any] = NOTHING) -> str:
 
 @cache
 def _fields(kind: Any) -> Sequence[Any]:
-    """Return the fields of a section, none of any other type; a section may be one that need not be given."""
+    """Return the fields of a section, possibly an optional one; none for any other type."""
     sections = [each for each in (kind, *get_args(kind)) if isinstance(each, type) and issubclass(each, Struct)]
     return structs.fields(sections[0]) if sections else ()
 
 
 def _assign(document: dict[str, Any], steps: list[str], value: Any) -> None:
-    """Set the value at a path; missing or empty sections on the way are created."""
+    """Set the value at a path; missing or empty sections along it are created."""
     place: Any = document
     for depth, step in enumerate(steps):
         if not isinstance(place, dict | list):
@@ -369,7 +369,7 @@ def _assign(document: dict[str, Any], steps: list[str], value: Any) -> None:
 
 
 def pieces_of(path: Path, where: str) -> list[dict[str, Any]]:
-    """Return the polynomial pieces of a file as a scenario has them: `duration_s`, and `x`, `y`, `z`, `yaw` as lists.
+    """Return the polynomial pieces of a file in the form of a scenario: `duration_s`, and lists `x`, `y`, `z`, `yaw`.
 
     The file is as uav_trajectories and Crazyswarm write and read it: a header line, then a line for each piece of 33
     numbers: its duration [s], and the coefficients of t^0 to t^7 in x, y, z [m] and yaw [rad], t being the time from
@@ -379,7 +379,7 @@ def pieces_of(path: Path, where: str) -> list[dict[str, Any]]:
         where: path of the field that names the file.
 
     Raises:
-        DocumentError: it cannot be read, or a line for each that is not as it must be.
+        DocumentError: the file cannot be read, or a line for each invalid piece.
     """
     try:
         if path.stat().st_size > BYTES_MAX:
@@ -414,7 +414,7 @@ def pieces_of(path: Path, where: str) -> list[dict[str, Any]]:
 
 
 def _without_end(row: list[str]) -> list[str]:
-    """Return a row without empty cells at its end: files of Crazyswarm have a comma there."""
+    """Return a row without empty cells at its end: files of Crazyswarm have a trailing comma."""
     while row and not row[-1]:
         row.pop()
     return row

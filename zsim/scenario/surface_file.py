@@ -1,7 +1,7 @@
 """Surfaces and points from files: meshes (STL, OBJ, PLY), height maps (CSV, NPY), point clouds (PCD, PLY).
 
-A scenario has their content once it is resolved: whoever reads it later, on another machine too, needs no file.
-Formats other than numbers in text are read by trimesh and pypcd4, of the extra `obstacles`.
+A resolved scenario contains their content, so that its readers need no file. Formats other than numbers in text are
+read by trimesh and pypcd4, of the extra `obstacles`.
 """
 
 import base64
@@ -35,7 +35,7 @@ def triangles_of(path: Path, where: str, cell_m: float | None) -> Array:
     origin; two triangles a cell.
 
     Raises:
-        DocumentError: it cannot be read, or is none; one line that begins with `where`.
+        DocumentError: the file cannot be read, or is not a mesh; one line that begins with `where`.
     """
     kind = path.suffix.lower()
     if kind in (".csv", ".npy"):
@@ -64,7 +64,7 @@ def triangles_of(path: Path, where: str, cell_m: float | None) -> Array:
 
 
 def points_of(path: Path, where: str) -> Array:
-    """Return the points of a cloud, (P, 3) [m], but those that are not finite. Errors as of `triangles_of`."""
+    """Return the finite points of a cloud, (P, 3) [m]. Errors as for `triangles_of`."""
     kind = path.suffix.lower()
     if kind == ".pcd":
         read = lambda p: importlib.import_module("pypcd4").PointCloud.from_path(p).numpy(("x", "y", "z"))  # noqa: E731
@@ -127,10 +127,10 @@ def packed(triangles: Array) -> str:
 
 
 def unpacked(text: str) -> Array:
-    """Return the triangles of such a text, (T, 9).
+    """Return the triangles of a text made by `packed`, (T, 9).
 
     Raises:
-        ValueError: it is none.
+        ValueError: the text is invalid.
     """
     each = CORNERS * SINGLE.itemsize
     reader = zlib.decompressobj()

@@ -1,7 +1,7 @@
-"""The triangles of a scenario's surfaces: the nearest point of them, whether a way crosses one, and a tree over them.
+"""The triangles of a scenario's surfaces: nearest points, crossings, and a tree over them.
 
-A surface is a sheet without thickness: a distance from it has no sign. An edge that one triangle has alone is its rim.
-All is exact, in a fixed order of plain operations, compiled where numba is installed.
+A surface is a sheet without thickness: distances from it are unsigned. An edge of a single triangle is on its rim. All
+is exact, in a fixed order of plain operations, and compiled if numba is installed.
 """
 
 import math
@@ -115,7 +115,7 @@ def _rim(corners: Array) -> NDArray[np.int8]:
 
 
 def tree_over(low: Array, high: Array) -> Tree:
-    """Return the tree over P boxes, given their least and greatest corners (P, 3): halves along the longest side."""
+    """Return the tree over P boxes, given their minimum and maximum corners (P, 3), halved along the longest side."""
     low, high = low - MARGIN_M, high + MARGIN_M
     part, middle = np.arange(len(low), dtype=np.int32), 0.5 * (low + high)
     bounds: list[Array] = []
@@ -184,7 +184,7 @@ def nearest_on(row: NDArray, x: Vector) -> tuple[Vector, int]:
 
 @noinline
 def nearest_point(sheet: Sheet, x: Vector, far: float) -> Nearest:
-    """Return the nearest point that is nearer than `far` [m]; of those equally near, the first that is found."""
+    """Return the nearest point closer than `far` [m]; of equally near points the first found."""
     tree = sheet.tree
     best, which, feature, point = far * far, -1, FACE, x
     if tree.bounds.shape[0] > 0 and _square(tree.bounds[0], x) < best:
@@ -226,7 +226,7 @@ def side_of(row: NDArray, x: Vector) -> tuple[float, Vector]:
 
 @noinline
 def crosses(sheet: Sheet, start: Vector, end: Vector) -> bool:
-    """Tell whether a way from one point to another crosses a triangle; a point in its plane is in front of it."""
+    """Tell whether the path from one point to another crosses a triangle; a point in its plane is in front of it."""
     tree = sheet.tree
     if tree.bounds.shape[0] == 0:
         return False
@@ -274,9 +274,9 @@ def _find_nearest(held: Held, points: NDArray, least: NDArray, found: NDArray) -
 
 
 def nearest_points(sheet: Held, p_W: ArrayLike, far_m: ArrayLike) -> tuple[Array, Array]:
-    """Return distances (P,) [m] and places (P, 3) of what of a sheet, by `hold`, is nearest to points (P, 3).
+    """Return distances (P,) [m] and positions (P, 3) of the nearest points of a sheet, by `hold`, to points (P, 3).
 
-    `far_m` and the point itself where it is not nearer than that.
+    They are `far_m` and the point itself if nothing is closer.
     """
     points = np.ascontiguousarray(p_W, dtype=float).reshape(-1, 3)
     least, found = np.array(np.broadcast_to(far_m, len(points)), dtype=float), np.empty_like(points)
@@ -285,7 +285,7 @@ def nearest_points(sheet: Held, p_W: ArrayLike, far_m: ArrayLike) -> tuple[Array
 
 
 class Surroundings:
-    """What a drone may come near to: the obstacles and surfaces of a scenario's environment.
+    """The obstacles and surfaces of a scenario's environment.
 
     Attributes:
         is_empty: whether there are none.
@@ -297,7 +297,7 @@ class Surroundings:
         self.is_empty = not self._obstacles and self._sheet is None
 
     def distances_m(self, p_W: ArrayLike) -> Array:
-        """Return the distance [m] of each point (P, 3) from what is nearest, below 0 in an obstacle; inf if none is."""
+        """Return the distance [m] of each point (P, 3) to the nearest one, below 0 in an obstacle; inf without any."""
         least = least_distances(self._obstacles, p_W)
         if self._sheet is not None:
             least = np.minimum(least, nearest_points(self._sheet, p_W, np.maximum(least, 0.0))[0])

@@ -1,6 +1,6 @@
-"""Every fault of a document against a typed description, not only the first one.
+"""All faults of a document against a typed description.
 
-msgspec stops at the first fault; a user who corrects a scenario needs them all at once.
+msgspec stops at the first fault; a user correcting a scenario needs all of them.
 """
 
 import math
@@ -44,8 +44,8 @@ def first_lines(lines: Iterable[str]) -> list[str]:
 def sound(value: Any, description: Any) -> Any:
     """Return the sound parts of a faulty document.
 
-    Structs become namespaces with a field for each of theirs: as given, by default, or None where it is
-    missing or faulty. Lists keep their length. What fits is returned as it is.
+    Structs become namespaces with the same fields: as given, by default, or None if missing or faulty. Lists keep their
+    length. Valid values are returned unchanged.
     """
     return _sound(value, _type_info(description))
 
@@ -201,13 +201,13 @@ def _sound(value: Any, info: types.Type) -> Any:
 
 
 def suggestion(name: Any, known: Iterable[str]) -> str:
-    """Return "did you mean NAME? " with the known name most like an unknown one; "" if none is like it."""
+    """Return "did you mean NAME? " with the known name most similar to an unknown one; "" if none is similar."""
     close = get_close_matches(str(name)[:SHOWN_MAX], known, 1)
     return f"did you mean {close[0]}? " if close else ""
 
 
 def field_path(path: str, name: Any) -> str:
-    """Return the path of a field below another, on one printable line whatever the name is."""
+    """Return the path of a field below another, on one printable line for any name."""
     text = str(name)
     text = text if text.isprintable() and len(text) <= SHOWN_MAX else show(text)
     return f"{path}.{text}" if path else text

@@ -1,11 +1,11 @@
-"""Messages: types of their fields, the first fields of each, and those that users declare.
+"""Messages: field types, common first fields, and declarations by users.
 
-Users declare them by words that every language can read: number, number[3], whole, flag, text.
+Declarations use language-independent words: number, number[3], whole, flag, text.
 
     field_types(State, Message)  →  {"position_m": "number[3]", "leader": "flag"}
     declared_type("State", {"position_m": "number[3]", "leader": "flag"}, Message)
 
-A process that has the user's module has the class; all others make one of the same name and fields from `world/info`.
+A process with the user's module has the class; others make one of the same name and fields from `world/info`.
 """
 
 import sys
@@ -45,7 +45,7 @@ _TYPES: dict[str, Any] = {
 class Message(Struct, frozen=True, gc=False):
     """The first fields of every message: simulated time of publication, and a count per key from 0.
 
-    A class may have a method `fault`: it returns what is wrong with a message and no type can express, or None.
+    A class may have a method `fault`, which returns a fault of a message that types cannot express, or None.
     """
 
     t_ns: Count
@@ -53,13 +53,13 @@ class Message(Struct, frozen=True, gc=False):
 
 
 def field_types(message: type[Struct], base: type[Struct], but: Collection[str] = ()) -> dict[FieldName, FieldType]:
-    """Return the types of the fields that a message has beside those of its base.
+    """Return the types of a message's fields beside those of its base.
 
     Args:
-        but: words of types that are not allowed.
+        but: words of excluded types.
 
     Raises:
-        TypeError: a field is of a type that no message of a user's has.
+        TypeError: a field has a type not allowed in users' messages.
     """
     info: Any = types.type_info(message)
     words: dict[str, Any] = {}

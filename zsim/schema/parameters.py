@@ -32,10 +32,10 @@ def parameters_type(kind: Callable[..., Any], filled: tuple[str, ...] = ()) -> t
     """Return the struct of a class's parameters: its `Parameters`, or the arguments of its constructor.
 
     Args:
-        filled: arguments of the constructor that are no parameters.
+        filled: arguments of the constructor that are not parameters.
 
     Raises:
-        TypeError: its `Parameters` are no subclass of `zsim.Parameters`.
+        TypeError: its `Parameters` is not a subclass of `zsim.Parameters`.
     """
     declared = getattr(kind, "Parameters", None)
     if declared is not None:
@@ -60,7 +60,7 @@ def resolved(kind: Callable[..., Any], given: Any, where: str, filled: tuple[str
     """Return all parameters of a class as a file holds them, by name: as given, else by default.
 
     Raises:
-        DocumentError: a line for each that is unknown, missing, or not what is allowed.
+        DocumentError: a line for each unknown, missing or invalid parameter.
     """
     try:
         declared = parameters_type(kind, filled)
@@ -73,10 +73,10 @@ def resolved(kind: Callable[..., Any], given: Any, where: str, filled: tuple[str
 
 
 def bound(kind: Any, given: Any, where: str) -> Any:
-    """Return a class whose instances have these parameters, there when its constructor is called.
+    """Return a subclass whose instances have these parameters, set before the constructor is called.
 
     Raises:
-        DocumentError: as of `resolved`; or there are some, and the class has no `Parameters`.
+        DocumentError: as for `resolved`; or parameters are given and the class has no `Parameters`.
     """
     if not has_parameters(kind):
         if given:

@@ -1,11 +1,11 @@
-"""Code of a user's own that a document names: `package.module`, `package.module:Class` or `package.module:function`.
+"""User code named in a document: `package.module`, `package.module:Class` or `package.module:function`.
 
 A module is found as Python finds modules: installed beside zsim, or on PYTHONPATH. The folder of the document is
 searched last (`search`), so a module beside the scenario's file needs no installation on that machine, and hides
 nothing that is installed. On other hosts the module must be installed.
 
-Importing a module runs it: fly scenarios of others only if you trust what they name. Commands that only read what
-others have written look names up without importing anything (`names_only`).
+Importing a module runs it: fly scenarios of others only if you trust their modules. Commands that only read documents
+look names up without importing anything (`names_only`).
 """
 
 import ast
@@ -46,12 +46,12 @@ CLASS_NAME = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z"
 
 
 def search(*places: Path) -> None:
-    """Search modules in the folder of the document that is read now, here and in processes started from here.
+    """Search modules in the folder of the present document, in this process and its child processes.
 
-    It replaces the former folders, so that a program that reads many documents does not fill its environment.
+    It replaces the former folders, so that the environment of a program that reads many documents does not grow.
 
     Args:
-        places: folders, that of the document first; those that are not there are left out.
+        places: folders, that of the document first; missing ones are left out.
     """
     found = dict.fromkeys(str(place.resolve()) for place in places if place.is_dir())
     os.environ[FOLDERS] = json.dumps([*found])  # a name may hold any separator
@@ -62,21 +62,21 @@ def folders() -> tuple[Path, ...]:
 
 
 def beside(name: str) -> Path:
-    """Return the path of a file that a scenario names: in the folders of its modules, or in this one."""
+    """Return the path of a file named in a scenario: in the folders of its modules, or the working directory."""
     places = [folder / name for folder in (*folders(), Path())]
     return next((place for place in places if place.is_file()), places[0])
 
 
 @contextmanager
 def names_only(wanted: bool = True, looked_up: bool = True) -> Iterator[list[str]]:
-    """Import nothing that documents name, here and in processes started from here, unless `wanted` is False.
+    """Prevent imports of modules named in documents, in this process and its children, unless `wanted` is False.
 
     Args:
-        wanted: whether to do so at all.
-        looked_up: whether a name that is nowhere is a fault, as where it is imported.
+        wanted: whether to prevent them.
+        looked_up: whether an unknown name is a fault, as it is with imports.
 
     Yields:
-        the names of what was found and not imported, as documents have them; empty where all may be imported.
+        names that were found and not imported, as in documents; empty if imports are allowed.
     """
     former, _SKIPPED[:] = os.environ.get(IMPORTS), []
     if wanted:
@@ -102,8 +102,8 @@ def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Cal
         is_constructed: whether its constructor is called as that of `kind`.
 
     Raises:
-        DocumentError: no such module or class, or a method is missing or takes other arguments; one line.
-        NotTrustedError: it is there, and must not be imported.
+        DocumentError: there is no such module or class, or a method is missing or takes other arguments; one line.
+        NotTrustedError: it exists, but must not be imported.
     """
     loaded = _attribute(name, where, "Class", isclass)
     methods = [method for method in dir(kind) if not method.startswith("_") and callable(getattr(kind, method))]
@@ -121,22 +121,22 @@ def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Cal
 
 
 def load_function(name: str, where: str) -> Callable[..., Any]:
-    """Return the function of a name `package.module:function`; arguments and errors as of `load`."""
+    """Return the function of a name `package.module:function`; arguments and errors as for `load`."""
     return _attribute(name, where, "function", callable)
 
 
 def load_any(name: str, where: str, kind: type) -> Any:
-    """Return the class, the function, or the object of a kind, of a name `package.module:Name`; errors as of `load`."""
+    """Return the class, function or object of a kind named `package.module:Name`; errors as for `load`."""
     return _attribute(name, where, "class", lambda found: callable(found) or isinstance(found, kind))
 
 
 def load_module(name: str, where: str) -> ModuleType:
-    """Return the module of a name `package.module`; errors as of `load`."""
+    """Return the module named `package.module`; errors as for `load`."""
     return _imported(name, f"{where} is {show(name)}")
 
 
 def load_object(name: str, where: str, attribute: str, kind: type[Object]) -> Object:
-    """Return the object of a kind that a module `package.module` defines under a fixed name; errors as of `load`."""
+    """Return the object of a kind that a module `package.module` defines under a fixed name; errors as for `load`."""
     found = getattr(load_module(name, where), attribute, None)
     if not isinstance(found, kind):
         holds = f"whose {attribute} is {show(type(found).__name__)}" if found else f"which defines no {attribute}"
@@ -150,7 +150,7 @@ def is_own(kind: type) -> bool:
 
 
 def is_library(path: str) -> bool:
-    """Tell whether a file is of Python or of an installed package."""
+    """Tell whether a file belongs to Python or an installed package."""
     return path.startswith(LIBRARIES) or "site-packages" in path or "dist-packages" in path
 
 
@@ -166,8 +166,8 @@ def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
     """Return an exception of a user's code as an error that names class, method, file and line; None for others.
 
     Args:
-        error: caught by code of zsim, so that its traceback begins there.
-        where: which process, at which simulated time.
+        error: exception caught in zsim, where its traceback begins.
+        where: process and simulated time.
     """
     if isinstance(error, UserCodeError):
         return UserCodeError(error.text, error.where or where)  # another one, to be raised from it
@@ -184,14 +184,14 @@ def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
 
 
 def innermost_line(frame: FrameType | None) -> str:
-    """Return file and line of a user's code that a frame is in, in parentheses; empty if it is in none."""
+    """Return file and line of the user's code executed by a frame, in parentheses; empty if there is none."""
     while frame and not is_user_frame(frame):
         frame = frame.f_back
     return f" ({_place(frame.f_code.co_filename, frame.f_lineno)})" if frame else ""
 
 
 def is_user_frame(frame: FrameType) -> bool:
-    """Tell whether a frame is of a user's file or notebook, or of an installed package that a document names."""
+    """Tell whether a frame is in a user's file or notebook, or in an installed package named in a document."""
     package, path = frame.f_globals.get("__name__", "").partition(".")[0], frame.f_code.co_filename
     if package in PACKAGES or (path.startswith("<") and package != "__main__"):
         return False
@@ -199,7 +199,7 @@ def is_user_frame(frame: FrameType) -> bool:
 
 
 def numbers(returned: Any) -> NDArray[np.float64]:
-    """Return what a user's code returned as an array; ValueError if these are not real numbers of a regular shape."""
+    """Return a result of user code as an array; ValueError if it is not a regular array of real numbers."""
     array = np.asarray(returned)
     if array.dtype.kind not in "biuf":
         raise ValueError(f"no real numbers: {array.dtype}")
@@ -226,7 +226,7 @@ _CELL = re.compile(r".*ipykernel_\d+[/\\]\d+\.py|<ipython-input-(\d+)-.*>")
 
 
 def _place(path: str, line: int) -> str:
-    """Return file and line, or cell and line of a notebook, as the notebook names it."""
+    """Return file and line, or cell and line of a notebook."""
     cell = _CELL.fullmatch(path)
     if cell is None:
         return f"{path.removeprefix(f'{os.getcwd()}{os.sep}')}:{line}"
@@ -242,7 +242,7 @@ _SKIPPED: list[str] = []  # what documents have named and was not imported
 
 
 def _attribute(name: str, where: str, kind: str, is_kind: Callable[[Any], bool]) -> Any:
-    """Return the class or function of a name `package.module:attribute`; errors as of `load`."""
+    """Return the class or function named `package.module:attribute`; errors as for `load`."""
     module_name, colon, attribute = name.partition(":")
     if not (colon and module_name and attribute):
         raise DocumentError([f"{where} is {show(name)}; must be package.module:{kind}"])
@@ -260,7 +260,7 @@ def _attribute(name: str, where: str, kind: str, is_kind: Callable[[Any], bool])
 
 
 def _imported(name: str, what: str, attribute: str = "") -> ModuleType:
-    """Import a module, if that is allowed; else check that it exists and that its text defines the attribute."""
+    """Import a module if allowed; else check that it exists and that its text defines the attribute."""
     package = name.partition(".")[0]
     if not may_import() and package not in PACKAGES:
         if os.environ[IMPORTS] != NO_LOOKUP:
@@ -282,7 +282,7 @@ def _imported(name: str, what: str, attribute: str = "") -> ModuleType:
 
 
 def located(name: str, what: str) -> ModuleSpec:
-    """Return where a module is, without running any of it; DocumentError, beginning with `what`, if it is nowhere."""
+    """Locate a module without running it; DocumentError, beginning with `what`, if it does not exist."""
     spec: ModuleSpec | None = None
     for part in accumulate(name.split("."), "{}.{}".format):
         where = spec.submodule_search_locations if spec else None
@@ -301,7 +301,7 @@ def located(name: str, what: str) -> ModuleSpec:
 
 
 def _find(name: str, what: str, attribute: str) -> None:
-    """Find a module without running any of it; DocumentError if there is none, or its text does not bind the name."""
+    """Find a module without running it; DocumentError if it does not exist or its text does not bind the name."""
     spec = located(name, what)
     if not attribute or not (spec.origin or "").endswith(".py"):
         return
@@ -337,7 +337,7 @@ def _imported_names(tree: ast.AST) -> set[str]:
 
 
 def _other_arguments(loaded: type, kind: type, method: str) -> tuple[str, str] | None:
-    """Return what a method takes and is given, if it cannot be called as that of `kind`; else None."""
+    """Return the parameters of a method and those expected, if it cannot be called as that of `kind`; else None."""
     wanted, own = getattr_static(kind, method), getattr_static(loaded, method)
     if not (isfunction(wanted) and isfunction(own)) or wanted is own:
         return None  # of a builtin, or bound in its own way

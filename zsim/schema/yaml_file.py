@@ -1,4 +1,4 @@
-"""YAML documents that people write, read with limits: no aliases, no tags, words as in YAML 1.2, one line per fault."""
+"""Handwritten YAML documents, read with limits: no aliases, no tags, words as in YAML 1.2, one line per fault."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -21,8 +21,8 @@ def read(path: Path, example: str, refuse: type[DocumentError]) -> dict[str, Any
     """Return the map that a YAML file holds.
 
     Args:
-        example: a file of that kind, named to whoever gave another one.
-        refuse: the error to raise, with a line for each fault.
+        example: a file of that kind, named in errors.
+        refuse: the error class to raise, with a line for each fault.
     """
     try:
         with path.open("rb") as file:
@@ -41,7 +41,7 @@ def read(path: Path, example: str, refuse: type[DocumentError]) -> dict[str, Any
 
 
 def parse(text: str, source: str, example: str, refuse: type[DocumentError]) -> dict[str, Any]:
-    """Return the map that a YAML text holds; `source` opens the lines of the faults."""
+    """Return the map in a YAML text; `source` begins the lines of the faults."""
     try:
         document = value(text)
     except ValueError as error:
@@ -75,11 +75,11 @@ _Base: Any = yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader  # l
 
 
 class _Reader:
-    """Builds values from YAML's events as they come, so that the first refused one ends the work.
+    """Builds values from YAML events, stopping at the first refused one.
 
-    Refused are aliases, which can expand without end, tags, directives, keys that are given twice, and a depth or a
-    number of values for which C code has no limit of its own. Words mean what YAML 1.2 says (its core schema, section
-    10.3.2): 1e3 and 010 are decimal numbers; 1:30, 1_000, yes, off, 2026-01-31 and the key << are text.
+    It refuses aliases, which can expand without end, tags, directives, duplicate keys, and excessive depth or numbers
+    of values, which the C library does not limit. Words follow the core schema of YAML 1.2 (section 10.3.2): 1e3 and
+    010 are decimal numbers; 1:30, 1_000, yes, off, 2026-01-31 and the key << are text.
     """
 
     def __init__(self, text: str) -> None:
@@ -153,12 +153,12 @@ def _whole(text: str) -> int:
 
 
 def _real(text: str) -> float:
-    """Return a number; YAML writes .inf and .nan for what Python knows as inf and nan."""
+    """Return a number; YAML writes .inf and .nan for Python's inf and nan."""
     return float(text.replace(".", "", 1) if text[-1] in "fFnN" else text)
 
 
 class _Dumper(yaml.SafeDumper):
-    """Puts into quotes the texts that `_word` would read as something else."""
+    """Quotes texts that `_word` would read as another type."""
 
 
 _DIRECTIVE = re.compile(r"^\ufeff?%", re.MULTILINE)

@@ -1,6 +1,6 @@
-"""Cameras of a drone, what it sees with them, and the hats by which drones see each other, as a scenario has them.
+"""The camera, sighting and hat settings of a scenario.
 
-The defaults are the AR.Drone 2.0's own figures. None of them is there unless the scenario has its section.
+Defaults are those of the AR.Drone 2.0. Each exists only if the scenario has its section.
 """
 
 from typing import Annotated, Literal, NamedTuple
@@ -96,11 +96,11 @@ FRAME_BYTES = 9  # marker, length, precision, height, width
 
 
 class PictureError(ValueError):
-    """Bytes that are no picture of the kind and size that is allowed; one line."""
+    """Bytes that are not a picture of an allowed kind and size; one line."""
 
 
 class Frame(NamedTuple):
-    """How a JPEG is coded, by the marker of its frame, and its size [px]."""
+    """The coding of a JPEG, by the marker of its frame, and its size [px]."""
 
     marker: int
     width: int
@@ -108,10 +108,10 @@ class Frame(NamedTuple):
 
 
 def frame_of(data: bytes) -> Frame:
-    """Return what the frame's header of a JPEG says.
+    """Return the frame header of a JPEG.
 
     Raises:
-        PictureError: it has no sound one.
+        PictureError: there is no valid one.
     """
     at = len(BEGINS) if data.startswith(BEGINS) else len(data)
     while at + 4 <= len(data) and data[at] == 0xFF:

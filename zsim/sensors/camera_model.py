@@ -41,7 +41,7 @@ class Lens(NamedTuple):
 
 
 class CameraPose(NamedTuple):
-    """Where a camera is in the body: its place [m; B], and the rotation from K to B, (3, 3)."""
+    """The pose of a camera in the body: position [m; B], and the rotation from K to B, (3, 3)."""
 
     p_BK: Array
     R_BK: Array
@@ -73,7 +73,7 @@ def camera_matrix(lens: Lens) -> Array:
 
 @portable
 def distorted(lens: Lens, x: Number, y: Number) -> tuple[Number, Number]:
-    """Return where a ray (x, y, 1) of K falls on the picture plane after the lens, in focal lengths."""
+    """Return the position of a ray (x, y, 1) of K in the picture plane after the lens, in focal lengths."""
     r2 = x * x + y * y
     radial = 1.0 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
     return (
@@ -121,7 +121,7 @@ def folds(lens: Lens) -> bool:
 
 @portable
 def pixel(lens: Lens, x: float, y: float, z: float) -> tuple[float, float]:
-    """Return the pixel of a point of K in front of the camera (z > 0) [px]; it may lie outside of the picture."""
+    """Return the pixel of a point of K in front of the camera (z > 0) [px], possibly outside the picture."""
     at_x, at_y = distorted(lens, x / z, y / z)
     return lens.fx * at_x + lens.cx, lens.fy * at_y + lens.cy
 

@@ -1,10 +1,10 @@
 """Sensors that measure distances along rays: beams, lidars, depth cameras. Messages and settings.
 
-The world casts the rays at ground, obstacles and the hulls of other drones (zsim_world.sensors.scans). Not one of these
-is there unless the scenario has its section; `status` counts their messages as those of all sensors.
+The world casts the rays at ground, obstacles and the hulls of other drones (zsim_world.sensors.scans). Each exists only
+if the scenario has its section; `status` counts their messages like those of all sensors.
 
-A distance of 0 says that nothing came back: there is nothing within the sensor's range, or the ray was missed. No
-message of the contract has an infinity, and no ray measures 0, whose range begins above it.
+A distance of 0 means no echo: nothing is within the sensor's range, or the ray was missed. Messages of the contract
+contain no infinities, and measured ranges are above 0.
 """
 
 import math
@@ -114,7 +114,7 @@ def _without_zeros(data: bytes, rows: int) -> NDArray[np.float32]:
 
 
 class Scanner(Sensor, frozen=True, kw_only=True):
-    """What all of them have: range, and the errors of every ray, added in quadrature."""
+    """Common settings: range, and the errors of every ray, added in quadrature."""
 
     min_m: Positive
     max_m: Positive

@@ -1,4 +1,4 @@
-"""What a sensor is: its message, settings, channels with errors, and, for a user's sensor, its equation.
+"""The definition of a sensor: message, settings, channels with errors, and, for a user's sensor, its equation.
 
     SENSOR = SensorType(message=Airspeed, settings=AirspeedConfig, channels=(...), equation=dynamic_pressure)
 
@@ -99,7 +99,7 @@ class Channel(Struct, frozen=True, omit_defaults=True):
 
 
 class SensorTruth(Struct, frozen=True):
-    """What a sensor is exposed to at one instant. W: world (east, north, up); B: body; S: sensor.
+    """The truth at a sensor at one instant. W: world (east, north, up); B: body; S: sensor.
 
     Attributes:
         t_s: simulated time [s].
@@ -189,7 +189,7 @@ class SensorType(Struct, frozen=True, kw_only=True):
 
 
 class Declaration(Struct, frozen=True, omit_defaults=True):
-    """What readers of a run need to know about a user's sensor without its module; part of the resolved scenario."""
+    """The description of a user's sensor for readers without its module; part of the resolved scenario."""
 
     message: MessageName
     fields: dict[FieldName, FieldType]
@@ -229,7 +229,7 @@ def as_fields(numbers: Sequence[Any], fields: Mapping[str, str]) -> list[Any]:
     """Return a row of numbers as the values of a message's fields.
 
     Raises:
-        ValueError: they are more or fewer than the fields have.
+        ValueError: their number does not match the fields.
     """
     values, at = [], 0
     for word in fields.values():

@@ -57,7 +57,7 @@ class Sensors(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         """Yield name, type and settings of every sensor; a user's module is imported.
 
         Raises:
-            DocumentError: a module is not there, or is not what the scenario was resolved with.
+            DocumentError: a module is missing, or differs from the one with which the scenario was resolved.
         """
         for name, kind in STOCK.items():
             yield name, kind, getattr(self, name)
@@ -91,7 +91,7 @@ def sensor_type(module_name: str, where: str = "module") -> SensorType:
     """Return the SENSOR of a user's module.
 
     Raises:
-        DocumentError: there is none, or it contradicts itself; one line.
+        DocumentError: there is none, or it is inconsistent; one line.
     """
     sensor = plugin.load_object(module_name, where, "SENSOR", SensorType)
     try:
@@ -132,10 +132,10 @@ def _check(sensor: SensorType) -> None:
 def separate(
     section: dict[str, Any], imports: bool = True
 ) -> tuple[dict[str, Any], dict[str, dict[str, Any]], list[Fault]]:
-    """Return a `sensors:` section without the user's sensors, these with all their settings, and their faults.
+    """Return a `sensors:` section without users' sensors, the users' sensors with all settings, and their faults.
 
-    One that is resolved already is taken as it is: whoever reads `world/info` imports nothing that it names. Without
-    `imports` any other is a fault; one that must not be imported (`plugin.names_only`) is left out.
+    A resolved sensor is returned unchanged, so that readers of `world/info` import nothing. Without `imports` any other
+    is a fault; one that must not be imported (`plugin.names_only`) is left out.
     """
     rest = {name: value for name, value in section.items() if name in FIELDS}
     own: dict[str, dict[str, Any]] = {}
@@ -164,7 +164,7 @@ def separate(
 
 
 def flattened(sensors: dict[str, Any]) -> dict[str, Any]:
-    """Return a resolved `sensors:` section as a file has it: the user's sensors beside the others."""
+    """Return a resolved `sensors:` section in the form of a file: users' sensors beside the others."""
     rest = {name: value for name, value in sensors.items() if name != "own"}
     return rest | sensors.get("own", {})
 
@@ -178,13 +178,13 @@ def declarations(drones: Any) -> dict[str, Declaration]:
 
 
 def own_sections(drone: Any) -> dict[str, dict[str, Any]]:
-    """Return the sections of the users' sensors of a drone, as far as they are sound."""
+    """Return the sound sections of the users' sensors of a drone."""
     own = drone.sensors.own if drone.sensors is not None else None
     return own if isinstance(own, dict) else {}
 
 
 def sensor_names(sensors: Any) -> list[str]:
-    """Return the names under which a drone with this section publishes measurements, as far as it is sound."""
+    """Return the names of the sensors of a drone with this section, as far as it is sound."""
     optional = [name for name in ("sightings", *SCANNERS) if getattr(sensors, name)]
     return [*STOCK, *optional, *(sensors.own or ())]
 
@@ -221,5 +221,5 @@ def _section_faults(name: str, section: dict[str, Any], imports: bool) -> Iterat
 
 
 def _plain(value: Struct) -> dict[str, Any]:
-    """Return a struct as a file holds it: maps, lists, texts and numbers."""
+    """Return a struct in the form of a file: maps, lists, texts and numbers."""
     return msgspec.json.decode(msgspec.json.encode(value))

@@ -1,4 +1,4 @@
-"""The stock sensors: message, settings, channels and presets of each, one after the other.
+"""The stock sensors: message, settings, channels and presets of each.
 
 Their equations are compiled in zsim_world.sensors. Where the paper is silent about a sensor, its preset `paper` is
 chosen as the AR.Drone's or as said there.

@@ -1,4 +1,4 @@
-"""Zenoh: sessions, their settings, TLS, how a process finds the world, and the messages that pass the hub as batches.
+"""Zenoh: sessions, settings, TLS, finding the world, and the traffic through the hub.
 
 Only `session` imports zenoh. Imports contract.
 """

@@ -1,6 +1,6 @@
-"""How a process joins a federation: the hub listens, a router forwards, all other processes connect to one of them.
+"""Joining a federation: the hub listens, routers forward, all other processes connect to one of them.
 
-`find_world` connects and reads `world/info`; while there is no world yet it waits, and says so.
+`find_world` connects and reads `world/info`; it waits, with progress messages, until there is a world.
 """
 
 import errno
@@ -25,8 +25,8 @@ _OS_ERROR = re.compile(r"(?:os error |code: )(\d+)")
 _OTHER = "another is given by --listen, and to the other commands by --connect"
 _LISTEN_FAULTS = {  # by errno
     errno.EADDRINUSE: f"another process listens there; {_OTHER}",
-    errno.EADDRNOTAVAIL: f"that is no address of this machine, whose own `ip address` shows; {_OTHER}",
-    errno.EACCES: f"this user may not open it, as ports below 1024 without being root; {_OTHER}",
+    errno.EADDRNOTAVAIL: f"that is no address of this machine (`ip address` lists them); {_OTHER}",
+    errno.EACCES: f"this user may not open it; ports below 1024 need root; {_OTHER}",
     errno.EPERM: f"this process may not open it; {_OTHER}",
     errno.EINVAL: f"the address lacks its network interface, as in tcp/[fe80::1%eth0]:7447; {_OTHER}",
     errno.ENODEV: "there is no such network interface, of those that `ip address` shows",
@@ -45,10 +45,10 @@ _LISTEN_TEXTS = {  # of Zenoh, where the system has no number
 def listen(
     endpoints: Sequence[str], federation: str, mode: Mode, identity: Identity | None = None
 ) -> Iterator[Session]:
-    """Open the hub: a router that listens, to which every other role is a client.
+    """Open the hub: a listening router, of which every other role is a client.
 
-    A peer would do for clients, but carries nothing between two routers that both connect to it. SessionError if an
-    endpoint is taken or malformed, or the identity cannot be used.
+    A peer would suffice for clients, but does not forward between two routers connected to it. SessionError if an
+    endpoint is in use or malformed, or the identity is unusable.
     """
     with _listening(endpoints, federation, mode, identity or Identity(), zenoh_settings.hub(mode)) as session:
         session.use(mode)
@@ -58,9 +58,9 @@ def listen(
 def route(
     endpoint: str, upstream: str, federation: str, mode: Mode = "lockstep", identity: Identity | None = None
 ) -> AbstractContextManager[Session]:
-    """Open a router: it listens on an endpoint, and keeps trying to reach the world, or another router, upstream.
+    """Open a router: it listens on an endpoint, and keeps trying to connect upstream to the world or another router.
 
-    Errors as of `listen`.
+    Errors as in `listen`.
     """
     identity = identity or Identity()
     return _listening([endpoint], federation, mode, identity, zenoh_settings.upstream(upstream, identity))
@@ -79,7 +79,7 @@ def connect(
     """Open a client of the hub (or of a router).
 
     Raises:
-        SessionError: nobody listens there within `wait_s`, or a certificate, here or there, is refused.
+        SessionError: no process listens there within `wait_s`, or a certificate, here or there, is refused.
     """
     identity = identity or Identity()
     client = zenoh_settings.connecting(endpoint, identity, wait_s or 0.5)
@@ -89,9 +89,9 @@ def connect(
 
 
 def check_listening(endpoints: Sequence[str], identity: Identity | None = None) -> None:
-    """Raise SessionError, without listening, if an endpoint is malformed or does not go with the identity."""
+    """Raise SessionError, without listening, if an endpoint is malformed or does not match the identity."""
     if any(endpoint.endswith(":0") for endpoint in endpoints):
-        raise SessionError(f"cannot listen on {', '.join(endpoints)}: port 0 is no port that others can connect to")
+        raise SessionError(f"cannot listen on {', '.join(endpoints)}: other processes cannot connect to port 0")
     identity = identity or Identity()
     config_of(zenoh_settings.listening(endpoints, identity), identity)
 
@@ -117,7 +117,7 @@ def _listening(
 
 
 def no_listening(endpoints: Sequence[str], error: str) -> str:
-    """Return why nobody can listen on endpoints, and what to do; `error` is Zenoh's text."""
+    """Return why listening on endpoints fails, and the remedy; `error` is Zenoh's text."""
     found = _OS_ERROR.search(error)
     why = _LISTEN_FAULTS.get(int(found[1]) if found else 0)
     if why is None:
@@ -137,7 +137,7 @@ def find_world(
     run_id: str | None = None,  # of the only run to take part in; None takes any
     identity: Identity | None = None,
 ) -> Iterator[tuple[Session, messages.Info]]:
-    """Yield a session and the `world/info` of the run that it belongs to.
+    """Yield a session and the `world/info` of its run.
 
     Raises:
         NoWorldError: no world answered within `wait_s`, or `stopped` returned true.
@@ -185,8 +185,8 @@ def find_world(
 
 
 def _no_answer(link: Session, identity: Identity | None) -> str:
-    """Return why a hub that is there may not answer; one of another version or federation does not let us ask."""
-    may_be = ", but somebody listens there: another federation, a world on its way up, a router without one"
+    """Return why a hub that accepts connections may not answer; hubs of other versions or federations never do."""
+    may_be = ", but a process listens there: another federation, a starting world, or a router without a world"
     if identity is None or identity.tls is None or link.permissions is not None:
         return f"{may_be}; correct --federation, or wait longer"
     return (
@@ -196,7 +196,7 @@ def _no_answer(link: Session, identity: Identity | None) -> str:
 
 
 def _no_link(endpoint: str) -> str:
-    """Return why there is no session; a port that opens nevertheless speaks another protocol, or TLS."""
+    """Return why there is no session; a port that accepts connections may use another protocol, or TLS."""
     nobody = "; start one with `zsim world`"
     protocol, _, place = endpoint.partition("/")
     if protocol != "tcp":
@@ -210,9 +210,9 @@ def _no_link(endpoint: str) -> str:
 
 
 def read_permissions(link: Session) -> Permissions | None:
-    """Return what access control at the other end permits us, None where nobody answers that.
+    """Return our permissions under access control at the other end, None without an answer.
 
-    SessionError if it does not let us in.
+    SessionError if this process is not admitted.
     """
     for sample in link.get(keys.access(link.process), timeout_s=ANSWER_S):
         permissions = messages.decode_as(Permissions, sample.payload, sample.key)
@@ -223,7 +223,7 @@ def read_permissions(link: Session) -> Permissions | None:
 
 
 def read_info(link: Session) -> messages.Info | None:
-    """Return the `world/info` that the hub answers, None if nobody does."""
+    """Return the `world/info` answered by the hub, None without an answer."""
     for sample in link.get(keys.INFO, timeout_s=ANSWER_S):
         try:
             return messages.decode(keys.INFO, sample.payload)

@@ -1,11 +1,11 @@
-"""Bounds what one link of the hub holds back: a reader that takes nothing, and that nobody waits for, loses its link.
+"""Limits the backlog of the hub's links: a stalled reader that the run does not wait for loses its link.
 
-Zenoh knows two ways for a full link: drop what is for it, or block the sender and with it everybody, for all readers of
-a key alike. Participants must lose nothing, so everything blocks; a reader that nobody waits for is therefore cut off
-before its link is full, or at once if it comes back and does so again.
+On a full link Zenoh either drops messages or blocks the sender, and with it the run, for all readers of a key alike.
+Participants must lose nothing, so everything blocks; a reader that the run does not wait for is therefore disconnected
+before its link is full, and immediately if it reconnects and stalls again.
 
-Order of this file: the watch, which session stands for which process, the TCP connections of this process, and the
-processes of this machine at their far ends.
+Order of this file: the watch, the sessions of each process, the TCP connections of this process, and the local
+processes at their far ends.
 """
 
 import os
@@ -50,7 +50,7 @@ COMMAND_MAX = 80  # characters of a command line that are shown
 
 
 class Awaited(NamedTuple):
-    """A process that is waited for: its own name and those whose work it does, and its pid as it joined."""
+    """A process that the run waits for: its name and those whose work it does, and the pid in its join."""
 
     names: tuple[str, ...]
     pid: int
@@ -68,7 +68,7 @@ class ClosedLink(NamedTuple):
 
 @dataclass
 class _Backlog:
-    """Of one link: since when it takes nothing, and since when it has too much."""
+    """The backlog of a link: since when nothing is acknowledged, and since when there is too much."""
 
     acknowledged: int
     moved_s: float
@@ -76,7 +76,7 @@ class _Backlog:
 
 
 class LinkWatch:
-    """Watches the links of the hub, in a thread of its own while it is entered."""
+    """Watches the links of the hub, in a separate thread while the context is entered."""
 
     def __init__(
         self,
@@ -115,7 +115,7 @@ class LinkWatch:
             self.look()
 
     def look(self) -> None:
-        """Look at all links once, and close those that have to be."""
+        """Check all links once, and close stalled ones."""
         now_s, queued = self._wall_s(), self._sockets.queued()
         self._backlogs = {address: self._backlogs[address] for address in queued if address in self._backlogs}
         for address, held_bytes in queued.items():
@@ -123,7 +123,7 @@ class LinkWatch:
                 self._judge(address, held_bytes, now_s)
 
     def stuck(self) -> list[str]:
-        """Return who is at the far end of the links that take nothing, the fullest first."""
+        """Return the processes at the far ends of stalled links, the fullest link first."""
         queued, before_s = self._sockets.queued(), self._wall_s() - STALL_S
         standing = [address for address, backlog in self._backlogs.copy().items() if backlog.moved_s <= before_s]
         lines = []
@@ -135,7 +135,7 @@ class LinkWatch:
         return lines
 
     def _holds_up(self, address: str, held_bytes: int, now_s: float) -> bool:
-        """Tell whether a link takes nothing, or never catches up."""
+        """Tell whether a link acknowledges nothing, or never catches up."""
         if held_bytes < STALL_BYTES:
             self._backlogs.pop(address, None)
             return False
@@ -161,7 +161,7 @@ class LinkWatch:
         return self._far_ends.get(address)
 
     def _judge(self, address: str, held_bytes: int, now_s: float) -> None:
-        """Close a link, unless a participant that must lose nothing is, or may be, behind it."""
+        """Close a link, unless a participant that must lose nothing is or may be behind it."""
         far, inode = self._far_end(address, now_s), local_socket(address)
         if far is None or far.is_router:
             return
@@ -189,11 +189,11 @@ Sessions = frozenset[str]  # by Zenoh's names of them: hexadecimal digits
 
 
 class SessionTokens:
-    """Which sessions stand for which process: by liveliness tokens, kept up to date in threads of Zenoh.
+    """The sessions of each process, known by liveliness tokens and updated in threads of Zenoh.
 
-    A token `process/{p}` says that a process lives, but not whose it is: Zenoh names no holder, and its admin space,
-    which would, can stop a router for good when it is asked (eclipse-zenoh/zenoh#2619). So each process also declares
-    `process/{p}/session/{session}`.
+    A token `process/{p}` shows that a process lives, but not its session: Zenoh does not name the holder, and a query
+    of its admin space, which does, can block a router for good (eclipse-zenoh/zenoh#2619). So each process also
+    declares `process/{p}/session/{session}`.
     """
 
     def __init__(self, link: Session) -> None:
@@ -202,11 +202,11 @@ class SessionTokens:
         self._alive: set[str] = set()
 
     def watch(self) -> None:
-        """Keep up with the tokens from now on; those that are there are known at once."""
+        """Follow the tokens from now on; existing ones are known immediately."""
         self._link.on_token(keys.token("**"), self._on_token)
 
     def sessions(self, process: str) -> Sessions:
-        """Return the sessions that stand for a process; none for one that does not say so."""
+        """Return the sessions declared by a process."""
         return self._sessions.get(process, Sessions())
 
     def shown(self) -> list[str]:
@@ -233,7 +233,7 @@ class SessionTokens:
 
 
 class Progress(NamedTuple):
-    """How many bytes a far end has acknowledged so far, -1 if it is gone, and how long that takes [s]."""
+    """The bytes that a far end has acknowledged, -1 if it is gone, and its round-trip time [s]."""
 
     acknowledged: int
     round_trip_s: float
@@ -242,16 +242,16 @@ class Progress(NamedTuple):
 class LinkSockets:
     """The TCP connections of this process, by the address of their far end; callable from any thread.
 
-    Zenoh does not show them, and lets its sockets linger for 10 s when it closes them itself, as that of a process
-    that is stopped in realtime: meanwhile the thread that closes, which also passes on what others publish, does
-    nothing else. So no socket lingers that was seen once. Only Linux shows connections; elsewhere there are none.
+    Zenoh does not expose them, and lets sockets linger for 10 s when it closes them itself, such as that of a stopped
+    process in realtime; this blocks the thread that also forwards messages. So lingering is disabled on every socket
+    found here. Only Linux lists connections; elsewhere there are none.
     """
 
     def __init__(self) -> None:
         self._far: dict[tuple[int, int], str] = {}  # address by file and inode; empty for what is no connection
 
     def queued(self) -> dict[str, int]:
-        """Return how many bytes wait for each far end in the kernel."""
+        """Return the bytes in the kernel's send queue of each far end."""
         if sys.platform != "linux":
             return {}
         waiting = {}
@@ -268,13 +268,13 @@ class LinkSockets:
         return Progress(-1, 0.0)
 
     def close(self, address: str) -> None:
-        """Close a connection and drop what it holds back; Zenoh takes it for lost."""
+        """Close a connection and drop its backlog; Zenoh treats it as lost."""
         with suppress(OSError), self._open(address) as connection:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
             connection.shutdown(socket.SHUT_RDWR)
 
     def _open(self, address: str) -> socket.socket:
-        """Return a connection as a socket of our own; OSError if it is gone."""
+        """Return a duplicate socket of a connection; OSError if it is gone."""
         for file, far in self._connections().items():
             if far == address:
                 duplicate = socket.socket(fileno=os.dup(file))
@@ -284,7 +284,7 @@ class LinkSockets:
         raise OSError(f"{address}: no connection")
 
     def _connections(self) -> dict[int, str]:
-        """Return the far end of each TCP connection, by its file, and see to it that none lingers."""
+        """Return the far end of each TCP connection by its file, and disable lingering on all of them."""
         far: dict[tuple[int, int], str] = {}
         for name in os.listdir(OWN_FILES):
             with suppress(OSError):
@@ -330,7 +330,7 @@ def local_socket(address: str) -> str:
 
 
 def owner(inode: str) -> str:
-    """Return the pid of the process that has a socket open; empty if there is none, or we may not know."""
+    """Return the pid of the process that has a socket open; empty if there is none or it is not accessible."""
     for pid in filter(str.isdigit, os.listdir("/proc")) if inode else ():
         with suppress(OSError), os.scandir(f"/proc/{pid}/fd") as files:
             for file in files:

@@ -25,7 +25,7 @@ QUEUE_MAX = 1_000_000  # messages; a subscription that is not read blocks the wh
 
 
 class ReceivedSample(NamedTuple):
-    """One message off the wire, not decoded; its key is without the federation's prefix."""
+    """A received message, not decoded; its key is without the federation's prefix."""
 
     key: str
     payload: bytes
@@ -39,7 +39,7 @@ class FarEnd(NamedTuple):
 
 
 class RawSample(NamedTuple):
-    """A publication, or a reply to a query, with all that Zenoh knows of it."""
+    """A publication, or a reply to a query, with all of Zenoh's metadata."""
 
     kind: str  # "PUT" or "DELETE"; "ERROR" for a reply that refuses, which has no key
     key: str  # without the prefix of the session that received it
@@ -50,7 +50,7 @@ class RawSample(NamedTuple):
 
 
 def _raw_sample(sample: zenoh.Sample, prefix: str) -> RawSample:
-    """Return a sample of Zenoh; `prefix` is removed from its key."""
+    """Return a Zenoh sample without the prefix of its key."""
     return RawSample(
         kind="PUT" if sample.kind == zenoh.SampleKind.PUT else "DELETE",
         key=str(sample.key_expr).removeprefix(prefix),
@@ -62,14 +62,14 @@ def _raw_sample(sample: zenoh.Sample, prefix: str) -> RawSample:
 
 
 def check_expression(expression: str) -> None:
-    """Raise SessionError if a text is no key expression."""
+    """Raise SessionError if a text is not a key expression."""
     with _key_errors(expression):
         zenoh.KeyExpr(expression)
 
 
 @contextmanager
 def _key_errors(expression: str) -> Iterator[None]:
-    """Turn Zenoh's refusal of a key into a SessionError in the contract's words."""
+    """Convert Zenoh's refusal of a key to a SessionError in the contract's terms."""
     try:
         yield
     except zenoh.ZError as error:
@@ -85,13 +85,13 @@ def _first_sentence(error: BaseException) -> str:
 
 
 class Subscription:
-    """Everything that is published on one expression, in order of arrival at this session.
+    """All messages published on one expression, in order of arrival at this session.
 
     Args:
         raw: the session.
-        prefix: of its keys.
-        expression: the keys to receive.
-        without: prefixes of keys to leave out; if given, pictures and this session's own messages are left out too.
+        prefix: prefix of its keys.
+        expression: keys to receive.
+        without: prefixes of keys to exclude; if given, pictures and this session's own messages are excluded too.
     """
 
     def __init__(self, raw: zenoh.Session, prefix: str, expression: str, without: tuple[str, ...] = ()) -> None:
@@ -117,21 +117,21 @@ class Subscription:
             raise SessionError(f"{self.expression}: is closed") from error
 
     def drain(self) -> Iterator[ReceivedSample]:
-        """Yield what has arrived, without waiting."""
+        """Yield received messages without waiting."""
         while (raw := self._handler.try_recv()) is not None:
             sample = self._take(raw)
             if sample is not None:
                 yield sample
 
     def wake(self) -> None:
-        """Let a waiting `receive` return None; callable from any thread."""
+        """Make a waiting `receive` return None; callable from any thread."""
         try:
             self._raw.put(self._wake_key, b"", allowed_destination=zenoh.Locality.SESSION_LOCAL)
         except zenoh.ZError:
             return  # closed: nobody waits any longer
 
     def undeclare(self) -> None:
-        """Receive nothing more; a waiting `receive` raises SessionError."""
+        """Stop receiving; a waiting `receive` raises SessionError."""
         self._subscriber.undeclare()
 
     def _take(self, raw: zenoh.Sample) -> ReceivedSample | None:
@@ -146,7 +146,7 @@ class Query:
     """A query to be answered once.
 
     Attributes:
-        payload, attachment: as sent; empty where nothing was.
+        payload, attachment: as sent; empty if absent.
     """
 
     def __init__(self, raw: zenoh.Query, prefix: str) -> None:
@@ -158,7 +158,7 @@ class Query:
         self.attachment = raw.attachment.to_bytes() if raw.attachment is not None else b""
 
     def request(self) -> ControlRequest:
-        """Return the request in it; DecodeError if it holds none."""
+        """Return its request; DecodeError if it has none."""
         return messages.decode_as(ControlRequest, self.payload, self.expression)
 
     def reply(self, key: str, payload: bytes) -> None:
@@ -166,7 +166,7 @@ class Query:
             self._raw.reply(self._prefix + key, payload, encoding=zenoh.Encoding(messages.encoding(key)))
 
     def reply_raw(self, key: str, payload: bytes, attachment: bytes) -> None:
-        """Reply with a payload that is not a message of the contract, and end the query."""
+        """Reply with a payload outside the contract, and end the query."""
         if self._raw is not None:
             self._raw.reply(self._prefix + key, payload, attachment=attachment)
         self.end()
@@ -178,14 +178,14 @@ class Query:
         self.end()
 
     def end(self) -> None:
-        """End the query; Zenoh lets its sender know when the last reference goes."""
+        """End the query; Zenoh informs its sender when the last reference is dropped."""
         if self._raw is not None:
             self._raw.drop()
             self._raw = None
 
 
 class Unanswered(ControlAnswer, frozen=True):
-    """Takes the place of an answer that did not come, and says why."""
+    """The reason for a missing answer, in place of the answer."""
 
 
 def result_of(answer: ControlAnswer) -> Any:
@@ -216,7 +216,7 @@ class Session:
         self._realtime = False
 
     def use(self, mode: Mode) -> None:
-        """Choose what happens to sensor messages on a full link: BLOCK in lockstep, DROP in realtime."""
+        """Set the treatment of sensor messages on a full link: BLOCK in lockstep, DROP in realtime."""
         self._realtime = mode == "realtime"
 
     def unprefixed(self) -> "Session":
@@ -229,7 +229,7 @@ class Session:
         return str(self._raw.info.zid())
 
     def undeclare_all(self) -> None:
-        """Undeclare everything: what is still declared when a Zenoh session closes holds files and memory for ever."""
+        """Undeclare everything: declarations left when a Zenoh session closes leak files and memory."""
         for undeclare in list(self._declared.values()):
             with suppress(zenoh.ZError):  # undeclared already, or its session is gone
                 undeclare()
@@ -239,7 +239,7 @@ class Session:
         return declared
 
     def _refusal(self, act: Act, expression: str) -> str | None:
-        """Return why access control at the other end would silently drop what we do, None if it permits it."""
+        """Return why access control at the other end would drop an action, None if it permits it."""
         if self.permissions is None:
             return None
         with _key_errors(expression):
@@ -279,7 +279,7 @@ class Session:
         return publisher
 
     def has_subscribers(self, key: str) -> bool:
-        """Tell whether anybody subscribes to a key of ours; kept up to date, as Zenoh is too slow for each gate."""
+        """Tell whether one of our keys has subscribers; cached, since Zenoh is too slow to be asked at each gate."""
         if key in self._matching:
             return self._matching[key]
         publisher = self._publishers.get(key) or self._declare(key)
@@ -322,7 +322,7 @@ class Session:
         Samples are numbered, since no session here stamps them.
 
         Raises:
-            SessionError: it is no key.
+            SessionError: it is not a key.
         """
         with _key_errors(key):
             if key not in self._cached_publishers:
@@ -338,16 +338,16 @@ class Session:
             self._cached_publishers[key].put(payload, attachment=attachment)
 
     def delete(self, key: str) -> None:
-        """Publish that a key has no value any more; SessionError if it is no key."""
+        """Publish that a key no longer has a value; SessionError if it is not a key."""
         with _key_errors(key):
             self._raw.delete(self._prefix + key)
 
     # Subscribing
 
     def subscribe(self, expression: str) -> Subscription:
-        """Return a subscription to everything that others publish on an expression, in order.
+        """Return a subscription to all messages on an expression, in order.
 
-        SessionError if it is no key expression, or our certificate does not permit us to read it.
+        SessionError if it is not a key expression, or our certificate does not permit reading it.
         """
         self._check("read", expression)
         self.reads.append(expression)
@@ -355,7 +355,7 @@ class Session:
             return self._keep(Subscription(self._raw, self._prefix, expression))
 
     def subscribe_remote(self, without: tuple[str, ...]) -> Subscription:
-        """Return a subscription to all that other sessions publish, but for pictures and keys with these prefixes.
+        """Return a subscription to all messages of other sessions, except pictures and keys with these prefixes.
 
         A waiting `receive` cannot be woken.
         """
@@ -363,9 +363,9 @@ class Session:
         return self._keep(Subscription(self._raw, self._prefix, "**", without))
 
     def declare_subscriber(self, expression: str, callback: Callable[[RawSample], None]) -> Callable[[], None]:
-        """Call back, in a thread of Zenoh's, for everything on an expression until the returned function is called.
+        """Call back, in a Zenoh thread, for every message on an expression until the returned function is called.
 
-        SessionError if it is no key expression, or our certificate does not permit us to read it.
+        SessionError if it is not a key expression, or our certificate does not permit reading it.
         """
         self._check("read", expression)
         self.reads.append(expression)
@@ -387,7 +387,7 @@ class Session:
     def query(
         self, expression: str, parameters: str = "", payload: bytes = b"", encoding: str = "", timeout_s: float = 2.0
     ) -> list[RawSample]:
-        """Return all replies to a query, refusals among them; SessionError if it is no key expression."""
+        """Return all replies to a query, including refusals; SessionError if it is not a key expression."""
         body: dict[str, Any] = {"payload": payload, "encoding": zenoh.Encoding(encoding)} if payload else {}
         with _key_errors(expression):
             selector = zenoh.Selector(self._prefix + expression, parameters)
@@ -444,12 +444,12 @@ class Session:
     # Liveliness and links
 
     def declare_process(self, name: str) -> None:
-        """Show that a process lives, and that this session is its own."""
+        """Declare the liveliness token of a process, and that this session belongs to it."""
         self.declare_token(keys.session_token(name, self.zid()))
         self.declare_token(keys.token(name))
 
     def declare_token(self, key: str) -> None:
-        """Show that the subject of a key lives; the token disappears with this session."""
+        """Declare a liveliness token; it disappears with this session."""
         self._keep(self._raw.liveliness().declare_token(self._prefix + key))
 
     def on_token(self, expression: str, callback: Callable[[str, bool], None]) -> None:
@@ -473,7 +473,7 @@ class Session:
         self._keep(listener)
 
     def far_ends(self) -> dict[str, FarEnd]:
-        """Return who is at the other end of each link, by its address there, e.g. "192.168.1.2:41000"."""
+        """Return the session at the far end of each link, by its address there, e.g. "192.168.1.2:41000"."""
         routers = {str(each) for each in self._raw.info.routers_zid()}
         return {
             str(link.dst).partition("/")[2]: FarEnd(str(link.zid), str(link.zid) in routers)
@@ -488,13 +488,13 @@ class Session:
 def open_session(
     settings: Settings, federation: str, identity: Identity, explain: Callable[[str], str]
 ) -> Iterator[Session]:
-    """Open a session of Zenoh, and close it with everything that it has declared.
+    """Open a Zenoh session, and close it with all its declarations.
 
     Args:
-        explain: turns Zenoh's error into the line that the user reads.
+        explain: converts Zenoh's error to the line shown to the user.
 
     Raises:
-        SessionError: it cannot be opened, or the process may not open as many files as it needs.
+        SessionError: it cannot be opened, or the limit of open files is too low.
     """
     require_files(SESSION_FILES, "a session")
     config = config_of(settings, identity)
@@ -515,10 +515,9 @@ def open_session(
 
 
 def _flow(view: bool, drop: bool) -> dict[str, Any]:
-    """Return what Zenoh does with a message on a full link.
+    """Return the treatment of a key's messages on a full link.
 
-    Views have a queue of their own: in one with others, a view that the hub forwards would wait behind a put that
-    blocks.
+    Views have a separate queue: in a shared one, a view forwarded by the hub would wait behind a blocked put.
     """
     return {
         "congestion_control": zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK,

@@ -1,11 +1,11 @@
-"""The identity of a process on the network, why a TLS link fails, and what a certificate permits.
+"""The identity of a process on the network, diagnosis of failed TLS links, and the permissions of a certificate.
 
-Zenoh reports only that it could not connect. Python's ssl does the same handshake with the same files and gets the
-reason. Dates are checked here, so that an expired certificate can still be read and named.
+Zenoh reports only that it could not connect. Python's ssl repeats the handshake with the same files and reports the
+reason. Dates are checked here, so that the error can name an expired certificate.
 
-What access control does not permit Zenoh drops without telling the sender. So a process that listens answers a get on
-`@access/NAME` with `Permissions`, to everybody with a certificate of its authority, and a client refuses before it
-sends.
+Zenoh silently drops messages that access control does not permit. So a listening process answers a get on
+`@access/NAME` with `Permissions` to every client with a certificate of its authority, and the client raises an error
+instead of sending.
 """
 
 import contextlib
@@ -40,7 +40,7 @@ _MISNAMED = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISM
 
 
 class Identity(NamedTuple):
-    """The identity that a process is started with: its host, its certificate, and whom it admits."""
+    """The identity of a process: its host, its certificate, and the processes that it admits."""
 
     host: str = socket.gethostname()  # the name that its messages give
     tls: Path | None = None  # folder with ca.pem, certificate.pem and key.pem; None goes without TLS
@@ -50,7 +50,7 @@ class Identity(NamedTuple):
 
     @property
     def files(self) -> tuple[Path, Path, Path]:
-        """The certificate of the authority that signs for everybody; the process's own; its key."""
+        """The certificate of the common authority, the certificate of the process, and its key."""
         assert self.tls is not None
         return self.tls / AUTHORITY, self.tls / CERTIFICATE, self.tls / KEY
 
@@ -60,7 +60,7 @@ def is_tls(endpoint: str) -> bool:
 
 
 def leaves_machine(endpoint: str) -> bool:
-    """Tell whether a link of an endpoint goes over a network; False for a malformed endpoint."""
+    """Tell whether links of an endpoint use a network; False for a malformed endpoint."""
     protocol, _, place = endpoint.partition("/")
     host = (place.rpartition(":")[0] or place).strip("[]")
     if protocol not in NETWORKED or host == "localhost":
@@ -72,7 +72,7 @@ def leaves_machine(endpoint: str) -> bool:
 
 
 def own_fault(identity: Identity) -> str | None:
-    """Return what is wrong with a process's own files, None if they are good."""
+    """Return the fault of a process's own files, None if they are valid."""
     for path in identity.files:
         try:
             with open(path, "rb") as file:
@@ -83,7 +83,7 @@ def own_fault(identity: Identity) -> str | None:
     try:
         certificate = _read_own(identity)
     except (ssl.SSLError, ValueError) as error:
-        return f"{identity.tls}: certificate.pem, key.pem and ca.pem do not go together ({_reason(error)}); {MEND}"
+        return f"{identity.tls}: certificate.pem, key.pem and ca.pem do not match ({_reason(error)}); {MEND}"
     if fault := _date_fault(certificate):
         return fault
     found, wanted = _name(certificate), identity.process
@@ -93,21 +93,21 @@ def own_fault(identity: Identity) -> str | None:
 
 
 def own_name(identity: Identity) -> str:
-    """Return the name in a process's own certificate, in which `own_fault` has found nothing wrong."""
+    """Return the name in a process's own certificate, which `own_fault` has found valid."""
     return _name(_read_own(identity))
 
 
 def no_link(identity: Identity, endpoint: str, error: str) -> str:
-    """Return in a line why a client could not connect; `error` is Zenoh's text."""
+    """Return a line on why a client could not connect; `error` is Zenoh's text."""
     if fault := peer_fault(identity, endpoint):
         return f"cannot connect to {endpoint}: {fault}"
     return f"nobody listens on {endpoint}; start a world there ({error})"
 
 
 def peer_fault(identity: Identity, endpoint: str) -> str | None:
-    """Return why a handshake with the process that listens on an endpoint fails.
+    """Return why a handshake with the process listening on an endpoint fails.
 
-    None where it does not fail, and where nobody listens or answers, which may change by waiting.
+    None if it does not fail, or if no process listens or answers, which may change.
     """
     place = _ENDPOINT.fullmatch(endpoint)
     if identity.tls is None or place is None:
@@ -126,9 +126,9 @@ def peer_fault(identity: Identity, endpoint: str) -> str | None:
             return fault
     except ssl.SSLCertVerificationError as error:
         if error.verify_code in _UNRELATED:
-            return f"the certificate of who listens there is of another authority than ours; {MEND} and use one set"
+            return f"the listener's certificate is of another authority than ours; {MEND} and use one set"
         if error.verify_code not in _MISNAMED:
-            return f"the certificate of who listens there is refused ({error.verify_message}); {MEND}"
+            return f"the listener's certificate is refused ({error.verify_message}); {MEND}"
     except ssl.SSLError as error:
         return _words(error, endpoint)
     except OSError:
@@ -141,7 +141,7 @@ def peer_fault(identity: Identity, endpoint: str) -> str | None:
     except OSError:
         return None
     found = ", ".join(str(name) for _, name in there) or "no address"
-    return f"the certificate of who listens there is for {found}; must be for {host}; {ADDRESS_MEND}"
+    return f"the listener's certificate is for {found}; must be for {host}; {ADDRESS_MEND}"
 
 
 def _client(identity: Identity) -> ssl.SSLContext:
@@ -154,16 +154,16 @@ def _client(identity: Identity) -> ssl.SSLContext:
 
 
 def _words(error: ssl.SSLError, endpoint: str) -> str | None:
-    """Return an error of the handshake in words; None if the next attempt may succeed."""
+    """Return the text of a handshake error; None if the next attempt may succeed."""
     reason = error.reason or ""
     if "EXPIRED" in reason:
-        return f"our certificate has expired by the clock of who listens there; {RENEW}"
+        return f"our certificate has expired by the listener's clock; {RENEW}"
     if "UNKNOWN_CA" in reason or "DECRYPT_ERROR" in reason:
-        return f"our certificate is of another authority than that of who listens there; {MEND} and use one set"
+        return f"our certificate is of another authority than the listener's; {MEND} and use one set"
     if "ALERT" in reason:
-        return f"who listens there refuses our certificate ({_reason(error)}); {MEND}"
+        return f"the listener refuses our certificate ({_reason(error)}); {MEND}"
     if "WRONG_VERSION" in reason or "RECORD_LAYER" in reason or "HTTP" in reason:
-        return f"who listens there has no TLS; start it with --tls, or say tcp/ instead of {endpoint.split('/')[0]}/"
+        return f"the listener has no TLS; start it with --tls, or say tcp/ instead of {endpoint.split('/')[0]}/"
     return None
 
 
@@ -173,7 +173,7 @@ def _reason(error: Exception) -> str:
 
 
 def _date_fault(certificate: dict[str, Any]) -> str | None:
-    """Return that a certificate has expired, or is not valid yet; None if it is valid now."""
+    """Return a text for a certificate that has expired or is not yet valid; None if it is valid now."""
     if not certificate:
         return None
     now_s, whose = time.time(), f"the certificate of {_name(certificate)}"
@@ -192,9 +192,9 @@ def _name(certificate: dict[str, Any]) -> str:
 
 
 def _read_own(identity: Identity) -> dict[str, Any]:
-    """Return the content of a process's own certificate, by a handshake with itself in memory.
+    """Return the content of a process's own certificate, read by a handshake with itself in memory.
 
-    ssl.SSLError if key, certificate and authority do not belong together.
+    ssl.SSLError if key, certificate and authority do not match.
     """
     server_side = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     server_side.load_cert_chain(*identity.files[1:])
@@ -210,7 +210,7 @@ def _read_own(identity: Identity) -> dict[str, Any]:
 
 
 class Permissions(Struct, frozen=True):
-    """What one process may do at the process that listens; expressions include the federation's name."""
+    """The permissions of one process at a listening process; expressions include the federation's name."""
 
     listener: str  # name of the process that listens
     process: str  # name in the certificate
@@ -222,12 +222,12 @@ class Permissions(Struct, frozen=True):
         if self.allowed:
             return None
         return (
-            f"certificate for {self.process} is not let in by {self.listener}; must be for one of "
+            f"certificate for {self.process} is not admitted by {self.listener}; must be for one of "
             f"{_shown(self.known)}; let it in with zsim certs init, and start {self.listener} again"
         )
 
     def denial(self, act: Act, expression: str, prefix: str) -> str:
-        """Return in a line that the process may not do something; its keys are without the federation's prefix."""
+        """Return a line on an action that is not permitted; keys are without the federation's prefix."""
         kind = expression.partition("/")[0]
         allowed = [each.removeprefix(prefix) for each in self.allowed.get(act, ())]
         alike_first = sorted(allowed, key=lambda each: each.partition("/")[0] != kind)
@@ -236,11 +236,11 @@ class Permissions(Struct, frozen=True):
 
 
 def permissions_of(access: Mapping[str, Any], listener: str, process: str) -> Permissions:
-    """Return what Zenoh's access control at a listening process permits another process by its certificate.
+    """Return the permissions of a process, by its certificate, under Zenoh's access control at a listening process.
 
     Args:
-        access: the content of an access.json, which Zenoh has accepted.
-        listener: name of the process that listens.
+        access: the content of an access.json that Zenoh has accepted.
+        listener: name of the listening process.
         process: name in the certificate.
     """
     subjects = {each["id"] for each in access.get("subjects", ()) if process in each.get("cert_common_names", ())}

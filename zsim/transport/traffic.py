@@ -1,4 +1,4 @@
-"""Everything that passes the hub, received by one subscription, or replayed: batches are taken apart here alone.
+"""All traffic through the hub, received by one subscription or replayed; batches are unpacked only here.
 
 traffic = Traffic(link, run_key_table(info))
 for entry in traffic.receive(): ...     ReceivedSample(key, payload), or GateMessages of the world's drones
@@ -15,11 +15,11 @@ Passed = ReceivedSample | GateMessages
 
 
 class Traffic:
-    """What the world and others publish, in the order in which it passed the hub, except views.
+    """All messages except views, in the order in which they passed the hub.
 
     Args:
         table: keys of the world's messages about the drones of the run, see `run_key_table`.
-        refused: called for each batch, or part of one, that cannot be read.
+        refused: called for each batch, or part of one, that cannot be decoded.
     """
 
     def __init__(self, link: Session, table: tuple[str, ...], refused: Callable[[], None] = lambda: None) -> None:
@@ -28,15 +28,15 @@ class Traffic:
         self._refused = refused
 
     def wake(self) -> None:
-        """Let a waiting `receive` return; callable from any thread."""
+        """Make a waiting `receive` return; callable from any thread."""
         self._subscription.wake()
 
     def close(self) -> None:
-        """Receive nothing more; a waiting `receive` raises SessionError."""
+        """Stop receiving; a waiting `receive` raises SessionError."""
         self._subscription.undeclare()
 
     def receive(self) -> list[Passed]:
-        """Wait for what passes next; nothing when woken by `wake`.
+        """Wait for the next messages; return none when woken by `wake`.
 
         SessionError if the session, or this subscription, was closed meanwhile.
         """
@@ -77,17 +77,17 @@ def samples(passed: Iterable[Passed]) -> Iterator[ReceivedSample]:
 def replay(
     link: Session, process: str, from_ns: int, expressions: Sequence[str], timeout_s: float
 ) -> Iterator[tuple[str, bytes]]:
-    """Yield (key, payload), in the order in which they passed the world, of what is stamped after `from_ns`.
+    """Yield (key, payload) of the messages stamped after `from_ns`, in the order in which they passed the world.
 
     The world keeps the last seconds, and answers page by page.
 
     Args:
         from_ns: simulated time [ns]; -1 for everything that the world still has.
-        expressions: keys that are wanted.
-        timeout_s: how long each page is waited for.
+        expressions: wanted keys.
+        timeout_s: timeout of each page.
 
     Raises:
-        NoWorldError: the world does not answer, or not with a replay; what was yielded until then is valid.
+        NoWorldError: the world does not answer, or not with a replay; messages already yielded are valid.
     """
     page: int | None = 0
     while page is not None:
@@ -96,7 +96,7 @@ def replay(
             answer = link.request(keys.replay(process), "replay", process, args, timeout_s)
             passed = pairs_of(answer.result) if answer.ok else []
         except DecodeError as error:
-            raise NoWorldError(f"{process}: the world's replay is of no use: {error}") from error
+            raise NoWorldError(f"{process}: the world's replay is not usable: {error}") from error
         if not answer.ok:
             raise NoWorldError(answer.error)
         yield from passed

@@ -1,4 +1,4 @@
-"""What a session needs: Zenoh's settings, and how many files the process may have open.
+"""Zenoh's settings for a session, and the limit of open files.
 
 Settings are {path in Zenoh's configuration: JSON5}; reasons in docs/decisions/0002. The limit of open files
 (RLIMIT_NOFILE, `ulimit -n`) is checked in advance: Zenoh panics, or waits without end, where a socket or a thread's
@@ -16,7 +16,7 @@ from zsim.transport.tls import Identity
 
 LEASE_LOCKSTEP_MS = 3_600_000  # a stopped or debugged process must not lose its link in lockstep
 LEASE_REALTIME_MS = 1_000
-# Nobody waits for a process that only reads, so its loss need not be noticed within a second.
+# The run does not wait for a process that only reads, so its loss need not be noticed within a second.
 LEASE_READER_MS = 10_000
 CLOSE_AFTER_US = 3_600_000_000  # -1 means for ever and panics in 1.10.2
 # A stopped reader (a recorder, `zsim echo`) fills its link and then holds up the hub and everybody; it loses its link.
@@ -46,7 +46,7 @@ Settings = dict[str, str]
 
 
 def common(mode: str, timing: Mode, reader: bool = False) -> Settings:
-    """Return what every session has; `mode` is Zenoh's (client, peer, router), a `reader` never gates."""
+    """Return the settings of every session; `mode` is Zenoh's (client, peer, router), a `reader` never gates."""
     lease = LEASE_READER_MS if reader else LEASE_REALTIME_MS if timing == "realtime" else LEASE_LOCKSTEP_MS
     return {
         "mode": json.dumps(mode),
@@ -61,9 +61,9 @@ def common(mode: str, timing: Mode, reader: bool = False) -> Settings:
 
 
 def listening(endpoints: Sequence[str], identity: Identity) -> Settings:
-    """Return what a hub or a router has in addition: it needs its port, and gives up on a reader that takes nothing.
+    """Return the additional settings of a hub or router: it requires its port, and closes links of stalled readers.
 
-    SessionError if endpoints and identity do not go together, or a file of the identity cannot be used.
+    SessionError if endpoints and identity do not match, or a file of the identity is unusable.
     """
     return {
         "listen/endpoints": json.dumps(list(endpoints)),
@@ -77,7 +77,7 @@ def listening(endpoints: Sequence[str], identity: Identity) -> Settings:
 
 
 def connecting(endpoint: str, identity: Identity, wait_s: float) -> Settings:
-    """Return what a client has in addition; it tries to connect for `wait_s`. Errors as of `listening`."""
+    """Return the additional settings of a client, which tries to connect for `wait_s`. Errors as in `listening`."""
     return {
         "connect/endpoints": json.dumps([endpoint]),
         "connect/timeout_ms": str(int(1000 * wait_s)),
@@ -86,12 +86,12 @@ def connecting(endpoint: str, identity: Identity, wait_s: float) -> Settings:
 
 
 def hub(timing: Mode) -> Settings:
-    """Return what the hub has in addition: nothing is upstream of it, so opening does not wait for a peer.
+    """Return the additional settings of the hub, which has no upstream and opens without waiting for a peer.
 
-    In lockstep its queues are as long as Zenoh allows, so that a link is closed before it is full (see link_watch); in
-    realtime, where less passes, long queues would make what passes a slow link stale.
+    In lockstep its queues are as long as Zenoh allows, so that a link is closed before it is full (see link_watch). In
+    realtime long queues would only delay the messages on a slow link.
 
-    A router keeps Zenoh's half a second, in which it learns from its upstream who answers there.
+    A router keeps Zenoh's half second, in which it learns the queryables of its upstream.
     """
     queue = {"transport/link/tx/queue/size/data": str(QUEUE_LOCKSTEP)} if timing == "lockstep" else {}
     return {"scouting/delay": "0", **queue}
@@ -102,7 +102,7 @@ def upstream(endpoint: str, identity: Identity) -> Settings:
 
 
 def _security(identity: Identity, endpoints: Sequence[str], doing: str) -> Settings:
-    """Return TLS with a certificate on both sides, and access control."""
+    """Return the settings of TLS, with certificates on both sides, and of access control."""
     for endpoint in endpoints:  # no combination is less secure than it looks
         secure = tls.is_tls(endpoint)
         if secure and identity.tls is None:
@@ -137,7 +137,7 @@ def _security(identity: Identity, endpoints: Sequence[str], doing: str) -> Setti
 def refusal(path: str, value: str, identity: Identity) -> str:
     """Return the error for a setting that Zenoh refuses: only endpoints and access control come from the user."""
     if path == ACCESS:
-        return f"{identity.access}: is no access control of Zenoh's; must be an access.json of zsim certs init"
+        return f"{identity.access}: is not an access control of Zenoh; must be an access.json of zsim certs init"
     endpoints = ", ".join(map(repr, json.loads(value)))
     return f"endpoint is {endpoints}; must be PROTOCOL/ADDRESS such as tcp/127.0.0.1:7447"
 
@@ -145,7 +145,7 @@ def refusal(path: str, value: str, identity: Identity) -> str:
 def read_access(identity: Identity) -> Any:
     """Return the access control in a file; Zenoh checks its content.
 
-    SessionError if it cannot be read, or is not JSON.
+    SessionError if it cannot be read or is not JSON.
     """
     assert identity.access is not None
     try:
@@ -163,11 +163,11 @@ def hub_files(clients: int) -> int:
 
 
 def launcher_files(roles: int, names: int) -> int:
-    """Return how many files the process of a run that needs most of them needs: its hub or its launcher.
+    """Return the largest number of open files needed by a process of a run: its hub or its launcher.
 
     Args:
-        roles: processes that are started, the world among them.
-        names: number of processes that the world waits for: more than are started, where one does the work of many.
+        roles: started processes, including the world.
+        names: number of processes that the world waits for, possibly more than are started.
     """
     return max(hub_files(max(roles - 1, names)), SESSION_FILES + ROLE_FILES * roles)
 
@@ -177,9 +177,9 @@ def host_launcher_files(roles: int, hosts: int) -> int:
 
 
 def require_files(needed: int, what: str) -> None:
-    """Raise the soft limit to the files needed at once; SessionError if the hard limit does not allow it.
+    """Raise the soft limit to the needed number of files; SessionError if the hard limit does not allow it.
 
-    `what`: what needs them, for the error: "12 processes".
+    `what`: the cause, for the error: "12 processes".
     """
     allowed = allow_files(needed)
     if allowed is not None and allowed < needed:
@@ -187,7 +187,7 @@ def require_files(needed: int, what: str) -> None:
 
 
 def allow_files(wanted: int) -> int | None:
-    """Raise the soft limit to what is wanted, as far as the hard one allows; return it, None where there is none."""
+    """Raise the soft limit to the wanted number, as far as the hard limit allows; return it, None without a limit."""
     if sys.platform == "win32":
         return None
     import resource

@@ -1,4 +1,4 @@
-"""The parameters of a vehicle: what a scenario may override for one drone, and what it is silent about.
+"""The parameters of a vehicle: those that a scenario may override for a drone, and the others.
 
 Geometry in B: x forward, y left, z up, origin at the centre of mass. Thrust, torque and drag hold at an air density of
 1.225 kg/m^3. A drone whose `arm_m`, `thrust_n_s2` or `torque_nm_s2` is overridden is taken as similar in shape: lengths
@@ -29,7 +29,7 @@ TakeoffHeight = Annotated[float, Meta(ge=0.3, le=5)]
 
 
 class Limits(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the firmware allows a commander; defaults of the AR.Drone SDK's outdoor set where it has them.
+    """The limits of the firmware for a commander; defaults of the AR.Drone SDK's outdoor set if it has them.
 
     How far they go is chosen: what larger and racing aircraft fly, and the loops still hold.
     """
@@ -71,7 +71,7 @@ class Rotor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Airframe(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What touches the ground and others: four feet, four points of the hull's rim, and the hull as a sphere."""
+    """The contact geometry: four feet, four points of the hull's rim, and the hull as a sphere."""
 
     hull_radius_m: Positive
     foot_xy_m: Positive  # |x| and |y| of a foot
@@ -96,7 +96,7 @@ class Battery(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Firmware(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the firmware's loops, sequences and observer are designed with.
+    """The design parameters of the firmware's loops, sequences and observer.
 
     The gains of rate, tilt and velocity loop follow from the rotors' lag: rate_per_lag over the overdriven lag, and
     each outer loop slower than the one in it by `loop_ratio`.
@@ -198,7 +198,7 @@ def cross_layout(arm_m: float) -> tuple[Rotor, ...]:
 
 
 def allocation(vehicle: Vehicle) -> np.ndarray:
-    """Return what each rotor's thrust gives of roll, pitch and yaw, (3, R).
+    """Return the roll, pitch and yaw moments per thrust of each rotor, (3, R).
 
     Roll and pitch in units of arm_m / sqrt(2), yaw in units of the torque per thrust.
     """
@@ -208,12 +208,12 @@ def allocation(vehicle: Vehicle) -> np.ndarray:
 
 
 def is_balanced(vehicle: Vehicle) -> bool:
-    """Tell whether rotors that turn alike give no moment."""
+    """Tell whether rotors at equal speed give no moment."""
     return bool(np.abs(allocation(vehicle).sum(axis=1)).max() <= BALANCE_MAX * len(vehicle.rotors))
 
 
 def mixing(vehicle: Vehicle) -> np.ndarray:
-    """Return the thrust of each rotor for a unit of roll, pitch and yaw, (R, 3), without any thrust in all.
+    """Return the thrust of each rotor for a unit of roll, pitch and yaw, (R, 3), with zero total thrust.
 
     The pseudo-inverse of `allocation`, of an unbalanced vehicle of it below a row of thrust.
     """
@@ -224,7 +224,7 @@ def mixing(vehicle: Vehicle) -> np.ndarray:
 
 
 def lift_shares(vehicle: Vehicle) -> np.ndarray:
-    """Return the thrust of each rotor over the mean, (R,), that gives no moment: 1 where they are balanced."""
+    """Return the ratio of each rotor's thrust to the mean, (R,), without a moment: 1 if they are balanced."""
     layout, count = allocation(vehicle), len(vehicle.rotors)
     if is_balanced(vehicle):
         return np.ones(count)

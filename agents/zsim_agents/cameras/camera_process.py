@@ -1,6 +1,6 @@
-"""The cameras of one or several drones as a process: draws what they see, from the truth, and publishes it.
+"""The cameras of one or several drones as a process: renders their pictures from the truth and publishes them.
 
-When it is too slow it drops and counts pictures; where the scenario lets cameras gate, the run waits.
+If it is too slow it drops and counts pictures; if cameras gate in the scenario, the run waits.
 """
 
 import math
@@ -39,7 +39,7 @@ PENDING_MAX = 64  # gates of which the truth of a drone may be missing
 
 
 class _Eye:
-    """One camera of one drone: its renderer, and which picture is next."""
+    """A camera of a drone: its renderer, and the next picture."""
 
     def __init__(self, drone: str, name: str, camera: Camera, renderer: Renderer) -> None:
         self.key, self.info_key = keys.camera(drone, name), keys.camera_info(drone, name)
@@ -89,7 +89,7 @@ class CameraProcess(RunProcess):
         super().__init__(link, participant)
 
     def begin(self) -> None:
-        """Subscribe to the truth, and publish what the pixels mean."""
+        """Subscribe to the truth, and publish the camera info."""
         for eye in self._eyes:
             self._link.declare_queryable(eye.info_key, self._on_query)
         self._link.declare_subscriber(keys.truth("*"), self._on_truth)
@@ -104,9 +104,9 @@ class CameraProcess(RunProcess):
             self._finish()
 
     def join(self) -> None:
-        """Let the world wait for this process.
+        """Join, so that the world waits for this process.
 
-        Replies to a query may overtake earlier publications: a run that has yet to begin is not queried.
+        Replies to a query may overtake earlier publications: a run that has not begun is not queried.
         """
         has_begun = bool(self._link.get(keys.truth("*"), timeout_s=ASK_S))
         self._participant.announce()
@@ -122,7 +122,7 @@ class CameraProcess(RunProcess):
         self._draw()
 
     def _finish(self) -> None:
-        """Publish the pictures that are due by the end of the run, whose truth may still be on its way."""
+        """Publish the pictures due by the end of the run, whose truth may not have arrived yet."""
         end_s = time.monotonic() + DRAIN_S
         self._draw()
         while self._truths.newest_ns < self._participant.now_ns and time.monotonic() < end_s:
@@ -131,7 +131,7 @@ class CameraProcess(RunProcess):
         time.sleep(OVERTAKING_S)
 
     def _catch_up(self) -> None:
-        """Ask for the newest truth where the world waits for this process: it may have passed already."""
+        """Request the newest truth if the world waits for this process: it may have been published before."""
         if self._participant.gates:
             self._arrived.extend(self._link.get(keys.truth("*"), timeout_s=ASK_S))
             self.wake()
@@ -171,7 +171,7 @@ class CameraProcess(RunProcess):
                 self._truths.add(number, truth)
 
     def _due(self) -> list[tuple[_Eye, int]]:
-        """Return the pictures that are due, one camera after the other; those that are too old are counted as dropped.
+        """Return the due pictures, one camera after the other; pictures that are too old are counted as dropped.
 
         The camera whose last picture is oldest comes first: a process that is too slow drops some of each.
         """
@@ -190,7 +190,7 @@ class CameraProcess(RunProcess):
         return [(eye, number) for _, number, eye in sorted(due, key=lambda each: (each[0], each[2].last))]
 
     def _expose(self, eye: _Eye, number: int) -> None:
-        """Draw and publish a picture unless it is too late for it by now."""
+        """Render and publish a picture unless it is too late."""
         start_ns = time.perf_counter_ns()
         t_sample_ns = eye.exposure_ns(number)
         health = self._participant.health
@@ -238,13 +238,13 @@ class CameraProcess(RunProcess):
 
 
 class TruthHistory:
-    """The last gates with the truth of every simulated drone, and the drones between two of them. Pure.
+    """The true states of every simulated drone at the last gates, with interpolation between gates. Pure.
 
     External drones, whose drivers may skip gates, are extrapolated from their last pose.
 
     Args:
-        span_ns: how far back it reaches, at least.
-        external: by index, where each external drone stands until its driver publishes.
+        span_ns: minimum time that it covers [ns].
+        external: start state of each external drone by index, valid until its driver publishes.
     """
 
     def __init__(self, drones: int, gate_ns: int, span_ns: int, external: Mapping[int, Truth] = {}) -> None:
@@ -279,7 +279,7 @@ class TruthHistory:
             del self._pending[min(self._pending)]
 
     def bodies(self, t_ns: int) -> DroneStates | None:
-        """Return all drones at an instant, or None where a neighbouring gate is missing."""
+        """Return all drones at an instant, or None if a neighbouring gate is missing."""
         before_ns = t_ns // self._gate_ns * self._gate_ns
         before, after = self._whole.get(before_ns), self._whole.get(before_ns + self._gate_ns)
         if before is None:
@@ -290,7 +290,7 @@ class TruthHistory:
 
 
 def standing(drone: Drone, rotors: int) -> Truth:
-    """Return a drone where the scenario puts it, its rotors at rest."""
+    """Return a drone at its start position, with stopped rotors."""
     half = 0.5 * math.radians(drone.yaw_deg)
     still, q_WB = (0.0, 0.0, 0.0), (math.cos(half), 0.0, 0.0, math.sin(half))
     return Truth(0, 0, drone.position_m, still, q_WB, still, still, (0.0,) * rotors)

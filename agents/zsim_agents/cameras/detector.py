@@ -1,4 +1,4 @@
-"""Finds magenta hats in a picture, from zsim or from a real camera: bearing and range of each, with sigmas. Pure.
+"""Finds magenta hats in a simulated or real picture: bearing and range of each, with standard deviations. Pure.
 
 How magenta a pixel is is a number that is linear where a hat mixes with grass, sky or hull, and zero for orange: the
 share of a pixel that a hat covers is that number over the hat's own. Direction and range follow from the circle of the
@@ -70,10 +70,10 @@ _PEAK = (1 - np.exp(-_x)) / _x  # of a blurred disc's middle over its own colour
 def decoded(data: bytes, width: int, height: int) -> Picture:
     """Return a JPEG as B, G, R, (height, width, 3).
 
-    Its size is read from the header before anything is decoded, so that a stranger's picture takes bounded memory.
+    Its size is read from the header before decoding, so that an untrusted picture takes bounded memory.
 
     Raises:
-        PictureError: no JPEG, another size than announced, or too many pixels.
+        PictureError: it is not a JPEG, differs from the announced size, or has too many pixels.
     """
     _, found_width, found_height = frame_of(data)
     if (found_width, found_height) != (width, height):
@@ -127,7 +127,7 @@ class HatDetector:
         return tuple(hat for hat in found if hat is not None)
 
     def _boxes(self, picture: Picture) -> list[_Box]:
-        """Return magenta parts of the picture at half of its resolution, the largest first."""
+        """Return magenta regions of the picture at half its resolution, the largest first."""
         blue, green, red = cv2.split(cv2.resize(picture, self._half, interpolation=cv2.INTER_AREA))
         level = cv2.subtract(red, green)
         strong = cv2.addWeighted(level, 1.0, red, -SHARE_MIN, 0.5 - LEVEL_MIN)
@@ -147,7 +147,7 @@ class HatDetector:
         return whole
 
     def _hat(self, picture: Picture, box: _Box) -> Seen | None:
-        """Return the hat in a box of the picture at half of its resolution; None if it is none, or cut by the edge."""
+        """Return the hat in a box of the picture at half its resolution; None if there is none, or the edge cuts it."""
         u, v, wide, high = (2 * side for side in box)
         room = ROOM_PX + max(wide, high) // 6
         u0, v0, u1, v1 = u - room, v - room, u + wide + room, v + high + room
@@ -262,7 +262,7 @@ def rehearse() -> None:
 
 @portable
 def outline(covered: NDArray, noise: float, rays: NDArray, scale: float) -> Outline:
-    """Return the circle of a ball, NONE where there is no circle.
+    """Return the circle of a ball, NONE if there is no circle.
 
     Args:
         covered: share of each pixel that the ball covers, float32 (h, w).
@@ -304,7 +304,7 @@ def outline(covered: NDArray, noise: float, rays: NDArray, scale: float) -> Outl
 
 @portable
 def _middle(covered: NDArray) -> tuple[float, float]:
-    """Return the middle of what is covered [px]."""
+    """Return the centroid of the covered pixels [px]."""
     area, across, along = 1e-9, 0.0, 0.0
     for v in range(covered.shape[0]):
         for u in range(covered.shape[1]):
@@ -349,7 +349,7 @@ def _edge(covered: NDArray, u: float, v: float, cosine: float, sine: float) -> f
 
 @portable
 def _fitted(points: NDArray, first: int, count: int) -> Circle:
-    """Return the circle fitted to those of `count` points in a row, from `first` on, that are marked as on it."""
+    """Return the circle fitted to the marked ones of `count` consecutive points from `first` on."""
     n, mx, my = 0.0, 0.0, 0.0
     for k in range(count):
         x, y, on = points[(first + k) % len(points)]

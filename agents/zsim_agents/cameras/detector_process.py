@@ -1,4 +1,4 @@
-"""A detector of hats as a process: reads the pictures of some drones' cameras, and publishes what it finds in them."""
+"""A detector of hats as a process: reads the pictures of drones' cameras, and publishes sightings."""
 
 import time
 from collections import OrderedDict, defaultdict
@@ -49,7 +49,7 @@ class DetectorProcess(RunProcess):
         super().run(stopped)
 
     def begin(self) -> None:
-        """Subscribe to pictures and to what their pixels mean, for known names only: anybody could make up others."""
+        """Subscribe to pictures and camera infos, for known names only, since any program could invent others."""
         rehearse()
         for drone, name in product(self._drones, CAMERAS):
             self._link.declare_subscriber(keys.camera_info(drone, name), self._on_info)

@@ -1,4 +1,4 @@
-"""What the processes of cameras and of detectors share: their place in a run, and waiting for messages."""
+"""Common parts of camera and detector processes: participation in a run, and waiting for messages."""
 
 import threading
 from collections.abc import Callable
@@ -11,10 +11,10 @@ TICK_S = 0.1  # how often a stop is looked for while nothing arrives
 
 
 class RunProcess:
-    """A process that waits for messages, which arrive in Zenoh's threads, and handles them in `turn`.
+    """A process that waits for messages from Zenoh's threads, and handles them in `turn`.
 
     Attributes:
-        is_back: whether the link was lost and is back.
+        is_back: whether a lost link has been restored.
     """
 
     def __init__(self, link: Session, participant: Participant) -> None:
@@ -29,7 +29,7 @@ class RunProcess:
         raise NotImplementedError
 
     def run(self, stopped: Callable[[], bool]) -> None:
-        """Take turns until the run is over or the process is stopped."""
+        """Call `turn` until the run ends or the process is stopped."""
         while not (self._participant.end_reason or stopped()):
             self.turn()
 
@@ -37,7 +37,7 @@ class RunProcess:
         self._wake_event.set()
 
     def wait(self) -> None:
-        """Return when something has arrived, or after a tick."""
+        """Return when a message has arrived, or after a tick."""
         self._wake_event.wait(TICK_S)
         self._wake_event.clear()
         self._participant.tick()

@@ -1,4 +1,4 @@
-"""Estimators of drones: sensors in, rows moved and corrected, an estimate out at every gate. Imports zsim alone.
+"""Estimators of drones: from sensor readings to an estimate at every gate. Imports zsim only.
 
 estimator (the agent) -> estimator_bank (one step for all drones) or joint_filter (of a cluster) -> measurement_update
 and strapdown -> kalman_update. Columns of a row: filter_state; initial values: filter_setup. Instead of these:

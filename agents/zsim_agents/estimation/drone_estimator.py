@@ -1,4 +1,4 @@
-"""The interface of estimators: made for one drone, fed with its sensors, asked for an estimate at every gate.
+"""The interface of estimators: one object per drone receives its sensors and returns an estimate at every gate.
 
 A scenario chooses one by `estimation: {algorithm: …}`: `ekf`, the default of this package; `paper`; or
 `package.module:Class`, a class of your own with the methods of `DroneEstimator`. It sees only plain objects: sections
@@ -43,12 +43,12 @@ class DroneEstimator(Protocol):
     """Estimates the state of one drone.
 
     A class may have three more methods, for a process that takes over from one that died. `snapshot(self)` returns the
-    whole state of the estimator as a map of plain values and arrays (`zsim.contract.snapshot.State`), and
+    state of the estimator as a map of plain values and arrays (`zsim.contract.snapshot.State`), and
     `restore(self, state)` sets it in a new object, which then continues with the same bits. Without them
     `warm_start(self, last)` is called, with the last `zsim.contract.flight_messages.Estimate` that was published.
 
     Args:
-        drone: its sensors, their mounts, rates and error models; where it was set down.
+        drone: its sensors, their mounts, rates and error models; its start position.
         environment: gravity and magnetic field.
         estimation: settings of the scenario's estimators.
         gate_s: interval of the gates [s].
@@ -57,13 +57,13 @@ class DroneEstimator(Protocol):
     def __init__(self, drone: Drone, environment: Environment, estimation: Estimation, gate_s: float) -> None: ...
 
     def receive(self, sensor: str, message: Any) -> None:
-        """Take a reading.
+        """Receive a reading.
 
-        Readings of a gate come in the order of arrival, then of their names; some may be late or missing.
+        Readings of a gate come in order of arrival, then of name; some may be late or missing.
 
         Args:
             sensor: "imu", "gps", "mag", "baro", "sonar", "flow", or of your own.
-            message: of that sensor, as `zsim.contract.messages.Imu`; `t_sample_ns` is the instant for which it holds.
+            message: message of that sensor, such as `zsim.contract.messages.Imu`; `t_sample_ns` is its instant.
         """
         ...
 
@@ -76,7 +76,7 @@ def estimator_class(algorithm: str, where: str = "estimation.algorithm") -> Call
     """Return the class that an algorithm names; None for `ekf`, whose drones share one `EstimatorBank`.
 
     Raises:
-        DocumentError: no such module or class, or it lacks a method; the text begins with `where`.
+        DocumentError: there is no such module or class, or a method is missing; the text begins with `where`.
     """
     if algorithm == ESTIMATORS[0]:
         return None
@@ -118,7 +118,7 @@ class EstimatorSet:
         return estimates
 
     def _raise(self, error: BaseException, i: int) -> NoReturn:
-        """Raise an error of a user's class with its drone, any other one again."""
+        """Raise an error of a user's class with its drone, any other one unchanged."""
         failure = plugin.user_code_error(error, "")
         if failure is None:
             raise error
@@ -147,7 +147,7 @@ class EstimatorSet:
 
 
 def _plain(estimate: StateEstimate, estimator: DroneEstimator, drone: str) -> StateEstimate:
-    """Return a validated estimate in plain numbers."""
+    """Return a validated estimate as plain numbers."""
     what = f"{plugin.full_name(type(estimator))}.estimate returns for {drone}"
     values = {}
     for field in (*SIZES, "yaw_rad", "yaw_sigma_rad"):

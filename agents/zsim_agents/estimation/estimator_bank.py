@@ -1,7 +1,7 @@
 """The estimators of many drones as rows of arrays: sensors in, a compiled step for all of them, estimates out.
 
-Readings are only stored when they come. At the end of the gate every drone's IMU moves its nominal state (strapdown),
-its covariance follows, and its other readings are judged and used (measurement_update).
+Readings are stored on arrival. At the end of the gate every drone's IMU propagates its nominal state (strapdown) and
+covariance, and its other readings are tested and used (measurement_update).
 """
 
 import struct
@@ -81,11 +81,11 @@ _VALUES: dict[str, Callable[[Any], tuple[float, ...]]] = {  # values and extra o
 class EstimatorBank:
     """Fuses the sensors of several drones; `i` is the index in the order given.
 
-    Sensors may come in any order between two gates. Duplicates are ignored; readings that are older than the sensor's
-    last one, not finite, or outside of their gate are refused and counted.
+    Sensors may come in any order between two gates. Duplicates are ignored; readings older than the sensor's last one,
+    not finite, or outside their innovation gate are refused and counted.
 
     Attributes:
-        counted: sensors in the order of publication, and where their used and refused are counted.
+        counted: sensors in the order of publication, and the columns of their used and refused counts.
     """
 
     counted = (*((name, k, _REFUSED + k) for k, name in enumerate(SENSORS) if k != IMU), ("imu", IMU, _REFUSED + IMU))
@@ -100,7 +100,7 @@ class EstimatorBank:
         self._reader = GateReader([drone.name for drone in drones])
 
     def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
-        """Take a message that arrived at `t_arrival_s`; sensors other than SENSORS are ignored."""
+        """Receive a message that arrived at `t_arrival_s`; sensors other than SENSORS are ignored."""
         if sensor not in _VALUES:
             return
         if self._count == len(self._readings):
@@ -111,7 +111,7 @@ class EstimatorBank:
         self._count += 1
 
     def receive_gate(self, gate: GateMessages) -> bool:
-        """Take all sensors of a gate; False, and none, if one of its messages has to be decoded."""
+        """Receive all sensors of a gate; return False, and take none, if one of its messages must be decoded."""
         while self._count + len(gate) > len(self._readings):
             self._make_room(2 * len(self._readings))
         count = self._reader.take(gate, self._readings, self._count)
@@ -150,7 +150,7 @@ class EstimatorBank:
     def warm_start(self, i: int, last: StateEstimate | Estimate) -> None:
         """Continue from a published estimate; call before the first reading.
 
-        Tilt and biases, of which an estimate has no covariance, start as uncertain as in a cold start.
+        Tilt and biases, whose covariance is not published, start as in a cold start.
         """
         w, x, y, z = (float(part) for part in last.orientation_wxyz)
         row, setting, P = self.rows.nominal[i], self.rows.setting[i], self.rows.covariance[i]
@@ -168,7 +168,7 @@ class EstimatorBank:
         return {name: getattr(self.rows, name) for name in STATES}
 
     def restore(self, state: State) -> None:
-        """Take over the rows of another bank of the same drones; KeyError, ValueError: they are of another shape."""
+        """Take over the rows of another bank of the same drones; KeyError, ValueError: the shapes differ."""
         for name in STATES:
             rows = getattr(self.rows, name)
             if state[name].shape != rows.shape:
@@ -201,7 +201,7 @@ def step(held: Held, t_s: float, readings: Array, estimates: Array) -> None:
 
 @portable
 def sort_readings(rows: Rows, readings: Array, first: Array, after: Array) -> None:
-    """Move every drone by its IMU, and chain the aiding readings that are to be used.
+    """Propagate every drone by its IMU, and chain the aiding readings to be used.
 
     Args:
         readings: (M, READING.size).
@@ -224,7 +224,7 @@ def sort_readings(rows: Rows, readings: Array, first: Array, after: Array) -> No
 
 @portable
 def _step_one(rows: Rows, i: int, t_s: float, readings: Array, first: int, after: Array, estimate: Array) -> None:
-    """Let the covariance of a drone follow its IMU, use its aiding readings, and write its estimate."""
+    """Propagate the covariance of a drone, use its aiding readings, and write its estimate."""
     row, counts, n = rows.nominal[i], rows.counts[i], rows.layout[i, LAYOUT.states]
     if not counts[COUNT.running]:
         strapdown.begin(row, counts, t_s)
@@ -242,7 +242,7 @@ def _step_one(rows: Rows, i: int, t_s: float, readings: Array, first: int, after
 def write_estimate(row: Array, setting: Array, P: Array, t_s: float, estimate: Array) -> None:
     """Write the estimate for an instant that the IMU may not have reached yet, (ESTIMATE.size,).
 
-    Until then it is extrapolated with the acceleration of the last sample, its noise, and possible manoeuvres.
+    Until then it is extrapolated with the acceleration of the last sample, its noise and possible manoeuvres.
     """
     p, v, q, a_W, w, _ = reckoning(row)
     ahead = t_s - row[NOMINAL.t]

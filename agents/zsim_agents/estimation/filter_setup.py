@@ -1,8 +1,8 @@
-"""From a scenario to the rows of the filter before the first reading: noise, biases, gain, and initial uncertainty.
+"""The initial rows of the filter from a scenario: noise, biases, gain and initial uncertainty.
 
 The error state is position (3), velocity (3), small rotation of the attitude (3), all in the world frame, gyroscope
-bias (3) in the body frame, accelerometer bias (3) where the drone has one, then the bias of every other channel that
-has one, then the clones.
+bias (3) in the body frame, accelerometer bias (3) if the drone has one, then the biases of other channels, then the
+clones.
 """
 
 import math
@@ -76,7 +76,7 @@ class UpdateChannel(NamedTuple):
 
     Attributes:
         field: of the sensor's section in a scenario, which holds the error model.
-        sigma_min: error of the model itself, so that a scenario without noise does not give infinite trust.
+        sigma_min: model error, so that a scenario without noise does not give infinite confidence.
     """
 
     sensor: str
@@ -105,7 +105,7 @@ AIDING = (  # in the order of the values of a reading
 
 
 class Bias(NamedTuple):
-    """Equal states of bias: standard deviation at the start, random walk per sqrt(s) in the channel's unit.
+    """Bias states: initial standard deviation, and random walk per sqrt(s) in the channel's unit.
 
     `decay_1_s` of a Gauss-Markov process is 1 over its correlation time.
     """
@@ -119,7 +119,7 @@ class Bias(NamedTuple):
 def initial_rows(
     drones: Sequence[Drone], environment: Environment, estimation: Estimation, gate_s: float
 ) -> tuple[Rows, Array]:
-    """Return the rows of drones before their first reading, and room for their estimates, (N, ESTIMATE.size)."""
+    """Return the initial rows of drones, and an array for their estimates, (N, ESTIMATE.size)."""
     setups = [DroneSetup(drone, environment, estimation, gate_s) for drone in drones]
     count, size = len(drones), max(each.size for each in setups)
     covariance, walk, decay = np.zeros((count, size, size)), np.zeros((count, size)), np.zeros((count, size))
@@ -153,10 +153,10 @@ def initial_rows(
 
 
 class DroneSetup:
-    """What the sections of a scenario give for the rows of one drone.
+    """The parameters of one drone's rows, from the sections of a scenario.
 
     Attributes:
-        clones: how many late readings need; 0 where process noise is small compared to their noise.
+        clones: number needed by late readings; 0 if process noise is small compared to their noise.
         biases: that the filter estimates, in the order of the error state: "gyro", "accel" if present, then of aiding
             channels, which are (channel, whether it is a Gauss-Markov process).
         first: first state of each bias.
@@ -200,7 +200,7 @@ class DroneSetup:
             )
 
     def _clone_count(self) -> int:
-        """Return how many clones late readings need, by what process noise adds to position and velocity meanwhile.
+        """Return the number of clones that late readings need, from the process noise during their delay.
 
         White acceleration and a random walk of the tilt, integrated per horizontal axis (Y. Bar-Shalom, X. R. Li,
         T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 6.2).
@@ -224,10 +224,10 @@ class DroneSetup:
         return math.ceil(longest_s / CLONE_EVERY_S) + 1 if longest_s else 0
 
     def _floor_m(self) -> float:
-        """Return z of the roof that the drone starts upon, 0 on the ground.
+        """Return the height of the roof on which the drone starts [m], 0 on the ground.
 
-        Its first heights come from the sonar alone, and so would be wrong by the height of the roof. Over other
-        obstacles the sonar is as wrong, and its readings are refused as outliers.
+        Its first heights come from the sonar alone, and would be wrong by the height of the roof. Over other obstacles
+        the readings of the sonar are refused as outliers.
         """
         x, y, z = self._drone.position_m
         away_m = float(Surroundings(self._environment).distances_m((x, y, z))[0])
@@ -305,10 +305,10 @@ BiasName = str | tuple[UpdateChannel, bool]
 
 
 def biases_of(sensors: Sensors, estimation: Estimation) -> dict[BiasName, Bias]:
-    """Return the biases that the filter estimates.
+    """Return the estimated biases.
 
-    A Gauss-Markov process of the IMU is combined with its other biases as a random walk, which gains as much over the
-    correlation time and goes on growing: never overconfident. That of an aiding channel is a state by itself.
+    A Gauss-Markov process of the IMU is combined with its other biases as a random walk with the same growth over the
+    correlation time, which is never overconfident. That of an aiding channel is a separate state.
     """
 
     def gauss_markov_walk(error: ErrorModel) -> float:  # driving noise per sqrt(s)
@@ -358,17 +358,17 @@ def accel_sigma(imu: ImuConfig) -> float:
 
 
 def madgwick_beta(estimation: Estimation, imu: ImuConfig, gravity: float) -> float:
-    """Return the gain [rad/s]: the scenario's, or the one that levels in `LEVELLING_S` under the IMU's noise."""
+    """Return the gain [rad/s] of the scenario, or the one that levels in `LEVELLING_S` under the IMU's noise."""
     if estimation.madgwick_beta is not None:
         return estimation.madgwick_beta
     return beta_for(LEVELLING_S, accel_sigma(imu) / gravity)
 
 
 def tilt_density(beta: float, direction_sigma: float, gravity: float, period_s: float) -> float:
-    """Return what Madgwick's accelerometer step adds to the tilt's error, per axis [rad^2/s].
+    """Return the tilt noise per axis added by Madgwick's accelerometer step [rad^2/s].
 
-    Noise turns each step of 2 beta dt to a random side (half its square per axis). An acceleration a is taken for a
-    tilt a/g, towards which the attitude is pulled with the levelling time, at most with 2 beta; it is modelled as white
+    Noise turns each step of 2 beta dt in a random direction (half its square per axis). An acceleration a acts as a
+    tilt a/g, towards which the attitude is pulled with the levelling time, at most at 2 beta; it is modelled as white
     noise of the same power at low frequency.
     """
     if beta == 0.0:

@@ -1,6 +1,6 @@
-"""The state of the estimators of N drones: arrays with a row for each drone, and the meaning of their columns.
+"""The state of the estimators of N drones: arrays with a row per drone, and their columns.
 
-Compiled code reads the columns as constants. A sensor's number is its place in `zsim.contract.keys.SENSORS`.
+Compiled code reads the columns as constants. A sensor's number is its index in `zsim.contract.keys.SENSORS`.
 """
 
 from typing import NamedTuple
@@ -238,7 +238,7 @@ def put_moment(row: Array, m: Moment) -> None:
 
 @inlined
 def moment(row: Array) -> Moment:
-    """Return a moment of the history, or the present one from a nominal row."""
+    """Return a moment of the history, or the present moment from a nominal row."""
     return (
         float(row[MOMENT.t]), vector(row, MOMENT.p_WB), vector(row, MOMENT.v_WB), quaternion(row, MOMENT.q_WB),
         vector(row, MOMENT.w_WB_B), vector(row, MOMENT.p_corrected), vector(row, MOMENT.v_corrected),

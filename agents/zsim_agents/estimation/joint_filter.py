@@ -1,8 +1,8 @@
 """The joint filter of the drones of a cluster: one covariance of all their errors, corrected by mutual sightings.
 
-Each estimator of such a cluster reads the sensors of all its drones and computes the same filter; it publishes its own
-drones' estimates. For a sighting, first the owner of the seen hat is found, then both drones are corrected. A sighting
-is compared with the states of both drones at the instant of its picture. Errors are those of strapdown.
+Each estimator of such a cluster reads the sensors of all its drones and computes the same filter; it publishes the
+estimates of its own drones. For a sighting, the owner of the hat is identified, then both drones are corrected. A
+sighting is compared with the states of both drones at the instant of its picture. Errors are defined as in strapdown.
 """
 
 import math
@@ -70,7 +70,7 @@ class ClusterBanks:
     """A JointBank for each cluster of some drones, an EstimatorBank for a drone of none; methods of an EstimatorBank.
 
     Attributes:
-        drones: whose sensors are needed, in the order in which `receive` counts them.
+        drones: drones whose sensors are needed, in the order of indices of `receive`.
     """
 
     def __init__(self, scenario: Scenario, drones: Sequence[str], gate_s: float) -> None:
@@ -113,7 +113,7 @@ class ClusterBanks:
 
 
 class JointBank(EstimatorBank):
-    """Fuses the sensors and the sightings of the drones of a cluster; arguments as of EstimatorBank."""
+    """Fuses the sensors and the sightings of the drones of a cluster; arguments as for EstimatorBank."""
 
     counted = (
         *EstimatorBank.counted,
@@ -208,8 +208,8 @@ def step_jointly(rows: Rows, t_s: float, readings: Array, sightings: Array, hat_
     """Use the readings and sightings of a gate of all drones and write their estimates for `t_s`.
 
     Args:
-        readings: (M, READING.size), each drone's in the order of their arrival.
-        sightings: (M, SIGHTING.size), those of one picture in sequence.
+        readings: (M, READING.size), in order of arrival for each drone.
+        sightings: (M, SIGHTING.size), those of one picture adjacent.
         hat_B: centre of a hat in the body of its drone [m].
         estimates: (N, ESTIMATE.size), written.
     """
@@ -246,7 +246,7 @@ def _grow(rows: Rows, i: int, t_s: float) -> None:
 
 @portable
 def use_sightings(rows: Rows, sightings: Array, hat_B: Vector) -> None:
-    """Use the sightings of a gate, one after the other; those that no hat explains are counted as refused."""
+    """Use the sightings of a gate one after the other; those that match no hat are counted as refused."""
     taken = np.zeros(rows.nominal.shape[0], dtype=np.bool_)
     HJ, S, y = np.zeros((3, rows.joint.shape[0])), np.zeros((3, 3)), np.zeros(3)
     for m in range(sightings.shape[0]):
@@ -276,9 +276,9 @@ def is_possible(rows: Rows, sighting: Array) -> bool:
 
 @portable
 def owner(rows: Rows, sighting: Array, hat_B: Vector, taken: Array, HJ: Array, S: Array, y: Array) -> int:
-    """Return whose hat was seen; NOBODY where none fits, two do, or the filter could not tell two from each other.
+    """Return the drone whose hat was seen; NOBODY if none fits, two fit, or two are not distinguishable.
 
-    HJ, S and the innovation y, (3,), are those of the returned hat; `taken` marks the hats already seen in the picture.
+    HJ, S and the innovation y, (3,), are those of the returned hat; `taken` marks hats already seen in the picture.
     """
     count, i = rows.nominal.shape[0], int(sighting[SIGHTING.drone])
     places, seen = np.zeros((count, 3)), place_of(sighting)
@@ -314,7 +314,7 @@ def owner(rows: Rows, sighting: Array, hat_B: Vector, taken: Array, HJ: Array, S
 def predict_sighting(
     rows: Rows, sighting: Array, j: int, hat_B: Vector, HJ: Array, S: Array
 ) -> tuple[Vector, tuple[Vector, Vector, Vector]]:
-    """Return the expected place of the hat of drone j, and axes along and across.
+    """Return the expected position of the hat of drone j, and axes along and across the line of sight.
 
     Writes H J, (3, D), and the covariance S of the innovation, (3, 3), along these axes.
     """
@@ -342,7 +342,7 @@ def predict_sighting(
 
 @portable
 def expected(a: Moment, b: Moment, hat_B: Vector, p_BK: Vector) -> Vector:
-    """Return the place of drone b's hat as seen from drone a's camera [m; axes of a's body]."""
+    """Return the position of drone b's hat relative to drone a's camera [m; axes of a's body]."""
     away = subtract(add(b[1], product(matrix(b[3]), hat_B)), a[1])
     return subtract(product(transposed(matrix(a[3])), away), p_BK)
 
@@ -386,7 +386,7 @@ def across(d: Vector) -> tuple[Vector, Vector, Vector]:
 
 @portable
 def innovation(axes: tuple[Vector, Vector, Vector], seen: Vector, r: Vector) -> Array:
-    """Return the difference of what was seen and what was expected, along and across, (3,) [m]."""
+    """Return the measured minus the expected position, along and across, (3,) [m]."""
     miss = subtract(seen, r)
     return np.array([dot(axes[0], miss), dot(axes[1], miss), dot(axes[2], miss)])
 
@@ -400,5 +400,5 @@ def distance_squared(rows: Rows, S: Array, y: Array) -> float:
 
 @portable
 def place_of(sighting: Array) -> Vector:
-    """Return where a hat was seen, from the camera in axes of the body [m]."""
+    """Return the measured position of a hat relative to the camera [m; body axes]."""
     return scaled(vector(sighting, SIGHTING.direction_B), sighting[SIGHTING.range])

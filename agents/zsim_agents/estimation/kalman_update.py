@@ -21,7 +21,7 @@ JOSEPH_MAX = 24  # states, chosen: with more, of clones, its products of n^3 wou
 def stacked_update(
     P: Array, H: Array, variance: Array, y: Array, blocks: Array, limits: Array, distances: Array
 ) -> tuple[bool, Array, Array, Array]:
-    """Judge the innovations y (m,) of a stack and, if all are within their gates, use them; P (n, n) stays as it is.
+    """Test the innovations y (m,) of a stack and, if all are within their gates, use them; P (n, n) is not changed.
 
     H is the Jacobian, (m, n), `variance` that of each row's white noise, (m,); for the others see `within_gates`.
 
@@ -42,7 +42,7 @@ def stacked_update(
 
 @portable
 def within_gates(S: Array, y: Array, blocks: Array, limits: Array, distances: Array) -> bool:
-    """Write y^T S^-1 y of every block of innovations by itself; return whether all are within their limits.
+    """Write y^T S^-1 y of each separate block of innovations; return whether all are within their limits.
 
     By the block's Cholesky factor; infinite where S is not positive definite or the innovation is NaN.
 
@@ -101,7 +101,7 @@ def predicted_covariance(P: Array, F: Array, Q: Array) -> Array:
 
 @portable
 def predict_jointly(J: Array, i: int, F: Array, Q: Array) -> None:
-    """Let the i-th n errors of J grow by F and Q, (n, n), and with them their covariance with all others."""
+    """Propagate the i-th n errors of J by F and Q, (n, n), and their covariance with all others."""
     n, size = F.shape[0], J.shape[0]
     first = i * n
     former = J[first : first + n].copy()

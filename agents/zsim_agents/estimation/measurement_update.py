@@ -1,6 +1,6 @@
-"""The aiding readings of a drone's gate: accepted as they come, compared with dead reckoning, used in one update.
+"""The aiding readings of a drone in a gate: accepted on arrival, compared with dead reckoning, used in one update.
 
-A reading is compared with the state at its own instant. Each is judged by an innovation gate; accepted ones correct the
+A reading is compared with the state at its own instant and tested by an innovation gate; accepted readings correct the
 nominal state, the biases and the covariance.
 
 A measurement model takes the state at the instant of the sample (p, v in the world, R_WB, w_WB_B), writes its rows of
@@ -75,10 +75,10 @@ COSINE_MIN = 0.1  # of the sonar's ray to the vertical; beyond 84 deg it does no
 
 @inlined
 def accept(rows: Rows, i: int, reading: Array) -> bool:
-    """Tell whether an aiding reading is to be used at the end of the gate.
+    """Tell whether to use an aiding reading at the end of the gate.
 
-    One that is out of order, too old or not finite is counted as refused; a duplicate is not counted, nor is a sonar
-    without an echo, which has no information.
+    A reading that is out of order, too old or not finite is counted as refused; duplicates and sonar readings without
+    an echo are not counted.
     """
     row, counts, setting, layout = rows.nominal[i], rows.counts[i], rows.setting[i], rows.layout[i]
     kind = int(reading[READING.sensor])
@@ -105,7 +105,7 @@ def accept(rows: Rows, i: int, reading: Array) -> bool:
 
 @inlined
 def start_heading(rows: Rows, i: int, P: Array, t_s: float, readings: Array, first: int, after: Array) -> None:
-    """Initialise the heading: by the magnetometer, or where that gives none, as the drone was set down."""
+    """Initialise the heading by the magnetometer, or else by the heading in the scenario."""
     row, counts, setting = rows.nominal[i], rows.counts[i], rows.setting[i]
     if math.isnan(row[NOMINAL.t_first_gate]):
         row[NOMINAL.t_first_gate] = t_s
@@ -134,7 +134,7 @@ def _turn_heading(row: Array, counts: Array, gravity: float, angle: float) -> No
 
 @inlined
 def set_variance(P: Array, k: int, variance: float) -> None:
-    """Give one state a new variance, uncorrelated with the others."""
+    """Set the variance of a state, and remove its correlations."""
     for j in range(P.shape[0]):
         P[k, j] = P[j, k] = 0.0
     P[k, k] = variance
@@ -142,7 +142,7 @@ def set_variance(P: Array, k: int, variance: float) -> None:
 
 @portable
 def fuse(rows: Rows, i: int, P: Array, readings: Array, first: int, after: Array) -> Array:
-    """Judge and use a gate's readings, in one stacked update unless there are very many; return the covariance.
+    """Test and use a gate's readings, in one stacked update unless there are very many; return the covariance.
 
     Args:
         P: covariance of drone i, (n, n).
@@ -235,11 +235,11 @@ def with_biases(rows: Rows, i: int, kind: int, H: Array, at: int, out: Array) ->
 
 @inlined
 def distrust_turn(P: Array, H: Array, expected: Array, at: int) -> None:
-    """Let the flow determine the heading, in rows from `at` on, only as far as the drone surely moves.
+    """Limit the effect of flow on the heading, in rows from `at` on, to the certain part of the motion.
 
-    A heading's error turns the velocity. The velocity's error of a drone at rest would thereby give a heading that
-    nothing measures (G. P. Huang, A. I. Mourikis, S. I. Roumeliotis, "Observability-based rules for designing
-    consistent EKF SLAM estimators", International Journal of Robotics Research 29, 2010).
+    A heading error rotates the velocity. At rest the velocity error would thereby yield spurious heading information
+    (G. P. Huang, A. I. Mourikis, S. I. Roumeliotis, "Observability-based rules for designing consistent EKF SLAM
+    estimators", International Journal of Robotics Research 29, 2010).
     """
     squared = expected[at] * expected[at] + expected[at + 1] * expected[at + 1]
     noise = MOVES_SIGMAS * MOVES_SIGMAS * (P[VELOCITY, VELOCITY] + P[VELOCITY + 1, VELOCITY + 1])
@@ -251,7 +251,7 @@ def distrust_turn(P: Array, H: Array, expected: Array, at: int) -> None:
 
 @inlined
 def write_variance(reading: Array, setting: Array, variance: Array, at: int) -> None:
-    """Write the variances of a reading's rows; a GPS receiver's own figure counts where it is worse."""
+    """Write the variances of a reading's rows; a larger variance stated by a GPS receiver is used instead."""
     kind = int(reading[READING.sensor])
     known = SETTING.sensors + kind * SENSOR.size
     for k in range(SIZES[kind]):
@@ -275,7 +275,7 @@ def is_denied(rows: Rows, i: int, kind: int) -> bool:
 
 @portable
 def inflate(rows: Rows, i: int, P: Array, kind: int, z: Array, expected: Array, at: int) -> None:
-    """Make the states observed by a long refused sensor as uncertain as its innovation: it is trusted again."""
+    """Widen the states observed by a long refused sensor to its innovation, so that it is used again."""
     row, layout = rows.nominal[i], rows.layout[i]
     squares, total = np.zeros(VALUES_MAX), 0.0
     for k in range(SIZES[kind]):
@@ -312,9 +312,9 @@ def widen(P: Array, k: int, variance: float, layout: Array) -> None:
 def correct(
     rows: Rows, i: int, P: Array, H: Array, z: Array, expected: Array, variance: Array, blocks: Array, kinds: Array
 ) -> Array:
-    """Use a stack of measurements, (m,) each, whose blocks are in `blocks` (b, 2); return the covariance.
+    """Use a stack of measurements, (m,) each, with blocks (b, 2); return the covariance.
 
-    All are tried together; if that fails, those outside of their own gates are left out.
+    All are tested together; if that fails, those outside their own gates are omitted.
     """
     y, distances = z - expected, np.zeros(ROWS_MAX)
     if rows.joint.shape[0]:
@@ -386,7 +386,7 @@ def correct_all(rows: Rows, HJ: Array, S: Array, y: Array) -> None:
 
 @portable
 def keep(rows: Rows, i: int, used: bool, distances: Array, blocks: Array, kinds: Array) -> Array:
-    """Count the outcome of each block; return the rows (m,) to use: all, or those inside of their own gates."""
+    """Count the outcome of each block; return the rows (m,) to use: all, or those inside their own gates."""
     kept, m = np.zeros(ROWS_MAX, dtype=np.int64), 0
     for b in range(blocks.shape[0]):
         first, size = blocks[b, 0], blocks[b, 1]
@@ -400,7 +400,7 @@ def keep(rows: Rows, i: int, used: bool, distances: Array, blocks: Array, kinds:
 
 @inlined
 def count_outcome(row: Array, counts: Array, kind: int, passed: bool) -> None:
-    """Count a reading as used or refused, and note since when its sensor is refused."""
+    """Count a reading as used or refused, and note since when its sensor has been refused."""
     if passed:
         counts[COUNT.used + kind] += 1
         row[NOMINAL.refused_since + kind] = math.nan

@@ -2,10 +2,10 @@
 
 I. Mas, S. Curi, R. Sánchez Peña, "Open-source Multi-UAV Simulator for the ROS Environment", section III: gyroscopes and
 accelerometers give the attitude by Madgwick's filter; the position is that of dead reckoning and a GPS receiver, fused
-by an extended Kalman filter "due to the non-linear dynamics". Nothing measures the heading: it starts with the one that
-the drone was set down with, and only the fixes of a moving drone correct it.
+by an extended Kalman filter "due to the non-linear dynamics". The heading is not measured: it starts at the scenario's
+value, and only the fixes of a moving drone correct it.
 
-Dead reckoning integrates the velocity u that the aircraft itself gives in its heading frame:
+Dead reckoning integrates the velocity u measured by the aircraft in its heading frame:
 
     x = (p_WB, yaw)      p' = Rz(yaw) u      yaw' = rate of Madgwick's heading      z = p_WB
 """
@@ -58,7 +58,7 @@ class PaperEstimator:
         self._filter = DeadReckoningFilter(yaw)
 
     def receive(self, sensor: str, message: Any) -> None:
-        """Take a reading of the IMU, the GPS receiver or the aircraft's own velocity; ignore the others."""
+        """Receive a reading of the IMU, the GPS receiver or the aircraft's own velocity; ignore others."""
         if sensor in self._used:
             self._used[sensor] += 1
         if sensor == "imu":
@@ -97,7 +97,7 @@ class PaperEstimator:
         )
 
     def snapshot(self) -> State:
-        """Return all that changes; a fix is used at the end of its gate and not kept."""
+        """Return the state; a fix is used at the end of its gate and not kept."""
         filter_ = {"x": self._filter.x, "P": self._filter.P}
         times = {"t_imu_s": self._t_imu_s, "t_s": self._t_s}
         return {**filter_, **times, "q": self._q, "velocity": self._velocity, "used": self._used}
@@ -156,7 +156,7 @@ class DeadReckoningFilter:
 
 
 def correlation_factor(error: ErrorModel, rate_hz: float) -> float:
-    """Return by how much correlation raises the variance of a mean of samples: (1 + a)/(1 - a), a of neighbours.
+    """Return the factor by which correlation raises the variance of a mean: (1 + a)/(1 - a), a of neighbours.
 
     The variance of a mean of n samples of a Gauss-Markov process is this factor times sigma^2/n (G. V. Bayley, J. M.
     Hammersley, "The 'effective' number of independent observations in an autocorrelated time series", Supplement to the

@@ -1,8 +1,8 @@
-"""The nominal state of a drone, a row: moved by every sample of its IMU, corrected by the filter, and remembered.
+"""The nominal state of a drone: propagated by every IMU sample, corrected by the filter, with a history.
 
-A late reading measures a state that does not contain the process noise since then. Where that matters, clones of
-position and velocity stand in the error state: the reading is compared with the clone nearest to its instant, and the
-correlations do the rest. S. I. Roumeliotis, J. W. Burdick, "Stochastic cloning: a generalized framework for processing
+A late reading measures a state without the process noise since then. If that matters, the error state has clones of
+position and velocity: the reading is compared with the clone nearest to its instant, whose correlations correct the
+present state. S. I. Roumeliotis, J. W. Burdick, "Stochastic cloning: a generalized framework for processing
 relative state measurements", IEEE International Conference on Robotics and Automation, 2002.
 
 Dead reckoning, from `reckon` on: Madgwick's attitude filter, strapdown integration, and the growth of small errors.
@@ -82,7 +82,7 @@ COAST_VELOCITY_DENSITY = 1.0  # m^2/s^3: 1 m/s after 1 s without an IMU
 
 @inlined
 def move(rows: Rows, i: int, t_s: float, accel: Vector, gyro: Vector) -> None:
-    """Move to the instant of an IMU sample; ignore a duplicate, refuse and count a late or impossible sample.
+    """Propagate to the instant of an IMU sample; ignore a duplicate, refuse and count a late or impossible sample.
 
     `accel` is the specific force [m/s^2], `gyro` the body rate [rad/s], both in S.
     """
@@ -117,7 +117,7 @@ def move(rows: Rows, i: int, t_s: float, accel: Vector, gyro: Vector) -> None:
 
 @inlined
 def possible(accel: Vector, gyro: Vector) -> bool:
-    """Tell whether an IMU can read such values; NaN fails each comparison."""
+    """Tell whether values are possible for an IMU; NaN fails each comparison."""
     good = True
     for k in range(3):
         good = good and abs(accel[k]) < ACCEL_MAX_M_S2 and abs(gyro[k]) < GYRO_MAX_RAD_S
@@ -133,7 +133,7 @@ def _lose(row: Array, missing_s: float) -> None:
 
 @inlined
 def _of_body(row: Array, setting: Array, accel: Vector, gyro: Vector, dt: float) -> tuple[Vector, Vector]:
-    """Convert a sample of a turned or displaced IMU into one at the centre of mass, in body axes."""
+    """Convert a sample of a rotated or displaced IMU to the centre of mass, in body axes."""
     imu = SETTING.sensors + IMU * SENSOR.size
     R_BS = matrix_at(setting, imu + SENSOR.R_BS)
     accel, gyro = product(R_BS, accel), product(R_BS, gyro)
@@ -158,7 +158,7 @@ def begin_interval(row: Array, t_s: float) -> None:
 
 @inlined
 def coast(row: Array, setting: Array, t_s: float) -> None:
-    """Go on without an IMU after a long gap: velocity and attitude are held and become less certain."""
+    """Propagate without an IMU after a long gap: velocity and attitude are held and become less certain."""
     dt = t_s - row[NOMINAL.t]
     if dt <= setting[SETTING.coast_after]:
         return
@@ -171,7 +171,7 @@ def coast(row: Array, setting: Array, t_s: float) -> None:
 
 @portable
 def grow(rows: Rows, i: int, P: Array) -> Array:
-    """Return the covariance grown over the interval of dead reckoning that ends now, and begin the next one."""
+    """Return the covariance propagated over the dead-reckoning interval that ends now, and begin the next one."""
     row, n = rows.nominal[i], rows.layout[i, LAYOUT.first_clone]
     if row[NOMINAL.t] > row[NOMINAL.t_start]:
         F, Q = np.eye(n), np.zeros((n, n))
@@ -217,7 +217,7 @@ def write_growth(rows: Rows, i: int, F: Array, Q: Array) -> None:
 
 @portable
 def correct(row: Array, layout: Array, gravity: float, error: Array) -> None:
-    """Correct the state and the biases by an error of the filter."""
+    """Correct the state and the biases by an estimated error."""
     with_accel_bias = layout[LAYOUT.accel_bias] != 0
     put_reckoning(row, corrected(reckoning(row), error, with_accel_bias, gravity))
     put(row, NOMINAL.v_start, vector(row, NOMINAL.v_WB))
@@ -239,7 +239,7 @@ def turn_heading(row: Array, gravity: float, angle: float) -> None:
 
 @portable
 def clone(rows: Rows, i: int, J: Array, first: int) -> None:
-    """Replace the oldest clone by the present position and velocity, if it is time for one.
+    """Replace the oldest clone by the present position and velocity, if one is due.
 
     J is the covariance of the drone's errors, or of all drones' together, in which `first` is its first state.
     """
@@ -274,7 +274,7 @@ def remember(counts: Array, history: Array, longest: int, now: Moment) -> None:
 
 @inlined
 def recall_known(rows: Rows, i: int, t_s: float, now: Moment) -> tuple[Moment, float, int]:
-    """Return the state at `t_s` as it is known now, with the errors that it has.
+    """Return the state at `t_s` as known now, and the errors that it has.
 
     Returns:
         the state; how much earlier it is than the position and velocity whose errors it has [s]; the place of these in
@@ -298,7 +298,7 @@ def recall_known(rows: Rows, i: int, t_s: float, now: Moment) -> tuple[Moment, f
 
 @inlined
 def recall(counts: Array, history: Array, longest: int, t_s: float, now: Moment) -> Moment:
-    """Return the state at `t_s` as `now` sees it, later corrections included.
+    """Return the state at `t_s` as known at `now`, including later corrections.
 
     It is interpolated between the history's entries and `now`, the oldest one before them, and extrapolated with
     constant velocity and rate after `now`. `history` is the drone's ring, of which it uses `longest` entries.
@@ -450,7 +450,7 @@ def rotation_vector_quaternion(v: Vector) -> Quaternion:
 
 
 def levelling_time_s(beta: float, direction_sigma_rad: float) -> float:
-    """Return the time constant with which the filter pulls its tilt to the measured one [s]; infinite for beta = 0.
+    """Return the time constant of the filter's correction to the measured tilt [s]; infinite for beta = 0.
 
     The step has a fixed length 2 beta dt. Under noise of the measured direction, per axis [rad], its mean along a small
     offset e is 2 beta dt * sqrt(pi/8) * e/sigma, hence a first-order pull.
@@ -467,7 +467,7 @@ def beta_for(levelling_s: float, direction_sigma_rad: float) -> float:
 
 @inlined
 def corrected(state: Reckoning, error: Array, with_accel_bias: bool, gravity: float) -> Reckoning:
-    """Return the state corrected by an error of the filter, (n,), ordered as in `write_transition`."""
+    """Return the state corrected by an estimated error, (n,), ordered as in `write_transition`."""
     p, v, q, _, w, f_B = state
     p, v = add(p, vector(error, POSITION)), add(v, vector(error, VELOCITY))
     q = normalised(multiply(rotation_vector_quaternion(vector(error, ATTITUDE)), q))

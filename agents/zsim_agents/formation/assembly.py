@@ -103,7 +103,7 @@ def assembly_goal(
         given = {variable_of(space, name, "assemble", ".values").entry for name in values}
         known = (name in PLACE or space.neutral[i] or i in given for i, name in enumerate(space.names))
         if lacking := [name for name, is_known in zip(space.names, known, strict=True) if not is_known]:
-            raise RefusalError(f"the drones are no formation yet; values must name {', '.join(lacking)} as well")
+            raise RefusalError(f"the drones are not in a formation yet; values must name {', '.join(lacking)} as well")
     return named_values(space, values, "assemble", base, ".values")
 
 

@@ -1,1 +1,1 @@
-"""Formation laws of the literature, one a file: the equations of its paper, pure, and the agent that flies them."""
+"""Formation laws of the literature, one per file: the equations of the paper, pure, and the agent that flies them."""

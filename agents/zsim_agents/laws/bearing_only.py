@@ -1,12 +1,12 @@
-"""Bearing-only control: drones measure in which direction the others are, not how far away.
+"""Bearing-only control: drones measure the directions to their neighbours, not the distances.
 
     u_i = -k sum_{j in N_i} P(g_ij) g_ij*,    g_ij = z_ij / |z_ij|,    P(g) = I - g g^T       (1)
 
 Zhao, Zelazo, Bearing rigidity and almost global bearing-only formation stabilization, IEEE Trans. Automatic Control 61
-(2016), arXiv:1408.6552. The centroid and the scale s = sqrt(mean |p_i - centroid|^2) never change, so
-that the figure comes to its shape and attitude, in the size with which it began; V = 1/2 |p - p*|^2 falls. It must be
-infinitesimally bearing rigid: the rank of the bearing rigidity matrix is d n - d - 1. All drones need one compass. The
-figure turned inside out is an equilibrium too, and unstable.
+(2016), arXiv:1408.6552. The centroid and the scale s = sqrt(mean |p_i - centroid|^2) are constant, so that the figure
+attains its shape and attitude at its initial size; V = 1/2 |p - p*|^2 decreases. It must be infinitesimally bearing
+rigid: the rank of the bearing rigidity matrix is d n - d - 1. All drones need a common compass. The point-reflected
+figure is an unstable equilibrium.
 """
 
 from typing import Annotated
@@ -46,7 +46,7 @@ def bearing_rigidity_matrix(p: ArrayLike, edges: list[tuple[int, int]]) -> Array
 
 
 class BearingOnly(ShapePilot):
-    """Two drones are informed by default, the first ones: pinned to their places they hold the figure's size."""
+    """By default the first two drones are informed: pinned to their places they fix the figure's size."""
 
     class Parameters(ShapeParameters):
         gain_m_s: Annotated[float, Meta(gt=0, le=20)] = 2.0

@@ -3,8 +3,8 @@
     u_i = k sum_{j in N_i} ((p_j - p_i) - (c_j - c_i))        (1)
 
 Olfati-Saber, Fax, Murray, Consensus and cooperation in networked multi-agent systems, Proc. IEEE 95 (2007), with the
-displacement from one's place as the state on which all agree. On a connected, undirected graph the errors about their
-mean decay at the rate k lambda_2 of its Laplacian, and the mean stays where it is.
+displacement from the own place as the agreement state. On a connected, undirected graph the errors about their mean
+decay at the rate k lambda_2 of its Laplacian, and the mean is constant.
 """
 
 from zsim_agents.laws.pilot import Array, Sight, added

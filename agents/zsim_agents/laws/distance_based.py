@@ -1,4 +1,4 @@
-"""Distance-based control of a rigid graph: each drone needs no common compass, only where the others are from it.
+"""Distance-based control of a rigid graph: drones need only relative positions, without a common compass.
 
     u_i = k sum_{j in N_i} (|z_ij|^2 - d_ij^2) z_ij,    z_ij = p_j - p_i       (1)
 
@@ -6,8 +6,8 @@ Krick, Broucke, Francis, Stabilisation of infinitesimally rigid formations of mu
 (2009). It is the descent of V = 1/4 sum e_ij^2, e_ij = |z_ij|^2 - d_ij^2, over the edges: dV/dt = -sum |u_i|^2 / k, and
 the centroid stays. The figure must be infinitesimally rigid: the rank of its rigidity matrix R, a row z_ij, z_ji for
 each edge, is 2 n - 3 in the plane and 3 n - 6 in space. Then errors decay near it at the rate 2 k lambda_min(R R^T),
-for as many edges as that rank. Only near it: drones in one line stay in a line, and a corner with two edges may settle
-on the wrong side of them. Distances that the two ends of an edge know differently make the figure drift.
+for as many edges as that rank. Convergence is local: collinear drones stay collinear, and a corner with two edges may
+settle on the wrong side. Inconsistent distances at the two ends of an edge make the figure drift.
 """
 
 from typing import Annotated

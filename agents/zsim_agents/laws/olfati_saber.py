@@ -1,13 +1,13 @@
-"""Flocking by Olfati-Saber: a lattice of spacing d that keeps together, moves as one, and flows around obstacles.
+"""Flocking by Olfati-Saber: a lattice of spacing d that stays together, moves as one, and flows around obstacles.
 
     u_i = c1 sum phi_alpha(|z_ij|_s) n_ij + c2 sum a_ij (v_j - v_i)                     alpha: flockmates
         + c1b sum phi_beta(|z_ik|_s) n_ik + c2b sum b_ik (v_k - v_i)                    beta: obstacles
-        - c1g (p_i - p_r) - c2g (v_i - v_r)                                             gamma: where all want to go
+        - c1g (p_i - p_r) - c2g (v_i - v_r)                                             gamma: the common objective
 
 Olfati-Saber, Flocking for multi-agent dynamic systems: algorithms and theory, IEEE Trans. Automatic Control 51 (2006),
-Algorithms 2 and 3. u is an acceleration; the pilot integrates it to the velocity that it commands. Each drone hears
-others within r; the last term is its own knowledge of the group's aim. A lattice may settle in several ways: its
-measure is the deviation from d of the sides between those within r.
+Algorithms 2 and 3. u is an acceleration; the pilot integrates it to the commanded velocity. Each drone receives the
+messages of others within r; the last term is its own knowledge of the objective. Several lattices are possible: the
+quality measure is the deviation from d of the distances within r.
 """
 
 import math
@@ -67,7 +67,7 @@ def phi_beta(z: float, d: float) -> float:
 
 
 def alpha_force(p: Array, v: Array, heard: list[Heard], d: float, r: float, c1: float) -> Array:
-    """Return the part of u_i that is of flockmates (dim,) [m/s^2]; c2 = 2 sqrt(c1)."""
+    """Return the flockmate term of u_i (dim,) [m/s^2]; c2 = 2 sqrt(c1)."""
     u = np.zeros(len(p))
     for each in heard:
         z = each.p_W - p
@@ -78,9 +78,9 @@ def alpha_force(p: Array, v: Array, heard: list[Heard], d: float, r: float, c1: 
 
 
 def beta_force(v: Array, obstacles: list[tuple[float, Array]], d: float, c1: float) -> Array:
-    """Return the part of u_i that is of obstacles; of each its distance [m] and the direction away from it.
+    """Return the obstacle term of u_i, given distance [m] and direction away of each obstacle.
 
-    What it is repelled by stands at the nearest point, and slides along the surface as the drone does.
+    The virtual agent that repels it is at the nearest point, and moves along the surface with the drone.
     """
     u = np.zeros(len(v))
     for distance, away in obstacles:
@@ -94,7 +94,7 @@ def beta_force(v: Array, obstacles: list[tuple[float, Array]], d: float, c1: flo
 
 
 def gamma_force(p: Array, v: Array, p_r: Array, v_r: Array, c1: float) -> Array:
-    """Return the part of u_i that is of the group's aim (dim,) [m/s^2]; c2 = 2 sqrt(c1)."""
+    """Return the objective term of u_i (dim,) [m/s^2]; c2 = 2 sqrt(c1)."""
     return -c1 * (p - p_r) - 2.0 * math.sqrt(c1) * (v - v_r)
 
 

@@ -1,16 +1,16 @@
-"""What the pilots of all formation laws share: an agent per drone that flies it by what it hears of the others.
+"""The base of the pilots of all formation laws: an agent per drone, which flies it by messages of the others.
 
-Each pilot sends where its drone estimates itself, hears the same of others, and computes a horizontal velocity from it.
-It takes off, climbs, engages its law at the height of flight, holds that height, and lands. What flies at one height
-is a plane figure; the laws themselves are written for any number of dimensions.
+Each pilot sends the estimated position of its drone, receives those of others, and computes a horizontal velocity. It
+takes off, climbs, engages its law at the flight height, holds that height, and lands. Formations are therefore plane
+figures; the laws themselves are written for any number of dimensions.
 
 A law is a subclass with one method:
 
     class Consensus(ShapePilot):
         def velocity(self, now: Sight) -> Array: ...  # (2,) [m/s; W]
 
-Neighbours are those that a drone hears, by the topology and the radio of the scenario, and that are engaged themselves.
-They are sorted by name, and all sums run in that order, so that the bits do not depend on who was heard first.
+Neighbours are the engaged drones from which a drone receives messages, by the topology and the radio of the scenario.
+They are sorted by name, and all sums use that order, so that the bits do not depend on the order of arrival.
 """
 
 import math
@@ -50,7 +50,7 @@ TINY = 1e-9  # m: two drones in one place have no direction to each other
 
 
 class Motion(AgentMessage, frozen=True):
-    """What a pilot tells the others: where its drone estimates itself in W, and whether its law is engaged."""
+    """The message of a pilot: the estimated position of its drone in W, and whether its law is engaged."""
 
     key = "formation/{drone}/motion"
 
@@ -60,7 +60,7 @@ class Motion(AgentMessage, frozen=True):
 
 
 class Heard(NamedTuple):
-    """Another drone, as its last message has it."""
+    """Another drone, from its last message."""
 
     name: str
     p_W: Array  # (2,) [m]
@@ -68,7 +68,7 @@ class Heard(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """What a pilot computes from at a gate."""
+    """The inputs of a pilot at a gate."""
 
     t_s: float
     p_W: Array  # (2,) of its own drone, estimated [m]
@@ -78,7 +78,7 @@ class Sight(NamedTuple):
 
 
 class PilotParameters(Parameters):
-    """What every law has; times are simulated, lengths horizontal."""
+    """Common parameters of all laws; times are simulated, lengths horizontal."""
 
     height_m: Annotated[float, Meta(gt=0, le=1000)] = 2.0
     takeoff_s: NonNegative = 2.0
@@ -102,7 +102,7 @@ class Pilot(Agent):
     """Flies one drone by a law; see the module.
 
     Raises:
-        ExpressionError: a reference is no expression of t.
+        ExpressionError: a reference is not an expression of t.
     """
 
     Parameters: Any = PilotParameters
@@ -130,7 +130,7 @@ class Pilot(Agent):
         self.begin(scenario)
 
     def begin(self, scenario: Scenario) -> None:
-        """Prepare what a law needs of the scenario."""
+        """Prepare the law's data from the scenario."""
 
     @staticmethod
     def reference_of(own: Any) -> FormationReference:
@@ -138,11 +138,11 @@ class Pilot(Agent):
 
     @abstractmethod
     def velocity(self, now: Sight) -> Array:
-        """Return the velocity (2,) that the law wants [m/s; W]; speed limit and repulsion are applied to it."""
+        """Return the velocity (2,) of the law [m/s; W], before speed limit and repulsion."""
 
     @classmethod
     def flaws(cls, parameters: Mapping[str, Any], scenario: Scenario) -> Iterator[Fault]:
-        """Yield path and text of what cannot be flown in a scenario, of parameters as it has them."""
+        """Yield path and text of the parameters that cannot be flown in a scenario."""
         try:
             cls.reference_of(cls.Parameters(**parameters))
         except ExpressionError as error:
@@ -200,7 +200,7 @@ class Pilot(Agent):
         return limited(v_W, self.parameters.speed_max_m_s)
 
     def avoidance(self, p_W: Array, heard: Sequence[Heard]) -> Array:
-        """Return the repulsion (2,) from the drones that it hears, obstacles and surfaces [m/s; W]."""
+        """Return the repulsion (2,) from neighbouring drones, obstacles and surfaces [m/s; W]."""
         reach, gain = self.parameters.avoid_m, self.parameters.avoid_m4_s
         v_W = np.zeros(2)
         for each in heard:
@@ -305,6 +305,6 @@ def added(terms: Sequence[Array], size: int = 2) -> Array:
 
 
 def limited(v: Array, most: float) -> Array:
-    """Return v, or the vector of its direction and of length `most` where it is longer."""
+    """Return v, scaled to length `most` if it is longer."""
     size = length(v)
     return v * (most / size) if size > most else v

@@ -1,4 +1,4 @@
-"""Where a formation is to be: its centre, heading and scale as functions of time, and the places that follow.
+"""The reference of a formation: centre, heading and scale as functions of time, and the resulting places.
 
     p_i*(t) = p_c(t) + s(t) R(psi(t)) c_i        v_i* = dp_i*/dt
 
@@ -27,19 +27,19 @@ class Pose(NamedTuple):
     turn_rate: Array  # (2, 2) its derivative [1/s]
 
     def place(self, c: Array) -> tuple[Array, Array]:
-        """Return the displacement from the centre that a place c (2,) has now [m; W], and its rate [m/s]."""
+        """Return the present displacement of a place c (2,) from the centre [m; W], and its rate [m/s]."""
         return turned(self.turn, c), turned(self.turn_rate, c)
 
 
 class FormationReference:
-    """The motion of a formation from `start_s` on; before, it stands where it begins.
+    """The motion of a formation from `start_s` on; before, it rests at its start.
 
     Args:
         centre_m: x and y in W: numbers, or expressions of t, in seconds since start_s.
         heading_deg, scale: likewise.
 
     Raises:
-        ExpressionError: one is no expression of t, or has no value at its start.
+        ExpressionError: a text is not an expression of t, or has no value at its start.
     """
 
     def __init__(

@@ -1,10 +1,10 @@
-"""What the laws share whose formation is a figure: the places of the drones, and who knows where it is to be.
+"""Common parts of laws whose formation is a figure: the drones' places, and the terms that tie it to the reference.
 
-A law that looks at differences leaves open where the figure is, some how it is turned, one how large it is. Two terms,
-the same for all, tie it to the reference:
+A law of differences leaves the position of the figure undetermined, some also its rotation, one its scale. Two terms,
+the same for all laws, tie it to the reference:
 
-    u_i = law + v_i*                          feed-forward, of those who know the reference's motion
-              + b_i (p_i* - p_i)              of the informed ones: pinning
+    u_i = law + v_i*                          feed-forward, by drones that know the reference's motion
+              + b_i (p_i* - p_i)              pinning, by informed drones
 
 Pinning one node of a connected, undirected graph turns the rate k lambda_2(L) of consensus, about the mean, into
 lambda_min(k L + diag(b)), about the reference.
@@ -24,7 +24,7 @@ from zsim_agents.laws.reference import FormationReference, polygon
 
 
 class ShapeParameters(PilotParameters):
-    """Of the laws whose formation is a figure."""
+    """Parameters of the laws whose formation is a figure."""
 
     gain_1_s: Annotated[float, Meta(gt=0, le=5)] = 0.3
     places_m: Annotated[list[tuple[Real, Real]], Meta(max_length=DRONES_MAX)] = field(default_factory=list)
@@ -58,7 +58,7 @@ class ShapePilot(Pilot):
         return FormationReference(own.centre_m, own.heading_deg, own.scale, own.start_s)
 
     def relative(self, now: Sight) -> list[tuple[Array, Array]]:
-        """Return of each neighbour z_ij = p_j - p_i [m; W] and what the places have for it."""
+        """Return z_ij = p_j - p_i [m; W] of each neighbour and its value by the places."""
         own = now.reference.place(self._places[self._drone])[0]
         return [(each.p_W - now.p_W, now.reference.place(self._places[each.name])[0] - own) for each in now.heard]
 

@@ -1,4 +1,4 @@
-"""Flocking by Vasarhelyi et al.: repulsion, and friction that grows as two drones could no longer brake in time.
+"""Flocking by Vasarhelyi et al.: repulsion, and friction above the speed difference that allows braking in time.
 
     v_i = v_flock v_i / |v_i| + sum v_rep_ij + sum v_frict_ij + sum v_wall_is          limited to v_max
     v_rep_ij   = p_rep (r0_rep - r_ij) away from j,                 r_ij < r0_rep       (1)
@@ -7,12 +7,12 @@
     D(r, a, p) = 0 for r <= 0;  r p for r p < a / p;  sqrt(2 a r - a^2 / p^2) beyond    (4)
 
 Vasarhelyi, Viragh, Somorjai, Nepusz, Eiben, Vicsek, Optimized flocking of autonomous drones in confined environments,
-Science Robotics 3 (2018). D is the speed from which a drone stops within r, at a deceleration a and exponentially at
-the rate p in the end. A wall or an obstacle is a shill: an imaginary drone at the nearest point that flies away from
+Science Robotics 3 (2018). D is the speed from which a drone stops within r, with deceleration a and finally
+exponentially at the rate p. A wall or an obstacle is a shill: a virtual drone at the nearest point that moves away from
 it at v_shill, to which (2) applies with C = 1 and v_frict = 0.
 
-The arena of the paper, a square within which the flock stays, is here about the reference and moves with it; its rate
-is added to what all want. There is no lattice in it: what it promises is that no two meet, and that all fly alike.
+The arena of the paper, a square that contains the flock, is here centred on the reference and moves with it; its rate
+is added to all velocities. The law forms no lattice: it ensures separation and velocity alignment.
 """
 
 import math
@@ -80,7 +80,7 @@ class Vasarhelyi(Pilot):
         return wanted
 
     def _walls(self, now: Sight) -> list[tuple[float, Array, Array]]:
-        """Return of each wall and obstacle its distance [m], the direction away from it, and its own velocity [m/s]."""
+        """Return the distance [m], the direction away and the velocity [m/s] of each wall and obstacle."""
         own, walls = self.parameters, []
         most, final = own.v_shill_m_s + own.speed_max_m_s, own.a_shill_m_s2 / own.p_shill_1_s
         reach = own.r0_shill_m + (most * most + final * final) / (

@@ -1,7 +1,7 @@
-"""How near paths of drones come to each other, and to formations as far as these are known before the flight. Pure.
+"""Minimum distances between paths of drones, and to formations as far as known before the flight. Pure.
 
-When a formation is engaged depends on its estimates, and so do its ways. From when it has certainly come to its target
-or onto its trajectory, it is where its plan has it.
+The time of engagement of a formation and its paths depend on its estimates. Its position is known from the time at
+which it has certainly reached its target or trajectory.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ NEARER_M = 0.5  # chosen: by which a drone and a robot come nearer within LOOK_S
 
 
 class Approach(NamedTuple):
-    """Two of some paths that come too near to each other: their places in the list, how near, and when."""
+    """Two paths that come too close: their indices in the list, the distance [m], and when [s]."""
 
     first: int
     second: int
@@ -41,7 +41,7 @@ class Approach(NamedTuple):
 
 
 def first_approach(paths: Sequence[Reference], least_m: Array, until_s: float) -> Approach | None:
-    """Return the first pair of paths, in time, that comes nearer than allowed, to a millimetre; None if none does.
+    """Return the first pair of paths, in time, that comes closer than allowed, to a millimetre; None if none does.
 
     Between two instants a distance falls by at most the sum of both greatest speeds times half of the time between;
     where that is not enough, the time is halved.
@@ -72,7 +72,7 @@ def first_approach(paths: Sequence[Reference], least_m: Array, until_s: float) -
 def _nearer(
     a: Reference, b: Reference, speed: float, least_m: float, from_s: float, to_s: float
 ) -> tuple[float, float] | None:
-    """Return the first distance below least_m that is found between two instants, and when; None: there is none."""
+    """Return the first distance below least_m found between two instants, and when; None if there is none."""
 
     def apart(t_s: float) -> float:
         return el.distance(a.value(t_s)[0][:3].tolist(), b.value(t_s)[0][:3].tolist())
@@ -121,7 +121,7 @@ def meetings(
 def _meeting(
     planned: PlannedMotion, flight: Reference, until_s: float, least_m: float
 ) -> tuple[float, float, int] | None:
-    """Return when a drone first is too near to a robot of a formation, how near, and to which; None if never."""
+    """Return when a drone is first too close to a robot of a formation, the distance, and the robot; None if never."""
     from_s, to_s = planned.from_s + LATE_S, min(planned.until_s, until_s)
     for t_s in np.arange(from_s, to_s, LOOK_S).tolist():
         if float(_distances(planned, flight, t_s).min()) >= least_m + NEARER_M:

@@ -1,4 +1,4 @@
-"""Ways to places at a cruise speed, from any motion, within speeds and accelerations. Pure.
+"""Paths to places at a cruise speed, from any motion, within limits of speed and acceleration. Pure.
 
 A way has three parts. The velocity changes from v, that at the start, into q, that of the cruise, straight and at full
 acceleration a, in t1; the drone flies on at q for t2; it brakes straight, in t3 = |q| / a, and rests at the goal. From
@@ -34,7 +34,7 @@ COEFFICIENTS = 8  # of a piece of `PiecewisePolynomial`
 
 
 class Cruise(NamedTuple):
-    """Speeds [m/s] that a way keeps to where they are less than the limits."""
+    """Cruise speeds [m/s], which apply if lower than the limits."""
 
     horizontal_m_s: float = math.inf
     up_m_s: float = math.inf
@@ -54,17 +54,17 @@ class _Bounds(NamedTuple):
     accel_z: float
 
     def rise_s(self, x: float, y: float, z: float) -> float:
-        """Return the time that a change of velocity takes."""
+        """Return the time of a change of velocity [s]."""
         return max(el.hypot(x, y) / self.accel, abs(z) / self.accel_z)
 
     def speed_along(self, x: float, y: float, z: float) -> float:
-        """Return the greatest speed in a direction."""
+        """Return the maximum speed in a direction [m/s]."""
         aside, climb = el.hypot(x, y), self.up if z > 0.0 else self.down
         return min(self.speed / aside if aside else math.inf, climb / abs(z) if z else math.inf)
 
 
 class _Part(NamedTuple):
-    """A part of a way, with a constant acceleration: its time, and place and velocity at its beginning."""
+    """A part of a path with constant acceleration: its duration, and position and velocity at its start."""
 
     duration_s: float
     place: Vector
@@ -78,12 +78,12 @@ STILL: Vector = (0.0, 0.0, 0.0)
 def cruise(
     start: Array, goal: Array, limits: PathLimits, rate: Array | None = None, speeds: Cruise = FREE
 ) -> PiecewisePolynomial:
-    """Return the way from a place (4,), at a rate (4,) that is 0 by default, to rest at another one.
+    """Return the path from a place (4,), with a rate (4,) that is 0 by default, to rest at another one.
 
-    The yaw turns by the shorter way, from the beginning on, and does not wait for the rest.
+    The yaw turns by the shorter way, independently of the translation.
 
     Args:
-        limits: of speeds, and of accelerations: those of climb and turn are their limit in RISE_S.
+        limits: of speeds and horizontal acceleration; climb and turn reach their limits in RISE_S.
     """
     vx, vy, vz, turning = (0.0, 0.0, 0.0, 0.0) if rate is None else rate.tolist()
     (x, y, z, yaw), (to_x, to_y, to_z, to_yaw) = start.tolist(), goal.tolist()
@@ -105,9 +105,9 @@ def cruise_through(
     speeds: Cruise = FREE,
     radius_m: float = 0.0,
 ) -> PiecewisePolynomial:
-    """Return the way through places (4,), to rest at the last one.
+    """Return the path through places (4,) to rest at the last one.
 
-    From within radius_m of each other place it turns towards the next one; 0: it rests at each.
+    Within radius_m of each other place it turns towards the next one; 0: it rests at each.
     """
     durations: list[Array] = []
     coefficients: list[Array] = []
@@ -129,7 +129,7 @@ def cruise_through(
 
 
 def cruise_to_rest(start: Array, limits: PathLimits, rate: Array) -> PiecewisePolynomial:
-    """Return how a drone that moves at a rate (4,) comes to rest as soon as it can, straight on."""
+    """Return the shortest straight path to rest of a drone moving at a rate (4,)."""
     aside, climb, turn = el.hypot(rate[0], rate[1]), abs(float(rate[2])), abs(float(rate[3]))
     rise_s = max(aside / limits.accel_m_s2, climb / limits.climb_m_s * RISE_S), turn / limits.yaw_rate_rad_s * RISE_S
     stop = start + rate * np.array([*(rise_s[0],) * 3, rise_s[1]]) / 2.0
@@ -137,7 +137,7 @@ def cruise_to_rest(start: Array, limits: PathLimits, rate: Array) -> PiecewisePo
 
 
 def _parts(start: Vector, velocity: Vector, goal: Vector, bounds: _Bounds) -> list[_Part]:
-    """Return the parts of a way, those left out that take no time."""
+    """Return the parts of a path with a duration."""
     x, y, z = (to - from_ for to, from_ in zip(goal, start, strict=True))
     vx, vy, vz = velocity
 
@@ -184,7 +184,7 @@ def _moved(place: Vector, velocity: Vector, accel: Vector, t: float) -> Vector:
 
 
 def _polynomials(way: list[_Part], turn: list[_Part]) -> PiecewisePolynomial:
-    """Return a way and a turn that begin together as one path."""
+    """Return a translation and a turn that begin together as one path."""
     begins = [_begins(way), _begins(turn)]
     times = sorted({t for each in begins for t in each})
     kept = [t for t, after in pairwise(times) if after - t > SHORT_S]
@@ -198,7 +198,7 @@ def _polynomials(way: list[_Part], turn: list[_Part]) -> PiecewisePolynomial:
 
 
 def _begins(parts: list[_Part]) -> list[float]:
-    """Return when the parts begin, and when the last one ends."""
+    """Return the start times of the parts, and the end of the last one."""
     times = [0.0]
     for part in parts:
         times.append(times[-1] + part.duration_s)
@@ -206,7 +206,7 @@ def _begins(parts: list[_Part]) -> list[float]:
 
 
 def _state(parts: list[_Part], begins: list[float], t: float) -> tuple[Vector, Vector, Vector]:
-    """Return place, velocity and acceleration from t on; after the last part it rests."""
+    """Return position, velocity and acceleration from t on; at rest after the last part."""
     number = max(k for k, begin in enumerate(begins) if begin <= t)
     if number == len(parts):
         last = parts[-1]

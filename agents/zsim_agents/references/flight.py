@@ -1,7 +1,7 @@
-"""The flights of a scenario's drones that have references of their own: take-off, the way to a path, the path. Pure.
+"""The flights of a scenario's drones with their own references: take-off, approach to a path, the path. Pure.
 
-A flight is judged before it is flown: its speeds, turns and horizontal accelerations against the drone's limits, its
-heights, and its distance from the flights of the others.
+A flight is checked in advance: speeds, turns and horizontal accelerations against the drone's limits, heights, and the
+distances to other flights.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ QUANTITIES = (
 
 
 class FlightError(ValueError):
-    """A flight is not possible; `path` is of the field below the reference or the exchange, the text follows it."""
+    """A flight is not possible; `path` is the field below the reference or the exchange, which the text follows."""
 
     def __init__(self, path: str, text: str) -> None:
         super().__init__(f"{path} {text}".strip())
@@ -82,7 +82,7 @@ class Place:
 
 
 class Leg(NamedTuple):
-    """A part of a flight: a path from start_s of simulated time on."""
+    """A part of a flight: a path that starts at simulated time start_s."""
 
     start_s: float
     path: Reference
@@ -91,7 +91,7 @@ class Leg(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """Where a drone is to be at every simulated time [s]: a `Reference`.
+    """The reference of a drone at every simulated time [s]: a `Reference`.
 
     Before its first leg it is at `hover` (4,), to which the take-off leads; each leg holds its end until the next.
     """
@@ -114,7 +114,7 @@ class Flight:
         return (self.hover, np.zeros(4)) if leg is None else leg.path.value(t_s - leg.start_s)
 
     def phase(self, t_s: float) -> tuple[ReferencePhase, float | None]:
-        """Return what is flown, and the path's own time where it is a path."""
+        """Return the phase, and the path's own time if it is a path."""
         leg = self.leg_at(t_s)
         if leg is None:
             return "holding", None
@@ -131,7 +131,7 @@ class Flight:
 
 
 def limits_of(drone: Drone, gravity_m_s2: float) -> PathLimits:
-    """Return what a path may ask of a drone at most: the limits of its firmware, its tilt as an acceleration."""
+    """Return the path limits of a drone: the limits of its firmware, with the tilt as an acceleration."""
     own = drone.limits
     accel = gravity_m_s2 * el.tan(math.radians(own.tilt_deg))
     return PathLimits(own.horizontal_speed_m_s, own.vertical_speed_m_s, math.radians(own.yaw_rate_deg_s), accel)
@@ -144,7 +144,7 @@ def hover_of(drone: Drone) -> Array:
 
 
 def flight_of(scenario: Scenario, drone: str) -> Flight:
-    """Return the flight of a drone that has a reference, or is in an exchange; FlightError: it cannot be flown."""
+    """Return the flight of a drone with a reference or in an exchange; FlightError: it cannot be flown."""
     flown = scenario.piloted()[drone]
     if isinstance(flown, Exchange):
         return exchange_flights(scenario, flown)[drone]
@@ -162,7 +162,7 @@ def flight_of(scenario: Scenario, drone: str) -> Flight:
 
 
 def way_to(start: Array, path: Reference, limits: PathLimits, begin: EndMotion | None = None) -> PiecewisePolynomial:
-    """Return the way from a place (4,) onto the beginning of a path, in its motion; FlightError: it is too fast."""
+    """Return the approach from a place (4,) to the moving start of a path; FlightError: it is too fast."""
     place, rate = path.value(0.0)
     end = EndMotion(rate, np.zeros(4), np.zeros(4)) if rate.any() else None
     own = limits.share(SHARE if rate.any() else WAY_SHARE)
@@ -173,10 +173,10 @@ def way_to(start: Array, path: Reference, limits: PathLimits, begin: EndMotion |
 
 
 def fitted_path(spec: DroneReference, limits: PathLimits, yaw: float, altitude_max_m: float) -> Reference:
-    """Return the path of a reference, as slow as it asks for, or as the limits need where it is to fit.
+    """Return the path of a reference at its own speed, or slowed to the limits if `fit` is set.
 
     Raises:
-        FlightError: it cannot be read, is too fast, too low or too high; names the field.
+        FlightError: the path is invalid, too fast, too low or too high; names the field.
     """
     (kind,) = spec.paths()
     try:
@@ -197,7 +197,7 @@ def fitted_path(spec: DroneReference, limits: PathLimits, yaw: float, altitude_m
 
 
 def _paths_of(spec: DroneReference, yaw: float) -> Mapping[str, Callable[[], Reference]]:
-    """Return what makes the path of each kind; `yaw` is the heading [rad] of one that has none."""
+    """Return the constructors of the kinds of path; `yaw` is the default heading [rad]."""
     base = np.array([0.0, 0.0, 0.0, yaw])
 
     def expressions() -> Reference:
@@ -234,7 +234,7 @@ def _named(points: Sequence[PathPoint]) -> list[dict[str, Any]]:
 
 
 def _through(points: Sequence[PathPoint], yaw: float) -> Reference:
-    """Return the minimum-snap path through points, which begins at the time of the first; yaw by the shorter way."""
+    """Return the minimum-snap path through points, starting at the time of the first; yaw by the shorter way."""
     places = np.empty((len(points), 4))
     for row, point in zip(places, points, strict=True):
         wanted = yaw if point.yaw_deg is None else math.radians(point.yaw_deg)
@@ -264,7 +264,7 @@ def _polynomials(spec: DroneReference) -> Reference:
 
 
 def _too_fast(peaks: Peaks, limits: PathLimits, factor: float, now: str) -> str:
-    """Return what of a path is beyond the limits, and the factor that would fit."""
+    """Return a text on the quantity beyond the limits, and the factor that would satisfy them."""
     shares = [own / most for own, most in zip(peaks[:4], limits, strict=True)]
     weighed = [*shares[:3], math.sqrt(shares[3] * SHARE)]  # as in `Peaks.factor`, which this explains
     worst = int(np.argmax(weighed))
@@ -347,9 +347,9 @@ def land_s_of(flown: Piloted) -> float:
 
 
 def flight_faults(scenario: Scenario) -> Iterator[tuple[str, str]]:
-    """Yield path and text of what cannot be flown of all references, and where they come too near.
+    """Yield path and text of the faults of all references, and of distances that are too small.
 
-    To each other, and to formations as far as these are known before.
+    Distances are those between flights, and to formations as far as known in advance.
     """
     flights: dict[str, Flight] = {}
     exchanges = [] if not isinstance(scenario.exchanges, list) else scenario.exchanges
@@ -375,7 +375,7 @@ def flight_faults(scenario: Scenario) -> Iterator[tuple[str, str]]:
 
 
 def too_near(scenario: Scenario, flights: Mapping[str, Flight]) -> str | None:
-    """Return which drones' flights come nearer than both need for themselves; None if none do."""
+    """Return the pair of drones whose flights come too close, None if none do."""
     names = [*flights]
     try:
         clearance = np.array([vehicle_of(scenario.drone(name).model).airframe.clearance_m for name in names])
@@ -395,7 +395,7 @@ def too_near(scenario: Scenario, flights: Mapping[str, Flight]) -> str | None:
 
 
 def checked_flight(scenario: Scenario, drone: str) -> Flight:
-    """Return the flight of a drone; of the first one that has any, all are compared with each other.
+    """Return the flight of a drone; for the first drone with one, all flights are compared with each other.
 
     Raises:
         RunError: it cannot be flown.

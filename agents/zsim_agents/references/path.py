@@ -1,9 +1,9 @@
-"""Paths of one drone: a place and its rate for every instant, their peaks, and the time that fits limits. Pure.
+"""Paths of one drone: position and rate over time, their peaks, and the duration that satisfies limits. Pure.
 
-Polynomials of minimum snap; and circle, helix and figure-8, flown in laps, which begin and end at rest on the curve.
+Minimum-snap polynomials; and circle, helix and figure-8, flown in laps that begin and end at rest on the curve.
 
 A path is a `Reference` of four variables, x, y, z [m, W] and yaw [rad, not wrapped]; time is in seconds from its start,
-and it stands still at the nearest end outside of [0, duration_s].
+and outside [0, duration_s] it stands still at the nearest end.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Curve = Callable[[float], tuple[Array, Array]]
 
 
 class PathLimits(NamedTuple):
-    """What a path may ask of its drone: horizontal and vertical speed, turn, horizontal acceleration."""
+    """Limits of a path: horizontal and vertical speed, turn rate, horizontal acceleration."""
 
     speed_m_s: float
     climb_m_s: float
@@ -54,7 +54,7 @@ class PathLimits(NamedTuple):
 
 
 class Peaks(NamedTuple):
-    """The greatest of each quantity of `PathLimits` on a path, and when it is reached [s]."""
+    """The maximum of each quantity of `PathLimits` on a path, and when it is reached [s]."""
 
     speed_m_s: float
     climb_m_s: float
@@ -63,13 +63,13 @@ class Peaks(NamedTuple):
     at_s: tuple[float, float, float, float]
 
     def factor(self, limits: PathLimits) -> float:
-        """Return by how much a path has to be slower to keep within limits; below 1 where it may be faster."""
+        """Return the factor by which a path must be slowed to satisfy limits; below 1 if it may be faster."""
         speeds = max(own / most for own, most in zip(self[:3], limits[:3], strict=True))
         return max(speeds, math.sqrt(self.accel_m_s2 / limits.accel_m_s2))  # speeds fall with time, accelerations twice
 
 
 class PiecewisePolynomial:
-    """Polynomials of local time that follow each other.
+    """A sequence of polynomials of local time.
 
     Args:
         durations_s: (m,) of the pieces.
@@ -98,7 +98,7 @@ class PiecewisePolynomial:
         return np.array(place), np.array(rate) if clamped == t_s else np.zeros(4)
 
     def until(self, end_s: float) -> PiecewisePolynomial:
-        """Return the part before end_s, which is after the beginning."""
+        """Return the part before end_s > 0."""
         count = bisect.bisect_left(self._begins, end_s)
         durations = self.durations_s[:count].copy()
         durations[-1] = min(durations[-1], end_s - self._begins[count - 1])
@@ -124,7 +124,7 @@ def _powers(x: float, count: int) -> Array:
 
 
 def _greatest(columns: Array) -> tuple[float, float]:
-    """Return the greatest sum of squares of polynomials (n, k) in [0, 1], and where: by samples and golden section.
+    """Return the maximum sum of squares of polynomials (n, k) in [0, 1], and where: by samples and golden section.
 
     The derivative of such a sum has at most twelve roots, so samples show all maxima wider than their distance.
     """
@@ -168,7 +168,7 @@ def at_rest() -> EndMotion:
 def minimum_snap(
     times_s: Sequence[float], places: Array, begin: EndMotion | None = None, end: EndMotion | None = None
 ) -> PiecewisePolynomial:
-    """Return the path through places (m, 4) at times with the least integral of the squared fourth derivative.
+    """Return the path through places (m, 4) at given times with the least integral of the squared fourth derivative.
 
     Among all paths with given derivatives up to the third at both ends, at rest by default, that is the spline of
     degree 7: Mellinger and Kumar, ICRA 2011, for the cost; Schoenberg, Proc. Nat. Acad. Sci. 52 (1964) 947, for the
@@ -186,7 +186,7 @@ def minimum_snap(
     diagonals, b = np.zeros((m * size, BELOW + 1 + ABOVE)), np.zeros((m * size, 4))
 
     def put(row: int, piece: int, values: Array, first: int = 0) -> None:
-        """Write what a row takes of a piece's coefficients from t^first on."""
+        """Write the entries of a row for a piece's coefficients from t^first on."""
         at = piece * size + first - row + BELOW
         diagonals[row, at : at + len(values)] = values
 
@@ -224,9 +224,9 @@ def move(
     begin: EndMotion | None = None,
     end: EndMotion | None = None,
 ) -> PiecewisePolynomial:
-    """Return the minimum-snap way from one place to another (4,), within limits.
+    """Return the minimum-snap path from one place to another (4,), within limits.
 
-    It lasts over_s, or longer where the limits need that. It begins and ends at rest, or in the motions that are given.
+    It lasts over_s, or longer if the limits require. It begins and ends at rest, or in the given motions.
     The yaw turns by the shorter way.
 
     Raises:
@@ -253,7 +253,7 @@ def round_up(factor: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Scaled:
-    """A path that is flown `factor` times as slowly, from an origin (4,)."""
+    """A path flown `factor` times as slowly, displaced by an origin (4,)."""
 
     of: Reference
     factor: float
@@ -276,7 +276,7 @@ class Scaled:
 
 
 def peaks_of(path: Reference) -> Peaks:
-    """Return the peaks of any path: exact ones of polynomials, of others refined between samples."""
+    """Return the peaks of any path: exact for polynomials, refined between samples for others."""
     own: Callable[[], Peaks] | None = getattr(path, "peaks", None)
     if own is not None:
         return own()
@@ -297,7 +297,7 @@ def peaks_of(path: Reference) -> Peaks:
 
 
 def _refined(quantity: Callable[[float], float], times: Array, samples: Array) -> tuple[float, float]:
-    """Return the greatest value of a quantity near its greatest sample, and when."""
+    """Return the maximum of a quantity near its largest sample, and when."""
     from scipy.optimize import minimize_scalar
 
     best = int(np.argmax(samples))
@@ -310,7 +310,7 @@ def _refined(quantity: Callable[[float], float], times: Array, samples: Array) -
 
 
 def circle(radius_m: float, climb_m: float = 0.0) -> Curve:
-    """Return a circle around the origin, from (radius, 0) counter-clockwise; it climbs so much in a lap."""
+    """Return a circle around the origin, counter-clockwise from (radius, 0), with a climb per lap."""
 
     def at(angle: float) -> tuple[Array, Array]:
         c, s, rise = radius_m * el.cos(angle), radius_m * el.sin(angle), climb_m / math.tau
@@ -320,7 +320,7 @@ def circle(radius_m: float, climb_m: float = 0.0) -> Curve:
 
 
 def figure_eight(length_m: float, width_m: float) -> Curve:
-    """Return the lemniscate of Gerono along x, so long and so wide, from its crossing at the origin."""
+    """Return the lemniscate of Gerono along x, with a length and a width, from its crossing at the origin."""
 
     def at(angle: float) -> tuple[Array, Array]:
         x, y = length_m / 2.0, width_m / 2.0
@@ -331,7 +331,7 @@ def figure_eight(length_m: float, width_m: float) -> Curve:
 
 
 class Laps:
-    """A curve that is flown for some laps of period_s each, with a quarter of a period more for start and stop.
+    """A curve flown for a number of laps of period_s each, plus a quarter of a period for start and stop.
 
     The angle's rate follows a quintic at both ends, so that acceleration and jerk begin and end at zero too.
     """

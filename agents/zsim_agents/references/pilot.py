@@ -1,6 +1,6 @@
-"""The pilot of one drone that has a reference of its own: takes off, follows it by velocities, lands; takes requests.
+"""The pilot of one drone with its own reference: take-off, tracking by velocity commands, landing, requests.
 
-What is flown is a function of simulated time and of the newest request, `drone/{d}/control`:
+The flight is a function of simulated time and of the newest request on `drone/{d}/control`:
 
 takeoff, land
 hold: come to rest
@@ -135,7 +135,7 @@ class ReferencePilot(Agent):
         return [self.command(t_ns, self._drone, Velocity(0, 0, "", velocity, yaw_rate, "world"))]
 
     def _velocity(self, t_s: float, estimate: Estimate, age_s: float) -> tuple[tuple[float, float, float], float]:
-        """Return the velocity [m/s, W] and yaw rate [rad/s] that lead to the reference, within the drone's limits."""
+        """Return the velocity [m/s; W] and yaw rate [rad/s] that track the reference, within the drone's limits."""
         place, _ = self._flight.value(t_s)
         _, ahead = self._flight.value(t_s + self._settings.lead_s)
         x, y, z = (at + moving * age_s for at, moving in zip(estimate.position_m, estimate.velocity_m_s, strict=True))
@@ -143,7 +143,7 @@ class ReferencePilot(Agent):
         return velocity_towards(place.tolist(), ahead.tolist(), here, self._limits, self._settings)
 
     def _mode(self, t_ns: int, mode: Any) -> list[Output]:
-        """Return a mode command, repeated only after a while without effect."""
+        """Return a mode command, repeated after a time without effect."""
         if t_ns - self._mode_ns < RESEND_S * 1e9:
             return []
         self._mode_ns = t_ns
@@ -155,7 +155,7 @@ class ReferencePilot(Agent):
         return (keys.drone_control(self._drone),)
 
     def control(self, key: str, request: ControlRequest) -> ControlAnswer:
-        """Take a request; it acts from the next gate on."""
+        """Handle a request; it takes effect from the next gate on."""
         if len(self._answered) >= REQUESTS_MAX:
             return ControlAnswer(ok=False, error=f"{key}: {REQUESTS_MAX} requests wait for the next gate; ask after it")
         try:
@@ -195,7 +195,7 @@ class ReferencePilot(Agent):
         return {"from_s": t_s, "until_s": flight.duration_s}
 
     def _requests_of_gate(self, t_ns: int) -> list[Output]:
-        """Return on record what was asked since the last gate."""
+        """Return the requests since the last gate as outputs for the record."""
         answered, self._answered = self._answered, []
         return [
             Output(
@@ -248,11 +248,11 @@ def _vector(place: Array) -> tuple[float, float, float]:
 
 
 class DroneRequestError(ValueError):
-    """A request cannot be understood, or not be done now; the text names the field, finding and remedy."""
+    """A request cannot be understood or carried out now; the text names the field, finding and remedy."""
 
 
 class Goto(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A place to fly to, in W, or several one after the other."""
+    """A place to fly to in W, or several in sequence."""
 
     position_m: Position | None = None
     places_m: Annotated[list[Position], Meta(max_length=POINTS_MAX)] = []
@@ -269,7 +269,7 @@ Asked = Literal["takeoff", "land", "hold"] | Goto | DroneReference
 
 
 def read_request(op: str, args: Mapping[str, Any]) -> Asked:
-    """Return what is asked for; DroneRequestError: none of OPERATIONS, or arguments that are not allowed."""
+    """Return the request; DroneRequestError: it is not one of OPERATIONS, or arguments are not allowed."""
     if op not in OPERATIONS:
         raise DroneRequestError(f"is unknown; allowed: {', '.join(OPERATIONS)}")
     if op in PLAIN:
@@ -297,7 +297,7 @@ def read_request(op: str, args: Mapping[str, Any]) -> Asked:
 
 
 def _unused(asked: DroneReference, args: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what is wrong with fields that a request has no use for."""
+    """Yield the faults of fields that a request does not use."""
     for name, value in args.items():
         if name not in FOLLOWED:
             yield f"{name} is {show(value)}; must be left out of a request"
@@ -306,7 +306,7 @@ def _unused(asked: DroneReference, args: Mapping[str, Any]) -> Iterator[str]:
 
 
 def requested_flight(asked: Any, t_s: float, place: Array, rate: Array, drone: Drone, limits: PathLimits) -> Flight:
-    """Return the flight that is asked for at t_s, from a place (4,) in motion; FlightError: it cannot be flown."""
+    """Return the flight requested at t_s, from a place (4,) in motion; FlightError: it cannot be flown."""
     begin = EndMotion(rate, np.zeros(4), np.zeros(4)) if rate.any() else None
     if isinstance(asked, DroneReference):
         path = fitted_path(asked, limits, float(place[3]), drone.limits.altitude_m)

@@ -1,8 +1,7 @@
-"""The law that keeps a drone to a reference, and the course of one that is sent to places at any moment. Pure.
+"""The tracking law of a drone's reference, and the course of a drone sent to places at any time. Pure.
 
-The velocity that is commanded is the reference's own, as early as the drone's velocity loop is late, and a share of the
-distance by which the drone is off. To first order that is the acceleration in front of the velocity loop, without a
-second derivative.
+The commanded velocity is that of the reference, advanced by the lag of the drone's velocity loop, plus a share of the
+position error. To first order this is an acceleration feed-forward without a second derivative.
 """
 
 from __future__ import annotations
@@ -30,11 +29,11 @@ Axes = tuple[float | None, float | None, float | None, float | None]
 def velocity_towards(
     place: Four, ahead: Four, here: Four, limits: PathLimits, law: Piloted, down_m_s: float = math.inf
 ) -> tuple[Vector, float]:
-    """Return the velocity [m/s, W] and yaw rate [rad/s] of a drone here, whose reference is at a place.
+    """Return the velocity [m/s; W] and yaw rate [rad/s] for a drone at `here` whose reference is at a place.
 
     Args:
-        ahead: the rate of the reference `law.lead_s` from now.
-        limits: that the result keeps to; `down_m_s` where less is allowed than upwards.
+        ahead: rate of the reference `law.lead_s` from now.
+        limits: limits of the result; `down_m_s` if the limit is lower downwards than upwards.
     """
     x, y, z = (v + law.gain_1_s * (p - own) for v, p, own in zip(ahead[:3], place[:3], here[:3], strict=True))
     speed = el.hypot(x, y)
@@ -45,14 +44,13 @@ def velocity_towards(
 
 
 class Course:
-    """The ways of a drone that is sent to places, and at any moment to another one.
+    """The paths of a drone that is sent to a place, and at any time to another one.
 
-    A way begins where the one before has come to, in its motion; where there is none, or the drone has been driven off
-    it by more than LOST_M, at the drone. An axis without a place is flown at its rate; one with both has its place and
-    rate from elsewhere, and is followed as they are.
+    A path begins in the present state of the previous one, or at the drone if there is none or the drone is off it by
+    more than LOST_M. An axis without a place is flown at its rate; an axis with both is tracked as given.
 
     Args:
-        limits: of the drone; a way has SHARE of the acceleration.
+        limits: limits of the drone; a path uses SHARE of the acceleration.
     """
 
     def __init__(self, limits: PathLimits, law: Piloted) -> None:
@@ -64,7 +62,7 @@ class Course:
         self._begun_s = 0.0
 
     def leave(self) -> None:
-        """Forget the way: the next one begins at the drone."""
+        """Clear the path: the next one begins at the drone."""
         self._goal = self._way = None
 
     def send(
@@ -105,7 +103,7 @@ class Course:
         return velocity, self._rate[3] if goal[3] is None else turn
 
     def _motion(self, t_s: float, here: Four, moving: Four) -> tuple[Four, Four]:
-        """Return place and rate of the way on the axes that it leads, and of the drone on the others."""
+        """Return place and rate of the path on its axes, and of the drone on the others."""
         own, rate = list(here), list(moving)
         if self._way is not None and not self._is_lost(t_s, here):
             place, pace = self._state(t_s)
@@ -114,7 +112,7 @@ class Course:
         return own, rate
 
     def _axes(self) -> list[int]:
-        """Return the axes that the way leads."""
+        """Return the axes of the path."""
         goal = self._goal or (None,) * 4
         return [k for k in range(4) if goal[k] is not None and self._rate[k] == 0.0]
 

@@ -35,7 +35,7 @@ from zsim_bridges.vehicle_links.drone_link import CommandSender, OnboardState
 
 WATCHDOG_NS = 50_000_000  # ns without an AT command until the watchdog's bit (Developer Guide 6.6, COMWDG)
 LAND_AFTER_NS = 2_000_000_000  # ns of hovering without a pilot's program before it lands, chosen
-MALFORMED_SHOWN = 20  # parts of datagrams that are no commands, chosen; more are only counted
+MALFORMED_SHOWN = 20  # chosen; reports of invalid parts of datagrams, further ones are only counted
 LOW_BATTERY_PERCENT = 10.0  # %, below it zsim's firmware does not take off; below 5 % it lands
 RANGE_COSINE = math.cos(math.radians(75.0))  # of the tilt at which the firmware cuts the motors
 THREADS = StateBit.AT_THREAD | StateBit.NAVDATA_THREAD | StateBit.VIDEO_THREAD | StateBit.ACQUISITION_THREAD
@@ -51,7 +51,7 @@ CONTROL_STATES = {
 FRONT_CHANNELS = (0, 2)  # video_channel: 0 front, 1 bottom, 2 and 3 with the other one small, 4 the next one
 NEXT_CHANNEL = 4
 FIGURES = "figures are not flown here; the aircraft's flips are its firmware's"
-CLIENTS_MAX = 8  # programs that are sent navdata, chosen; beyond, the one that asked first is dropped
+CLIENTS_MAX = 8  # programs that receive navdata, chosen; beyond it the oldest one is dropped
 REQUESTS = (b"\x01", b"Init")  # how a request for navdata begins (ARDroneLib; its Windows client)
 SECOND_NS = 1_000_000_000
 ACCEL_LSB_PER_G, ACCEL_ZERO_LSB = 512, 2048  # of the raw accelerometer, nominal (measured: 516 to 518, 2031 to 2038)
@@ -75,7 +75,7 @@ Putters = dict[str, Callable[..., None]]
 
 
 class Outlets(NamedTuple):
-    """The outputs of an aircraft: messages to the run, navdata to programs, bytes to the control port, refusals."""
+    """The outputs of an aircraft: commands to the run, navdata to programs, bytes to the control port, refusals."""
 
     put: Callable[[str, Any], None]
     send_navdata: Send
@@ -84,7 +84,7 @@ class Outlets(NamedTuple):
 
 
 class Aircraft:
-    """One aircraft, steered by the programs of its pilot; `gate_ns` is how exactly the time of an arrival is known."""
+    """One aircraft, flown by its pilot's programs; `gate_ns` is the resolution of arrival times."""
 
     def __init__(self, drone: Drone, source: str, gate_ns: int, outlets: Outlets) -> None:
         self._name = drone.name
@@ -139,7 +139,7 @@ class Aircraft:
                 self._navdata.on_instant(message.t_ns)
 
     def _watch_pilot(self) -> None:
-        """Hover, and then land, when the pilot's program has gone silent."""
+        """Hover, and later land, when the pilot's program is silent."""
         silent_ns = self._silent_ns()
         lost_ns = round(self.configuration.number("general:com_watchdog") * SECOND_NS)
         if silent_ns <= lost_ns:
@@ -152,20 +152,20 @@ class Aircraft:
             self.pilot.land()
 
     def _silent_ns(self) -> int:
-        """Return since when no AT command has arrived, less the gate within which its arrival is not known."""
+        """Return how long no AT command has arrived, less the gate that is the resolution of its arrival."""
         return 0 if self._command_ns is None else max(0, self._now_ns - self._command_ns - self._gate_ns)
 
     # Pilots' programs
 
     def on_navdata_request(self, datagram: bytes, address: Hashable) -> None:
         if not self._navdata.on_request(datagram, address, self._now_ns):
-            self._refuse(f"a datagram of {len(datagram)} bytes on the navdata port does not ask for navdata")
+            self._refuse(f"a datagram of {len(datagram)} bytes on the navdata port is not a request for navdata")
 
     def on_at(self, datagram: bytes) -> None:
         commands, refusals = at_commands.parse(datagram)
         for refusal in refusals:
             self._malformed += 1
-            self._refuse(refusal if self._malformed <= MALFORMED_SHOWN else "more is sent that is no AT command")
+            self._refuse(refusal if self._malformed <= MALFORMED_SHOWN else "more data that are not AT commands")
         for command in commands:
             # numbers begin again with 0 or 1, and after a silence
             if command.sequence > self._last_sequence or command.sequence in (0, 1) or self._is_lost:
@@ -202,7 +202,7 @@ class Aircraft:
                 self._refuse(f"ANIM is not obeyed: {FIGURES}")
 
     def _configure(self, config: at_commands.Config, ids: at_commands.ConfigIds | None) -> None:
-        """Set an entry, and acknowledge it in any case, as the aircraft does."""
+        """Set an entry, and acknowledge it even if it is refused, as the aircraft does."""
         self._ack = True
         key = config.key.lower()
         is_foreign = ids and not self.configuration.is_current(ids.session, ids.user, ids.application)
@@ -257,7 +257,7 @@ class Aircraft:
 
 
 class NavdataSender:
-    """Sends an aircraft's navdata: which packets are due, with which options, to which programs, and what they hold.
+    """Sends an aircraft's navdata: when packets are due, their options, receivers and contents.
 
     The SDK's body axes are x forward, y right, z down; its angles theta nose up, phi to the right, psi clockwise, 0
     where the aircraft was switched on. What no sensor of the drone measures is zero.
@@ -316,7 +316,7 @@ class NavdataSender:
                 self._send(packet, address)
 
     def on_gate(self) -> None:
-        """Renew what changes at gates."""
+        """Update the values that change at gates."""
         self._is_gate_new = True
 
     def _packet(self, t_ns: int) -> bytes:
@@ -355,7 +355,7 @@ class NavdataSender:
 
 
 class NavdataContent:
-    """Fills packets with what is known of one aircraft."""
+    """Fills packets with the state of one aircraft."""
 
     def __init__(self, state: OnboardState, rotor_max_rad_s: float) -> None:
         self._state = state
@@ -429,7 +429,7 @@ class NavdataContent:
         return round(1e3 * self._sonar.range_m) if self._sonar and self._sonar.valid else 0
 
     def fill_gate(self, put: Putters, tags: tuple[int, ...]) -> None:
-        """Fill what changes with a gate; an option that is left out costs nothing."""
+        """Fill the values that change with a gate; omitted options cost nothing."""
         state = self._state
         climb_mm_s = 1e3 * state.flow.velocity_m_s[2] if state.flow else 0.0
         if PWM in tags:

@@ -1,4 +1,4 @@
-"""The session with one AR.Drone 2.0: it is set up, its navdata is requested and read, and it does what is demanded.
+"""The session with one AR.Drone 2.0: configures it, requests and decodes its navdata, and makes it carry out demands.
 
 Pure. Units and axes of navdata: millidegrees, millimetres, milli-g; x forward, y right, z down; psi clockwise from
 where the aircraft was switched on. Source: AR.Drone Developer Guide SDK 2.0, chapters 6 to 8.
@@ -135,7 +135,7 @@ class AircraftSession(VehicleSession):
 
     def _take(self, packet: Navdata, now_ns: int) -> None:
         if StateBit.COM_LOST in packet.state and StateBit.COM_LOST not in self._bits:
-            self.texts.append("the aircraft has lost our commands for a while")
+            self.texts.append("the aircraft has not received our commands for a while")
         if packet.bootstrap and not self._pending:
             self._pending.extend(self._entries)  # it was switched on again
         self._bits = packet.state
@@ -189,9 +189,9 @@ class AircraftSession(VehicleSession):
 
 
 class FlightCommands:
-    """The AT commands by which one aircraft does what is demanded, without their numbers.
+    """The AT commands that make one aircraft carry out demands, without sequence numbers.
 
-    REF says take off or land and is repeated while it is meant; PCMD is sent every 30 ms.
+    REF commands take-off or landing and is repeated while that is demanded; PCMD is sent every 30 ms.
     Source: AR.Drone Developer Guide SDK 2.0, chapter 6.
     """
 
@@ -257,7 +257,7 @@ class _Axis:
         self._references: deque[tuple[int, float]] = deque()
 
     def accel(self, now_ns: int, wanted: float, measured: float, most_m_s2: float) -> float:
-        """Return the acceleration that the tilt is to give."""
+        """Return the acceleration to be produced by the tilt."""
         dt_s = 0.0 if self._then_ns is None else min(STEP_S_MAX, (now_ns - self._then_ns) * 1e-9)
         if self._then_ns is None:
             self._reference = measured
@@ -276,7 +276,7 @@ class _Axis:
 
 
 class NavdataReadings(AircraftReadings):
-    """What one aircraft measures, and where it has flown since the start.
+    """The measurements of one aircraft, and its integrated position since the start.
 
     Args:
         origin: of W: latitude, longitude [deg], height [m].
@@ -345,7 +345,7 @@ class NavdataReadings(AircraftReadings):
         self.read("flow", taken_ns, own, 1.0)
 
     def _align(self, yaw: float, magnetic: float, dt_s: float) -> None:
-        """Let the heading follow the magnetometer slowly; a stated one is kept."""
+        """Let the heading follow the magnetometer slowly, unless it is given."""
         if self._stated_yaw_rad is not None:
             if self._yaw_offset_rad is None:
                 self._yaw_offset_rad = self._stated_yaw_rad - yaw
@@ -356,13 +356,13 @@ class NavdataReadings(AircraftReadings):
         self._yaw_offset_rad += min(1.0, YAW_1_S * max(0.0, dt_s)) * error
 
     def _on_gps(self, gps: Any, taken_ns: int) -> None:
-        """Read a fix once, and let the position follow it."""
+        """Process each fix once, and let the position follow it."""
         place = gps.latitude_deg, gps.longitude_deg, gps.elevation_m
         values = self.gps_values(place, gps.speed_m_s, math.radians(gps.degree), gps.ehpe_m, GPS_FIX, gps.satellites)
         before_ns, fix = self._gps_ns, (place, gps.speed_m_s, gps.degree)
         if fix != self._fix and self.read("gps", taken_ns, *values):
             self._gps_ns, self._fix = taken_ns, fix
-            if before_ns is not None:  # the first one is worse than the place that is stated
+            if before_ns is not None:  # the first one is less accurate than the stated place
                 x, y, _ = values[3]
                 share = min(1.0, GPS_1_S * (taken_ns - before_ns) * 1e-9)
                 self._x, self._y = self._x + share * (x - self._x), self._y + share * (y - self._y)

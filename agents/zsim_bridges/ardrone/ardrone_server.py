@@ -179,4 +179,4 @@ class DroneServer:
         if datagram.startswith(QUESTION):
             self._authentication.send(ANSWER, address)
         else:
-            self._refuse("a datagram on the authentication port is no PARROT AUTH")
+            self._refuse("a datagram on the authentication port is not a PARROT AUTH")

@@ -1,4 +1,4 @@
-r"""AT commands: what a pilot's program sends to UDP port 5556.
+r"""AT commands, which a pilot's program sends to UDP port 5556.
 
 A datagram holds one or more `AT*NAME=sequence,argument,...\r`, whole. Integers are decimal, strings are quoted, a float
 is written as the signed integer that has the same 32 bits.
@@ -22,7 +22,7 @@ SEND_CONFIGURATION, ACKNOWLEDGE, SEND_CUSTOM_LIST = 4, 5, 6  # modes of CTRL (AR
 IGNORED_NAMES = frozenset(
     ("PMODE", "MISC", "PWM", "AFLIGHT", "CAD", "ZAP", "MTRIM", "GAIN", "VISP", "VISO", "CAP", "POL", "VICON")
 )
-"""Commands of the SDK that a pilot's program may send, and that change nothing here."""
+"""Commands of the SDK that are accepted and have no effect here."""
 
 
 class Ref(NamedTuple):
@@ -103,7 +103,7 @@ class Control(NamedTuple):
 
 
 class ResetWatchdog(NamedTuple):
-    """Show that the pilot's program is still there."""
+    """Show that the pilot's program is still running."""
 
     sequence: int
 
@@ -126,7 +126,7 @@ class Animation(NamedTuple):
 
 
 class Ignored(NamedTuple):
-    """A command of the SDK that changes nothing."""
+    """A command of the SDK without effect."""
 
     sequence: int
     name: str
@@ -156,18 +156,18 @@ _SEQUENCE_MAX = 2**32 - 1
 
 
 class Parsed(NamedTuple):
-    """The commands of a datagram in order, and a text for each part that is none."""
+    """The commands of a datagram in order, and a text for each invalid part."""
 
     commands: list[Command]
     refusals: list[str]
 
 
 class _RefusalError(ValueError):
-    """A part of a datagram is no command; the text says why."""
+    """A part of a datagram is not a command; the text says why."""
 
 
 def parse(datagram: bytes) -> Parsed:
-    """Return the commands of a datagram; it raises for no input."""
+    """Return the commands of a datagram; never raises."""
     if len(datagram) > DATAGRAM_MAX:
         return Parsed([], [f"a datagram has {len(datagram)} bytes; must have at most {DATAGRAM_MAX}"])
     parsed = Parsed([], [])
@@ -178,7 +178,7 @@ def parse(datagram: bytes) -> Parsed:
         except _RefusalError as error:
             parsed.refusals.append(str(error))
     if rest.strip(b"\n\0 "):
-        parsed.refusals.append(f"{_shown(rest)} does not end in a carriage return; a part of a command is none")
+        parsed.refusals.append(f"{_shown(rest)} does not end in a carriage return; must be a complete command")
     return parsed
 
 
@@ -186,7 +186,7 @@ def _command(part: bytes) -> Command:
     if len(part) >= COMMAND_MAX:
         raise _RefusalError(f"a command has {len(part) + 1} characters; must have at most {COMMAND_MAX}")
     if not part.isascii() or not (form := _FORM.fullmatch(part.decode("ascii").strip("\n "))):
-        raise _RefusalError(f"{_shown(part)} is no AT command; must be AT*NAME=sequence,arguments")
+        raise _RefusalError(f"{_shown(part)} is not an AT command; must be AT*NAME=sequence,arguments")
     name, sequence, text = form[1], int(form[2]), form[3] or ""
     if sequence > _SEQUENCE_MAX:
         raise _RefusalError(f"{name} has the sequence number {sequence}; must be <= {_SEQUENCE_MAX}")

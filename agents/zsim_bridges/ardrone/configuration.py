@@ -146,7 +146,7 @@ for _name, _kind, _category, _default, *_range in (line.split("|") for line in _
 
 
 class ConfigurationError(ValueError):
-    """An entry is not accepted; the text says why."""
+    """An entry is refused; the text says why."""
 
 
 class Configuration:
@@ -207,7 +207,7 @@ class Configuration:
             return
         entry = ENTRIES.get(key)
         if entry is None:
-            raise ConfigurationError(f"{key[:60]!r} is no entry of the configuration")
+            raise ConfigurationError(f"{key[:60]!r} is not an entry of the configuration")
         self._values(entry)[key] = _checked(key, entry, value)
         # the limits in force are those of the set in use
         place = "outdoor" if self.flag("control:outdoor") else "indoor"
@@ -232,7 +232,7 @@ class Configuration:
         prefix, _, what = name.rpartition("_")
         level = _LEVELS.get(prefix)
         if level is None or what not in ("id", "desc"):
-            raise ConfigurationError(f"'custom:{name[:40]}' is no entry of the configuration")
+            raise ConfigurationError(f"'custom:{name[:40]}' is not an entry of the configuration")
         if what == "desc":
             self._described[level][self._current[level]] = _checked_text(f"custom:{name}", value)
         elif value.startswith("-"):
@@ -255,7 +255,7 @@ class Configuration:
 
 
 def _checked(key: str, entry: ConfigurationEntry, value: str) -> str:
-    """Return a value as it is kept: a number clipped to its range."""
+    """Return a value as it is stored: a number is clipped to its range."""
     if entry.kind == "fixed":
         raise ConfigurationError(f"{key} is read only")
     if entry.kind == "text":

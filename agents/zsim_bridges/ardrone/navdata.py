@@ -132,7 +132,7 @@ LOST_COM, MAGNETO_CALIBRATION = 8, 12  # the lower half of ctrl_state while it h
 
 
 class NavdataError(ValueError):
-    """A datagram is no navdata; the text says why."""
+    """A datagram is not navdata; the text says why."""
 
 
 class Navdata(NamedTuple):
@@ -178,7 +178,7 @@ def unpack(datagram: bytes) -> Navdata:
     """Return a packet.
 
     Raises:
-        NavdataError: it is none, or its checksum is wrong.
+        NavdataError: it is not a packet, or its checksum is wrong.
     """
     if len(datagram) < _START.size + _SUM.size:
         raise NavdataError(f"has {len(datagram)} bytes; must have at least {_START.size + _SUM.size}")
@@ -211,7 +211,7 @@ def unpack(datagram: bytes) -> Navdata:
 
 
 class NavdataTemplate:
-    """A packet that is made once and filled anew for each sending; options keep their values until then."""
+    """A packet that is built once and refilled for each transmission; options keep their values until then."""
 
     def __init__(self, tags: Sequence[int]) -> None:
         self.tags = tuple(tags)

@@ -1,4 +1,4 @@
-"""What a pilot's REF and PCMD make a drone do: modes until they are obeyed, a setpoint as long as it holds.
+"""The effect of a pilot's REF and PCMD: modes, repeated until obeyed, and a setpoint as long as it holds.
 
 Source: AR.Drone Developer Guide SDK 2.0, 6.6; what clients of it send.
 """
@@ -160,7 +160,7 @@ class Pilot:
             self._follow(HOVER)
 
     def land(self) -> None:
-        """Land: the pilot's program stays silent."""
+        """Land, since the pilot's program remains silent."""
         if self._is_own_flight() and self._mode != "land":
             self._ask("land")
 
@@ -194,7 +194,7 @@ class Pilot:
         self._pursue(mode)
 
     def _pursue(self, mode: ModeName) -> None:
-        """Ask for a mode until it is entered, given up, or no longer possible."""
+        """Request a mode until it is entered, abandoned, or no longer possible."""
         entered = {
             "takeoff": self.state in (*IN_THE_AIR, "emergency"),
             "land": self.state not in IN_THE_AIR,
@@ -214,7 +214,7 @@ class Pilot:
             self._sender.mode(self._now_ns, mode)
 
     def _follow(self, setpoint: TiltSetpoint) -> None:
-        """Take a setpoint, and send it at once if it differs from the last one."""
+        """Set the setpoint, and send it at once if it differs from the last one."""
         if setpoint != self.setpoint:
             self.setpoint, self._sent_ns = setpoint, None
         self._send_due()
@@ -238,8 +238,8 @@ class SetpointSender:
     """Sends setpoints to one drone: shares of the firmware's limits, below a height, in the drone's frame.
 
     Args:
-        limits: what zsim's shares of 1 mean.
-        configuration: what the pilot's shares of 1 mean.
+        limits: the values of zsim's shares of 1.
+        configuration: has the values of the pilot's shares of 1.
 
     Attributes:
         altitude_m, heading_rad: over the ground, and clockwise from magnetic north, to be kept up to date.

@@ -1,4 +1,4 @@
-"""The addresses and ports of drones: who is obeyed there, datagrams, connections, and the FTP server.
+"""The addresses and ports of drones: permitted peers, datagrams, connections, and the FTP server.
 
 The FTP server is the drone's as far as programs of the SDK use it: anonymous, passive, one file `version.txt`.
 Source: RFC 959; ARDroneLib, ardrone_ftp.c and its check of the firmware's version.
@@ -90,10 +90,10 @@ def peer_addresses(hosts: Iterable[str]) -> frozenset[str]:
 
 
 class AllowedHosts:
-    """Who is obeyed on an address: on loopback every program of this host, elsewhere the hosts that were named.
+    """The peers obeyed on an address: on loopback every program of this host, elsewhere the named hosts.
 
     Raises:
-        RunError: the address is not loopback, and nobody is named.
+        RunError: the address is not loopback, and no host is named.
     """
 
     def __init__(self, address: str, named: frozenset[str]) -> None:
@@ -101,7 +101,7 @@ class AllowedHosts:
         self._named = named
         if not self._is_loopback and not named:
             raise RunError(
-                f"{address} is reached by every host of its network, and an AR.Drone asks nobody for a password; "
+                f"{address} is reached by every host of its network, and an AR.Drone has no password; "
                 "give --peer HOST, the host that is obeyed, or an address 127.x.y.z"
             )
 
@@ -132,7 +132,7 @@ class DatagramPort(asyncio.DatagramProtocol):
         if self._peers.allow(addr[0]):
             self._take(data, addr[:2])
         else:
-            self._refuse(f"{addr[0]} sends datagrams, and is no --peer")
+            self._refuse(f"{addr[0]} sends datagrams and is not a --peer")
 
     def send(self, datagram: bytes, address: Any) -> None:
         if self._transport is not None and not self._transport.is_closing():
@@ -178,7 +178,7 @@ class StreamPort:
     def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         host = (writer.get_extra_info("peername") or ("somebody",))[0]
         if not self._peers.allow(host):
-            self._refuse(f"{host} connects, and is no --peer")
+            self._refuse(f"{host} connects and is not a --peer")
             writer.transport.abort()
         elif len(self._tasks) >= CONNECTIONS_MAX:
             self._refuse(f"{host} connects, and there are {CONNECTIONS_MAX} connections already")

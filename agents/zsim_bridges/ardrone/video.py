@@ -25,7 +25,7 @@ BIT_RATE = 1_000_000  # bit/s: video:bitrate of the SDK, 1000 kbit/s
 IDR_FRAME, P_FRAME = 1, 3  # of a header; an IDR frame has SPS and PPS before it
 IDR, SPS, PPS = 5, 7, 8  # types of NAL units (ITU-T H.264, table 7-1)
 PRESET = {"preset": "ultrafast", "tune": "zerolatency", "profile": "baseline", "x264-params": "annexb=1"}
-BACKLOG_MAX = 500_000  # bytes that a connection may be behind, chosen: some seconds; then it waits for an IDR frame
+BACKLOG_MAX = 500_000  # chosen; backlog of a connection in bytes, some seconds; beyond it it waits for an IDR frame
 _HEADER = struct.Struct("<4sBBHIHHHHIIBBBBIIHBBBB2xI12x")
 
 
@@ -161,7 +161,7 @@ class VideoEncoder:
         """Return the frame of a JPEG picture; `begins`: decoding must be able to begin here.
 
         Raises:
-            VideoError: it is no JPEG that can be read.
+            VideoError: it is not a readable JPEG.
         """
         import av
         from av.error import FFmpegError
@@ -171,9 +171,9 @@ class VideoEncoder:
         try:
             pictures = reader.decode(av.Packet(jpeg))
         except (FFmpegError, ValueError) as error:
-            raise VideoError(f"it is no JPEG that can be read ({error})") from error
+            raise VideoError(f"it is not a readable JPEG ({error})") from error
         if not pictures:
-            raise VideoError("it is no JPEG that can be read")
+            raise VideoError("it is not a readable JPEG")
         picture = pictures[0].reformat(WIDTH_PX, HEIGHT_PX, "yuv420p")
         picture.pts, picture.time_base = self._count, self._codec.time_base
         picture.pict_type = PictureType.I if begins else PictureType.NONE

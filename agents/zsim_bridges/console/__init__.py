@@ -1,10 +1,10 @@
-"""The console: one run on a web page that viser draws, for operators who steer it and viewers who look.
+"""The console: one run on a web page that viser draws, for operators, who control it, and viewers, who only watch.
 
-From what a browser reaches down to what is pure:
+From the code that a browser reaches to the pure code:
 - serving: `page_server` (HTTP, tokens), `page_sockets` (actions, pictures), `private_viser`;
 - one run: `console_server` ties it together; `console_page` and the forms are its panels, `scene`, `page_cameras` its
   scene, `page_flying` and `manual_flight` fly single drones;
-- requests: `command_client` sends them, `orders` follows them, `control_desk` decides which page may make them;
-- what is known: `view_buffer`, `time_monitor`, `run_monitor`, `run_condition`, `alarms`, `camera_feed`, `histories`.
-The parts of the page beside viser's are HTML files in `frame`. Imports viser and aiohttp.
+- requests: `command_client` sends them, `orders` tracks them, `control_desk` decides which page may send them;
+- state of the run: `view_buffer`, `time_monitor`, `run_monitor`, `run_condition`, `alarms`, `camera_feed`, `histories`.
+The parts of the page that are not viser's are HTML files in `frame`. Imports viser and aiohttp.
 """

@@ -1,7 +1,7 @@
 """Multirotors as meshes of simple solids; B is x ahead, y left, z up, its origin at the centre of mass.
 
 They look like the AR.Drone, scaled by the length of their arms, with their own rotors. Lengths are in metres; those
-without a name are the AR.Drone's, chosen for the looks, and used in no computation.
+without a name are the AR.Drone's; they are for display only and enter no computation.
 """
 
 import math
@@ -22,8 +22,8 @@ from zsim.vehicles.vehicle import cross_layout
 ARM_M = 0.1785  # from the centre to a rotor's axis
 ROTOR_RADIUS_M = 0.10  # 8 inch propellers of the AR.Drone
 RING = 1.31  # rotor radii, outer radius of a hull ring: half of the 0.515 m of the hull, less 0.126 m to its centre
-ROTOR_Z_M = 0.030  # of the rotors over the centre of mass; drawn
-COLOURS = {  # sRGB, 0 to 255; the greys are lighter than the AR.Drone's, to be seen on the ground of the dark theme too
+ROTOR_Z_M = 0.030  # height of the rotors above the centre of mass, as drawn
+COLOURS = {  # sRGB, 0 to 255; the greys are lighter than the AR.Drone's, to stand out in the dark theme too
     "cross": (104, 108, 116),
     "hull": (124, 129, 138),
     "nose": (240, 108, 24),  # the orange of the outdoor hull's nose
@@ -40,7 +40,7 @@ class Mesh(NamedTuple):
 
 
 class DroneShape(NamedTuple):
-    """The look of a drone: its rotors' axes (x, y) and their radius [m]."""
+    """The appearance of a drone: the axes (x, y) of its rotors and their radius [m]."""
 
     hubs_B: tuple[tuple[float, float], ...]
     radius_m: float
@@ -52,12 +52,12 @@ class DroneShape(NamedTuple):
 
     @property
     def reach_m(self) -> float:
-        """How far its hull reaches from the centre [m]."""
+        """Distance of its hull's outer edge from the centre [m]."""
         return self.size * ARM_M + RING * self.radius_m
 
 
 def shape_of(drone: DroneInfo, arm_m: float) -> DroneShape:
-    """Return the look of a drone; one without named rotors has four, in a cross of this arm [m]."""
+    """Return the appearance of a drone; one without named rotors has four, on arms of this length [m]."""
     if not drone.rotors:
         hubs = tuple((rotor.x_m, rotor.y_m) for rotor in cross_layout(arm_m))
         return DroneShape(hubs, ROTOR_RADIUS_M * arm_m / ARM_M)
@@ -111,7 +111,7 @@ def _solids(shape: DroneShape) -> dict[str, list[trimesh.Trimesh]]:
     }
     for solid in (solid for of_one in solids.values() for solid in of_one):
         solid.apply_scale(shape.size)
-    hats = Hats()  # by which drones see each other, as large as the cameras have them
+    hats = Hats()  # by which drones detect each other, in the size that the cameras assume
     return {**solids, "hat": [_moved(icosphere(subdivisions=3, radius=hats.diameter_m / 2), hats.position_m)]}
 
 

@@ -1,7 +1,7 @@
-"""Alarms of a run, amber or red, from its condition and events; and what injected faults have changed.
+"""Alarms of a run, amber or red, from its condition and events; and the effects of injected faults.
 
-Order of this file: alarms of drones, formations and processes, which are pure; losses of processes; the board with the
-age of each alarm, and whether it was acknowledged; the watch on faults.
+Order of this file: alarms of drones, formations and processes, which are pure; losses of processes; the board with
+the age of each alarm and its acknowledgement; the watch on faults.
 """
 
 import threading
@@ -18,8 +18,8 @@ Severity = Literal["amber", "red"]
 BATTERY_LOW_PERCENT, BATTERY_EMPTY_PERCENT = 20.0, 10.0  # the AR.Drone warns at the first
 UPSIDE_DOWN_DEG = 90.0
 LATE_MS = 200.0  # of an estimator: ten gates of 20 ms
-SIGMA_HIGH_M = 2.0  # of a position; chosen: as far apart as the paper's drones may come
-LINK_OLD_MS, LINK_LOSS_PERCENT = 500.0, 10.0  # chosen: PX4 leaves offboard mode after the first
+SIGMA_HIGH_M = 2.0  # of a position; chosen: the greatest distance between the paper's drones
+LINK_OLD_MS, LINK_LOSS_PERCENT = 500.0, 10.0  # chosen; PX4 leaves offboard mode after the first
 LOST = {
     "death": "dead",
     "no_show": "missing",
@@ -30,10 +30,10 @@ LOST = {
 }
 """Kinds of events that report the loss of a process or drone, with the name of the alarm."""
 BACK = frozenset({"join", "restart", "superseded", "silent_end", "leave"})  # kinds that end a loss; a drop does not
-OFF_REFERENCE_M = 2.0  # of a length of an engaged formation; chosen: as close as the paper's drones come
+OFF_REFERENCE_M = 2.0  # of a length of an engaged formation; chosen: the least distance between the paper's drones
 FLOWN_PHASES = frozenset({"assembling", "engaged"})  # in which a formation's controller flies all of its drones
 KEPT = 8  # faults that are over and still shown
-SIGMA_GROWN = 1.2  # times: an estimate's sigma changes by as much without a fault
+SIGMA_GROWN = 1.2  # ratio; the sigma of an estimate changes by that much without a fault
 LAG_GROWN_MS = 40.0  # two gates
 LIFE = ("alive", "dead")  # states of a process
 DEATH_AND_RETURN = 3  # alive, dead, alive
@@ -41,7 +41,7 @@ WIND_GROWN_M_S = 0.3  # chosen: above the rounding of what is shown
 
 
 class Alarm(NamedTuple):
-    """An alarm: amber to look at, red to act on; `name` is unique to its subject, a drone, formation or process."""
+    """An alarm: amber calls for attention, red for action; `name` is unique per drone, formation or process."""
 
     severity: Severity
     subject: str
@@ -50,7 +50,7 @@ class Alarm(NamedTuple):
 
 
 class DroneCondition(NamedTuple):
-    """What alarms and checks of a drone depend on; None where unknown or not applicable."""
+    """The inputs of a drone's alarms and checks; None where unknown or not applicable."""
 
     name: str
     state: str
@@ -60,7 +60,7 @@ class DroneCondition(NamedTuple):
     yaw_sigma_deg: float | None = None
     estimate_lost: bool = False
     tilt_deg: float | None = None
-    failsafe: str = ""  # why its firmware lands it, or has stopped its rotors, by itself; otherwise empty
+    failsafe: str = ""  # why its firmware is landing it or has stopped its rotors without a command; otherwise empty
     commander: str | None = None
     is_external: bool = False
     link_age_s: float | None = None  # wall, since its driver has published the state of the link
@@ -110,7 +110,7 @@ def formation_alarms(
     foreign: Mapping[str, Mapping[str, str]],
     views: Mapping[str, ViewCluster],
 ) -> list[Alarm]:
-    """Return the alarms of formations, from phase and reason of each, who else flies its drones, and its view."""
+    """Return the alarms of formations, by their phases and reasons, other commanders of their drones, and views."""
     found = []
     for name, (phase, reason) in phases.items():
         if TOO_NEAR in reason:
@@ -131,12 +131,12 @@ def foreign_text(commanders: Mapping[str, str]) -> str:
 def foreign_commanders(
     controller: str, members: Iterable[str], commanders: Mapping[str, str | None], roles: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return who flies drones of a formation instead of its controller, by drone.
+    """Return the commanders, other than its controller, of a formation's drones, by drone.
 
-    Args:
-        controller: expected name of the formation's process; where it flies no drone, the controller may have another
-            name, so only consoles count as foreign.
-        roles: of processes, as far as known.
+        Args:
+    controller: expected name of the formation's process; if it flies no drone, the controller may have another
+                name, so only consoles count as foreign.
+            roles: of processes, as far as known.
     """
     others = {drone: who for drone in members if (who := commanders.get(drone)) and who != controller}
     if any(commanders.get(drone) == controller for drone in members):
@@ -145,7 +145,7 @@ def foreign_commanders(
 
 
 def _strayed(view: ViewCluster) -> str:
-    """Return the length of an engaged formation farthest from its reference; empty where all are near theirs."""
+    """Describe the length of an engaged formation that deviates most from its reference; empty if all are close."""
     apart = [
         (abs(value - desired), name, value, desired)
         for name, value, desired in zip(view.names, view.value, view.desired, strict=True)
@@ -156,7 +156,7 @@ def _strayed(view: ViewCluster) -> str:
 
 
 def run_alarms(losses: Mapping[str, Event], active: Iterable[Fault], silent_s: float) -> list[Alarm]:
-    """Return the alarms of lost processes, of active injected faults, and of a world silent for so long."""
+    """Return the alarms of lost processes, of active injected faults, and of a silent world."""
     found = [Alarm("red", name, LOST[event.kind], event.text) for name, event in losses.items()]
     if silent_s:
         found.append(Alarm("red", "world", "silent", f"no answer for {silent_s:.0f} s"))
@@ -169,21 +169,21 @@ def parameters_text(fault: Fault) -> str:
 
 
 class Losses:
-    """Knows which processes and drones are lost: `now` has the newest event about each; thread-safe."""
+    """Tracks which processes and drones are lost: `now` holds the newest event about each; thread-safe."""
 
     def __init__(self) -> None:
         self.now: dict[str, Event] = {}
 
     def note(self, event: Event) -> None:
-        """Take an event: of a loss, or of a return, as itself or in another process that does its work."""
-        no_process_joined = event.kind == "no_show" and "incarnation" in event.data  # that of its name is where it was
+        """Process an event: a loss, or a return, of the process itself or of one that replaces it."""
+        no_process_joined = event.kind == "no_show" and "incarnation" in event.data  # it has returned
         if event.kind in LOST and not no_process_joined:
             self.now = {**self.now, event.subject: event}
         elif event.kind in BACK:
             self._remove({event.subject, *map(str, event.data.get("serves") or ())})
 
     def note_health(self, name: str, health: Health) -> None:
-        """Take the health of a process: one of another host or pid replaces a lost one."""
+        """Process a health message: a process with another host or pid replaces a lost one."""
         lost = self.now.get(name)
         pid = None if lost is None else lost.data.get("pid")
         if lost is not None and pid and (lost.data.get("host"), pid) != (health.host, health.pid):
@@ -195,7 +195,7 @@ class Losses:
 
 @dataclass
 class _Standing:
-    """An alarm on the board: how often it was raised, and when it ended [s; wall]; None while it stands."""
+    """An alarm on the board: how often it was raised, and when it ended [s; wall]; None while it is active."""
 
     alarm: Alarm
     since_s: float
@@ -205,7 +205,7 @@ class _Standing:
 
 
 class AlarmBoard:
-    """The standing alarms; an ended red one stays until it is acknowledged, since nobody may have been looking."""
+    """The active alarms; a red one that has ended stays until it is acknowledged, since it may have gone unnoticed."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -232,7 +232,7 @@ class AlarmBoard:
             self.alarms = tuple(sorted(now.values(), key=_rank))
 
     def acknowledge(self) -> None:
-        """Acknowledge all alarms and remove ended ones; one that turns red later needs a new acknowledgement."""
+        """Acknowledge all alarms and remove ended ones; an alarm that turns red later needs a new acknowledgement."""
         with self._lock:
             self._standing = {key: each for key, each in self._standing.items() if each.over_s is None}
             for standing in self._standing.values():
@@ -244,7 +244,7 @@ class AlarmBoard:
             self._standing, self.alarms = {}, ()
 
     def rows(self, wall_s: float) -> list[dict[str, object]]:
-        """Return the alarms as plain data, red ones first, with how long each has stood or been over [s; wall]."""
+        """Return the alarms as plain data, red ones first, with how long each has been active or over [s; wall]."""
         with self._lock:
             ordered = sorted(self._standing.values(), key=lambda each: _rank(each.alarm, each.over_s is not None))
             return [
@@ -268,7 +268,7 @@ def _rank(alarm: Alarm, is_over: bool = False) -> tuple[bool, bool, str, str]:
 
 
 class FaultWatch:
-    """What injected faults strike, and what has changed since they began. Pure."""
+    """The targets of injected faults, and what has changed since they began. Pure."""
 
     def __init__(self) -> None:
         self._watched: dict[int, _WatchedFault] = {}
@@ -285,7 +285,7 @@ class FaultWatch:
         lost: Collection[str],
         wind_m_s: float,
     ) -> None:
-        """Take over the present condition: faults that have begun, or act now; processes that are dead or silent."""
+        """Update from the present condition: faults begun or active, processes dead or silent."""
         acting = {fault.id: fault for fault in active}
         known = {fault.id: fault for fault in begun} | acting
         for number in self._watched.keys() - known.keys():
@@ -304,12 +304,12 @@ class FaultWatch:
 
 @dataclass
 class _WatchedFault:
-    """A fault, and what it may change of its target, which names drones, or processes named after them."""
+    """A fault and the quantities of its target (drones, or processes named after them) that it may change."""
 
     fault: Fault
     before: tuple[float, ...] = ()  # sigma [m], lag [ms] and wind [m/s] of the target at first
-    worst: tuple[float, ...] = ()  # the same, the worst while the fault acts
-    states: dict[str, list[str]] = field(default_factory=dict)  # that drones, formations and processes went through
+    worst: tuple[float, ...] = ()  # the worst of these while the fault is active
+    states: dict[str, list[str]] = field(default_factory=dict)  # successive states of drones, formations and processes
     over: bool = False
 
     def update(
@@ -319,7 +319,7 @@ class _WatchedFault:
         lost: Collection[str],
         wind_m_s: float,
     ) -> None:
-        """Keep the worst figures and all states while the fault acts; a killed process dies and returns after it."""
+        """Record the worst figures and all states while the fault is active; a killed process returns afterwards."""
         parts = self.fault.target.split("/")
         things = {part.rpartition(".")[2] for part in parts}
         everybody = not things & (set(drones) | set(phases))  # the world

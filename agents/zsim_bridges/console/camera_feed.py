@@ -1,4 +1,4 @@
-"""Cameras of a run for pages: which there are, the newest picture of each one watched, and the marks drawn on it.
+"""The cameras of a run for pages: their names, the newest picture of each one watched, and the marks drawn on it.
 
 Pictures may come from any program, so each is checked before a browser decodes it. Frames: B of the drone; K of the
 camera, x right, y down, z ahead. Pixels count from the picture's upper left corner, whole numbers at pixel centres.
@@ -22,16 +22,16 @@ from zsim.sensors.camera import CAMERAS, PictureError, frame_of
 from zsim.sensors.camera_model import Lens, pixel, undistorted
 from zsim.transport.session import RawSample, Session
 
-ASKED_S = 15.0  # wall; a page silent for longer sleeps: a slow one takes seconds for a picture
-MESSAGE_BYTES = 1_000  # of a picture's message beside its data, at most; chosen
+ASKED_S = 15.0  # wall; a page silent for longer counts as asleep: a slow one takes seconds for a picture
+MESSAGE_BYTES = 1_000  # of a picture's message, besides its data, at most; chosen
 SIGHTINGS_KEPT = 8  # of one camera from one key: half a second of 15 Hz
 MARKS_MAX = 40  # on a picture; more would hide it
 RADIUS_MIN_PX = 5.0  # of a circle; a smaller one goes unnoticed
-SIGMAS = 2.0  # of direction, drawn around a hat
-FOLD_MAX = 1e-3  # focal lengths between a ray and the undistorted ray of its pixel; beyond it the lens folds over
+SIGMAS = 2.0  # of the direction, drawn around a hat
+FOLD_MAX = 1e-3  # focal lengths between a ray and the undistorted ray of its pixel; beyond it the polynomial folds over
 NORM_MIN = 1e-6  # of a quaternion or a direction
 AGE_MAX_NS = 300_000_000  # simulated, between a picture and sightings drawn on it; chosen: 3 pictures of 10 Hz
-PICTURE_BYTES_MAX = 1_000_000  # of a picture that is shown: ten a second of it fill 80 Mbit/s
+PICTURE_BYTES_MAX = 1_000_000  # of a picture that is shown; ten a second fill 80 Mbit/s
 PIXELS_MAX = 1920 * 1200  # chosen: the largest camera of a scenario; a browser needs 4 bytes for each
 ENDS = b"\xff\xd9"  # of an image; ITU-T T.81, table B.1
 SHOWN = frozenset({0xC0, 0xC1, 0xC2})  # frames that browsers show: baseline, extended, progressive
@@ -54,7 +54,7 @@ class Mark(Struct, frozen=True):
 
 
 class _Watched:
-    """What is kept of a camera while a page watches it."""
+    """The state of a camera while a page watches it."""
 
     def __init__(self) -> None:
         self.payload: bytes | None = None  # newer than the picture; not decoded yet
@@ -91,13 +91,13 @@ class CameraFeed:
         self.reasons: dict[str, str] = {}  # why the last of them was refused
 
     def open(self) -> None:
-        """Learn which cameras exist, and of those that appear later."""
+        """Discover the existing cameras, and those that appear later."""
         expression = keys.camera_info("*", "*")
         self._link.declare_subscriber(expression, self._on_info)
         try:
             samples = self._link.get(expression)
         except ZsimError:
-            return  # a certificate older than cameras does not permit the query; later cameras are still seen
+            return  # an older certificate does not permit the query; later cameras are still discovered
         for sample in samples:
             self._on_info(sample, kept=True)
 
@@ -107,7 +107,7 @@ class CameraFeed:
         self.update()
 
     def update(self) -> None:
-        """Subscribe to the cameras that pages asked for lately, and no others; to be called several times a second."""
+        """Subscribe to the cameras that pages recently requested, and no others; call it several times a second."""
         with self._lock:
             now_s = self._wall_s()
             self._asked = {page: asked for page, asked in self._asked.items() if asked[1] > now_s}
@@ -128,7 +128,7 @@ class CameraFeed:
         return tuple((camera, infos[camera]) for camera in self._order if camera in infos)
 
     def ask(self, page: object, cameras: Iterable[str]) -> None:
-        """Request pictures of these cameras, and of no others, for a page; to be repeated within ASKED_S."""
+        """Request pictures of these cameras, and no others, for a page; to be repeated within ASKED_S."""
         with self._lock:
             self._asked[page] = tuple(cameras), self._wall_s() + ASKED_S
 
@@ -221,7 +221,7 @@ class CameraFeed:
                 watched.sightings.setdefault(sample.key, deque(maxlen=SIGHTINGS_KEPT)).append(seen)
 
     def _checked(self, camera: str, payload: bytes) -> CameraPicture | None:
-        """Return a picture that may be shown; count one that may not."""
+        """Return a valid picture; count an invalid one."""
         try:
             image: CameraImage = messages.decode(keys.camera(*camera.split("/")), payload)
             check_picture(image.data, image.width, image.height)
@@ -249,16 +249,18 @@ def _sighting_keys(camera: str) -> tuple[str, str]:
 
 
 def check_picture(data: bytes, width: int, height: int) -> None:
-    """Refuse data that is not a whole JPEG of a size [px], or is too large for a page.
+    """Refuse data that is not a complete JPEG of a size [px], or is too large for a page.
 
     Raises:
-        PictureError: in one line.
+        PictureError: what is wrong, in one line.
     """
     if len(data) > PICTURE_BYTES_MAX:
         raise PictureError(f"picture has {len(data)} bytes; must have {PICTURE_BYTES_MAX} at most")
     frame = frame_of(data)
     if frame.marker not in SHOWN or not data.endswith(ENDS):
-        raise PictureError("JPEG is cut off, or not one that browsers show; must be baseline or progressive, and whole")
+        raise PictureError(
+            "JPEG is truncated, or browsers cannot show it; must be complete, and baseline or progressive"
+        )
     if (frame.width, frame.height) != (width, height):
         found = f"{frame.width} × {frame.height}"
         raise PictureError(f"JPEG is {found}, its message says {width} × {height}; must be the same")
@@ -270,7 +272,7 @@ def check_picture(data: bytes, width: int, height: int) -> None:
 
 
 def is_usable(info: CameraInfo) -> bool:
-    """Return whether a camera's own description, which any program may have sent, can be computed with."""
+    """Return whether a camera's description, which any program may have sent, is valid for computation."""
     fx, fy = info.K[0], info.K[4]
     return fx > 0 and fy > 0 and math.sqrt(sum(q * q for q in info.orientation_wxyz)) > NORM_MIN
 
@@ -280,7 +282,7 @@ def field_of_view(info: CameraInfo) -> float:
 
 
 def sightings_of(picture_ns: int, candidates: Iterable[Sightings]) -> Sightings | None:
-    """Return the sightings nearest to a picture's exposure; None where all are too far from it."""
+    """Return the sightings nearest to a picture's exposure; None where all are too far from it in time."""
     nearest = min(candidates, key=lambda each: abs(each.t_sample_ns - picture_ns), default=None)
     if nearest is None or abs(nearest.t_sample_ns - picture_ns) > AGE_MAX_NS:
         return None
@@ -307,9 +309,9 @@ def marks_of(info: CameraInfo, seen: Iterable[Seen], hat_m: float) -> tuple[Mark
 
 
 def _place(lens: Lens, ray_K: rotation.Vector) -> tuple[float, float] | None:
-    """Return the pixel of a ray, None where it is not on the picture.
+    """Return the pixel of a ray, None where it is outside the picture.
 
-    A distortion polynomial folds over far outside of the field of view: a ray from there would be drawn at the pixel of
+    A distortion polynomial folds over far outside the field of view: a ray from there would be drawn at the pixel of
     another ray.
     """
     x, y, z = ray_K

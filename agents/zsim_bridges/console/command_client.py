@@ -1,4 +1,4 @@
-"""Requests and modes of an operator, sent off the page's threads; the outcome of each is reported."""
+"""An operator's requests and modes, sent outside the page's threads; the outcome of each is reported."""
 
 import threading
 from collections import Counter, deque
@@ -19,26 +19,26 @@ PRIORITY = 10  # contract: of operators
 PRIORITY_EMERGENCY = 100  # contract: the highest; an operator who flies a drone must not keep others from stopping it
 THREADS_PER_POOL = 8  # separate pools: unanswered requests must not delay modes
 ANSWER_TIMEOUT_S = 5.0  # the world and controllers answer within a gate
-EMERGENCY_TIMEOUT_S = 1.0  # for acquiring a drone to stop it; after this the mode is sent all the same
+EMERGENCY_TIMEOUT_S = 1.0  # for acquiring a drone to stop it; afterwards the mode is sent anyway
 ACCEPTANCE_TIMEOUT_S = 1.0  # for the world to accept a command before the drone is released
-OVERTAKEN = "an emergency was asked for after it"
+OVERTAKEN = "superseded by a later emergency"
 Task = Callable[[], None]
 
 
 class RequestOutcome(NamedTuple):
-    """A described request, and why it was refused; empty if it was not."""
+    """A request as described, and why it was refused; empty if accepted."""
 
     request: str
     refusal: str
     subject: str = ""  # the formation or drone; empty for the run
     op: str = ""
     args: Mapping[str, Any] = {}
-    order: str = ""  # id of the order of which it is an attempt; empty for none
-    unanswered: bool = False  # whether it may still be carried out, since nobody has answered
+    order: str = ""  # id of the order that it attempts to carry out; empty for none
+    unanswered: bool = False  # whether it may still be carried out, since there was no answer
 
 
 class NoAnswer(str):
-    """A refusal for want of an answer."""
+    """A refusal because there was no answer."""
 
     __slots__ = ()
 
@@ -54,7 +54,7 @@ class PastInstant(NamedTuple):
 class CommandClient:
     """Sends requests in the console's name.
 
-    `views` know which commands have been answered, `now_ns` gives the time of a stamp and may poll the world, and
+    `views` tells which commands have been answered, `now_ns` gives the time of a stamp and may poll the world, and
     `report` is called with the outcome of each request, in any thread.
     """
 
@@ -110,7 +110,7 @@ class CommandClient:
         return {}
 
     def read(self, act: Task) -> bool:
-        """Run a task that reads in another thread; return whether it will be run."""
+        """Run a reading task in another thread; return whether it was scheduled."""
         try:
             self._requests.submit(act)
         except RuntimeError:  # closed
@@ -141,10 +141,10 @@ class CommandClient:
         self._submit(self._requests.submit, what, self._request, keys.cluster_control(cluster), op, args)
 
     def send_mode(self, drones: Sequence[str], mode: str, order: str = "") -> None:
-        """Let drones take off, land, stop at once or leave the emergency, whoever commands them.
+        """Let drones take off, land, stop at once or leave the emergency, regardless of their commander.
 
-        Modes of one drone are sent in the order of the requests, except for an emergency: it waits for none of them,
-        and none that was requested before it is sent after it.
+        Modes of one drone are sent in the order of the requests, except for an emergency: it does not wait for them,
+        and no earlier request is sent after it.
         """
         for drone in drones:
             self._modes[drone] += 1
@@ -161,17 +161,17 @@ class CommandClient:
         return self._modes[drone]
 
     def take(self, drone: str, done: Callable[[str], None]) -> None:
-        """Acquire a drone with an operator's priority; `done` receives why that is refused, otherwise an empty text."""
+        """Acquire a drone with an operator's priority; `done` receives the reason for a refusal, else an empty text."""
         with suppress(RuntimeError):  # closed; the run has ended
             self._requests.submit(lambda: done(_refusal_of(self._acquire, drone, PRIORITY)))
 
     def give_back(self, drone: str) -> None:
-        """Release a drone: it hovers until somebody else flies it."""
+        """Release a drone: it hovers until another process flies it."""
         with suppress(RuntimeError):
             self._releases.submit(_refusal_of, self._request, keys.CONTROL, "release", {"drone": drone})
 
     def send_velocity(self, drone: str, velocity_m_s: tuple[float, float, float], yaw_rate_rad_s: float) -> None:
-        """Command a velocity, in its heading frame, of an acquired drone."""
+        """Command a velocity to an acquired drone, in its heading frame."""
         key, v = keys.command(drone, "velocity"), velocity_m_s
         with suppress(ZsimError):  # the link is lost: the world lets the drone hover
             message = flight_messages.Velocity(self._now_ns(), self._next_seq(key), self._name, v, yaw_rate_rad_s)
@@ -206,10 +206,10 @@ class CommandClient:
         return self._acquire(drone, PRIORITY) or self._send(drone, mode, stops)
 
     def _send_emergency(self, drone: str, mode: str) -> str:
-        """Send the mode even if the drone could not be acquired: the world may accept it all the same."""
+        """Send the mode even if the drone could not be acquired: the world may accept it anyway."""
         refusal = _refusal_of(self._acquire, drone, PRIORITY_EMERGENCY, EMERGENCY_TIMEOUT_S)
         self._send(drone, mode)
-        told = refusal and f"{refusal}; {mode} was sent all the same"
+        told = refusal and f"{refusal}; {mode} was sent anyway"
         return NoAnswer(told) if isinstance(refusal, NoAnswer) else told
 
     def _acquire(self, drone: str, priority: int, timeout_s: float = ANSWER_TIMEOUT_S) -> str:

@@ -1,6 +1,6 @@
-"""The page's panels in one run: forms, plots and tables that all pages share, and those of each page.
+"""The panels of the page in one run: forms, plots and tables shared by all pages, and those of each page.
 
-A page's own are the modes of the chosen drone, or of those selected for one command, the drones, and the events.
+Each page has its own modes of the chosen drone (or of those selected for one command), table of drones, and events.
 """
 
 import math
@@ -43,7 +43,7 @@ SWITCHES = {
     "estimates": "Estimates: 2σ ellipsoids (hold 74 % in 3-D)",
     "trails": "Trails",
 }
-MANY = 12  # drones; of more, which do not fit on a page, the worst come first by default
+MANY = 12  # drones; more do not fit on a page, so the worst come first by default
 FILTER_MAX = 80  # characters
 SEVERITIES = ("red", "amber", None)
 SORTINGS: dict[str, Callable[[DroneRow], tuple[float, ...]]] = {
@@ -62,15 +62,15 @@ FILTERS: dict[str, Callable[[DroneRow, "frozenset[str]"], bool]] = {
     "battery low": lambda row, selected: row.drone.battery_percent < BATTERY_LOW_PERCENT,
     "selected": lambda row, selected: row.name in selected,
 }
-NO_ROW = "no drone is like that; change the filter"
+NO_ROW = "no drone matches; change the filter"
 DRONE_MODES = {
     "takeoff": "Take off",
     "land": "Land",
     "return": "Return",
     "emergency": "Emergency",
     "reset": "Reset",
-}  # and, which is no mode, the return to the start
-IN_CONTROL = ("takeoff", "return", "reset")  # these need control; any page may land a drone, or stop it
+}  # and the return to the start, which is not a mode
+IN_CONTROL = ("takeoff", "return", "reset")  # these need control; any page may land or stop a drone
 DRONE_ICONS = {"takeoff": viser.Icon.PLANE_DEPARTURE, "return": viser.Icon.HOME, "reset": viser.Icon.REFRESH}
 
 
@@ -80,17 +80,17 @@ class ConsolePage:
     Its folders are for each page's own controls.
 
     Args:
-        gui: viser's; the controls of another run are removed.
-        report: called with requests that are refused here.
+        gui: of viser; the controls of another run are removed.
+        report: called with the outcome of requests that are refused here.
         show: shows or hides one of `SWITCHES` in the scene.
         choose_trail: sets the length of trails [s].
         request_return: lets a formation return to its start, and land.
-        show_preview: shows what a formation would fly; None: nothing.
+        show_preview: shows the path that a formation would fly; None: nothing.
 
     Attributes:
         flights: history of single drones, for plots.
-        chosen: the formation that is shown; empty if there is none.
-        parts: what a page must be in control of to use a control, by the control's id.
+        chosen: name of the formation that is shown; empty if there is none.
+        parts: the part that a page must control to use a control, by the control's id.
     """
 
     def __init__(
@@ -173,7 +173,7 @@ class ConsolePage:
 
     @contextmanager
     def _part(self, gui: viser.GuiApi, part: str) -> Iterator[None]:
-        """Note that the controls added meanwhile belong to a part."""
+        """Assign the controls added in this context to a part."""
         before = control_ids(gui)
         yield
         self.parts |= dict.fromkeys(control_ids(gui) - before, part)
@@ -204,12 +204,12 @@ class _PageForm(NamedTuple):
 
 
 class PageForms:
-    """Adds its own controls to each page of a run, and keeps them.
+    """Adds the per-page controls to each page of a run, and keeps them.
 
     Args:
         shared: the controls of all pages, with folders for those of each.
         names, radii_m: of the drones.
-        part_of: returns what a page must be in control of to let a drone take off.
+        part_of: returns the part that a page must control to let a drone take off.
         request_return: lets drones return to their starts.
     """
 
@@ -256,7 +256,7 @@ class PageForms:
         return form.drone.chosen if form else ""
 
     def use(self, client_id: int | None, drone: str) -> str:
-        """Put a page in control of a drone's formation, if that is free; return why it may not be."""
+        """Give a page control of a drone's formation, if it is free; otherwise return the reason."""
         return self._desk.use(client_id, self._part_of(drone)) if client_id is not None else ""
 
     def move_rings(self, drones: DronePoses) -> None:
@@ -269,7 +269,7 @@ class PageForms:
         sensors_of: Callable[[str], str],
         events: Sequence[EventRow],
     ) -> None:
-        """Show on each page the drones as it sorts and filters them, all of the chosen one, and the chosen events.
+        """Show on each page the drones, sorted and filtered, the figures of the chosen one, and the chosen events.
 
         `sensors_of` returns the sensors of a drone as HTML.
         """
@@ -284,7 +284,7 @@ class PageForms:
         self._update(show)
 
     def refresh(self, run: RunCondition, formation: str) -> None:
-        """Grey out what would be refused; show who controls the formation that is shown, and the run."""
+        """Disable what would be refused; show who controls the formation that is shown, and the run."""
 
         def refresh(form: _PageForm) -> None:
             form.drone.refresh(run)
@@ -293,7 +293,7 @@ class PageForms:
         self._update(refresh)
 
     def _update(self, change: Callable[[_PageForm], None]) -> None:
-        """Change the forms of all pages; a page that closes meanwhile, whose handles viser has removed, is dropped."""
+        """Change the forms of all pages; drop a page that has closed meanwhile, whose handles viser has removed."""
         for client_id, form in list(self._forms.items()):
             try:
                 change(form)
@@ -342,7 +342,7 @@ class DroneForm:
     """Modes of one drone, or of all that are selected, on one page.
 
     Args:
-        may: returns why this page may not let a drone take off or reset it; with true, it takes control to do so.
+        may: returns why this page may not let a drone take off or reset it; with `use` true, it takes control first.
         request_return: lets drones return to their starts, and land.
     """
 
@@ -378,7 +378,7 @@ class DroneForm:
 
     @property
     def targets(self) -> list[str]:
-        """Names of the drones that buttons are for: the selected ones, or else the chosen one."""
+        """Names of the drones that the buttons act on: the selected ones, or else the chosen one."""
         return self._selected or [self.chosen]
 
     @property
@@ -393,12 +393,12 @@ class DroneForm:
         self._choice.value = drone
 
     def select(self, drones: Sequence[str]) -> None:
-        """Let the buttons be for these drones; if there are none, for the chosen one."""
+        """Let the buttons act on these drones; without any, on the chosen one."""
         self._selected = list(drones)
         self._rename()
 
     def refresh(self, run: RunCondition) -> None:
-        """Grey out what all of the drones would refuse."""
+        """Disable what all of the drones would refuse."""
         self._run = run
         refusals = [offered(run, partial(drone_refusals, drone=drone)) for drone in self.targets]
         for drone, each in zip(self.targets, refusals, strict=True):
@@ -412,9 +412,9 @@ class DroneForm:
         self._reasons.content = refusal_lines(DRONE_MODES, common) + shown
 
     def _request(self, mode: str) -> None:
-        """Request what needs control, of all drones that would not refuse it."""
+        """Request an operation that needs control from all drones that would not refuse it."""
         able = [drone for drone in self.targets if not drone_refusals(self._run, drone)[mode]]
-        drones = able or self.targets  # the condition may have changed meanwhile; otherwise the refusal is shown
+        drones = able or self.targets  # the condition may have changed; otherwise the refusal is shown
         drones = [drone for drone in drones if not self._may(drone, True)]
         if not drones:
             return
@@ -480,7 +480,7 @@ def filtered_rows(
     text: str = "",
     selected: frozenset[str] = frozenset(),
 ) -> list[DroneRow]:
-    """Return rows sorted by one of `SORTINGS`, and of them those of one of `FILTERS`.
+    """Return rows sorted by one of `SORTINGS` and filtered by one of `FILTERS`.
 
     Each word of the text must be in a row's name, state, commander, faults or link.
     """
@@ -495,7 +495,7 @@ def filtered_rows(
 
 
 class EventForm:
-    """The events that one page has chosen, by drone and kind."""
+    """The events that one page shows, filtered by drone and kind."""
 
     def __init__(self, gui: viser.GuiApi, names: Sequence[str]) -> None:
         self._drone = gui.add_dropdown("about", [ALL, *names])

@@ -1,4 +1,4 @@
-"""The console: shows one run after the other on a viser server that only its own HTTP server can reach.
+"""The console: shows one run after another on a viser server that only its own HTTP server can reach.
 
 A `RunPage` shows one run, its views as pictures, tables and plots, and sends the operators' requests.
 """
@@ -44,15 +44,15 @@ from zsim_bridges.console.scene import RunScene
 from zsim_bridges.console.time_monitor import KEPT_S, RecordPlayer, TimeMonitor
 from zsim_bridges.console.view_buffer import ViewBuffer
 
-REASON_S = 0.1  # wall; between two looks for a reason to end
-OFFER_S = 20.0  # wall; how long pages may take to copy what a run left behind: 100 MB over Wi-Fi of 40 Mbit/s
+REASON_S = 0.1  # wall; between two checks for a reason to end
+OFFER_S = 20.0  # wall; how long pages may take to copy the files of a run: 100 MB over 40 Mbit/s Wi-Fi
 TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster
-STAMPS_PER_AGE = 5.0  # a stamp is at most this fraction of a command's largest age old; it ages on its way
-TOLD_S = 2.0  # wall; a slider that is dragged is refused many times
+STAMPS_PER_AGE = 5.0  # greatest age of a stamp, as a fraction of a command's maximum age; it grows older in transit
+TOLD_S = 2.0  # wall; a dragged slider is refused many times
 NOTICE_S = 8.0  # wall; how long a notification stays in the corner
 EVENTS_MAX = 20  # in `state`
 SILENT = "silent"  # in place of the clock's state, when the world does not answer
-FEW_DRONES = 20  # drones from which on pictures come half as often
+FEW_DRONES = 20  # drones; from this number on the picture rate is halved
 RATE_HZ, RATE_LOW_HZ = 20.0, 10.0
 FAST_RATE = 4.0  # × real time; from then on the picture rate is halved, too: the run needs the processors
 
@@ -61,13 +61,13 @@ class Console:
     """One console.
 
     Args:
-        token: of operators; None on this machine alone.
+        token: of operators; None if only this machine can connect.
         rate_hz: pictures a second; None: by the number of drones.
-        world: where a run is looked for, in words.
-        folder: where the run that is shown is recorded, if known here.
+        world: description of where a run is searched for.
+        folder: where the shown run is recorded, if known.
 
     Raises:
-        RunError: others could reach it, and there is no token.
+        RunError: other machines could reach it, and there is no token.
     """
 
     def __init__(
@@ -142,11 +142,11 @@ class Console:
             page.close()
 
     def remain(self, end_reason: Callable[[], str | None], deserted: Callable[[], bool]) -> None:
-        """Serve the pages of a run that is over until there is a reason to end, and they have copies of its files.
+        """Serve the pages of a finished run until there is a reason to end and they have copies of its files.
 
         Args:
-            end_reason: returns it, None while there is none.
-            deserted: whether nobody waits for this process any more, so that pages are not waited for.
+            end_reason: returns the reason, None while there is none.
+            deserted: returns whether to stop waiting for the pages.
         """
         while not (reason := end_reason()):
             time.sleep(REASON_S)
@@ -170,9 +170,9 @@ class RunPage:
     """The page of one run.
 
     Args:
-        server: viser's; what another run has left on it is removed.
+        server: of viser; what another run left on it is removed.
         rate_hz: pictures a second; None: by the number of drones and the rate of the run.
-        world: where the run is, in words.
+        world: description of where the run is.
 
     Raises:
         RunError: a user's cluster space refuses its robots.
@@ -240,7 +240,7 @@ class RunPage:
         )
 
     def close(self) -> None:
-        """Send nothing any more."""
+        """Stop sending."""
         self._client.close()
         self._page_forms.close()
         self.cameras.close()
@@ -262,7 +262,7 @@ class RunPage:
                 self._update(time.monotonic())
                 next_s = max(next_s + self._period_s(), time.monotonic())
                 pause.wait(next_s - time.monotonic())
-        # the end of the run, for pages that are opened between two runs
+        # pages opened between two runs see the end of the run
         self.views.update()
         if self._observer.end_reason or self.views.end:
             self._monitor.end(self._observer.end_reason)
@@ -274,7 +274,7 @@ class RunPage:
             self._update_tables(time.monotonic())
 
     def end(self, reason: str) -> None:
-        """Show that the run is over, after `run`, which may not have learnt of it."""
+        """Show that the run is over, after `run`, which may not have noticed."""
         self._monitor.end(reason)
         self._monitor.update(time.monotonic())
         with self._server.atomic():
@@ -300,7 +300,7 @@ class RunPage:
         return self.orders.place(request)
 
     def permits(self, client_id: int, control: str) -> bool:
-        """Return whether a page may use a shared control; tell it why if not."""
+        """Return whether a page may use a shared control; if not, show the reason on it."""
         part = self._page.parts.get(control)
         refusal = "" if part is None else self.desk.use(client_id, part)
         if refusal and time.monotonic() - self._told_s.get(client_id, -math.inf) > TOLD_S:
@@ -311,7 +311,7 @@ class RunPage:
     # Pictures
 
     def _period_s(self) -> float:
-        """Return the time from one picture to the next [wall]."""
+        """Return the wall time from one picture to the next [s]."""
         rate = self._time_monitor.clock.rate if self._time_monitor.clock is not None else 0.0
         return 1.0 / (self._rate_hz or picture_rate_hz(len(self._names), rate))
 
@@ -363,7 +363,7 @@ class RunPage:
     # Trails and plots
 
     def _fill_past(self, instants: list[PastInstant]) -> None:
-        """Add what was read of a record to trails and plots."""
+        """Add a piece of the record to trails and plots."""
         spaces = self._run.spaces
         for past in instants:
             drones = drone_poses(past.drones, self._names)
@@ -417,9 +417,9 @@ class RunPage:
         self._scene.draw_trails()
 
     def _on_outcome(self, outcome: RequestOutcome) -> None:
-        """Show the outcome of a request: a refusal in the corner of every page, and either among the events.
+        """Show the outcome of a request: a refusal in the corner of every page, and every outcome among the events.
 
-        The world publishes events of what it does, but not of requests to formations, which are only accepted.
+        The world publishes events of what it does, but not of requests to formations.
         """
         if outcome.order and not self.orders.note(outcome):
             return
@@ -440,12 +440,12 @@ class RunPage:
         self._notify(event.subject, str(event.data.get("reason", event.text)))
 
     def _on_foreign_request(self, cluster: str, text: str) -> None:
-        """Tell every page of a request that somebody else made of a formation, since the last one counts."""
+        """Notify every page of another client's request to a formation, since the last request takes effect."""
         for client_id in () if self._run.is_replay else self._server.get_clients():
             self._tell("Control", "orange", client_id, text)
 
     def _note(self, kind: str, subject: str, text: str) -> None:
-        """Log an event of the console's own."""
+        """Log an event of the console itself."""
         self.views.log.add(Event(self._observer.now_ns, 0, kind, self._observer.name, subject, text))
 
     def _notify(self, what: str, refusal: str) -> None:
@@ -460,14 +460,14 @@ class RunPage:
 
 
 def picture_rate_hz(drones: int, rate: float) -> float:
-    """Return a suitable number of pictures a second for so many drones at a rate [× real time]."""
+    """Return a suitable picture rate [Hz] for a number of drones and a rate of the run [× real time]."""
     return RATE_LOW_HZ if drones >= FEW_DRONES or rate >= FAST_RATE else RATE_HZ
 
 
 def console_state(
     run_id: str, views: ViewBuffer, time_monitor: TimeMonitor, shapes: Mapping[str, FormationShape | None]
 ) -> dict[str, Any]:
-    """Return what is shown of a run as plain data; called in another thread than the one that draws.
+    """Return what is shown of a run as plain data; called from another thread than the one that draws.
 
     `shapes` are the formations' true shapes.
     """

@@ -1,4 +1,4 @@
-"""What the console shows of the newest views as tables of HTML, in which all texts of other processes are escaped."""
+"""The newest views as HTML tables, in which all texts from other processes are escaped."""
 
 import importlib.resources
 import math
@@ -43,11 +43,11 @@ PITCH_PX_PER_DEG, PITCH_MAX_PX = 0.9, 36.0  # of the artificial horizon
 NO_FAULT = "no fault acts"
 FEW_LINES = "max-height:8em;overflow-y:auto"  # many formations must not push the emergency button off the page
 STYLE = "font-size:12px;line-height:1.35;font-variant-numeric:tabular-nums"
-BESIDE = "padding:2px 10px"  # of a text in a panel, which viser lets touch the edge; as wide as of its controls
+BESIDE = "padding:2px 10px"  # padding of a text in a panel, equal to that of viser's controls
 TABLE_BESIDE = "padding:2px 12px 2px 8px;overflow-x:auto"  # of a table; the panel's scroll bar is 12 px wide
-NAME_WHOLE = 8  # characters of a name that stand on one line of the table of drones
+NAME_WHOLE = 8  # characters of a name that fit on one line of the table of drones
 WRAP = "white-space:normal"
-SPAN_NS = 1_000_000_000  # simulated, over which at least a sensor's rate is averaged
+SPAN_NS = 1_000_000_000  # simulated; shortest time over which a sensor's rate is averaged
 
 Counts = Mapping[str, tuple[int, int]]
 """Measurements (used, refused) by sensor."""
@@ -58,8 +58,8 @@ class DroneRow(NamedTuple):
 
     drone: DroneCondition
     gps: str = "–"  # fixes used and refused
-    faults: tuple[str, ...] = ()  # injected ones that act on it
-    link: tuple[str, str] = ("", "")  # of a driver, described, and its colour
+    faults: tuple[str, ...] = ()  # active injected ones
+    link: tuple[str, str] = ("", "")  # description of a driver's link, and its colour
     severity: Severity | None = None  # of its worst alarm
 
     @property
@@ -68,7 +68,7 @@ class DroneRow(NamedTuple):
 
     @property
     def link_badness(self) -> float:
-        """How bad its link, or its estimator's lag, is: 1 where it is an alarm, infinite without a link."""
+        """Badness of its link or its estimator's lag: 1 at the alarm threshold, infinite without a link."""
         drone = self.drone
         if not drone.is_external:
             return (drone.lag_ms or 0.0) / LATE_MS
@@ -135,7 +135,7 @@ class SensorRates:
             if drone != self._drone or t_ns < last_ns or restarted:  # the estimator, or a replay has gone back
                 self._samples = []
             elif t_ns == last_ns:
-                self._samples.pop()  # the run stands still
+                self._samples.pop()  # the run is paused
         self._drone = drone
         self._samples.append((t_ns, dict(counts)))
         while len(self._samples) > 2 and t_ns - self._samples[1][0] >= SPAN_NS:
@@ -161,9 +161,9 @@ def drone_table(
 
     Args:
         figures: of their flight by name.
-        selected: names of those that one command is for.
+        selected: names of those selected for one command.
         chosen: whose instruments are shown.
-        empty: text where there is no row.
+        empty: text shown if there are no rows.
     """
     if not rows and empty:
         return f"<div style='{STYLE};{BESIDE};color:{GREY}'>{escape(empty)}</div>"
@@ -182,7 +182,7 @@ def drone_table(
 
 
 def _drone_cells(row: DroneRow, figures: FlightFigures | None, selected: bool, chosen: bool) -> str:
-    """Return the rows of a drone: its figures, who flies it, and what is wrong."""
+    """Return the rows of a drone: its figures, its commander, and its faults."""
     drone = row.drone
     name = _coloured(drone.name, SEVERITY_COLOURS[row.severity]) if row.severity else escape(drone.name)
     if len(drone.name) > NAME_WHOLE:
@@ -261,7 +261,7 @@ def sensor_table(
 ) -> str:
     """Return the table of one drone's sensors: measurements that its estimator used and refused, and rates [Hz].
 
-    `own_rates` are those set for the user's sensors [Hz], which have a row even if they are not counted.
+    `own_rates` are the configured rates of the user's sensors [Hz], which have a row even if they are not counted.
     """
     counted = [
         (kind, used, refused, f"{rates[kind]:.0f} Hz" if kind in rates else "–")
@@ -272,8 +272,8 @@ def sensor_table(
     head = _head(
         ("sensor", "of the drone"),
         ("used", "measurements that its estimator used"),
-        ("refused", "measurements that were too unlikely, or of no use"),
-        ("rate", "at which they come, in simulated time"),
+        ("refused", "measurements that were too unlikely or unusable"),
+        ("rate", "at which they arrive, in simulated time"),
     )
     rows = (_cells(escape(str(cell)) for cell in row) for row in (*counted, *others))
     return title + _table(head + "".join(rows))
@@ -310,7 +310,7 @@ def preflight_lines(checks: Mapping[str, Sequence[Check]]) -> str:
 
 
 def event_table(newest_first: Iterable[EventRow]) -> str:
-    """Return the table of events; the page unfolds what is longer than a few lines, by the mark of its row."""
+    """Return the table of events; the page unfolds long texts, by the mark of the row."""
     lines = []
     for event, times, _ in newest_first:
         kind = _coloured(event.kind, EVENT_COLOURS.get(event.kind, GREY))
@@ -326,7 +326,7 @@ def event_table(newest_first: Iterable[EventRow]) -> str:
 
 
 def fault_lines(active: Sequence[str], over: Sequence[str] = ()) -> str:
-    """Return the faults that act, and in grey those that are over."""
+    """Return the active faults, and those that are over in grey."""
     lines = [_coloured(f"⚠ {fault}", AMBER) for fault in active] or [_coloured(NO_FAULT, GREY)]
     lines += [_coloured(f"over: {fault}", GREY) for fault in reversed(over)]
     return f"<div style='{STYLE};{FEW_LINES};{BESIDE};overflow-wrap:anywhere'>{'<br>'.join(lines)}</div>"

@@ -1,7 +1,7 @@
-"""Which page of the console is in control of which part: a formation, or the run itself.
+"""Which page of the console controls which part: a formation, or the run itself.
 
-A page takes control of a free part by using one of its controls. Another page asks for it, and has it once that is
-granted, or the page in control is closed or lost. An emergency, a landing and a hold need no control.
+A page takes control of a free part by using one of its controls. Another page requests it, and has it once that is
+granted, or once the controlling page is closed or lost. An emergency, a landing and a hold need no control.
 """
 
 import threading
@@ -18,8 +18,8 @@ from zsim_bridges.console.run_forms import assign
 
 RUN = "run"  # the part of time, faults and drones of no formation; a formation of that name shares it
 EVERY = ""  # the part of a control that acts on all parts
-LOST_S = 10.0  # wall; after so long without a look a page counts as lost: its script stands, or its machine is gone
-SILENT_SHOWN_S = 3.0  # wall; pages look twice a second
+LOST_S = 10.0  # wall; a page that has not polled for so long counts as lost: its script or its machine has stopped
+SILENT_SHOWN_S = 3.0  # wall; pages poll twice a second
 HERE = ("", "127.0.0.1", "::1")  # addresses of pages on the console's machine
 OPERATOR, VIEWER = "operator", "viewer"
 Tell = Callable[[int, str], None]
@@ -27,7 +27,7 @@ CONTROL_STYLE = "font-size:12px;line-height:1.35;padding:2px 10px 6px;overflow-w
 
 
 class Holding(NamedTuple):
-    """Who is in control of a part, and who asks for it, as seen by one page; empty for nobody."""
+    """The controlling page of a part and the page that requests control, as seen by one page; empty for none."""
 
     part: str
     holder: str = ""
@@ -42,7 +42,7 @@ class _Page:
     number: int
     role: str = OPERATOR
     address: str = ""
-    looked_s: float | None = None  # wall; None before the first look
+    looked_s: float | None = None  # wall; None before the first poll
 
     @property
     def name(self) -> str:
@@ -50,7 +50,7 @@ class _Page:
 
 
 class ControlDesk:
-    """Keeps which page, by viser's number, is in control; thread-safe.
+    """Records which page, by viser's number, is in control; thread-safe.
 
     Args:
         parts: the formations; RUN is added.
@@ -90,7 +90,7 @@ class ControlDesk:
             known.role, known.address, known.looked_s = role, address, self._wall_s()
 
     def release_lost(self) -> None:
-        """Pass on requested parts of pages that are silent; a page keeps a part that nobody requests.
+        """Pass on requested parts of silent pages; a page keeps a part that no other page requests.
 
         A page whose socket is closed has released its parts already.
         """
@@ -111,7 +111,7 @@ class ControlDesk:
         return ""
 
     def use(self, page: int, part: str) -> str:
-        """Put a page in control of a free part; return why it may not use it, empty where it may."""
+        """Give a page control of a free part; return why it may not use it, empty where it may."""
         with self._lock:
             refusal = self.refusal(page, part)
             if not refusal and part != EVERY and part not in self._holders:
@@ -158,7 +158,7 @@ class ControlDesk:
         return found
 
     def others(self, page: int) -> list[str]:
-        """Return the names of the other open pages that have looked, operators first."""
+        """Return the names of the other open pages that have polled, operators first."""
         with self._lock:
             known = [each for number, each in self._pages.items() if number != page and each.looked_s is not None]
             return [each.name for each in sorted(known, key=lambda each: (each.role == VIEWER, each.number))]
@@ -190,9 +190,9 @@ def words(part: str) -> str:
 
 
 class ControlForm:
-    """Who is in control, on one page (viser's number), with buttons to ask for control, grant it and give it up.
+    """Shows on one page (viser's number) who is in control, with buttons to request, grant and release control.
 
-    `part_of` has the part of each shared control by its id, which its element on the page has, too.
+    `part_of` has the part of each shared control by its id, which its element on the page also has.
     """
 
     def __init__(self, gui: viser.GuiApi, desk: ControlDesk, page: int, part_of: Mapping[str, str]) -> None:
@@ -256,7 +256,7 @@ def _holding_line(holding: Holding) -> str:
 
 
 def _offer(holding: Holding | None) -> tuple[str, bool]:
-    """Return the label of a part's first button, empty for none, and whether somebody asks this page for the part."""
+    """Return the label of a part's first button (empty for none), and whether another page requests the part here."""
     if holding is None or not holding.holder or holding.asked_by_me:
         return "", False
     if not holding.mine:

@@ -38,12 +38,12 @@ from zsim_bridges.console.run_forms import (
 )
 
 PREVIEW_STYLE = "font-size:12px;line-height:1.3;padding:2px 10px;color:#d9480f"
-REST_S = 1.0  # wall; sliders must rest for so long before their values are sent: people type slowly
-STILL_S = 2.0  # wall; a formation whose goal has not changed for so long is not on its way: the slider shows its goal
+REST_S = 1.0  # wall; sliders must rest this long before their values are sent, since people type slowly
+STILL_S = 2.0  # wall; if a formation's goal has not changed for this long, it is not moving: the slider shows its goal
 OVER_MAX_S = 3600.0  # simulated; of a move, as controllers take it
 OPERATIONS = {"Take off": "takeoff", "Engage": "engage", "Hold": "hold", "Rejoin": "rejoin", "Land": "land"}
 SAFE = ("hold", "land")  # operations that need no control
-RETURN = "Return"  # over the middle of the starts, to land there
+RETURN = "Return"  # above the middle of the starts, to land there
 LABELS = {
     **{op: label for label, op in OPERATIONS.items()},
     "target": "sliders",
@@ -73,9 +73,9 @@ class FormationForm:
     """Controls of one formation.
 
     Args:
-        report: called with requests that are refused here.
+        report: called with the outcome of requests that are refused here.
         request_return: lets a formation move over the middle of its starts, and land.
-        show_preview: shows in the scene what would be flown; None: nothing.
+        show_preview: shows in the scene the path that would be flown; None: nothing.
 
     Attributes:
         safe: the controls that a page may use without being in control.
@@ -117,11 +117,11 @@ class FormationForm:
             self._controls["return"] = back
         self._reasons = gui.add_html("")
         self._checks = gui.add_html("")
-        self._others: list[tuple[str, Any]] = []  # further controls with the operation that each requests
-        hint = "Duration of a move; 0: as fast as the robots' limits let it"
+        self._others: list[tuple[str, Any]] = []  # further controls, with the operation that each requests
+        hint = "Duration of a move; 0: as fast as the robots' limits allow"
         self._over = gui.add_number("over [s]", 0.0, min=0.0, max=OVER_MAX_S, step=0.5, hint=hint)
         gui.add_html(limits_line(f"over: 0 to {OVER_MAX_S:g} s"))
-        hint = "Show what a target or a trajectory would fly, and ask before it is flown"
+        hint = "Preview the path of a target or trajectory, and ask before it is flown"
         self._first = gui.add_checkbox("Preview first", False, hint=hint)
         self._preview_text = gui.add_html("", visible=False)
         self._fly_it = gui.add_button("Fly what is previewed", icon=viser.Icon.PLAYER_PLAY, color="blue", visible=False)
@@ -135,7 +135,7 @@ class FormationForm:
         self._trajectories(gui, cluster.plan.trajectory)
 
     def offer(self, run: RunCondition) -> None:
-        """Grey out, with its reason, what the controller would refuse; sliders still show where the formation is."""
+        """Disable, with the reason, what the controller would refuse; sliders still show the formation's state."""
         name = self._cluster.name
         refusals = offered(run, partial(formation_refusals, cluster=name))
         refusals["return"] = refusals["target"]  # its first part
@@ -152,7 +152,7 @@ class FormationForm:
         self._checks.content = preflight_lines(checks) if checks and not run.grounded() else ""
 
     def refresh(self, view: ViewCluster | None, wall_s: float) -> None:
-        """Let sliders that were not moved, and waypoints that nobody has edited, follow the formation."""
+        """Let sliders that were not moved, and waypoints that were not edited, follow the formation."""
         if view is None:
             return
         shown = view.desired if view.phase in SHAPED_PHASES else view.value
@@ -165,14 +165,14 @@ class FormationForm:
             slider.follow(shown[self._space.index(name)], wall_s)
 
     def send(self, wall_s: float) -> None:
-        """Request the values of moved sliders together, once all have come to rest."""
+        """Request the values of all moved sliders together, once none is moving."""
         moves = [slider.moved for slider in self._sliders.values()]
         if wall_s - max((move[1] for move in moves if move is not None), default=wall_s) < REST_S:
             return
         moved = {name: value for name, slider in self._sliders.items() if (value := slider.pop_value()) is not None}
         if self.request_target(moved):
             for name in moved:
-                self._sliders[name].hold(wall_s)  # one that is only previewed goes back by itself
+                self._sliders[name].hold(wall_s)  # a previewed one returns without a request
 
     def request_target(self, shown: dict[str, float]) -> bool:
         """Request values in the units of the page; return whether they are within their ranges."""
@@ -262,9 +262,9 @@ class FormationForm:
             add("Fly the waypoints", lambda: self._fly(lambda: parse_waypoints(points.value, self._ranges)))
 
     def _prefill(self) -> None:
-        """Write the formation's place as the first waypoint, and once more as the next, to be changed.
+        """Fill in the formation's place as the first waypoint, and again as the second, to be edited.
 
-        The waypoints then follow the formation until somebody edits them.
+        The waypoints then follow the formation until they are edited.
         """
         if self._shown is None:
             return
@@ -287,7 +287,7 @@ class _HeldValue(NamedTuple):
 
 
 class VariableSlider:
-    """A slider of one cluster variable, in whose range's unit all values here are.
+    """A slider of one cluster variable; all values here are in the unit of its range.
 
     It follows the formation while no operator moves it.
     """
@@ -305,19 +305,19 @@ class VariableSlider:
         assign(self._slider, disabled=locked)
 
     def pop_value(self) -> float | None:
-        """Return once the value to which it was moved, None if it was not."""
+        """Return, once, the value to which it was moved; None if it was not."""
         with self._lock:
             moved, self.moved = self.moved, None
         return None if moved is None else moved[0]
 
     def hold(self, wall_s: float) -> None:
-        """Keep its value while the formation goes there."""
+        """Keep its value while the formation moves there."""
         self._held = _HeldValue(float(self._slider.value), float("nan"), wall_s)
 
     def follow(self, goal: float, wall_s: float) -> None:
         """Show the formation's goal [m, rad], unless it was moved and the formation is on its way.
 
-        The slider reaches as far as what it shows; what may be requested remains the range.
+        The slider extends to the value that it shows; requests remain limited to the range.
         """
         shown = self._range.to_display(goal)
         if self.moved is not None or self._is_held(shown, wall_s):

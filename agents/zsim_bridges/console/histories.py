@@ -1,6 +1,6 @@
 """The recent past of a run, in memory: trails of its drones, and points of variables as plots show them. Pure.
 
-Of a flight both go back a few minutes, and begin anew when time goes back. Of a replayed record they hold whatever was
+For a flight both cover a few minutes, and restart when time goes back. For a replayed record they hold whatever was
 read of it, in any order, until it is far from the shown instant.
 """
 
@@ -23,18 +23,18 @@ from zsim_bridges.console.picture import Array, DronePoses
 
 Row = TypeVar("Row")
 
-SPAN_S = 180.0  # simulated; how far trails and curves go back at most
+SPAN_S = 180.0  # simulated; greatest length of trails and curves
 INTERVAL_S = 0.25  # simulated, between two points of a curve; a formation answers within seconds
 HISTORY_POINTS_MAX = int(SPAN_S / INTERVAL_S)
 SERIES = ("desired", "estimated", "true")
 
-TRAIL_POINTS_MAX = 6_000  # of all trails together: 144 kB for a browser each time
+TRAIL_POINTS_MAX = 6_000  # of all trails together: 144 kB sent to a browser each time
 TRAILS_S = (10.0, 30.0, 60.0, SPAN_S)  # selectable lengths of trails, simulated
 TRAIL_S = 60.0  # initial length
 SPACING_M = 0.08  # between two points of a trail: a sixth of a hull
 SPACING_S = 0.05  # simulated, and in time: as often as pictures come at 1 × real time
-RECORD_GAP_S = 5.0  # simulated; between points of a record farther apart it was not read yet, so nothing is drawn
-STILL_M = 1e-3  # of a segment: a drone that does not move leaves no trail
+RECORD_GAP_S = 5.0  # simulated; a larger gap between points of a record was not read yet, so nothing is drawn across it
+STILL_M = 1e-3  # of a segment; a stationary drone leaves no trail
 PLOTS_SHOWN = 3  # plots
 COLOURS = ("#868e96", "#1971c2", "#e8590c")  # of SERIES
 HEIGHT_PX = 150
@@ -60,7 +60,7 @@ class _TimedRows(Generic[Row]):
         self.rows: list[Row] = []
 
     def is_near(self, t_s: float, within_s: float) -> bool:
-        """Return whether there is a row less than that far away in time."""
+        """Return whether there is a row closer in time than this."""
         place = bisect_left(self.times, t_s)
         return any(abs(other_s - t_s) < within_s for other_s in self.times[max(0, place - 1) : place + 1])
 
@@ -75,15 +75,15 @@ class _TimedRows(Generic[Row]):
 
 
 class CanvasTrails:
-    """The trails of N drones: where each was within the last seconds.
+    """The trails of N drones: the recent positions of each.
 
     Args:
         count: N.
-        around: whether they are of a record.
+        around: whether they belong to a record.
 
     Attributes:
-        length_s: how far trails go back, simulated.
-        number: changes whenever trails are not the previous ones plus what was added.
+        length_s: length of the trails, simulated.
+        number: changes whenever the trails are not merely the previous ones extended.
     """
 
     def __init__(self, count: int, around: bool = False) -> None:
@@ -94,9 +94,9 @@ class CanvasTrails:
         self.number = 0
 
     def add(self, t_s: float, p_W: Array) -> None:
-        """Add positions (N, 3) [m] of an instant, NaN of a drone that is not in the view.
+        """Add positions (N, 3) [m] at an instant, NaN for a drone that is not in the view.
 
-        Those of a flight are left out while no drone has moved on.
+        In a flight, they are skipped while no drone has moved.
         """
         points = self._points
         if not self._around and points.times and t_s < points.times[-1]:
@@ -117,7 +117,7 @@ class CanvasTrails:
         self._points.keep(from_s, to_s)
 
     def choose_length(self, length_s: float) -> None:
-        """Let trails go back so far [s, simulated]."""
+        """Set the length of the trails [s, simulated]."""
         self.length_s = length_s
         self.number += 1
 
@@ -132,7 +132,7 @@ class CanvasTrails:
         times = np.array(points.times[begin:end])
         rows = np.arange(len(times))
         if len(times) * self._count > TRAIL_POINTS_MAX:
-            # A step that hardly ever changes, and points that stay the same: else trails would tremble.
+            # The step rarely changes and points are kept; otherwise trails would flicker.
             step_s = 2.0 ** math.ceil(math.log2((times[-1] - times[0]) * self._count / TRAIL_POINTS_MAX))
             rows = np.flatnonzero(np.diff(np.floor(times / step_s), prepend=-math.inf))
         times = np.append(times[rows], t_s)
@@ -149,14 +149,14 @@ class VariableHistory:
     """Points of some variables, each with the values of `SERIES`.
 
     Args:
-        around: whether they are of a record.
+        around: whether they belong to a record.
     """
 
     def __init__(self, size: int, around: bool = False) -> None:
         self._size = size
         self._around = around
         self._points = _TimedRows[Array]()
-        self._lock = threading.Lock()  # pages' threads ask for curves, too
+        self._lock = threading.Lock()  # threads of pages read curves, too
 
     def is_due(self, t_s: float) -> bool:
         """Return whether a point of that time [s] would be added."""
@@ -168,7 +168,7 @@ class VariableHistory:
     def add(
         self, t_s: float, desired: Sequence[float] | None, value: Sequence[float] | Array, true: Array | None
     ) -> bool:
-        """Add a point of an instant, simulated, unless one is hardly older; return whether it was added.
+        """Add a point at a simulated instant, unless the last one is too recent; return whether it was added.
 
         `desired`, `value` and `true` have shape (size,), m and rad; None where unknown.
         """
@@ -182,7 +182,7 @@ class VariableHistory:
                 return False
             points.insert(t_s, row)
             if not self._around:
-                points.keep(max(t_s - SPAN_S, points.times[-HISTORY_POINTS_MAX:][0]))  # a fast run's are far apart
+                points.keep(max(t_s - SPAN_S, points.times[-HISTORY_POINTS_MAX:][0]))  # sparse in a fast run
         return True
 
     def keep(self, from_s: float, to_s: float) -> None:
@@ -204,7 +204,7 @@ class VariableHistory:
         Args:
             span_s: length of the curves.
             less: the one of `SERIES` that is subtracted, for errors; None for values.
-            at_s: the middle of the curves; None: they end with the newest point.
+            at_s: centre of the curves; None: they end at the newest point.
         """
         with self._lock:
             t = np.array(self._points.times)
@@ -297,7 +297,7 @@ class VariablePlots:
             control.on_update(lambda _: self._redraw())
 
     def draw(self, t_s: float = 0.0) -> None:
-        """Send the chosen curves, unless they are to stand still; t_s is the instant that a replay shows."""
+        """Send the chosen curves, unless they are frozen; t_s is the instant that a replay shows."""
         if self._cursor_s is not None:
             self._cursor_s = t_s
         if not self._still.value:
@@ -345,8 +345,8 @@ class AxisRange(NamedTuple):
     def of_times(cls, t_s: Array, span_s: float, at_s: float | None = None) -> "AxisRange":
         """Return the range of points of these times (M,) [s], M > 0, in a window of `span_s`, around at_s if given.
 
-        viser derives an automatic range from the previous data before the first range is committed: a page that draws
-        slowly would show a stretch without data for ever.
+        Before the first range is committed, viser derives an automatic range from the previous data: a page that draws
+        slowly would show an empty interval for ever.
         """
         step_s = span_s / STEPS_PER_WINDOW
         if at_s is not None:
@@ -358,7 +358,7 @@ class AxisRange(NamedTuple):
     def of_values(cls, values: Sequence[Array], always: bool = False) -> "AxisRange | None":
         """Return the range of curves (M,) of one unit, NaN where unknown; None where uPlot finds it itself.
 
-        It does not where a curve is entirely unknown; `always`: return the range of other curves, too.
+        uPlot does not where a curve is entirely unknown; `always`: return the range in other cases, too.
         """
         known = np.concatenate(values)
         known = known[np.isfinite(known)]
@@ -370,7 +370,7 @@ class AxisRange(NamedTuple):
 
 
 def _with_cursor(curves: Sequence[Array], at_s: float, values: AxisRange) -> tuple[Array, ...]:
-    """Return curves with one more, a line across the range of values at an instant."""
+    """Return the curves with an additional vertical line at an instant."""
     place = int(np.searchsorted(curves[0], at_s))
     nearest = min(place, len(curves[0]) - 1)
     cursor = np.full(len(curves[0]) + 2, np.nan)

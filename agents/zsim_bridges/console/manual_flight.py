@@ -1,6 +1,6 @@
-"""Drones flown from pages, by a stick or to a place on the map: acquired, commanded at a steady rate, given back.
+"""Drones flown from pages, by a stick or to a place on the map: acquired, commanded at a steady rate, released.
 
-Whatever is not requested continuously means hover: a stick that is released, a page that is silent, hidden or gone.
+A drone hovers unless motion is requested continuously: if the stick is released, or the page is silent, hidden or gone.
 Axes of W, unless a name ends otherwise.
 """
 
@@ -25,21 +25,21 @@ from zsim_bridges.console.command_client import CommandClient, NoAnswer
 from zsim_bridges.console.operator_input import SIDEWAYS_M, height_range_m
 
 PERIOD_S = 0.05  # wall; of commands: at 5 × real time ten of them within a drone's silence of 0.5 s
-STALE_S = 0.5  # wall; a page silent for longer does not fly any more: as the firmware's silence
-GONE_S = 5.0  # wall; after which the drone of a lost page is given back: it may be reloaded meanwhile
-REPEAT_S = 1.0  # wall; after which a silent world is asked for a drone again
+STALE_S = 0.5  # wall; a page silent for longer no longer flies, as with the firmware's silence
+GONE_S = 5.0  # wall; after which the drone of a lost page is released; the page may be reloaded before
+REPEAT_S = 1.0  # wall; after which the request for a drone is repeated to a silent world
 SETTLED_S = 1.5  # wall; after which a view shows who has acquired a drone; views come 20 times a second
-RATE_MAX = 5.0  # × real time; chosen: faster, manual flight is hopeless, and the firmware takes pauses for silence
+RATE_MAX = 5.0  # × real time; chosen: above it manual flight is not feasible, and the firmware takes pauses for silence
 CLIMB_SHARE = 0.5  # of the horizontal speed, up and down; chosen: height is harder to see on a page
 YAW_RATE_RAD_S = math.radians(45.0)  # chosen: a full turn in 8 s
 SPEED_M_S = 1.5  # towards a place; chosen: as the paper's formations
-NEAR_M = 0.5  # of a place, from which a drone turns to the one after it; chosen
-PLACES_MAX = 50  # of one drone, chosen: more are no longer an operator's
+NEAR_M = 0.5  # distance from a place at which a drone proceeds to the next one; chosen
+PLACES_MAX = 50  # of one drone; chosen: more are no longer manual flight
 BRAKE_S = 1.0  # in which a drone comes to rest before the fence; chosen: three times the lag of its velocity loop
 
 
 class Stick(NamedTuple):
-    """Deflections of a stick, or of held keys, from -1 to 1, in the drone's heading frame; yaw to the left."""
+    """Deflections of a stick or of held keys, -1 to 1, in the drone's heading frame; yaw is positive to the left."""
 
     forward: float
     left: float
@@ -49,7 +49,7 @@ class Stick(NamedTuple):
 
 
 class DronePose(NamedTuple):
-    """Position, heading and velocity of a drone by its estimator, and for which simulated time."""
+    """Position, heading and velocity of a drone by its estimator, and their simulated time."""
 
     p_W: Vector  # m
     yaw_rad: float
@@ -68,7 +68,7 @@ HOVER = FlownVelocity()
 
 
 class DroneSight(NamedTuple):
-    """What is known of a drone: its firmware's state, empty before it is seen, who flies it, and a present estimate."""
+    """The state of a drone: that of its firmware (empty before it is seen), its commander, and its current estimate."""
 
     state: str = ""
     commander: str | None = None
@@ -76,29 +76,29 @@ class DroneSight(NamedTuple):
 
 
 class RunSight(NamedTuple):
-    """What is known of the run."""
+    """The state of the run, as far as it matters to manual flight."""
 
     off: str = ""  # why nothing can be flown; otherwise empty
     rate: float = 1.0  # simulated per wall second, as measured
     paused: bool = False
-    silence: str = ""  # that the world does not answer, in words; a drone is requested all the same
+    silence: str = ""  # description of a silent world; a drone is requested regardless
 
 
 class FlightAnswer(NamedTuple):
-    """What a page shows of the drone that it flies."""
+    """What a page shows about the drone that it flies."""
 
     drone: str = ""
     state: str = "none"  # none, taking or flying
-    text: str = ""  # why it is not flown, or what it does
+    text: str = ""  # why it is not flown, or what it is doing
     over: bool = False  # whether it may be taken over from its commander
     commander: str = ""
     id: str = ""  # of the page's request to take it
-    goal: Vector | None = None  # the place to which it flies [m; W]
-    then: tuple[Vector, ...] = ()  # and those after it
+    goal: Vector | None = None  # its present destination [m; W]
+    then: tuple[Vector, ...] = ()  # later destinations
 
 
 class Geofence(NamedTuple):
-    """A box around the drones' starts by its corners [m; W]; ranges of formations are those of their variables."""
+    """A box around the drones' starts, by its corners [m; W]."""
 
     low_m: Vector
     high_m: Vector
@@ -107,13 +107,13 @@ class Geofence(NamedTuple):
         """Return why no drone may be sent to a place; empty where it may."""
         for axis, value, low, high in zip("xy", (x_m, y_m), self.low_m, self.high_m, strict=False):
             if not low <= value <= high:
-                return f"{axis} is {value:.1f} m, outside of the geofence: {low:g} to {high:g} m"
+                return f"{axis} is {value:.1f} m, outside the geofence: {low:g} to {high:g} m"
         return ""
 
     def within(self, velocity_W: Vector, p_W: Vector) -> Vector:
-        """Return a wanted velocity [m/s] without what leads out; braking begins BRAKE_S before the fence.
+        """Return a demanded velocity [m/s] without its outward components; braking begins BRAKE_S before the fence.
 
-        From outside of the fence, a drone at p_W [m] may come back.
+        Outside the fence, a drone at p_W [m] may return.
         """
         x, y, z = (
             min(max(v, min(0.0, (low - p) / BRAKE_S)), max(0.0, (high - p) / BRAKE_S))
@@ -140,7 +140,7 @@ def stick_velocity(stick: Stick, pose: DronePose, limits: Limits, fence: Geofenc
 
 
 def _fenced(velocity_W: Vector, pose: DronePose, fence: Geofence) -> Vector:
-    """Return a velocity of W in the heading frame, without what leads out of the fence."""
+    """Return a velocity in W in the heading frame, without the components that lead out of the fence."""
     return turned_about_up(fence.within(velocity_W, pose.p_W), -pose.yaw_rad)
 
 
@@ -151,20 +151,20 @@ def _too_fast(rate: float) -> str:
 
 @dataclass
 class _Flight:
-    """A drone that a page flies, or is about to; times in s, wall."""
+    """A drone that a page flies or has requested; times in s, wall."""
 
     drone: str
-    modes: int  # number requested of the drone before; a later one ends the flight
+    modes: int  # number of earlier mode requests for the drone; a later one ends the flight
     begun_s: float  # when the page requested it
-    seen_s: float  # when the page was last heard
+    seen_s: float  # when the page last sent something
     id: str = ""  # of the page's request
     owned_s: float | None = None  # since when it is commanded; None before
     sent_s: float = 0.0  # when it was last commanded
-    stick: Stick | None = None  # that is held; None: hover, or on the way to `places_W`
-    places_W: tuple[Vector, ...] = ()  # to which it flies, one after the other
-    sent_W: Vector | None = None  # the place to which its course leads; None: to none
+    stick: Stick | None = None  # present deflection; None: hover, or fly to `places_W`
+    places_W: tuple[Vector, ...] = ()  # its destinations, in order
+    sent_W: Vector | None = None  # destination of its course; None for none
     lost: bool = False  # whether the page's connection is gone
-    asked_s: float = 0.0  # when the world was last asked for the drone
+    asked_s: float = 0.0  # when the drone was last requested from the world
     asking: bool = False  # whether its answer is outstanding
 
 
@@ -172,8 +172,8 @@ class ManualFlight:
     """Flies drones for pages, each identified by any hashable value; thread-safe.
 
     Args:
-        courses: of each drone, by which it flies to places.
-        gate_s: the simulated time of a gate, for which one command is sent at most.
+        courses: of each drone, for flights to places.
+        gate_s: simulated duration of a gate, in which at most one command is sent.
     """
 
     def __init__(
@@ -199,14 +199,14 @@ class ManualFlight:
         self._wall_s = wall_s
         self._lock = threading.RLock()
         self._flights: dict[Any, _Flight] = {}
-        self._texts: dict[Any, FlightAnswer] = {}  # why a page flies no more
-        self._released: dict[str, float] = {}  # drones given back, and when to check on them [s; wall]
+        self._texts: dict[Any, FlightAnswer] = {}  # why a page no longer flies
+        self._released: dict[str, float] = {}  # released drones, and when to check on them [s; wall]
         self._ticked_s = wall_s()
-        self._wake = threading.Event()  # something has to be sent at once
+        self._wake = threading.Event()  # set when something must be sent at once
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Send commands meanwhile, in a thread of its own."""
+        """Send commands in a separate thread while the context is open."""
         over = threading.Event()
 
         def run() -> None:
@@ -228,9 +228,9 @@ class ManualFlight:
             self._give_back(self._wall_s())
 
     def take(self, page: Any, drone: str, over: bool, request: str = "") -> FlightAnswer:
-        """Take a drone for a page; `over`: even from whoever flies it, with an operator's priority.
+        """Take a drone for a page; `over`: even from its present commander, with an operator's priority.
 
-        A repeated request, with its id, is carried out once; a page that has reconnected keeps its drone.
+        A request repeated with the same id is carried out once; a page that has reconnected keeps its drone.
         """
         with self._lock:
             if request and self._texts.get(page, FlightAnswer()).id == request:
@@ -260,7 +260,7 @@ class ManualFlight:
         self._client.take(flight.drone, partial(self._on_taken, flight))
 
     def steer(self, page: Any, stick: Stick | None) -> FlightAnswer:
-        """Fly the page's drone by a stick; None: its dead-man key is not held, so hover, or continue to a place."""
+        """Fly the page's drone by a stick; None: the dead-man key is not held, so hover, or continue to a place."""
         with self._lock:
             flight = self._flights.get(page)
             if flight is not None:
@@ -272,10 +272,10 @@ class ManualFlight:
         return self.answer(page)
 
     def go(self, page: Any, x_m: float, y_m: float, z_m: float | None = None, then: bool = False) -> FlightAnswer:
-        """Fly the page's drone to a place, at its present height unless another one is given.
+        """Fly the page's drone to a place, at its present height unless another is given.
 
         Args:
-            then: after the places to which it flies already, rather than instead of them.
+            then: append the place to the present destinations instead of replacing them.
         """
         with self._lock:
             flight = self._flights.get(page)
@@ -287,7 +287,7 @@ class ManualFlight:
             place = x_m, y_m, pose.p_W[2] if z_m is None else z_m
             before = flight.places_W if then else ()
             flight.stick, flight.seen_s = None, self._wall_s()
-            if before[-1:] != (place,):  # a page repeats what is not confirmed yet
+            if before[-1:] != (place,):  # a page repeats an unconfirmed request
                 flight.places_W = (*before[: PLACES_MAX - 1], place)
         return self.answer(page)
 
@@ -297,7 +297,7 @@ class ManualFlight:
             return flight is not None and bool(flight.places_W)
 
     def leave(self, page: Any, text: str = "") -> FlightAnswer:
-        """Let the page's drone hover, and give it back; `text` says why."""
+        """Let the page's drone hover, and release it; `text` says why."""
         with self._lock:
             flight = self._flights.pop(page, None)
             if flight is not None:
@@ -308,7 +308,7 @@ class ManualFlight:
         return self.answer(page)
 
     def lose(self, page: Any) -> None:
-        """Note that a page's connection is gone: its drone hovers at once, and is given back after a while."""
+        """Record that a page's connection is gone: its drone hovers at once, and is released after a while."""
         with self._lock:
             flight = self._flights.get(page)
             self._texts.pop(page, None)
@@ -335,9 +335,9 @@ class ManualFlight:
             return FlightAnswer(flight.drone, "flying", text, id=flight.id, goal=goal, then=then)
 
     def tick(self) -> None:
-        """Command every drone that is due; give back those that may not be flown any more.
+        """Command every drone that is due; release those that may no longer be flown.
 
-        Everything is sent from here, in one thread: no command follows a newer one, or the return of a drone.
+        Everything is sent from here, in one thread, so that no command follows a newer one or the release of a drone.
         """
         wall_s, run = self._wall_s(), self._run_sight()
         stood_s, self._ticked_s = wall_s - self._ticked_s, wall_s
@@ -357,7 +357,7 @@ class ManualFlight:
         self._give_back(wall_s)
 
     def _give_back(self, wall_s: float) -> None:
-        """Release drones; again if the world took a command after the release, which made the console commander."""
+        """Release drones; again if a command accepted after the release made the console commander."""
         with self._lock:
             due = [drone for drone, at_s in self._released.items() if wall_s >= at_s]
             flown = {flight.drone for flight in self._flights.values()}
@@ -380,10 +380,10 @@ class ManualFlight:
             flight.asking = False
             page = next((key for key, each in self._flights.items() if each is flight), None)
             if page is None:
-                if not refusal or isinstance(refusal, NoAnswer):  # the page has given it up meanwhile
+                if not refusal or isinstance(refusal, NoAnswer):  # the page has released it meanwhile
                     self._released[flight.drone] = -math.inf
             elif isinstance(refusal, NoAnswer):
-                return  # to be asked for again
+                return  # to be requested again
             elif refusal:
                 del self._flights[page]
                 if not flight.lost:
@@ -396,7 +396,7 @@ class ManualFlight:
         if wall_s - flight.seen_s > GONE_S:
             return "the page was silent"
         if self._client.modes_requested(drone) != flight.modes:
-            return f"another mode of {drone} was asked for"
+            return f"another mode of {drone} was requested"
         if flight.owned_s is not None and wall_s - flight.owned_s > SETTLED_S and sight.commander != self._name:
             return f"{drone} is flown by {sight.commander or 'nobody'} now"
         off = run.off or (run.silence if flight.owned_s is not None else "")
@@ -412,7 +412,7 @@ class ManualFlight:
             return HOVER if pose is None or stick is None else stick_velocity(stick, pose, limits, self._fence)
         course, here, moving = self._courses[flight.drone], (*pose.p_W, pose.yaw_rad), (*pose.v_W, 0.0)
         if before is None:
-            course.leave()  # it leads from where the drone was flown to a place before
+            course.leave()  # it starts where the drone was last flown to a place
         if place != before:
             climb_m_s = CLIMB_SHARE * min(SPEED_M_S, limits.horizontal_speed_m_s)
             course.send((*place, None), pose.t_s, here, moving, speeds=Cruise(SPEED_M_S, climb_m_s, climb_m_s))
@@ -420,7 +420,7 @@ class ManualFlight:
         return FlownVelocity(_fenced(velocity_W, pose, self._fence), turn)
 
     def _next_place(self, flight: _Flight, pose: DronePose | None) -> Vector | None:
-        """Return the place to which a drone flies, past those that it has come near to."""
+        """Return the drone's next destination, skipping those that it has approached."""
         with self._lock:
             places = flight.places_W
             if pose is not None and len(places) > 1 and el.distance(pose.p_W, places[0]) <= NEAR_M:
@@ -428,6 +428,6 @@ class ManualFlight:
             return next(iter(places), None)
 
     def _send_soon(self, flight: _Flight) -> None:
-        """Let a command be sent at once, not a period after the last one."""
+        """Let a command be sent at once, without waiting for the period."""
         flight.sent_s = -math.inf
         self._wake.set()

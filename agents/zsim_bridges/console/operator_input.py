@@ -19,15 +19,15 @@ SIDE_MAX_M = 20.0  # of a formation; chosen
 DISPLACEMENT_M = 5.0  # of a robot from its place in a template; chosen
 TILT_MAX_DEG = 29.0  # of a formation; controllers take less than 30, flight_check.py
 CORNER_DEG = 10.0  # least angle at a corner; at 0 and 180 degrees the robots are in line
-DIGITS = 6  # of a value as it is shown: 5.1, not 5.1000000000000005
+DIGITS = 6  # of a displayed value: 5.1, not 5.1000000000000005
 STEPS = {"m": 0.1, "deg": 1.0}
-SHOWN_MAX = 16  # variables that a page shows one by one; of more, only those of the whole formation
+SHOWN_MAX = 16  # variables that a page shows one by one; of more, only those of the formation as a whole
 WAYPOINT_STEP_S = 20.0  # from the first to the second prefilled waypoint
 PREFILLED = ("x_c", "y_c", "z_c", "yaw")  # variables in prefilled waypoints, where a formation has them
 
 
 def range_refusal(name: str, value: float, low: float, high: float, unit: str = "") -> str | None:
-    """Return why a typed number may not be requested, None if it may; it is never changed to a limit."""
+    """Return why a typed number may not be requested, None if it may; it is never clipped to a limit."""
     if low <= value <= high:
         return None
     in_unit = f" {unit}" if unit else ""
@@ -60,9 +60,9 @@ class SliderRange(NamedTuple):
         return math.radians(shown) if self.unit == "deg" else shown
 
     def to_display(self, value: float) -> float:
-        """Return a value [m, rad] in the unit of the range, rounded to its step; just beyond a limit, the limit.
+        """Return a value [m, rad] in the unit of the range, rounded to its step; the limit if it is just beyond it.
 
-        Limits need not be whole steps: those of sides are of the scenario.
+        Limits need not be whole steps: those of sides come from the scenario.
         """
         shown = self.in_unit(value)
         rounded = round(round(shown / self.step) * self.step, DIGITS)
@@ -70,7 +70,7 @@ class SliderRange(NamedTuple):
         return within if abs(shown - within) <= self.step / 2.0 else rounded
 
     def label_of(self, value: float) -> str:
-        """Return the label for a value [m, rad], which it contains if that is out of range."""
+        """Return the label; it contains the value [m, rad] if that is out of range."""
         shown, slack = self.in_unit(value), self.step / 2.0
         if self.low - slack <= shown <= self.high + slack:
             return self.label
@@ -82,7 +82,7 @@ class SliderRange(NamedTuple):
 
 
 def height_range_m(drones: Iterable[Drone]) -> tuple[float, float]:
-    """Return between which heights some drones may be sent, below the lowest of their ceilings."""
+    """Return the range of heights to which some drones may be sent, below the lowest of their ceilings."""
     top_m = min(HEIGHT_MAX_M, *(drone.limits.altitude_m for drone in drones))
     return min(HEIGHT_MIN_M, top_m / 2.0), top_m
 
@@ -112,7 +112,7 @@ def slider_ranges(space: ClusterSpace, cluster: Cluster, scenario: Scenario) -> 
 
 
 def primary_variables(names: Sequence[str]) -> list[str]:
-    """Return the variables that a page shows one by one: all of few; of many, those of the whole formation."""
+    """Return the variables that a page shows one by one: all if few; if many, those of the formation as a whole."""
     whole = ("x_c", "y_c", "z_c", "roll", "pitch", "yaw", "p", "q", "beta")
     return list(names) if len(names) <= SHOWN_MAX else [name for name in names if name in whole]
 
@@ -144,12 +144,12 @@ def parse_expressions(text: str, names: Sequence[str], angles: Collection[str] =
         elif name in names:
             by_variable[name] = value
         else:
-            constants[name] = _number(value, f"line {number}: {name} is no variable, and as a constant")
+            constants[name] = _number(value, f"line {number}: {name} is not a variable, and as a constant")
     if not by_variable:
-        raise InputError("trajectory is empty; must have a line VARIABLE = EXPRESSION at least")
+        raise InputError("trajectory is empty; must have at least one line VARIABLE = EXPRESSION")
     for name in constants:
         if not any(re.search(rf"\b{re.escape(name)}\b", expression) for expression in by_variable.values()):
-            raise InputError(f"{name} is no variable, nor used as a constant; variables are {', '.join(names)}")
+            raise InputError(f"{name} is neither a variable nor used as a constant; variables are {', '.join(names)}")
     return {"expressions": by_variable, "constants": constants}
 
 
@@ -169,7 +169,7 @@ def parse_waypoints(text: str, ranges: Mapping[str, SliderRange]) -> dict[str, A
         values = {name: ranges[name].to_si(value) if name in ranges else value for name, value in shown.items()}
         points.append({"at_s": _number(at, f"line {number}: the time"), "values": values})
     if not points:
-        raise InputError("waypoints are empty; must have a line SECONDS: VARIABLE = VALUE at least")
+        raise InputError("waypoints are empty; must have at least one line SECONDS: VARIABLE = VALUE")
     return {"waypoints": points}
 
 
@@ -186,7 +186,7 @@ def waypoints_from(value: Sequence[float], ranges: Sequence[SliderRange]) -> str
 def is_apart(value: Sequence[float], other: Sequence[float], ranges: Sequence[SliderRange]) -> bool:
     """Return whether a formation's prefilled waypoints at one place differ from those at another by more than a step.
 
-    Text that followed every estimate would never rest.
+    Text that followed every estimate would change constantly.
     """
     return any(
         abs(round(each.in_unit(here - there), 2)) > each.step
@@ -196,12 +196,12 @@ def is_apart(value: Sequence[float], other: Sequence[float], ranges: Sequence[Sl
 
 
 def parse_fault(text: str, name: str, kind: FaultKind) -> dict[str, Any]:
-    """Return the parameters and times of a fault, typed as behind TARGET KIND in a terminal.
+    """Return the parameters and times of a fault, typed as after TARGET KIND in a terminal.
 
-    Every magnitude must be stated, even one with a default: an empty text must not strike all samples.
+    Every magnitude must be given, even one with a default: an empty text must not affect all samples.
 
     Raises:
-        InputError: the text is no such list, names something unknown to the kind, or leaves a magnitude out.
+        InputError: the text is not such a list, names something unknown to the kind, or omits a magnitude.
     """
     where = f"parameters are {text[:40]!r}"
     try:
@@ -220,7 +220,7 @@ def parse_fault(text: str, name: str, kind: FaultKind) -> dict[str, Any]:
 
 
 def _lines(text: str) -> list[tuple[int, str]]:
-    """Return the lines with their numbers, without comments and blank ones."""
+    """Return the lines with their numbers, without comments and blank lines."""
     numbered = enumerate(text.splitlines(), start=1)
     return [(number, line.strip()) for number, line in numbered if line.strip() and not line.lstrip().startswith("#")]
 

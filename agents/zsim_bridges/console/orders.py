@@ -1,7 +1,7 @@
-"""Requests of operators, followed until they have had their effect.
+"""Requests of operators, tracked until they have taken effect.
 
-Orders must not get lost: each is sent until the world has carried it out or refused it. Its page chooses its id, and
-repeats it until it is answered; the console carries out each id once, and repeats towards the world whatever the world
+Orders must not be lost: each is sent until the world has carried it out or refused it. The page chooses its id, and
+repeats it until it is answered; the console carries out each id once, and repeats to the world whatever the world
 has not confirmed: after a missing answer, a command lost by a radio, or a stamp that grew old while a process stalled.
 Other requests are made once; `PendingRequests` tells when an accepted one is done.
 """
@@ -22,11 +22,11 @@ from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.view_buffer import commanded_drone
 
-REPEAT_S = 1.0  # wall; an order without an effect for so long is sent again: the world answers within a gate
-KEPT = 200  # orders whose ids are remembered: at one click a second those of three minutes
+REPEAT_S = 1.0  # wall; an order without an effect for this long is sent again: the world answers within a gate
+KEPT = 200  # orders whose ids are remembered: three minutes' worth at one click a second
 SHOWN_S = 20.0  # wall; for which pages show a settled order
 NAME_MAX = 64  # characters
-REASONS_MAX = 2  # that are named of an order
+REASONS_MAX = 2  # number of targets of an order that are named
 STALE_STAMP = "age is "  # begins the world's refusal of a command with too old a stamp, which is then stamped anew
 OrderState = Literal["sent", "confirmed", "refused", "replaced"]
 _CARRIED_OUT = {
@@ -34,7 +34,7 @@ _CARRIED_OUT = {
     "land": frozenset({"landing", "landed", "idle"}),
     "hold": frozenset({"held"}),
 }
-"""States of drones, and phases of formations, that show an order's effect."""
+"""The states of drones and phases of formations that show that an order has taken effect."""
 _WORST_FIRST: tuple[OrderState, ...] = ("sent", "refused", "replaced", "confirmed")
 PHASES_DONE = {
     "takeoff": frozenset({"assembling", "engaged"}),
@@ -49,7 +49,7 @@ STATES_DONE = {
     "emergency": frozenset({"emergency"}),
     "reset": frozenset({"landed"}),
 }
-THERE_M, THERE_RAD = 0.2, 0.05  # of a variable at its target; chosen: about as close as the paper's formations
+THERE_M, THERE_RAD = 0.2, 0.05  # of a variable from its target; chosen: about the accuracy of the paper's formations
 
 Name = Annotated[str, Meta(max_length=NAME_MAX)]
 
@@ -61,10 +61,10 @@ class OrderRequest(Struct, frozen=True, forbid_unknown_fields=True):
     id: Name = ""
     """Chosen by the page; carried out once. Empty: the order will not be repeated."""
     run: Name = ""
-    """The run for which it was given; refused in any other one. Empty: whichever is shown."""
+    """The run for which it was given; refused in any other. Empty: the run that is shown."""
     drone: Name = ""
     cluster: Name = ""
-    """What it concerns; all where both are empty."""
+    """The targets; all where both are empty."""
 
 
 @dataclass
@@ -77,7 +77,7 @@ class _Target:
     busy: bool = False  # whether an attempt is in progress
     attempts: int = 0
     sent_s: float = 0.0  # when the last attempt began [s; wall]
-    modes: int = 0  # number requested of a drone up to this order's; a further one replaces it
+    modes: int = 0  # number of modes requested of a drone, including this order's; a later one replaces it
     accepted: bool = False  # whether the world has accepted the last command
 
 
@@ -106,11 +106,11 @@ class OrderBook:
     """Carries out orders of one run; thread-safe.
 
     Args:
-        members: drones of each formation.
-        refusal: returns why nothing can be flown at all, apart from a silent world; otherwise empty.
+        members: the drones of each formation.
+        refusal: returns why nothing can be flown, apart from a silent world; otherwise empty.
         now_ns: returns the simulated time of the newest clock.
         silent_s: returns for how long the world has not answered [s; wall].
-        external: drones whose modes the world only forwards; their states alone show an effect.
+        external: drones whose modes the world only forwards, so that only their states show an effect.
     """
 
     def __init__(
@@ -139,7 +139,7 @@ class OrderBook:
         self._lock = threading.RLock()
 
     def place(self, request: OrderRequest) -> dict[str, Any]:
-        """Carry out an order, unless one of its id was carried out already; return it as plain data."""
+        """Carry out an order, unless one with its id was already carried out; return it as plain data."""
         order_id = request.id or uuid4().hex
         with self._lock:
             order = self._orders.get(order_id)
@@ -154,7 +154,7 @@ class OrderBook:
             return self._row(order)
 
     def note(self, outcome: RequestOutcome) -> bool:
-        """Take the outcome of an attempt; return whether operators are to be notified, once for each target."""
+        """Process the outcome of an attempt; return whether to notify operators, once for each target."""
         with self._lock:
             order = self._orders.get(outcome.order)
             target = order.targets.get(outcome.subject) if order else None
@@ -191,9 +191,9 @@ class OrderBook:
                         self._settle(order, target, "refused", target.reason)
 
     def update(self, states: Mapping[str, str], t_ns: int, *, paused: bool) -> None:
-        """Settle orders that have had their effect, and repeat those that have not.
+        """Settle orders that have taken effect, and repeat the others.
 
-        `states`, with the phases of formations, are those at t_ns. Commands accepted in a paused run act later.
+        `states` and the phases of formations are those at t_ns. Commands accepted in a paused run take effect later.
         """
         with self._lock:
             self._paused = paused
@@ -240,9 +240,9 @@ class OrderBook:
         if request.run and request.run != self._run_id:
             order.refusal = "it was given for another run"
         elif subject and subject not in (*self._drones, *self._members):
-            order.refusal = f"{subject!r} is none of the run's drones and formations"
+            order.refusal = f"{subject!r} is not a drone or formation of the run"
         elif not targets:
-            order.refusal = f"there is nobody to {request.op}"
+            order.refusal = f"no drone or formation to {request.op}"
         if order.refusal:
             order.over_s = order.given_s
         return order
@@ -282,7 +282,7 @@ class OrderBook:
         if order.state == "sent" and silent_s:
             reason = f"the world has not answered for {silent_s:.0f} s"
         elif order.state == "sent" and self._paused and all(target.accepted for target in found.values()):
-            reason = "the world has it, and is paused"
+            reason = "accepted by the world, which is paused"
         return {
             "id": order.id,
             "op": order.op,
@@ -297,7 +297,7 @@ class OrderBook:
 
 
 class PendingRequest(NamedTuple):
-    """A request of a formation or drone, described by its text."""
+    """A request to a formation or drone, described by its text."""
 
     subject: str
     op: str
@@ -306,7 +306,7 @@ class PendingRequest(NamedTuple):
 
 
 class PendingRequests:
-    """Keeps the last accepted request of each drone and formation until it is done, or replaced by another."""
+    """Keeps the last accepted request to each drone and formation until it is done or replaced."""
 
     def __init__(self) -> None:
         self._pending: dict[str, PendingRequest] = {}

@@ -1,6 +1,6 @@
-"""Cameras in the scenes of pages: those with which pages look at it, and frusta of drones' cameras within it.
+"""Cameras in the scenes of pages: the pages' own viewpoints, and frusta of drones' cameras.
 
-A page's camera follows the formation and keeps all of it in view, unless the page wants otherwise. A page may show the
+A page's camera follows the formation and keeps all of it in view, unless the page chooses otherwise. It may show the
 frustum of one drone's camera, with its picture.
 """
 
@@ -20,20 +20,20 @@ from zsim_bridges.console.camera_feed import CameraPicture, field_of_view
 from zsim_bridges.console.picture import Array, DronePoses
 from zsim_bridges.console.private_viser import show_jpeg
 
-OFFSET_M = np.array([-2.3, -3.9, 1.7])  # of a page's camera from what it looks at, where nothing needs more
+OFFSET_M = np.array([-2.3, -3.9, 1.7])  # of a page's camera from its target, unless more is needed
 DISTANCE_MIN_M = float(np.linalg.norm(OFFSET_M))
-SLOPE_MIN = 0.05  # of the narrowest page that is fitted; a hidden one has no width
-REACH_M = 0.6  # of a drone around its position, with its name over it; chosen
+SLOPE_MIN = 0.05  # of the narrowest page that is considered; a hidden one has no width
+REACH_M = 0.6  # of a drone around its position, with its name above it; chosen
 FAR_M = 15.0  # beyond which a drone on the page is too small to count as in view; chosen: about 15 pixels
-MARGIN = 0.85  # of half the page, within which a point counts as in view
+MARGIN = 0.85  # of half the page; a point within it counts as in view
 UP_W = np.array([0.0, 0.0, 1.0])
-DIRECTIONS = {  # from the centre to the camera; not quite from above, where no direction would be up
+DIRECTIONS = {  # from the centre to the camera; not straight from above, where the up direction is undefined
     "reset": OFFSET_M / DISTANCE_MIN_M,
     "top": np.array([0.0, -0.02, 1.0]),
     "side": np.array([0.0, -1.0, 0.06]),
 }
 DEADBAND = 0.05  # of the distance; a shorter move does not move the camera, so pictures need not be drawn anew
-SPARE = 1.15  # of the distance from which everything is just in view
+SPARE = 1.15  # of the distance at which everything is just in view
 NEARER = 0.6  # of the distance; the camera comes nearer if the fitting one is less
 NODE = "/camera_frustum"
 SCALE = 0.8  # of a frustum: the picture on it is about a metre wide; chosen: beside a hull of half a metre
@@ -44,7 +44,7 @@ PAGE_KEY_BYTES = 12
 
 
 class CameraView(NamedTuple):
-    """What a page's camera sees; fov is the vertical angle of view."""
+    """The view of a page's camera; fov is the vertical angle of view [rad]."""
 
     position: Array  # (3,) m; W
     look_at: Array  # (3,) m; W
@@ -53,7 +53,7 @@ class CameraView(NamedTuple):
     aspect: float  # width / height
 
     def contains(self, p_W: Array) -> bool:
-        """Return whether a point [m; W] is in view, and not far away."""
+        """Return whether a point [m; W] is in view and near enough."""
         ahead = _unit(self.look_at - self.position)
         right = _unit(np.cross(ahead, self.up))
         away = p_W - self.position
@@ -62,13 +62,13 @@ class CameraView(NamedTuple):
         return bool(0.0 < z <= FAR_M and abs(y) <= half and abs(x) <= half * self.aspect)
 
     def offset(self) -> Array:
-        """Return from where to look at another point [m; W]: in the present direction, OFFSET_M away at most."""
+        """Return the position from which to look at a point [m; W]: in the present direction, at most OFFSET_M away."""
         back = self.position - self.look_at
         return back * min(1.0, float(np.linalg.norm(OFFSET_M) / np.linalg.norm(back)))
 
 
 def fit_distance_m(points_W: Array, centre_W: Array, back_W: Array, up_W: Array, fov: float, aspect: float) -> float:
-    """Return from how far a camera that looks at a centre has all points in view [m]; DISTANCE_MIN_M at least.
+    """Return the distance at which a camera aimed at a centre has all points in view [m]; at least DISTANCE_MIN_M.
 
     Args:
         points_W: (n, 3) m.
@@ -103,8 +103,8 @@ class _Page:
     client: viser.ClientHandle
     key: str = field(default_factory=lambda: secrets.token_urlsafe(PAGE_KEY_BYTES))
     follows: bool = True  # whether its camera moves with the formation
-    fits: bool = True  # whether that keeps all drones in view by its distance
-    direction: Array | None = field(default_factory=DIRECTIONS["reset"].copy)  # of the next look; None: unchanged
+    fits: bool = True  # whether its distance is adjusted to keep all drones in view
+    direction: Array | None = field(default_factory=DIRECTIONS["reset"].copy)  # next viewing direction; None: unchanged
     moved: bool = True  # whether it must be aimed anew
     camera: str = ""  # whose frustum is shown
     clicked: str = ""  # the drone clicked last in its scene
@@ -135,7 +135,7 @@ class PageCameras:
     def _on_connect(self, client: viser.ClientHandle) -> None:
         page = _Page(client)
         self._move(page)
-        page.moved = True  # once more at the next picture: this one may be that of another run
+        page.moved = True  # again at the next picture: this one may be of another run
         with self._lock:
             self._pages[client.client_id] = page
         client.gui.add_html(f'<i data-zsim-page="{page.key}"></i>', order=-2.0)
@@ -154,13 +154,13 @@ class PageCameras:
     # How pages look at the scene
 
     def restart(self) -> None:
-        """Aim all cameras anew at the first picture of another run."""
+        """Aim all cameras again at the first picture of another run."""
         with self._lock:
             for page in self._pages.values():
                 page.moved = True
 
     def look(self, client_id: int, follows: bool, fits: bool, direction: str = "") -> None:
-        """Let a page's camera follow or not, keep all in view or not, and look from a direction of `DIRECTIONS`."""
+        """Set whether a page's camera follows and keeps all in view, and look from a direction of `DIRECTIONS`."""
         with self._lock:
             page = self._pages.get(client_id)
             if page is None:
@@ -208,13 +208,13 @@ class PageCameras:
                     page.camera = camera
 
     def click(self, client_id: int | None, drone: str) -> None:
-        """Note that a drone was clicked in the scene of a page."""
+        """Record that a drone was clicked in the scene of a page."""
         with self._lock:
             if client_id in self._pages:
                 self._pages[client_id].clicked = drone
 
     def take_click(self, key: str) -> str:
-        """Return once the drone that was clicked last in a page's scene; empty for none."""
+        """Return, once, the drone last clicked in a page's scene; empty for none."""
         clicked = ""
         with self._lock:
             for page in self._pages.values():
@@ -225,7 +225,7 @@ class PageCameras:
     def draw_frusta(
         self, drones: DronePoses | None, shown: Callable[[str], tuple[CameraInfo, CameraPicture] | None]
     ) -> None:
-        """Draw the chosen frusta, and remove others; `shown` returns a camera with its newest picture."""
+        """Draw the chosen frusta, and remove the others; `shown` returns a camera with its newest picture."""
         with self._lock:
             chosen = {number: (page.client, page.camera) for number, page in self._pages.items() if page.camera}
         for number, frustum in list(self._frusta.items()):
@@ -265,7 +265,7 @@ def frustum_pose(info: CameraInfo, p_WB: Array, q_WB: Array) -> tuple[Array, Arr
 
 
 def drone_index(drones: DronePoses | None, camera: str) -> int | None:
-    """Return which drone a camera is on, None if it is not in the view."""
+    """Return the index of the drone that carries a camera, None if it is not in the view."""
     drone = camera.partition("/")[0]
     if drones is None or drone not in drones.names:
         return None
@@ -274,7 +274,7 @@ def drone_index(drones: DronePoses | None, camera: str) -> int | None:
 
 
 def _bring_into_view(client: viser.ClientHandle, *points_W: Array) -> None:
-    """Aim a page's camera at the first of some points [m; W], unless it has all in view."""
+    """Aim a page's camera at the first of some points [m; W], unless all are in view."""
     camera = client.camera
     view = CameraView(camera.position, camera.look_at, camera.up_direction, camera.fov, camera.aspect)
     if not all(view.contains(p_W) for p_W in points_W):

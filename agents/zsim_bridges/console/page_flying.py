@@ -1,7 +1,7 @@
-"""Single drones and the plan view for the pages of one run: choose a drone, fly it, see all from above, return.
+"""Single drones and the plan view for the pages of one run: choose a drone, fly it, view all from above, return.
 
-A return to launch flies a drone back over its start, as if sent to a place on the map, and a formation, by its
-controller, over the middle of its starts; there they land. A later request ends a return.
+A return to launch flies a drone back above its start, as if sent to a place on the map, and a formation, by its
+controller, above the middle of its starts; there they land. A later request ends a return.
 """
 
 import math
@@ -37,18 +37,18 @@ from zsim_bridges.console.scene import LARGE_MAX, RunScene
 
 DIGITS = 2  # of a metre: finer than a pixel
 HEADING_DIGITS = 3  # of a radian
-ABOVE_START_M = 0.5  # over the ground, from a start: near enough to land; chosen: as large as a hull
+ABOVE_START_M = 0.5  # horizontal distance from a start, near enough to land; chosen: the size of a hull
 OVER_STARTS_M = 0.5  # of a formation from the middle of its starts
-OVERRULED_M = 1.0  # by which its goal moves away again when somebody sends it elsewhere
+OVERRULED_M = 1.0  # increase of the goal's distance that shows that it was sent elsewhere
 MIDDLE = ("x_c", "y_c")  # variables of a formation that a return sets
 
 Place = tuple[float, float]
 
 
 class PageFlying:
-    """Single drones for the pages of one run, which viser's number identifies.
+    """Single drones for the pages of one run; pages are identified by viser's number.
 
-    `note` is called with a drone or formation whose return is over, and why.
+    `note` is called with each drone or formation whose return is over, and the reason.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class PageFlying:
         self.returns = ReturnFlights(run.scenario, client, self.control, self._sight, lambda: views.clusters, note)
 
     def plan(self, client_id: int | None, whole: bool) -> dict[str, Any]:
-        """Return the view from above as plain data; `whole`: with what does not change, and the past trails."""
+        """Return the plan view as plain data; `whole`: including what does not change, and the past trails."""
         drones, chosen = self._scene.drones, self.pages.chosen(client_id)
         if drones is None:
             return {"t_s": None, "chosen": chosen}
@@ -121,7 +121,7 @@ class PageFlying:
 
 
 def surroundings(scenario: Scenario, fence: Geofence) -> dict[str, Any]:
-    """Return what does not change: drones' names, labels and colours, the fence, outlines of what stands around."""
+    """Return what does not change: names, labels and colours of drones, the fence, outlines of obstacles."""
     names = [drone.name for drone in scenario.drones]
     return {
         "names": names,
@@ -146,7 +146,7 @@ def surroundings(scenario: Scenario, fence: Geofence) -> dict[str, Any]:
 
 
 def positions(drones: DronePoses, states: Mapping[str, str]) -> list[list[Any] | None]:
-    """Return x, y, z [m; W], heading [rad] and state of each drone; None of one that is not in the view."""
+    """Return x, y, z [m; W], heading [rad] and state of each drone; None for one that is not in the view."""
     yaw = frames.heading(drones.q_WB)
     return [
         [*np.round(p_W, DIGITS).tolist(), round(float(yaw[i]), HEADING_DIGITS), states.get(drones.names[i], "")]
@@ -169,7 +169,7 @@ def formations(
 
 
 def trail_lines(trails: CanvasTrails, drones: DronePoses) -> list[list[list[float]]]:
-    """Return the trail of each drone: x and y [m; W], and when it was there [s]."""
+    """Return the trail of each drone: x and y [m; W], and time [s]."""
     segments, owners, times = trails.segments(drones.t_ns / 1e9, drones.p_W)
     points = np.round(np.column_stack((segments[:, 0, :2], times)), DIGITS)
     return [points[owners == i].tolist() for i in range(len(drones.names))]
@@ -186,8 +186,8 @@ class ReturningDrone(NamedTuple):
 
 @dataclass
 class _ReturningFormation:
-    requests: int  # made of it up to its return
-    nearest_m: float = math.inf  # how near its goal has come to the middle
+    requests: int  # number of requests to it up to its return
+    nearest_m: float = math.inf  # least distance so far of its goal from the middle
 
 
 class ReturnFlights:
@@ -217,7 +217,7 @@ class ReturnFlights:
         self._formations: dict[str, _ReturningFormation] = {}
 
     def request_drones(self, drones: Sequence[str]) -> None:
-        """Take each drone, from whoever flies it, over its start at its present height, and land it."""
+        """Take over each drone, fly it above its start at its present height, and land it."""
         for drone in drones:
             answer = self._control.take(ReturningDrone(drone), drone, over=True)
             if answer.state == "none":
@@ -227,14 +227,14 @@ class ReturnFlights:
                 self._drones.add(drone)
 
     def request_formation(self, cluster: str) -> None:
-        """Let a formation move over the middle of its starts in its present shape, and land."""
+        """Move a formation above the middle of its starts in its present shape, and land it."""
         values = dict(zip(MIDDLE, self.middles[cluster], strict=True))
         self._client.request_cluster(cluster, "target", values=values)
         with self._lock:
             self._formations[cluster] = _ReturningFormation(self._client.cluster_requests[cluster])
 
     def refused(self, cluster: str) -> None:
-        """Note that a formation was refused a request: its return is over."""
+        """Record that a request to a formation was refused: its return is over."""
         with self._lock:
             self._formations.pop(cluster, None)
 
@@ -252,11 +252,11 @@ class ReturnFlights:
                     self._formations.pop(name, None)
 
     def _continue_drone(self, drone: str) -> bool:
-        """Send a drone on its way, or land it at the end; return whether it is on its way."""
+        """Send a drone on its way, or land it at the end; return whether it is still returning."""
         key, pose = ReturningDrone(drone), self._sight_of(drone).pose
-        answer = self._control.steer(key, None)  # as a page that is still open
+        answer = self._control.steer(key, None)  # like a page that is still open
         if answer.state == "none":
-            self._note(drone, f"return of {drone} is over: {answer.text or 'it was given back'}")
+            self._note(drone, f"return of {drone} is over: {answer.text or 'it was released'}")
             return False
         if answer.state == "taking" or pose is None:
             return True
@@ -270,10 +270,10 @@ class ReturnFlights:
         return True
 
     def _continue_formation(self, name: str, returning: _ReturningFormation) -> bool:
-        """Land a formation that has come over its starts; return whether it is on its way."""
+        """Land a formation that has arrived above its starts; return whether it is still returning."""
         view = self._clusters().get(name)
         if self._client.cluster_requests[name] != returning.requests or view is None:
-            return False  # somebody has made another request
+            return False  # another request was made
         if view.phase != "engaged":
             self._note(name, f"return of {name} is over: it is {view.phase}")
             return False

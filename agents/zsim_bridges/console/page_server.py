@@ -1,7 +1,7 @@
-"""The console's HTTP server: serves the page to those who may open it, and relays between the page and viser.
+"""The console's HTTP server: serves the page to permitted clients, and relays between the page and viser.
 
-The page is viser's, with a head, tools over the scene and windows of the cameras in `frame/`; viewers see its controls
-disabled. It may also show what its run leaves behind, and copy that before the console leaves.
+The page is viser's, extended in `frame/` by a head, tools over the scene and camera windows; viewers see its controls
+disabled. It may also show the files that its run has written, and copy them before the console exits.
 """
 
 import asyncio
@@ -40,17 +40,17 @@ from zsim_bridges.web.web_server import (
 VIEW_PATH = "/view"
 MESSAGE_MAX = 100_000  # bytes of one message of a page
 BACKEND_HOST = "127.0.0.1"  # where viser listens
-PAGE_HEADER = "X-Zsim-Page"  # a page's name; pages of other sites cannot send it without permission
-CLIENT_HEADER = "X-Zsim-Client"  # the key of a page, by which viser's number of it is known
-COPIED_HEADER = "X-Zsim-Copied"  # sent once a page has what it keeps of a console that leaves
+PAGE_HEADER = "X-Zsim-Page"  # name of a page; pages of other sites cannot send it without permission
+CLIENT_HEADER = "X-Zsim-Client"  # key of a page, which maps to viser's number
+COPIED_HEADER = "X-Zsim-Copied"  # sent once a page has its copies from a console that is exiting
 SECRET_HEADER = "X-Zsim-Console"  # demanded by viser's server
 ALL_ADDRESSES = ("0.0.0.0", "::")
-PAGES_MAX = 50  # open at once, of operators and of viewers: viewers keep no operator out
-HEARTBEAT_S = 20.0  # after which a page on a machine that is gone is noticed
+PAGES_MAX = 50  # open at once, counted separately for operators and viewers, so that viewers do not exclude operators
+HEARTBEAT_S = 20.0  # after which a page on a machine that has gone is detected
 CLOSE_S = 0.3  # wall; twice at the end, for requests in progress, and for pages to close their sockets
 POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; frame-ancestors 'none'; form-action 'none'"
 HEADERS = {
-    "Content-Security-Policy": POLICY,  # the page is one file, and nothing on it comes from elsewhere
+    "Content-Security-Policy": POLICY,  # the page is one file and loads nothing from elsewhere
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
@@ -67,28 +67,28 @@ PARTS = (  # of the page, beside viser's; each part may use those before it
     "map_view.html",
     "touch.html",
 )
-LOOKED_S = 5.0  # wall; a page that has not looked for so long is closed; above GONE_MS + LOOK_MS of head_bar.html
-MTIME_S = 2.0  # by which a file's time may be too early at most: that of FAT
-POLL_S = 0.1  # wall; between two looks at whether all pages have their copies
+LOOKED_S = 5.0  # wall; without a poll for this long a page counts as closed; above GONE_MS + LOOK_MS of head_bar.html
+MTIME_S = 2.0  # greatest amount by which a file's time may be too early: the resolution of FAT
+POLL_S = 0.1  # wall; between two checks whether all pages have their copies
 LOOKS_MAX = 200  # pages remembered: more than may be open, 50 of operators and 50 of viewers
 
 
 class ListenAddress(NamedTuple):
-    """Where pages are served; `or_any`: on another port if this one is taken."""
+    """The address where pages are served; `or_any`: on another port if this one is taken."""
 
     host: str
     port: int
     or_any: bool = False
 
     def url(self, path: str = "/", token: str | None = None) -> str:
-        """Return the URL of a page; by the name of this machine if it listens on all addresses."""
+        """Return the URL of a page, with the name of this machine if it listens on all addresses."""
         host = socket.gethostname() if self.host in ALL_ADDRESSES else self.host
         query = f"?token={quote(token, safe='')}" if token else ""
         return f"http://{url_host(host)}:{self.port}{path}{query}"
 
 
 class RunFiles:
-    """The report and the record of one run; files older than this object are of another run.
+    """The report and the record of one run; files older than this object belong to another run.
 
     Args:
         folder: of the run; None where it is unknown.
@@ -101,11 +101,11 @@ class RunFiles:
         whole = folder and folder.absolute()
         self.paths = {"report": whole / "report.html", "record": whole / RECORD} if whole else {}
         self._since_s = time.time()
-        self._looked_s: dict[str, float] = {}  # when pages without copies last looked [s; monotonic], by their names
+        self._looked_s: dict[str, float] = {}  # when pages without copies last polled [s; monotonic], by their names
         self._leaves = False
 
     def shown(self, page: str, has_copies: bool) -> dict[str, Any]:
-        """Return what a page, empty where none asks, shows of them; `has_copies`: of all that it wants to keep."""
+        """Return the files for a page (empty: no page asks); `has_copies`: it has all that it wants to keep."""
         self._looked_s.pop(page, None)
         if page and not has_copies:
             while len(self._looked_s) >= LOOKS_MAX:
@@ -115,7 +115,7 @@ class RunFiles:
         return {"files": files, "leaves": self._leaves}
 
     def offer(self, within_s: float, deserted: Callable[[], bool]) -> None:
-        """Tell pages to copy the files, since the console leaves; wait until all open ones have, unless deserted."""
+        """Tell pages to copy the files, since the console exits; wait until all open ones have, unless deserted."""
         self._leaves = True
         until_s = time.monotonic() + within_s
         while (now_s := time.monotonic()) < until_s and not deserted():
@@ -134,7 +134,7 @@ class RunFiles:
 
 
 class ViserBackend(NamedTuple):
-    """What is behind the HTTP server; sockets are served until they close."""
+    """The services behind the HTTP server; sockets are served until they close."""
 
     port: int  # of viser, on BACKEND_HOST
     secret: str  # demanded by viser in SECRET_HEADER
@@ -149,10 +149,10 @@ class ViserBackend(NamedTuple):
 
 
 class HttpProxy:
-    """One server of pages; `token` is that of operators, None where only this machine can connect.
+    """The server of the pages; `token` is that of operators, None where only this machine can connect.
 
     Raises:
-        RunError: others could reach it, and there is no token.
+        RunError: other machines could reach it, and there is no token.
     """
 
     def __init__(self, address: ListenAddress, token: str | None, backend: ViserBackend) -> None:
@@ -162,7 +162,7 @@ class HttpProxy:
         self._tokens = self._tokens_at(address)
         self._backend = backend
         self._pages = {OPERATOR: _page(), VIEWER: _page("viewer.html")}
-        self._open_pages: Counter[str] = Counter()  # sockets, by what they are for
+        self._open_pages: Counter[str] = Counter()  # sockets, by purpose
         self._loop = asyncio.new_event_loop()
         self._client: ClientSession | None = None
 
@@ -175,7 +175,7 @@ class HttpProxy:
 
     @contextmanager
     def open(self) -> Iterator[None]:
-        """Serve pages on a thread; a RunError says that the port is taken, or the address is not of this machine."""
+        """Serve pages on a thread; raise RunError if the port is taken or the address is not of this machine."""
         with open_on_thread(self._loop, "console server", self._open, self._close):
             yield
 
@@ -192,7 +192,7 @@ class HttpProxy:
             site = await start_site(app, host, (port, ANY_PORT) if or_any else (port,), shutdown_s=CLOSE_S)
         except OSError as error:
             reason = f"cannot listen on {host}, port {port} ({error.strerror})"
-            raise RunError(f"console: {reason}; say --port") from error
+            raise RunError(f"console: {reason}; give --port") from error
         self._address = self._address._replace(port=site.port)
         self._tokens = self._tokens_at(self._address)
         self._client = ClientSession()
@@ -212,7 +212,7 @@ class HttpProxy:
         if role is None:
             return _missing_token()
         if page_request.token:
-            # The token moves into a cookie; a reverse proxy may serve the page below a path of its own.
+            # The token moves into a cookie; a reverse proxy may serve the page below another path.
             response = web.Response(status=303, headers={**HEADERS, "Location": f".{page_request.path}"})
             shown = self._tokens.role_of_address(page_request)
             if shown is not None:
@@ -238,7 +238,7 @@ class HttpProxy:
         return _json_response({**self._backend.head(), **files})
 
     async def _file(self, path: Path, request: web.Request) -> web.StreamResponse:
-        """Serve what a run left behind: a page to be read, or a file to be kept."""
+        """Serve a file of the run: a page to display, or a file to download."""
         if self._role_of(request) is None:
             return _missing_token()
         if self._backend.files.size_bytes(path) is None:
@@ -247,7 +247,7 @@ class HttpProxy:
         return web.FileResponse(path, headers={**HEADERS, **kept})
 
     async def _command(self, request: web.Request) -> web.Response:
-        """Take an order of an operator; viewers have no such path."""
+        """Process an order of an operator; viewers have no such path."""
         if self._role_of(request) != OPERATOR:
             return _missing_token()
         try:
@@ -361,7 +361,7 @@ class PageTokens:
         operator, viewer: tokens; the first is None where only this machine can connect.
 
     Raises:
-        RunError: others could reach it, and there is no token.
+        RunError: other machines could reach it, and there is no token.
     """
 
     def __init__(self, listen: str, port: int, operator: str | None, viewer: str) -> None:
@@ -391,7 +391,7 @@ class PageTokens:
         return None
 
     def role_of_address(self, request: PageRequest) -> str | None:
-        """Return the role whose token stands in the address, to become a cookie; None if none does."""
+        """Return the role whose token is in the address, to be set as a cookie; None if there is none."""
         roles = (role for role in (OPERATOR, VIEWER) if self._is_token(request.token, role))
         return next(roles, None) if request.token else None
 

@@ -1,7 +1,7 @@
-"""The sockets of the console's own that a page opens: one for what it does, one for pictures of the drones' cameras.
+"""The console's own sockets, opened by a page: one for actions, one for pictures of the drones' cameras.
 
-Pictures have a socket of their own, since a megabyte of them on a slow link must not delay the answers to a stick. Both
-end when a page says what no page of ours would. Viewers look and choose; operators also fly and play a record.
+Pictures have a separate socket, since a megabyte of them on a slow link must not delay the answers to a stick. Both
+are closed on an invalid message. Viewers look and choose; operators also fly and play a record.
 """
 
 import asyncio
@@ -21,8 +21,8 @@ from zsim_bridges.console.time_monitor import RecordPlayer
 
 ACTION_MAX = 2_000  # bytes
 NAME_MAX = 64  # characters of the name of a drone or camera, or of a page's key
-PLACE_MAX_M = 1e5  # of a place on the plan view; the fence is far nearer
-SPEED_MAX_M_S = 100.0  # of a stick; the drones' own limits are far lower
+PLACE_MAX_M = 1e5  # of a place on the plan view; the fence is much nearer
+SPEED_MAX_M_S = 100.0  # of a stick; the drones' own limits are much lower
 PERIOD_S = 0.1  # wall, from one picture of a camera to the next, at least
 WANTED_MAX = 16  # pictures on one page
 REQUEST_MAX = 10_000  # bytes
@@ -37,7 +37,7 @@ class _Action(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do"):
 
 
 class LookFrom(_Action, frozen=True, tag="look"):
-    """Let the page's camera follow the formation or not, keep all of it in view or not, and look from a direction."""
+    """Set whether the page's camera follows the formation and keeps all of it in view, and look from a direction."""
 
     page: Name
     follows: bool
@@ -46,7 +46,7 @@ class LookFrom(_Action, frozen=True, tag="look"):
 
 
 class LookAtPlan(_Action, frozen=True, tag="plan"):
-    """Request the view from above; `whole`: with what does not change."""
+    """Request the plan view; `whole`: including what does not change."""
 
     page: Name
     whole: bool = False
@@ -67,7 +67,7 @@ class SelectDrone(_Action, frozen=True, tag="select"):
 
 
 class PlayRecord(_Action, frozen=True, tag="play"):
-    """Let a replay continue from an instant, pause, resume, step, or change its rate; of operators only."""
+    """Let a replay continue from an instant, pause, resume, step, or change its rate; for operators only."""
 
     op: Literal["seek", "pause", "resume", "step", "rate"]
     value: Annotated[float, Meta(ge=0.0, le=1e9)] = 1.0
@@ -75,9 +75,9 @@ class PlayRecord(_Action, frozen=True, tag="play"):
 
 
 class TakeDrone(_Action, frozen=True, tag="take"):
-    """Take a drone to fly it; `over`: even from whoever flies it; of operators only, as all below.
+    """Take a drone to fly it; `over`: even from its present commander; for operators only, like all below.
 
-    To be repeated until it is answered; requests with the same `id` are carried out once.
+    The page repeats it until it is answered; requests with the same `id` are carried out once.
     """
 
     drone: Name
@@ -86,7 +86,7 @@ class TakeDrone(_Action, frozen=True, tag="take"):
 
 
 class SteerDrone(_Action, frozen=True, tag="steer"):
-    """Fly the drone that was taken, or let it hover if not `held`; to be repeated, since a silent page does not fly."""
+    """Fly the taken drone, or let it hover if not `held`; to be repeated, since a silent page does not fly."""
 
     held: bool = False
     forward: Deflection = 0.0
@@ -97,9 +97,9 @@ class SteerDrone(_Action, frozen=True, tag="steer"):
 
 
 class GoToPlace(_Action, frozen=True, tag="go"):
-    """Send the drone that was taken to a place, at its present height unless `z_m` is given.
+    """Send the taken drone to a place, at its present height unless `z_m` is given.
 
-    `then`: after the places to which it flies already.
+    `then`: append the place to the present destinations.
     """
 
     x_m: Metres
@@ -109,7 +109,7 @@ class GoToPlace(_Action, frozen=True, tag="go"):
 
 
 class LeaveDrone(_Action, frozen=True, tag="leave"):
-    """Give the drone back."""
+    """Release the drone."""
 
 
 _Look = LookFrom | LookAtPlan | ChooseDrone | SelectDrone
@@ -118,9 +118,9 @@ _ACTIONS = msgspec.json.Decoder(_Look | _Operate)
 
 
 class ActionSockets:
-    """The sockets for actions of all pages.
+    """The action sockets of all pages.
 
-    `record` returns what a replay plays, and `flying` what pages may do with single drones, None without a run.
+    `record` returns the control of a replay, and `flying` that of single drones; None without a run.
     """
 
     def __init__(
@@ -146,21 +146,21 @@ class ActionSockets:
                 if answer:
                     await socket.send_bytes(msgspec.json.encode(answer))
         except ConnectionError:
-            pass  # the page has gone while it was answered
+            pass  # the page closed while it was answered
         finally:
             self.lose(socket)
         await socket.close()
         return socket
 
     def lose(self, page: Any) -> None:
-        """Note that a page's socket is closed: the drone that it flies hovers."""
+        """Record that a page's socket is closed: the drone that it flies hovers."""
         self._keys.pop(page, None)
         flying = self._flying()
         if flying is not None:
             flying.control.lose(page)
 
     def act(self, text: str, role: str, page: Any = None) -> dict[str, Any] | None:
-        """Carry out an action, as JSON, of a page in a role; return the answer, None for what is not permitted.
+        """Carry out an action, given as JSON, of a page in a role; return the answer, None if it is not permitted.
 
         `page` identifies the page that flies a drone.
         """
@@ -216,7 +216,7 @@ class ActionSockets:
 
 
 class PicturesRequest(Struct, frozen=True, forbid_unknown_fields=True):
-    """What a page requests; each request also confirms that it has shown what it was sent before."""
+    """A page's request; each also confirms that the page has shown what it was sent before."""
 
     page: Name = ""
     want: Annotated[tuple[Name, ...], Meta(max_length=WANTED_MAX)] = ()
@@ -228,7 +228,7 @@ _PICTURES = msgspec.json.Decoder(PicturesRequest)
 
 
 class PageBatches:
-    """What one page is sent: all changes of the cameras that it wants, in one message.
+    """The messages to one page: all changes of the cameras that it requested, in one message.
 
     A message is the length of its header (4 bytes, big-endian), the header as JSON, and the JPEGs one after the other.
     The header has `cameras` (name, width, height; null if unchanged), `pictures` (camera, size [bytes; 0: unchanged],
@@ -266,7 +266,7 @@ class PageBatches:
 
 
 class CameraSockets:
-    """The sockets for pictures of all pages; `feed` returns the cameras of the run that is shown, None without one."""
+    """The picture sockets of all pages; `feed` returns the cameras of the run that is shown, None without one."""
 
     def __init__(self, feed: Callable[[], CameraFeed | None], cameras: PageCameras) -> None:
         self._feed = feed
@@ -281,9 +281,9 @@ class CameraSockets:
         return socket
 
     async def serve(self, socket: web.WebSocketResponse) -> None:
-        """Send pictures until the page closes its socket, or sends what is no request.
+        """Send pictures until the page closes its socket or sends an invalid request.
 
-        Only changes are sent, PERIOD_S apart at least, and none before the page has shown the previous ones.
+        Only changes are sent, at least PERIOD_S apart, and none before the page has shown the previous ones.
         """
         wanted, ready = PicturesRequest(), asyncio.Event()
 

@@ -21,20 +21,20 @@ from zsim_agents.references.flight import FlightError, flight_of
 
 Array = NDArray[np.float64]
 
-ROTOR_SLOWDOWN = 50.0  # at 10 pictures/s the fastest turn by 57 degrees, so they do not seem to turn backwards
+ROTOR_SLOWDOWN = 50.0  # at 10 pictures/s the fastest turn by 57 degrees, so they do not appear to turn backwards
 SIGMAS = 2.0  # of an ellipsoid
 SHARE_WITHIN = 1 - math.erfc(SIGMAS / math.sqrt(2)) - math.sqrt(2 / math.pi) * SIGMAS * math.exp(-(SIGMAS**2) / 2)
 """Of a Gaussian in three dimensions, within 2 sigma: chi-squared of three degrees of freedom at 4, 0.739."""
-RADIUS_MAX_M = 60.0  # of an ellipsoid: one of before the first fix would enclose the viewer
+RADIUS_MAX_M = 60.0  # of an ellipsoid; before the first fix it would enclose the viewer
 PATH_POINTS = 120  # of a part of a drone's reference: smooth at the size of a page
 SHAPED_PHASES = frozenset({"assembling", "engaged", "held"})  # phases in which a formation has a desired shape
-CORNER_SHARE = 0.25  # of the way from a corner to the opposite side; where its angle is written, clear of names
+CORNER_SHARE = 0.25  # of the way from a corner to the opposite side: position of its angle's label, clear of names
 CLICK_RAD = 0.012  # half the angle within which a click hits a small, far drone; chosen: about five pixels
 SIDES = {"p": (0, 1), "q": (0, 2)}  # robots at their ends; docs/conventions.md
 
 
 class DronePoses(NamedTuple):
-    """N drones at one instant, those of a run in its order."""
+    """The N drones of a run, in its order, at one instant."""
 
     t_ns: int
     names: tuple[str, ...]
@@ -75,7 +75,7 @@ class FormationShape(NamedTuple):
 
 
 def drone_poses(view: ViewDrones, names: Sequence[str]) -> DronePoses:
-    """Return a view as arrays over the drones of those names; a replay's view may lack some of them."""
+    """Return a view as arrays over the named drones; a replay's view may lack some of them."""
     count = len(names)
     p_W, q_WB = np.full((count, 3), np.nan), np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
     rotor = np.zeros((count, ROTORS_MAX))
@@ -90,7 +90,7 @@ def drone_poses(view: ViewDrones, names: Sequence[str]) -> DronePoses:
 
 
 def radio_lines(hears: Sequence[Sequence[int]], drones: DronePoses) -> tuple[Array, Array]:
-    """Return the ends (n, 2, 3) [m] of the links between drones that are there: those both ways, and those one way."""
+    """Return the ends (n, 2, 3) [m] of the links between visible drones: the bidirectional and the one-way ones."""
     there = drones.present
     links = {(i, j) for i, heard in enumerate(hears) for j in heard if max(i, j) < len(there) and there[i] and there[j]}
     both = sorted((i, j) for i, j in links if i < j and (j, i) in links)
@@ -102,7 +102,7 @@ def radio_lines(hears: Sequence[Sequence[int]], drones: DronePoses) -> tuple[Arr
 def drone_on_ray(
     drones: DronePoses, radii_m: Array, origin_W: Sequence[float], direction_W: Sequence[float]
 ) -> str | None:
-    """Return the drone hit by a ray, of several the one whose centre is nearest to it; None where it hits none.
+    """Return the drone hit by a ray, of several the one whose centre is nearest to the ray; None if it hits none.
 
     Args:
         drones: N of them.
@@ -121,7 +121,7 @@ def drone_on_ray(
 
 
 def short_names(names: Sequence[str]) -> list[str]:
-    """Return names without the letters that all begin with; in full where one would be empty."""
+    """Return names without their common prefix; in full if one would become empty."""
     alike = takewhile(lambda column: len(set(column)) == 1 and not column[0].isdigit(), zip(*names, strict=False))
     stem = len(list(alike))
     short = [name[stem:] for name in names]
@@ -166,7 +166,7 @@ def reference_lines(scenario: Scenario) -> Array:
         try:
             legs = flight_of(scenario, drone).legs
         except FlightError:
-            continue  # its pilot says so
+            continue  # demanded by its pilot
         for leg in legs:
             length_s = leg.path.duration_s
             end_s = scenario.duration_s - leg.start_s if length_s is None else length_s
@@ -177,7 +177,7 @@ def reference_lines(scenario: Scenario) -> Array:
 
 
 def ghosts(space: ClusterSpace, view: ViewCluster) -> tuple[Array, Array] | None:
-    """Return the desired positions (n, 3) and quaternions (n, 4) of a formation's robots, None where there are none."""
+    """Return the desired positions (n, 3) and quaternions (n, 4) of a formation's robots, None if it has none."""
     if view.phase not in SHAPED_PHASES:
         return None
     try:
@@ -209,21 +209,21 @@ def formation_shape(space: ClusterSpace, p_W: Array, yaw: Array) -> FormationSha
 
 # What a formation would fly
 
-POINTS = 121  # of a way; chosen: a curve in 3-D looks smooth
-WAY_SHARE = 0.25  # of them on the way to the start of a trajectory
+POINTS = 121  # of a path; chosen so that a curve in 3-D looks smooth
+WAY_SHARE = 0.25  # of these, on the way to the start of a trajectory
 ENDLESS_S = 120.0  # simulated; how much of a trajectory without an end is shown
 
 
 class PreviewError(ValueError):
-    """A request that cannot be flown from where the formation is."""
+    """A request that cannot be flown from the formation's present state."""
 
 
 class FlightPreview(NamedTuple):
-    """Ways of n drones.
+    """The paths of n drones.
 
     Attributes:
         paths_W: (n, M, 3) m, from where they are desired now.
-        text: figures of the ways.
+        text: figures of the paths.
     """
 
     paths_W: Array
@@ -231,7 +231,7 @@ class FlightPreview(NamedTuple):
 
 
 def preview_of(space: ClusterSpace, op: str, args: Mapping[str, Any], base: Array, apart_min_m: float) -> FlightPreview:
-    """Return the ways of a `target` or `trajectory`; the controller may still refuse it, or fly it slower.
+    """Return the paths of a `target` or `trajectory`; the controller may still refuse it, or fly it slower.
 
     Args:
         op, args: of the request, as sent.
@@ -266,8 +266,8 @@ def preview_of(space: ClusterSpace, op: str, args: Mapping[str, Any], base: Arra
         figures.append(f"{steps_m.max() * (POINTS - 1) / span_s:.1f} m/s at most")
     pairs = combinations(flown_W, 2)
     apart_m = min((float(np.linalg.norm(a - b, axis=1).min()) for a, b in pairs), default=math.inf)
-    too_near = f", less than the {apart_min_m:g} m that the controller asks for" if apart_m < apart_min_m else ""
-    return FlightPreview(paths_W, "; ".join([*figures, f"drones {apart_m:.1f} m apart at least{too_near}"]))
+    too_near = f", less than the {apart_min_m:g} m that the controller requires" if apart_m < apart_min_m else ""
+    return FlightPreview(paths_W, "; ".join([*figures, f"drones {apart_m:.1f} m apart or more{too_near}"]))
 
 
 def _way(space: ClusterSpace, start: Array, goal: Array, count: int) -> Array:

@@ -1,6 +1,6 @@
-"""viser's server, reachable through the console's own HTTP server alone, and which messages of pages may reach it.
+"""viser's server, reachable only through the console's HTTP server, and a filter of the messages of pages to it.
 
-This is the only file that uses internals of viser 1.1 and websockets, which have no public way to
+This is the only file that uses internals of viser 1.1 and websockets, which have no public interface to
 - refuse connections without a secret (`_requiring_secret`),
 - refuse one page the use of a control that all pages share (`_guard_controls`),
 - find a control by its id, or the id of a control (`control_ids`, `control_id`, `PageControls`),
@@ -33,7 +33,7 @@ from zsim_bridges.console.page_server import BACKEND_HOST, MESSAGE_MAX, OPERATOR
 
 NAME_MAX = 64  # characters of a key that modifies a click
 VALUE_MAX = 2_000  # characters of a control's text: expressions of twelve variables, a line each
-EXACT_MAX = 2**53  # a page's numbers are exact up to it; a larger one fits no message
+EXACT_MAX = 2**53  # a page's numbers are exact up to it; a larger one does not fit any message
 
 Value = bool | message.Number | Annotated[str, Meta(max_length=VALUE_MAX)]
 Permits = Callable[[int, str], bool]
@@ -47,7 +47,7 @@ class AnyThreadEvent(asyncio.Event):
     """
 
     def set(self) -> None:
-        """Set it; on the loop, wake the waiters even if another thread has set it before."""
+        """Set the event; on the loop, wake the waiters even if another thread has already set it."""
         if asyncio._get_running_loop() is None:
             self._value = True
         else:
@@ -61,7 +61,7 @@ class Buffer(AsyncMessageBuffer):
     def __init__(self, *args: Any, **more: Any) -> None:
         super().__init__(*args, **more)
         self.message_event = AnyThreadEvent()
-        self._warned_push_after_done = True  # a page may close while a picture is drawn for it
+        self._warned_push_after_done = True  # a page may close while a picture is being drawn for it
 
 
 viser.infra._infra.AsyncMessageBuffer = Buffer  # type: ignore[misc]
@@ -70,7 +70,7 @@ viser.infra._infra.AsyncMessageBuffer = Buffer  # type: ignore[misc]
 class PrivateViser:
     """A viser server on a port of loopback that refuses connections without a secret in SECRET_HEADER.
 
-    A use that is not permitted changes nothing, and its page shows the previous value again.
+    A control used without permission changes nothing, and its page shows the previous value again.
     """
 
     def __init__(self, permits: Permits = lambda *_: True) -> None:
@@ -84,7 +84,7 @@ class PrivateViser:
         return self.server.get_port()
 
     def close(self) -> None:
-        """Stop it, without the address that viser prints."""
+        """Stop the server, without printing an address as viser does."""
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
@@ -108,7 +108,7 @@ def _guard_controls(server: viser.ViserServer, permits: Permits) -> None:
 
 @contextlib.contextmanager
 def _requiring_secret(secret: str) -> Iterator[None]:
-    """Let servers that are started meanwhile refuse connections without the secret."""
+    """Let servers started in this context refuse connections without the secret."""
     serve = websockets.asyncio.server.serve
 
     def serve_checked(*args: Any, process_request: Callable[..., Any] | None = None, **more: Any) -> Any:
@@ -131,12 +131,12 @@ def control_ids(gui: viser.GuiApi) -> frozenset[str]:
 
 
 def control_id(control: Any) -> str:
-    """Return the id of one of viser's controls; empty for other ones."""
+    """Return the id of a control of viser; empty for other controls."""
     return control._impl.uuid if hasattr(control, "_impl") else ""
 
 
 def show_jpeg(frustum: Any, data: bytes) -> None:
-    """Show a JPEG on a camera's frustum as it is; viser would decode and encode it again."""
+    """Show a JPEG on a camera's frustum unchanged; viser would decode and re-encode it."""
     if getattr(frustum, "_format", "") != "jpeg":
         frustum._format = "jpeg"
     frustum._image_data = data
@@ -146,7 +146,7 @@ def show_jpeg(frustum: Any, data: bytes) -> None:
 
 
 class ViewerCamera(Struct, tag_field="type", tag="ViewerCameraMessage"):
-    """Every page sends where its camera is."""
+    """The pose of a page's camera, sent by every page."""
 
     wxyz: flight_messages.Quaternion
     position: message.Vector3
@@ -160,10 +160,10 @@ class ViewerCamera(Struct, tag_field="type", tag="ViewerCameraMessage"):
 
 
 class ControlUpdate(Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unknown_fields=True):
-    """A page sends this when somebody uses a control."""
+    """The use of a control."""
 
     class Updates(Struct, forbid_unknown_fields=True):
-        """Only the value of a control."""
+        """The value of a control."""
 
         value: Value
 
@@ -172,7 +172,7 @@ class ControlUpdate(Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unk
 
 
 class SceneClick(Struct, tag_field="type", tag="ScenePointerMessage"):
-    """A page sends this when somebody clicks into the scene; only the ray is used."""
+    """A click into the scene; only the ray is used."""
 
     event_type: Literal["click"]
     ray_origin: message.Vector3
@@ -182,18 +182,18 @@ class SceneClick(Struct, tag_field="type", tag="ScenePointerMessage"):
 
 
 _DECODER = msgspec.msgpack.Decoder(ViewerCamera | ControlUpdate | SceneClick)
-"""All other messages are refused, such as those to share the page on the Internet, or to upload files."""
+"""All other messages are refused, such as those that share the page on the Internet or upload files."""
 
 
 class PageControls:
-    """The controls known to viser: those of all pages, and of each of the open `pages`."""
+    """The controls known to viser: those shared by all pages, and those of each of the open `pages`."""
 
     def __init__(self, gui: viser.GuiApi, pages: Callable[[], Sequence[viser.GuiApi]] = tuple) -> None:
         self._gui = gui
         self._pages = pages
 
     def accepts(self, uuid: str, value: Value) -> bool:
-        """Return whether a control accepts such a value, which viser would fail to convert otherwise."""
+        """Return whether a control accepts a value; viser would fail to convert an invalid one."""
         found = (gui._gui_input_handle_from_uuid.get(uuid) for gui in (self._gui, *self._pages()))
         handle: Any = next((each for each in found if each is not None), None)
         if handle is None or getattr(handle, "disabled", False):

@@ -1,6 +1,6 @@
-"""The condition of the run that pages show: its head, checks before a take-off, and what would be refused. Pure.
+"""The condition of the run that pages show: its head, checks before a take-off, and refusals. Pure.
 
-A control of a page is greyed out with the reason for which its request would be refused; an empty reason means that the
+A control of a page is disabled with the reason for which its request would be refused; an empty reason means that the
 request would be accepted.
 """
 
@@ -24,18 +24,18 @@ from zsim_agents.formation.flight_check import (
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.alarms import BATTERY_EMPTY_PERCENT, BATTERY_LOW_PERCENT, LATE_MS, DroneCondition
 
-TILT_MAX_DEG = 30.0  # of a drone that takes off; chosen: steeper than any ground, far less than its side or back
+TILT_MAX_DEG = 30.0  # of a drone that takes off; chosen: more than any slope, much less than on its side
 LINK_SILENT_S = 3.0  # wall; drivers publish the state of a link once a second
 LIMITS = EngagementLimits()  # of a formation's controller that lets its drones take off
 AT_END = "the record is at its end; go back on the timeline"
 WAITING_SHOWN = 4  # processes that are named
-STANDS_S = 2.0  # wall; a running world that waits for longer appears to stand still
+STANDS_S = 2.0  # wall; a running world that waits for longer appears to have stopped
 NO_RUN = {"t_s": 0.0, "replay": False, "age_s": 0.0, "alarms": []}
 Level = Literal["no run", "waiting", "running", "paused", "emergency", "silent", "ended"]
 
 
 class ShownRun(NamedTuple):
-    """What does not change of the run that pages show; cluster spaces by formation."""
+    """The constant properties of the run that pages show; cluster spaces by formation."""
 
     info: Info
     scenario: Scenario
@@ -72,7 +72,7 @@ class Check(NamedTuple):
     name: str  # what is checked
     text: str  # figures, with what is allowed where the check fails
     ok: bool = True
-    blocks: bool = False  # whether no take-off is offered where it fails
+    blocks: bool = False  # whether a failure disables the take-off
 
 
 def preflight_checks(drone: DroneCondition, in_formation: bool, foreign: str = "") -> tuple[Check, ...]:
@@ -80,7 +80,7 @@ def preflight_checks(drone: DroneCondition, in_formation: bool, foreign: str = "
 
     Args:
         in_formation: whether a controller flies it, which needs its estimator.
-        foreign: who flies it, if neither this console nor its formation's controller; otherwise empty.
+        foreign: its commander, if neither this console nor its formation's controller; otherwise empty.
     """
     percent, tilt_deg = drone.battery_percent, drone.tilt_deg or 0.0
     checks = []
@@ -98,7 +98,7 @@ def preflight_checks(drone: DroneCondition, in_formation: bool, foreign: str = "
 
     sigma_m, yaw_deg, yaw_max_deg = drone.sigma_m, drone.yaw_sigma_deg or 0.0, math.degrees(LIMITS.yaw_sigma_max_rad)
     if sigma_m is None:
-        checks.append(Check("estimator", "no estimate of the present", False, in_formation))
+        checks.append(Check("estimator", "no current estimate", False, in_formation))
     elif sigma_m > LIMITS.sigma_max_m:
         text = f"σ of position is {sigma_m:.1f} m; must be {LIMITS.sigma_max_m:g} m or less"
         checks.append(Check("estimator", text, False, in_formation))
@@ -112,29 +112,29 @@ def preflight_checks(drone: DroneCondition, in_formation: bool, foreign: str = "
 
     link, link_age_s = drone.link_state, drone.link_age_s
     if not drone.is_external:
-        pass  # it has no driver, whatever somebody publishes as its link
+        pass  # it has no driver, whatever is published as its link
     elif link is None or link_age_s is None:
         checks.append(Check("link", "no driver yet", False, True))
     elif link_age_s > LINK_SILENT_S:
         checks.append(Check("link", f"its driver has been silent for {link_age_s:.0f} s", False, True))
     else:
         checks.append(Check("link", link, link in ("connected", "armed"), blocks=True))
-    text = f"flown by {foreign}; must be given back" if foreign else drone.commander or "free"
+    text = f"flown by {foreign}; must be released" if foreign else drone.commander or "free"
     return *checks, Check("control", text, not foreign, blocks=in_formation)
 
 
 class RunCondition(NamedTuple):
-    """What the controls of a page depend on."""
+    """The condition on which the controls of a page depend."""
 
     clock: str | None = None  # state of the run's clock; None before the first answer
-    silent_s: float = 0.0  # for how long the world has not answered [wall]; 0 while it does
+    silent_s: float = 0.0  # how long the world has not answered [wall]; 0 while it answers
     ended: str = ""  # why the run is over; empty while it goes on
     replayed: bool = False  # whether it is a replay, in which nothing can be flown
-    at_end: bool = False  # whether that stands at the end of its record
+    at_end: bool = False  # whether the replay is at the end of its record
     drones: Mapping[str, str] = {}  # state by name of the drones seen so far
     phases: Mapping[str, tuple[str, str]] = {}  # phase and reason of each formation by name
     members: Mapping[str, Collection[str]] = {}  # names of the drones of each formation
-    checks: Mapping[str, tuple[Check, ...]] = {}  # of each drone before a take-off, as far as known
+    checks: Mapping[str, tuple[Check, ...]] = {}  # checks of each drone before a take-off, as far as known
 
     @property
     def level(self) -> Level:
@@ -155,7 +155,7 @@ class RunCondition(NamedTuple):
         return self.off() or ("a record is played back" if self.replayed else "")
 
     def all_down(self, names: Collection[str] | None = None) -> bool:
-        """Return whether all drones seen so far, or those of some names, are on the ground."""
+        """Return whether all drones seen so far, or the named ones, are on the ground."""
         return DOWN.issuperset(state for name, state in self.drones.items() if names is None or name in names)
 
 
@@ -173,10 +173,10 @@ def run_refusals(run: RunCondition) -> dict[str, str]:
 def drone_refusals(run: RunCondition, drone: str) -> dict[str, str]:
     state = run.drones.get(drone)
     modes = ("takeoff", "land", "return", "emergency", "reset")
-    unseen = run.grounded() or ("" if state else f"{drone} was not seen yet")
+    unseen = run.grounded() or ("" if state else f"{drone} has not been seen yet")
     refused = {mode: unseen or state_refusal(drone, state or "", mode) or "" for mode in modes}
     refused["takeoff"] = refused["takeoff"] or preflight_refusal(run, [drone])
-    return {**refused, "emergency": run.grounded()}  # always offered: the state shown may be older than the real one
+    return {**refused, "emergency": run.grounded()}  # always enabled: the state shown may be outdated
 
 
 def preflight_refusal(run: RunCondition, drones: Collection[str]) -> str:
@@ -189,14 +189,14 @@ def preflight_refusal(run: RunCondition, drones: Collection[str]) -> str:
 
 
 def is_held_by_fault(run: RunCondition, cluster: str) -> bool:
-    """Return whether a formation is held, and not on request."""
+    """Return whether a formation is held by a fault rather than on request."""
     phase, reason = run.phases.get(cluster, ("", ""))
     on_request = any(note in reason for note in (HELD_ON_REQUEST, GUARD_PARTS)) and REJOINING not in reason
     return phase == "held" and not on_request
 
 
 def formation_refusals(run: RunCondition, cluster: str) -> dict[str, str]:
-    """Return why each operation of a formation would be refused, as far as its phase says."""
+    """Return why each operation of a formation would be refused, as far as its phase determines it."""
     phase, reason = run.phases.get(cluster, ("", ""))
     off = run.grounded() or ("" if phase else f"{cluster} has no controller yet")
     flown = "" if phase == "engaged" else f"{cluster} is {_words(phase)}, not engaged"
@@ -229,7 +229,7 @@ def formation_refusals(run: RunCondition, cluster: str) -> dict[str, str]:
 
 
 def _takeoff_refusal(run: RunCondition, cluster: str, phase: str) -> str:
-    """Return why a formation would not take off, which starts with drones that are landed or in the air."""
+    """Return why a formation would not take off; its drones must be landed or in the air."""
     members = run.members.get(cluster, ())
     if phase != "idle":
         idle_first = "; Land makes it idle" if phase == "held" and run.all_down(members) else ""
@@ -249,7 +249,7 @@ def _reset_first(stopped: Sequence[str]) -> str:
 
 
 def fleet_refusals(run: RunCondition, single: Collection[str] = ()) -> dict[str, str]:
-    """Return why each operation on all drones would do nothing; `single` are the drones of no formation."""
+    """Return why each operation on all drones would have no effect; `single` are the drones without a formation."""
     off = run.grounded()
     in_air = not run.all_down() or any(phase not in ("idle", "landing") for phase, _ in run.phases.values())
     in_emergency = "emergency" in run.drones.values()
@@ -291,8 +291,8 @@ def page_head(
     Args:
         t_ns: simulated time of what is shown.
         alarms: as `AlarmBoard.rows`.
-        single: drones of no formation.
-        world: where the run is, in words.
+        single: drones without a formation.
+        world: description of where the run is.
         record_s: of a replay, times of the first and the last gate on record [s].
     """
     stands = clock is not None and any(each.since_wall_s > STANDS_S for each in clock.waiting_for)
@@ -302,7 +302,7 @@ def page_head(
         title, detail = f"run over at {t_s:.1f} s", run.ended
     elif run.level == "silent":
         title = f"no answer from the world for {run.silent_s:.0f} s"
-        detail = f"what is shown is of {t_s:.1f} s, and may be over"
+        detail = f"the display is as of {t_s:.1f} s and may be outdated"
     else:
         state = "waiting" if run.clock == "running" and stands else run.clock or "no clock yet"
         pace = f" × {clock.rate:.1f}" if clock is not None and state == "running" else ""
@@ -325,8 +325,8 @@ def no_run_head(world: str, ended: str = "") -> dict[str, Any]:
     """Return the head of a page without a run.
 
     Args:
-        world: where one is looked for, in words.
-        ended: why the launcher's run was over before the console had found it.
+        world: description of where a run is searched for.
+        ended: why the launcher's run ended before the console had found it.
     """
     reason = f"the run is over: {ended}" if ended else "there is no run yet"
     level, title, detail = ("ended", "run over", ended) if ended else ("waiting", "waiting for a world", world)
@@ -335,7 +335,7 @@ def no_run_head(world: str, ended: str = "") -> dict[str, Any]:
 
 
 def _waiting(clock: Clock | None, world: str) -> str:
-    """Return which processes hold up the world, and where absent ones are expected."""
+    """Describe which processes the world is waiting for, and where absent ones are expected."""
     if clock is None:
         return "waiting for the world's clock"
     late = holding_up(clock.state, clock.waiting_for)

@@ -25,28 +25,28 @@ from zsim_bridges.console.run_condition import (
 )
 
 REASON_STYLE = "font-size:11px;line-height:1.3;color:#868e96;padding:0 10px 10px;overflow-wrap:anywhere"
-"""The row of tabs below begins 9 px above the end of the text."""
+"""Padding for the row of tabs below, which overlaps the end of the text by 9 px."""
 LIMITS_STYLE = "font-size:11px;line-height:1.2;color:#868e96;padding:0 12px 4px;text-align:right"
-HELD_HINT = "hold it for 0.6 s, by hand or by Space or Enter"  # as long as HOLD_MS of orders.html
+HELD_HINT = "hold for 0.6 s, with the pointer, Space or Enter"  # as long as HOLD_MS of orders.html
 DURATION_MAX_S = 1e5  # of a fault; longer than any run
 DURATION_S = 30.0  # of a fault, unless another time is typed
 FIXES_LOST_PERCENT = 100.0
-THRUST_LEFT_PERCENT = 70.0  # of a weak motor: with less, the aircraft cannot be held level
-GUST_M_S = 4.0  # about what a formation's drones can still withstand
+THRUST_LEFT_PERCENT = 70.0  # of a weak motor; with less, the aircraft cannot be held level
+GUST_M_S = 4.0  # about the strongest that a formation's drones can withstand
 MESSAGES_LOST_PERCENT = 30.0
 STRIKES = {
     "drone": "a drone",
-    "world": "the world, so all drones",
+    "world": "the world, hence all drones",
     "link": "the messages between two processes A/B; the radio of a drone is the kind radio",
     "radio": "the radio between drones and others: the world's, or a formation's",
     "process": "a process",
 }
-"""What the target of a kind of fault is, in words."""
-ORDERS = ("hold", "land", "emergency")  # operations whose buttons are those of orders
+"""Description of the target of each kind of fault."""
+ORDERS = ("hold", "land", "emergency")  # operations whose buttons are order buttons
 
 
 class RunForm:
-    """Pause or resume, single steps, rate; initially that with which the run was started."""
+    """Pause or resume, single steps, and rate, initially that with which the run was started."""
 
     def __init__(self, gui: viser.GuiApi, client: CommandClient, rate: float) -> None:
         pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
@@ -58,12 +58,12 @@ class RunForm:
         step = gui.add_button("Step", icon=viser.Icon.PLAYER_TRACK_NEXT)
 
         def request_step() -> None:
-            count = gates.value  # a fraction is sent as it is, and refused by the world
+            count = gates.value  # a fraction is sent unchanged, and refused by the world
             client.request_world("step", gates=int(count) if count == int(count) else count)
 
         step.on_click(lambda _: request_step())
         wanted = gui.add_number(
-            "rate", rate, min=0.0, max=RATE_MAX, step=0.5, hint="Real time is 1; 0: as fast as it goes"
+            "rate", rate, min=0.0, max=RATE_MAX, step=0.5, hint="1 is real time; 0: as fast as possible"
         )
         gui.add_html(limits_line(f"rate: 0 to {RATE_MAX:g} × real time"))
         set_rate = gui.add_button("Set rate")
@@ -72,7 +72,7 @@ class RunForm:
         self._reasons = gui.add_html("")
 
     def refresh(self, run: RunCondition) -> None:
-        """Grey out what would be refused; Resume takes the place of Pause in a paused run."""
+        """Disable what would be refused; Resume replaces Pause in a paused run."""
         refusals = run_refusals(run)
         set_refusals(self._controls, refusals)
         paused = run.clock == "paused"
@@ -85,7 +85,7 @@ class RunForm:
 class FleetForm:
     """Take-off and reset of all drones; their landing and emergency are orders in the head of the page.
 
-    Formations take off by their controllers, single drones each by itself.
+    Formations take off by their controllers, single drones individually.
     """
 
     def __init__(self, gui: viser.GuiApi, client: CommandClient, scenario: Scenario) -> None:
@@ -102,7 +102,7 @@ class FleetForm:
         self._reasons = gui.add_html("")
 
     def refresh(self, run: RunCondition) -> None:
-        """Grey out what would be refused; Reset all is visible only while a drone is in an emergency."""
+        """Disable what would be refused; Reset all is visible only while a drone is in an emergency."""
         self._run = run
         refusals = fleet_refusals(run, self._single)
         set_refusals(self._controls, refusals)
@@ -122,12 +122,12 @@ class FleetForm:
 
 
 class FaultForm:
-    """Controls of faults: common ones of a chosen drone, and any fault.
+    """Controls of faults: the common ones of a chosen drone, and any fault.
 
     Args:
-        report: called with requests that are refused here.
+        report: called with the outcome of requests that are refused here.
         scenario: has the drones and processes.
-        drones: of the run, with the names of their rotors; where they have none, the AR.Drone's.
+        drones: of the run, with the names of their rotors; where they have none, those of the AR.Drone.
     """
 
     def __init__(
@@ -202,13 +202,13 @@ class FaultForm:
         with gui.add_folder("Any fault", expand_by_default=False):
             kind = gui.add_dropdown("kind", list(self._kinds))
             help_ = gui.add_markdown("")
-            target = gui.add_text("target", "", hint="as the kind asks; a link of processes is A/B")
+            target = gui.add_text("target", "", hint="as the kind requires; a link between processes is A/B")
             text = gui.add_text(
                 "parameters", "", hint="as in `zsim fault add TARGET KIND …`: NAME=VALUE … --for 10s --at 40s"
             )
 
             def choose() -> None:
-                """Describe the kind, and fill in a possible target, and magnitudes that have a default."""
+                """Describe the kind, and fill in a possible target and default magnitudes."""
                 chosen = self._kinds[kind.value]
                 magnitudes = unstated(chosen, {})
                 lines = [
@@ -239,10 +239,10 @@ class FaultForm:
 
 
 class OrderButton:
-    """A button of an order, which its page repeats until it is confirmed: the page's own HTML, not one of viser's.
+    """An order button; its page repeats the order until it is confirmed. It is HTML, not a control of viser.
 
     Args:
-        of: what it concerns: {"drone": name}, several separated by commas, or {"cluster": name}.
+        of: its target: {"drone": name}, several separated by commas, or {"cluster": name}.
         held: whether it must be held for a while.
     """
 
@@ -277,12 +277,12 @@ def assign(control: Any, **properties: Any) -> None:
 
 
 def limits_line(text: str) -> str:
-    """Return the limits of a number as HTML, to stand below its field."""
+    """Return the limits of a number as HTML, to be shown below its field."""
     return f"<div style='{LIMITS_STYLE}'>{escape(text)}</div>"
 
 
 def set_refusals(controls: Mapping[str, Any], refusals: Mapping[str, str]) -> None:
-    """Grey out the controls of operations that would be refused; the reason is their tooltip."""
+    """Disable the controls of operations that would be refused; the reason is their tooltip."""
     for op, control in controls.items():
         reason = refusals.get(op, "")
         if isinstance(control, OrderButton):
@@ -292,7 +292,7 @@ def set_refusals(controls: Mapping[str, Any], refusals: Mapping[str, str]) -> No
 
 
 def offered(run: RunCondition, refusals_of: Callable[[RunCondition], Mapping[str, str]]) -> dict[str, str]:
-    """Return refusals with those of orders, which may be given to a silent world, and of emergencies always."""
+    """Return the refusals, adapted for orders (allowed while the world is silent) and emergencies (always allowed)."""
     orders = {op: reason for op, reason in refusals_of(run._replace(silent_s=0.0)).items() if op in ORDERS}
     if "emergency" in orders:
         orders["emergency"] = ""
@@ -300,7 +300,7 @@ def offered(run: RunCondition, refusals_of: Callable[[RunCondition], Mapping[str
 
 
 def refusal_lines(labels: Mapping[str, str], refusals: Mapping[str, str]) -> str:
-    """Return a line of HTML for each reason, with the greyed-out controls; `labels` are by operation."""
+    """Return a line of HTML for each reason, with the disabled controls; `labels` are by operation."""
     by_reason: dict[str, list[str]] = {}
     for op, label in labels.items():
         if refusals.get(op):

@@ -1,4 +1,4 @@
-"""What is known of a run beyond the newest views: condition, alarms, figures of flight, requests in progress."""
+"""The state of a run derived from its views: condition, alarms, figures of flight, requests in progress."""
 
 import math
 from collections import defaultdict, deque
@@ -19,14 +19,14 @@ from zsim_bridges.console.time_monitor import TimeMonitor
 from zsim_bridges.console.view_buffer import ViewBuffer
 
 ROUNDING_NS = 1_000.0  # of a time given in seconds
-SPEED_S = 0.2  # simulated, over which a speed is averaged; over less it would show the rounding of positions
+SPEED_S = 0.2  # simulated, over which a speed is averaged; less would show the rounding of positions
 BATTERY_S = 20.0  # simulated, for which a battery must have been seen before its remaining time is shown
 BATTERY_POINTS_MAX = 120
 BATTERY_SPACING_S = 1.0  # simulated
 
 
 class RunMonitor:
-    """Follows the condition of a run, which is in `world`, in words.
+    """Follows the condition of a run; `world` describes where the run is.
 
     Attributes:
         condition: of the run, at the last update.
@@ -52,11 +52,11 @@ class RunMonitor:
         self._ended = self.views.end or reason
 
     def unflyable(self) -> str:
-        """Return why nothing can be flown in this run any more; a silent world does not count."""
+        """Return why nothing can be flown in this run any longer; a silent world does not count."""
         return self.condition._replace(silent_s=0.0, ended=self._ended).grounded()
 
     def update(self, wall_s: float) -> list[PendingRequest]:
-        """Take over the newest views; return the requests that were done meanwhile."""
+        """Update from the newest views; return the requests completed since the last update."""
         views, clock = self.views, self.time_monitor.clock
         self._forget_future(views.drones.t_ns if views.drones else 0)
         drones = views.conditions()
@@ -98,7 +98,7 @@ class RunMonitor:
         return self.pending.pop_done(views.clusters, self.condition.drones)
 
     def head(self, wall_s: float) -> dict[str, Any]:
-        """Return the head of the page as plain data; called in another thread than `update`."""
+        """Return the head of the page as plain data; called from another thread than `update`."""
         t_ns = self.views.drones.t_ns if self.views.drones else 0
         name, clock, rows = self.run.scenario.name, self.time_monitor.clock, self.board.rows(wall_s)
         return page_head(name, self.now(), clock, t_ns, rows, self._single, self._world, self.record_s)
@@ -119,7 +119,7 @@ class RunMonitor:
     def _reason(
         self, name: str, view: ViewCluster, drones: Mapping[str, DroneCondition], foreign: dict[str, str]
     ) -> str:
-        """Return a formation's reason: its controller's, who else flies its drones, and failsafes."""
+        """Return a formation's reason: its controller's, other commanders of its drones, and failsafes."""
         notes = [alarms.foreign_text(foreign)] if foreign and view.phase in alarms.FLOWN_PHASES else []
         members = (drones[drone] for drone in self._members[name] if drone in drones)
         notes += [d.failsafe for d in members if d.failsafe and d.state in ("landing", "emergency", "landed")]
@@ -136,11 +136,11 @@ class FlightFigures(NamedTuple):
     pitch_deg: float
     heading_deg: float  # 0 to 360
     battery_left_s: float | None  # at the present drain; None while unknown
-    obstacle_m: float | None = None  # from its centre to what is nearest of obstacles and surfaces; None without any
+    obstacle_m: float | None = None  # from its centre to the nearest obstacle or surface; None without any
 
 
 class FlightMeter:
-    """Derives figures of each drone's flight from views of the true states, and of what is around."""
+    """Derives figures of each drone's flight from views of the true states, and from the surroundings."""
 
     def __init__(self, environment: Environment) -> None:
         self._around = Surroundings(environment)
@@ -153,7 +153,7 @@ class FlightMeter:
         self._drones: tuple[DroneView, ...] = ()
 
     def update(self, view: ViewDrones) -> None:
-        """Take over a view; an earlier one, as in a replay, begins anew."""
+        """Process a view; an earlier one, as in a replay, restarts the history."""
         t_s = view.t_ns / 1e9
         if t_s < self._t_s:
             self._places.clear()
@@ -174,7 +174,7 @@ class FlightMeter:
         away_m = self._around.distances_m([drone.position_m for drone in self._drones]).tolist()
         for drone, obstacle_m in zip(self._drones, away_m, strict=True):
             (first_s, first), (last_s, last) = self._places[drone.name][0], self._places[drone.name][-1]
-            span_s = max(last_s - first_s, 1e-9)  # of one view: at rest
+            span_s = max(last_s - first_s, 1e-9)  # a single view: at rest
             velocity_m_s = [(b - a) / span_s for a, b in zip(first, last, strict=True)]  # the mean over SPEED_S
             roll, pitch, yaw = np.degrees(frames.rpy_from_quaternion(np.array([drone.orientation_wxyz]))[0]).tolist()
             since_s, charge = self._charges[drone.name][0]

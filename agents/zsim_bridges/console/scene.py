@@ -1,7 +1,7 @@
-"""The 3-D scene of a run: its newest views as viser's nodes, of which only changes are sent.
+"""The 3-D scene of a run: its newest views as nodes of viser, of which only changes are sent.
 
 `RunScene` decides what is drawn, `SceneNodes` draws it for all pages; the ground follows each page's own theme, and the
-ring about the chosen drone is of one page alone.
+ring around the chosen drone belongs to one page.
 """
 
 import math
@@ -43,11 +43,11 @@ from zsim_bridges.console.picture import (
 from zsim_bridges.console.run_condition import ShownRun
 from zsim_bridges.console.view_buffer import ViewBuffer
 
-NAMED_MAX = 60  # drones with their names beside them; more would hide each other
-LARGE_MAX = 12  # names in full, at full size; of more drones short names, smaller
+NAMED_MAX = 60  # drones with names beside them; more would overlap
+LARGE_MAX = 12  # drones with full names at full size; more have short, smaller names
 SMALL = 0.8  # of the size of a name
 SOLID = (134, 142, 150)
-EDGE = (96, 102, 118)  # of the triangles of a surface, whose slopes differ little in light
+EDGE = (96, 102, 118)  # of the triangles of a surface, whose slopes differ little in shading
 GHOST, ELLIPSOID, WIND, SIDE = (77, 171, 247), (250, 176, 5), (21, 170, 191), (226, 0, 134)
 PREVIEW = (217, 72, 15)
 PREVIEW_PX = 3.0  # of a previewed way
@@ -55,15 +55,15 @@ RADIO, ONE_WAY = (64, 192, 87), (250, 82, 82)  # links of the radio: both ways, 
 RADIO_PX = 1.5
 SIDE_PX = 2.0  # of a formation's sides, at any distance
 WIND_M_PER_M_S = 0.5  # length of the arrow
-WIND_MIN_M_S = 0.05  # below it no arrow
-WIND_ABOVE_M = 1.5  # of the arrow over the highest drone
-LABEL_B = np.array([0.0, 0.0, 0.32])  # m; of a name over its drone
+WIND_MIN_M_S = 0.05  # no arrow below it
+WIND_ABOVE_M = 1.5  # of the arrow above the highest drone
+LABEL_B = np.array([0.0, 0.0, 0.32])  # m; of a name above its drone
 MIDDLE = "center-center"  # of a label
 LABELS_MAX = 3  # p, q and beta
 LUMINANCE_MIN = 0.12  # of a trail: 2.5 times as bright as the ground of the dark theme, as WCAG 2.2 counts contrast
-HIDDEN = (0.0, 0.0, -1000.0)  # m; of instances that are not shown: viser cannot hide them one by one
+HIDDEN = (0.0, 0.0, -1000.0)  # m; position of hidden instances: viser cannot hide them one by one
 HALF_M = 150.0  # half a side of the ground
-FIELD_BELOW_M = 0.15  # of the field below the grid; a depth buffer cannot order surfaces that are nearer to each other
+FIELD_BELOW_M = 0.15  # of the field below the grid; a depth buffer cannot order surfaces closer to each other
 THICK_M = 0.02
 LIGHT = ((206, 219, 196), (190, 200, 184), (138, 150, 132))  # of the field, of the grid's cells and of its sections
 DARK = ((30, 35, 30), (84, 94, 82), (122, 134, 118))
@@ -81,7 +81,7 @@ class RunScene:
         self._drawn_ghosts: dict[str, Any] = {}
         self.drones: DronePoses | None = None  # their newest poses
         self.shapes: dict[str, FormationShape | None] = {}  # true ones by formation; None where a drone is missing
-        self.previews: dict[str, Array] = {}  # ways (n, M, 3) [m] that formations would fly
+        self.previews: dict[str, Array] = {}  # paths (n, M, 3) [m] that formations would fly
         self.trails = CanvasTrails(len(run.names), around=run.is_replay)
         robots = sum(space.n for space in run.spaces.values())
         arms_m = [drone.arm_m for drone in run.scenario.drones]
@@ -97,7 +97,7 @@ class RunScene:
         return drone_on_ray(self.drones, self.nodes.radii_m, event.ray_origin, event.ray_direction)
 
     def store(self, view: ViewDrones) -> DronePoses:
-        """Keep and return the drones' newest poses, at which cameras of later pages look."""
+        """Store and return the drones' newest poses, at which the cameras of new pages are aimed."""
         drones = drone_poses(view, self._run.names)
         self.drones = drones
         self.trails.add(drones.t_ns / 1e9, drones.p_W)
@@ -108,7 +108,7 @@ class RunScene:
     def draw(self, view: ViewDrones, longest_s: float, chosen: str) -> DronePoses:
         """Draw a view of the drones, and return their poses.
 
-        Rotors turn for `longest_s` at most from one picture to the next; `chosen` is the formation with figures.
+        Rotors turn for at most `longest_s` between pictures; `chosen` is the formation with figures.
         """
         before_ns = self.drones.t_ns if self.drones is not None else 0
         drones = self.store(view)
@@ -129,7 +129,7 @@ class RunScene:
         return drones
 
     def preview(self, cluster: str, shown: FlightPreview | None) -> None:
-        """Show what a formation would fly in place of its previous preview; None: nothing."""
+        """Show a formation's preview instead of its previous one; None: nothing."""
         others = {name: paths_W for name, paths_W in self.previews.items() if name != cluster}
         self.previews = {**others, cluster: shown.paths_W} if shown else others
         self.nodes.previews(list(self.previews.values()))
@@ -156,7 +156,7 @@ class RunScene:
 
 
 class SceneNodes:
-    """The nodes of one run, of N drones; `robots` is the number of those in formations, each of which has a ghost."""
+    """The nodes of one run of N drones, of which `robots` are in formations and have a ghost each."""
 
     def __init__(
         self,
@@ -248,20 +248,20 @@ class SceneNodes:
             self._scene.add_mesh_simple(f"/surfaces/{each.name}/edges", corners, faces, color=EDGE, wireframe=True)
 
     def references(self, lines: Array) -> None:
-        """Draw the paths of drones that fly by themselves, as segments (M, 2, 3) [m; W]."""
+        """Draw the reference paths of single drones, as segments (M, 2, 3) [m; W]."""
         if len(lines):
             look: Any = {"thickness": SIDE_PX, "thickness_units": "screen"}
             self._scene.add_line_segments("/references", lines.astype(np.float32), GHOST, **look)
 
     def on_click(self, act: Callable[[viser.SceneClickEvent], None]) -> None:
-        """Call back with viser's event of each click into the scene.
+        """Register a callback for viser's event of each click into the scene.
 
-        Not on the drones' nodes: a page of viser 1.1.1 fails to open when a batched mesh is clickable already.
+        It is not on the drones' nodes: a page of viser 1.1.1 fails to open if a batched mesh is already clickable.
         """
         self._scene.on_click()(act)
 
     def close(self) -> None:
-        """End callbacks; the nodes stay."""
+        """Remove the callbacks; the nodes remain."""
         self._scene.remove_click_callback("all")
 
     def drones(self, drones: DronePoses, dt_s: float) -> None:
@@ -285,7 +285,7 @@ class SceneNodes:
             self._wind_label.position, self._wind_label.text = start, f"wind {speed:.1f} m/s"
 
     def radio(self, lines: tuple[Array, Array]) -> None:
-        """Set the lines between drones that hear each other, and those of which one hears the other only."""
+        """Set the lines of bidirectional and of one-way radio links between drones."""
         points = np.concatenate([*lines, np.tile(HIDDEN, (1, 2, 1))]).astype(np.float32)
         count, weak = len(points), len(lines[0])
         colours = np.tile(linear(np.array(RADIO)), (count, 2, 1))
@@ -340,7 +340,7 @@ class SceneNodes:
                 label.text, label.position = texts[i]
 
     def trails(self, segments: Array, owners: NDArray[np.int64]) -> None:
-        if not len(segments):  # a replay went back: the old ones must vanish
+        if not len(segments):  # a replay went back: remove the old ones
             segments, owners = np.tile(HIDDEN, (1, 2, 1)), np.zeros(1, dtype=np.int64)
         colours = np.repeat(self._trail_colours[owners][:, None], 2, axis=1)
         if self._trail_node is None:
@@ -393,7 +393,7 @@ def _padded(count: int, p_W: Array | None = None, q: Array | None = None) -> tup
 
 
 class ChosenRing:
-    """A ring about the chosen drone in the scene of one page; `radii_m` are the drones', in their order."""
+    """A ring around the chosen drone in the scene of one page; `radii_m` are those of the drones, in order."""
 
     def __init__(self, scene: viser.SceneApi, radii_m: Array) -> None:
         self._radii_m = radii_m
@@ -406,7 +406,7 @@ class ChosenRing:
         )  # fmt: skip
 
     def move(self, drones: DronePoses, chosen: str) -> None:
-        """Put the ring about the chosen drone; out of sight while that is missing."""
+        """Move the ring to the chosen drone; out of sight while that is missing."""
         index = drones.names.index(chosen)
         self._node.batched_positions = drones.p_W[[index]] if drones.present[index] else np.reshape(HIDDEN, (1, 3))
         if index != self._chosen:
@@ -415,9 +415,9 @@ class ChosenRing:
 
 
 def draw_ground(scene: viser.SceneApi, *, dark: bool = False) -> None:
-    """Draw a field with a grid in place of the previous ground.
+    """Draw a field with a grid instead of the previous ground.
 
-    It is opaque, without a background image: viser's plane of a grid, or a sky, would hide whatever is transparent.
+    It is opaque, without a background image: viser's grid plane, or a sky, would hide transparent objects.
     """
     field, cells, sections = DARK if dark else LIGHT
     position = (0.0, 0.0, -FIELD_BELOW_M - THICK_M / 2.0)
@@ -434,7 +434,7 @@ def luminance(colour: Sequence[float]) -> float:
 
 
 def lightened(colour: Sequence[float]) -> Sequence[float]:
-    """Return a colour, mixed with white until it stands out from the ground of the dark theme."""
+    """Return a colour mixed with white until it has enough contrast with the ground of the dark theme."""
     mixed = (np.array(colour) + share * (255.0 - np.array(colour)) for share in np.arange(0.0, 1.01, 0.05))
     return next(each.tolist() for each in mixed if luminance(each.tolist()) >= LUMINANCE_MIN)
 

@@ -21,24 +21,24 @@ ANSWER_TIMEOUT_S = 1.0  # wall; the world answers within milliseconds
 BEAT_S = 0.1  # wall; between two beats of this process
 BEAT_MAX_S = 0.5  # wall; counted between two beats at most: a busy machine delays a thread by less
 STALL_S = 2.0  # wall; a longer time without a beat is a stall
-SILENT_S = 1.7  # wall; after so long without an answer the world counts as silent: a stop is shown within 2 s
-PIECE_S = 10.0  # simulated; read at once: the replay is blocked meanwhile, for 0.15 s with thirty drones
+SILENT_S = 1.7  # wall; after this long without an answer the world counts as silent: a stop is shown within 2 s
+PIECE_S = 10.0  # simulated; read in one request, which blocks the replay for 0.15 s with thirty drones
 INSTANT_DRONES_MAX = 9_000  # in a piece; a replay answers fewer than 10 000
 BEHIND_S, AHEAD_S = SPAN_S, SPAN_S / 2.0  # simulated; around the shown instant, as far as trails and curves reach
 KEPT_S = 2.0 * SPAN_S  # simulated; kept of what was read, on both sides of the shown instant
 
 
 class Stall(NamedTuple):
-    """A time for which this process itself stood still."""
+    """An interval in which this process itself was stopped."""
 
     lasted_s: float  # wall
     ended_s: float  # monotonic
 
 
 class AwakeClock:
-    """Wall time while this process runs; of a time for which it was stopped or starved, BEAT_MAX_S at most is counted.
+    """Wall time while this process runs; of an interval in which it was stopped or starved, at most BEAT_MAX_S counts.
 
-    A process that stood still has heard nothing, which is no silence of the others.
+    A stopped process receives nothing, which does not mean that the others were silent.
     """
 
     def __init__(self, wall_s: Callable[[], float]) -> None:
@@ -48,7 +48,7 @@ class AwakeClock:
         self.stall: Stall | None = None  # the last one
 
     def beat(self) -> None:
-        """Note that this process runs; to be called every BEAT_S."""
+        """Record that this process runs; to be called every BEAT_S."""
         with self._lock:
             wall_s = self._wall_s()
             gap_s = wall_s - self._beat_s
@@ -64,10 +64,10 @@ class AwakeClock:
 
 
 class TimeMonitor:
-    """Polls the run's clock in a thread of its own, so that drawing waits for no answer.
+    """Polls the run's clock in a separate thread, so that drawing never waits for an answer.
 
-    The observer of the console in the run follows it, too; `stamp_age_s` is how old the time of a stamp may be
-    [simulated].
+    It also updates the console's observer in the run; `stamp_age_s` is the greatest age of a stamp's time
+        [simulated].
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class TimeMonitor:
 
     @contextmanager
     def polling(self) -> Iterator[None]:
-        """Poll the clock meanwhile."""
+        """Poll the clock while the context is open."""
         over = threading.Event()
 
         def poll() -> None:
@@ -123,14 +123,14 @@ class TimeMonitor:
             try:
                 samples = self._link.get(keys.CLOCK, timeout_s=ANSWER_TIMEOUT_S)
             except ZsimError:
-                return  # the link is lost, and comes back
+                return  # the link is lost and will return
             for sample in samples:
                 clock = self._observer.update_clock(sample.payload)
                 if clock is not None:
                     self.clock, self._known_s, self._answered_s = clock, start_s, self._awake.now_s()
 
     def now_ns(self) -> int:
-        """Return simulated time for a stamp, after a poll if it may be too old; takes 2 ANSWER_TIMEOUT_S at most."""
+        """Return simulated time for a stamp, after a poll if it may be too old; takes at most 2 ANSWER_TIMEOUT_S."""
 
         def is_old() -> bool:
             rate = max(1.0, self.clock.rate) if self.clock else 1.0  # as measured: 0 at the beginning of a run
@@ -144,7 +144,7 @@ class TimeMonitor:
 
     @property
     def silent_s(self) -> float:
-        """For how long the world has not answered [s; wall]; 0 below SILENT_S."""
+        """How long the world has not answered [s; wall]; 0 below SILENT_S."""
         return self.heard_s if self.heard_s >= SILENT_S else 0.0
 
     @property
@@ -158,10 +158,10 @@ class TimeMonitor:
 
 
 class RecordPlayer:
-    """Controls the time of a replay, and reads its record around the shown instant, piece by piece.
+    """Controls the time of a replay, and reads its record around the shown instant in pieces.
 
     Args:
-        is_replay: whether the run is a replay; otherwise everything here does nothing.
+        is_replay: whether the run is a replay; otherwise all methods do nothing.
 
     Attributes:
         timeline: from_s, to_s [s] and marks (t_s, kind, text); empty before `load`.
@@ -180,7 +180,7 @@ class RecordPlayer:
         self._arrived: deque[list[PastInstant]] = deque()
 
     def load(self) -> None:
-        """Read the timeline; let a paused replay publish its instant again, for subscribers that came later."""
+        """Read the timeline; let a paused replay publish its instant again, for later subscribers."""
         if not self._is_replay:
             return
         self.timeline = self._client.timeline()
@@ -190,7 +190,7 @@ class RecordPlayer:
             self.play("seek", clock.t_ns / 1e9)
 
     def state(self, run: RunCondition) -> dict[str, Any]:
-        """Return the timeline, with why each operation of `play` would be refused."""
+        """Return the timeline, with the reasons why operations of `play` would be refused."""
         return {**self.timeline, "refusals": run_refusals(run)} if self.timeline else {}
 
     def play(self, op: str, value: float) -> None:
@@ -205,7 +205,7 @@ class RecordPlayer:
             self._client.request_world(op, **args.get(op, {}))
 
     def fill(self, t_s: float) -> None:
-        """Read missing pieces of the record around an instant in another thread, the nearest first."""
+        """Read the missing pieces of the record around an instant in another thread, nearest first."""
         if "to_s" not in self.timeline:
             return
         with self._lock:
@@ -231,7 +231,7 @@ class RecordPlayer:
         return min(unread, key=lambda k: abs(self._middle_s(k) - self._shown_s), default=None)
 
     def _read_missing(self) -> None:
-        """Read until no piece is missing; a piece that cannot be read is not tried again."""
+        """Read until no piece is missing; a piece that cannot be read is not retried."""
         while True:
             with self._lock:
                 piece = self._missing()

@@ -1,4 +1,4 @@
-"""What a run has published: the newest views, kept undecoded until the next picture, and the log of its events."""
+"""The messages of a run: the newest views, kept undecoded until the next picture, and the log of its events."""
 
 import math
 import re
@@ -21,11 +21,11 @@ from zsim.runtime.participant import Participant
 from zsim.transport.session import RawSample, Session
 from zsim_bridges.console.alarms import BACK, LOST, DroneCondition, Losses
 
-FRESH_S = 1.0  # simulated, or wall; views come 20 times a wall second: the estimator of an older one is dead, or stuck
-FAULTS_KEPT = 8  # the last that have begun
+FRESH_S = 1.0  # simulated, or wall; views come 20 times a wall second: if one is older, its estimator is dead or stuck
+FAULTS_KEPT = 8  # number of the last faults that have begun
 EVENTS_KEPT = 200  # the newest, each by itself
-ROWS_KEPT, OWN_ROWS_KEPT = 200, 100  # of unequal events; of the console's own requests
-OWN_KINDS = frozenset({"accepted", "done", "control", "refused"})  # kinds by which an operator's request is answered
+ROWS_KEPT, OWN_ROWS_KEPT = 200, 100  # of distinct events; of the console's own requests
+OWN_KINDS = frozenset({"accepted", "done", "control", "refused"})  # kinds of events that answer an operator's request
 ALL, OWN = "all", "own actions"
 INCIDENTS = frozenset({"emergency", "flip", "impact", "touchdown", "battery"})  # of drones
 KINDS: dict[str, frozenset[str]] = {
@@ -41,7 +41,7 @@ _FIGURE = re.compile(r"\d[\d.e+-]*")
 
 
 class ReceivedEstimate(NamedTuple):
-    """A drone's last estimate, from an estimator's process; fresh if it is of the same time as the drones' view."""
+    """A drone's last estimate, from an estimator process; fresh if it has the time of the drones' view."""
 
     process: str
     t_ns: int
@@ -54,13 +54,13 @@ class ReceivedEstimate(NamedTuple):
 
     @property
     def sigma_m(self) -> float:
-        """Root of the position's variance averaged over its axes; 0 where that is negative, so invalid."""
+        """Root of the position variance averaged over the axes; 0 if that is negative, hence invalid."""
         xx, _, _, yy, _, zz = self.estimate.covariance_m2
         return math.sqrt(max(0.0, xx + yy + zz) / 3)
 
 
 class ReceivedLink(NamedTuple):
-    """The last state of a driver's link to its drone, and how long ago it was received [s; wall]."""
+    """The last state of a driver's link to its drone, and its age since reception [s; wall]."""
 
     state: LinkState
     age_s: float
@@ -73,8 +73,8 @@ class ViewBuffer:
 
     Args:
         variables: names of each formation's variables; views of other formations or variables are refused.
-        refused: called with the event of each of the console's commands that the world refuses.
-        asked: called with a formation and a description of each request that somebody else makes of it.
+        refused: called with the event of each command of the console that the world refuses.
+        asked: called with a formation and a description of each request to it by another client.
     """
 
     def __init__(
@@ -109,10 +109,10 @@ class ViewBuffer:
         self.faults: tuple[Fault, ...] = ()  # injected ones, planned and active
         self.log = EventLog(observer.name)
         self.losses = Losses()
-        self.failsafes: dict[str, Event] = {}  # automatic landing or stop of drones that had no other mode since
+        self.failsafes: dict[str, Event] = {}  # automatic landing or stop of drones without a later mode
         self.begun: deque[Fault] = deque(maxlen=FAULTS_KEPT)  # the last injected faults that have begun
         self.end = ""  # why the run ended, by its last event; empty while it goes on
-        self.on_own_event: Callable[[Event], None] = lambda _: None  # called with events that a command of ours causes
+        self.on_own_event: Callable[[Event], None] = lambda _: None  # called with events that our commands cause
 
     def open(self) -> None:
         """Subscribe, and read the values published last."""
@@ -139,7 +139,7 @@ class ViewBuffer:
         return keys.VIEW_DRONES in new
 
     def estimates(self) -> dict[str, ReceivedEstimate]:
-        """Return the newest estimate of each drone by name, from whichever estimator; no future ones of a replay."""
+        """Return the newest estimate of each drone by name, from any estimator; none of a replay's future."""
         now_ns = self.drones.t_ns if self.drones else 0
         newest: dict[str, ReceivedEstimate] = {}
         for process, view in sorted(self.estimators.items(), key=lambda each: each[1].t_ns):
@@ -186,7 +186,7 @@ class ViewBuffer:
         return [f for f in self.faults if f.from_ns <= now_ns and (f.until_ns is None or f.until_ns > now_ns)]
 
     def lag_ms(self, received: ReceivedEstimate) -> float:
-        """Return an estimator's lag: by its health, or by its view where that is old."""
+        """Return an estimator's lag: by its health, or by its view if the health is old."""
         health = self.healths.get(received.process)
         if health is not None and received.fresh:
             return health.lag_ns / 1e6
@@ -196,7 +196,7 @@ class ViewBuffer:
         return self._answers[drone]
 
     def await_answer(self, drone: str, beyond: int, within_s: float) -> None:
-        """Wait up to a time until more commands to a drone than `beyond` have been answered."""
+        """Wait, up to a timeout, until more than `beyond` commands to a drone have been answered."""
         with self._arrived:
             self._arrived.wait_for(lambda: self._answers[drone] > beyond, within_s)
 
@@ -228,7 +228,7 @@ class ViewBuffer:
             self.faults = message.faults
 
     def _on_request(self, sample: RawSample) -> None:
-        """Log a request that somebody else, such as another console, has made of a formation."""
+        """Log a request to a formation by another client, such as another console."""
         try:
             request: run_messages.ClusterRequest = messages.decode(sample.key, sample.payload)
         except DecodeError:
@@ -254,7 +254,7 @@ class ViewBuffer:
         elif event.kind == "mode" and event.data.get("mode") != "emergency":
             self.failsafes = {name: each for name, each in self.failsafes.items() if name != event.subject}
         elif event.kind == "fault":
-            with suppress(msgspec.ValidationError):  # anybody may publish an event
+            with suppress(msgspec.ValidationError):  # any process may publish an event
                 self.begun.append(msgspec.convert(event.data, Fault))
         elif event.kind == "end":
             self.end = event.text
@@ -288,7 +288,7 @@ def commanded_drone(event: Event) -> str:
 
 
 class EventRow(NamedTuple):
-    """The newest of events that differ by their figures alone, and how many there were."""
+    """The newest of events that differ only in their figures, and their number."""
 
     event: Event
     times: int
@@ -296,9 +296,9 @@ class EventRow(NamedTuple):
 
 
 class EventLog:
-    """Keeps the newest events, and a row for all that are equal but for their figures; thread-safe.
+    """Keeps the newest events, with one row for all that differ only in their figures; thread-safe.
 
-    Rows of events of the console's own process, of this name, are kept apart from others.
+    Rows of events of the console's own process, which has this name, are kept separate.
     """
 
     def __init__(self, name: str) -> None:

@@ -1,4 +1,4 @@
-"""Messages of clients: errors and limits, keys that clients may use, defaults, JSON, and requests on a stream. Pure.
+"""Client messages: errors and limits, permitted keys, defaults, JSON, and requests on a stream. Pure.
 
 A request on a stream is one JSON object per line:
 {"op": "put", "key": "drone/drone1/cmd/velocity", "value": {"velocity_m_s": [1, 0, 0]}, "id": 7}
@@ -22,7 +22,7 @@ from zsim.transport.session import RawSample
 
 COUNTED_KEYS = (keys.command("*", "*"), keys.estimate("*"), keys.cluster_state("*"))  # contract: `sent` of a done
 CAMERA_KEYS = (keys.camera("*", "*"), keys.camera_info("*", "*"), keys.detections("*"))
-"""Of cameras, renderers and detectors of clients' own."""
+"""Keys of clients' own cameras, renderers and detectors."""
 CLIENT_KEYS = (*COUNTED_KEYS, keys.cluster_view("*"), keys.estimates_view("*"), *CAMERA_KEYS)
 """Keys of the contract on which clients publish."""
 CONTROL_KEYS = (keys.CONTROL, keys.cluster_control("*"), keys.drone_control("*"))  # requests go there
@@ -41,12 +41,12 @@ RESERVED_KEYS = (
     keys.drone_request("*"),
     keys.reference("*"),
 )
-"""Keys on which the world, or a process in its own name, publishes: a client's message would be taken for theirs.
+"""Keys on which only the world, or a process in its own name, publishes: a client's message would impersonate them.
 
-A driver is asked to arm by operators on Zenoh alone.
+A driver is armed by operators on Zenoh only.
 """
-CACHED_VALUES = 256  # values; one goes to many clients, and is encoded once
-INTEGER_MAX = 2.0**63  # a double above it is no integer of 64 bits
+CACHED_VALUES = 256  # values; a value sent to many clients is encoded once
+INTEGER_MAX = 2.0**63  # a double of this size or more does not fit a 64-bit integer
 JSON = ("application/json", "text/json", "text/json5")
 TEXT = ("text/plain", "zenoh/string")
 _to_json = msgspec.json.Encoder().encode
@@ -57,7 +57,7 @@ class ForbiddenError(ZsimError):
 
 
 class TooManyError(ZsimError):
-    """More requests, clients or subscriptions than the gateway takes at once."""
+    """More requests, clients or subscriptions than the gateway accepts at once."""
 
 
 class UnknownError(ZsimError):
@@ -73,14 +73,14 @@ class MethodError(ZsimError):
 
 
 def count_request(limit: RateLimit, address: str = "") -> None:
-    """Count a request of an address, or raise a TooManyError with how long to wait."""
+    """Count a request of an address, or raise a TooManyError with the time to wait."""
     if not limit.spend(address):
         wait_s = limit.wait(address)
         raise TooManyError(f"more than {1 / limit.period:g} requests a second; wait {wait_s:.3f} s")
 
 
 class ClientLimit:
-    """Bounds how many clients there are at a time."""
+    """Bounds the number of clients at a time."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
@@ -124,9 +124,9 @@ def _matches_any(expressions: Sequence[str], key: str) -> bool:
 
 
 def check_not_reserved(key: str) -> None:
-    """Raise a DecodeError for what is no key, a ForbiddenError for a key on which clients may not publish."""
+    """Raise a DecodeError for an invalid key, a ForbiddenError for a key on which clients may not publish."""
     if "*" in key or not key:
-        raise DecodeError(f"{key[:80]!r}: is no key; must be names with / between them")
+        raise DecodeError(f"{key[:80]!r}: is not a key; must be names separated by /")
     if is_reserved(key):
         raise ForbiddenError(
             f"{key[:80]}: only the process that this is about writes here; a client may write on "
@@ -154,7 +154,7 @@ class MessageDefaults:
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """Undo the counting of what is filled in meanwhile if anything is refused: numbers have no gaps."""
+        """Roll back the sequence numbers if anything is refused in this context, so that they have no gaps."""
         before = self._next_seq.copy()
         try:
             yield
@@ -167,7 +167,7 @@ class MessageDefaults:
 
 
 def is_sound(key: str, payload: bytes) -> bool:
-    """Tell whether a payload is the message that the contract puts on its key; on other keys anything is."""
+    """Return whether a payload is the message that the contract defines for its key; on other keys any payload is."""
     try:
         return messages.type_of(key) is None or messages.decode(key, payload) is not None
     except DecodeError:
@@ -177,11 +177,11 @@ def is_sound(key: str, payload: bytes) -> bool:
 def payload_to_json(key: str, payload: bytes, encoding: str = "") -> bytes:
     """Return a payload as JSON.
 
-    A message of the contract comes with all of its fields; JSON, text and msgpack on other keys as their value, bytes
+    A message of the contract has all of its fields; JSON, text and msgpack on other keys give their value, bytes
     within as base64; anything else as base64 of the whole. `encoding` is Zenoh's, where it is known.
 
     Raises:
-        DecodeError: it is not the message that the contract puts on its key.
+        DecodeError: it is not the message that the contract defines for its key.
     """
     if messages.type_of(key) is not None:
         return _to_json(messages.decode(key, payload))
@@ -200,7 +200,7 @@ def payload_to_json(key: str, payload: bytes, encoding: str = "") -> bytes:
 
 
 def json_value(value: Any) -> Any:
-    """Return a value if JSON can write it, otherwise its msgpack as base64."""
+    """Return a value if JSON can represent it, otherwise its msgpack as base64."""
     try:
         _to_json(value)
     except REFUSALS:
@@ -211,10 +211,10 @@ def json_value(value: Any) -> Any:
 def json_to_payload(key: str, value: Any) -> bytes:
     """Return plain data, as decoded from JSON, as the payload of a key.
 
-    Where a field is an integer, 20000000.0 will do: languages that have only doubles write it so.
+    An integer field also accepts 20000000.0, as written by languages that have only doubles.
 
     Raises:
-        DecodeError: with key, field, value and what is allowed; a key outside of the contract takes anything.
+        DecodeError: with key, field, value and what is allowed; a key outside the contract accepts anything.
     """
     if messages.type_of(key) is None:
         return _pack(key, value)
@@ -222,7 +222,7 @@ def json_to_payload(key: str, value: Any) -> bytes:
         try:
             value = {**value, "data": base64.b64decode(value["data"], validate=True)}
         except ValueError as error:
-            raise DecodeError(f"{key[:80]}: data is no base64 ({error}); must be a JPEG as base64") from error
+            raise DecodeError(f"{key[:80]}: data is not base64 ({error}); must be a JPEG as base64") from error
     try:
         return messages.encode(messages.decode(key, _pack(key, value)))
     except DecodeError:
@@ -230,7 +230,7 @@ def json_to_payload(key: str, value: Any) -> bytes:
             value = _with_integers(value)
         except RecursionError as error:
             must = "must be the message of docs/protocol.md"
-            raise DecodeError(f"{key[:80]}: too many lists in each other; {must}") from error
+            raise DecodeError(f"{key[:80]}: lists are nested too deeply; {must}") from error
         return messages.encode(messages.decode(key, _pack(key, value)))
 
 
@@ -238,11 +238,11 @@ def _pack(key: str, value: Any) -> bytes:
     try:
         return msgspec.msgpack.encode(value)
     except REFUSALS as error:
-        raise DecodeError(f"{key:.80}: {error}; must be JSON of numbers of 64 bits") from error
+        raise DecodeError(f"{key:.80}: {error}; must be JSON with 64-bit numbers") from error
 
 
 def _with_integers(value: Any) -> Any:
-    """Return a value with the floats in it that are whole as integers."""
+    """Return a value with its whole-number floats as integers."""
     if isinstance(value, dict):
         return {name: _with_integers(entry) for name, entry in value.items()}
     if isinstance(value, list):
@@ -256,7 +256,7 @@ def json_entry(key: str, payload: bytes, encoding: str = "") -> dict[str, Any]:
 
 @lru_cache(maxsize=CACHED_VALUES)
 def value_line(sample: RawSample) -> bytes:
-    """Return the line of a value for a client; null for a key that was deleted, nothing for what is no message."""
+    """Return the line of a value for a client: null for a deleted key, nothing for an invalid message."""
     try:
         value = payload_to_json(sample.key, sample.payload, sample.encoding) if sample.payload else b"null"
     except DecodeError:
@@ -271,7 +271,7 @@ Keys = Annotated[list[Key], Meta(max_length=1000)]
 
 
 class StreamRequest(Struct, tag_field="op", forbid_unknown_fields=True, kw_only=True):
-    """Any request: its `id` comes back with the answer."""
+    """Any request; the answer repeats its `id`."""
 
     id: int | str | None = None
 
@@ -296,13 +296,13 @@ class SubscribeRequest(StreamRequest, tag="subscribe"):
 
 
 class UnsubscribeRequest(StreamRequest, tag="unsubscribe"):
-    """No more values on it."""
+    """End the subscription to a key expression."""
 
     key: Key
 
 
 class PutRequest(StreamRequest, tag="put"):
-    """A value for a key. `quiet`: an answer comes only if it is refused."""
+    """A value for a key. `quiet`: answered only if it is refused."""
 
     key: Key
     value: Any
@@ -310,7 +310,7 @@ class PutRequest(StreamRequest, tag="put"):
 
 
 class AskRequest(StreamRequest, tag="ask"):
-    """A control request to whoever answers on a key: world/control, cluster/*/control."""
+    """A control request to the process that answers on a key: world/control, cluster/*/control."""
 
     key: Key
     request: str
@@ -319,10 +319,10 @@ class AskRequest(StreamRequest, tag="ask"):
 
 
 class JoinRequest(StreamRequest, tag="join"):
-    """Take part in the lockstep: a `gate` comes every `period_s`, and time waits for its `done`.
+    """Take part in the lockstep: a `gate` is sent every `period_s`, and time waits for its `done`.
 
-    `reads` are the key expressions whose messages come with each gate; `gates` the keys that close one, of which a
-    message comes at every gate: the status of its drones where none are given.
+    `reads` are the key expressions whose messages are sent with each gate; `gates` the keys that close one, of which a
+    message arrives at every gate; by default the status of the drones that are read.
     """
 
     name: str
@@ -346,7 +346,7 @@ class DoneRequest(StreamRequest, tag="done"):
 
 
 class LeaveRequest(StreamRequest, tag="leave"):
-    """Take part in the lockstep no more."""
+    """Leave the lockstep."""
 
     reason: str = ""
 

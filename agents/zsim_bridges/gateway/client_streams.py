@@ -1,6 +1,6 @@
 """Byte streams to clients: lines of JSON on TCP, text messages on a WebSocket, server-sent events, and pictures.
 
-Each client has a bounded outbox, so that one that does not read costs the others nothing.
+Each client has a bounded outbox, so that one that does not read does not affect the others.
 """
 
 import asyncio
@@ -20,17 +20,17 @@ from zsim.transport.session import RawSample
 from zsim_bridges.gateway.run_access import SharedSubscriptions
 
 OUTBOX_BYTES_MAX = 4_000_000  # about 20 s of a drone's sensors as JSON
-FLUSH_S = 2.0  # how long the rest may take to be sent to a client that closes its connection
-LINES_PER_TURN = 100  # lines of one client after which the other tasks of the loop run
+FLUSH_S = 2.0  # time limit for sending the rest to a client that closes its connection
+LINES_PER_TURN = 100  # consecutive lines of one client before other tasks of the loop run
 LINE_MAX = 1_000_000  # bytes of a request
-HEARTBEAT_S = 20.0  # wall time after which a WebSocket whose client is gone is noticed
-ALIVE_S = 10.0  # wall time after which a stream without news shows that it lives: the client may have gone
-LINGER_S = 10.0  # wall time that a camera's subscription outlives its last client: some request single pictures
+HEARTBEAT_S = 20.0  # wall time after which a WebSocket without a client is detected
+ALIVE_S = 10.0  # wall time after which an idle stream sends a sign of life, to detect a client that is gone
+LINGER_S = 10.0  # wall time that a camera's subscription outlives its last client, since some request single pictures
 BOUNDARY = "zsim-picture"
 PICTURE_HEADERS = {"Cache-Control": "no-store", "Access-Control-Allow-Origin": "*"}
 _SOCKET_OPTIONS = (
-    (socket.IPPROTO_TCP, "TCP_NODELAY", 1),  # a line that waits for more is late
-    (socket.SOL_SOCKET, "SO_KEEPALIVE", 1),  # hosts that are gone are noticed
+    (socket.IPPROTO_TCP, "TCP_NODELAY", 1),  # send a line at once, without waiting for more
+    (socket.SOL_SOCKET, "SO_KEEPALIVE", 1),  # detect hosts that are gone
     (socket.IPPROTO_TCP, "TCP_KEEPIDLE", 5),  # s of silence before the first keepalive probe
     (socket.IPPROTO_TCP, "TCP_KEEPINTVL", 2),  # s between two probes
     (socket.IPPROTO_TCP, "TCP_KEEPCNT", 3),  # probes without an answer that end a connection
@@ -41,12 +41,12 @@ Half = Coroutine[Any, Any, None]
 
 
 class Outbox:
-    """Lines for one client. When it is full the oldest values are lost; losing an answer ends the connection.
+    """A queue of lines for one client. When full, it drops the oldest values; dropping an answer ends the connection.
 
     Args:
         cut: ends the connection at once.
-        lost_line: makes the line that reports how many values were lost.
-        bytes_max: of the lines that wait.
+        lost_line: returns the line that reports how many values were dropped.
+        bytes_max: size limit of the waiting lines.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Outbox:
         self._closed = False
 
     def put(self, line: bytes, droppable: bool = False) -> None:
-        """Add a line, with its end; on the loop. One is droppable if a newer one of its kind replaces it."""
+        """Add a line, with its newline; on the loop. A line is droppable if a newer one of its kind replaces it."""
         if self._closed:
             return
         self._lines.append((line, droppable))
@@ -77,12 +77,12 @@ class Outbox:
         self._filled.set()
 
     def close(self) -> None:
-        """Let `take` end once nothing waits any more."""
+        """Let `take` end once the queue is empty."""
         self._closed = True
         self._filled.set()
 
     async def take(self) -> list[bytes]:
-        """Return all lines that wait, as soon as there are any; nothing once it is closed and empty."""
+        """Return all waiting lines, as soon as there are any; nothing once the queue is closed and empty."""
         while not self._lines and not self._closed:
             await self._filled.wait()
             self._filled.clear()
@@ -103,7 +103,7 @@ class StreamHandler(Protocol):
 
 
 ClientFactory = Callable[[Outbox, bool], StreamHandler]
-"""Makes the client of a connection from its outbox and whether it is authenticated; it may be refused already."""
+"""Creates the client of a connection from its outbox and whether it is authenticated; may refuse it."""
 
 
 async def run_duplex(reading: Half, sending: Half, finish: Callable[[], None], cut: Callable[[], None]) -> None:
@@ -111,9 +111,9 @@ async def run_duplex(reading: Half, sending: Half, finish: Callable[[], None], c
 
     Args:
         reading: ends with the client's last request.
-        sending: ends when nothing is to be sent any more.
+        sending: ends when nothing remains to be sent.
         finish: ends the client, so that sending ends.
-        cut: ends the connection at once, for a client that does not take the rest.
+        cut: ends the connection at once, for a client that does not receive the rest.
     """
     reader, sender = asyncio.create_task(reading), asyncio.create_task(sending)
     try:
@@ -160,7 +160,7 @@ async def serve_lines(
 
 
 async def _read_lines(client: StreamHandler, reader: asyncio.StreamReader) -> None:
-    """Handle line by line; a browser whose page makes it send an HTTP request here is refused."""
+    """Process the lines; refuse a browser that a page caused to send an HTTP request here."""
     count = 0
     while True:
         try:
@@ -175,7 +175,7 @@ async def _read_lines(client: StreamHandler, reader: asyncio.StreamReader) -> No
         if not line:
             return
         if count == 0 and not line.lstrip().startswith(b"{"):
-            client.refuse_line("request: is no JSON object a line; see docs/gateway.md")
+            client.refuse_line("request: is not one JSON object per line; see docs/gateway.md")
             return
         await client.handle_line(line)
         count += 1
@@ -227,7 +227,7 @@ async def stream_events(
 
     For errors see `SharedSubscriptions.subscribe_stream`.
     """
-    lost = b": %d events were lost, they came faster than they were read\n\n"
+    lost = b": %d events were lost, since they came faster than they were read\n\n"
     outbox = Outbox(_cutter(request), lambda count: lost % count)
 
     def put(sample: RawSample) -> None:
@@ -251,12 +251,12 @@ async def stream_events(
         unsubscribe()
 
 
-# Pictures of cameras, with one subscription for all clients of a camera. A client that reads slowly misses pictures: it
-# is sent the newest one each time, beside what its connection holds.
+# Pictures of cameras, with one subscription for all clients of a camera. A slow client misses pictures: it is sent the
+# newest one each time.
 
 
 class NumberedPicture(NamedTuple):
-    """A picture, and the number of those before it."""
+    """A picture, and the number of earlier ones."""
 
     number: int
     image: CameraImage
@@ -265,7 +265,7 @@ class NumberedPicture(NamedTuple):
 class PictureFeed:
     """The newest picture of a camera, for clients on one loop.
 
-    `refuse` is called with the reason for each message that is no picture; `stop` ends its subscription.
+    `refuse` is called with the reason for each message that is not a picture; `stop` ends its subscription.
     """
 
     def __init__(self, key: str, refuse: Callable[[str], None]) -> None:

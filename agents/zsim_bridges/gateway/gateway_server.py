@@ -1,4 +1,4 @@
-"""The gateway: serves HTTP, WebSocket and lines of JSON, for one run after the other, and each client on a stream."""
+"""The gateway: serves HTTP, WebSocket and lines of JSON for one run after another, and each client on a stream."""
 
 import asyncio
 import secrets
@@ -45,24 +45,24 @@ from zsim_bridges.web.web_server import (
 )
 
 CLIENTS_MAX = 500  # streams at once
-UNAUTHENTICATED_MAX = 100  # connections at once that have not shown the token yet
-HELLO_TIMEOUT_S = 5.0  # how long a client may take to show it
+UNAUTHENTICATED_MAX = 100  # unauthenticated connections at once
+HELLO_TIMEOUT_S = 5.0  # time limit for a client to present its token
 DRAIN_S = 2.0  # after the end of a run, how long agents may still answer their last gates
 FAULTS_REPORTED_MAX = 100
-PICTURES_WAITING_MAX = 4  # of a camera that wait for the loop; each may have megabytes
+PICTURES_WAITING_MAX = 4  # waiting messages of a camera; each may have megabytes
 RELEASE_TIMEOUT_S = 1.0  # the world answers within milliseconds
-STREAM_RATE_HZ = 5_000.0  # requests per wall second of one stream; a loop at the speed of the fastest run has 2 500
+STREAM_RATE_HZ = 5_000.0  # requests per wall second of one stream; a loop at the speed of the fastest run makes 2 500
 STREAM_BURST = 10_000.0
-BYE_TIMEOUT_S = 2.0  # how long the end waits for the byes of the agents
+BYE_TIMEOUT_S = 2.0  # how long shutdown waits for the agents to leave
 SUBSCRIPTIONS_MAX = 100  # of one client; `drone/*/truth` is one
 ANSWER_MAX = OUTBOX_BYTES_MAX  # bytes of an answer
-PENDING_MAX = 8  # requests of one client that wait for their answers
+PENDING_MAX = 8  # unanswered requests of one client
 ROLE = "client"  # of a name without a role
 _encode = msgspec.json.Encoder().encode
 
 
 class GatewayPorts(NamedTuple):
-    """Where the gateway listens."""
+    """The address where the gateway listens."""
 
     host: str
     http_port: int
@@ -73,13 +73,13 @@ class Gateway:
     """One gateway.
 
     Args:
-        token: that clients must show; None on this machine alone.
-        dial: opens a session to the world for a process of a name.
+        token: of clients; None if only this machine can connect.
+        dial: opens a session to the world for a named process.
         say: prints a line.
-        secured: whether access control decides where it may publish.
+        secured: whether access control restricts where it may publish.
 
     Raises:
-        RunError: others could reach it, and there is no token.
+        RunError: other machines could reach it, and there is no token.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class Gateway:
         self._link_lost = False
         self._reported_faults: set[str] = set()
         self._clients: set[Client] = set()
-        self._unauthenticated: dict[Client, None] = {}  # those of them that have shown no token yet, in order
+        self._unauthenticated: dict[Client, None] = {}  # the unauthenticated ones among them, in order
         self._lockstep_threads: set[threading.Thread] = set()
 
     # For clients
@@ -123,7 +123,7 @@ class Gateway:
         return self._run
 
     def start_lockstep(self, session: LockstepSession, ended: Callable[[str], None]) -> None:
-        """Run a client's agent, on a link of its own, until it leaves; `ended` is called with the reason."""
+        """Run a client's agent on a separate link until it leaves; `ended` is called with the reason."""
         for client in self._clients:
             client.lose_lockstep(session, "another client took the name")
         thread = threading.Thread(target=self._run_lockstep, args=(session, ended), name=session.name, daemon=True)
@@ -138,7 +138,7 @@ class Gateway:
                 reason = Runner(link, info, session, left, self._say, lost).run()
         except ZsimError as error:
             reason = str(error)
-        except Exception as error:  # a fault of the gateway: the client is not to wait for ever
+        except Exception as error:  # an internal error: the client must not wait for ever
             self.report(f"{session.name}: {error!r}")
         finally:
             self._say(f"{session.name}: left, {'its client is gone' if session.connection_lost else reason}")
@@ -147,11 +147,11 @@ class Gateway:
                 self.loop.call_soon_threadsafe(ended, reason)
 
     def report(self, text: str) -> None:
-        """Print a fault of the gateway itself."""
+        """Print an internal error of the gateway."""
         self._say(f"{self.name}: {text}")
 
     def remove(self, client: "Client") -> None:
-        """Forget a client that is gone, and release the drones that it commanded."""
+        """Remove a client that is gone, and release the drones that it commanded."""
         if client not in self._clients:
             return
         self._clients.discard(client)
@@ -164,13 +164,13 @@ class Gateway:
             self.loop.run_in_executor(None, _release_drones, self._run.link, released)
 
     def admit(self, client: "Client") -> None:
-        """Count a client that has shown the token among those that have.
+        """Count a client as authenticated.
 
         Raises:
-            TooManyError: the limit of clients is reached, or it had to make room for others.
+            TooManyError: the limit of clients is reached, or it was evicted meanwhile.
         """
         if client not in self._unauthenticated:
-            raise TooManyError("the connection has waited too long for its token; connect again")
+            raise TooManyError("the connection was closed, since it waited too long for its token; connect again")
         self._client_limit.enter()
         del self._unauthenticated[client]
 
@@ -193,7 +193,7 @@ class Gateway:
         try:
             run.receive_until_end(stopped)
         finally:
-            if not observer.end_reason:  # the gateway goes, and the run goes on
+            if not observer.end_reason:  # the gateway exits while the run goes on
                 for client in list(self._clients):
                     _release_drones(link, client.commanded)
             self._call_on_loop(self._end, run, observer.end_reason == ANOTHER_RUN)
@@ -214,7 +214,7 @@ class Gateway:
         self._notify_clients("begun", run)
 
     def _end(self, run: RunAccess, another: bool = False) -> None:
-        """End a run for the clients; where the world has begun another one, the link is back, whoever reports it."""
+        """End a run for the clients; if the world has begun another one, the link is back."""
 
         def end_lockstep_sessions() -> None:
             for client in self._clients:
@@ -239,17 +239,17 @@ class Gateway:
                 self.loop.call_soon_threadsafe(self._notify_link, run, up)
 
         run.link.on_link(on_link)
-        if not run.link.links():  # lost before anything was observed, so that no event follows
+        if not run.link.links():  # lost before anything was observed, so no event follows
             on_link(False)
 
     def _notify_link(self, run: RunAccess, up: bool) -> None:
-        """Notify clients of a link that is lost or back, but not when the world goes after the end of its run."""
+        """Notify clients of a link that is lost or back, but not when the world exits after the end of its run."""
         if run is self._run and up == self._link_lost:
             self._link_lost = not up
             self._notify_clients("back" if up else "lost", run)
 
     def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Print what reaches no client, each text once: a flood of connections makes a flood of these."""
+        """Print an error that no client receives, each text once: a flood of connections causes a flood of these."""
         self._report_once(f"{context.get('message')}: {context.get('exception')!r}")
 
     def _refuse_picture(self, reason: str) -> None:
@@ -266,7 +266,7 @@ class Gateway:
 
     @contextmanager
     def open(self) -> Iterator[None]:
-        """Serve clients, on a thread of its own; a RunError says that a port is taken."""
+        """Serve clients on a separate thread; raise RunError if a port is taken."""
         with open_on_thread(self.loop, "gateway servers", self._open, lambda servers: self._close(*servers)):
             yield
 
@@ -286,7 +286,7 @@ class Gateway:
                 raise
         except OSError as error:
             ports = f"{host}, ports {http_port} and {lines_port}"
-            raise RunError(f"gateway: cannot listen on {ports} ({error.strerror}); say --http and --lines") from error
+            raise RunError(f"gateway: cannot listen on {ports} ({error.strerror}); give --http and --lines") from error
         address = f"http://{url_host(host)}:{http_port}"
         self._say(f"{self.name}: HTTP and WebSocket on {address}, lines on port {lines_port}")
         return site, lines
@@ -314,7 +314,7 @@ class Gateway:
                 client.refuse(str(error))
                 return client
         else:
-            if len(self._unauthenticated) >= UNAUTHENTICATED_MAX:  # who has waited longest makes room
+            if len(self._unauthenticated) >= UNAUTHENTICATED_MAX:  # close the one that has waited longest
                 oldest = next(iter(self._unauthenticated))
                 oldest.expire()
                 self.remove(oldest)
@@ -325,21 +325,21 @@ class Gateway:
 
 
 def _release_drones(link: Session, commanded: Iterable[tuple[str, str]]) -> None:
-    """Let others command drones, each with the source that did; the world knows whether it holds them still."""
+    """Release drones in the name of the source that commanded each; the world knows whether it still holds them."""
     with suppress(ZsimError):
         for source, drone in commanded:
             link.request(keys.CONTROL, "release", source, {"drone": drone}, RELEASE_TIMEOUT_S)
 
 
 class Client:
-    """One connection of a stream: its requests are executed, answers and values go into its outbox.
+    """The client on one stream: executes its requests; answers and values go into its outbox.
 
     Args:
-        source: name under which it publishes until it gives its own.
-        authenticated: whether it has shown the token already, or needs none.
+        source: name under which it publishes until it gives one.
+        authenticated: whether it has presented the token, or needs none.
 
     Attributes:
-        commanded: (source, drone) of the drones that it has commanded, outside of a lockstep session, in this run.
+        commanded: (source, drone) of the drones that it has commanded in this run, outside a lockstep session.
     """
 
     def __init__(self, gateway: Gateway, outbox: Outbox, source: str, authenticated: bool, limit: RateLimit) -> None:
@@ -356,7 +356,7 @@ class Client:
         self.source = source
 
     async def handle_line(self, line: bytes) -> None:
-        """Execute the request in a line; an error is an answer."""
+        """Execute the request in a line; an error is sent as an answer."""
         request: StreamRequest | None = None
         try:
             count_request(self._limit)
@@ -364,11 +364,11 @@ class Client:
                 return
             request = client_messages.decode_request(line)
             if not self.authenticated and not isinstance(request, client_messages.HelloRequest):
-                raise ForbiddenError('a token is asked for here; begin with {"op": "hello", "token": "…"}')
-            getattr(self, f"_{request.__struct_config__.tag}")(request)  # the method that has the name of the op
+                raise ForbiddenError('a token is required; begin with {"op": "hello", "token": "…"}')
+            getattr(self, f"_{request.__struct_config__.tag}")(request)  # the method named after the op
         except ZsimError as error:
             self.refuse_line(str(error), request)
-        except Exception as error:  # a fault of the gateway: this client and the others are served on
+        except Exception as error:  # an internal error: the gateway goes on
             self._gateway.report(f"{self.source}: {line[:80]!r}: {error!r}")
             self.refuse_line(f"the gateway failed ({type(error).__name__}); its terminal says more", request)
 
@@ -383,7 +383,7 @@ class Client:
         self._outbox.put(line)
 
     def refuse_line(self, error: str, request: StreamRequest | None = None) -> None:
-        """Answer a request, or a line that is none, with an error."""
+        """Answer a request, or an invalid line, with an error."""
         self.send({"op": "error", "error": error}, request)
 
     def refuse(self, error: str, request: StreamRequest | None = None) -> None:
@@ -392,13 +392,13 @@ class Client:
         self._outbox.close()
 
     def expire(self) -> None:
-        """Close the connection of a client that has not shown the token."""
+        """Close the connection of an unauthenticated client."""
         if not self.authenticated and not self._closed:
-            self.refuse("hello: none came with the token in time")
+            self.refuse("hello: not received with the token in time")
 
     def _hello(self, request: client_messages.HelloRequest) -> None:
         if not self.authenticated and not self._gateway.is_token(request.token):
-            self.refuse("hello: no token, or a wrong one; ask whoever started the gateway for it", request)
+            self.refuse("hello: no token, or a wrong one; the gateway's operator has it", request)
             return
         name = self._process_name(request.name) if request.name else self.source
         if not self.authenticated:
@@ -446,13 +446,13 @@ class Client:
 
     def _ask(self, request: client_messages.AskRequest) -> None:
         if len(self._pending) >= PENDING_MAX:
-            raise TooManyError(f"ask: {PENDING_MAX} of this client wait for their answers already")
+            raise TooManyError(f"ask: {PENDING_MAX} requests of this client are already waiting for answers")
         task = asyncio.create_task(self._send_answer(request, self._gateway.run()))
         self._pending.add(task)
         task.add_done_callback(self._pending.discard)
 
     async def _send_answer(self, request: client_messages.AskRequest, run: RunAccess) -> None:
-        """Wait for an answer while other requests are executed: the answer may need the client's next done."""
+        """Wait for an answer while other requests are executed: it may depend on the client's next done."""
         try:
             answer = await run.request(request.key, request.request, request.args, self.source, request.timeout_s)
         except ZsimError as error:
@@ -486,7 +486,7 @@ class Client:
 
     def _join(self, request: client_messages.JoinRequest) -> None:
         if self._session is not None:
-            raise DecodeError(f"join: is {self._session.name} already; leave first, or use another connection")
+            raise DecodeError(f"join: has joined as {self._session.name}; leave first, or use another connection")
         name = self._process_name(request.name)
         session = LockstepSession(name, request, self._gateway.run(), self._gateway.loop, self._outbox.put)
         self._session, self.source, self._defaults = session, name, session.defaults
@@ -495,18 +495,18 @@ class Client:
 
     def _done(self, request: client_messages.DoneRequest) -> None:
         if self._session is None:
-            raise DecodeError("done: has not joined; must say join first")
+            raise DecodeError("done: has not joined; must join first")
         self._session.answer_gate(request)
 
     def lose_lockstep(self, successor: LockstepSession, reason: str) -> None:
-        """End another session of the same name: its name has been taken."""
+        """End the session, since another one has taken its name."""
         session = self._session
         if session is not None and session.name == successor.name and session is not successor:
             session.leave(connection_lost=True)
             self._on_session_ended(session, reason)
 
     def end_lockstep(self, run: RunAccess, reason: str) -> None:
-        """End the session in a run that is over, answered or not."""
+        """End the session of a finished run, even with an unanswered gate."""
         session = self._session
         if session is not None and session.run is run:
             session.leave()
@@ -527,7 +527,7 @@ class Client:
     # Runs, and the end of the connection
 
     def notify_run(self, state: str, run_id: str) -> None:
-        """Send that a run has begun or ended, or that the link to its world is lost or back."""
+        """Notify the client that a run has begun or ended, or that the link to its world is lost or back."""
         if state == "begun":
             self._defaults = MessageDefaults(self.source)
             self.commanded.clear()
@@ -535,7 +535,7 @@ class Client:
             self.send({"op": "run", "state": state, "run_id": run_id})
 
     def close(self, connection_lost: bool = True) -> None:
-        """End everything that it has; a process in the lockstep whose connection is lost dies rather than leaves."""
+        """Release everything that the client holds; in the lockstep, a lost connection counts as a dead process."""
         if self._closed:
             return
         self._closed = True

@@ -69,9 +69,9 @@ METHODS = "GET, POST, PUT, PATCH, DELETE, OPTIONS"
 EVENT_STREAM = "text/event-stream"
 RAW, TOKEN = "_raw", "token"
 BYTES = "zenoh/bytes"  # encoding that the plugin gives a body without Content-Type
-PICTURE_S = 2.0  # wall time that the first picture is waited for; twice the period of a slow camera
-NO_PICTURE = "no picture yet; does a camera process publish there, and does time run?"
-NO_VALUE = "no value yet; is the key right, and does somebody publish it?"
+PICTURE_S = 2.0  # wall time to wait for the first picture; twice the period of a slow camera
+NO_PICTURE = "no picture yet; is a camera process publishing there, and is time running?"
+NO_VALUE = "no value yet; is the key right, and does a process publish it?"
 STREAM, DESCRIPTION, CAMERA = "/stream", "/openapi.json", "/camera/{drone}/{camera}"
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 _encode = msgspec.json.Encoder().encode
@@ -81,14 +81,14 @@ ONE_PICTURE = ".jpg"  # end of the path of a single picture
 DEFAULTED = ("t_ns", "seq", "source")  # fields that a client may leave out
 CONTROL_PATHS = ("world/control", "cluster/{cluster}/control", "drone/{drone}/control")
 _REF = "#/components/schemas/{name}"
-_OWN_KEY = {"type": "string", "pattern": "^[A-Za-z0-9_.-]{1,64}$"}  # of a client's own key; Zenoh takes more
+_OWN_KEY = {"type": "string", "pattern": "^[A-Za-z0-9_.-]{1,64}$"}  # of a client's own key; Zenoh accepts more
 _ERRORS = {
     400: "an invalid key or value",
     401: "no token, or a wrong one",
     403: "a reserved key, or a page of another server",
     404: "no such drone or cluster, or no value yet",
     405: "a method that this key does not have",
-    408: "a request that did not come whole in its time",
+    408: "a request that did not arrive completely in time",
     413: "a body that is too long",
     429: "too many requests",
     503: "there is no run now",
@@ -154,11 +154,11 @@ def application(
 
 
 class AccessCheck:
-    """Passes requests on or refuses them.
+    """Passes on or refuses requests.
 
     Args:
         token: that every request must have; None where only this machine can connect.
-        report: prints a fault of the gateway itself.
+        report: prints an internal error of the gateway.
     """
 
     def __init__(self, token: str | None, report: Callable[[str], None]) -> None:
@@ -187,9 +187,7 @@ class AccessCheck:
             if not self.is_token(token.strip() if kind.lower() == "bearer" else request.query.get(TOKEN, "")):
                 raise MissingTokenError("no token, or a wrong one; send Authorization: Bearer TOKEN, or ?token=TOKEN")
             if self._token is None and not _is_from_this_machine(request):
-                raise ForbiddenError(
-                    "a page of another server may not ask here; give the gateway a token, and ask with it"
-                )
+                raise ForbiddenError("pages of another server need a token; start the gateway with one, and send it")
             return await handler(request)
         except ZsimError as error:
             status = next(status for kind, status in STATUS if isinstance(error, kind))
@@ -200,24 +198,24 @@ class AccessCheck:
             return error_response(error.status, f"{request.method} {request.path[:80]}: {text}", sorted(allowed))
         except ConnectionError:
             raise
-        except Exception as error:  # a fault of the gateway: other requests are served on
-            if isinstance(error, RuntimeError) and request.transport is None:  # aiohttp's for a body that is cut
+        except Exception as error:  # an internal error: the gateway goes on
+            if isinstance(error, RuntimeError) and request.transport is None:  # raised by aiohttp for a truncated body
                 raise ConnectionResetError("the client is gone") from error
             self._report(f"{request.method} {request.path[:80]}: {error!r}")
             return error_response(500, f"the gateway failed ({type(error).__name__}); its terminal says more")
 
 
 def error_response(status: int, text: str, allowed: Iterable[str] = ()) -> web.Response:
-    """Return a response that has no value but an error, and the methods that the key has."""
+    """Return a response with an error, and with the methods of the key."""
     headers = {"Allow": ", ".join(allowed)} if allowed else None
     return web.Response(status=status, body=_encode({"error": text}), content_type="application/json", headers=headers)
 
 
 def _is_from_this_machine(request: web.Request) -> bool:
-    """Return whether a program of this machine sent a request, and no page of another server: browsers give its origin.
+    """Return whether a request is from a program of this machine and not from a page of another server (by its origin).
 
-    A server on another port of this machine is another one, whose pages may be anybody's. The Host header counts too:
-    another site can let its own name resolve to this machine.
+    A server on another port of this machine is another one, whose pages are not trusted. The Host header counts too:
+    another site can make its own name resolve to this machine.
     """
     origin = request.headers.get("Origin")  # "null" for a sandboxed frame: any page can make one
     try:
@@ -232,7 +230,7 @@ class RestTree:
     """Handlers of the tree of full keys."""
 
     run: Callable[[], RunAccess]  # the current one
-    subscriptions: SharedSubscriptions  # to full keys
+    subscriptions: SharedSubscriptions  # subscriptions to full keys
 
     async def get(self, request: web.Request) -> web.StreamResponse:
         """Answer a GET or a POST."""
@@ -259,7 +257,7 @@ class RestTree:
         stored = [] if body else run.last_samples(expression)
         if stored and "*" not in expression:
             return stored
-        # What follows the `?` are Zenoh's parameters, but for the gateway's own.
+        # The query string holds Zenoh's parameters and the gateway's own.
         parts = [part for part in request.query_string.split("&") if part.partition("=")[0] not in (TOKEN, "")]
         answers = await run.query(expression, ";".join(parts), body, _encoding_of(request))
         stored_keys = {sample.key for sample in stored}
@@ -280,7 +278,7 @@ class JsonTree:
     """Handlers of the tree of JSON."""
 
     run: Callable[[], RunAccess]
-    subscriptions: SharedSubscriptions  # to keys without the federation's name
+    subscriptions: SharedSubscriptions  # subscriptions to keys without the federation's name
     source: str  # of control requests that name none
 
     async def get(self, request: web.Request) -> web.StreamResponse:
@@ -305,7 +303,7 @@ class JsonTree:
         return _as_json({})
 
     async def post(self, request: web.Request) -> web.Response:
-        """Send a control request to whoever answers on a key."""
+        """Send a control request to the process that answers on a key."""
         key = _checked_key(request)
         try:
             control = _control_request(await request.read())
@@ -324,7 +322,7 @@ class CameraTree:
     limit: ClientLimit  # in which streams count
 
     async def get(self, request: web.Request) -> web.StreamResponse:
-        """Answer with all pictures from now on, or with the newest one alone where the path ends with `.jpg`."""
+        """Answer with all pictures from now on, or with only the newest one if the path ends with `.jpg`."""
         camera = request.match_info["camera"]
         key = self.run().camera_key(request.match_info["drone"], camera.removesuffix(ONE_PICTURE))
         self.limit.enter()
@@ -342,7 +340,7 @@ class CameraTree:
 
 
 def methods_of(key: str) -> tuple[str, ...]:
-    """Return the HTTP methods of a key: control keys take requests, reserved ones are read, clients' own take all."""
+    """Return the HTTP methods of a key: control keys accept requests, reserved keys reads, clients' own keys all."""
     if is_control_key(key):
         return ("POST",)
     if is_reserved(key):
@@ -371,7 +369,7 @@ def _checked_key(request: web.Request) -> str:
     allowed = methods_of(key)
     if request.method not in allowed:
         raise MethodError(
-            f"{key[:80]}: {request.method} is nothing for this key; must be {' or '.join(allowed)}", allowed
+            f"{key[:80]}: {request.method} is not a method of this key; must be {' or '.join(allowed)}", allowed
         )
     return key
 
@@ -385,7 +383,7 @@ def _encoding_of(request: web.Request) -> str:
 
 
 def _first_accepted(request: web.Request) -> str:
-    """Return the first media type that is accepted: the plugin looks at no other."""
+    """Return the first accepted media type: the plugin ignores the others."""
     return request.headers.get("Accept", "application/json").split(",")[0].split(";")[0].strip()
 
 
@@ -393,9 +391,9 @@ def _first_accepted(request: web.Request) -> str:
 
 
 def described_sample(sample: RawSample) -> dict[str, Any]:
-    """Return an answer or a publication as the plugin describes it."""
+    """Return an answer or a publication in the plugin's JSON format."""
     kind, payload = sample.encoding.partition(";")[0], sample.payload
-    value: Any = base64.b64encode(payload).decode() if payload else None  # what is not of its encoding: as bytes
+    value: Any = base64.b64encode(payload).decode() if payload else None  # not valid in its encoding: as bytes
     try:
         if payload and kind in JSON:
             value = json.loads(payload)
@@ -414,7 +412,7 @@ def _sample_event(sample: RawSample) -> bytes:
 
 @lru_cache(maxsize=CACHED_VALUES)
 def value_event(sample: RawSample) -> bytes:
-    """Return a publication as an event; nothing for what is no message."""
+    """Return a publication as an event; nothing for an invalid message."""
     deleted = {"key": sample.key, "value": None}
     try:
         value = json_entry(sample.key, sample.payload, sample.encoding) if sample.payload else deleted
@@ -444,13 +442,13 @@ def description() -> dict[str, Any]:
         names = [parts[i - 1] for i, part in enumerate(parts) if part == "*"]
         path = "/".join(f"{{{parts[i - 1]}}}" if part == "*" else part for i, part in enumerate(parts))
         get = {
-            "summary": f"The last {name}, or with Accept: text/event-stream every one from now on",
+            "summary": f"The last {name}, or with Accept: text/event-stream each one from now on",
             "description": kind.__doc__ or "",
             "responses": _responses(_json({"$ref": _REF.format(name=name)})),
         }
         paths[f"{JSON_PREFIX}{path}"] = item = {"parameters": [_named(each) for each in names], "get": get}
         if is_client_key(shape.replace("*", "any")):
-            # Fields that are filled in are not required of what clients send.
+            # Fields that the gateway fills in are optional for clients.
             required = [field for field in schemas[name]["required"] if field not in DEFAULTED]
             schemas[f"{name}Sent"] = {**schemas[name], "required": required}
             item["put"] = {
@@ -462,7 +460,7 @@ def description() -> dict[str, Any]:
     return {
         "openapi": "3.1.0",
         "info": {"title": "zsim gateway", "version": __version__, "description": "See docs/gateway.md."},
-        "servers": [{"url": "."}],  # beside this description, below whatever path a proxy has it
+        "servers": [{"url": "."}],  # relative to this description, under any path of a proxy
         "paths": {**paths, **_other_paths()},
         "components": {
             "schemas": {**schemas, "Refusal": refusal},
@@ -473,7 +471,7 @@ def description() -> dict[str, Any]:
 
 
 def _without_prefix_items(schema: Any) -> Any:
-    """Return a schema with vectors as arrays of one kind of entry: fewer tools know `prefixItems`."""
+    """Return a schema with vectors as arrays of one item type, since few tools know `prefixItems`."""
     if isinstance(schema, list):
         return [_without_prefix_items(entry) for entry in schema]
     if not isinstance(schema, dict):
@@ -503,7 +501,7 @@ def _other_paths() -> dict[str, Any]:
         "parameters": [_parameter("key", _OWN_KEY)],
         "get": {"summary": "The last value", "responses": _responses(_json(anything))},
         "put": {
-            "summary": "Publish any JSON on a key of one's own",
+            "summary": "Publish any JSON on a key of your own",
             "requestBody": {"required": True, **_json({})},
             "responses": _responses(text="published"),
         },
@@ -557,7 +555,7 @@ def _json(schema: dict[str, Any]) -> dict[str, Any]:
 
 
 def _responses(content: dict[str, Any] | None = None, text: str = "answered") -> dict[str, Any]:
-    """Return the responses of an operation: what it answers, and the errors."""
+    """Return the responses of an operation: its answer, and the errors."""
     errors = _json({"$ref": _REF.format(name="Refusal")})
     refusals = {str(status): {"description": text, **errors} for status, text in _ERRORS.items()}
     return {"200": {"description": text, **(content or {})}, **refusals}

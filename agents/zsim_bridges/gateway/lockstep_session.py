@@ -1,4 +1,4 @@
-"""A client that takes part in the lockstep: an agent whose step is executed at the other end of a socket."""
+"""A client in the lockstep: an agent whose step is executed at the other end of a socket."""
 
 import asyncio
 import queue
@@ -17,15 +17,15 @@ from zsim_bridges.gateway.client_messages import DoneRequest, JoinRequest, Messa
 from zsim_bridges.gateway.run_access import RunAccess
 
 ANSWER_TIMEOUT_S = 10.0  # wall time after which a client that answers nothing in realtime leaves the lockstep
-LATE_PERIODS = 2  # in realtime a gate that is older by so many is sent together with a newer one
+LATE_PERIODS = 2  # in realtime, a gate older by this many is sent together with a newer one
 NO_GATE_NS = -1  # no gate waits for an answer
 _encode = msgspec.json.Encoder().encode
 
 
 class LockstepSession(Agent):
-    """A client's part in the lockstep, from its join until it leaves: sends each gate's inputs, waits for its outputs.
+    """A client's session in the lockstep, from joining to leaving: sends each gate's inputs, waits for its outputs.
 
-    The runner's methods are called in a thread of its own, all others on the loop.
+    The runner calls its methods in a separate thread; all others are called on the loop.
 
     Args:
         name: process name of the participant, role.thing.
@@ -33,12 +33,12 @@ class LockstepSession(Agent):
         send: sends the line of a gate; called on the loop.
 
     Attributes:
-        connection_lost: whether its client went without leaving, so that its process counts as dead.
+        connection_lost: whether its client disconnected without leaving, so that its process counts as dead.
 
     Raises:
         DecodeError: name, period or a gate key is invalid.
-        UnknownError: a gate key is about a drone or a cluster that the run does not have.
-        SessionError: an entry of `reads` is no key expression.
+        UnknownError: a gate key names a drone or cluster that the run does not have.
+        SessionError: an entry of `reads` is not a key expression.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class LockstepSession(Agent):
         for key in gates:
             run.check_known(key)
         self.gate_keys = tuple(gates) or gate_keys_of(info, reads, name, run.required_processes)
-        # A key that two expressions match would come twice.
+        # A key that matches two expressions would arrive twice.
         missing = [key for key in self.gate_keys if not any(keys.matches(each, key) for each in reads)]
         self.reads = tuple(dict.fromkeys((*reads, *missing)))
         self.counted = tuple(d.name for d in info.drones if any(_matches_sensors(each, d.name) for each in self.reads))
@@ -104,17 +104,17 @@ class LockstepSession(Agent):
             self._send(line)
 
     def answer_gate(self, request: DoneRequest) -> None:
-        """Answer the gate that waits; an error changes nothing, and the gate goes on waiting.
+        """Answer the waiting gate; on an error nothing changes, and the gate keeps waiting.
 
         Raises:
-            DecodeError: there is no such gate, or an output is no message of its key.
+            DecodeError: there is no such gate, or an output is not a message of its key.
             ForbiddenError: an output's key is reserved.
         """
         if self._gate_ns == NO_GATE_NS:
             raise DecodeError("done: there is no gate to answer; wait for the next")
         if request.t_ns != self._gate_ns:
             raise DecodeError(f"done: t_ns is {request.t_ns}; must be {self._gate_ns}, the gate that came last")
-        counted: list[Output] = []  # by a done; they go out by the runner, the rest by the gateway
+        counted: list[Output] = []  # counted by a done: the runner publishes these, the gateway the rest
         others: list[tuple[str, bytes]] = []
         with self.defaults.transaction():
             for key, value in ((output.key, output.value) for output in request.outputs):
@@ -132,15 +132,15 @@ class LockstepSession(Agent):
         self._answers.put(counted)
 
     def leave(self, connection_lost: bool = False) -> None:
-        """End a step that waits: the client is gone."""
+        """End a waiting step: the client is gone."""
         self.has_left, self.connection_lost = True, connection_lost
         self._answers.put([])
 
 
 def gate_keys_of(info: Info, reads: Sequence[str], name: str, required: Collection[tuple[str, str]]) -> tuple[str, ...]:
-    """Return the keys that come at every gate and match some expression; `clock` where there are none.
+    """Return the keys with a message at every gate that match some expression; `clock` if there are none.
 
-    A drone's status and truth come from the world. Its estimate, and the state of a cluster, come at every gate if the
+    A drone's status and truth come from the world. Its estimate and the state of a cluster arrive at every gate if the
     run does not start without a process for it, other than the one that joins.
     """
     served = {thing for process, thing in required if process != name}

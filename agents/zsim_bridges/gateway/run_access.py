@@ -1,4 +1,4 @@
-"""A run for the gateway's clients: the last value of every key, shared subscriptions, publications and requests."""
+"""Access to a run for the gateway's clients: last values of keys, shared subscriptions, publications and requests."""
 
 import asyncio
 import threading
@@ -33,13 +33,13 @@ from zsim_bridges.gateway.client_messages import (
 )
 
 TICK_S = 0.1  # how often health is published and a stop is noticed while nothing arrives
-REQUESTS_MAX = 64  # requests under way at once; each has a thread that waits for Zenoh
+REQUESTS_MAX = 64  # concurrent requests; each has a thread that waits for Zenoh
 ECHOES_MAX = 256  # of a key; a paused world returns none, and clients may go on
 DELETED = None
 OWN_BYTES_MAX = 64_000_000  # of the values on clients' own keys
 KEYS_MAX = 200_000  # kept; 1000 drones have about 12 000
-WAITING_MAX = 50_000  # messages of an expression that wait for the loop, unless said otherwise
-DELIVER_MAX = 500  # messages delivered before the other tasks of the loop run
+WAITING_MAX = 50_000  # default limit of an expression's messages that wait for the loop
+DELIVER_MAX = 500  # messages delivered before other tasks of the loop run
 EXPRESSIONS_MAX = 2_000  # of all clients together; each is a subscription that the world's session checks
 
 Subscriber = Callable[[RawSample], None]
@@ -52,12 +52,12 @@ class RunAccess:
         link: an open session.
         info: of the run.
         observer: of the gateway in it.
-        secured: whether access control decides what it may do.
+        secured: whether access control restricts what it may do.
 
     Attributes:
         values: last ones.
         defaults: of messages in the gateway's own name.
-        required_processes: (process, drone or cluster that it serves) of all without which the run does not start.
+        required_processes: (process, drone or cluster served) of all processes that the run needs to start.
     """
 
     def __init__(self, link: Session, info: Info, observer: Participant, secured: bool) -> None:
@@ -81,10 +81,10 @@ class RunAccess:
         """Simulated time of the newest gate."""
         return self._observer.now_ns
 
-    # What passes the world
+    # Messages that pass the world
 
     def open(self) -> None:
-        """Subscribe to what passes the world, and read the last values of before."""
+        """Subscribe to the messages that pass the world, and read the earlier last values."""
         self._traffic = Traffic(self.link, run_key_table(self.info), self.count_refused)
         # Views do not pass the world.
         self.link.declare_subscriber("view/**", lambda sample: self._keep(self.values.add, sample))
@@ -93,7 +93,7 @@ class RunAccess:
                 self._keep(self.values.add, sample)
 
     def receive_until_end(self, stopped: Callable[[], bool]) -> None:
-        """Store what passes the world until the run is over or `stopped` returns true."""
+        """Store the messages that pass the world until the run is over or `stopped` returns true."""
         traffic, over = self._traffic, threading.Event()
         assert traffic is not None
 
@@ -118,7 +118,7 @@ class RunAccess:
             ticker.join()
 
     def _keep(self, add: Callable[[str, bytes], None], sample: RawSample | ReceivedSample) -> None:
-        """Keep a last value; of what is no message, which anybody may publish, the one before stays."""
+        """Store a last value; ignore an invalid message, which any process may publish."""
         if is_sound(sample.key, sample.payload):
             add(sample.key, sample.payload)
         else:
@@ -127,22 +127,22 @@ class RunAccess:
             self._observer.update_clock(sample.payload)
 
     def close(self) -> None:
-        """Give up requests that wait."""
+        """Abandon waiting requests."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     # By keys without the federation's name
 
     def put(self, key: str, value: Any, defaults: MessageDefaults) -> None:
-        """Publish plain data on a key with what it leaves out filled in; for errors see `encode`, `check_writable`."""
+        """Publish plain data on a key, with missing fields filled in; for errors see `encode`, `check_writable`."""
         self.check_writable(key)
         with defaults.transaction():
             payload = self.encode(key, defaults.fill(key, value, self.now_ns))
         self.publish(key, payload)
 
     def publish(self, key: str, payload: bytes, encoding: str = "") -> None:
-        """Publish a payload that has been checked; of an encoding that is not its key's where one is given."""
+        """Publish a checked payload, with the given encoding or else that of its key."""
         self.link.put_sample(key, payload, encoding or messages.encoding(key))
-        if not keys.is_picture(key):  # nobody's last value: they are large, and the world keeps none either
+        if not keys.is_picture(key):  # not kept as last values: they are large, and the world keeps none either
             self.values.add_own(key, payload, encoding)
 
     def encode(self, key: str, value: Any) -> bytes:
@@ -152,18 +152,18 @@ class RunAccess:
             DecodeError: with key, field, value and what is allowed.
             ForbiddenError: the key is reserved.
             UnknownError: the run has no such drone or cluster.
-            SessionError: it is no key.
+            SessionError: the key is invalid.
         """
         self._check_key(key)
         return json_to_payload(key, value)
 
     def _check_key(self, key: str) -> None:
-        """Refuse a key of the federation that is reserved, or is no key."""
+        """Refuse a key of the federation that is reserved or invalid."""
         check_not_reserved(key)
         check_expression(key)
         self.check_known(key)
         if is_client_key(key) and messages.type_of(key) is None:
-            raise DecodeError(f"{key[:80]}: is no key of the contract; see docs/protocol.md")
+            raise DecodeError(f"{key[:80]}: is not a key of the contract; see docs/protocol.md")
 
     def check_writable(self, key: str) -> None:
         """Raise a ForbiddenError for a key on which access control drops the gateway's messages."""
@@ -195,9 +195,9 @@ class RunAccess:
     async def request(
         self, key: str, op: str, args: dict[str, Any], source: str, timeout_s: float = 5.0
     ) -> ControlAnswer:
-        """Send a control request to whoever answers on a key; a TooManyError says that REQUESTS_MAX wait already."""
+        """Send a control request to the process that answers on a key; TooManyError if REQUESTS_MAX are waiting."""
         if "*" in key:
-            raise DecodeError(f"{key[:80]!r}: is no key; a request goes to one, without wildcards")
+            raise DecodeError(f"{key[:80]!r}: is not a key; a request needs one without wildcards")
         self.check_known(key)
         return await self._in_thread(self.link.request, key, op, source, args, timeout_s)
 
@@ -214,7 +214,7 @@ class RunAccess:
         return await self._in_thread(self.bare_link.query, expression, parameters, payload, encoding)
 
     def put_full_key(self, key: str, payload: bytes, encoding: str) -> None:
-        """Publish a payload on a full key; a DecodeError says that it is not the message of the key."""
+        """Publish a payload on a full key; raise DecodeError if it is not the message of the key."""
         own = self._federation_key(key)
         if own is None:
             self.bare_link.put_sample(key, payload, encoding)
@@ -224,7 +224,7 @@ class RunAccess:
         self.publish(own, payload, encoding)
 
     def delete_full_key(self, key: str) -> None:
-        """Publish that a full key has no value any more."""
+        """Publish that a full key no longer has a value."""
         own = self._federation_key(key)
         self.bare_link.delete(key)
         if own is not None:
@@ -247,7 +247,7 @@ class RunAccess:
 
     async def _in_thread(self, wait: Callable[..., Any], *args: Any) -> Any:
         if self._pending >= REQUESTS_MAX:
-            raise TooManyError(f"{REQUESTS_MAX} requests wait for their answers already; ask again later")
+            raise TooManyError(f"{REQUESTS_MAX} requests are already waiting for answers; try again later")
         self._pending += 1
         try:
             return await asyncio.get_running_loop().run_in_executor(self._threads, wait, *args)
@@ -256,11 +256,11 @@ class RunAccess:
 
 
 class EchoFilter:
-    """Recognises values of clients that come back from the world after a newer value, by key.
+    """Recognises clients' values that return from the world after a newer value, by key.
 
-    After two values in a row the first comes back when the second is there already; after a value and its deletion
-    the value comes back. An echo that never comes is forgotten with the next of its key. Echoes are expected of
-    `keys_max` keys at most.
+    After two values in a row the first returns when the second is already stored; after a value and its deletion
+    the value returns. An echo that never arrives is dropped with the next one of its key. Echoes are expected for
+    at most `keys_max` keys.
     """
 
     def __init__(self, keys_max: int) -> None:
@@ -273,12 +273,12 @@ class EchoFilter:
             self._waiting.setdefault(key, deque(maxlen=ECHOES_MAX)).append(hash(payload))
 
     def add_deletion(self, key: str) -> None:
-        """Note that a key whose echoes are expected has no value any more."""
+        """Record that a key whose echoes are expected no longer has a value."""
         if key in self._waiting:
             self._waiting[key].append(DELETED)
 
     def is_stale(self, key: str, payload: bytes) -> bool:
-        """Return whether a payload from the world is an echo that a newer value or deletion has followed."""
+        """Return whether a payload from the world is an echo superseded by a newer value or deletion."""
         waiting = [*self._waiting.get(key, ())]
         if hash(payload) not in waiting:
             return False
@@ -290,7 +290,7 @@ class EchoFilter:
 
 
 class LastValues:
-    """The last value of every key that has passed the world, or was published by clients here.
+    """The last value of every key that has passed the world or was published by clients here.
 
     Args:
         table: keys of the world's messages about the drones of the run, see `run_key_table`.
@@ -311,7 +311,7 @@ class LastValues:
             self._add(key, payload)
 
     def add_own(self, key: str, payload: bytes, encoding: str = "") -> None:
-        """Store a message of a client here, which the world will return, too."""
+        """Store a message of a client, which the world will echo."""
         with self._lock:
             self._echoes.add(key, payload)
             self._add(key, payload, encoding)
@@ -327,7 +327,7 @@ class LastValues:
         if messages.type_of(key) is None:
             more = len(payload) - len(self._payloads.get(key, b""))
             if not has_room or self._own_bytes + more > OWN_BYTES_MAX:
-                self._drop(key)  # no value is better than an old one
+                self._drop(key)  # better no value than an outdated one
                 return
             self._own_bytes += more
         if has_room:
@@ -336,7 +336,7 @@ class LastValues:
                 self._encodings[key] = (payload, encoding)
 
     def drop(self, key: str) -> None:
-        """Forget the value of a key that is deleted here."""
+        """Remove the value of a key that a client here deletes."""
         with self._lock:
             self._echoes.add_deletion(key)
             self._drop(key)
@@ -362,7 +362,7 @@ class LastValues:
 
         Args:
             expression: of keys with the prefix.
-            prefix: that is put before each key to compare it; what is returned is without it.
+            prefix: prepended to each key for the comparison; returned keys are without it.
         """
         if "*" not in expression:
             matching = [expression.removeprefix(prefix)] if expression.startswith(prefix) else []
@@ -381,8 +381,8 @@ class SharedSubscriptions:
 
     Args:
         loop: on which everything but Zenoh's callbacks is called.
-        limit: of clients, in which streams count that are nothing but one subscription.
-        waiting_max: messages of an expression that wait for the loop; then the oldest go.
+        limit: of clients; a stream that is only one subscription counts as one.
+        waiting_max: messages of an expression that wait for the loop; beyond it the oldest are dropped.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, limit: ClientLimit, waiting_max: int = WAITING_MAX) -> None:
@@ -395,11 +395,11 @@ class SharedSubscriptions:
     def attach(self, link: Session) -> None:
         self._link = link
         for expression, shared in self._by_expression.items():
-            with suppress(SessionError):  # no right to read it; as from keys without publishers, nothing comes
+            with suppress(SessionError):  # no right to read it: nothing arrives, as from keys without publishers
                 shared.undeclare = link.declare_subscriber(expression, shared.on_publication)
 
     def detach(self) -> None:
-        """Receive nothing until the next `attach`: the session closes."""
+        """Receive nothing until the next `attach`, since the session is closing."""
         self._link = None
         for shared in self._by_expression.values():
             shared.undeclare = None
@@ -408,14 +408,14 @@ class SharedSubscriptions:
         """Call a subscriber with every publication on an expression until the returned function is called.
 
         Raises:
-            SessionError: it is no key expression.
+            SessionError: it is not a key expression.
             TooManyError: there are EXPRESSIONS_MAX others.
         """
         shared = self._by_expression.get(expression)
         if shared is None:
             check_expression(expression)
             if len(self._by_expression) >= EXPRESSIONS_MAX:
-                raise TooManyError(f"subscribe: there are {EXPRESSIONS_MAX} expressions already; take one of them")
+                raise TooManyError(f"subscribe: there are {EXPRESSIONS_MAX} expressions already; use one of them")
             shared = self._by_expression[expression] = _SharedSubscription(self._loop, self._waiting_max)
             if self._link is not None:
                 shared.undeclare = self._link.declare_subscriber(expression, shared.on_publication)
@@ -434,10 +434,10 @@ class SharedSubscriptions:
         return unsubscribe
 
     def subscribe_stream(self, expression: str, subscriber: Subscriber) -> Callable[[], None]:
-        """Subscribe for a connection that has nothing else, and count it among the clients.
+        """Subscribe for a connection with a single subscription, and count it among the clients.
 
         Raises:
-            SessionError: it is no key expression.
+            SessionError: it is not a key expression.
             TooManyError: the limit of clients or of expressions is reached.
         """
         self._limit.enter()
@@ -465,7 +465,7 @@ class _SharedSubscription:
         self.undeclare: Callable[[], None] | None = None
 
     def on_publication(self, sample: RawSample) -> None:
-        """Store a publication, in a thread of Zenoh's."""
+        """Store a publication; called in a thread of Zenoh."""
         self._waiting.append(sample)
         if not self._scheduled:
             self._scheduled = True

@@ -1,4 +1,4 @@
-"""The session with one MAVLink vehicle: its telemetry is requested, followed and read, and it does what is demanded.
+"""The session with one MAVLink vehicle: requests, tracks and decodes its telemetry, and makes it carry out demands.
 
 Pure. Sources: https://mavlink.io/en/services/ (heartbeat, command, timesync, message intervals); PX4
 px4_custom_mode.h; ArduPilot Copter mode.h; https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_MODE.
@@ -37,13 +37,13 @@ from zsim_bridges.vehicle_links.vehicle_session import (
 SYSTEM, COMPONENT = 245, 191  # of this driver; MAV_COMP_ID_ONBOARD_COMPUTER
 HEARTBEAT_NS = 1_000_000_000  # https://mavlink.io/en/services/heartbeat.html
 TIMESYNC_NS = 500_000_000  # chosen: ten round trips in the window of a clock's offset
-REQUEST_NS = 3_000_000_000  # chosen: after which a missing stream is requested again
+REQUEST_NS = 3_000_000_000  # chosen; time after which a missing stream is requested again
 STRANGERS_MAX = 256  # other systems that are reported, each once
-CLIMBED = 0.85  # chosen: of the height of a take-off, from which on it counts as up
+CLIMBED = 0.85  # chosen; fraction of the take-off height from which it counts as reached
 REPEAT_NS = 1_000_000_000  # chosen: an autopilot answers a command within some 0.1 s
 KILL_REPEAT_NS = 200_000_000  # chosen: the one command that must not be lost
 SETPOINT_NS = 40_000_000  # 25 Hz: PX4 takes 2 Hz for silence
-CHANGED_NS = 15_000_000  # chosen: less than a gate, in which a controller commands once
+CHANGED_NS = 15_000_000  # chosen: less than a gate, in which a controller sends one command
 STREAMED_NS = 600_000_000  # PX4 wants more than 0.5 s of setpoints before OFFBOARD
 VELOCITY_AND_YAW_RATE = 0xFFF & ~(TypeMask.VX | TypeMask.VY | TypeMask.VZ | TypeMask.FORCE | TypeMask.YAW_RATE)
 HERE = (0.0, 0.0, 0.0, math.nan, math.nan, math.nan)  # the first parameters of NAV_LAND and NAV_TAKEOFF: no place
@@ -66,13 +66,13 @@ DOP_M = 2.0  # m for a dilution of 1, usual for a single frequency
 
 
 class ExternalControl(NamedTuple):
-    """How an autopilot's velocity is controlled from outside, and what leads there.
+    """How an autopilot's velocity is controlled externally, and how that mode is entered.
 
     Attributes:
         custom_mode: the mode for that, in its heartbeats; parameters: of DO_SET_MODE, from the second on.
         takes_off: whether it takes off in this mode; else in a mode of its own.
-        own: further modes while nobody but this driver has control: it may be led back from them.
-        landing: in which it lands, be it for this driver, its pilot, or its own failsafe.
+        own: further modes in which only this driver has control, and from which it may return.
+        landing: in which it lands, for this driver, its pilot, or its own failsafe.
     """
 
     custom_mode: int
@@ -88,7 +88,7 @@ CONTROL = {
         PX4_MODES[FlightMode.OFFBOARD],
         (6, 0),
         takes_off=False,
-        own=(PX4_MODES[FlightMode.TAKEOFF], PX4_MODES[FlightMode.HOLD]),  # it holds also when setpoints stay away
+        own=(PX4_MODES[FlightMode.TAKEOFF], PX4_MODES[FlightMode.HOLD]),  # it also holds when setpoints stop
         landing=PX4_MODES[FlightMode.LAND],
         rates_hz={**_RATES_HZ, dialect.HighresImu: 200.0},
     ),
@@ -108,10 +108,10 @@ class AutopilotSession(VehicleSession):
 
     Args:
         origin: of W: latitude, longitude [deg], height [m].
-        system: its system id; 0 for the first autopilot that shows itself.
-        local_origin_m: origin of its local frame [m; W]; None for what it reports.
+        system: its system id; 0 for the first autopilot that appears.
+        local_origin_m: origin of its local frame [m; W]; None for the reported one.
         key: of signatures, both ways; None for none.
-        unix_s: wall time since 1970, which signatures carry.
+        unix_s: returns wall time since 1970, used in signatures.
     """
 
     def __init__(
@@ -167,7 +167,7 @@ class AutopilotSession(VehicleSession):
                 self._take(received.message, now_ns)
 
     def _is_vehicle(self, received: Received) -> bool:
-        """Return whether a message is of the vehicle; the first heartbeat of an autopilot decides which one that is."""
+        """Return whether a message is from the vehicle, which the first heartbeat of an autopilot determines."""
         message: Any = received.message
         address = received.system_id, received.component_id
         if self._autopilot is not None and address == self._autopilot.address:
@@ -202,7 +202,7 @@ class AutopilotSession(VehicleSession):
                 taken_over = self._autopilot.is_taken_over(self._action == "land")
                 if taken_over != self._taken_over:  # in the air, by somebody else
                     self._taken_over = taken_over
-                    what = "somebody else has control" if taken_over else "it is given back"
+                    what = "another program or pilot has control" if taken_over else "it is given back"
                     self.texts.append(f"{what} (mode {self._autopilot.custom_mode:#x})")
 
     # To the vehicle
@@ -267,7 +267,7 @@ class AutopilotSession(VehicleSession):
 
 
 class AutopilotState:
-    """What an autopilot tells of its flight; `landed` is its MAV_LANDED_STATE."""
+    """The flight state that an autopilot reports; `landed` is its MAV_LANDED_STATE."""
 
     def __init__(self, address: tuple[int, int], control: ExternalControl) -> None:
         self.address = address
@@ -290,10 +290,10 @@ class AutopilotState:
                 self.sea_height_m = message.alt / 1e3
 
     def is_taken_over(self, lands: bool) -> bool:
-        """Return whether somebody else, first of all its pilot, has chosen its mode in the air.
+        """Return whether another controller, usually its pilot, has chosen its mode in the air.
 
         Args:
-            lands: whether this driver lands it.
+            lands: whether this driver is landing it.
         """
         control, mode = self.control, self.custom_mode
         own = mode in (control.custom_mode, *control.own) or (lands and mode == control.landing)
@@ -308,7 +308,7 @@ class AutopilotState:
         return dialect.CommandLong(*self.address, number, 0, *parameters)
 
     def state(self, flies: bool, climbed: bool) -> DroneState:
-        """Return its state as the contract names it.
+        """Return its state as a state of the contract.
 
         Args:
             flies: whether it has a setpoint to fly.
@@ -326,7 +326,7 @@ class AutopilotState:
 
 
 class DemandSequence:
-    """The commands and setpoints by which one autopilot does what is demanded.
+    """The commands and setpoints that make one autopilot carry out demands.
 
     Commands are repeated until the telemetry shows their effect; setpoints are sent at once when they change, and
     repeated while they hold.
@@ -369,7 +369,7 @@ class DemandSequence:
             yield from self._repeat("take off", now_ns, autopilot.command(Cmd.NAV_TAKEOFF, *HERE, height_m))
 
     def _fly(self, now_ns: int, demand: Demand, autopilot: AutopilotState) -> Iterator[Any]:
-        """Yield a setpoint, and the command for the mode in which it is obeyed."""
+        """Yield a setpoint, and the command for the mode that accepts it."""
         age_ns = now_ns - self._setpoint_ns
         if age_ns > STREAMED_NS:
             self._stream_ns = now_ns
@@ -402,11 +402,11 @@ class DemandSequence:
 
 
 class TelemetryReadings(AircraftReadings):
-    """What one vehicle tells of itself.
+    """The telemetry of one vehicle.
 
     Args:
         origin: of W: latitude, longitude [deg], height [m].
-        local_origin_m: origin of its local frame [m; W]; None for what its GPS_GLOBAL_ORIGIN says, or that of W.
+        local_origin_m: origin of its local frame [m; W]; None for its GPS_GLOBAL_ORIGIN, or else that of W.
 
     Attributes:
         clock, unix_clock: of messages stamped with the time since its start, and with the time since 1970.
@@ -428,7 +428,7 @@ class TelemetryReadings(AircraftReadings):
         self.unix_clock.add_round_trip(duration_ns, now_ns)
 
     def receive(self, m: Any, now_ns: int) -> None:
-        """Read a message that arrives now, if it is finite."""
+        """Decode a message that arrives now, if its values are finite."""
         values = (getattr(m, name) for name in m.__struct_fields__)
         if not all(math.isfinite(value) for value in values if isinstance(value, float)):
             return
@@ -436,7 +436,7 @@ class TelemetryReadings(AircraftReadings):
             case dialect.AttitudeQuaternion():
                 q = dialect.attitude_ned((m.q1, m.q2, m.q3, m.q4))
                 length = el.length(q)
-                if length > 0.5:  # else it is no attitude at all
+                if length > 0.5:  # otherwise not an attitude
                     w, x, y, z = (part / length for part in q)
                     self._q_WB, self._w_WB_B = (w, x, y, z), frd((m.rollspeed, m.pitchspeed, m.yawspeed))
             case dialect.LocalPositionNed():
@@ -446,7 +446,7 @@ class TelemetryReadings(AircraftReadings):
                 x, y, z = geodetic_to_enu(place, self._origin).tolist()
                 self._local_origin_m = (x, y, z)
                 self.has_origin = True
-            case dialect.SysStatus() if m.battery_remaining >= 0:  # -1: it does not know
+            case dialect.SysStatus() if m.battery_remaining >= 0:  # -1: unknown
                 self.battery_percent = float(min(100, m.battery_remaining))
             case dialect.HighresImu():
                 taken_ns, updated = self._since_1970(m, now_ns), m.fields_updated

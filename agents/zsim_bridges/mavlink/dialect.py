@@ -357,12 +357,12 @@ class WireMessage(msgspec.Struct, gc=False):
 
 
 class MessageLayout(WireLayout):
-    """How messages of one kind lie in a payload: larger fields first, extensions as they are defined.
+    """The layout of one kind of message in a payload: larger fields first, extensions in the order of definition.
 
     Attributes:
-        crc_extra: sums up the definition, so that sides with different ones do not understand each other.
+        crc_extra: checksum of the definition, so that peers with different definitions reject each other's messages.
         size, base_size: with the extensions [bytes], and without them, as in MAVLink 1.
-        wire_order: names of the fields as they lie in a payload.
+        wire_order: names of the fields in the order of the payload.
     """
 
     def __init__(self, entry: Entry) -> None:
@@ -387,7 +387,7 @@ class MessageLayout(WireLayout):
         return (getattr(message, self.wire_order[0]),)
 
     def pack(self, message: WireMessage) -> bytes:
-        """Return the payload, with its extensions, and with the zeros at its end.
+        """Return the payload with its extensions and trailing zeros.
 
         Raises:
             struct.error, OverflowError: a value is out of the range of its type, or an array has another length.
@@ -396,7 +396,7 @@ class MessageLayout(WireLayout):
         return self.codec.pack(*(values if self.is_flat else self.flat(values)))
 
     def unpack(self, payload: bytes) -> WireMessage:
-        """Return the message of a payload; what is missing at its end is 0, what it has beyond is left out."""
+        """Return the message of a payload; missing bytes at the end are 0, excess bytes are ignored."""
         if len(payload) != self.size:
             payload = payload[: self.size].ljust(self.size, b"\0")
         return self.kind(*self.nested(self.codec.unpack(payload)))

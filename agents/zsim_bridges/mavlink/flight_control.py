@@ -1,6 +1,6 @@
-"""From what a vehicle is to hold to the commands of its drone: targets, the course to places, climbs, firmware modes.
+"""Converts the targets of a vehicle to commands of its drone: targets, courses to places, climbs, firmware modes.
 
-Places are flown to as references of drones are: `zsim_agents.references.tracking`.
+Places are approached like references of drones: `zsim_agents.references.tracking`.
 """
 
 import math
@@ -15,11 +15,11 @@ from zsim_bridges.mavlink.vehicle_state import VehicleState
 from zsim_bridges.vehicle_links.drone_link import CommandSender, ModeName
 
 PLACE_MAX_M = 1e6  # m; positions farther away are refused
-ANSWER_NS = 1_000_000_000  # ns within which the drone is to begin a take-off or a landing
+ANSWER_NS = 1_000_000_000  # ns within which the drone should begin a take-off or a landing
 ARRIVED_M = 0.3  # m of the height at which a climb is over
 STEP_NS = 40_000_000  # ns; the law is evaluated 25 times a second
 BURST = 500  # commands at once: half of what the world records of a source that is not in the lockstep
-REPEAT_NS = 100_000_000  # ns; the firmware takes a commander that is silent for 0.5 s for dead
+REPEAT_NS = 100_000_000  # ns; the firmware treats a commander that is silent for 0.5 s as dead
 
 Axes = tuple[float | None, float | None, float | None]
 NOWHERE: Axes = (None, None, None)
@@ -30,7 +30,7 @@ class Target(NamedTuple):
 
     Attributes:
         position_m: in W, None in axes where only the velocity counts.
-        velocity_m_s: flown, and added to what the position asks for.
+        velocity_m_s: flown, added to the velocity towards the position.
         yaw_rad: counter-clockwise from east; None to turn at the rate.
         yaw_rate_rad_s: counter-clockwise.
         along_heading: the velocity is forward, left, up instead of in W.
@@ -62,15 +62,15 @@ def is_place(position_m: Axes) -> bool:
 
 
 class FlightControl:
-    """Sends a drone the commands by which it does what is asked.
+    """Sends a drone the commands that make it hold a target.
 
-    The world takes one more command of a source with each gate, so each gate allows one here; a new target is sent at
+    The world accepts one more command of a source at each gate, so each gate allows one here; a new target is sent at
     once while the burst lasts.
 
     Attributes:
-        target: what is held; None while nothing is sent.
+        target: held at present; None while nothing is sent.
         climb_to_m: z in W of the climb under way.
-        asked: the mode that the firmware has yet to enter, and since when it is wanted.
+        asked: the mode that the firmware has yet to enter, and since when it is requested.
     """
 
     def __init__(self, parameters: Parameters, state: VehicleState, sender: CommandSender, course: Course) -> None:
@@ -93,7 +93,7 @@ class FlightControl:
 
     @property
     def is_moving(self) -> bool:
-        """Whether what is held never comes to rest; a vehicle that holds a tilt flies away."""
+        """Whether the target never brings the vehicle to rest; one that holds a tilt flies away."""
         target = self.target
         if not isinstance(target, Target):
             return target is not None
@@ -108,19 +108,19 @@ class FlightControl:
                 self._send()
 
     def hold_here(self) -> None:
-        """Come to rest, whatever was under way."""
+        """Come to rest, cancelling anything in progress."""
         self.climb_to_m = None
         if self._state.is_steerable:
             self.hold(Target(self._course.stop(*self._motion())))
 
     def climb(self, z_m: float) -> None:
-        """Climb, or take off, to z in W above where the vehicle is."""
+        """Climb, or take off, vertically to z in W."""
         self.target, self.climb_to_m = None, z_m
         if not self._state.is_airborne:
             self.ask("takeoff")
 
     def continue_climb(self) -> bool:
-        """Do what a climb needs now; return whether it has just ended."""
+        """Continue a climb; return whether it has just ended."""
         z_m = self.climb_to_m
         if z_m is None:
             return False
@@ -133,7 +133,7 @@ class FlightControl:
         return True
 
     def ask(self, mode: Literal["takeoff", "land"]) -> None:
-        """Ask the firmware for a mode; again only if it does not answer."""
+        """Request a mode from the firmware; repeat only without an answer."""
         if self.asked is None or self.asked[0] != mode or self._state.t_ns - self.asked[1] > ANSWER_NS:
             self.asked = mode, self._state.t_ns
             if mode == "land":
@@ -145,7 +145,7 @@ class FlightControl:
         self._sender.mode(self._now_ns, mode)
 
     def is_takeoff_overdue(self) -> bool:
-        """Return whether the drone still stands although it was asked to take off."""
+        """Return whether the drone is still on the ground although a take-off was requested."""
         if self.asked is None or self.asked[0] != "takeoff" or self._state.is_airborne:
             return False
         return self._state.t_ns - self.asked[1] > ANSWER_NS
@@ -183,7 +183,7 @@ class FlightControl:
             self._sender.attitude(self._now_ns, target.q_WB, target.thrust_n, target.yaw_rate_rad_s)
 
     def _velocity(self, target: Target) -> tuple[Vector, float]:
-        """Return the velocity [m/s] in the axes of the target's own, and the yaw rate [rad/s], that lead to it."""
+        """Return the velocity [m/s], in the axes of the target, and the yaw rate [rad/s] that lead to it."""
         speeds, (t_s, here, moving) = self._parameters.speeds, self._motion()
         level = min(target.speed_m_s or math.inf, speeds.horizontal_m_s)
         asked = target, Cruise(level, speeds.up_m_s, speeds.down_m_s)

@@ -19,9 +19,9 @@ KEY_BYTES = 32  # a secret key
 SIGNATURE_BYTES = 13  # link id, 6 of time, 6 of hash
 HASH_BYTES = 6  # the first of SHA-256
 LINK_ID = b"\0"  # of signatures
-TICKS_PER_S = 100_000  # timestamps count 10 us
+TICKS_PER_S = 100_000  # unit of timestamps: 10 us
 EPOCH_S = 1_420_070_400  # 2015-01-01 in seconds since 1970: zero of timestamps
-BEHIND_MAX = 6_000_000  # ticks, a minute: a new stream may be behind that much
+BEHIND_MAX = 6_000_000  # ticks, a minute: greatest lag of a new stream
 TIMESTAMP_MAX = 2**48 - 1
 STREAMS_MAX = 4096  # remembered; only holders of the key begin any
 Version = Literal[1, 2]
@@ -112,7 +112,7 @@ class Link:
 
 
 class Parser:
-    """Takes received datagrams apart, frame by frame.
+    """Splits received datagrams into frames and decodes them.
 
     Args:
         signing: checks signatures, without which no frame is accepted; None to read frames unchecked.

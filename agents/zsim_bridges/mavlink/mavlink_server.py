@@ -33,26 +33,26 @@ from zsim_bridges.vehicle_links.drone_link import CommandSender
 from zsim_bridges.vehicle_links.server import Say, TrafficIntake, VehicleServer
 from zsim_bridges.web import is_loopback
 
-ANSWER_S = 1.0  # wall time for which an answer of the world is waited for, aside from the traffic
-TICK_S = 0.1  # wall time between two looks at what is due by wall time
-SWITCH_S = 5e-4  # s after which the thread that takes in a gate lets a setpoint pass; Python's own is 5 ms
+ANSWER_S = 1.0  # wall time to wait for an answer of the world
+TICK_S = 0.1  # wall time between two checks of what is due by wall time
+SWITCH_S = 5e-4  # s; thread switch interval, so that a setpoint does not wait for a gate; Python's default is 5 ms
 SYSTEM_IDS = 254  # 255 is the ground station's by custom
 DATAGRAM_MAX = 1400  # bytes; fits into a frame of Ethernet
 READ_MAX = 65_536  # bytes
-READS_MAX = 64  # datagrams at once, then others have their turn
+READS_MAX = 64  # datagrams read at once, before other tasks run
 LEARNT_MAX = 8  # programs at once, on one port
 SILENT_S = 30.0  # wall time after which a silent program is forgotten
 REASONS = {
     "bad_crc": "a frame with a wrong checksum",
     "unknown": "a message that is not in the dialect",
     "incompatible": "a frame with flags that are not known",
-    "truncated": "a frame that is cut",
+    "truncated": "a truncated frame",
     "unsigned": "a frame without a signature",
     "bad_signature": "a frame with a wrong signature",
     "replayed": "a signed frame that was sent before",
-    "noise": "bytes that are no frame",
+    "noise": "bytes outside frames",
     "unsent": "a message of its own whose values do not fit into their fields",
-    "stranger": "a datagram of who is not the configured peer",
+    "stranger": "a datagram that is not from the configured peer",
 }
 Address = tuple[str, int]
 
@@ -65,7 +65,7 @@ class MavlinkOptions(NamedTuple):
         gcs, gcs_local: the ground station, and the first port that talks to it.
         api, api_local: the first of the programs' ports, and the first port that talks to them.
         key: of signatures; None for none.
-        rate: pace that is asked of a run as fast as possible; None for none.
+        rate: pace requested of a run that goes as fast as possible; None for none.
         first_system_id: of the first drone; +1 each.
     """
 
@@ -145,7 +145,7 @@ class MavlinkServer(VehicleServer):
         stack.callback(loop.create_task(self._tick_always()).cancel)
 
     async def on_arrivals(self, intake: TrafficIntake) -> None:
-        """Read what has arrived; of a drone's messages the newest of each."""
+        """Process what has arrived; of each message of a drone, only the newest."""
         newest: dict[str, bytes] = {}
         for arrived in intake.arrivals():
             for key, payload in arrived:
@@ -168,7 +168,7 @@ class MavlinkServer(VehicleServer):
             await asyncio.sleep(0)  # setpoints that have arrived meanwhile go first
 
     def report_mission(self, vehicle: MavlinkVehicle) -> None:
-        """Tell the world how far a mission was flown, for the record; no gate waits for it."""
+        """Report to the world how far a mission was flown, for the record; no gate waits for it."""
         for report in vehicle.flight.mission.reports:
             args = {"drone": vehicle.name, **report._asdict()}
             self._requests.submit(self.link.request, keys.CONTROL, "mission", self.observer.name, args, ANSWER_S)
@@ -196,7 +196,7 @@ class MavlinkServer(VehicleServer):
 
 
 class ServedVehicle:
-    """A vehicle and its ports, with one numbering of what is sent."""
+    """A vehicle and its ports, with one sequence of message numbers."""
 
     def __init__(self, vehicle: MavlinkVehicle, ports: "Sequence[VehiclePort]", link: Link) -> None:
         self.vehicle = vehicle
@@ -264,7 +264,7 @@ class VehiclePort:
         self._socket.close()
 
     def send(self, datagrams: Sequence[bytes]) -> None:
-        """Send to all peers; what a full buffer does not take is lost, as on any radio."""
+        """Send to all peers; datagrams that do not fit into the buffer are lost, as on a radio link."""
         for address in self.peers.addresses(self._wall_s()) if datagrams else ():
             for datagram in datagrams:
                 with contextlib.suppress(OSError):  # nobody there, no route, no room

@@ -83,7 +83,7 @@ Point = tuple[float, float]
 
 
 class Options(NamedTuple):
-    """How a vehicle presents itself: system id, autopilot, telemetry, name of this process, and its id of 64 bits."""
+    """The identity of a vehicle: system id, autopilot, telemetry level, name of this process, and its 64-bit id."""
 
     system_id: int
     personality: Personality
@@ -111,7 +111,7 @@ class Request(NamedTuple):
         return cls(m.command, (m.param1, m.param2, m.param3, m.param4, *place), frame)
 
     def integer(self, place: int) -> int:
-        """Return a parameter that is a whole number; -1 if it is none."""
+        """Return a parameter as a whole number; -1 if it is not one."""
         value = self.params[place]
         return int(value) if math.isfinite(value) and 0 <= value < 2**31 else -1
 
@@ -120,7 +120,7 @@ class MavlinkVehicle:
     """One drone as a MAVLink vehicle.
 
     Attributes:
-        state: of the drone, to be kept up to date; watch: to be told of events.
+        state: of the drone, to be kept up to date; watch: to be notified of events.
         outbox: messages for its clients, to be taken.
     """
 
@@ -179,7 +179,7 @@ class MavlinkVehicle:
     # From clients
 
     def on_message(self, received: Received, wall_ns: int) -> None:
-        """Do what a client's message asks for; `wall_ns` is wall time, of any zero."""
+        """Carry out a client's message; `wall_ns` is wall time from any zero."""
         message: Any = received.message
         sender = received.system_id, received.component_id
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
@@ -239,7 +239,7 @@ class MavlinkVehicle:
                 self._deny("the origin is the scenario's")
 
     def _carry_out(self, request: Request) -> str | Result | None:
-        """Carry out a command; return None, why not, or that it is not supported."""
+        """Carry out a command; return None, the reason for a refusal, or that it is not supported."""
         flight, state, parameters = self.flight, self.state, self._parameters
         first, second = request.params[:2]
         match request.command:
@@ -345,7 +345,7 @@ class MavlinkVehicle:
         return None
 
     def _deny(self, reason: str | None) -> None:
-        """Tell the operator why something was not done; no reason: it was."""
+        """Report the reason for a refusal to the operator, if there is one."""
         if reason:
             self.report(dialect.Severity.WARNING, f"Denied: {reason}")
 
@@ -464,7 +464,7 @@ def _target(
         vx, vy, vz = (v if is_known else 0.0 for v, is_known in zip(given, known, strict=True))
         velocity_m_s = dialect.frd((vx, vy, vz)) if along_heading else ned((vx, vy, vz))
     if not is_place(position) or not all(abs(v) < SPEED_MAX_M_S for v in velocity_m_s):
-        return "a setpoint is beyond all bounds"
+        return "a setpoint is out of bounds"
     along = along_heading and position == NOWHERE
     if along_heading and not along and any(known):
         velocity_m_s = turned_about_up(velocity_m_s, state.yaw_rad)
@@ -483,14 +483,14 @@ def _yaw(mask: TypeMask, yaw: float, yaw_rate: float, frame: int, state: Vehicle
 
 
 def from_attitude(message: dialect.SetAttitudeTarget, weight_n: float) -> Setpoint | str:
-    """Return what SET_ATTITUDE_TARGET asks for; half of the thrust carries the weight [N]."""
+    """Return the target of a SET_ATTITUDE_TARGET; half thrust carries the weight [N]."""
     mask = AttitudeMask(message.type_mask & 0xFF)
     values = (*message.q, message.thrust, message.body_yaw_rate)
     if mask & AttitudeMask.ATTITUDE:
         return "body rates alone are not flown; give an attitude"
     length = el.length(message.q)
     if not all(map(math.isfinite, values)) or not 0.5 < length < 2.0:
-        return "the attitude of a setpoint is no quaternion"
+        return "the attitude of a setpoint is not a quaternion"
     w, x, y, z = dialect.attitude_ned((message.q[0], message.q[1], message.q[2], message.q[3]))
     q_WB = w / length, x / length, y / length, z / length
     thrust = HOVER_THRUST if mask & AttitudeMask.THRUST else max(0.0, min(1.0, message.thrust))
@@ -501,7 +501,7 @@ def from_attitude(message: dialect.SetAttitudeTarget, weight_n: float) -> Setpoi
 class DroneWatch:
     """Watches one drone, reports changes, and acts at its fence.
 
-    Its pilot is told of sensors, battery, faults, refusals and collisions. The fence is a circle and a ceiling by
+    It reports sensors, battery, faults, refusals and collisions. The fence is a circle and a ceiling by
     parameters, and circles and polygons that clients upload, in the axes of W. Source of its items:
     https://mavlink.io/en/services/mission.html#fence.
 
@@ -571,7 +571,7 @@ class DroneWatch:
 
 
 class Circle(NamedTuple):
-    """A circle that must not be left, or not be entered."""
+    """A circle that must not be left (or not entered)."""
 
     centre_m: Point
     radius_m: float
@@ -582,13 +582,13 @@ class Circle(NamedTuple):
 
 
 class Polygon(NamedTuple):
-    """A polygon that must not be left, or not be entered."""
+    """A polygon that must not be left (or not entered)."""
 
     corners_m: tuple[Point, ...]
     inside: bool
 
     def allows(self, x: float, y: float) -> bool:
-        """Return whether a point may be flown to, by the parity of the edges crossed to the east of it."""
+        """Return whether a point is permitted, by the parity of the edges crossed to the east of it."""
         crossed = False
         for (x1, y1), (x2, y2) in zip(self.corners_m, (*self.corners_m[1:], self.corners_m[0]), strict=True):
             if (y1 > y) != (y2 > y) and x < x1 + (x2 - x1) * (y - y1) / (y2 - y1):
@@ -597,7 +597,7 @@ class Polygon(NamedTuple):
 
 
 def fence_shapes(items: Sequence[PlanItem], state: VehicleState) -> list[Circle | Polygon]:
-    """Return the shapes of uploaded items; a polygon has an item for each corner."""
+    """Return the shapes of uploaded items; a polygon has one item per corner."""
     shapes: list[Circle | Polygon] = []
     corners: list[Point] = []
     for item in items:

@@ -54,7 +54,7 @@ class PlanItem(NamedTuple):
 
     @property
     def has_place(self) -> bool:
-        """Whether it names a place, beside a height; one of x and y is enough."""
+        """Whether it gives a horizontal place; one of x and y is enough."""
         return any(math.isfinite(value) and value for value in (self.x, self.y))
 
 
@@ -74,7 +74,7 @@ class MissionReport(NamedTuple):
 
 
 class MissionStep(NamedTuple):
-    """What a mission asks for now: a target, or another action; z in W for a climb."""
+    """The present action of a mission: a target, or another action; z in W for a climb."""
 
     action: Literal["fly", "climb", "land", "return", "over"]
     target: Target = Target()
@@ -107,7 +107,7 @@ class Mission:
     Attributes:
         reached: numbers of items that have been reached, to be reported to clients.
         reports: of how far it was flown, to be sent to the world.
-        has_climbed: whether the climb that was asked for is over.
+        has_climbed: whether the requested climb is over.
     """
 
     def __init__(self, first: int = 0, turns: bool = True) -> None:
@@ -162,7 +162,7 @@ class Mission:
             self._report_active()
 
     def note_progress(self) -> None:
-        """Report what more of it has been flown; a jump back is none."""
+        """Report further progress; a jump back is not progress."""
         if self._reported is not None and self._index > self._reported:
             self._report_active()
 
@@ -177,7 +177,7 @@ class Mission:
             self._reported = None
 
     def abort(self, reason: str, failsafe: bool) -> None:
-        """Report that it is flown no longer, unless it has ended already."""
+        """Report that it is no longer flown, unless it has already ended."""
         if self._reported is not None:
             self.reports.append(MissionReport("aborted", len(self.items), self._reported, reason, failsafe))
             self._reported = None
@@ -190,7 +190,7 @@ class Mission:
         return place_of(item, state)[2] if item and item.command == Cmd.NAV_TAKEOFF else None
 
     def step(self, state: VehicleState, parameters: Parameters) -> MissionStep:
-        """Return what is to be done now, past the items that have been done."""
+        """Return the present action, skipping completed items."""
         for _ in range(JUMPS_MAX):
             item = self._item
             if item is None:
@@ -251,7 +251,7 @@ class Mission:
         return self._wait(target, stay_s, state)
 
     def _wait(self, target: Target, stay_s: float, state: VehicleState) -> MissionStep | None:
-        """Stay for some time; neither 0 nor NaN is any."""
+        """Stay for some time; 0 and NaN mean no delay."""
         if self._since_ns is None:
             self._since_ns = state.t_ns
         if (state.t_ns - self._since_ns) * 1e-9 < stay_s:
@@ -274,7 +274,7 @@ class _Upload:
 
 
 class MissionProtocol:
-    """The transfers of one vehicle.
+    """The item transfers of one vehicle.
 
     Args:
         loaded: called with the type and the items of a complete upload, or of a removal.
@@ -295,7 +295,7 @@ class MissionProtocol:
         self._upload: _Upload | None = None
 
     def on_message(self, message: dialect.WireMessage, sender: Address, wall_ns: int) -> bool:
-        """Do what a message of the protocol asks for; False for any other. `wall_ns` is wall time, of any zero."""
+        """Process a message of the protocol; return False for any other. `wall_ns` is wall time from any zero."""
         match message:
             case dialect.MissionCount():
                 upload = _Upload(sender, message.mission_type, message.count)
@@ -311,7 +311,7 @@ class MissionProtocol:
             case dialect.MissionItemInt() | dialect.MissionItem():
                 upload = self._upload
                 if upload is not None and upload.sender == sender and message.seq == len(upload.items):
-                    self._take_item(upload, message, wall_ns)  # else it is repeated, or not asked for
+                    self._take_item(upload, message, wall_ns)  # otherwise repeated or unrequested
             case dialect.MissionRequestList(mission_type=type_):
                 self._send(dialect.MissionCount(*sender, count=len(self._stored(type_)), mission_type=type_))
             case dialect.MissionRequestInt() | dialect.MissionRequest():
@@ -338,7 +338,7 @@ class MissionProtocol:
         return True
 
     def tick(self, wall_ns: int) -> None:
-        """Request an item again that has not come."""
+        """Request a missing item again."""
         upload = self._upload
         if upload is None or wall_ns - upload.asked_ns < RETRY_NS:
             return
@@ -350,7 +350,7 @@ class MissionProtocol:
 
     def _request(self, upload: _Upload, wall_ns: int) -> None:
         upload.asked_ns = wall_ns
-        as_int = (self._home is None) != bool(upload.tries % 2)  # some clients know one of the two only
+        as_int = (self._home is None) != bool(upload.tries % 2)  # some clients know only one of the two
         kind = dialect.MissionRequestInt if as_int else dialect.MissionRequest
         self._send(kind(*upload.sender, seq=len(upload.items), mission_type=upload.type))
 
@@ -397,7 +397,7 @@ def item_of(message: dialect.MissionItemInt | dialect.MissionItem) -> PlanItem:
 
 
 def item_fault(item: PlanItem, type_: int) -> MissionResult | None:
-    """Return what is wrong with an item; None if nothing is."""
+    """Return the fault of an item; None if it is valid."""
     if item.command not in (COMMANDS if type_ == MISSION else FENCE_COMMANDS):
         return MissionResult.UNSUPPORTED
     if item.frame not in FRAMES:

@@ -1,4 +1,4 @@
-"""What differs between PX4 and ArduPilot as their clients see them: modes, parameters, rules of offboard flight.
+"""The differences between PX4 and ArduPilot for clients: modes, parameters, rules of offboard flight.
 
 Sources: PX4-Autopilot, src/modules/commander/px4_custom_mode.h and the parameter reference; ArduPilot,
 ArduCopter/mode.h and the parameter list of Copter.
@@ -56,7 +56,7 @@ COPTER_MODES = {
 
 
 FenceAction = Enum("FenceAction", "NONE WARN HOLD RETURN LAND")
-"""What a vehicle does outside its fence."""
+"""The action of a vehicle outside its fence."""
 
 
 PX4_FENCE = {  # GF_ACTION
@@ -87,7 +87,7 @@ Setting = Literal[
     "fence_altitude_m",
     "fence_action",
 ]
-"""Parameters that a vehicle flies by, under names common to both autopilots."""
+"""Parameters that affect the flight, under names common to both autopilots."""
 
 
 class ParameterSpec(NamedTuple):
@@ -157,8 +157,8 @@ class Personality(NamedTuple):
     Attributes:
         specs: returns the parameters of a drone with a system id.
         fence_actions: by the value of the parameter.
-        is_px4: PX4 begins OFFBOARD only while setpoints come and holds without them, sends integer parameters as their
-            bytes, and has no item 0 for home in its missions.
+        is_px4: PX4 enters OFFBOARD only while it receives setpoints and holds without them, sends integer parameters as
+            their bytes, and has no item 0 for home in its missions.
         version: flight_sw_version, major, minor, patch and type.
     """
 
@@ -216,7 +216,7 @@ class Parameters:
 
     @property
     def fence_action(self) -> FenceAction:
-        """What is done outside the fence; ArduPilot has a fence only while FENCE_ENABLE is 1."""
+        """The action outside the fence; ArduPilot has a fence only while FENCE_ENABLE is 1."""
         if not self.values.get("FENCE_ENABLE", 1.0):
             return FenceAction.NONE
         return self._personality.fence_actions.get(int(self["fence_action"]), FenceAction.WARN)
@@ -233,7 +233,7 @@ class Parameters:
         if spec.fixed:
             return f"{name} is {self.values[name]:g} and cannot be set"
         if not math.isfinite(value):
-            return f"{name}: {value} is no finite number"
+            return f"{name}: {value} is not a finite number"
         value = min(spec.high, max(spec.low, value))
         self.values[name] = value if spec.type == ParamType.REAL32 else float(round(value))
         return None

@@ -55,7 +55,7 @@ BREACH_NONE, BREACH_ALTITUDE, BREACH_BOUNDARY = 0, 2, 3  # FENCE_BREACH
 
 
 class TelemetrySource:
-    """What telemetry is built from; values that several messages need are computed once a gate.
+    """The source of telemetry; values that several messages need are computed once per gate.
 
     Attributes:
         voltage_v, capacity_mah: of its battery, nominal.
@@ -72,7 +72,7 @@ class TelemetrySource:
         self.breaches = self.breach_ns = 0
 
     def advance(self) -> None:
-        """Forget what was computed for the previous gate."""
+        """Discard the values computed for the previous gate."""
         for name in ("rpy_ned_rad", "place", "position_ned_m", "velocity_ned_m_s"):
             self.__dict__.pop(name, None)
 
@@ -399,7 +399,7 @@ BY_ID = {dialect.LAYOUTS[kind].id: kind for kind in ROWS}
 
 
 class Telemetry:
-    """What one vehicle sends, and how often; clients may change the rates."""
+    """The messages that one vehicle sends, and their rates, which clients may change."""
 
     def __init__(self, source: TelemetrySource, level: Level) -> None:
         self._source = source
@@ -426,7 +426,7 @@ class Telemetry:
         messages: list[WireMessage] = []
         for kind, interval_ns in self._interval_ns.items():
             due_ns, delay_ns, sensor = self._due_ns[kind], 0, ROWS[kind].sensor
-            if sensor is not None:  # it waits for a sample, at the latest two intervals
+            if sensor is not None:  # wait for a sample, at most two intervals
                 delay_ns = -interval_ns // 2 if arrived.get(sensor) else 2 * interval_ns
             if t_ns >= due_ns + delay_ns:
                 self._due_ns[kind] = max(due_ns + interval_ns, t_ns + interval_ns // 2)
@@ -438,7 +438,7 @@ class Telemetry:
         return messages
 
     def build(self, message_id: int) -> WireMessage | None:
-        """Return a message now; None for one that this vehicle does not send."""
+        """Return the present message; None if this vehicle does not send it."""
         kind = BY_ID.get(message_id)
         self._source.advance()
         return ROWS[kind].build(self._source) if kind else None

@@ -1,6 +1,6 @@
-"""The flight of one vehicle: armed or not, its mode, and what that asks for.
+"""The flight of one vehicle: its arming state, its mode, and the resulting targets.
 
-A landed drone of zsim has no state of its own for armed: armed means that it takes off on command.
+A landed drone of zsim has no separate armed state: armed means that it takes off on command.
 """
 
 from collections.abc import Callable
@@ -52,7 +52,7 @@ class Flight:
 
     @property
     def target(self) -> Target | TiltTarget | None:
-        """What is held; None while nothing is sent."""
+        """The held target; None while nothing is sent."""
         return self._control.target
 
     @property
@@ -95,13 +95,13 @@ class Flight:
         return None if force else "in flight; land first, or force"
 
     def terminate(self) -> None:
-        """Stop the rotors at once, whoever flies it."""
+        """Stop the rotors at once, regardless of the commander."""
         self.mission.abort("a client stopped its rotors", failsafe=False)
         self._control.send_mode("emergency")
         self._stand("Emergency: rotors stopped")
 
     def reboot(self) -> str | None:
-        """Begin again, on the ground only; leave an emergency."""
+        """Restart, on the ground only; leave an emergency."""
         if self._state.is_airborne:
             return "in flight"
         if self._state.state == "emergency":
@@ -156,7 +156,7 @@ class Flight:
         return reason
 
     def steer_by_sticks(self, target: Target) -> None:
-        """Fly as a joystick asks, in the modes that hold otherwise."""
+        """Fly by a joystick, in the modes that otherwise hold."""
         if self.mode in HOLDING and self._state.is_steerable and self._is_armed and not self.refusal():
             self._setpoint_ns = self._state.t_ns
             self._control.hold(target)
@@ -248,7 +248,7 @@ class Flight:
                 self._enter(FlightMode.HOLD)
 
     def _fly_home(self) -> None:
-        """Climb to the height of returns, fly home, land, one after the other."""
+        """Climb to the return height, fly home, and land, in this order."""
         home_x, home_y, home_z = self._state.home_or_here_m
         x, y, z = self._state.position_m
         target = self.target

@@ -1,1 +1,1 @@
-"""What bridges to the wire of a real aircraft share, whichever wire it is."""
+"""Parts shared by the bridges to the protocols of real aircraft."""

@@ -1,6 +1,6 @@
 """The driver as a process: an aircraft at the other end of a wire is one drone of a run.
 
-The session with the aircraft and the failsafe are pure and have files of their own; here are the messages of the drone,
+The session with the aircraft and the failsafe are pure and have separate files; here are the messages of the drone,
 keys, sockets, the event loop, and the options on the command line.
 """
 
@@ -50,7 +50,7 @@ class DriverOptions(NamedTuple):
 
     Attributes:
         drone: which drone of the run the aircraft is.
-        origin_m: origin of the aircraft's own frame, or where it stands [m; W]; None for what it or the scenario says.
+        origin_m: origin of the aircraft's own frame, or its place [m; W]; None for the aircraft's or the scenario's.
         yaw_deg: its heading at the start, counter-clockwise from east; None for its own compass.
     """
 
@@ -63,12 +63,12 @@ class DriverOptions(NamedTuple):
 
 TICK_S = 0.01  # s, wall; half of the period at which setpoints are repeated
 REPORT_S = 1.0  # s, wall; of the link's figures
-LANDING_S = 30.0  # s, wall; how long it waits for the aircraft to be down before it leaves
-PATIENCE_S = 5.0  # s, wall, chosen: heartbeats come once a second; then it prints what may be amiss
-FORMER_S = 2.0  # s, wall, chosen: a driver that this one replaces keeps its port for some 10 ms more
-AGAIN_S = 0.02  # s, wall, chosen: between two tries to open a port
+LANDING_S = 30.0  # s, wall; time to wait for the aircraft to be down before exiting
+PATIENCE_S = 5.0  # s, wall, chosen: heartbeats come once a second; then it prints possible causes
+FORMER_S = 2.0  # s, wall, chosen: a replaced driver keeps its port for some 10 ms
+AGAIN_S = 0.02  # s, wall, chosen: between two attempts to open a port
 WAITING_MAX = 4000  # readings, 10 s of an IMU at 200 Hz and all else; then the oldest are dropped
-EXTRAPOLATED_NS = 500_000_000  # chosen: an older pose is not extrapolated further; it says where the aircraft was
+EXTRAPOLATED_NS = 500_000_000  # chosen: an older pose is not extrapolated further
 Say = Callable[[str], None]
 SessionMaker = Callable[[Info, Scenario, DriverOptions], VehicleSession]
 
@@ -221,11 +221,11 @@ class DriverProcess:
             self._report(self._clock.now_ns())
 
     def _hint(self) -> None:
-        """Print what may be amiss if an aircraft does not show itself."""
+        """Print possible causes if an aircraft does not appear."""
         if self._session.state.received_ns is None:
             channel, refused = self._session.channels[0], self._session.figures(self._clock.now_ns()).refused
             silence = self._sockets[0].fault.lower() or "nothing comes"
-            what = f"{refused} messages came that are not its own" if refused else silence
+            what = f"{refused} messages of other senders arrived" if refused else silence
             advice = "check its address, that it is switched on, and over MAVLink its system id and key"
             self._say(f"no aircraft at {channel.host}:{channel.port} ({what}); {advice}")
 
@@ -268,16 +268,16 @@ class DriverProcess:
         self._link.put(keys.link(self._drone), message)
 
     async def _land_and_leave(self, interrupted: bool) -> None:
-        """Land what still flies for this driver, or finish a kill; a driver that replaces this one takes it over."""
+        """Land an aircraft that this driver still flies, or finish a kill; a replacing driver takes it over."""
         if self._observer.superseded:
             return
         reason = "its driver is stopped" if interrupted else self._observer.end_reason or RUN_ENDED
         if not interrupted:
-            self._observer.leave(reason)  # the run is over for everybody; the aircraft may still be on its way down
+            self._observer.leave(reason)  # the run is over; the aircraft may still be descending
         self._failsafe.land(reason, self._clock.now_ns())
         until_s = time.monotonic() + LANDING_S
         if self._failsafe.phase == "landing":
-            self._say(f"{reason}; it lands; a second Ctrl-C leaves it to itself")
+            self._say(f"{reason}; it lands; a second Ctrl-C exits without waiting")
         while (stopping := self._failsafe.is_stopping(self._session.state)) and time.monotonic() < until_s:
             self._tick()
             await asyncio.sleep(TICK_S)
@@ -390,7 +390,7 @@ class AircraftSocket(asyncio.DatagramProtocol):
                     continue
                 why = error.strerror or str(error)
                 if error.errno in (errno.EADDRINUSE, errno.EACCES):
-                    advice = "give another --local-port, or end who has it"
+                    advice = "give another --local-port, or end the program that uses it"
                     raise RunError(f"UDP port {channel.local_port} here cannot be had: {why}; {advice}") from error
                 advice = "give the address of the aircraft"
                 raise RunError(f"{channel.host}:{channel.port} cannot be reached: {why}; {advice}") from error
@@ -407,7 +407,7 @@ class AircraftSocket(asyncio.DatagramProtocol):
         self._receive(data)
 
     def error_received(self, exc: Exception) -> None:
-        """Note that nobody listens there yet; what is due is sent again."""
+        """Record that no program listens there yet; due messages are repeated."""
         self.fault = getattr(exc, "strerror", None) or str(exc)
 
 
@@ -462,7 +462,7 @@ def check_host(host: str) -> None:
     try:
         socket.getaddrinfo(host, None)
     except (OSError, UnicodeError) as error:
-        raise RunError(f"the address is that of {host!r}, which is no host that is known here") from error
+        raise RunError(f"the address is that of {host!r}, which is not a known host") from error
 
 
 def check_run(info: Info, process: str, drone: str) -> None:

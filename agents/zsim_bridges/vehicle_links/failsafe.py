@@ -1,4 +1,4 @@
-"""What a driver demands of its aircraft: accepted commands within limits, and a hold or a landing when one is missing.
+"""A driver's demands on its aircraft: accepted commands within limits, and a hold or a landing without commands.
 
 Pure. The rules, by the clock of the run:
 
@@ -34,7 +34,7 @@ Phase = Literal["idle", "taking_off", "airborne", "landing", "killed", "resettin
 
 
 class FlightLimits(NamedTuple):
-    """What a driver never exceeds, whoever commands: limits in W; the fence is a cylinder about the origin.
+    """Limits that a driver never exceeds, in W; the fence is a cylinder around the origin.
 
     Attributes:
         speed_m_s, climb_m_s, yaw_rate_rad_s: greatest, in any direction, up or down, either way.
@@ -78,7 +78,7 @@ def _approach(distance_m: float) -> float:
 
 
 class Failsafe:
-    """The phases of a flight, by what is commanded and who is silent.
+    """The phases of a flight, by commands and silences.
 
     Attributes:
         armed: whether commands are obeyed.
@@ -101,16 +101,16 @@ class Failsafe:
     # Operators
 
     def arm(self, now_ns: int, vehicle: AircraftState) -> str | None:
-        """Obey from now on; return None, or why not."""
+        """Start obeying commands; return None, or the reason for a refusal."""
         if _is_lost(vehicle, now_ns):
-            return "nothing comes from the aircraft; check its address, and that it is switched on"
+            return "nothing is received from the aircraft; check its address, and that it is switched on"
         self.armed, self._uncommanded = True, False
         if self.phase == "killed":
             self._enter("idle", now_ns)
         return None
 
     def disarm(self, vehicle: AircraftState) -> str | None:
-        """Obey no longer; return None, or why not."""
+        """Stop obeying commands; return None, or the reason for a refusal."""
         if vehicle.state not in STANDING:
             return f"the aircraft is {vehicle.state}; land first, or kill"
         self.armed, self.phase = False, "idle"
@@ -138,7 +138,7 @@ class Failsafe:
         self._clock_ns = now_ns
 
     def on_command(self, command: flight_messages.Command, now_ns: int, vehicle: AircraftState) -> str | None:
-        """Take an accepted command; return None, or why it is not obeyed."""
+        """Process an accepted command; return None, or why it is not obeyed."""
         match command:
             case flight_messages.Mode(mode="emergency"):
                 self.kill(now_ns, command.source)
@@ -146,7 +146,7 @@ class Failsafe:
             case flight_messages.Mode(mode="reset"):
                 return self._reset(now_ns, vehicle)
             case _ if not self.armed:
-                return "its driver is not armed; an operator asks `arm` of it"
+                return "its driver is not armed; an operator must arm it"
             case flight_messages.Mode(mode="land"):
                 self._enter("landing", now_ns)
                 return None
@@ -171,7 +171,7 @@ class Failsafe:
         return None
 
     def _reset(self, now_ns: int, vehicle: AircraftState) -> str | None:
-        """Leave the emergency, once no motor turns; return None, or why not."""
+        """Leave the emergency, once no motor turns; return None, or the reason for a refusal."""
         if self.is_stopping(vehicle):
             return f"the aircraft is {vehicle.state}; its motors are being stopped"
         if self.phase == "killed" or vehicle.state == "emergency":
@@ -199,7 +199,7 @@ class Failsafe:
                 return Demand("none")
 
     def _advance(self, now_ns: int, vehicle: AircraftState) -> None:
-        """Enter the next phase once the aircraft has reached it, or somebody is silent."""
+        """Enter the next phase once the aircraft has reached it, or because of a silence."""
         airborne = vehicle.state in AIRBORNE
         has_had_time = now_ns - self._began_ns > LINK_LOST_S * 1e9  # to show that it obeys
         if self.phase in ("taking_off", "airborne") and vehicle.state == "emergency":
@@ -228,7 +228,7 @@ class Failsafe:
             self.land("the world is silent", now_ns)
 
     def _settle(self, now_ns: int) -> None:
-        """Note that it is down: after a landing that nobody commanded, only an operator lets it fly again."""
+        """Record that it is down: after an uncommanded landing, only an operator can let it fly again."""
         self._enter("idle", now_ns)
         if self._uncommanded:
             self.armed, self._uncommanded = False, False
@@ -254,5 +254,5 @@ class Failsafe:
 
 
 def _is_lost(vehicle: AircraftState, now_ns: int) -> bool:
-    """Return whether nothing has come from an aircraft for too long, or ever."""
+    """Return whether nothing has been received from an aircraft for too long, or ever."""
     return vehicle.received_ns is None or now_ns - vehicle.received_ns > LINK_LOST_S * 1e9

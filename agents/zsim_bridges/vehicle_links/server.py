@@ -18,7 +18,7 @@ from zsim.runtime.participant import Participant
 from zsim.transport.session import RawSample, ReceivedSample, Session, Unanswered
 from zsim.transport.traffic import Passed, Traffic, samples
 
-BACKLOG = 100  # times that something arrived, a second or two of realtime
+BACKLOG = 100  # arrivals, one or two seconds in realtime
 
 
 class TrafficIntake:
@@ -35,7 +35,7 @@ class TrafficIntake:
         self._backlog: deque[Sequence[Passed]] = deque()
         self._thread = threading.Thread(target=self._run, name="intake", daemon=True)
         self.news = asyncio.Event()
-        for sample in link.get(keys.CLOCK):  # a world that stands, or has ended, publishes it no more
+        for sample in link.get(keys.CLOCK):  # a world that is stopped or has ended no longer publishes it
             self._backlog.append([sample])
         self.news.set()
         self._thread.start()
@@ -77,7 +77,7 @@ WAITING_MAX = 10  # pictures that wait for the loop; then the oldest go
 
 
 class PictureIntake:
-    """Pictures of the cameras that somebody looks at: subscriptions come and go with the readers."""
+    """Pictures of the cameras in use: subscriptions follow the readers."""
 
     def __init__(self, link: Session, loop: asyncio.AbstractEventLoop, take: Callable[[str, bytes], None]) -> None:
         self._link = link
@@ -98,7 +98,7 @@ class PictureIntake:
             self._undeclare.pop(key)()
 
     def _on_picture(self, sample: RawSample) -> None:
-        """Hand a picture over, in a thread of Zenoh's."""
+        """Pass on a picture; called in a thread of Zenoh."""
         self._waiting.append(sample)
         with contextlib.suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(self._deliver)
@@ -109,7 +109,7 @@ class PictureIntake:
             self._take(sample.key, sample.payload)
 
 
-POLL_S = 0.1  # how often a stop is looked for
+POLL_S = 0.1  # how often a stop is checked
 REPORTED_MAX = 1000  # texts remembered, so that each is printed once
 Say = Callable[[str], None]
 
@@ -180,7 +180,7 @@ class VehicleServer(ABC):
         self._say(f"{self.observer.name}: {text}")
 
     def refuse(self, reason: str) -> None:
-        """Count what is not done, and print the reason, once."""
+        """Count a refusal, and print its reason once."""
         self.observer.health.refused += 1
         self.say_once(reason)
 
@@ -193,16 +193,16 @@ class VehicleServer(ABC):
 
 
 def set_pace(link: Session, info: Info, name: str, rate: float | None) -> None:
-    """Ask the world for a pace, if one is given; refuse a run that has none: programs go by the wall clock.
+    """Request a pace from the world, if one is given; refuse a run without one, since programs use the wall clock.
 
     Raises:
         RunError: the run goes as fast as possible, or the world refuses the pace.
-        NoWorldError: the world went meanwhile.
+        NoWorldError: the world has ended meanwhile.
     """
     if rate is None:
         if info.mode == "lockstep" and not info.rate:
             raise RunError(
-                f"{name}: run {info.run_id} goes as fast as possible, and programs for real aircraft go by the wall "
+                f"{name}: run {info.run_id} goes as fast as possible, and programs for real aircraft use the wall "
                 "clock; give --rate 1 here, or start the run with --rate 1 or --realtime"
             )
         return

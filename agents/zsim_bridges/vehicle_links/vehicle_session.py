@@ -1,4 +1,4 @@
-"""What all wires have in common for a driver: demands on an aircraft, its pose, readings and clock, the session. Pure.
+"""The parts of a driver common to all wires: demands on an aircraft, its pose, readings and clock, the session. Pure.
 
 Poses and readings are stamped by the clock of this process.
 """
@@ -14,7 +14,7 @@ from zsim.math.frames import geodetic_to_enu
 from zsim.math.rotation import LEVEL, Quaternion, Vector
 
 WINDOW_NS = 5_000_000_000  # chosen: long against queues, short against the drift of two clocks (50 ppm: 0.25 ms)
-SIGMA_UNKNOWN_M = 2.0  # m, of a GPS receiver that does not tell (paper, section VI)
+SIGMA_UNKNOWN_M = 2.0  # m, of a GPS receiver that does not report it (paper, section VI)
 P0_PA = 101_325.0  # Pa, at sea level (ISO 2533)
 SCALE_M = 44_330.77  # m, T0 / lapse rate = 288.15 K / 6.5 K/km (ISO 2533)
 EXPONENT = 0.190263  # R lapse / g (ISO 2533)
@@ -41,7 +41,7 @@ class Reading(NamedTuple):
 
 
 class AircraftReadings:
-    """What one aircraft measures; `origin` of W is latitude, longitude [deg], height [m].
+    """The measurements of one aircraft; `origin` of W is latitude, longitude [deg], height [m].
 
     Attributes:
         pose: newest; None before the first.
@@ -120,11 +120,11 @@ class ClockOffset:
         self._round_trips: deque[tuple[int, int]] = deque()
 
     def add(self, stamp_ns: int, arrival_ns: int) -> None:
-        """Note a message that the other clock stamped and that arrived by this one."""
+        """Record a message stamped by the other clock, and its arrival by this one."""
         _keep_least(self._least, arrival_ns, arrival_ns - stamp_ns)
 
     def add_round_trip(self, duration_ns: int, arrival_ns: int) -> None:
-        """Note how long a request and its answer took together."""
+        """Record the round trip of a request and its answer."""
         _keep_least(self._round_trips, arrival_ns, duration_ns)
 
     @property
@@ -144,7 +144,7 @@ class ClockOffset:
         return self._round_trips[0][1] / 1e6 if self._round_trips else None
 
     def taken_ns(self, stamp_ns: int, arrival_ns: int) -> int:
-        """Take a stamped message that arrives now; return when it was made, by this clock."""
+        """Record a stamped message that arrives now; return when it was created, by this clock."""
         self.add(stamp_ns, arrival_ns)
         return min(arrival_ns, self.to_local(stamp_ns))
 
@@ -173,7 +173,7 @@ Action = Literal["none", "take_off", "hold", "fly", "land", "kill", "reset"]
 
 
 class Demand(NamedTuple):
-    """What an aircraft is to do now: velocities in W, turns counter-clockwise.
+    """The present demand on an aircraft: velocities in W, turns counter-clockwise.
 
     Attributes:
         action: `none`: send nothing that starts or steers a motor.
@@ -185,7 +185,7 @@ class Demand(NamedTuple):
 
 
 class AircraftState(NamedTuple):
-    """What is known of an aircraft; `received_ns`: when we last received anything from it; None for never."""
+    """The state of an aircraft; `received_ns`: time of the last reception from it; None for never."""
 
     state: DroneState = "landed"
     battery_percent: float = 0.0
@@ -221,11 +221,11 @@ class VehicleSession(ABC):
 
     Args:
         channels: its ports, in the order in which they are numbered.
-        readings: what its telemetry is turned into.
-        modulus: at which the numbers of its telemetry begin again.
+        readings: converted from its telemetry.
+        modulus: at which the sequence numbers of its telemetry wrap around.
 
     Attributes:
-        texts: lines for people, taken by the process.
+        texts: lines for the terminal, taken by the process.
     """
 
     def __init__(self, channels: tuple[UdpChannel, ...], readings: AircraftReadings, modulus: int) -> None:
@@ -239,11 +239,11 @@ class VehicleSession(ABC):
     @property
     @abstractmethod
     def state(self) -> AircraftState:
-        """What is known of the aircraft."""
+        """The state of the aircraft."""
 
     @abstractmethod
     def receive(self, channel: int, datagram: bytes, now_ns: int) -> None:
-        """Take a datagram from one of its ports."""
+        """Process a datagram from one of its ports."""
 
     @abstractmethod
     def advance(self, now_ns: int, demand: Demand) -> Iterable[tuple[int, bytes]]:
@@ -263,7 +263,7 @@ class StreamLoss:
         self._steps: deque[int] = deque(maxlen=LOSS_WINDOW)
 
     def add(self, number: int) -> bool:
-        """Take the number of a message; return whether it is newer than those before."""
+        """Process the number of a message; return whether it is newer than the previous ones."""
         step = 1 if self._last is None else (number - self._last) % self._modulus
         if step == 0 or step > self._modulus // 2:
             return False  # repeated, or overtaken
@@ -272,7 +272,7 @@ class StreamLoss:
         return True
 
     def restart(self) -> None:
-        """Accept any number next: the sender has begun to count again."""
+        """Accept any number next: the sender has restarted its count."""
         self._last = None
 
     @property

@@ -1,4 +1,4 @@
-"""The messages of a wire as a table of text, and how the fields of one lie in its bytes.
+"""The messages of a wire protocol as a text table, and the layout of their fields in bytes.
 
 An entry of a table begins a line with number and name; its fields follow in the order of their definition, on as many
 indented lines as they need:
@@ -68,7 +68,7 @@ def _fields(text: str) -> Iterator[WireField]:
 
 
 class WireLayout:
-    """How fields lie in bytes: little-endian, one directly behind another.
+    """The layout of fields in bytes: little-endian and packed.
 
     Args:
         fields: in the order of their definition.

@@ -1,6 +1,6 @@
-"""What web servers share: listening on a thread of their own, access, connections, streams of pictures.
+"""Parts shared by web servers: listening on a separate thread, access, connections, streams of pictures.
 
-Console and gateway serve HTTP by it. This file imports no aiohttp, since other bridges use it, too.
+Console and gateway use it for HTTP. This file does not import aiohttp, since other bridges use it, too.
 """
 
 from ipaddress import ip_address

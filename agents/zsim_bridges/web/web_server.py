@@ -1,4 +1,4 @@
-"""What the web servers of console and gateway share: event loop thread, listening, access, and bounded connections.
+"""Parts shared by the web servers of console and gateway: event loop thread, listening, access, bounded connections.
 
 aiohttp waits for the end of a request without a limit, and keeps what has arrived of its body; a thousand connections
 that never end theirs would take all the files that a process may open, and a gigabyte. A connection is a stranger until
@@ -111,11 +111,11 @@ async def cancel_other_tasks() -> None:
 
 
 def check_token(process: str, host: str, token: str | None) -> None:
-    """Raise a RunError where the token is empty, or others could connect without one."""
+    """Raise a RunError if the token is empty, or other machines could connect without one."""
     if token == "":
-        raise RunError(f"{process}: the token is empty; give it one, or leave ZSIM_TOKEN and --token away")
+        raise RunError(f"{process}: the token is empty; give one, or omit ZSIM_TOKEN and --token")
     if token is None and not is_loopback(host):
-        remedy = "set ZSIM_TOKEN (or --token, which everybody on this machine can read), or --listen 127.0.0.1"
+        remedy = "set ZSIM_TOKEN (or --token, which every user of this machine can read), or --listen 127.0.0.1"
         raise RunError(f"{process}: {host} can be reached by others; {remedy}")
 
 
@@ -193,7 +193,7 @@ class HttpConnections:
                     await room.enter_async_context(self._body_room(size))
                 await request.read()
         except TimeoutError:
-            connection.known = False  # what it sends next is waited for as for a stranger's
+            connection.known = False  # its next request has the time limit of a stranger's
             raise web.HTTPRequestTimeout(text=f"a request must be whole within {self._request_s:g} s") from None
 
     @asynccontextmanager

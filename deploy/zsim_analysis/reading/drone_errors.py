@@ -1,4 +1,4 @@
-"""Errors of single drones against their truth: of estimates and of flown velocities; distances between drones. Pure."""
+"""Errors of single drones: of estimates, references and flown velocities; distances between drones. Pure."""
 
 from itertools import combinations
 from typing import NamedTuple
@@ -12,12 +12,12 @@ from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_analysis.reading.formation import common_instants
 from zsim_analysis.reading.recorded_flight import Array, RecordedFlight
 
-SIGMAS = 2.0  # half width of the band that is drawn, in standard deviations
+SIGMAS = 2.0  # half width of the drawn band, in standard deviations
 DEGREES = 6  # of freedom of a drone's NEES: position and velocity
-ESTIMATES_MAX = 200_000  # of a flight, which take a second to evaluate
+ESTIMATES_MAX = 200_000  # evaluated per flight, which takes a second
 FLOWN = ("approaching", "path", "holding")  # phases of a reference in the air
 POSITION, YAW = (0, 1, 2), 3  # columns of errors and velocities: x, y, z, heading
-INSTANTS = 1500  # at which distances are computed, spread over the flight: more than a figure has pixels
+INSTANTS = 1500  # number of instants at which distances are computed, more than a figure has pixels
 
 
 class EstimateErrors(NamedTuple):
@@ -26,12 +26,12 @@ class EstimateErrors(NamedTuple):
     t_s: Array  # (K,) simulated time
     error: Array  # (K, 4) x, y, z in W [m], heading wrapped to ±π [rad]
     sigma: Array  # (K, 4) their standard deviations as stated by the estimator
-    # (K,) normalised error squared of position and velocity, eᵀ P⁻¹ e; NaN where P is singular. Its mean is DEGREES
-    # where the stated covariance is true [Bar-Shalom, Li, Kirubarajan 2001, 5.4.2].
+    # (K,) normalised estimation error squared of position and velocity, eᵀ P⁻¹ e; NaN where P is singular. Its mean is
+    # DEGREES for a consistent estimator [Bar-Shalom, Li, Kirubarajan 2001, 5.4.2].
     nees: Array
 
     def share_inside(self, rows: np.ndarray) -> Array:
-        """Return the share (4,) of the errors at some instants that are within SIGMAS standard deviations."""
+        """Return the share (4,) of the errors at the instants `rows` that are within SIGMAS standard deviations."""
         return np.mean(np.abs(self.error[rows]) <= SIGMAS * self.sigma[rows], axis=0)
 
 
@@ -47,7 +47,7 @@ class VelocityResponse(NamedTuple):
 def estimate_errors(flight: RecordedFlight) -> dict[str, EstimateErrors]:
     """Return the errors of the estimates of every drone that has both truth and estimates on record.
 
-    Of more than ESTIMATES_MAX estimates, every n-th instant of truth is evaluated, the same for all drones.
+    If there are more than ESTIMATES_MAX estimates, only every n-th instant of truth is evaluated.
     """
     step = 1 + sum(len(each.t_ns) for each in flight.estimates.values()) // ESTIMATES_MAX
     errors = {}
@@ -69,7 +69,7 @@ def estimate_errors(flight: RecordedFlight) -> dict[str, EstimateErrors]:
 def nees(error: Array, covariance: Array) -> Array:
     """Return eᵀ P⁻¹ e (K,) of errors (K, n) and their covariances (K, n, n); NaN where P is not positive definite."""
     values, vectors = np.linalg.eigh(covariance)
-    definite = values[:, 0] > 1e-12 * np.maximum(values[:, -1], 1e-30)  # below, the error is divided by rounding
+    definite = values[:, 0] > 1e-12 * np.maximum(values[:, -1], 1e-30)  # below, the divisor is rounding error
     along = np.einsum("kij,ki->kj", vectors, error)
     squares = np.sum(along**2 / np.where(definite[:, None], values, 1.0), axis=1)
     return np.where(definite, squares, np.nan)
@@ -80,12 +80,12 @@ class ReferenceErrors(NamedTuple):
 
     t_s: Array  # (K,) simulated time
     error: Array  # (K, 4) x, y, z in W [m], heading wrapped to ±π [rad]
-    reference: Array  # (K, 3) where it was to be, in W [m]
-    on_path: np.ndarray  # (K,) bool: on its path, not on the way to it or holding a place
+    reference: Array  # (K, 3) reference position in W [m]
+    on_path: np.ndarray  # (K,) bool: on its path, not approaching it or holding a place
 
 
 class Tracking(Struct, frozen=True):
-    """How well one drone kept to its reference, within a window and in the air; None if it was not."""
+    """Errors of one drone against its reference, within a window and in the air; None without such instants."""
 
     true_rms_m: float | None
     true_max_m: float | None
@@ -125,7 +125,7 @@ def velocity_responses(flight: RecordedFlight) -> dict[str, VelocityResponse]:
     """Return the velocities of every drone that has both truth and velocity commands on record."""
 
     def in_heading(v_W: Array) -> Array:
-        """Return velocities (K, 3) forward, left and up, of those in W."""
+        """Convert velocities (K, 3) from W to forward, left and up."""
         return np.column_stack([c * v_W[:, 0] + s * v_W[:, 1], c * v_W[:, 1] - s * v_W[:, 0], v_W[:, 2]])
 
     responses = {}
@@ -148,7 +148,7 @@ class Distances(NamedTuple):
 
     t_s: Array  # (K,) simulated time
     pairs: tuple[tuple[str, str], ...]  # names, in the order of the columns of `between`
-    between: Array  # (K, P) [m] of every pair; without columns if there are more pairs than requested
+    between: Array  # (K, P) [m] of every pair; no columns if there are more pairs than requested
     nearest: Array  # (K, N) [m] of each drone to its nearest neighbour
 
 
@@ -182,13 +182,13 @@ def distances(flight: RecordedFlight, pairs_max: int) -> Distances | None:
 
 
 def separations(flight: RecordedFlight) -> Separations:
-    """Return the limits of distances by the scenario of a flight: the largest of its clusters, and of its two hulls."""
+    """Return the limits of distances in a flight's scenario: the largest of its clusters, and of any two hulls."""
     gains = [cluster.gains for cluster in flight.scenario.clusters] if flight.scenario else []
     margin_m = max((each.separation_min_m for each in gains), default=None)
     alarm_m = max((each.separation_alarm_m for each in gains), default=None)
     drones = flight.scenario.drones if flight.scenario else ()
     try:
         radii_m = sorted(vehicle_of(drone.model).airframe.hull_radius_m for drone in drones)
-    except ZsimError:  # a model of the user's that is not here
+    except ZsimError:  # a user's model that is not available here
         radii_m = []
     return Separations(margin_m, alarm_m, sum(radii_m[-2:]) if len(radii_m) > 1 else None)

@@ -1,4 +1,4 @@
-"""The console as a process of its own: beside a replay that runs in this one, and after a run."""
+"""The console as a separate process: beside a replay in this process, and after a run."""
 
 import subprocess
 import sys
@@ -12,24 +12,24 @@ from zsim_deploy.launch.supervisor import Outcome, RunProcess
 from zsim_deploy.roles.stop_channel import interruptible
 
 ZSIM = (sys.executable, SAFE_PATH, "-m", "zsim_deploy")
-END_S = 10.0  # wall; how long it may take to end
-COPIED_S = 22.0  # wall; how long one may take to end after a run: its pages may copy for 20 s
-INTERRUPTED_S = 1.0  # wall; how long after Ctrl-C: the run itself may take 2 s, the whole is promised within 3 s
-SLOW_S = 2.0  # wall; after which it is shown what is waited for
+END_S = 10.0  # wall time for it to end
+COPIED_S = 22.0  # wall time for it to end after a run: its pages may copy for 20 s
+INTERRUPTED_S = 1.0  # wall time for it to end after Ctrl-C: the run may take 2 s, and in all 3 s are promised
+SLOW_S = 2.0  # wall time after which a notice is shown
 
 
 class RunConsole:
-    """Owns the console of a run, which goes on until the report is there and pages have copies.
+    """Owns the console of a run, which continues until the report is made and its pages have copied it.
 
-    To be entered before the run, so that the console never outlives it. Ctrl-C ends the wait for its pages.
+    Must be entered before the run, so that the console always ends. Ctrl-C ends the wait for its pages.
     """
 
     def __init__(self) -> None:
         self.process: RunProcess | None = None
-        self.outcome = Outcome("interrupted", interrupted=True)  # of the run, to be set
+        self.outcome = Outcome("interrupted", interrupted=True)  # of the run; set by the caller
 
     def own(self, process: RunProcess) -> None:
-        """Take a process that is not started yet; a former one ends."""
+        """Take a process that has not been started; end a former one."""
         if self.process is not None:
             self.process.close()
         self.process = process
@@ -50,17 +50,17 @@ class RunConsole:
                     print(printable(text), file=sys.stderr)
                     self.process.wait(limit_s - SLOW_S)
         except KeyboardInterrupt:
-            pass  # the run is over, and ended as it did
+            pass  # the run is over already
         finally:
             self.process.close()
 
 
 @contextmanager
 def console_beside(endpoint: str, record: Path, federation: str | None, tls: Path | None) -> Iterator[None]:
-    """Run a console meanwhile, which waits for the world and prints its links.
+    """Run a console for the duration of the block, which waits for the world and prints its links.
 
-    It reaches the world at its endpoint, on this machine where that is all addresses, in the name of a federation, by
-    default that of the record.
+    It connects to the world's endpoint, on this machine if that is all addresses; the default federation is the
+    record's.
     """
     if federation is None:
         from zsim_analysis.reading.recorded_run import open_run

@@ -1,4 +1,4 @@
-"""A program of a user's that is started with a run, watched like the run's own processes."""
+"""A user's program that is started with a run, and supervised like the run's own processes."""
 
 import threading
 from collections.abc import Iterable, Mapping, Sequence
@@ -9,8 +9,8 @@ from zsim_api.programs import Program, environment_of, filled
 from zsim_api.run_folder import Launch
 from zsim_deploy.launch.supervisor import end_text, last_line
 
-HERE = "here"  # as the host of a program that `zsim up` starts itself
-LEAVES_S = 2.0  # wall time that a program has to see that the run is over, before it is interrupted
+HERE = "here"  # host of a program that `zsim up` starts itself
+LEAVES_S = 2.0  # wall time for a program to notice the end of the run before it is interrupted
 
 
 class ProgramProcess:
@@ -60,7 +60,7 @@ class ProgramProcess:
         return last_line(self._log)
 
     def request_stop(self, reason: str) -> None:
-        """Interrupt it, as Ctrl-C does, unless it leaves by itself within LEAVES_S."""
+        """Interrupt it, as Ctrl-C does, unless it ends by itself within LEAVES_S."""
         if self._program is not None and self._asked is None:
             self._asked = threading.Timer(LEAVES_S, self._program.interrupt)
             self._asked.daemon = True
@@ -83,10 +83,11 @@ class ProgramProcess:
 def programs_of(
     scenario: Scenario, names: Iterable[str], endpoint: str, out: Path, launch: Launch
 ) -> list[ProgramProcess]:
-    """Return some of the users' programs of a scenario; they run where its modules are, beside its file.
+    """Return some of the users' programs of a scenario; they run in the folder of its modules, beside its file.
 
     Args:
-        endpoint: at which they find the run; out: its folder.
+        endpoint: of the run.
+        out: folder of the run.
     """
     folder, environment = next(map(Path, launch.modules), None), environment_of(endpoint, scenario.federation)
     values = {"endpoint": endpoint, "federation": scenario.federation, "folder": str(out.absolute())}

@@ -1,8 +1,8 @@
-"""The processes of a run on this host: started, watched, stopped, their output kept in logs.
+"""The processes of a run on this host: started, watched and stopped; their output goes to logs.
 
-They are forked from a process that has everything imported, which is far cheaper, and are children of this process
-either way. Only Linux can do it; elsewhere, and if the fork server is gone or does not answer, a role is started as any
-other program.
+On Linux they are forked from a process that has imported everything, which is much faster; on other systems, and if
+this fork server is gone or does not answer, they are started as normal programs. Either way they are children of this
+process.
 """
 
 import ctypes
@@ -28,16 +28,16 @@ SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "NUMBA_NUM_THREADS": "1",
-}  # matrices of a dozen rows: threads only cost, and would compete with the other roles
+}  # threads slow matrices of a dozen rows down, and would compete with the other roles
 FORKSERVER = (sys.executable, SAFE_PATH, "-m", "zsim_deploy.cli.forkserver")
 COMMAND = (sys.executable, SAFE_PATH, "-m", "zsim_deploy.cli")
-ROOM = " " * 1024  # behind the fork server's command line: each role writes its own there
+ROOM = " " * 1024  # padding of the fork server's command line, over which each role writes its own
 PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # linux/prctl.h
 PACKET_MAX = 1 << 17  # bytes, of a command line; a thousand names of drones are half of it
-REPLY_MAX = 32  # bytes, of an answer: READY, or a process number
+REPLY_MAX = 32  # bytes, of an answer: READY, or a process id
 ANSWER_S = 5.0  # the fork server answers within 20 ms, unless it is stopped
-POLL_S = 0.01  # how often one looks whether it has ended
-UNKNOWN = 0  # exit code, as of Popen, where the status was collected elsewhere
+POLL_S = 0.01  # polling interval of a process's end
+UNKNOWN = 0  # exit code, as in Popen, if the status was collected elsewhere
 
 
 class RoleProcess(Protocol):
@@ -51,9 +51,9 @@ class RoleProcess(Protocol):
 
 
 class ChildProcess:
-    """A role as a child process, by arguments of the `zsim` command; `logs`: folder for its standard error.
+    """A role as a child process, given arguments of the `zsim` command; `logs`: folder for its standard error.
 
-    `on_line` takes every line of its standard output; None sends that to the log too.
+    `on_line` takes every line of its standard output; with None they go to the log too.
     """
 
     is_program = False
@@ -105,10 +105,10 @@ class ChildProcess:
         return last_line(self._log)
 
     def request_stop(self, reason: str) -> None:
-        """Ask it to leave; harmless when it is gone."""
+        """Ask it to leave; no effect once it has ended."""
         if self._process is None or self._process.stdin is None or self._process.stdin.closed:
             return
-        with suppress(OSError):  # it is gone already
+        with suppress(OSError):  # it has ended
             self._process.stdin.write(f"stop {reason}\n")
             self._process.stdin.flush()
 
@@ -141,9 +141,9 @@ class ChildProcess:
 
 
 class RoleLauncher:
-    """Starts roles. To be entered by the main thread, which then waits until they can be started.
+    """Starts roles. Must be entered by the main thread, which then waits until they can be started.
 
-    `say` takes a line on what takes long; `run`: by what `ps` shows the fork server.
+    `say` takes a notice on slow steps; `run`: label of the fork server in `ps`.
     """
 
     def __init__(self, say: Callable[[str], None], run: str = "") -> None:
@@ -155,7 +155,7 @@ class RoleLauncher:
 
     def __enter__(self) -> "RoleLauncher":
         if sys.platform == "linux":
-            signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # whoever started this may have ignored it
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # the parent process may have ignored it
             try:
                 self._start_forkserver()
             except BaseException:  # Ctrl-C, too
@@ -197,7 +197,7 @@ class RoleLauncher:
             start.over()
 
     def _fork(self, arguments: Sequence[str], log: IO[str], listened: bool) -> "ForkedProcess | None":
-        """Return None where the fork server cannot do it. The process waits for a byte before it begins."""
+        """Fork a role; None if the fork server cannot do it. The process waits for a byte before it begins."""
         packet = json.dumps(list(arguments)).encode()
         if self._line is None or len(packet) > PACKET_MAX:
             return None
@@ -219,13 +219,13 @@ class RoleLauncher:
                 if file is not None:
                     os.close(file)
             return None
-        with suppress(BrokenPipeError):  # killed already
+        with suppress(BrokenPipeError):  # it was killed
             os.write(go_write, b"!")
         os.close(go_write)
         return ForkedProcess(int(reply), os.fdopen(stdin_write, "w"), None if out_read is None else os.fdopen(out_read))
 
     def _receive(self) -> bytes:
-        """Return an answer; empty where the fork server is gone or silent, and then it is stopped."""
+        """Return an answer; if the fork server is gone or silent, stop it and return an empty one."""
         reply = b""
         if self._line is not None:
             with suppress(OSError):
@@ -235,7 +235,7 @@ class RoleLauncher:
         return reply
 
     def _stop_forkserver(self) -> None:
-        """End the fork server; roles are started as programs from now on."""
+        """End the fork server; further roles are started as programs."""
         if self._line is not None:
             self._line.close()
             self._line = None
@@ -264,7 +264,7 @@ class ForkedProcess:
             return self._code
 
     def wait(self, timeout: float | None = None) -> int:
-        """Return its exit code when it has ended; subprocess.TimeoutExpired if it has not within so many seconds."""
+        """Wait for its end and return its exit code; subprocess.TimeoutExpired after `timeout` seconds."""
         until_s = None if timeout is None else time.monotonic() + timeout
         while (code := self.poll()) is None:
             if until_s is not None and time.monotonic() >= until_s:

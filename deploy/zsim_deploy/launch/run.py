@@ -1,4 +1,4 @@
-"""A whole run on this host: every process of a scenario started, watched, recorded, and ended."""
+"""A complete run on this host: every process of a scenario started, supervised, recorded, and ended."""
 
 import contextlib
 import os
@@ -34,9 +34,9 @@ from zsim_deploy.launch.supervisor import EndSignals, Outcome, RunProcess, Super
 from zsim_deploy.roles.stop_channel import REASONS, StopChannel, handled_by
 
 RECORDER = "recorder"
-CONSOLE = "console.run"  # the one that a run starts: not to be taken over by the first that is started by hand
-DEFAULT_PORT = 7447  # Zenoh's own
-PORTS_TRIED = 5  # when other runs that start at this moment take each before our world listens
+CONSOLE = "console.run"  # a name that a console started by hand does not take over
+DEFAULT_PORT = 7447  # Zenoh's default
+PORTS_TRIED = 5  # in case other runs take each of them before our world listens
 
 
 Shown = Screen | JsonProgress
@@ -48,17 +48,17 @@ class RunOptions:
 
     scenario: Scenario
     out: Path
-    launch: Launch  # what is kept of it, for a run that goes on
+    launch: Launch  # the part that is stored for a continuation
     order: Sequence[str] = ()  # names of processes in the order in which they are started
-    console: RunConsole | None = None  # owns the console that is started; None for a run without
+    console: RunConsole | None = None  # owner of the console; None for a run without
     cameras: bool = False
     detect: bool = False
-    continued: bool = False  # it goes on where an earlier launch of it was interrupted
-    json_progress: bool = False  # progress is written for a program that has started this one
-    supervisor: Supervisor | None = None  # over its processes, once they are started
+    continued: bool = False  # it continues an interrupted launch
+    json_progress: bool = False  # progress is written for the program that started this one
+    supervisor: Supervisor | None = None  # of its processes, once they are started
 
     def status(self) -> dict[str, Any]:
-        """Return what `zsim ps` shows of the run; callable from any thread."""
+        """Return the run's content in `zsim ps`; callable from any thread."""
         if self.supervisor:
             rows, clock = self.supervisor.rows(), self.supervisor.clock
         else:
@@ -89,7 +89,7 @@ def fly(options: RunOptions) -> Outcome:
 def run_processes(options: RunOptions, screen: Shown) -> Outcome:
     """Run a scenario as real processes; the record is finished in any case.
 
-    KeyboardInterrupt, with the reason, where nothing flew yet, or Ctrl-C came twice.
+    KeyboardInterrupt, with the reason, if nothing has flown yet, or Ctrl-C came twice.
     """
 
     def interrupt(number: int, _: object) -> None:
@@ -101,7 +101,7 @@ def run_processes(options: RunOptions, screen: Shown) -> Outcome:
                 outcome = _run(options, screen, signals)
         except KeyboardInterrupt:
             with contextlib.suppress(OSError):
-                (options.out / "logs").rmdir()  # nothing was written there: the folder may be used again
+                (options.out / "logs").rmdir()  # if it is empty, the folder may be used again
                 run_folder.forget_launch(options.out)
             raise
         with contextlib.suppress(RecordError):
@@ -110,10 +110,10 @@ def run_processes(options: RunOptions, screen: Shown) -> Outcome:
 
 
 def _run(options: RunOptions, screen: Shown, signals: EndSignals) -> Outcome:
-    """Prepare the folder and the fork server, and run on an endpoint; on another one where its port was lost."""
+    """Prepare the folder and the fork server, and run on an endpoint; on another one if its port was lost."""
     run_folder.prepare(options.out, options.scenario, options.launch, screen.say, options.continued)
     if options.camera_children() and not options.launch.rate and not options.scenario.gates("camera"):
-        screen.say("as fast as it goes, a lockstep run is faster than its cameras; --rate 1 leaves them time")
+        screen.say("an unpaced lockstep run is faster than its cameras; --rate 1 leaves them time")
     with RoleLauncher(screen.say, str(options.out)) as launcher:
         if listen := options.launch.listen:
             return _run_on(options, listen, screen, launcher, signals)
@@ -145,7 +145,7 @@ def _run_on(options: RunOptions, endpoint: str, screen: Shown, launcher: RoleLau
 
 def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launcher: RoleLauncher) -> list[RunProcess]:
     logs, scenario, launch = options.out / "logs", options.scenario, options.launch
-    # Another run's world may listen where ours could not: no process of this run is to join that one.
+    # Another run's world may listen where ours could not: the id keeps processes of this run from joining it.
     launched = ["--launched", launch.run_id, *(["--insecure"] if launch.insecure else [])]
     reach = ["--connect", endpoint, "--federation", scenario.federation, *launched]
     pace = [*pace_options(launch.mode, launch.rate), *launched, *changed_options(launch.changed)]
@@ -200,7 +200,7 @@ def run_in_process(options: RunOptions, screen: Shown) -> Outcome:
 
 
 def options_of(folder: Path) -> RunOptions:
-    """Return how an interrupted run goes on, if there is something left to fly; one in process is flown anew."""
+    """Return the options to continue an interrupted run, if it is not over; one in process is flown again."""
     launch = run_folder.launch_of(folder)
     if launch.in_process:
         (folder / RECORD).unlink(missing_ok=True)
@@ -211,7 +211,7 @@ def options_of(folder: Path) -> RunOptions:
 
 
 def check_endpoint(endpoint: str | None, insecure: bool) -> None:
-    """Refuse an endpoint on which no world can listen: malformed, or less secure than was asked for."""
+    """Refuse an endpoint on which no world can listen: malformed, or insecure without `insecure`."""
     if endpoint is None:
         return
     from zsim.transport.connection import check_listening
@@ -222,7 +222,7 @@ def check_endpoint(endpoint: str | None, insecure: bool) -> None:
 
 
 def check_open_files(options: RunOptions) -> None:
-    """Refuse a run of more processes than this machine allows files for."""
+    """Refuse a run that needs more open files than this machine allows."""
     cameras = {child.name for child in options.camera_children()}
     expected = {*expected_processes(options.scenario), RECORDER}
     agents = 1 + len(options.launch.agents) if options.launch.hosted else len(expected - cameras) - 1
@@ -231,7 +231,7 @@ def check_open_files(options: RunOptions) -> None:
 
 
 def free_port(screen: Shown) -> int:
-    """Return Zenoh's port, or another free one, shown on the screen, where that is taken."""
+    """Return Zenoh's port or, if that is in use, another free one, with a notice."""
     if is_free(DEFAULT_PORT):
         return DEFAULT_PORT
     with socket.socket() as probe:
@@ -255,7 +255,7 @@ def is_free(port: int) -> bool:
 
 
 class CameraChild(NamedTuple):
-    """A camera or detector that is started with a run, for some drones; for all that have cameras if empty."""
+    """A camera or detector that is started with a run, for some drones; empty: for all that have cameras."""
 
     role: str
     name: str
@@ -263,7 +263,7 @@ class CameraChild(NamedTuple):
 
 
 def with_cameras(scenario: Scenario) -> Scenario:
-    """Return a scenario in which some drone has a camera: where none has, all get the AR.Drone's two."""
+    """Return a scenario with cameras: if no drone has one, all get the AR.Drone's two."""
     if any(drone.sensors.cameras() for drone in scenario.drones):
         return scenario
     two = {"front_camera": FrontCamera(), "bottom_camera": BottomCamera()}
@@ -272,13 +272,13 @@ def with_cameras(scenario: Scenario) -> Scenario:
 
 
 def camera_children(scenario: Scenario, cameras: bool, detect: bool) -> list[CameraChild]:
-    """Return the cameras and detectors that a scenario expects, as far as they are known by name, or a user wants.
+    """Return the cameras and detectors that a scenario expects by name, or a user wants.
 
-    There is one for each drone that a name in `expect` is about, and ROLE.main for the others. `cameras`, `detect`:
-    draw the pictures of all that have cameras, find hats in the pictures of all.
+    There is one for each drone named in `expect`, and ROLE.main for the others. `cameras`, `detect`: render the cameras
+    of all drones, detect hats in the pictures of all.
     """
     having = watched_drones("", scenario)
-    everybody = [drone.name for drone in scenario.drones]  # a detector's cameras need not be zsim's
+    everybody = [drone.name for drone in scenario.drones]  # pictures may come from cameras outside zsim
     expected = scenario.processes.expect or ()
     children: list[CameraChild] = []
     for role, known, drones, wanted in (

@@ -1,6 +1,6 @@
-"""The watch over the processes of a run: what is done when one of them ends, and how all of them end.
+"""Supervises the processes of a run: reacts when one of them ends, and ends all of them.
 
-Where a process runs, on this machine (`ChildProcess`) or on another one (`RemoteProcess`), makes no difference here.
+The processes may run on this machine (`ChildProcess`) or on another one (`RemoteProcess`).
 """
 
 import signal
@@ -22,25 +22,25 @@ from zsim_deploy import USER_FAULT
 from zsim_deploy.roles.closed_output import CLOSED, STREAMS, is_unread, redirect_output
 from zsim_deploy.roles.stop_channel import REASONS, TWICE_INTERRUPTED, handled_by
 
-POLL_S = 0.05  # how often the processes are looked at
-END_S = 8.0  # after the world has ended, how long the others may take; the recorder may have a disk to wait for
-WORLD_FIRST_S = 1.0  # after Ctrl-C, how long the world has to end the run for all
-INTERRUPT_S = 2.0  # after Ctrl-C, how long anybody may take; the whole is promised within 3 s
-SILENT_S = 10.0  # after which a world that has printed nothing is named; it takes 1 s, and compiles with a notice
-QUIET_WORLD_S = 1.8  # a world that stands still shows its clock once a second; so a stop is named within 2 s
-TAKE_OVER_S = 60.0  # how long a process may stay once another was started in its place; a slow one starts in half
-RESTARTS_MAX = 5  # of one process within RESTART_WINDOW_S; more is a fault that a restart does not heal
+POLL_S = 0.05  # polling interval of the processes
+END_S = 8.0  # time for the others after the world has ended; the recorder may wait for its disk
+WORLD_FIRST_S = 1.0  # time for the world to end the run after Ctrl-C
+INTERRUPT_S = 2.0  # time for all processes after Ctrl-C; in all 3 s are promised
+SILENT_S = 10.0  # after which a world that has printed nothing is reported; it takes 1 s, and compiles with a notice
+QUIET_WORLD_S = 1.8  # a world that stands still shows its clock once a second; so a stop is reported within 2 s
+TAKE_OVER_S = 60.0  # after which a replaced process is killed; a slow successor starts in half the time
+RESTARTS_MAX = 5  # of one process within RESTART_WINDOW_S; with more, restarts do not help
 RESTART_WINDOW_S = 20.0
-SUPERSEDED = 3  # exit code of a role whose place another process of its name has taken
-UNREAD = "nobody reads the output any more"  # as of `zsim run … | head`
-OUTPUT_LOOK_S = 0.1  # between two looks at who reads the output
+SUPERSEDED = 3  # exit code of a role that another process of its name has replaced
+UNREAD = "the output is no longer read"  # as by `zsim run … | head`
+OUTPUT_LOOK_S = 0.1  # between two checks whether the output is read
 
 
 class RunProcess(Protocol):
     name: str
     role: str
     restarts: int
-    is_program: bool  # of a user's: its pid is not that as which it joins
+    is_program: bool  # a user's program: its pid differs from the one with which it joins
 
     @property
     def pid(self) -> int: ...
@@ -62,7 +62,7 @@ def end_text(code: int | None, last_line: str) -> str:
 
 
 def last_line(log: Path) -> str:
-    """Return the last line of a log, empty where there is none."""
+    """Return the last line of a log, empty if there is none."""
     try:
         lines = log.read_text(errors="replace").strip().splitlines()
     except OSError:
@@ -83,12 +83,12 @@ class Outcome:
 
 
 class Supervisor:
-    """Starts the processes of a run, watches them, and leaves nothing behind; `show` takes progress."""
+    """Starts the processes of a run, supervises them, and ends them all; `show` takes progress."""
 
     def __init__(self, processes: Processes, show: ProgressSink) -> None:
-        self.members: list[RunProcess] = []  # to be given before `run`; the world among them
-        self.lasting: RunProcess | None = None  # goes on after the run; the caller has to stop and close it
-        self.clock: dict[str, Any] | None = None  # the world's last
+        self.members: list[RunProcess] = []  # must be set before `run`; includes the world
+        self.lasting: RunProcess | None = None  # continues after the run; the caller must stop and close it
+        self.clock: dict[str, Any] | None = None  # the world's last clock line
         self._deaths = DeathPolicy(processes)
         self._show = show
         self._reason = ""
@@ -96,18 +96,18 @@ class Supervisor:
         self._flies = False
         self._interrupted: str | None = None
         self._until_s: float | None = None
-        self._silent_s: float | None = None  # when a world without a line of its own is to be named (monotonic)
+        self._silent_s: float | None = None  # when a world without any output is reported (monotonic)
         self._dead: set[str] = set()
-        self._lost: dict[str, int | None] = {}  # pid of each that has ended without a bye
+        self._lost: dict[str, int | None] = {}  # pids of processes that ended without a bye
         self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and since when (monotonic, s)
-        self._gone: list[RunProcess] = []  # no longer waited for
+        self._gone: list[RunProcess] = []  # replaced processes that have ended or were killed
         self._world_watch = WorldWatch()
         self._requests: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
 
     def run(self, look: Callable[[], None] = lambda: None) -> Outcome:
-        """Start everything, watch it to its end, leave nothing behind; `look` is called at every look at the processes.
+        """Start all processes, supervise them to the end, and end them all; `look` is called at every poll.
 
-        Ctrl-C and SIGTERM are requests to end the run in order; a second Ctrl-C does not wait.
+        Ctrl-C and SIGTERM end the run in order; a second Ctrl-C does not wait.
         """
         if self._interrupted:
             return Outcome(self._interrupted, interrupted=True)
@@ -120,7 +120,7 @@ class Supervisor:
         with handled_by(on_signal):
             try:
                 for child in self.members:
-                    if not child.is_program:  # these may connect only once, so the world is to be there
+                    if not child.is_program:  # programs may try to connect only once, so they start after the world
                         child.start()
                 self._watch(look)
                 self._finish()
@@ -135,14 +135,14 @@ class Supervisor:
         return Outcome(self._reason or "ended", self._failed, self._interrupted is not None)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return what `zsim ps` shows of each process; callable from any thread."""
+        """Return the row of each process in `zsim ps`; callable from any thread."""
         rows = []
         for child in self.members:
             state = "running" if child.code is None else f"ended ({child.outcome()})" if child.code else "ended"
             rows.append(status_row(child.name, socket.gethostname(), child.pid, state, child.restarts))
         return rows
 
-    # What the world says
+    # Lines of the world
 
     def handle_line(self, text: str) -> None:
         kind, content = JsonProgress.read(text)
@@ -170,7 +170,7 @@ class Supervisor:
         kind, subject, data = event["kind"], event.get("subject", ""), event.get("data", {})
         if kind == "end":
             self._reason = self._reason or event["text"]
-        elif kind == "overdue" and data.get("on_overdue") == "drop":  # it has not come back, the run goes on without
+        elif kind == "overdue" and data.get("on_overdue") == "drop":  # it did not return; the run continues without it
             self.submit(give_up)
         elif kind == "overdue" or (kind == "failure" and data.get("on_death") == "end"):
             self._fail(event["text"])
@@ -180,16 +180,16 @@ class Supervisor:
             self.submit(lambda: self._on_death(subject, data.get("pid")))
 
     def _on_death(self, name: str, pid: int | None) -> None:
-        """Restart a process that the world reports dead where its exit code gave no reason to.
+        """Restart a process that the world reports dead although its exit code did not show that.
 
-        It has left its place to the one that is dead now, or has ended with 0 without a bye, as by `os._exit(0)`.
+        It was superseded by a process that is dead now, or has ended with code 0 without a bye, as by `os._exit(0)`.
         """
         for child in self.members:
             if child.name == name and (child.pid == pid or child.is_program) and child.code in (0, None):
                 self._lost[name] = child.pid
                 self._dead.discard(name)
             elif child.name == name and child.code == SUPERSEDED and name in self._dead:
-                self._show.say(f"{name} is started again, since the process that took its place is dead")
+                self._show.say(f"{name} is restarted, since the process that replaced it is dead")
                 self._dead.discard(name)
                 child.restarts += 1
                 child.start()
@@ -214,7 +214,7 @@ class Supervisor:
                 if outcome.set_running_or_notify_cancel():
                     try:
                         outcome.set_result(act())
-                    except Exception as error:  # whatever it is, the run goes on
+                    except Exception as error:  # of any type: the run continues
                         outcome.set_exception(error)
             while to_start and self._world_watch.last_s is not None:
                 to_start.pop().start()
@@ -253,7 +253,7 @@ class Supervisor:
             world.request_stop(self._reason)
 
     def _apply_on_death(self, child: RunProcess, flies: bool) -> OnDeath:
-        """Return what is to be done after the death of a process; if that is to restart it, it is done."""
+        """Decide what to do after the death of a process; restart it if that is the decision."""
         action, why = self._deaths.decide(child.name, child.code, flies)
         if child.role != "world" or action == "restart":
             self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; {why}")
@@ -263,9 +263,9 @@ class Supervisor:
         return action
 
     def submit(self, act: Callable[[], Any]) -> Future[Any]:
-        """Let the watch do something between two looks at the processes; callable from any thread.
+        """Call a function between two polls of the processes; callable from any thread.
 
-        The outcome is cancelled when the run ends before.
+        The outcome is cancelled if the run ends before.
         """
         outcome: Future[Any] = Future()
         self._requests.put((act, outcome))
@@ -275,31 +275,31 @@ class Supervisor:
         self._interrupted = self._interrupted or reason
 
     def replace(self, new: RunProcess) -> None:
-        """Start a process that takes the place of the one of its name, which then leaves or is killed.
+        """Start a process that replaces the one of its name, which then leaves or is killed.
 
-        RunError if another one is taking that place at this moment: the last to come would not be the last to join.
+        RunError while another replacement is in progress: the last one started might not be the last to join.
         """
         self._release_replaced()
         if self.is_being_replaced(new.name):
-            raise RunError(f"{new.name} is being taken over already; try again when its former process has ended")
+            raise RunError(f"{new.name} is already being replaced; try again when its former process has ended")
         index = next(i for i, child in enumerate(self.members) if child.name == new.name)
         old, self.members[index] = self.members[index], new
         new.restarts = old.restarts + 1
         self._dead.discard(new.name)
         self._leaving[new.name] = (old, time.monotonic())
         if not old.pid:
-            old.kill()  # it waits for its host, and must not take the name back when that is there
+            old.kill()  # it waits for its host, and must not take the name back once that is reached
         new.start()
 
     def is_being_replaced(self, name: str) -> bool:
-        """Whether a process is taking the place of another that has not left yet; callable from any thread."""
+        """Return whether a process of this name was replaced and has not left yet; callable from any thread."""
         return name in self._leaving
 
     def _release_replaced(self) -> None:
         for name, (child, since_s) in list(self._leaving.items()):
             hangs = child.code is None and time.monotonic() - since_s > TAKE_OVER_S
             if hangs:
-                self._show.say(f"{name} (pid {child.pid}) has not made way within {TAKE_OVER_S:g} s; it is killed")
+                self._show.say(f"{name} (pid {child.pid}) has not left within {TAKE_OVER_S:g} s; it is killed")
                 child.kill()
             if hangs or child.code is not None:
                 del self._leaving[name]
@@ -315,7 +315,7 @@ class Supervisor:
         """Let all processes leave; the recorder leaves last, by itself."""
         members = [child for child in self.members if child is not self.lasting]
         programs = [child for child in members if child.is_program and child.name not in self._dead]
-        for program in programs:  # one may have died after the last look at it
+        for program in programs:  # one may have died after the last poll
             if program.code and self._deaths.decide(program.name, program.code, self._flies).action == "end":
                 self._fail(f"{program.name} ended: {program.outcome()}", after_end=True)
         for child in members:
@@ -332,7 +332,7 @@ class Supervisor:
             self._fail(f"the recorder ended: {recorder.outcome()}", after_end=True)
 
     def _left_s(self) -> float:
-        """Return how long the others may still take, now that the run is to end; Ctrl-C makes it shorter."""
+        """Return the remaining time for the processes to leave; Ctrl-C shortens it."""
         now_s = time.monotonic()
         latest_s = now_s + (INTERRUPT_S if self._interrupted else END_S)
         self._until_s = latest_s if self._until_s is None else min(self._until_s, latest_s)
@@ -345,7 +345,7 @@ class DeathDecision(NamedTuple):
 
 
 class DeathPolicy:
-    """Decides by what the scenario says of deaths, and by how often a process has died."""
+    """Decides on restarts, from the scenario and the number of deaths of a process."""
 
     def __init__(self, processes: Processes) -> None:
         self._processes = processes
@@ -373,27 +373,27 @@ class DeathPolicy:
         is_awaited = not flies and not is_needed(name) and name in (processes.expect or ())
         if ends or is_awaited:  # a run that has not begun would wait for it indefinitely
             return DeathDecision("end", f"{why}; the run ends")
-        return DeathDecision("drop", f"{why}; it is given up, and the run goes on without it")
+        return DeathDecision("drop", f"{why}; it is dropped, and the run continues without it")
 
 
 class WorldWatch:
-    """Notices when the world falls silent: a stopped process cannot report that itself.
+    """Detects when the world falls silent: a stopped process cannot report that itself.
 
-    Nothing is noticed before its first line: it may compile.
+    It is not considered silent before its first line, because it may be compiling.
     """
 
     def __init__(self) -> None:
-        self.last_s: float | None = None  # when a line of the world came (monotonic); set by any thread
+        self.last_s: float | None = None  # time of the world's last line (monotonic); set by any thread
         self._is_silent = False
         self._ends_for: list[str] = []
 
     def clock(self, line: dict[str, Any]) -> None:
-        """Note whom a world that has ended waits for: its links to them close only when they take what is left."""
+        """Remember the processes that an ended world waits for: its links close when they have read everything."""
         if line.get("state") == "stopped":
             self._ends_for = [each["name"] for each in line.get("waiting_for", ())]
 
     def change(self, now_s: float, pid: int) -> str | None:
-        """Return a line when the world has fallen silent or is back, None as long as it is as before."""
+        """Return a line when the world has fallen silent or is back, None otherwise."""
         if self.last_s is None or self._is_silent == (now_s - self.last_s >= QUIET_WORLD_S):
             return None
         self._is_silent = not self._is_silent
@@ -403,15 +403,15 @@ class WorldWatch:
             named = ", ".join(self._ends_for)
             return f"world (pid {pid}) has ended and waits for {named}: stopped, or out of reach"
         silent_s = now_s - self.last_s
-        go_on = f"kill -CONT {pid} lets it go on"
+        go_on = f"kill -CONT {pid} continues it"
         return f"world (pid {pid}) shows no sign of life for {silent_s:.1f} s: it is stopped ({go_on}) or out of reach"
 
 
 class EndSignals:
-    """Takes SIGTERM and SIGHUP for as long as it is entered; SIGHUP stays ignored under nohup.
+    """A context that handles SIGTERM and SIGHUP; under nohup SIGHUP stays ignored.
 
-    Nothing is raised for a closed terminal, as shells send that signal more than once: `hung_up` is called, and output
-    goes to the file `log` from then on.
+    Nothing is raised for a closed terminal, since shells send SIGHUP more than once: `hung_up` is called, and further
+    output goes to the file `log`.
     """
 
     def __init__(self, log: Path, hung_up: Callable[[], None]) -> None:
@@ -440,7 +440,7 @@ class EndSignals:
         self._hung_up()
 
     def look(self) -> str:
-        """Return why the output can no longer be seen; to be called repeatedly, as nothing need be written for it."""
+        """Return why the output can no longer be seen, empty if it can; must be called repeatedly."""
         if time.monotonic() - self._looked_s >= OUTPUT_LOOK_S:
             if unread := [stream for stream in STREAMS if is_unread(stream)]:
                 self.reason = self.reason or UNREAD

@@ -1,4 +1,4 @@
-"""Output that nobody reads any more, or that cannot be written: a closed terminal, a broken pipe, a full disk.
+"""Handles output that can no longer be read or written: a closed terminal, a broken pipe, a full disk.
 
 It imports nothing that opens files: `renew_streams` is called before anything else.
 """
@@ -18,7 +18,7 @@ CLOSED = "the terminal was closed"
 
 
 class _Output(io.FileIO):
-    """A standard stream that loses what its file does not take; only a broken pipe is raised."""
+    """A standard stream that drops output that cannot be written; only a broken pipe is raised."""
 
     _lost = False
 
@@ -29,22 +29,21 @@ class _Output(io.FileIO):
             raise
         except OSError as error:  # a full disk, a terminal that is gone
             if not self._lost and self.fileno() != STREAMS[-1]:
-                write_error(f"standard output cannot be written ({error.strerror}); what follows is lost")
+                write_error(f"standard output cannot be written ({error.strerror}); further output is lost")
             self._lost = True
             return len(data)
 
 
 def write_error(text: str) -> None:
-    """Write a line to standard error without Python's stream, as from a signal handler; it may be lost."""
+    """Write a line to standard error without Python's stream, for signal handlers; it may be lost."""
     with contextlib.suppress(OSError):
         os.write(STREAMS[-1], f"{text}\n".encode(errors="replace"))
 
 
 def renew_streams() -> None:
-    """Reopen Python's standard streams, so that nothing fails because one of them is closed, or its disk full.
+    """Reopen Python's standard streams, so that nothing fails because one is closed or its disk is full.
 
-    To be called before any file is opened: the file would take the number of a closed stream, and receive what a
-    library prints.
+    Must be called before any file is opened, which would get the number of a closed stream, and so its output.
     """
     for number in (0, *STREAMS):
         try:
@@ -57,7 +56,7 @@ def renew_streams() -> None:
     encodings = [getattr(stream, "encoding", None) for stream in (sys.stdin, sys.stdout, sys.stderr)]
     sys.stdin = os.fdopen(0, encoding=encodings[0], errors=getattr(sys.stdin, "errors", None), closefd=False)
     out, error = (io.BufferedWriter(_Output(number, "w", closefd=False)) for number in STREAMS)
-    # a question mark for a character that the terminal's encoding lacks, rather than the end of the command
+    # characters that the terminal's encoding lacks become question marks instead of errors
     sys.stdout = io.TextIOWrapper(out, encodings[1], "replace", line_buffering=os.isatty(STREAMS[0]))
     sys.stderr = io.TextIOWrapper(error, encodings[2], "replace", line_buffering=True)
 
@@ -67,12 +66,12 @@ def is_unread(stream: int) -> bool:
         if stat.S_ISFIFO(os.fstat(stream).st_mode) and hasattr(select, "poll"):  # not on Windows
             poller = select.poll()
             poller.register(stream, 0)
-            return bool(poller.poll(0))  # an error is reported whatever is asked for
+            return bool(poller.poll(0))  # errors are always reported
     return False
 
 
 def redirect_output(log: Path, streams: Sequence[int] = STREAMS, why: str = CLOSED) -> None:
-    """Send to a file what is written from now on to a terminal or a pipe that may be gone."""
+    """Redirect further output to a terminal or pipe that may be gone into a file."""
     try:
         into = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     except OSError:
@@ -82,7 +81,7 @@ def redirect_output(log: Path, streams: Sequence[int] = STREAMS, why: str = CLOS
         with contextlib.suppress(OSError):  # not open at all
             lost += [] if stat.S_ISREG(os.fstat(stream).st_mode) else [stream]
     if lost:
-        write_error(f"{why}; what there is still to say is in {log}")
+        write_error(f"{why}; further output is in {log}")
     for stream in lost:
         os.dup2(into, stream)
     os.close(into)

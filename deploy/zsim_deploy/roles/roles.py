@@ -54,28 +54,28 @@ from zsim_deploy import USER_FAULT
 from zsim_deploy.arguments import RUN_ID, WorldAccess
 from zsim_deploy.roles.stop_channel import StopChannel, lower_priority
 
-RUN_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # an id of a run that is part of a folder's name
-PATTERN = "*?["  # signs of a pattern; fnmatch
+RUN_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # a run id that may be part of a folder's name
+PATTERN = "*?["  # special characters of patterns; fnmatch
 ANY = "*"  # in a process name, for a number
-TICK_S = 0.1  # how often a router looks for a stop
-PROBE_S = 1.0  # how often a router that reaches nobody upstream looks for the reason
-PAUSE_S = 0.2  # between two looks at a world whose run has ended and that waits for byes
-JOINS_MAX = 10_000  # remembered by a router; anybody can make up names
-SLACK_GATES = 3  # a picture between two gates needs the second; one more, and the world and the cameras work at once
+TICK_S = 0.1  # polling interval of a router for a stop
+PROBE_S = 1.0  # how often a router that cannot connect upstream checks for the reason
+PAUSE_S = 0.2  # polling interval of a world whose run has ended and that waits for byes
+JOINS_MAX = 10_000  # remembered by a router, since names can be made up
+SLACK_GATES = 3  # a picture between two gates needs the second; one more lets world and cameras work in parallel
 
 Stopped = Callable[[], bool]
 Say = Callable[[str], None]
 Build = Callable[[Info, Scenario], Agent]
 Serve = Callable[[Session, Info, Participant, Stopped, Say], None]
 """Serves one run with (session, info, participant, stopped, say), until the run is over or the process stopped."""
-StandsFor = Callable[[Info], tuple[str, ...]]  # names of processes whose work a process does in a run
+StandsFor = Callable[[Info], tuple[str, ...]]  # names of the processes that a process replaces in a run
 SlackNs = Callable[[Info], int]  # how far the world of a run may be ahead of a process; 0 for one that never gates
 Remain = Callable[[Callable[[], str | None], Callable[[], bool]], None]
-"""Does with (reason, deserted) what is left to do after a run, until there is a reason to stop; deserted, at once."""
+"""Called after a run with (reason, deserted); returns once there is a reason to stop, at once if deserted."""
 
 
 def log_printer(launched: str | None) -> Say:
-    """Return a function that prints a line on standard error, with the time in a launched process, whose log it is."""
+    """Return a function that prints a line on standard error; with the time in a launched process, as in a log."""
 
     def say(text: str) -> None:
         if launched is not None:
@@ -86,9 +86,9 @@ def log_printer(launched: str | None) -> Say:
 
 
 def agent(build: Build, reach: WorldAccess, name: str = "") -> None:
-    """Run one agent against a world; `name` is the process's, where that is known before the world is.
+    """Run one agent in the run of a world; `name`: of the process, if known in advance.
 
-    UserCodeError if a user's class raised, or returned what cannot be used.
+    UserCodeError if a user's class raised, or returned something unusable.
     """
     launched, who = reach.launched, reach.who._replace(process=name)
     stop = StopChannel(launched, who)
@@ -113,7 +113,7 @@ def agent(build: Build, reach: WorldAccess, name: str = "") -> None:
         print(printable(str(error)), file=sys.stderr)
         if (raised := plugin.raised_by_user(error)) is not None:
             print(printable("".join(format_exception(raised, chain=False))), end="", file=sys.stderr)
-        sys.exit(USER_FAULT)  # its launcher is not to start it again
+        sys.exit(USER_FAULT)  # so that its launcher does not restart it
     say(f"{member.name}: left, {reason}")
     if runner.killed:  # end as by kill -9, so that the launcher sees it die; Windows has no SIGKILL
         os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))
@@ -122,7 +122,7 @@ def agent(build: Build, reach: WorldAccess, name: str = "") -> None:
 
 def agent_of(role: str, names: Sequence[str]) -> Build:
     """Return a function that makes the agent of a role for drones or clusters, by name or by patterns like `drone*`."""
-    agent_class(role)  # loaded while the world is not there yet
+    agent_class(role)  # loaded before the world is reached
 
     def build(info: Info, scenario: Scenario) -> Agent:
         wanted = chosen(f"{role}: {AGENTS[role].about}", names, things(role, scenario))
@@ -137,7 +137,7 @@ def host(names: Sequence[str]) -> Build:
 
 
 def recorder(out: Path, reach: WorldAccess) -> None:
-    """Record the run of a world into a folder, whose name may contain RUN_ID; RecordError if that cannot be."""
+    """Record the run of a world into a folder, whose name may contain RUN_ID; RecordError if that is not possible."""
     from zsim.output_folder import RECORD
     from zsim.record.completeness import record_completeness
     from zsim_agents.recorder import Recorder
@@ -160,7 +160,7 @@ def recorder(out: Path, reach: WorldAccess) -> None:
 
 
 def record_folder(out: Path, run_id: str) -> Path:
-    """Return the folder of a run's record; RecordError where the world's id would lead to another folder."""
+    """Return the folder of a run's record; RecordError if the run id cannot be part of its name."""
     if RUN_ID not in out.name:
         return out
     if not RUN_NAME.fullmatch(run_id):
@@ -177,7 +177,7 @@ def make_folder(folder: Path) -> None:
 def router(
     name: str, endpoint: str, upstream: str, federation: str, mode: Mode, launched: str | None, identity: Identity
 ) -> None:
-    """Run a router on an endpoint until it is stopped; SessionError if port or certificate cannot be used."""
+    """Run a router on an endpoint until it is stopped; SessionError if the port or a certificate cannot be used."""
     identity = identity._replace(process=f"{ROUTER}.{name}")
     stop = StopChannel(launched, identity)
     say = log_printer(launched)
@@ -197,10 +197,10 @@ def router(
 
 
 class RouterLinks:
-    """Watches the links of a router: readers that take nothing would hold up the world through it.
+    """Watches the links of a router, because readers that stop reading would block the world through it.
 
-    A router does not know the run. A process that nobody waits for has said so in its join, or shows no token of its
-    session.
+    A router does not know the run. Processes that the run does not wait for are known by their join, or by having no
+    token of their session.
     """
 
     def __init__(self, link: Session, say: Say) -> None:
@@ -219,7 +219,7 @@ class RouterLinks:
             self._joins[keys.thing(sample.key)] = join
 
     def awaited(self) -> list[Awaited]:
-        """Return the processes that must lose nothing; callable from any thread."""
+        """Return the processes that must not lose messages; callable from any thread."""
         joins = self._joins.copy()
         awaited = [Awaited((name,), 0) for name in self._tokens.shown() if name not in joins]
         for name, join in joins.items():
@@ -232,7 +232,7 @@ class RouterLinks:
             closed = self.watch.closed.popleft()
             names = ", ".join(closed.names) or "no process of the run"
             what = f"took nothing of {closed.held_bytes / 1e6:.1f} MB; its link is closed ({closed.times} so far)"
-            self._say(f"{closed.process or 'somebody'} at {closed.address} ({names}) {what}")
+            self._say(f"{closed.process or 'an unnamed client'} at {closed.address} ({names}) {what}")
 
 
 def serve_runs(
@@ -245,14 +245,16 @@ def serve_runs(
 ) -> None:
     """Serve one run after the other of the world on an endpoint, until stopped; a launched process serves only one.
 
-    NoWorldError if there was no first world within `wait_s`; SupersededError if another process of the name that was
-    given has taken over; SystemExit if it is launched, and was not ended by its launcher.
-
     Args:
         name: of the process; `role.*` for the first free number, kept until another process takes it.
-        stands_for: whose work it does in a run, beside its own.
+        stands_for: returns the processes that it replaces in a run.
         slack_ns: how far the world of a run may be ahead of it; 0 for a process that never gates.
-        remain: what it does after the run of its launcher, until that asks it to stop.
+        remain: called after the run of its launcher.
+
+    Raises:
+        NoWorldError: there was no first world within `wait_s`.
+        SupersededError: another process of the given name has taken over.
+        SystemExit: it is launched, and was not ended by its launcher.
     """
     launched, wait_s = reach.launched, reach.wait_s
     who = reach.who._replace(process="" if name.endswith(ANY) else name)
@@ -274,7 +276,7 @@ def serve_runs(
                     try:
                         _serve(serve, link, participant, info, stop, say)
                         served = info.run_id
-                    except NoWorldError as error:  # it went as this process came
+                    except NoWorldError as error:  # the world ended just as this process joined
                         if launched:
                             raise
                         say(str(error))
@@ -303,7 +305,7 @@ def _serve(serve: Serve, link: Session, participant: Participant, info: Info, st
     try:
         serve(link, info, participant, stop.stopped, say)
     except ZsimError as error:
-        participant.leave(str(error).removeprefix(f"{name}: "))  # otherwise the world would take it for dead
+        participant.leave(str(error).removeprefix(f"{name}: "))  # otherwise the world would consider it dead
         raise
     reason = participant.end_reason or stop.reason() or "stopped"
     participant.leave(reason)
@@ -315,8 +317,8 @@ def serve_pictures(
 ) -> None:
     """Serve one run after the other as a camera or a detector of some drones, by name or by patterns.
 
-    RunError if a run has no such drone. A detector's cameras need not be zsim's; it looks for hats of `diameter_m`,
-    None for the scenario's.
+    RunError if a run has no such drone. The pictures of a detector may come from outside zsim; it looks for hats of
+    `diameter_m`, None: the scenario's.
     """
 
     def drones_of(scenario: Scenario) -> list[str]:
@@ -346,7 +348,7 @@ def serve_pictures(
         return tuple(f"{role}.{drone}" for drone in drones_of(scenario_file.from_text(info.scenario)))
 
     def slack_ns(info: Info) -> int:
-        """Return how far the world may be ahead; 0 where nothing waits for it, as in a replay."""
+        """Return how far the world may be ahead; 0 if it is not waited for, as in a replay."""
         gates = not info.replay_of and scenario_file.from_text(info.scenario).gates(role)
         return SLACK_GATES * info.gate_ns if gates else 0
 
@@ -356,7 +358,7 @@ def serve_pictures(
 
 
 def process_of(role: str, names: Sequence[str]) -> str:
-    """Return the process name of the agent of one drone or cluster; empty for patterns, and for several."""
+    """Return the process name of the agent of one drone or cluster; empty for patterns or several."""
     return f"{role}.{names[0]}" if len(names) == 1 and not set(names[0]) & set(PATTERN) else ""
 
 
@@ -370,14 +372,14 @@ def process_name(role: str, name: str, who: Identity, thing: str = "main") -> st
 
 
 def check_certificate(member: Agent, identity: Identity) -> None:
-    """Refuse to publish for other processes where access control would drop it silently."""
+    """Refuse to publish for other processes if access control would drop that silently."""
     if not identity.tls:
         return
     if member.serves:
         others = ", ".join(member.serves)
         raise RunError(
-            f"{member.name}: a certificate is for one process, and this one stands for {others} too; "
-            "run each by itself, or without TLS"
+            f"{member.name}: a certificate is for one process, but this one also replaces {others}; "
+            "run each separately, or without TLS"
         )
     if fault := tls.own_fault(identity._replace(process=member.name)):
         raise RunError(fault)

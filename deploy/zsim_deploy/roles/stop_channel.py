@@ -1,12 +1,12 @@
 """How a process is stopped: by a signal, by its launcher, or because the launcher has died.
 
 A launched process has a pipe from its launcher as standard input. The launcher writes "stop REASON"; when it dies,
-the pipe ends. So nothing outlives its launcher, on any system, also after kill -9. A launcher on another host writes
-"orphan-after SECONDS" and then a "beat" every second: a host that vanishes closes no pipe. A launched process that is
-sent SIGTERM instead also ends in order, but counts as dead: its launcher did not ask for it.
+the pipe closes. So no process outlives its launcher, on any system, even after kill -9. A launcher on another host
+writes "orphan-after SECONDS" and then a "beat" every second, since the loss of a host closes no pipe. A launched
+process that receives SIGTERM instead also ends in order, but counts as dead: its launcher did not ask for it.
 
-When the process ends, so does the lease of the private key that `zsim up` has copied to its host. This file also holds
-the priority of processes that no gate waits for.
+When the process ends, it removes the private key that `zsim up` has copied to its host. This file also has
+`lower_priority`, for processes that no gate waits for.
 """
 
 import atexit
@@ -28,26 +28,26 @@ from zsim_deploy.roles.closed_output import CLOSED, redirect_output, write_error
 
 REASONS: dict[int, str] = {signal.SIGINT: "interrupted by Ctrl-C", signal.SIGTERM: "terminated"}
 HANGUP = (signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()  # not on Windows
-TWICE_INTERRUPTED = "interrupted twice, nobody was waited for"
-TERMINATED = 128 + signal.SIGTERM  # exit code, as shells have it
-GRACE_S = 4.0  # a role that hangs after a request to stop is ended; the world waits 5 s for byes only if unstopped
-FOLDER = "identity"  # in the folder of a run on a host; the certificates of its processes are below
-NICE = 5  # of processes for which no gate waits
+TWICE_INTERRUPTED = "interrupted twice, ended without waiting"
+TERMINATED = 128 + signal.SIGTERM  # exit code, as in shells
+GRACE_S = 4.0  # after which a role that hangs after a request to stop is ended
+FOLDER = "identity"  # folder of the certificates below that of a run on a host
+NICE = 5  # of processes that no gate waits for
 AUTOGROUP = Path("/proc/self/autogroup")  # sched(7)
 TRIES = 5
-AGAIN_S = 0.12  # the kernel lets ordinary users write there ten times a second, all of them together
+AGAIN_S = 0.12  # the kernel allows all ordinary users together ten writes a second
 
 
 class StopChannel:
     """The reason to stop, once there is one.
 
     Args:
-        launched: run that the process is part of. Then standard input is its launcher's pipe, and Ctrl-C is left to
-            the launcher. None if it was started by hand.
-        identity: its key is removed as soon as the launcher is gone, if it is leased.
-        held_by: of a process that flies a user's code itself: tells, from a frame of the main thread, which code it is
-            in. Where the reason is not asked for within GRACE_S, or the user presses Ctrl-C again, KeyboardInterrupt
-            is raised in that code.
+        launched: id of the run that the process is part of. Then standard input is its launcher's pipe, and Ctrl-C is
+            left to the launcher. None if it was started by hand.
+        identity: its key, if leased, is removed as soon as the launcher is gone.
+        held_by: for a process that runs a user's code itself: returns, from a frame of the main thread, which code is
+            running. If `reason` is not called within GRACE_S, or the user presses Ctrl-C again, KeyboardInterrupt is
+            raised in that code.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class StopChannel:
             threading.Thread(target=self._read, name="stop channel", daemon=True).start()
         else:
             handlers = {signal.SIGTERM: lambda *_: self._stop("terminated"), signal.SIGINT: self._on_interrupt}
-            # neither ignored, as under nohup, nor handled already
+            # unless ignored, as under nohup, or already handled
             fatal = (number for number in HANGUP if signal.getsignal(number) is signal.SIG_DFL)
             handlers |= dict.fromkeys(fatal, self._on_hangup)
         for number, handler in handlers.items():
@@ -82,16 +82,16 @@ class StopChannel:
         return self._reason is not None
 
     def orphaned(self) -> bool:
-        """Tell whether the launcher is gone, or did not ask for this end: others then see a death, not a leave."""
+        """Return whether the launcher is gone, or did not ask for this end: others then see a death, not a leave."""
         return self._orphaned
 
     def exit_if_terminated(self) -> None:
-        """Exit, at the very end, with the code that tells the launcher that it was another who sent SIGTERM."""
+        """Exit, at the very end, with the code that tells the launcher that SIGTERM came from someone else."""
         if self._terminated:
             raise SystemExit(TERMINATED)
 
     def restore_signals(self) -> None:
-        """Handle no signals any longer: what is left to do may be interrupted like any other work."""
+        """Restore the former signal handlers, so that the remaining work can be interrupted as usual."""
         self._is_heeded.set()
         for number, handler in self._former.items():
             signal.signal(number, handler)
@@ -115,7 +115,7 @@ class StopChannel:
         self._stop(REASONS[signal.SIGTERM])
 
     def _on_hangup(self, *_: object) -> None:
-        """End as after SIGTERM, and write nothing more to a terminal that may be gone."""
+        """End as after SIGTERM, without writing to a terminal that may be gone."""
         redirect_output(Path(os.devnull))
         self._stop(CLOSED)
 
@@ -131,7 +131,7 @@ class StopChannel:
         def await_beats(limit_s: float) -> None:
             while (left_s := self._last_line_s + limit_s - time.monotonic()) > 0:
                 time.sleep(left_s)
-            self._leave(f"nothing came from the launcher for {limit_s:g} s")
+            self._leave(f"no heartbeat from the launcher for {limit_s:g} s")
 
         for line in sys.stdin:
             self._last_line_s = time.monotonic()
@@ -153,7 +153,7 @@ class StopChannel:
 
 
 class KeyLease:
-    """A key that was copied to this host for this process, and is removed when the process ends for whatever reason."""
+    """A key that was copied to this host for this process, and is removed when the process ends for any reason."""
 
     def __init__(self, folder: Path) -> None:
         self._key = folder / KEY
@@ -161,14 +161,14 @@ class KeyLease:
         atexit.register(self.release)
 
     def release(self) -> None:
-        """Remove the key, but not a newer one at its path, which belongs to the process that takes over."""
+        """Remove the key, but not a newer one at its path, which belongs to its successor."""
         with contextlib.suppress(OSError):
             if _stamp(self._key) == self._stamp:
                 self._key.unlink(missing_ok=True)
 
 
 def key_lease(identity: Identity, launched: str | None) -> KeyLease | None:
-    """Return the lease of the key that the launcher of a run has copied here; None if the key is this host's own."""
+    """Return the lease of a key that the launcher of a run has copied here; None if the key is this host's own."""
     folder = identity.tls
     if launched is None or folder is None or folder.parts[-3:-1] != (launched, FOLDER):
         return None
@@ -176,7 +176,7 @@ def key_lease(identity: Identity, launched: str | None) -> KeyLease | None:
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:
-    """Return a mark that distinguishes a file from a newer one at its path; None if there is none."""
+    """Return an identifier that distinguishes a file from a newer one at its path; None if there is no file."""
     try:
         status = path.stat()
     except OSError:
@@ -197,7 +197,7 @@ def handled_by(handler: Callable[[int, Any], None]) -> Iterator[None]:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise KeyboardInterrupt at an interrupt or SIGTERM, even if a library loses it and fails in another way."""
+    """Raise KeyboardInterrupt on SIGINT or SIGTERM, even if a library swallows it and fails in another way."""
     asked = False
 
     def on_signal(*_: object) -> None:
@@ -215,9 +215,9 @@ def interruptible() -> Iterator[None]:
 
 
 def lower_priority() -> None:
-    """Let the world go first: make this process nicer, and the session that it leads, if it leads one.
+    """Give the world precedence: raise the nice value of this process, and of its session if it leads one.
 
-    Where Linux shares processors between sessions, niceness counts within each of them only.
+    If Linux schedules by session (autogroup), nice values count only within a session.
     """
     if hasattr(os, "nice"):
         os.nice(NICE)
@@ -229,6 +229,6 @@ def lower_priority() -> None:
         except BlockingIOError:
             time.sleep(AGAIN_S)
         except OSError:
-            return  # not shared that way here, or not ours to set
+            return  # no autogroups here, or no permission
         else:
             return

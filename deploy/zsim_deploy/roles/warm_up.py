@@ -1,9 +1,8 @@
-"""Compiles what a run needs, once on a machine, so that runs start at once there.
+"""Compiles the kernels of a run in advance, so that runs on this machine start at once.
 
     python -m zsim_deploy.roles.warm_up EXTRA...    for the roles that need these extras; `zsim push` runs it on a host
 
-Without numba nothing is compiled, and there is nothing to do. As a program it prints the name of each function before
-it compiles it, and nothing where all is compiled already.
+Without numba there is nothing to compile. As a program it prints the name of each function that it compiles.
 """
 
 import importlib.util
@@ -24,17 +23,17 @@ from zsim.math.distributions import normal_quantile
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 
-SIZES = {"pair": 2, "triad": 3, "template": 5}  # drones of each kind of cluster; each kind has code of its own
-ALONE = {"name": "warm-up", "duration_s": 1, "drones": [{"name": "alone", "position_m": [0, 0, 0]}]}  # as good as many
+SIZES = {"pair": 2, "triad": 3, "template": 5}  # drones of each kind of cluster; each kind has its own code
+ALONE = {"name": "warm-up", "duration_s": 1, "drones": [{"name": "alone", "position_m": [0, 0, 0]}]}  # one is enough
 NESTED = ("groups", 2, 3)  # name, groups, drones of each
-WITH_WORLD = {"world", "sweep", "all", "dev"}  # extras that bring it …
-WITH_AGENTS = WITH_WORLD | {"agents"}  # … and them; pyproject.toml
+WITH_WORLD = {"world", "sweep", "all", "dev"}  # extras that include the world; pyproject.toml
+WITH_AGENTS = WITH_WORLD | {"agents"}
 WITH_CAMERAS = {"cameras"}
-APART_M = 4.0  # on circles, so that no formation stands in a line
+APART_M = 4.0  # radius of circles, so that no formation is collinear
 
 
 def main(extras: Collection[str]) -> None:
-    """Build the world and one agent of each kind, as far as these extras need them, and let them compile."""
+    """Build the world and one agent of each kind, if these extras need them, which compiles their kernels."""
     if importlib.util.find_spec("numba") is None:
         return
     if WITH_WORLD & {*extras}:
@@ -54,7 +53,7 @@ def main(extras: Collection[str]) -> None:
 
 
 def _compile_mathematics() -> None:
-    """Call what scenarios, laws and references may call besides what the formations below do."""
+    """Call the functions that scenarios, laws and references may use, beyond those of the formations below."""
     for function in (el.sin, el.cos, el.tan, el.asin, el.acos, el.atan, el.exp, el.log, el.log1p, el.square):
         function(0.5)
     for function in (el.atan2, el.power, el.hypot):
@@ -68,7 +67,7 @@ def _compile_mathematics() -> None:
 
 
 def _info(scenario: Scenario) -> Info:
-    """Return the `world/info` from which agents are made without a world: their host needs no compiled kernel."""
+    """Return a `world/info` with which agents are made without a world, whose kernel their host does not need."""
     time = scenario.time
     drones = tuple(DroneInfo(drone.name, drone.model) for drone in scenario.drones)
     clusters = tuple(ClusterInfo(cluster.name, tuple(cluster.drones)) for cluster in scenario.clusters)
@@ -94,11 +93,11 @@ def formations() -> dict[str, Any]:
 
 
 def _show_compilation() -> None:
-    """Print a line whenever a function called from Python is compiled, but not if it is loaded from disk."""
+    """Print a line when a function called from Python is compiled, but not when it is loaded from disk."""
     from numba.core import event
 
     class Shown(event.Listener):
-        """Prints the outermost compilation: those inside it are of the functions that it calls."""
+        """Prints the outermost compilation, without those of the functions that it calls."""
 
         depth = 0
 

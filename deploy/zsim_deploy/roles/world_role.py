@@ -1,4 +1,4 @@
-"""The process that holds the run: the world of a scenario, or a record played back in its place."""
+"""The central process of a run: the world of a scenario, or a record played back in its place."""
 
 import gc
 import time
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from zsim_world.run.playback import PlaybackRange
 
 SHOWN_EVENTS = 2000  # events shown per run besides those below; all of them are in the record
-HEALTH_PERIOD_S = 0.5  # of one process; contract: 1 Hz, but anybody can publish more often
-VITAL = frozenset({"death", "doubled", "failure", "overdue", "end"})  # why a run ends, and what is lost or doubled
+HEALTH_PERIOD_S = 0.5  # of one process; contract: 1 Hz, but a process may publish more often
+VITAL = frozenset({"death", "doubled", "failure", "overdue", "end"})  # always shown
 
 
 def world(
@@ -43,8 +43,8 @@ def world(
 ) -> None:
     """Run the world of a scenario on the endpoints until the scenario ends or the process is stopped.
 
-    `journal`: its folder; `all_died`: all participants have to be started again too when it goes on from there.
-    RunError if the journal is of another run; SessionError if an endpoint is taken, or the identity cannot be used.
+    `journal`: its folder; `all_died`: all participants are restarted as well when it continues from the journal.
+    RunError if the journal is of another run; SessionError if an endpoint is in use, or the identity cannot be used.
     """
     from zsim.math.compiled import is_kept
     from zsim_world.fleet.kernel import advance
@@ -88,7 +88,7 @@ def world(
 
 
 class WorldProgress:
-    """Chooses what of a run is shown, and how often; the world calls `show` with its clocks, events, and the like."""
+    """Filters the progress of a run; the world calls `show` with its clocks, events and so on."""
 
     def __init__(self, sink: ProgressSink) -> None:
         self._sink = sink
@@ -117,7 +117,7 @@ class WorldProgress:
                 sink.say(f"  {message.t_ns / 1e9:8.2f} s  link of {about}: {message.state}, {message.peer}")
             self._links[about] = message.state
         elif kind == "resumed":
-            sink.say(f"{about}: goes on at t = {message / 1e9:.2f} s")
+            sink.say(f"{about}: continues at t = {message / 1e9:.2f} s")
         elif kind == "event":
             is_vital = message.kind in VITAL or message.data.get("fails")
             if is_vital or self._shown < SHOWN_EVENTS:
@@ -127,20 +127,20 @@ class WorldProgress:
 
 
 class ReplayOptions(NamedTuple):
-    """How a record is to be played."""
+    """How to play a record."""
 
     choice: "PlaybackRange"  # which part of it
     rate: float  # simulated per wall seconds; 0 = as fast as possible
     expect: tuple[str, ...]  # names of the processes that are waited for
-    endpoints: tuple[str, ...]  # on which others connect
-    federation: str | None = None  # None for that of the record
+    endpoints: tuple[str, ...]  # on which it listens
+    federation: str | None = None  # None: that of the record
 
 
 def play(place: Path, options: ReplayOptions, who: Identity) -> None:
     """Play a record until it is over or the process is stopped.
 
-    RunError or RecordError if there is no record, or nothing in it to play; SessionError if an endpoint is taken, a key
-    is no expression, or the identity cannot be used.
+    RunError or RecordError if there is no record, or nothing in it to play; SessionError if an endpoint is in use, a
+    key expression is invalid, or the identity cannot be used.
     """
     from zsim.record.record_reader import record_notes
     from zsim_analysis.reading.recorded_run import open_run

@@ -107,7 +107,7 @@ def test_an_authority_of_no_use_is_a_line(tmp_path: Path, signer) -> None:
     with refused(RunError, "ca.pem", "authority", "expired", "2031-10-31", "--force"):
         certificates.authority(tmp_path, NOW + timedelta(days=1826))
     (tmp_path / "ca.key").write_text("nothing")
-    with refused(RunError, "ca.key", "no private key", "--force"):
+    with refused(RunError, "ca.key", "not a private key", "--force"):
         certificates.authority(tmp_path, NOW)
     certificates.authority(tmp_path / "other", NOW)
     shutil.copy(tmp_path / "other" / "ca.key", tmp_path / "ca.key")
@@ -285,7 +285,7 @@ def test_what_a_run_does_not_need_may_be_missing(lab: Path) -> None:
     assert has_terms(line, "other addresses", "world", "h1", "router.field", "h2")
     (lab / "certs/ca.pem").write_text("")
     (line,) = certificate_faults(inventory.load(lab / "hosts.yaml"), None, datetime.now(UTC))
-    assert has_terms(line, f"{lab}/certs/ca.pem", "no certificate")
+    assert has_terms(line, f"{lab}/certs/ca.pem", "not a certificate")
     (lab / "hosts.yaml").write_text(LAB_HOSTS + "security: {insecure: true}\n")
     assert lacking(lab) == []
 

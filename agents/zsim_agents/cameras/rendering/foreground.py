@@ -1,11 +1,11 @@
-"""What stands before ground and sky in one camera's picture: drones, hats, obstacles and surfaces. Pure.
+"""The foreground of a camera's picture: drones, hats, obstacles and surfaces. Pure.
 
 Drones are hulls, arms, motors, rotors as their blades sweep, and hats; they look like the console's
 (zsim_bridges.console.airframe); lengths are the AR.Drone's, scaled by the arms. All of a picture are computed together.
 
-A ray belongs to a ball, such as a hat, if it passes the centre nearer than the radius. This is exact anywhere in the
-picture and for any lens, and smooth over one pixel at the edge, so that the centre of what is drawn is the projected
-centre. Faces of obstacles are clipped in front of the camera, curved by the lens, and shaded by the sun.
+A ray hits a ball, such as a hat, if it passes the centre within the radius. This is exact anywhere in the picture and
+for any lens, and antialiased over one pixel at the edge, so that the drawn centre is the projected centre. Faces of
+obstacles are clipped in front of the camera, curved by the lens, and shaded by the sun.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ BENT_PX = 24.0  # px, chosen: the lens bends the edges of larger triangles visib
 
 
 class DroneImager:
-    """The drones of a scene as one camera on the drone `carrier` sees them, over an exposure [s].
+    """Images of the drones of a scene in a camera on the drone `carrier`, over an exposure [s].
 
     `brightness` is that of the light, as the sensor has it.
     """
@@ -245,7 +245,7 @@ def _ellipsoid(middle: float, length: float, width: float, height: float, points
 def _blade_points(look: DroneLook, size: float, t_s: float, exposure_s: float, speeds: Array) -> Array:
     """Return the sweeps of blades over an exposure, (..., R BLADES (SECTOR + 1), 3) [m; B]: hub, then the arc.
 
-    The truth has no rotor angles: speed times time serves, since nobody can tell the difference.
+    The truth has no rotor angles: speed times time is used, which cannot be distinguished.
 
     Args:
         speeds: of the rotors, (..., R) [rad/s].
@@ -285,7 +285,7 @@ class DroneImage(NamedTuple):
     whole_turns: bool
 
     def draw(self, picture: Picture) -> None:
-        """Draw the drone without its hat; a moving one in a layer of its own, so that the background stays sharp."""
+        """Draw the drone without its hat; a moving one in a separate layer, so that the background stays sharp."""
         u0, v0, u1, v1 = self.box
         part = picture[v0:v1, u0:u1]
         pixels = self.pixels - np.array([u0, v0], np.int32) * (1 << SHIFT)

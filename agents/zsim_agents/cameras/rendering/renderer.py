@@ -1,8 +1,8 @@
-"""Draws what a drone's camera sees, from the true poses of all drones. Pure: the same inputs give the same bits.
+"""Renders the picture of a drone's camera from the true poses of all drones. Pure: equal inputs give equal bits.
 
-The backdrop, ground and sky, is one grey picture, which a map turns into colours: warping one channel costs a third of
-three. Greys up to 150 are the ground's, from HAZE on the sky's. The ground is a square tile about W's origin, repeated,
-in levels of decreasing resolution: coarser ones are drawn far away to avoid aliasing.
+The backdrop, ground and sky, is one grey picture, which a map converts to colours: warping one channel costs a third of
+three. Greys up to 150 are ground, from HAZE on sky. The ground is a repeated square tile around W's origin, in levels
+of decreasing resolution: coarser ones are drawn far away to avoid aliasing.
 """
 
 from __future__ import annotations
@@ -141,9 +141,9 @@ class Renderer:
         return picture
 
     def _blur_ground(self, grey: Picture, motion: CameraMotion) -> None:
-        """Blur the ground by the motion of the middle of the picture's lower half over the exposure.
+        """Blur the ground by the motion at the centre of the picture's lower half over the exposure.
 
-        The sky is smooth: its rows are left out, except those near the horizon.
+        The sky is smooth: its rows are skipped, except those near the horizon.
         """
         ray_K = np.array([0.0, self._view.lens.height / 4 / self._view.lens.fy, 1.0])
         down = -float(motion.R_WK[2] @ ray_K)
@@ -158,7 +158,7 @@ class Renderer:
 
 
 class _Noise:
-    """The noise of a sensor, made once and laid over each picture at another offset; sigma in grey levels."""
+    """The noise of a sensor, made once and added to each picture at another offset; sigma in grey levels."""
 
     def __init__(self, seed: int, name: str, shape: tuple[int, int], sigma: float) -> None:
         height, width = shape
@@ -181,7 +181,7 @@ class _Noise:
 
 
 def _pinhole(view: View) -> tuple[View, tuple[Picture, Picture]]:
-    """Return a view without distortion that holds all that a lens sees, and the map that bends its picture."""
+    """Return a view without distortion that covers the lens's field of view, and the map that distorts its picture."""
     lens = view.lens
     half = np.abs(view.plane).max(axis=(0, 1)) * (lens.fx, lens.fy)
     most = np.array([lens.width, lens.height]) * WIDER_MAX / 2
@@ -302,13 +302,13 @@ class Backdrop:
         return self.grey
 
     def ground_rows(self, motion: CameraMotion, room: int) -> slice:
-        """Return the rows that show ground, with so many more on either side."""
+        """Return the rows that show ground, plus `room` rows on either side."""
         down = (-motion.R_WK[2] @ self._K_inv).tolist()
         first, end = _rows(half_plane(self._size, down, 0.0), self._size) or (0, 0)
         return slice(max(0, first - room), min(self._size[1], end + room)) if first < end else slice(0, 0)
 
     def _draw_level(self, level: Level, to_ground: Array, down: Sequence[float], least: float, most: float) -> None:
-        """Draw a level in the rows that are near enough for it and not all near enough for a finer one."""
+        """Draw a level in the rows near enough for it and not entirely near enough for a finer one."""
         part = half_plane(self._size, down, least)
         rows = _rows(part, self._size)
         coarse = _rows(half_plane(self._size, [-each for each in down], -most), self._size) if most < math.inf else rows

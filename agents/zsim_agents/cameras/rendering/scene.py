@@ -51,7 +51,7 @@ NO_TRIANGLE = np.empty((0, TRIANGLE))
 
 
 class Scene(NamedTuple):
-    """What stays the same during a run.
+    """The constant scene of a run.
 
     Obstacles are rows of zsim.scenario.obstacle, surfaces those of zsim.scenario.triangles; light 1 is a clear day.
     """

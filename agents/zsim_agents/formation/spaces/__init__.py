@@ -1,1 +1,1 @@
-"""Cluster spaces: robots to cluster variables and back, with their Jacobians. Imports zsim alone."""
+"""Cluster spaces: robots to cluster variables and back, with their Jacobians. Imports zsim only."""

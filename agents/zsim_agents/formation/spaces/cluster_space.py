@@ -1,10 +1,10 @@
 """Cluster space: a formation of n robots described as one articulated body.
 
 Robot space is r = (x_i, y_i, z_i, theta_i), i = 1..n, positions in W [m], headings about z of W [rad]; cluster space c
-has as many variables: where the formation is, how it is turned, how each robot is turned relative to it, and its
-shape. Velocities are related by c_dot = J(r) r_dot (Mas, Curi, Sanchez Pena, eqs. 1, 2).
+has as many variables: position and attitude of the formation, the relative heading of each robot, and the shape.
+Velocities are related by c_dot = J(r) r_dot (Mas, Curi, Sanchez Pena, eqs. 1, 2).
 
-The mathematics of the cluster frame C, with Z-Y-X Euler angles, is compiled, because a gate has microseconds.
+The mathematics of the cluster frame C, with Z-Y-X Euler angles, is compiled, because a gate takes microseconds.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ LENGTH_MIN_M = 1e-9  # a nanometre: below it a direction is rounding noise
 
 
 class SingularClusterError(ValueError):
-    """The formation is so degenerate that it has no cluster frame."""
+    """The formation is degenerate and has no cluster frame."""
 
 
 class ClusterSpace(ABC):
@@ -79,7 +79,7 @@ class ClusterSpace(ABC):
 
     @classmethod
     def for_places(cls, places_m: Array) -> ClusterSpace:
-        """Return the space of as many robots as there are places (n, 3) [m]; by default cls(n).
+        """Return the space of n robots, given their places (n, 3) [m]; by default cls(n).
 
         Args:
             places_m: the cluster's `template_m`, else where its robots start; x ahead, y left of the formation.
@@ -91,7 +91,7 @@ class ClusterSpace(ABC):
         """Return c (4n,) of robots at p_W (n, 3) [m] with headings yaw (n,) [rad].
 
         Raises:
-            SingularClusterError: robots coincide or stand in line, so that there is no frame.
+            SingularClusterError: robots coincide or are collinear, so that there is no frame.
         """
 
     @abstractmethod
@@ -99,7 +99,7 @@ class ClusterSpace(ABC):
         """Return positions p_W (n, 3) [m] and headings yaw (n,) [rad, wrapped] of the robots of c (4n,).
 
         Raises:
-            SingularClusterError: the shape has no extent (h = 0), so that robots have no place.
+            SingularClusterError: the shape has no extent (h = 0), so that the robots' places are undefined.
         """
 
     @abstractmethod
@@ -120,14 +120,14 @@ class ClusterSpace(ABC):
 
     @abstractmethod
     def spread(self, c: Array) -> float:
-        """Return the smallest height of the shape [m] (see `spread_text`); 0 where the shape is singular."""
+        """Return the smallest height of the shape [m] (see `spread_text`); 0 if the shape is singular."""
 
     def motion(self, c: Array, c_dot: Array) -> Array:
         """Return r_dot (4n,) = J^-1 c_dot; spaces with a large J^-1 have a shorter way than through the matrix."""
         return linear.product(self.inverse_jacobian(c), c_dot)
 
     def specimen(self, apart_m: float) -> Array:
-        """Return c (4n,) of some level formation with robots at least so far apart, for rehearsals."""
+        """Return c (4n,) of a level formation with robots at least a distance apart, for rehearsals."""
         radius_m = self.n * apart_m
         turns = np.arange(self.n) * (TAU / self.n)
         x, y = (el.elementwise(of)(turns) for of in (el.cos, el.sin))
@@ -150,8 +150,8 @@ class ClusterSpace(ABC):
     def condition(self, c: Array) -> float:
         """Return the condition number of J^-1 (2-norm, metres and radians as they are).
 
-        It grows with the unit of length, so a formation larger than 4 m is judged scaled down to 4 m: a large formation
-        is not nearer to singularity than a small one of the same shape.
+        It grows with the unit of length, so a formation larger than 4 m is scaled down to 4 m: a large formation is not
+        closer to singularity than a small one of the same shape.
         """
         lengths = np.abs(c[self._lengths])
         scaled = c.copy()
@@ -172,7 +172,7 @@ class ClusterSpace(ABC):
         return near
 
     def index(self, name: str) -> int:
-        """Return the place of a variable in c; ValueError: there is none of that name."""
+        """Return the index of a variable in c; ValueError: there is none of that name."""
         if name not in self.names:
             raise ValueError(f"variable {name[:40]!r} is unknown; allowed: {_listed(self.names)}")
         return self.names.index(name)

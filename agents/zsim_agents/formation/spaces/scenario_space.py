@@ -1,4 +1,4 @@
-"""The cluster space that a scenario asks for: a stock one or a user's class, or a cluster of clusters by its groups.
+"""The cluster space of a scenario's cluster: a stock one, a user's class, or a cluster of clusters by its groups.
 
 A group k has the cluster c_k of its own robots. Its (x_c, y_c, z_c, yaw) are the place and heading of robot k of the
 parent; the rest of c_k, its tilts, headings and shape, is added to the parent's variables. 4m variables of the parent
@@ -61,7 +61,7 @@ def _space(spec: Cluster | ClusterGroup, starts: Array) -> ClusterSpace:
 
 
 def _starts(scenario: Scenario, drones: Sequence[str]) -> Array:
-    """Return where drones start (n, 3) [m]: x ahead and y left of the first of them, z up."""
+    """Return the start positions of drones (n, 3) [m]: x ahead and y left of the first drone, z up."""
     by_name = {drone.name: drone for drone in scenario.drones}
     yaw = math.radians(by_name[drones[0]].yaw_deg)
     c, s = el.cos(yaw), el.sin(yaw)
@@ -82,7 +82,7 @@ STOCK: dict[str, Callable[[Array], ClusterSpace]] = {
 
 
 class _Group(NamedTuple):
-    """Where a group stands in the whole.
+    """The indices of a group in the whole cluster.
 
     Attributes:
         robots, rows: its robots among all; their 4n_k entries in r, four each.
@@ -195,14 +195,14 @@ class NestedCluster(ClusterSpace):
         return min(space.spread(part) for space, part in self._pairs(c))
 
     def measures(self, c: Array) -> tuple[float, float]:
-        """Return the least spread and margin of parent and groups: the whole is singular where one of them is."""
+        """Return the least spread and margin of parent and groups: the whole is singular if one of them is."""
         spreads, margins = zip(*(space.measures(part) for space, part in self._pairs(c)), strict=True)
         return min(spreads), min(margins)
 
     def condition(self, c: Array) -> float:
-        """Return the greatest condition number of the parent and of the groups, each in its own measure.
+        """Return the largest condition number of the parent and the groups, each in its own measure.
 
-        J^-1 of the whole is a product of theirs: where none is large, neither is the whole.
+        J^-1 of the whole is a product of theirs: if none is large, neither is that of the whole.
         """
         return max(space.condition(part) for space, part in self._pairs(c))
 

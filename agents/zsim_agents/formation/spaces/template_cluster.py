@@ -1,10 +1,10 @@
-"""The cluster of many robots: a template that moves and turns as one body, and small departures from it.
+"""The cluster of many robots: a template that moves and rotates as a rigid body, and small departures from it.
 
     P_i = C + R (t_i + (N w)_i)
 
-C is the centroid, t_i the template's places, N a basis of the displacements that neither move nor turn it, and R the
-rotation that brings the template nearest to the robots. No robot is privileged, and the motion of one robot changes the
-frame by its n-th part only.
+C is the centroid, t_i the template's places, N a basis of the displacements that neither move nor rotate it, and R the
+best-fit rotation of the template to the robots. No robot is privileged, and the motion of one robot changes the frame
+by only the n-th part.
 
 Attitudes by best fit: Horn, Closed-form solution of absolute orientation using unit quaternions, J. Opt. Soc. Am. A 4
 (1987), section 4; the same rotation as Kabsch's (1976), and never a reflection. As a formation's frame: Belta, Kumar,

@@ -1,4 +1,4 @@
-"""The clusters of two, of three (the paper's) and of more robots, whose frame is given by robots 1, 2 and 3.
+"""The clusters of two, three (the paper's) or more robots, whose frame is given by robots 1, 2 and 3.
 
 Robots 1, 2, 3 give the frame C and the triangle (p, q, beta); each further robot k adds its distance rho, azimuth and
 elevation, seen from robot 1 in C. The origin is the centroid of all robots. Two robots are a rod with a direction and
@@ -110,7 +110,7 @@ class TriadCluster(ClusterSpace):
 
 @portable
 def triad_forward(p_W: Array, yaw: Array, c: Array) -> bool:
-    """Write c (4n,); return whether the robots have a frame, without which nothing is written."""
+    """Write c (4n,); return whether the robots have a frame; without one nothing is written."""
     n = yaw.size
     at = 6 + n  # place of p in c
     p_1 = row(p_W, 0)
@@ -132,7 +132,7 @@ def triad_forward(p_W: Array, yaw: Array, c: Array) -> bool:
 
 @portable
 def triad_inverse(c: Array, p_W: Array, yaw: Array) -> bool:
-    """Write positions (n, 3) and headings (n,); return whether the shape has an extent, else they mean nothing."""
+    """Write positions (n, 3) and headings (n,); return whether the shape has an extent, else they are invalid."""
     n = c.size // 4
     put_places_C(c, p_W)
     R_WC = matrix_from_rpy(c[3], c[4], c[5])
@@ -183,7 +183,7 @@ def put_shape_rates(J_inv: Array, c: Array, R_WC: Matrix) -> None:
 
 @portable
 def add_rate(J_inv: Array, robot: int, column: int, rate_W: Vector) -> None:
-    """Let one robot move with a variable; the centroid stays, so that all move back by the mean."""
+    """Add the motion of one robot with a variable; the centroid is fixed, so that all move back by the mean."""
     n = J_inv.shape[0] // 4
     for k in range(3):
         back = rate_W[k] / n
@@ -240,7 +240,7 @@ def put_places_C(c: Array, place: Array) -> None:
 
 @portable
 def has_direction(c: Array) -> bool:
-    """Return whether the middle of robots 2 and 3 is apart from robot 1."""
+    """Return whether the midpoint of robots 2 and 3 is distinct from robot 1."""
     at = 6 + c.size // 4
     return split_beta(c[at], c[at + 1], c[at + 2])[4] > 0.0
 
@@ -367,7 +367,7 @@ class PairCluster(ClusterSpace):
 
 @portable
 def pair_forward(p_W: Array, yaw: Array, c: Array) -> None:
-    """Write c (8,); only its length p is valid where that is zero."""
+    """Write c (8,); if its length p is zero, only p is valid."""
     d_W = subtract(row(p_W, 0), row(p_W, 1))
     c[0], c[1], c[2] = centroid(p_W)
     c[3], c[4] = pitch_yaw(d_W)

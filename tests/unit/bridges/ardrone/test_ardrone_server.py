@@ -45,8 +45,8 @@ def test_a_reason_is_printed_once_whatever_its_figures_and_all_are_counted():
     server = ArdroneServer(link, info, observer, lines.append, ArdroneOptions("127.0.0.2", frozenset(), None))
     for size in range(40):
         for drone in ("drone1", "drone2"):
-            server.refuse(f"{drone}: a datagram of {size} bytes on the navdata port does not ask for navdata")
+            server.refuse(f"{drone}: a datagram of {size} bytes on the navdata port is not a request for navdata")
     for host in ("10.0.0.7", "10.0.0.8", "fe80::1", "fe80::2"):
-        server.refuse(f"{host} sends datagrams, and is no --peer")
+        server.refuse(f"{host} sends datagrams and is not a --peer")
     assert len(lines) == 2 + 4
     assert observer.health.refused == 2 * 40 + 4

@@ -82,17 +82,17 @@ def test_commands_of_the_sdk_without_a_meaning_here_are_known():
         (b"AT*REF=1,99999999999\r", "must be an integer"),
         (b"AT*REF=1,9999999999\r", "of 32 bits"),
         (b"AT*REF=9999999999,512\r", "sequence number"),
-        (b"AT*REF=-1,512\r", "is no AT command"),
+        (b"AT*REF=-1,512\r", "AT command; must be"),
         (b"AT*FLIP=1,1\r", "FLIP is not known"),
-        (b"at*ref=1,512\r", "is no AT command"),
+        (b"at*ref=1,512\r", "AT command; must be"),
         (b"AT*PCMD=1,1,2143289344,0,0,0\r", "finite"),  # a NaN
         (b"AT*PCMD=1,1,2139095040,0,0,0\r", "finite"),  # infinity
         (b"AT*PCMD=1,1,4000000000,0,0,0\r", "finite"),
         (b'AT*CONFIG=1,"a:b,"c"\r', "CONFIG has the argument"),
         (b"AT*CONFIG=1,1,2\r", "must be a string"),
-        (b"AT*REF=1,\xb2\r", "is no AT command"),
+        (b"AT*REF=1,\xb2\r", "AT command; must be"),
         (b"AT*REF=1," + b"1" * 1100 + b"\r", "must have at most 1024"),
-        (b"\r", "is no AT command"),
+        (b"\r", "AT command; must be"),
         (b"A" * 9000, "must have at most 8192"),
     ],
 )

@@ -84,8 +84,8 @@ def test_there_is_an_end_to_identifiers(configuration: Configuration):
 @pytest.mark.parametrize(
     ("key", "value", "reason"),
     [
-        ("general:no_such", "1", "is no entry"),
-        ("custom:no_such", "1", "is no entry"),
+        ("general:no_such", "1", "not an entry"),
+        ("custom:no_such", "1", "not an entry"),
         ("custom:session_id", "not an id!", "letters and digits"),
         ("custom:session_id", "-dd", "there is no configuration"),
         ("general:flying_time", "1", "read only"),

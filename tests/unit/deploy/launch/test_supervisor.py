@@ -188,7 +188,7 @@ def test_too_many_deaths_in_a_row_end_the_run_where_it_cannot_go_on(name: str, p
     assert (outcome.failed, outcome.reason.startswith(f"{name} ended")) == (ends, ends)
     assert team.others[0].restarts == RESTARTS_MAX
     if not ends:
-        assert has_terms(team.show.lines[-1], name, "exit code 1", f"{RESTARTS_MAX} restarts", "given up")
+        assert has_terms(team.show.lines[-1], name, "exit code 1", f"{RESTARTS_MAX} restarts", "dropped")
 
 
 @pytest.mark.parametrize(("flies", "fails"), [(False, True), (True, False)])
@@ -309,7 +309,7 @@ def test_the_second_of_two_restarts_at_once_is_refused_and_the_run_goes_on():
     assert not team.go().failed
     assert orders[0].exception() is None
     assert isinstance(orders[1].exception(), RunError)
-    assert has_terms(str(orders[1].exception()), "taken over")
+    assert has_terms(str(orders[1].exception()), "being replaced")
     assert (first.pid, second.pid) == (1, 0)
 
 

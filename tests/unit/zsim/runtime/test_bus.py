@@ -350,7 +350,7 @@ def test_numbers_and_arrays_of_numpy_are_taken_as_they_would_arrive():
     [
         (lambda t_ns: velocity(t_ns, velocity_m_s=(0.0, math.nan, 0.0)), ("drone/d1/cmd/velocity", "[1]", "nan")),
         (lambda t_ns: velocity(t_ns, source="talk.b"), ("source", "'talk.b'", "'talk.a'")),
-        (lambda t_ns: [Output("swarm/d1/state", Bye(t_ns, 0, ""))], ("swarm/d1/state", "no key of the contract")),
+        (lambda t_ns: [Output("swarm/d1/state", Bye(t_ns, 0, ""))], ("swarm/d1/state", "not a key of the contract")),
         (lambda t_ns: [Output("view/cluster/a", ViewCluster(t_ns, 0, "idle", (), (), (), ""))], ("view", "`views`")),
         (lambda t_ns: [Output(keys.status("d1"), Bye(t_ns, 0, ""))], ("drone/d1/sensor/status",)),
         (lambda t_ns: [Output(keys.estimate("d1"), Bye(t_ns, 0, ""))], ("drone/d1/estimate", "Bye", "Estimate")),
