@@ -271,7 +271,10 @@ def test_as_processes_and_flown_again_they_have_the_same_bits(tmp_path: Path, fo
 
 
 @pytest.mark.soak
-def test_hosted_they_have_the_same_bits(federation: Federation, tmp_path: Path) -> None:
+def test_hosted_they_have_the_same_bits(
+    federation: Federation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(EXAMPLES))
     (tmp_path / "swarm.yaml").write_text(SWARM)
     alone = zsim.run(tmp_path / "swarm.yaml", out=tmp_path / "alone", progress=False)
     federation.run(SWARM, "--hosted").ends(with_code=0)
