@@ -486,7 +486,7 @@ class Client:
 
     def _join(self, request: client_messages.JoinRequest) -> None:
         if self._session is not None:
-            raise DecodeError(f"join: has joined as {self._session.name}; leave first, or use another connection")
+            raise DecodeError(f"join: is already {self._session.name}; leave first, or use another connection")
         name = self._process_name(request.name)
         session = LockstepSession(name, request, self._gateway.run(), self._gateway.loop, self._outbox.put)
         self._session, self.source, self._defaults = session, name, session.defaults
