@@ -209,7 +209,7 @@ BAD = {
     "several at once": (("--vary", "duration_s=1,-1", "--vary", "time.gate_ms=0"), "\npair.yaml: duration_s is -1"),
     "not a variation": (
         ("--vary", "duration_s"),
-        "--vary duration_s: is no variation; must be seed, seed=paired, a.b.c=v1,v2",
+        "--vary duration_s: is not a variation; must be seed, seed=paired, a.b.c=v1,v2",
     ),
     "a bad override": (("--set", "drones.drone9.mass_kg=1"), "--set drones.drone9.mass_kg=1: drone9 is not in drones"),
     "too few runs": (("--vary", "duration_s=1,2,3", "--runs", "2"), "--runs is 2; must be at least 3"),
