@@ -134,7 +134,8 @@ def test_silence(federation: Federation) -> None:
     sent_ns = step.me.done_ns + GATE_NS
     step.answer(sent_ns + 400 * GATE_NS)
     step.leave()
-    changes = changes_of(states.now())
+    states.until(lambda m: m["t_ns"] >= sent_ns + 400 * GATE_NS)
+    changes = changes_of(states.received)
     flying_ns, hovering_ns, landing_ns = changes["flying"], changes["hovering"], changes["landing"]
     assert flying_ns == sent_ns + DELAY_NS + GATE_NS
     assert hovering_ns - flying_ns == pytest.approx(500_000_000, abs=GATE_NS)

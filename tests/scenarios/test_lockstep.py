@@ -261,7 +261,8 @@ def test_pause_step_resume(federation: Federation) -> None:
     step.me.done_ns = 7 * GATE_NS
     step.answer(8 * GATE_NS)
     step.stands_at(10 * GATE_NS)
-    ops = [e.message["subject"] for e in step.events.now() if e.message["kind"] == "control"]
+    step.event("control", "resume")
+    ops = [e.message["subject"] for e in step.events.received if e.message["kind"] == "control"]
     assert ops == ["pause", "pause", "step", "resume"]
     step.leave()
 

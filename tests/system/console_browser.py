@@ -61,12 +61,15 @@ class BrowserPage:
     def press(self, name: str) -> None:
         self.page.get_by_role("button", name=name, exact=True).click()
 
-    def hold(self, selector: str) -> None:
-        """Hold a button down by the mouse until it is confirmed."""
+    @contextmanager
+    def held(self, selector: str) -> Iterator[None]:
+        """Hold a button down by the mouse while a block waits for what comes of it."""
         self.page.locator(selector).hover()
         self.page.mouse.down()
-        self.page.wait_for_timeout(HOLD_MS + 200)
-        self.page.mouse.up()
+        try:
+            yield
+        finally:
+            self.page.mouse.up()
 
     def select_tab(self, tab: str) -> None:
         wanted = self.page.get_by_role("tab", name=tab, exact=True)

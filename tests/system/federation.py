@@ -16,7 +16,6 @@ import os
 import re
 import select
 import signal
-import socket
 import struct
 import subprocess
 import tempfile
@@ -32,14 +31,12 @@ import msgpack
 import numpy as np
 import pytest
 from forked_commands import COLUMNS, ROOT, ZSIM
+from free_ports import free_port
 from wire import PATIENCE_S, Client
 
 from zsim.record import RecordReader, repair
 from zsim_agents.cameras import detector
 
-PORTS = range(20_000, 30_000)  # below the range from which systems take ports for outgoing connections
-WORKERS_MAX = 8  # that start processes side by side
-LAPS = 100  # through the ports, in one session of tests
 COMPILES_S = 600.0  # wall time that compiling takes at most
 
 ONE = """
@@ -273,33 +270,6 @@ def wait_gone(pid: int, within_s: float) -> bool:
         return bool(poller.poll(max(0.0, 1000 * within_s)))
     finally:
         os.close(descriptor)
-
-
-def free_port(host: str = "127.0.0.1") -> int:
-    """Return a port that nobody listens on, and that this process has not returned before.
-
-    Workers that run side by side have a part of the ports each.
-    """
-    for port in _ports:
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind((host, port))
-            except OSError:
-                continue
-            return port
-    raise OSError(f"no port free in {PORTS}")
-
-
-def _own_ports() -> Iterator[int]:
-    """Yield the ports of this worker again and again, from a place that differs from process to process."""
-    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-    own = PORTS[worker % WORKERS_MAX :: WORKERS_MAX]
-    start = os.getpid() * 37 % len(own)
-    yield from [*own[start:], *own[:start]] * LAPS
-
-
-_ports = _own_ports()
 
 
 class Record:

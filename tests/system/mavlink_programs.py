@@ -24,15 +24,17 @@ CACHE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "zsim-t
 NODE_MAVLINK = "node-mavlink@2.3.0"
 MAVPROXY = ("MAVProxy==1.8.75", "pyserial==3.5")
 INSTALL_S = 300.0
-TRIES = 50
+TRIES = 200
 
 
 def free_udp_ports(count: int) -> int:
-    """Return the first of some ports in a row that nobody has."""
+    """Return the first of some ports in a row that nobody has, and that are not returned again for others."""
+    row: list[int] = []
     for _ in range(TRIES):
-        first = free_port()
-        if all(map(_is_free, range(first, first + count))):
-            return first
+        port = free_port()
+        row = [*(row if row[-1:] == [port - 1] else []), port] if _is_free(port) else []
+        if len(row) == count:
+            return row[0]
     return pytest.fail(f"no {count} UDP ports in a row are free")
 
 

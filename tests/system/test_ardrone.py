@@ -10,6 +10,7 @@ import pytest
 from ardrone_clients import PlainPilot, addresses, node, node_modules, python, serve
 from ardrone_readers import configuration_entries
 from federation import ONE, Federation, Role
+from meanwhile import meanwhile
 from picture_pump import pumping
 from wire import PATIENCE_S, Client
 
@@ -34,6 +35,7 @@ processes: {expect: []}
 BOOTSTRAP_BYTES, DEMO_BYTES, FULL_BYTES, GPS_BYTES = 24, 500, 1904, 2120
 DEMO_AND_TIME = 1 << 0 | 1 << 1
 WITH_GPS = 65_537 | 1 << 27
+FLOWN_AGAIN_S = 0.1  # wall time between two setpoints; a drone hovers half a second after the last one
 
 
 class Fleet:
@@ -161,19 +163,19 @@ def test_a_drone_that_another_process_flies_is_shown_and_not_obeyed(fleet: Fleet
         statuses = fleet.client.subscribe("drone/drone6/sensor/status")
         fleet.client.put("drone/drone6/cmd/mode", t_ns=0, source="tester.one", mode="takeoff")
         statuses.until(lambda status: status["state"] == "hovering")
-        for _ in range(3):
-            still = {"velocity_m_s": [0.0, 0.0, 0.3], "yaw_rate_rad_s": 0.0, "frame": "world"}
-            fleet.client.put("drone/drone6/cmd/velocity", t_ns=0, source="tester.one", **still)
-        statuses.until(lambda status: status["commander"] == "tester.one")
-        pilot.request()  # it was silent, and is sent no more
-        shown = pilot.until(lambda packet: StateBit.FLYING in packet.state and packet.options[0].ctrl_state >> 16 == 3)
-        assert shown.options[0].altitude_mm > 500
-        pilot.send(at_commands.ref(0, takes_off=False, emergency=True), at_commands.Pcmd(0, 1, 1.0, 0.0, 0.0, 0.0))
-        fleet.server.line(r"drone6: REF is not obeyed: tester\.one flies the drone")
-        fleet.server.line(r"drone6: PCMD is not obeyed: tester\.one flies the drone")
-        packet = next(pilot.packets())
-        assert not packet.state & (StateBit.EMERGENCY | StateBit.USER_EMERGENCY)
-        assert fleet.states()["drone6"] in ("flying", "hovering")
+        still = {"velocity_m_s": [0.0, 0.0, 0.1], "yaw_rate_rad_s": 0.0, "frame": "world"}
+        other = lambda: fleet.client.put("drone/drone6/cmd/velocity", t_ns=0, source="tester.one", **still)  # noqa: E731
+        with meanwhile(other, FLOWN_AGAIN_S):
+            statuses.until(lambda status: status["commander"] == "tester.one")
+            pilot.request()  # it was silent, and is sent no more
+            flown = lambda packet: StateBit.FLYING in packet.state and packet.options[0].ctrl_state >> 16 == 3  # noqa: E731
+            assert pilot.until(flown).options[0].altitude_mm > 500
+            pilot.send(at_commands.ref(0, takes_off=False, emergency=True), at_commands.Pcmd(0, 1, 1.0, 0.0, 0.0, 0.0))
+            fleet.server.line(r"drone6: REF is not obeyed: tester\.one flies the drone")
+            fleet.server.line(r"drone6: PCMD is not obeyed: tester\.one flies the drone")
+            packet = next(pilot.packets())
+            assert not packet.state & (StateBit.EMERGENCY | StateBit.USER_EMERGENCY)
+            assert fleet.states()["drone6"] in ("flying", "hovering")
         fleet.client.put("drone/drone6/cmd/mode", t_ns=0, source="tester.one", mode="land")
         statuses.until(lambda status: status["state"] == "landed")
         assert fleet.client.request("world/control", "release", source="tester.one", drone="drone6")["ok"]

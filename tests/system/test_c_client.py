@@ -221,10 +221,10 @@ def test_values_wait_while_an_answer_is_awaited(talk: Talk, fake: FakeGateway) -
 
 
 def test_an_answer_that_came_too_late_is_nobodys(talk: Talk, fake: FakeGateway) -> None:
-    connected(talk, fake, timeout_s=2)
+    connected(talk, fake, timeout_s=5)
     talk.calls("latest clock t_ns")
     late = fake.receive("latest")
-    assert has_terms(talk.returned(), "-1 zsim: ", "2.0 s")
+    assert has_terms(talk.returned(), "-1 zsim: ", "5.0 s")
     fake.answer(late, values=[{"key": "clock", "value": {"t_ns": 1}}])
     talk.calls("latest clock t_ns")
     fake.answer(fake.receive("latest"), values=[{"key": "clock", "value": {"t_ns": 2}}])

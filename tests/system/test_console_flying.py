@@ -74,8 +74,8 @@ def test_a_drone_is_flown_by_hand_and_to_a_place(federation: Federation, opened:
     # its controller flies it: refused, unless it is taken over
     bar.locator(".take").click()
     bar.locator(".over").wait_for()
-    operator.hold("#zsim-flight .over")
-    bar.locator(".leave").wait_for()
+    with operator.held("#zsim-flight .over"):
+        bar.locator(".leave").wait_for()
 
     # without the dead-man key nothing moves; with it forward is where the nose points, here north
     operator.page.keyboard.down("KeyW")

@@ -167,7 +167,7 @@ def test_a_phone_shows_the_scene_above_one_panel(flight: str, opened: Callable[.
     page.close_notice()
     page.page.wait_for_function(f"({COVERED_JS})().free > 0.7")  # beside the tools over the scene
     page.select_tab("Drones")
-    assert page.page.get_by_role("tab", name="Fly", exact=True).is_hidden()  # one panel at a time
+    page.page.get_by_role("tab", name="Fly", exact=True).wait_for(state="hidden")  # one panel at a time
 
 
 @pytest.mark.slow

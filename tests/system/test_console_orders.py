@@ -2,17 +2,19 @@
 
 import json
 import signal
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 from chromium import needs_browser
-from console_browser import IN_SIGHT, PATIENCE_MS, PICTURES, BrowserPage, console, opening
+from console_browser import IN_SIGHT, PATIENCE_MS, PICTURES, POLL_MS, BrowserPage, console, opening
 from federation import Federation
 from page_overflow import overflow
 from staged_console import StagedRun, staged_console
 from test_console import TRIAD, states
 from test_console_flying import SEES, click_map
+from wire import PATIENCE_S
 
 pytestmark = needs_browser
 
@@ -71,8 +73,8 @@ def test_no_order_is_lost_where_page_console_or_world_stand_still(
     assert "controller.main" in str(over.text_content())
     over.click()  # too short
     note(page, "hold it")
-    page.hold("#zsim-flight .over")
-    page.page.wait_for_function(f"() => {BAR} === 'flying'")
+    with page.held("#zsim-flight .over"):
+        page.page.wait_for_function(f"() => {BAR} === 'flying'")
 
     # a console that stands still: what is flown is not called alive, and the order waits, in red and with its age
     role.signal(signal.SIGSTOP)
@@ -134,6 +136,14 @@ def asked(run: StagedRun, op: str) -> list[dict[str, Any]]:
     return [args for each, args in run.link.asked if each == op]
 
 
+def wait_for(page: BrowserPage, count: int, of: Callable[[], list[Any]]) -> None:
+    """Wait until there are so many of something."""
+    until_s = time.monotonic() + PATIENCE_S
+    while len(of()) < count:
+        assert time.monotonic() < until_s, of()
+        page.page.wait_for_timeout(POLL_MS)
+
+
 @pytest.mark.slow
 def test_what_is_typed_is_asked_for_or_refused_and_never_changed_to_a_limit(
     staged: tuple[StagedRun, BrowserPage],
@@ -150,7 +160,7 @@ def test_what_is_typed_is_asked_for_or_refused_and_never_changed_to_a_limit(
     field = page.page.locator(".mantine-Slider-root + * input").nth(0)
     field.fill("7.5")
     field.blur()
-    page.page.wait_for_timeout(REST_MS)
+    wait_for(page, 1, lambda: asked(run, "target"))
     assert [args["values"] for args in asked(run, "target")] == [{"x_c": 7.5}]
 
     page.select_tab("Run")
@@ -159,7 +169,7 @@ def test_what_is_typed_is_asked_for_or_refused_and_never_changed_to_a_limit(
     rate.fill("-1")
     rate.blur()
     page.press("Set rate")
-    page.page.wait_for_timeout(LATE_MS)
+    wait_for(page, 1, lambda: asked(run, "rate"))
     assert asked(run, "rate") == [{"value": -1.0}]
     picture(page, "limits")
     page.select_tab("Fly")
@@ -199,7 +209,8 @@ def test_a_confirmation_names_drone_place_and_height_and_its_marker_stays(
     page.page.wait_for_timeout(LATE_MS)
     assert asked(run, "acquire") == []
     picture(page, "confirm-over")
-    page.hold("#zsim-map .there .go")
+    with page.held("#zsim-map .there .go"):
+        wait_for(page, 1, lambda: asked(run, "acquire"))
     run.commander = "console.1"
     page.page.locator("#zsim-flight .text").get_by_text("goes to").wait_for()
     assert [args["drone"] for args in asked(run, "acquire")] == ["drone1"]

@@ -11,7 +11,7 @@ import pytest
 from federation import Federation, Role
 from forked_commands import ROOT, USER_FAULT, refusal, run_here
 from refused import has_terms
-from wire import Client, Subscription
+from wire import PATIENCE_S, Client, Subscription
 
 DRONE = "drone3"
 DRIVER, ARM = f"driver.{DRONE}", f"drone/{DRONE}/driver"
@@ -162,7 +162,7 @@ def test_a_run_waits_for_a_driver_that_the_scenario_expects(federation: Federati
     process = driver()
     assert link.until(lambda m: m["t_ns"] > 0).message["source"] == DRIVER
     stop(client, run)
-    assert process.wait(30) == 0
+    assert process.wait(PATIENCE_S) == 0
     assert os.path.exists(federation.out / "run.mcap")
 
 

@@ -50,7 +50,7 @@ def test_nobody_is_waited_for(federation: Federation) -> None:
     federation.kill("estimator.drone1", signal.SIGSTOP)
     stopped_ns = client.get("clock")["clock"]["t_ns"]
     clock.until(lambda m: m["t_ns"] > stopped_ns + 4e9)
-    assert states.until(lambda m: m["t_ns"] > stopped_ns + 3e9, within_s=30).message["reason"]
+    assert states.until(lambda m: m["t_ns"] > stopped_ns + 3e9).message["reason"]
     federation.kill("estimator.drone1", signal.SIGCONT)
     stop(client, run)
     end = federation.record().end()
@@ -96,10 +96,10 @@ def test_a_silent_commander_means_hover_then_land(federation: Federation) -> Non
     """A controller that hangs still holds its drones: the firmware's watchdog lands them."""
     run = federation.run(PAIR, "--realtime", "--rate", "3", *FOR_LONG)
     client = federation.client()
-    states, clock = client.subscribe("drone/drone1/sensor/status"), client.subscribe("clock")
-    clock.until(lambda m: m["t_ns"] > 6e9)
+    states = client.subscribe("drone/drone1/sensor/status")
+    states.until(lambda m: m["state"] == "flying" and m["t_ns"] > 6e9)
     federation.kill("controller.main", signal.SIGSTOP)
-    states.until(lambda m: m["state"] == "hovering" and m["t_ns"] > 6e9)
+    states.until(lambda m: m["state"] == "hovering")
     landing = states.until(lambda m: m["state"] == "landing")
     states.until(lambda m: m["state"] == "landed")
     federation.kill("controller.main", signal.SIGCONT)

@@ -36,11 +36,12 @@ def replay(federation: Federation, folder: Path, *options: str) -> Role:
 
 
 class Ear:
-    """Keeps the payloads of some keys, byte by byte."""
+    """Keeps the payloads of some keys, byte by byte, before its client is told of anything that arrives later."""
 
     def __init__(self, client: Client, *expressions: str) -> None:
         self.received: defaultdict[str, list[bytes]] = defaultdict(list)
-        self._kept = [client.session.declare_subscriber(f"zsim/{each}", self._take) for each in expressions]
+        take = zenoh.handlers.Callback(self._take, indirect=False)
+        self._kept = [client.session.declare_subscriber(f"zsim/{each}", take) for each in expressions]
 
     def _take(self, sample: zenoh.Sample) -> None:
         self.received[str(sample.key_expr).removeprefix("zsim/")].append(sample.payload.to_bytes())

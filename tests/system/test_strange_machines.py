@@ -11,6 +11,8 @@ import shutil
 import socket
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ from zsim_api import federation as tested
 __all__ = ["compiled"]
 needs_root = pytest.mark.skipif(os.geteuid() != 0 or not shutil.which("unshare"), reason="mounts need root")
 SHORT = ("--duration", "1", "--no-report")
+LOOK_MS = 50
 LOCKLESS = """
 import errno, fcntl, os
 def flock(*_):
@@ -319,6 +322,17 @@ PASSED = (
 )
 
 
+def wait_for_port(port: int) -> None:
+    """Wait until somebody listens on a port."""
+    until_s = time.monotonic() + PATIENCE_S
+    while True:
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        assert time.monotonic() < until_s
+        threading.Event().wait(LOOK_MS / 1000)
+
+
 @pytest.mark.skipif(not shutil.which("nginx"), reason="nginx is missing; on Debian: apt-get install nginx-light")
 def test_the_console_and_the_gateway_behind_a_path_of_a_proxy(federation: Federation, browser: Any) -> None:
     ports = {name: free_port() for name in ("port", "console", "gateway")}
@@ -332,6 +346,7 @@ def test_the_console_and_the_gateway_behind_a_path_of_a_proxy(federation: Federa
     nginx = subprocess.Popen(["nginx", "-c", str(folder / "nginx.conf"), "-p", str(folder)])
     try:
         base = f"http://127.0.0.1:{ports['port']}"
+        wait_for_port(ports["port"])
         page = browser.new_page()
         requested: list[str] = []
         page.on("request", lambda request: requested.append(request.url))
@@ -342,9 +357,16 @@ def test_the_console_and_the_gateway_behind_a_path_of_a_proxy(federation: Federa
             assert "token" not in page.url
             page.get_by_text("drone1").first.wait_for(timeout=1000 * PATIENCE_S)  # told by viser's socket
             page.wait_for_function("() => document.querySelector('#zsim-head')?.innerText.match(/\\d/)")
-        places = {url.partition(f"127.0.0.1:{ports['port']}")[2] for url in requested if url.startswith(("http", "ws"))}
-        assert {"/zsim/head", "/zsim/actions", "/zsim/view/head", "/zsim/view/actions"} <= places
-        assert all(place.startswith("/zsim") for place in places), places
+
+        def places() -> set[str]:
+            here = f"127.0.0.1:{ports['port']}"
+            return {url.partition(here)[2] for url in requested if url.startswith(("http", "ws"))}
+
+        until_s = time.monotonic() + PATIENCE_S
+        while not {"/zsim/head", "/zsim/actions", "/zsim/view/head", "/zsim/view/actions"} <= places():
+            assert time.monotonic() < until_s, places()
+            page.wait_for_timeout(LOOK_MS)
+        assert all(place.startswith("/zsim") for place in places()), places()
         answer = page.request.get(f"{base}/gateway/zsim/world/info")
         assert answer.ok
         description = page.request.get(f"{base}/gateway/openapi.json").json()

@@ -67,9 +67,9 @@ def test_two_runs_side_by_side_fly_as_each_would_alone(tmp_path: Path, runs: lis
 
 
 def endpoint_of(run: Role) -> str:
-    """Return where a run's world listens: Zenoh's own port, unless it says another."""
-    said = re.search(r"tcp/127\.0\.0\.1:\d+", run.text())
-    return said[0] if said else f"tcp/127.0.0.1:{DEFAULT_PORT}"
+    """Return where a run's world listens: Zenoh's own port, unless it says another, as the last of several tries."""
+    said = re.findall(r"this run is on (tcp/127\.0\.0\.1:\d+)", run.text())
+    return said[-1] if said else f"tcp/127.0.0.1:{DEFAULT_PORT}"
 
 
 def hash_of(path: Path) -> str:

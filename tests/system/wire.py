@@ -88,12 +88,17 @@ class Client:
         self.session.close()
 
     def subscribe(self, expression: str) -> Subscription:
-        """Listen on an expression."""
+        """Listen on an expression; what arrived before a message of another subscription is there before it.
+
+        Called back indirectly, each subscription would have a thread of its own, of which one may lag behind another.
+        """
         subscription = Subscription()
-        subscriber = self.session.declare_subscriber(
-            self._prefix + expression, lambda sample: subscription.take(sample, self._prefix)
-        )
-        self._kept.append(subscriber)
+
+        def take(sample: zenoh.Sample) -> None:
+            subscription.take(sample, self._prefix)
+
+        direct = zenoh.handlers.Callback(take, indirect=False)
+        self._kept.append(self.session.declare_subscriber(self._prefix + expression, direct))
         return subscription
 
     def get(self, expression: str, payload: bytes | None = None) -> dict[str, Any]:

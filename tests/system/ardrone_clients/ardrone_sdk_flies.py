@@ -8,7 +8,7 @@ from collections.abc import Callable
 import ardrone
 
 LANDED, FLYING, HOVERING = 2, 3, 4  # upper half of ctrl_state
-PERIOD_S, LATE_S = 0.05, 40.0
+PERIOD_S, LATE_S = 0.05, 100.0
 
 
 def main(host: str) -> None:

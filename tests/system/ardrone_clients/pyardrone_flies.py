@@ -9,7 +9,7 @@ import time
 from pyardrone import ARDrone, at
 
 LANDED, FLYING, HOVERING = 2, 3, 4  # upper half of ctrl_state
-PERIOD_S, LATE_S = 0.03, 40.0
+PERIOD_S, LATE_S = 0.03, 100.0
 BLACK = 20  # mean of a picture that is nearly so
 
 

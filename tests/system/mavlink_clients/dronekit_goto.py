@@ -15,7 +15,7 @@ warnings.simplefilter("ignore")
 import dronekit  # noqa: E402
 from pymavlink import mavutil  # noqa: E402
 
-PATIENCE_S = 40.0
+PATIENCE_S = 100.0
 TAKEOFF_M = 3.0
 NORTH_DEG = 4e-5  # about 4.4 m
 

@@ -15,7 +15,7 @@ from mavsdk.plugins.offboard import Offboard, PositionNedYaw, VelocityBodyYawspe
 from mavsdk.plugins.param import Param
 from mavsdk.plugins.telemetry import Telemetry
 
-PATIENCE_S = 40.0
+PATIENCE_S = 100.0
 TAKEOFF_M = 3.0
 SIDE_M = 3.0
 SILENCE_S = 5.0  # of setpoints, in simulated time, which may go faster than the wall clock by which they are sent

@@ -28,7 +28,7 @@ from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.sweep.sweep import load, read_table
 from zsim_analysis.sweep.sweep_run import fly_scenario
 
-PATIENCE_S = 30.0  # wall time within which processes end
+PATIENCE_S = 120.0  # wall time within which processes end
 DOCUMENT = yaml_file.value(ONE)
 
 

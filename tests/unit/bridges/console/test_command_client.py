@@ -19,7 +19,7 @@ from zsim_bridges.console.command_client import (
     RequestOutcome,
 )
 
-PATIENCE_S = 10.0
+PATIENCE_S = 120.0
 
 
 class Link:

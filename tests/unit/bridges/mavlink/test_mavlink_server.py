@@ -59,7 +59,7 @@ def program() -> Iterator[socket.socket]:
     """A program that has a port of its own."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
         opened.bind(("127.0.0.1", 0))
-        opened.settimeout(10.0)
+        opened.settimeout(120.0)
         yield opened
 
 

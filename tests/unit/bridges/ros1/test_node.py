@@ -16,7 +16,7 @@ from zsim_bridges.ros1 import master_api, tcpros
 from zsim_bridges.ros1.master_api import own_address
 from zsim_bridges.ros1.node import PublishedTopic, Ros1Node
 
-PATIENCE_S = 20.0
+PATIENCE_S = 120.0
 TWIST, EMPTY = "geometry_msgs/Twist", "std_msgs/Empty"
 Vector3 = tcpros.message_class("geometry_msgs/Vector3")
 

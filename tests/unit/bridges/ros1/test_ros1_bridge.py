@@ -146,7 +146,7 @@ class Link:
         for payload in self._payloads:
             return ReceivedSample(keys.BATCH, payload)
         self.emptied.set()
-        self._closed.wait(10.0)
+        self._closed.wait(120.0)
         raise SessionError("closed")
 
     def undeclare(self) -> None:
@@ -168,8 +168,8 @@ def test_who_is_too_slow_goes_on_with_the_newest_gates(monkeypatch: pytest.Monke
     async def run() -> tuple[list[Any], HealthMeter]:
         health = HealthMeter("ros1")
         intake = TrafficIntake(link, about, health, asyncio.get_running_loop())
-        await asyncio.to_thread(link.emptied.wait, 10.0)
-        await asyncio.wait_for(intake.news.wait(), 10.0)
+        await asyncio.to_thread(link.emptied.wait, 120.0)
+        await asyncio.wait_for(intake.news.wait(), 120.0)
         found = list(intake.arrivals())
         intake.close()
         return found, health

@@ -96,7 +96,7 @@ class Aircraft(asyncio.DatagramProtocol):
     async def next(self) -> None:
         """Wait for the next datagram."""
         self.news.clear()
-        await asyncio.wait_for(self.news.wait(), 30)
+        await asyncio.wait_for(self.news.wait(), 120)
 
     async def until(self, demand: str) -> None:
         while self.demands[-1:] != [demand]:

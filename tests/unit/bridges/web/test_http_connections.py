@@ -7,6 +7,7 @@ from functools import wraps
 from typing import Any
 
 from aiohttp import ClientSession, web
+from jumping_time import run_jumping
 
 from zsim_bridges.web.web_server import BODY_BYTES_MAX, SMALL_BYTES, HttpConnection, HttpConnections
 
@@ -63,7 +64,7 @@ async def server(
 def in_loop(test: Callable[[], Coroutine[Any, Any, None]]) -> Callable[[], None]:
     @wraps(test)
     def run() -> None:
-        asyncio.run(test())
+        run_jumping(test())
 
     return run
 

@@ -78,10 +78,10 @@ def test_following_ends_with_the_run_and_prints_its_last_words(run: Run, capsys:
     """The file comes only after the follower."""
     follower = threading.Thread(target=logs, args=("estimator.d1", True, "zsim"), daemon=True)
     follower.start()
-    assert run.asked.wait(20.0)
+    assert run.asked.wait(120.0)
     run.write("last words\n")
     run.end()
-    follower.join(20.0)
+    follower.join(120.0)
     assert not follower.is_alive()
     assert capsys.readouterr().out == "last words\n"
 

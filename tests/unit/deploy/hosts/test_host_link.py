@@ -12,6 +12,7 @@ from typing import Any
 
 import asyncssh
 import pytest
+from jumping_time import run_jumping
 from local_host import LocalHost
 from refused import has_terms, refused
 
@@ -157,7 +158,7 @@ class Link:
 
 def fetched(get: Get | None, into: Path, there: bool = True) -> Link:
     link: Any = Link(get)
-    assert asyncio.run(fetch(link, "~/.zsim/runs/1/run.mcap", into)) is there
+    assert run_jumping(fetch(link, "~/.zsim/runs/1/run.mcap", into)) is there
     return link
 
 

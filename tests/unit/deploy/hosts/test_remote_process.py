@@ -16,7 +16,7 @@ from zsim_deploy.hosts.host_link import EventLoopThread
 from zsim_deploy.hosts.host_run import LOST, ProcessLog, RemoteProcess
 
 FILES = {"identity/estimator.d1/key.pem": b"secret"}
-PATIENCE_S = 20.0  # after which a test that waits for ever fails
+PATIENCE_S = 120.0  # after which a test that waits for ever fails
 
 
 class Stream:

@@ -26,7 +26,7 @@ LIGHT = (
     *(sys.executable, "-P", "-c"),
     "from zsim_deploy.cli import forkserver as it; it._prepare = lambda: None; it.main()",
 )  # a fork server that imports nothing beforehand: each role does
-END_S = 30.0
+END_S = 120.0
 LOOK_S = 0.02
 
 

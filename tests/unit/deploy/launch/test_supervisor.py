@@ -374,7 +374,7 @@ def test_a_process_that_waits_for_its_host_is_given_up_when_another_takes_its_pl
 
 def test_all_are_closed_at_once():
     """Each close waits for the other's."""
-    together = threading.Barrier(4, timeout=20.0)
+    together = threading.Barrier(4, timeout=120.0)
 
     class Slow(Member):
         def close(self) -> None:
