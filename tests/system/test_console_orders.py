@@ -160,8 +160,8 @@ def test_what_is_typed_is_asked_for_or_refused_and_never_changed_to_a_limit(
     field = page.page.locator(".mantine-Slider-root + * input").nth(0)
     field.fill("7.5")
     field.blur()
-    wait_for(page, 1, lambda: asked(run, "target"))
-    assert [args["values"] for args in asked(run, "target")] == [{"x_c": 7.5}]
+    wait_for(page, 1, lambda: [args for args in asked(run, "target") if args["values"] == {"x_c": 7.5}])
+    assert not any(args["values"]["x_c"] >= 50 for args in asked(run, "target"))
 
     page.select_tab("Run")
     page.page.get_by_text("rate: 0 to").wait_for()

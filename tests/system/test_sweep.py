@@ -213,7 +213,7 @@ BAD = {
     ),
     "a bad override": (("--set", "drones.drone9.mass_kg=1"), "--set drones.drone9.mass_kg=1: drone9 is not in drones"),
     "too few runs": (("--vary", "duration_s=1,2,3", "--runs", "2"), "--runs is 2; must be at least 3"),
-    "the same again": (("--runs", "2"), "--runs is 2; must be 1, for further ones would have the same bits"),
+    "the same again": (("--runs", "2"), "--runs is 2; must be 1"),
     "no runs": (("--runs", "0"), "invalid value for '--runs'"),
     "workers and dask": (("--workers", "2", "--dask", "tcp://127.0.0.1:9"), "--workers is for processes of this host"),
     "no scheduler": (("--dask", "nonsense://127.0.0.1:9"), "--dask nonsense://127.0.0.1:9: no scheduler"),

@@ -6,7 +6,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -202,9 +201,7 @@ def test_ctrl_c_ends_the_workers_and_the_same_call_goes_on(near: None, tmp_path:
     assert (plan.runs, plan.vary) == (3, ("seed=1,2,3",))
 
 
-def test_what_a_killed_sweep_has_left_is_removed_by_the_next_one(
-    near: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_killed_sweep_has_left_is_removed_by_the_next_one(tmp_path: Path) -> None:
     """Its own folder, the modules of what the script defines, and in a worker the record of a run."""
     temporary = tmp_path / "tmp"
     temporary.mkdir()
@@ -221,11 +218,11 @@ def test_what_a_killed_sweep_has_left_is_removed_by_the_next_one(
         started = psutil.Process(killed.pid).children(recursive=True)
         killed.kill()
     assert psutil.wait_procs(started, PATIENCE_S)[1] == []
-    left = [*temporary.glob("*/*")]
-    assert {path.name.partition("-")[0] for path in left} == {"modules", "sweep", "run"}
-    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
-    zsim.sweep(DOCUMENT, {"seed": [1]}, progress=False)
-    assert not any(path.parent.exists() for path in left)
+    left = {path.name.partition("-")[0] for path in temporary.glob("*/*")}
+    assert left == {"modules", "sweep", "run"}
+    write(tmp_path, next_py="import zsim; zsim.sweep('one.yaml', {'seed': [1]}, workers=1, progress=False)")
+    subprocess.run([sys.executable, "next.py"], cwd=tmp_path, env=environment, check=True)
+    assert [*temporary.iterdir()] == []
 
 
 def test_the_same_call_flies_what_is_missing(
