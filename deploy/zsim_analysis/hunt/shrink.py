@@ -94,8 +94,7 @@ class Shrinker:
                 vector = np.array(case.faults[place][name], float)
                 size = float(np.linalg.norm(vector))
                 if size > 0:
-                    scaled = lambda x: [_round(float(each)) for each in vector * (x / size)]  # noqa: E731, B023
-                    case = self._bisected(lambda x: _set(case, place, name, scaled(x)), size, 0.0, case)  # noqa: B023
+                    case = self._bisected(lambda x: _set(case, place, name, _scaled(vector, x / size)), size, 0.0, case)  # noqa: B023
             elif isinstance(value, int | float) and _is_number(value):
                 case = self._bisected(
                     lambda x, case=case, name=name: _set(case, place, name, x), value, mildest.get(name, 0.0), case
@@ -197,6 +196,10 @@ def _between(mildest: float, value: float, share: float) -> float:
     if mildest > 0 and value > 0 and max(mildest / value, value / mildest) >= RATIO:
         return _round(mildest * (value / mildest) ** share)
     return _round(mildest + share * (value - mildest))
+
+
+def _scaled(vector: Any, factor: float) -> list[float]:
+    return [_round(float(x)) for x in vector * factor]
 
 
 def _round(x: float, digits: int = 4) -> float:
