@@ -17,7 +17,7 @@ from zsim import __version__
 from zsim.contract.fingerprint import TruthHash
 from zsim.errors import RecordError, printable
 from zsim.presentation import Column, FittedTable
-from zsim.scenario.triangles import Surroundings
+from zsim.scenario.surroundings import Surroundings
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.drone_errors import Tracking, reference_errors, tracking_of
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of, min_separation_m
