@@ -23,8 +23,7 @@ from zsim_analysis.bundle.bundle_file import opened
 from zsim_analysis.bundle.bundle_rerun import check_content
 from zsim_analysis.bundle.own_code import EXTRAS, pins_of
 from zsim_deploy import SAFE_PATH
-from zsim_deploy.hosts.push import default_cache
-from zsim_deploy.hosts.wheelhouse import PROJECT, checkout, requirement
+from zsim_deploy.hosts.wheelhouse import PROJECT, checkout, default_cache, requirement
 
 KEY_DIGITS = 16
 READY = "ready"  # marks a complete environment
