@@ -6,8 +6,7 @@ import struct
 import pytest
 
 from zsim_bridges.mavlink import dialect
-from zsim_bridges.mavlink.dialect import checksum
-from zsim_bridges.mavlink.frame import BEHIND_MAX, EPOCH_S, Link, Parser, Signing, Version
+from zsim_bridges.mavlink.dialect import BEHIND_MAX, EPOCH_S, Link, Parser, Signing, Version, checksum
 
 HEARTBEAT_EXTRA = bytes([50])  # its CRC_EXTRA
 MESSAGES = [dialect.Heartbeat(type=2), dialect.Statustext(6, "hello"), dialect.Attitude(1, 0.5), dialect.Ping()]
