@@ -1,4 +1,4 @@
-"""The flight of one vehicle: its arming state, its mode, the resulting targets, and the commands that make it hold them.
+"""The flight of one vehicle: its arming state, its mode, its targets, and the commands that make it hold them.
 
 A landed drone of zsim has no separate armed state: armed means that it takes off on command. Places are approached like
 references of drones: `zsim_agents.references.tracking`.
