@@ -27,8 +27,7 @@ from zsim_analysis.bundle import bundle_file as names
 from zsim_analysis.bundle.bundle_file import Manifest, WrittenBundle, refuse_existing, write_bundle
 from zsim_analysis.bundle.own_code import locked, own_modules
 from zsim_analysis.reading import recorded_run
-from zsim_analysis.reading.output_hashes import GateDigests, OutputHashes, content_of
-from zsim_analysis.reading.recorded_run import RecordedAgents, RecordedRun
+from zsim_analysis.reading.recorded_run import GateDigests, OutputHashes, RecordedAgents, RecordedRun, content_of
 from zsim_analysis.report.make_report import figures
 from zsim_analysis.report.summary import RunSummary, judge
 from zsim_world.run.coordinator import FLIGHT_REQUESTS

@@ -25,8 +25,7 @@ from zsim.scenario.surface_file import placed
 from zsim.scenario.triangles import corners_of
 from zsim_analysis.reading import drone_errors
 from zsim_analysis.reading.formation import Formation, common_instants
-from zsim_analysis.reading.radio_links import RadioHistory
-from zsim_analysis.reading.recorded_flight import Array, RecordedFlight, Track
+from zsim_analysis.reading.recorded_flight import Array, RadioHistory, RecordedFlight, Track
 from zsim_analysis.report import figure_style as style
 
 EACH_MAX = 4  # drones with a column each on a page

@@ -26,8 +26,7 @@ from zsim_analysis.reading.drone_errors import (
     velocity_responses,
 )
 from zsim_analysis.reading.formation import Formation, goal_errors
-from zsim_analysis.reading.radio_links import RadioSummary
-from zsim_analysis.reading.recorded_flight import RecordedFlight
+from zsim_analysis.reading.recorded_flight import RadioSummary, RecordedFlight
 from zsim_analysis.reading.shortfall import percent_text, seconds_text, span_text
 from zsim_analysis.report import FORMATS
 from zsim_analysis.report import drone_figures as drones

@@ -21,8 +21,7 @@ from zsim.scenario.triangles import Surroundings
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.drone_errors import Tracking, reference_errors, tracking_of
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of, min_separation_m
-from zsim_analysis.reading.radio_links import RadioSummary
-from zsim_analysis.reading.recorded_flight import TRUTH_WIDTH, RecordedFlight, read_flight
+from zsim_analysis.reading.recorded_flight import TRUTH_WIDTH, RadioSummary, RecordedFlight, read_flight
 from zsim_analysis.reading.recorded_run import DriverLink, command_age_ms, driver_links
 from zsim_analysis.reading.shortfall import (
     NOT_AS_PLANNED,

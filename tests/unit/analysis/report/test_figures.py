@@ -23,8 +23,7 @@ from zsim.scenario.scenario_file import resolve
 from zsim.scenario.surface_file import packed
 from zsim_analysis.reading.drone_errors import Distances, EstimateErrors, Separations, VelocityResponse
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of, goal_errors
-from zsim_analysis.reading.radio_links import RadioHistory
-from zsim_analysis.reading.recorded_flight import RecordedFlight
+from zsim_analysis.reading.recorded_flight import RadioHistory, RecordedFlight
 from zsim_analysis.report import FORMATS, make_report
 from zsim_analysis.report.drone_figures import (
     BAND_GREY,
