@@ -23,12 +23,22 @@ from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.formation import Formation
 from zsim_analysis.reading.recorded_flight import Array, RecordedFlight
 from zsim_analysis.reading.shortfall import span_text
-from zsim_analysis.report import drone_figures as drones
 from zsim_analysis.report import figure_style as style
-from zsim_analysis.report.formation_figures import curves, draw_error, numbered, parameter_groups
+from zsim_analysis.report.flight_figures import (
+    DRONE_PANELS,
+    NAMED_MAX,
+    curves,
+    draw_drone_panels,
+    draw_error,
+    draw_obstacles,
+    draw_path,
+    drone_panel_heights,
+    name_states,
+    numbered,
+    parameter_groups,
+)
 from zsim_analysis.report.make_report import Picture, facts, sources, template, write_page
-from zsim_analysis.report.paper import flies_paper_test
-from zsim_analysis.report.summary import STATISTICS, RunSummary, judge
+from zsim_analysis.report.summary import STATISTICS, RunSummary, flies_paper_test, judge
 
 ABSENT = "–"
 RUNS_PER_TABLE = 2  # side by side with all their statistics: as many as fit the page
@@ -531,9 +541,9 @@ def _draw_plans(runs: Sequence[ComparedRun]) -> Figure:
         style.dress(axes)
         axes.set_title(run.label, fontsize=style.PAPER_PT)
         axes.set_aspect("equal", adjustable="box")
-        drones.draw_obstacles(axes, run.flight.scenario)
+        draw_obstacles(axes, run.flight.scenario)
         for track in run.flight.tracks:
-            drones.draw_path(axes, track, colours[track.name], named=False)
+            draw_path(axes, track, colours[track.name], named=False)
     for axes in grid.flat[len(runs) - across : len(runs)]:
         axes.set_xlabel("east x (m)", fontsize=style.PAPER_PT)
         axes.tick_params(labelbottom=True)
@@ -550,7 +560,7 @@ def _draw_plans(runs: Sequence[ComparedRun]) -> Figure:
 
 def _draw_drones(runs: Sequence[ComparedRun]) -> Figure:
     """Draw true altitude, state and battery of every drone, a column per run."""
-    heights = drones.drone_panel_heights(max(len(run.flight.tracks) for run in runs))
+    heights = drone_panel_heights(max(len(run.flight.tracks) for run in runs))
     across, colours = _across(runs), _drone_colours(runs)
     rows = -(-len(runs) // across)
     figure = style.new_figure(style.PAGE_IN, (1.0 + 0.6 * sum(heights)) * rows)
@@ -560,11 +570,11 @@ def _draw_drones(runs: Sequence[ComparedRun]) -> Figure:
     for index, run in enumerate(runs):
         row, column = divmod(index, across)
         panels = list(grid[3 * row : 3 * row + 3, column])
-        for axes, quantity in zip(panels, drones.DRONE_PANELS, strict=True):
+        for axes, quantity in zip(panels, DRONE_PANELS, strict=True):
             axes.set_axis_on()
             style.dress(axes, quantity if column == 0 and quantity != "state" else "")
         panels[0].set_title(run.label, fontsize=style.PAPER_PT)
-        drones.draw_drone_panels(panels, run.flight.tracks, colours, named=0)
+        draw_drone_panels(panels, run.flight.tracks, colours, named=0)
         panels[-1].tick_params(labelbottom=True)
         style.draw_marks(panels, style.time_marks(run.flight, run.formations[0] if run.formations else None))
     style.letter_panels([grid[3 * (index // across), index % across] for index in range(len(runs))])
@@ -573,7 +583,7 @@ def _draw_drones(runs: Sequence[ComparedRun]) -> Figure:
         limits = [each.get_ylim() for each in drawn]
         for each in drawn:
             each.set_ylim(min(low for low, _ in limits), max(high for _, high in limits))
-    drones.name_states(figure, [track for run in runs for track in run.flight.tracks])
+    name_states(figure, [track for run in runs for track in run.flight.tracks])
     _name_drones(figure, grid[0, 0], colours)
     return figure
 
@@ -586,6 +596,6 @@ def _drone_colours(runs: Sequence[ComparedRun]) -> dict[str, str]:
 def _name_drones(figure: Figure, axes: Axes, colours: Mapping[str, str]) -> None:
     """Add the drones to the legend; of many only the first and the last."""
     named = list(colours.items())
-    for name, colour in named if len(named) <= drones.NAMED_MAX else (named[0], named[-1]):
+    for name, colour in named if len(named) <= NAMED_MAX else (named[0], named[-1]):
         axes.plot([], [], color=colour, lw=1.1, label=name)
     style.legend_above(figure, axes)

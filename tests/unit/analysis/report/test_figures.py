@@ -25,16 +25,6 @@ from zsim_analysis.reading.drone_errors import Distances, EstimateErrors, Separa
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of, goal_errors
 from zsim_analysis.reading.recorded_flight import RadioHistory, RecordedFlight
 from zsim_analysis.report import FORMATS, make_report
-from zsim_analysis.report.drone_figures import (
-    BAND_GREY,
-    draw_distances,
-    draw_drones,
-    draw_estimates,
-    draw_obstacles,
-    draw_plan,
-    draw_radio,
-    draw_velocities,
-)
 from zsim_analysis.report.figure_style import (
     ALPHA,
     COLOURS,
@@ -53,7 +43,20 @@ from zsim_analysis.report.figure_style import (
     new_figure,
     time_marks,
 )
-from zsim_analysis.report.formation_figures import ROWS_MAX, curves, draw_errors, draw_parameters
+from zsim_analysis.report.flight_figures import (
+    BAND_GREY,
+    ROWS_MAX,
+    curves,
+    draw_distances,
+    draw_drones,
+    draw_errors,
+    draw_estimates,
+    draw_obstacles,
+    draw_parameters,
+    draw_plan,
+    draw_radio,
+    draw_velocities,
+)
 from zsim_analysis.report.make_report import figures, page
 from zsim_analysis.report.summary import ClusterErrors, error_table, summarise
 
