@@ -155,10 +155,11 @@ def test_without_pandas_a_frame_is_a_dict_of_arrays(folder: Path, without_pandas
 def passes(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """The keys of each pass over a record."""
     made: list[list[str]] = []
+    read = recorded.read_tables
 
     def read_tables(record: Path, wanted: Collection[str]) -> dict[str, recorded.Table]:
         made.append([*wanted])
-        return recorded.read_tables(record, wanted)
+        return read(record, wanted)
 
     monkeypatch.setattr(recorded, "read_tables", read_tables)
     return made
