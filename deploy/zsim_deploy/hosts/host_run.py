@@ -34,8 +34,7 @@ from zsim_deploy.hosts.host_link import EventLoopThread, HostLink, HostLinks, fe
 from zsim_deploy.hosts.host_plan import RECORD, HostPlan, leftovers, port_faults
 from zsim_deploy.hosts.status_table import StatusTable
 from zsim_deploy.inventory import MODULE, MODULES, InventoryFile, extras
-from zsim_deploy.launch.program_process import programs_of
-from zsim_deploy.launch.role_launcher import SINGLE_THREADED
+from zsim_deploy.launch.role_launcher import SINGLE_THREADED, programs_of
 from zsim_deploy.launch.supervisor import EndSignals, Outcome, Supervisor, end_text
 
 CONNECT_S = 30.0  # how long all hosts together may take to accept the login, …
