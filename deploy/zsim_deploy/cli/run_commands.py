@@ -607,9 +607,8 @@ def board(
         PipedConsole().print(terminal_table(found))
         say(f"figures: {place}")
         return
-    from zsim_analysis.board.board import BoardRequest, fly_board
+    from zsim_analysis.board.board import LAW_NAMES, BoardRequest, chosen, fly_board, scenario_names
     from zsim_analysis.board.board_report import make_board_report, terminal_text
-    from zsim_analysis.board.entries import LAW_NAMES, chosen, scenario_names
 
     wanted = opt.figure_formats(formats)
     folder = out or Path("runs") / f"board-{time.strftime('%Y%m%d-%H%M%S')}"
