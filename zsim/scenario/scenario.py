@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 from msgspec import UNSET, Meta, Struct, UnsetType, defstruct, field
 from msgspec.structs import replace
 
-from zsim.contract.agent_messages import MessageInfo
+from zsim.contract.messages import MessageInfo
 from zsim.errors import PACKAGES
 from zsim.schema.parameters import Given
 from zsim.schema.plugin import CLASS_NAME

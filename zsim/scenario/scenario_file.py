@@ -21,8 +21,7 @@ from zsim.scenario.generated import with_generated
 from zsim.scenario.scenario import DRONES_MAX, VEHICLE_NUMBERS, Document, Scenario, SharedVehicle, Topology
 from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import Fault, faults, first_lines, show, sound, suggestion
-from zsim.sensors.error_units import in_channel_units
-from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, Sensors, flattened, separate
+from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, Sensors, flattened, in_channel_units, separate
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.vehicle import DEFAULT_MODEL, MODELS, Aerodynamics, Vehicle, vehicle_of
 

@@ -12,7 +12,7 @@ from vehicle_rows import one_drone, per_rotor
 
 from zsim.scenario.scenario_file import resolve
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
-from zsim.vehicles.vehicle import Rotor, Vehicle, vehicle_of
+from zsim.vehicles.vehicle import MODELS, Rotor, Vehicle, vehicle_of
 from zsim_world.physics import rigid_body
 from zsim_world.physics.fleet_arrays import (
     CROSS_ROTORS,
@@ -159,7 +159,7 @@ def plus() -> Vehicle:
     return replace(vehicle, rotors=rotors)
 
 
-@pytest.mark.parametrize("model", STOCK)
+@pytest.mark.parametrize("model", MODELS)
 def test_the_constants_are_those_of_the_stock_vehicles(model: str):
     _, rotors = one_drone(model=model)
     assert len(rotors.each) == CROSS_ROTORS
@@ -170,7 +170,7 @@ def test_the_constants_are_those_of_the_stock_vehicles(model: str):
 
 
 def test_other_vehicles_have_places_of_their_own():
-    stock = list(STOCK.values())
+    stock = [*map(vehicle_of, MODELS)]
     assert rotor_slots(stock) == CROSS_ROTORS
     assert rotor_slots([*stock, plus()]) == CROSS_ROTORS + 1
     assert rotor_slots([*stock, vehicle_of("hexacopter")]) == 6
