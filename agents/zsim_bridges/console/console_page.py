@@ -12,16 +12,15 @@ from typing import Any, NamedTuple
 import viser
 
 from zsim_agents.formation.flight_check import DOWN
-from zsim_bridges.console.alarms import BATTERY_LOW_PERCENT
-from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.console_tables import DroneRow, drone_table, event_table, figure_lines, preflight_lines
 from zsim_bridges.console.control_desk import EVERY, RUN, ControlDesk, ControlForm
 from zsim_bridges.console.formation_form import FormationForm
 from zsim_bridges.console.histories import TRAIL_S, TRAILS_S, FlightHistory, VariablePlots
 from zsim_bridges.console.operator_input import slider_ranges
+from zsim_bridges.console.orders import CommandClient, RequestOutcome
+from zsim_bridges.console.page_server import control_id, control_ids
 from zsim_bridges.console.picture import Array, DronePoses, FlightPreview
-from zsim_bridges.console.private_viser import control_id, control_ids
-from zsim_bridges.console.run_condition import RunCondition, ShownRun, drone_refusals
+from zsim_bridges.console.run_condition import BATTERY_LOW_PERCENT, RunCondition, ShownRun, drone_refusals
 from zsim_bridges.console.run_forms import (
     ORDERS,
     FaultForm,

@@ -13,7 +13,6 @@ import viser
 from zsim.contract.flight_messages import ViewCluster
 from zsim.scenario.scenario import Cluster, Trajectory
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
-from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.console_tables import preflight_lines
 from zsim_bridges.console.operator_input import (
     InputError,
@@ -25,6 +24,7 @@ from zsim_bridges.console.operator_input import (
     range_refusal,
     waypoints_from,
 )
+from zsim_bridges.console.orders import CommandClient, RequestOutcome
 from zsim_bridges.console.picture import SHAPED_PHASES, FlightPreview, PreviewError, preview_of
 from zsim_bridges.console.run_condition import RunCondition, formation_refusals, is_held_by_fault
 from zsim_bridges.console.run_forms import (

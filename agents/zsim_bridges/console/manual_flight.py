@@ -21,8 +21,8 @@ from zsim.scenario.scenario import Scenario
 from zsim.vehicles.vehicle import Limits
 from zsim_agents.references.cruise import Cruise
 from zsim_agents.references.tracking import Course
-from zsim_bridges.console.command_client import CommandClient, NoAnswer
 from zsim_bridges.console.operator_input import SIDEWAYS_M, height_range_m
+from zsim_bridges.console.orders import CommandClient, NoAnswer
 
 PERIOD_S = 0.05  # wall; of commands: at 5 × real time ten of them within a drone's silence of 0.5 s
 STALE_S = 0.5  # wall; a page silent for longer no longer flies, as with the firmware's silence

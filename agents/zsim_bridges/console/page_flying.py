@@ -20,7 +20,6 @@ from zsim.scenario.triangles import outline_of
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.references.flight import limits_of
 from zsim_agents.references.tracking import Course
-from zsim_bridges.console.command_client import CommandClient
 from zsim_bridges.console.console_page import PageForms
 from zsim_bridges.console.histories import CanvasTrails
 from zsim_bridges.console.manual_flight import (
@@ -31,6 +30,7 @@ from zsim_bridges.console.manual_flight import (
     RunSight,
     geofence_of,
 )
+from zsim_bridges.console.orders import CommandClient
 from zsim_bridges.console.picture import DronePoses, ghosts, short_names
 from zsim_bridges.console.run_monitor import RunMonitor
 from zsim_bridges.console.scene import LARGE_MAX, RunScene

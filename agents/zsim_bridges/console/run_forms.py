@@ -14,8 +14,8 @@ from zsim.contract.run_messages import GATES_MAX, RATE_MAX
 from zsim.scenario.faults import PROCESS_KILL, ROTORS, expected, kinds_of, unstated
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor_catalogue import declarations
-from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.operator_input import InputError, parse_fault, range_refusal
+from zsim_bridges.console.orders import CommandClient, RequestOutcome
 from zsim_bridges.console.run_condition import (
     RunCondition,
     fleet_refusals,

@@ -23,10 +23,10 @@ from zsim_agents.formation.flight_check import (
     place_fault,
 )
 from zsim_agents.formation.spaces.scenario_space import scenario_space
-from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.console_page import DRONE_MODES, SWITCHES, ConsolePage, DroneForm
 from zsim_bridges.console.formation_form import OPERATIONS, REST_S, STILL_S, FormationForm
 from zsim_bridges.console.operator_input import slider_ranges
+from zsim_bridges.console.orders import RequestOutcome
 from zsim_bridges.console.picture import FlightPreview
 from zsim_bridges.console.run_condition import RunCondition, ShownRun, fleet_refusals
 from zsim_bridges.console.run_forms import DURATION_S, FaultForm, FleetForm, RunForm

@@ -14,7 +14,6 @@ from zsim.scenario.scenario import Piloted
 from zsim.vehicles.vehicle import Limits
 from zsim_agents.references.path import SHARE, PathLimits
 from zsim_agents.references.tracking import Course
-from zsim_bridges.console.command_client import NoAnswer
 from zsim_bridges.console.manual_flight import (
     GONE_S,
     PERIOD_S,
@@ -29,6 +28,7 @@ from zsim_bridges.console.manual_flight import (
     geofence_of,
     stick_velocity,
 )
+from zsim_bridges.console.orders import NoAnswer
 
 NAME = "console.1"
 ACCEL_M_S2, LAW = 2.5, Piloted()

@@ -13,8 +13,8 @@ from zsim.math import frames
 from zsim.presentation import drone_colours, rgb
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
-from zsim_bridges.console import airframe
 from zsim_bridges.console import picture as pic
+from zsim_bridges.console import scene
 from zsim_bridges.console.picture import PreviewError, preview_of
 from zsim_bridges.console.scene import DARK, LIGHT, LUMINANCE_MIN, lightened, linear, luminance
 
@@ -197,7 +197,7 @@ def test_colours_of_lines_are_in_linear_light() -> None:
 @pytest.mark.parametrize("ground", [LIGHT[0], DARK[0]])
 @pytest.mark.parametrize("part", ["cross", "hull", "rotor"])
 def test_drones_are_seen_on_the_ground_of_both_themes(ground: tuple[int, int, int], part: str):
-    light, dark = sorted((luminance(airframe.COLOURS[part]), luminance(ground)), reverse=True)
+    light, dark = sorted((luminance(scene.COLOURS[part]), luminance(ground)), reverse=True)
     assert (light + 0.05) / (dark + 0.05) > CONTRAST_MIN
 
 
