@@ -3,7 +3,7 @@
 From the code that a browser reaches to the pure code:
 - serving: `page_server` (HTTP, tokens, viser), `page_sockets` (actions, pictures);
 - one run: `console_server` ties it together; `console_page` and the forms are its panels, `scene`, `page_cameras` its
-  scene, `page_flying` and `manual_flight` fly single drones;
+  scene, `manual_flight` flies single drones;
 - requests: `orders` sends and tracks them, `control_desk` decides which page may send them;
 - state of the run: `view_buffer`, `run_monitor`, `run_condition`, `camera_feed`, `histories`.
 The parts of the page that are not viser's are HTML files in `frame`. Imports viser and aiohttp.

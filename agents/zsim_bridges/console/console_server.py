@@ -30,9 +30,9 @@ from zsim_bridges.console.camera_feed import CameraFeed
 from zsim_bridges.console.console_page import ConsolePage, PageForms
 from zsim_bridges.console.console_tables import TableRows
 from zsim_bridges.console.control_desk import OPERATOR, RUN, VIEWER, ControlDesk
+from zsim_bridges.console.manual_flight import PageFlying
 from zsim_bridges.console.orders import CommandClient, OrderBook, OrderRequest, PastInstant, RequestOutcome
 from zsim_bridges.console.page_cameras import PageCameras
-from zsim_bridges.console.page_flying import PageFlying
 from zsim_bridges.console.page_server import (
     HttpProxy,
     ListenAddress,

@@ -13,9 +13,8 @@ from aiohttp import WSMsgType, web
 from msgspec import Meta, Struct
 
 from zsim_bridges.console.camera_feed import CameraFeed
-from zsim_bridges.console.manual_flight import FlightAnswer, Stick
+from zsim_bridges.console.manual_flight import FlightAnswer, PageFlying, Stick
 from zsim_bridges.console.page_cameras import PageCameras
-from zsim_bridges.console.page_flying import PageFlying
 from zsim_bridges.console.page_server import HEARTBEAT_S, OPERATOR
 from zsim_bridges.console.run_monitor import RecordPlayer
 

@@ -33,6 +33,7 @@ from zsim.vehicles.vehicle import cross_layout
 from zsim_bridges.console.histories import CanvasTrails
 from zsim_bridges.console.page_cameras import PageCameras
 from zsim_bridges.console.picture import (
+    LARGE_MAX,
     Array,
     DronePoses,
     Ellipsoids,
@@ -47,13 +48,12 @@ from zsim_bridges.console.picture import (
     reference_lines,
     rotor_angles,
     rotor_poses,
-    short_names,
+    shown_names,
 )
 from zsim_bridges.console.run_condition import ShownRun
 from zsim_bridges.console.view_buffer import ViewBuffer
 
 NAMED_MAX = 60  # drones with names beside them; more would overlap
-LARGE_MAX = 12  # drones with full names at full size; more have short, smaller names
 SMALL = 0.8  # of the size of a name
 SOLID = (134, 142, 150)
 EDGE = (96, 102, 118)  # of the triangles of a surface, whose slopes differ little in shading
@@ -218,9 +218,8 @@ class SceneNodes:
             )  # fmt: skip
         self._names: list[Any] = []
         if len(names) <= NAMED_MAX:
-            many = len(names) > LARGE_MAX
-            style: Any = {"anchor": "bottom-center", "font_screen_scale": SMALL if many else 1.0}
-            texts = zip(names, short_names(names) if many else names, strict=True)
+            style: Any = {"anchor": "bottom-center", "font_screen_scale": SMALL if len(names) > LARGE_MAX else 1.0}
+            texts = zip(names, shown_names(names), strict=True)
             self._names = [scene.add_label(f"/names/{name}", text, **style) for name, text in texts]
         self._wind = scene.add_arrows(
             "/wind", np.array([[(0, 0, 0), (1, 0, 0)]], float), WIND, shaft_radius=0.035, head_radius=0.1,
