@@ -15,7 +15,7 @@ from zsim.contract.flight_messages import EstimateView, ViewCluster, ViewDrones
 from zsim.math import frames
 from zsim.presentation import drone_colours
 from zsim.scenario.scenario import Scenario
-from zsim.scenario.triangles import outline_of
+from zsim.scenario.surroundings import outline_of
 from zsim.vehicles.vehicle import ROTORS_MAX
 from zsim_agents.formation.flight_plan import REFUSALS, Follow, MoveTo, read_request
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError

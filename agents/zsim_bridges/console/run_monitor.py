@@ -21,7 +21,7 @@ from zsim.errors import ZsimError
 from zsim.math import frames
 from zsim.runtime.participant import Participant
 from zsim.scenario.scenario import Environment
-from zsim.scenario.triangles import Surroundings
+from zsim.scenario.surroundings import Surroundings
 from zsim.transport.session import Session
 from zsim_bridges.console import run_condition
 from zsim_bridges.console.histories import INTERVAL_S, SPAN_S

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from zsim.math.compiled import inlined, noinline
 from zsim.math.rotation import Quaternion, Vector, add, norm, rotate, scaled, subtract
-from zsim.scenario.triangles import FACE, Sheet, crosses, nearest_point, side_of
+from zsim.scenario.surroundings import FACE, Sheet, crosses, nearest_point, side_of
 from zsim_world.physics.fleet_arrays import STATE, VEHICLE, Bodies, Row
 from zsim_world.physics.surfaces import (
     BALLS,

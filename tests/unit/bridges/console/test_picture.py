@@ -15,8 +15,7 @@ from zsim.math import frames
 from zsim.presentation import drone_colours, rgb
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Surface
-from zsim.scenario.surface_file import packed
-from zsim.scenario.triangles import outline_of
+from zsim.scenario.surroundings import outline_of, packed
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
 from zsim_bridges.console import picture as pic
 from zsim_bridges.console import scene

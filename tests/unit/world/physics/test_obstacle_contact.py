@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zsim.math.frames import quaternion_from_rpy
-from zsim.scenario.obstacle import SHAPES, nearest
 from zsim.scenario.scenario_file import resolve
+from zsim.scenario.surroundings import SHAPES, nearest
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.crazyflie2 import VEHICLE as CRAZYFLIE2
 from zsim_world.fleet.fleet import Fleet
