@@ -190,7 +190,7 @@ class Swarm(Judge):
 
 def bundle_of(t_ns: int, seq: int, entries: list[tuple[str, Any]]) -> GateMessages:
     """Return messages on drones d1 to d3 as the world bundles them."""
-    table = key_table([drone.name for drone in DRONES])
+    table = key_table(DRONES)
     return GateMessages.of(t_ns, seq, table, [(key, messages.encode(message)) for key, message in entries])
 
 
