@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from zsim.scenario.obstacle import BOX, CENTRE, COSINE, HALF, SHAPE, SINE, SPHERE
 from zsim.scenario.triangles import corners_of
-from zsim_agents.cameras.rendering.scene import (
+from zsim_agents.cameras.scene import (
     ARM_M,
     BLUR_MAX_PX,
     SHIFT,

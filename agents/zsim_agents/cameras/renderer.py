@@ -22,16 +22,8 @@ from zsim.math.random_streams import stream
 from zsim.scenario.obstacle import nearest
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import Lens, camera_pose, lens_of
-from zsim_agents.cameras.rendering.foreground import SEEN_M, DroneImager, SurfaceImager, draw_obstacle
-from zsim_agents.cameras.rendering.scene import (
-    SHIFT,
-    CameraMotion,
-    DroneStates,
-    Scene,
-    View,
-    camera_motion,
-    motion_blur_kernels,
-)
+from zsim_agents.cameras.foreground import SEEN_M, DroneImager, SurfaceImager, draw_obstacle
+from zsim_agents.cameras.scene import SHIFT, CameraMotion, DroneStates, Scene, View, camera_motion, motion_blur_kernels
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
