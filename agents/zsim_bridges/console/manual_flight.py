@@ -19,8 +19,7 @@ from zsim.math.frames import turned_about_up
 from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Scenario
 from zsim.vehicles.vehicle import Limits
-from zsim_agents.references.cruise import Cruise
-from zsim_agents.references.tracking import Course
+from zsim_agents.references.cruise import Course, Cruise
 from zsim_bridges.console.command_client import CommandClient, NoAnswer
 from zsim_bridges.console.operator_input import SIDEWAYS_M, height_range_m
 

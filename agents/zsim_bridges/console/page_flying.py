@@ -18,8 +18,8 @@ from zsim.presentation import drone_colours
 from zsim.scenario.scenario import Piloted, Scenario
 from zsim.scenario.triangles import outline_of
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
+from zsim_agents.references.cruise import Course
 from zsim_agents.references.flight import limits_of
-from zsim_agents.references.tracking import Course
 from zsim_bridges.console.command_client import CommandClient
 from zsim_bridges.console.console_page import PageForms
 from zsim_bridges.console.histories import CanvasTrails

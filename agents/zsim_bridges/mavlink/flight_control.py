@@ -1,6 +1,6 @@
 """Converts the targets of a vehicle to commands of its drone: targets, courses to places, climbs, firmware modes.
 
-Places are approached like references of drones: `zsim_agents.references.tracking`.
+Places are approached like references of drones: `zsim_agents.references.cruise`.
 """
 
 import math
@@ -8,8 +8,7 @@ from typing import Literal, NamedTuple
 
 from zsim.math import elementary as el
 from zsim.math.rotation import Quaternion, Vector
-from zsim_agents.references.cruise import Cruise
-from zsim_agents.references.tracking import Course
+from zsim_agents.references.cruise import Course, Cruise
 from zsim_bridges.mavlink.personality import Parameters
 from zsim_bridges.mavlink.vehicle_state import VehicleState
 from zsim_bridges.vehicle_links.drone_link import CommandSender, ModeName

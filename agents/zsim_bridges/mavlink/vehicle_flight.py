@@ -5,7 +5,7 @@ A landed drone of zsim has no separate armed state: armed means that it takes of
 
 from collections.abc import Callable
 
-from zsim_agents.references.tracking import Course
+from zsim_agents.references.cruise import Course
 from zsim_bridges.mavlink.dialect import Severity
 from zsim_bridges.mavlink.flight_control import ARRIVED_M, FlightControl, Target, TiltTarget
 from zsim_bridges.mavlink.mission import Mission

@@ -28,7 +28,7 @@ from zsim.errors import ReportError, ScenarioError
 from zsim.output_folder import held_folder
 from zsim.scenario import scenario_file
 from zsim_agents.hosting import check_classes
-from zsim_agents.laws.reference import FormationReference, polygon
+from zsim_agents.laws.pilot import FormationReference, polygon
 from zsim_analysis.board.entries import CLUSTER_SPACE, about, resolved, shipped
 from zsim_analysis.board.measures import Figure, flown_of, measures, shape_errors
 from zsim_analysis.reading.recorded_flight import RecordedFlight

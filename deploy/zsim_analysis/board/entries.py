@@ -16,7 +16,7 @@ import yaml
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import LAWS, Scenario
-from zsim_agents.laws.reference import polygon
+from zsim_agents.laws.pilot import polygon
 
 CLUSTER_SPACE = "cluster_space"
 LAW_NAMES = (CLUSTER_SPACE, *LAWS)
