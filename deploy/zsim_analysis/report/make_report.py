@@ -28,7 +28,7 @@ from zsim_analysis.reading.drone_errors import (
 from zsim_analysis.reading.formation import Formation, goal_errors
 from zsim_analysis.reading.recorded_flight import RadioSummary, RecordedFlight
 from zsim_analysis.reading.shortfall import percent_text, seconds_text, span_text
-from zsim_analysis.report import FORMATS
+from zsim_analysis.report import FORMATS, indented_json
 from zsim_analysis.report.figure_style import DARK, TAKE_OVER, VERMILION, ReportFigure, mark_figure, time_marks
 from zsim_analysis.report.flight_figures import (
     PAIRS_MAX,
@@ -77,7 +77,7 @@ def make_report(
     """
     flight, formations, summary = judge(directory / RECORD, progress, answers=True)
     drawings = figures(flight, formations, summary)
-    write_report(directory, summary.json(), drawings, partial(page, summary), progress, formats)
+    write_report(directory, summary, drawings, partial(page, summary), progress, formats)
     return summary
 
 
@@ -302,7 +302,7 @@ def sources(pictures: Iterable[Picture]) -> list[tuple[ReportFigure, str]]:
 
 def write_report(
     directory: Path,
-    summary: bytes,
+    summary: object,
     figures: Iterable[ReportFigure],
     page: Callable[[Sequence[Picture]], str],
     progress: Callable[[str], None],
@@ -327,7 +327,7 @@ def write_report(
         pictures = _render(figures, new / "figures", progress, formats)
         for figure, png in pictures:
             (new / "figures" / figure.name).write_bytes(png)
-        (new / "summary.json").write_bytes(summary)
+        (new / "summary.json").write_bytes(indented_json(summary))
         (new / "report.html").write_text(page(pictures), encoding="utf-8")
     _remove_others(pictures, directory / "figures", formats)
 

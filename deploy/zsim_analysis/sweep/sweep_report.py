@@ -61,7 +61,7 @@ def make_sweep_report(
         raise ReportError(f"{directory}: no run of this sweep is finished yet; there is nothing to report")
     results = SweepResults(sweep.design, rows)
     summary = results.summary()
-    write_report(directory, summary.json(), figures(results), partial(page, summary), progress, formats)
+    write_report(directory, summary, figures(results), partial(page, summary), progress, formats)
     return summary
 
 
