@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from matplotlib.patches import Rectangle
 from rich.console import Group
 
 from zsim.presentation import Column, FittedTable, drone_colours
@@ -18,13 +17,14 @@ from zsim_analysis.board.board import (
     about,
     board_of,
     cells,
-    document,
     heads,
     planned_figure,
+    resolved,
     write_tables,
 )
 from zsim_analysis.board.board import BoardRequest as Request
 from zsim_analysis.report import figure_style as style
+from zsim_analysis.report.flight_figures import draw_obstacles
 from zsim_analysis.report.make_report import Picture, sources, template, write_report
 from zsim_analysis.sweep.sweep_run import Row
 
@@ -121,7 +121,7 @@ def _ways(board: Board, first: dict[tuple[str, str], Row]) -> style.ReportFigure
     shape = {"squeeze": False, "height_ratios": heights}
     panels = figure.subplots(len(board.scenarios), len(board.laws), **shape)
     for line, (scenario, (low, high)) in enumerate(zip(board.scenarios, boxes, strict=True)):
-        plan, obstacles = planned_figure(scenario), _obstacles(scenario)
+        plan, flown = planned_figure(scenario), resolved("consensus", scenario, 1)  # with the obstacles of all laws
         for axes, law in zip(panels[line], board.laws, strict=True):
             axes.set_aspect("equal")
             axes.set_xlim(low[0], high[0])
@@ -129,8 +129,7 @@ def _ways(board: Board, first: dict[tuple[str, str], Row]) -> style.ReportFigure
             axes.set_xticks([])
             axes.set_yticks([])
             axes.spines[:].set_color(style.GREY)
-            for patch in map(_patch, obstacles):
-                axes.add_patch(patch)
+            draw_obstacles(axes, flown)
             if line == 0:
                 axes.set_title(law.replace("_", "\n"), fontsize=style.PAPER_PT - 2)
             if (row := first.get((scenario, law))) is None:
@@ -184,13 +183,3 @@ def _shapes(board: Board, first: dict[tuple[str, str], Row]) -> style.ReportFigu
         f"laws without places are not shown. {about_all[0].upper()}{about_all[1:]}."
     )
     return style.ReportFigure("shapes.png", "Shape error over time, first seed", caption, figure)
-
-
-def _obstacles(scenario: str) -> list[dict[str, Any]]:
-    return document("consensus", scenario, 1).get("environment", {}).get("obstacles", [])
-
-
-def _patch(each: dict[str, Any]) -> Rectangle:
-    """Return an obstacle of a shipped scenario: all are boxes along the axes."""
-    (x, y), (wide, deep) = each["position_m"][:2], each["size_m"][:2]
-    return Rectangle((x - wide / 2, y - deep / 2), wide, deep, color=style.GREY, alpha=0.6, lw=0)
