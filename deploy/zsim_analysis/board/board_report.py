@@ -25,7 +25,7 @@ from zsim_analysis.board.board import (
 from zsim_analysis.board.board import BoardRequest as Request
 from zsim_analysis.report import figure_style as style
 from zsim_analysis.report.flight_figures import draw_obstacles
-from zsim_analysis.report.make_report import Picture, sources, template, write_report
+from zsim_analysis.report.make_report import Picture, rendered, write_report
 from zsim_analysis.sweep.sweep_run import Row
 
 COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.VERMILION, style.SKY, style.PURPLE, style.BLACK, style.GREY)
@@ -50,12 +50,11 @@ def make_board_report(
 
 def page(board: Board, pictures: Sequence[Picture]) -> str:
     tables = [
-        (each, about(each), [(law, cells(board.entry(each, law))) for law in board.laws]) for each in board.scenarios
+        (each, about(each), [(law, *cells(board.entry(each, law))) for law in board.laws]) for each in board.scenarios
     ]
     failed = sum(entry.failed for entry in board.entries)
-    return template("board.html.j2", "zsim_analysis.board").render(
-        board=board, heads=heads(), tables=tables, failed=failed, figures=sources(pictures)
-    )
+    values = {"board": board, "heads": ["law", *heads()], "tables": tables, "failed": failed}
+    return rendered("board.html.j2", pictures, "zsim_analysis.board", **values)
 
 
 def terminal_text(board: Board) -> Group:

@@ -27,7 +27,7 @@ from zsim_analysis.hunt.hunt import (
 from zsim_analysis.hunt.shrink import causes_of
 from zsim_analysis.hunt.space import KindSpace
 from zsim_analysis.report import figure_style as style
-from zsim_analysis.report.make_report import Picture, make_report, sources, template, write_report
+from zsim_analysis.report.make_report import Picture, make_report, rendered, write_report
 
 QUARTERS = 4  # parts of a range whose number of trials is shown
 KINDS_DRAWN = 24  # greatest size of the matrix of pairs
@@ -126,7 +126,10 @@ def _pairs(kinds: Sequence[str], searched: Sequence[HuntFlight]) -> style.Report
 def page(hunted: Hunted, searched: Sequence[HuntFlight], pictures: Sequence[Picture]) -> str:
     summary, space = hunted.summary, hunted.space
     found = summary.violation
-    return template("hunt.html.j2", "zsim_analysis.hunt").render(
+    return rendered(
+        "hunt.html.j2",
+        pictures,
+        "zsim_analysis.hunt",
         summary=summary,
         facts=facts(hunted.request, summary),
         found=[cause_text(found.found, each) for each in causes_of(found.found)] if found else [],
@@ -135,7 +138,8 @@ def page(hunted: Hunted, searched: Sequence[HuntFlight], pictures: Sequence[Pict
         record=f"{VIOLATION}/report.html",
         number=number,
         kinds=[kind_row(space.kinds[name], searched) for name in space.kinds],
-        figures=sources(pictures),
+        causes=[(each.text, number(each.without), number(each.alone)) for each in found.causes] if found else [],
+        stages=[(each.name, each.flights, f"{each.wall_s:.1f}") for each in summary.stages],
     )
 
 
