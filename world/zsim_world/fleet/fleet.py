@@ -32,7 +32,7 @@ from zsim_world.fleet import kernel
 from zsim_world.fleet.fault_effects import Impairment
 from zsim_world.fleet.flight_watch import SEEN, FlightWatch, Incident
 from zsim_world.physics import rigid_body
-from zsim_world.physics.air import WIND
+from zsim_world.physics.contacts import WIND
 from zsim_world.physics.fleet_arrays import (
     CLOCK,
     EXPOSED,
@@ -58,16 +58,14 @@ from zsim_world.physics.simd import body_blocks
 from zsim_world.physics.surfaces import BALLS, PLANE, POINTS, SLOTS_MAX, contact_points, obstacle_rows
 from zsim_world.run_state import IN_PLACE, PART, Saved
 from zsim_world.sensors import sensor_set
-from zsim_world.sensors.equations import SONAR_COSINE_MIN
 from zsim_world.sensors.noise import NoiseTable
 from zsim_world.sensors.sampler import Sampled, Sampler, with_more
 from zsim_world.sensors.scans import Scan, ScanSampler
-from zsim_world.sensors.sensor_set import FleetSensors, fleet_sensors
+from zsim_world.sensors.sensor_set import SONAR_COSINE_MIN, FleetSensors, fleet_sensors
 from zsim_world.sensors.sightings import PictureSightings, SightingSampler
 from zsim_world.vehicles import firmware, observer
-from zsim_world.vehicles.firmware import MEMORY, SETPOINT, SETTING
+from zsim_world.vehicles.firmware import MEMORY, SETPOINT, SETTING, board_blocks, sound_actuators
 from zsim_world.vehicles.observer import BELIEF, CALIBRATION, DEVICE
-from zsim_world.vehicles.simd_firmware import board_blocks, sound_actuators
 
 GPS_FIX = 3  # NMEA: a three-dimensional fix
 GPS_SATELLITES = 9  # as in a real navdata packet of the AR.Drone

@@ -8,8 +8,7 @@ import pytest
 from zsim.scenario.scenario_file import resolve
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.physics.air import JET_WIDTHS, downwash
-from zsim_world.physics.contacts import hull_force, meet_drones
+from zsim_world.physics.contacts import JET_WIDTHS, downwash, hull_force, meet_drones
 from zsim_world.physics.fleet_arrays import STATE, VEHICLE, NearPairs
 
 pytestmark = pytest.mark.usefixtures("interpreted")

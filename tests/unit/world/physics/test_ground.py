@@ -9,7 +9,7 @@ from vehicle_rows import one_drone
 from zsim.math.frames import quaternion_from_rpy, rpy_from_quaternion
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim_world.physics import rigid_body as body
-from zsim_world.physics.fleet_arrays import STATE, VEHICLE
+from zsim_world.physics.fleet_arrays import STATE, VEHICLE, four, vector
 from zsim_world.physics.surfaces import contact, drag_anchors
 
 OFF, CALM = np.zeros(4), (0.0, 0.0, 0.0)
@@ -34,11 +34,11 @@ def placed(height=STAND_HEIGHT_M, rpy=(0.0, 0.0, 0.0)):
 
 def stand(row, state, seconds, push=CALM):
     anchor = np.zeros((8, 2))
-    drag_anchors(row, anchor, body.vector(state, 0), body.four(state, 6))
+    drag_anchors(row, anchor, vector(state, 0), four(state, 6))
     track = []
     for _ in range(round(seconds / DT)):
         body.step(row, ROTORS, anchor, state, OFF, CALM, push, DT)
-        drag_anchors(row, anchor, body.vector(state, 0), body.four(state, 6))
+        drag_anchors(row, anchor, vector(state, 0), four(state, 6))
         track.append(state.copy())
     return np.array(track)
 

@@ -12,9 +12,8 @@ from zsim.scenario.surface_file import packed
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.physics.fleet_arrays import STATE, VEHICLE
 from zsim_world.physics.rays import cast_hull
-from zsim_world.sensors.equations import SONAR_COSINE_MIN
 from zsim_world.sensors.sampler import WHOSE
-from zsim_world.sensors.sensor_set import FLOW, SONAR
+from zsim_world.sensors.sensor_set import FLOW, SONAR, SONAR_COSINE_MIN
 
 EXACT = {"noise": 0.0}
 TABLE = {"name": "table", "shape": "box", "position_m": [0, 0, 0], "size_m": [2, 2, 1]}

@@ -14,7 +14,7 @@ from zsim.sensors.camera import FrontCamera
 from zsim.sensors.camera_model import camera_pose, lens_of
 from zsim_world.physics.fleet_arrays import STATE
 from zsim_world.physics.rays import scene
-from zsim_world.sensors.hats_in_view import POINTS, VIEW, MountedCamera, hats_in_view
+from zsim_world.sensors.sightings import POINTS, VIEW, MountedCamera, hats_in_view
 
 HAT_B, DIAMETER_M, HULL_M = (-0.03, 0.0, 0.11), 0.14, 0.26
 LENS_B = (0.162, 0.0, 0.012)  # of the front camera

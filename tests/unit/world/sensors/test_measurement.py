@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from zsim.math.frames import quaternion_from_rpy
-from zsim_world.sensors.equations import (
+from zsim_world.sensors.sensor_set import (
     BodyTruth,
     MountedSensor,
     Site,

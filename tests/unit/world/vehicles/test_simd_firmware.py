@@ -10,9 +10,8 @@ from zsim_world.fleet.fleet import Fleet
 from zsim_world.physics.fleet_arrays import ROTOR, VEHICLE, PerRotor
 from zsim_world.physics.simd import LANES
 from zsim_world.vehicles import firmware, observer
-from zsim_world.vehicles.firmware import DRIVE
+from zsim_world.vehicles.firmware import BOARD_LANES, BOARD_ROTORS, DRIVE
 from zsim_world.vehicles.observer import BELIEF
-from zsim_world.vehicles.simd_firmware import BOARD_LANES, BOARD_ROTORS
 
 COUNT = 11  # a whole block and a part of one
 STEP_TICKS = 2  # of 2.5 ms
