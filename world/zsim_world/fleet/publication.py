@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from zsim.contract import encoding, flight_messages, messages
 from zsim.contract.encoding import GAP, Layouts, Program, TextTable
 from zsim.contract.framing import GateMessages, key_table
+from zsim.contract.snapshot import IN_PLACE, Saved
 from zsim.errors import UserCodeError, reason_of
 from zsim.math.compiled import compiled, inlined, kernel
 from zsim.math.held import Held, hold
@@ -23,7 +24,6 @@ from zsim.vehicles.vehicle import ROTORS_MAX, ROTORS_MIN
 from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, Fleet
 from zsim_world.physics.fleet_arrays import STATE
 from zsim_world.physics.rigid_body import charge_percent
-from zsim_world.run_state import IN_PLACE, Saved
 from zsim_world.sensors import sampler, sensor_set
 from zsim_world.sensors.sampler import WHOSE, Sampled
 from zsim_world.vehicles import firmware

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.contract.snapshot import IN_PLACE, PART, Saved
 from zsim.errors import UserCodeError, reason_of
 from zsim.math import frames
 from zsim.math.compiled import Field, columns, inlined, kernel
@@ -27,7 +28,6 @@ from zsim.schema import plugin
 from zsim.schema.checker import show
 from zsim.sensors.sensor import Sensor, SensorTruth, SensorType
 from zsim_world.physics.fleet_arrays import EXPOSED, STATE, Senses, four, vector
-from zsim_world.run_state import IN_PLACE, PART, Saved
 from zsim_world.sensors import sensor_set
 from zsim_world.sensors.noise import place, words
 from zsim_world.sensors.sensor_set import CHANNELS_MAX, CONFIG, SENSORS, FleetSensors, noise_width, read

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract.messages import Depth, Lidar, Range
+from zsim.contract.snapshot import IN_PLACE, PART, Saved
 from zsim.math import elementary as el
 from zsim.math.compiled import Field, columns, inlined, kernel
 from zsim.math.distributions import normal_quantile
@@ -27,7 +28,6 @@ from zsim.sensors.scanner import SINGLE, DepthConfig, LidarConfig, RangeConfig, 
 from zsim.sensors.sensor import Mount, Sample
 from zsim_world.physics.fleet_arrays import STATE, four, vector
 from zsim_world.physics.rays import Scene, cast, cast_hull
-from zsim_world.run_state import IN_PLACE, PART, Saved
 from zsim_world.sensors.noise import WORDS, fill, words
 from zsim_world.sensors.sampler import Between, Exposures, poses_between, released
 from zsim_world.sensors.sensor_set import rounded

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import Seen, Sightings
 from zsim.contract.keys import SIGHTINGS
+from zsim.contract.snapshot import IN_PLACE, PART, Saved
 from zsim.math import elementary as el
 from zsim.math import linear
 from zsim.math import rotation as rot
@@ -45,7 +46,6 @@ from zsim.sensors.camera import Camera, Hats, SightingModel
 from zsim.sensors.camera_model import Lens, camera_pose, lens_of, pixel, spread, undistorted
 from zsim_world.physics.fleet_arrays import STATE, four, vector
 from zsim_world.physics.rays import HULL_FLATNESS, Scene, cast_parts
-from zsim_world.run_state import IN_PLACE, PART, Saved
 from zsim_world.sensors.noise import WORDS, fill, words
 from zsim_world.sensors.sampler import Between, Exposures, poses_between, released
 

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from falling import check_slide, energy, fly, tilt_deg
 
-from zsim.contract.snapshot import pack, unpack
+from zsim.contract.snapshot import pack, restore, saved_state, unpack
 from zsim.math.frames import quaternion_from_rpy
 from zsim.scenario.scenario_file import resolve
 from zsim.scenario.surface_file import packed
 from zsim.vehicles.ardrone2 import VEHICLE
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.physics.fleet_arrays import STATE
-from zsim_world.run_state import restore, saved_state
 
 FRAME = VEHICLE.airframe
 FLOOR_M = 1.0
