@@ -34,7 +34,6 @@ from zsim_world.run.world import World
 from zsim_world.server.liveliness import Admission, LivelinessMonitor, SlowReaders
 from zsim_world.server.run_journal import RunJournal
 
-
 TICK_S = 0.1  # interval at which a waiting world checks the wall clock
 CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once per wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
