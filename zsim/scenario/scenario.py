@@ -251,7 +251,7 @@ class Cloud(Spec, frozen=True, kw_only=True):
 
 
 class Surface(Spec, frozen=True, kw_only=True):
-    """A sheet of triangles from a file, which is an obstacle; see zsim.scenario.surface_file."""
+    """A sheet of triangles from a file, which is an obstacle; see zsim.scenario.generated."""
 
     name: Name
     file: Annotated[str, Meta(min_length=1, max_length=1000)] | UnsetType = UNSET

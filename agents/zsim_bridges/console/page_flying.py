@@ -16,7 +16,7 @@ from zsim.contract.flight_messages import ViewCluster
 from zsim.math import frames
 from zsim.presentation import drone_colours
 from zsim.scenario.scenario import Piloted, Scenario
-from zsim.scenario.triangles import outline_of
+from zsim.scenario.surroundings import outline_of
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.references.flight import limits_of
 from zsim_agents.references.tracking import Course

@@ -10,7 +10,7 @@ import numpy as np
 from zsim.contract.flight_messages import DroneView, ViewCluster, ViewDrones
 from zsim.math import frames
 from zsim.scenario.scenario import Environment
-from zsim.scenario.triangles import Surroundings
+from zsim.scenario.surroundings import Surroundings
 from zsim_bridges.console import alarms
 from zsim_bridges.console.alarms import AlarmBoard, DroneCondition, FaultWatch
 from zsim_bridges.console.orders import PendingRequest, PendingRequests

@@ -17,8 +17,7 @@ from zsim.contract.messages import DroneInfo
 from zsim.math import frames
 from zsim.presentation import drone_colours, rgb
 from zsim.scenario.scenario import Obstacle, Surface
-from zsim.scenario.surface_file import placed
-from zsim.scenario.triangles import corners_of
+from zsim.scenario.surroundings import corners_of, placed
 from zsim.vehicles.vehicle import cross_layout
 from zsim_bridges.console import airframe
 from zsim_bridges.console.histories import CanvasTrails

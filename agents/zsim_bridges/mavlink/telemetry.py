@@ -28,10 +28,9 @@ from zsim_bridges.mavlink.dialect import (
     int16,
     ned,
 )
-from zsim_bridges.mavlink.flight_control import Target
 from zsim_bridges.mavlink.personality import BY_STICKS, FlightMode, Personality
 from zsim_bridges.mavlink.vehicle_flight import Flight
-from zsim_bridges.mavlink.vehicle_state import ALL_HEALTHY, VehicleState
+from zsim_bridges.mavlink.vehicle_state import ALL_HEALTHY, Target, VehicleState
 
 Level = Literal["normal", "full"]
 SECOND_NS = 1_000_000_000

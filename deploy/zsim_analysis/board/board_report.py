@@ -12,9 +12,19 @@ from matplotlib.patches import Rectangle
 from rich.console import Group
 
 from zsim.presentation import Column, FittedTable, drone_colours
-from zsim_analysis.board.board import MEASURES, Board, board_of, cells, heads, planned_figure, summary_of, write_tables
+from zsim_analysis.board.board import (
+    MEASURES,
+    Board,
+    about,
+    board_of,
+    cells,
+    document,
+    heads,
+    planned_figure,
+    summary_of,
+    write_tables,
+)
 from zsim_analysis.board.board import BoardRequest as Request
-from zsim_analysis.board.entries import about, document
 from zsim_analysis.report.figure_style import (
     BLACK,
     BLUE,

@@ -22,8 +22,7 @@ from zsim.errors import ReportError, printable
 from zsim.runtime.progress import cell
 from zsim_analysis.reading.shortfall import span_text
 from zsim_analysis.report.make_report import Picture, changed_text, date_text, sources, template, write_report
-from zsim_analysis.report.paper import PAPER_NOTE
-from zsim_analysis.report.summary import PAPER_COLUMN, STATISTICS
+from zsim_analysis.report.summary import PAPER_COLUMN, PAPER_NOTE, STATISTICS
 from zsim_analysis.sweep.sweep import load
 from zsim_analysis.sweep.sweep_figures import figures
 from zsim_analysis.sweep.sweep_summary import (

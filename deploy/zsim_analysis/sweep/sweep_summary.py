@@ -18,8 +18,7 @@ from scipy.special import betaincinv, stdtrit
 
 from zsim.errors import ScenarioError
 from zsim_agents.formation.spaces.cluster_space import unit
-from zsim_analysis.report.paper import PAPER_TABLE_1, paper_table
-from zsim_analysis.report.summary import STATISTICS
+from zsim_analysis.report.summary import PAPER_TABLE_1, STATISTICS, paper_table
 from zsim_analysis.sweep.design import Draw, SweepDesign, without_made
 from zsim_analysis.sweep.sweep_run import FIXED, METRIC, Row, engaged_column
 

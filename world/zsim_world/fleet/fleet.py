@@ -34,7 +34,7 @@ from zsim.math import linear
 from zsim.math.frames import quaternion_from_heading, quaternion_from_rpy
 from zsim.math.held import hold
 from zsim.scenario.scenario import Drone, Scenario
-from zsim.scenario.triangles import sheet_of
+from zsim.scenario.surroundings import sheet_of
 from zsim.sensors.scanner import SCANNERS
 from zsim.sensors.sensor import noise_sigma
 from zsim.vehicles.vehicle import Vehicle

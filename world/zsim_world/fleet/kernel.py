@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from zsim.math.compiled import inlined, kernel
 from zsim.math.held import Held
 from zsim.math.rotation import norm
-from zsim.scenario.triangles import Sheet
+from zsim.scenario.surroundings import Sheet
 from zsim_world.fleet.flight_watch import watch
 from zsim_world.physics import rigid_body as body
 from zsim_world.physics.contacts import WIND, blow, meet_drones

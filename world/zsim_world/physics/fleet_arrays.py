@@ -19,7 +19,7 @@ from zsim.math import elementary as el
 from zsim.math.compiled import Field, columns, inlined
 from zsim.math.rotation import Quaternion, Vector
 from zsim.scenario.scenario import Drone, Environment
-from zsim.scenario.triangles import Sheet
+from zsim.scenario.surroundings import Sheet
 from zsim.schema.quantities import COULOMB_PER_MAH, SEA_LEVEL_KG_M3
 from zsim.vehicles.vehicle import Aerodynamics, Vehicle, allocation, lift_shares, mixing
 from zsim_world.physics.rays import Scene

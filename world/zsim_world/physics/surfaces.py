@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from zsim.math import elementary as el
 from zsim.math.compiled import Field, columns, inlined, noinline
 from zsim.math.rotation import Quaternion, Vector, add, axpy, cross, dot, norm, rotate, rotate_back, scaled, subtract
-from zsim.scenario import obstacle
+from zsim.scenario import surroundings
 from zsim.scenario.scenario import Environment
-from zsim.scenario.triangles import FACE, Sheet, crosses, nearest_point, side_of
+from zsim.scenario.surroundings import FACE, Sheet, crosses, nearest_point, side_of
 from zsim_world.physics.fleet_arrays import STATE, VEHICLE, Bodies, Row, four, vector
 
 Pair = tuple[float, float]
@@ -117,7 +117,7 @@ _ANGLES = [2.0 * math.pi * (k + 0.5) / HULL_BALLS for k in range(HULL_BALLS)]
 _COSINES = (*(el.cos(angle) for angle in _ANGLES), 0.0)  # of the hull balls, in units of the hull's middle line
 _SINES = (*(el.sin(angle) for angle in _ANGLES), 0.0)
 
-nearest: Any = inlined(obstacle.nearest)
+nearest: Any = inlined(surroundings.nearest)
 
 
 PLANE = columns(  # of a ball: where it is nearest to a surface
@@ -144,7 +144,7 @@ class Touch(NamedTuple):
 
 
 def obstacle_rows(environment: Environment) -> NDArray[np.float64]:
-    return np.array([obstacle.row_of(each) for each in environment.obstacles]).reshape(-1, obstacle.COLUMNS)
+    return np.array([surroundings.row_of(each) for each in environment.obstacles]).reshape(-1, surroundings.COLUMNS)
 
 
 @inlined

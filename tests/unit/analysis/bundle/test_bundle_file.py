@@ -12,8 +12,17 @@ from refused import refused
 
 from zsim.errors import RunError
 from zsim_analysis.bundle import bundle_file
-from zsim_analysis.bundle.bundle_file import FORMAT, LOCK, MANIFEST, README, SCENARIO, Manifest, opened, write_bundle
-from zsim_analysis.bundle.own_code import pins_of
+from zsim_analysis.bundle.bundle_file import (
+    FORMAT,
+    LOCK,
+    MANIFEST,
+    README,
+    SCENARIO,
+    Manifest,
+    opened,
+    pins_of,
+    write_bundle,
+)
 
 MEMBERS: dict[str, Any] = {
     README: b"# one\n",

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from zsim.contract.run_messages import RadioLinks
-from zsim_analysis.reading.radio_links import RadioHistory
+from zsim_analysis.reading.recorded_flight import RadioHistory
 
 SECOND = 1_000_000_000
 RING = ((1,), (2,), (0,))  # of three drones, each hears the next: all reach all, over others

@@ -10,8 +10,8 @@ from zsim.contract.flight_messages import Reference, ReferencePhase, Status, Tru
 from zsim_analysis.reading.drone_errors import reference_errors, tracking_of
 from zsim_analysis.reading.recorded_flight import FlightReader, RecordedFlight
 from zsim_analysis.reading.shortfall import shortfalls
-from zsim_analysis.report.drone_figures import draw_references
 from zsim_analysis.report.figure_style import TimeMarks
+from zsim_analysis.report.flight_figures import draw_references
 
 Phases = dict[float, ReferencePhase]
 SECONDS, GATES = 30, 10  # ten gates a second

@@ -25,25 +25,23 @@ from zsim.contract.run_messages import Event
 from zsim.errors import RecordError, ReportError
 from zsim_analysis.report.comparison import (
     ABSENT,
+    POINTS,
+    STYLES,
     THERE,
+    UNPLANNED,
+    ComparedRun,
+    clusters,
     compare,
+    comparison_figures,
     comparison_page,
     comparison_path,
     fact_rows,
     flattened,
     notes,
     run_names,
+    run_style,
     scenario_rows,
     statistics_rows,
-)
-from zsim_analysis.report.comparison_figures import (
-    POINTS,
-    STYLES,
-    UNPLANNED,
-    ComparedRun,
-    clusters,
-    comparison_figures,
-    run_style,
 )
 from zsim_analysis.report.figure_style import ReportFigure
 from zsim_analysis.report.summary import STATISTICS, judge

@@ -12,7 +12,7 @@ from zsim.contract.run_messages import Event
 from zsim.scenario import scenario_file
 from zsim_analysis.reading.formation import Formation, formations_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
-from zsim_analysis.report.paper import PAPER_TABLE_1, flies_paper_test, paper_table, paper_table_of
+from zsim_analysis.report.summary import PAPER_TABLE_1, flies_paper_test, paper_table, paper_table_of
 from zsim_analysis.sweep.design import SweepDesign, make_plan, read_document
 from zsim_analysis.sweep.sweep_summary import SweepResults
 

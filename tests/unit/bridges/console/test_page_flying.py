@@ -13,8 +13,7 @@ import pytest
 from zsim.contract.flight_messages import DroneView, ViewCluster, ViewDrones
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Surface
-from zsim.scenario.surface_file import packed
-from zsim.scenario.triangles import outline_of
+from zsim.scenario.surroundings import outline_of, packed
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_bridges.console import page_flying
 from zsim_bridges.console.histories import CanvasTrails

@@ -17,7 +17,7 @@ from zsim.contract.messages import DroneInfo, RotorInfo
 from zsim.contract.run_messages import ControlAnswer, Event
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Surface
-from zsim.scenario.surface_file import packed
+from zsim.scenario.surroundings import packed
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import console_tables
 from zsim_bridges.console import scene as stages

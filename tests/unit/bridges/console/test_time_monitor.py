@@ -16,7 +16,7 @@ from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health, Wait
 from zsim.math import frames
 from zsim.runtime.participant import Participant
 from zsim.scenario.scenario import Environment, Obstacle, Surface
-from zsim.scenario.surface_file import packed
+from zsim.scenario.surroundings import packed
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.console_server import console_state
 from zsim_bridges.console.console_tables import TableRows

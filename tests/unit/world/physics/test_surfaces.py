@@ -12,9 +12,8 @@ from vehicle_rows import one_drone
 
 from zsim.contract.snapshot import pack, restore, saved_state, unpack
 from zsim.math.frames import quaternion_from_rpy, rpy_from_quaternion
-from zsim.scenario.obstacle import SHAPES, nearest
 from zsim.scenario.scenario_file import resolve
-from zsim.scenario.surface_file import packed
+from zsim.scenario.surroundings import SHAPES, nearest, packed
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.crazyflie2 import VEHICLE as CRAZYFLIE2
 from zsim_world.fleet.fleet import Fleet

@@ -9,7 +9,7 @@ import pytest
 from zsim.math.frames import quaternion_from_rpy
 from zsim.math.rotation import add, rotate, z_axis
 from zsim.scenario.scenario_file import resolve
-from zsim.scenario.surface_file import packed
+from zsim.scenario.surroundings import packed
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.physics.fleet_arrays import STATE, VEHICLE
 from zsim_world.physics.rays import cast_hull

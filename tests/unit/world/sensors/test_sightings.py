@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from zsim.math.frames import quaternion_from_rpy
 from zsim.scenario import scenario_file
-from zsim.scenario.obstacle import COLUMNS, row_of
 from zsim.scenario.scenario import Obstacle, Scenario
-from zsim.scenario.triangles import TRIANGLE
+from zsim.scenario.surroundings import COLUMNS, TRIANGLE, row_of
 from zsim.sensors.camera import FrontCamera
 from zsim.sensors.camera_model import camera_pose, lens_of
 from zsim_world.physics.fleet_arrays import STATE

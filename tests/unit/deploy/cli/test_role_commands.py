@@ -11,8 +11,8 @@ from refused import has_terms, refused
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from zsim.errors import RunError, install_command
-from zsim_bridges.ros2.ros_types import MESSAGES, type_hash
-from zsim_deploy.cli.bridge_commands import console, gateway, ros1, ros2
+from zsim_bridges.ros2.rmw_zenoh import MESSAGES, type_hash
+from zsim_deploy.cli.role_commands import console, gateway, ros1, ros2
 
 
 def test_the_package_has_the_types_that_go_over_the_wire(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
