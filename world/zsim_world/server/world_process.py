@@ -307,7 +307,6 @@ class WorldProcess:
         self._readers.report()
         self._admission.check_due(time.monotonic_ns())
         if self.health.due():
-            self._liveliness.count_second()
             health = self.health.message(self._world.now_ns, self._world.outbox.next_seq(HEALTH))
             self._outputs.publish(Output(HEALTH, health))
             self._run.progress("health", health, WORLD)

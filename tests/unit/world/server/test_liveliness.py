@@ -4,6 +4,7 @@ A join that nobody is behind costs nobody his place, and time for a while only.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 from fake_link import FakeLink
@@ -18,12 +19,12 @@ from zsim_world.run.inputs import Run
 from zsim_world.run.outbox import STRANGERS_MAX
 from zsim_world.run.world import World
 from zsim_world.server.liveliness import (
+    DEAD_NS,
     DONE_NS,
     HELD_NS,
     LOOK_NS,
     SHOWN_NS,
     SILENT_NS,
-    SILENT_S,
     TOKEN_NS,
     WITHHELD_MAX,
     Admission,
@@ -61,6 +62,7 @@ class Case:
         self.world = World(scenario_file.from_text(SCENARIO), run_id="run1")
         run, link = Run(self.world, HealthMeter(WORLD)), FakeLink()
         self.liveliness = LivelinessMonitor(link, run, lambda: self.take_in())  # type: ignore[arg-type]
+        self.wall_ns = 10 * S
         self.join(incarnation=1, pid=7)
 
     def join(self, incarnation: int, pid: int) -> None:
@@ -73,9 +75,24 @@ class Case:
         pending = self.world.outbox.pending
         return [message.kind for key, message in pending if key == keys.EVENT and message.subject == self.name]
 
-    def seconds(self, count: int) -> None:
-        for _ in range(count):
-            self.liveliness.count_second()
+    def passes(self, wall_ns: int) -> None:
+        """Let wall time pass, look by look."""
+        for _ in range(wall_ns // STEP_NS):
+            self.wall_ns += STEP_NS
+            self.liveliness.check_due()
+
+
+@pytest.fixture
+def case_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Case]:
+    """Return a function that makes a Case whose wall clock only tests turn."""
+
+    def made(*arguments: Any) -> Case:
+        case = Case(*arguments)
+        monkeypatch.setattr("zsim_world.server.liveliness.time.monotonic_ns", lambda: case.wall_ns)
+        case.passes(STEP_NS)
+        return case
+
+    return made
 
 
 @pytest.mark.parametrize(
@@ -88,22 +105,27 @@ class Case:
         ("recorder", 0, "somebody", False),
     ],
 )
-def test_a_reader_that_falls_silent_is_dead(name: str, period_ns: int, publisher: str | None, dies: bool) -> None:
-    case = Case(name, period_ns)
+def test_a_reader_that_falls_silent_is_dead(
+    case_of: Callable[..., Case], name: str, period_ns: int, publisher: str | None, dies: bool
+) -> None:
+    case = case_of(name, period_ns)
     if publisher:
         case.liveliness.health_received(publisher)
-    case.seconds(SILENT_S)
+    case.passes(DEAD_NS)
     assert "death" not in case.events()
-    case.seconds(2)
+    case.wall_ns += 60 * S  # in which the world itself stood still
+    case.passes(STEP_NS)
+    assert "death" not in case.events()
+    case.passes(2 * STEP_NS)
     assert ("death" in case.events()) == dies
     assert (case.world.ended is not None) == (dies and name == "recorder")
 
 
-def test_one_that_publishes_is_not() -> None:
-    case = Case("recorder")
+def test_one_that_publishes_is_not(case_of: Callable[..., Case]) -> None:
+    case = case_of("recorder")
     for _ in range(3):
         case.liveliness.health_received("recorder")
-        case.seconds(SILENT_S)
+        case.passes(DEAD_NS)
     assert "death" not in case.events()
 
 
