@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from zsim.math import elementary as el
 from zsim.math.compiled import Field, columns
-from zsim.math.distributions import normal_quantile
 from zsim.math.frames import quaternion_from_rpy
+from zsim.math.randomness import normal_quantile
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor import VALUES_MAX, ErrorModel, Sensor, SensorType, noise_sigma
 from zsim.sensors.sensor_catalogue import STOCK, Sensors

@@ -15,7 +15,7 @@ from zsim.contract import keys, messages, run_messages
 from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError, RunError
 from zsim.runtime.agent import Output
-from zsim.runtime.health import HealthMeter, rare_collections
+from zsim.runtime.membership import HealthMeter, rare_collections
 from zsim.scenario import roles
 from zsim.scenario.roles import WORLD
 from zsim.transport import connection

@@ -5,7 +5,7 @@ from fake_link import FakeLink
 
 from zsim.contract import keys
 from zsim.contract.run_messages import ControlRequest, Done, Event, Join
-from zsim.runtime.health import HealthMeter
+from zsim.runtime.membership import HealthMeter
 from zsim.scenario import scenario_file
 from zsim.scenario.roles import WORLD
 from zsim.transport.link_watch import SessionTokens
