@@ -17,7 +17,7 @@ from zsim.errors import RunError, UserCodeError
 from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.bus import Bus
-from zsim.runtime.health import rare_collections
+from zsim.runtime.membership import rare_collections
 from zsim.runtime.progress import PERIOD_S, HoldReasons, ProgressSink, SlowStart
 from zsim.runtime.rate_limit import RateLimit
 from zsim.scenario.roles import agent_names, check_alone, expected_processes, lets_drop

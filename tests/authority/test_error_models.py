@@ -12,7 +12,7 @@ import pytest
 from fleet_samples import samples_of
 from numpy.typing import NDArray
 
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.sensors import sensor_set

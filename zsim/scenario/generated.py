@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from zsim.errors import DocumentError, missing
 from zsim.math import elementary as el
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
 from zsim.scenario.scenario import OBSTACLES_MAX, Cloud, Corridor, Forest, Position, Scenario
 from zsim.scenario.surroundings import TRIANGLE, TRIANGLES_MAX, packed, unpacked
 from zsim.schema import plugin

@@ -25,8 +25,8 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from zsim.contract import keys
-from zsim.contract.agent_messages import AgentMessage
 from zsim.contract.flight_messages import Estimate, Mode, Status, Velocity
+from zsim.contract.messages import AgentMessage
 from zsim.contract.snapshot import State
 from zsim.errors import UserCodeError
 from zsim.runtime.agent import Agent, Output

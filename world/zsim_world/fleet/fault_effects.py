@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from zsim.contract.run_messages import Fault
 from zsim.contract.snapshot import Saved
 from zsim.math import elementary as el
-from zsim.math.distributions import normal_probability, normal_quantile
+from zsim.math.randomness import normal_probability, normal_quantile
 from zsim.scenario.faults import sensor_parts
 from zsim.sensors.scanner import SCANNERS
 from zsim.vehicles.vehicle import Vehicle

@@ -37,8 +37,7 @@ from zsim.scenario.scenario import Drone, Scenario
 from zsim.scenario.surroundings import sheet_of
 from zsim.sensors.scanner import SCANNERS
 from zsim.sensors.sensor import noise_sigma
-from zsim.vehicles.vehicle import Vehicle
-from zsim.vehicles.vehicle_catalogue import vehicle_of
+from zsim.vehicles.vehicle import Vehicle, vehicle_of
 from zsim_world.fleet import kernel
 from zsim_world.fleet.fault_effects import Impairment
 from zsim_world.fleet.flight_watch import SEEN, FlightWatch, Incident

@@ -21,7 +21,7 @@ from zsim.math import frames
 from zsim.math.compiled import Field, columns, inlined, kernel
 from zsim.math.frames import rotation_matrix
 from zsim.math.held import Held, hold
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
 from zsim.math.rotation import attitude_between, position_between
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin

@@ -16,10 +16,9 @@ from zsim.contract.messages import Depth, Lidar, Range
 from zsim.contract.snapshot import IN_PLACE, PART, Saved
 from zsim.math import elementary as el
 from zsim.math.compiled import Field, columns, inlined, kernel
-from zsim.math.distributions import normal_quantile
 from zsim.math.frames import quaternion_from_rpy, rotation_matrix
 from zsim.math.held import Held, hold
-from zsim.math.random_streams import stream
+from zsim.math.randomness import normal_quantile, stream
 from zsim.math.rotation import add, dot, matrix, product, subtract
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import Camera

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from zsim.math import elementary as el
 from zsim.math.compiled import Field, columns, inlined, kernel, noinline
-from zsim.math.distributions import normal_quantile
 from zsim.math.frames import quaternion_from_rpy
+from zsim.math.randomness import normal_quantile
 from zsim.math.rotation import (
     Quaternion,
     Vector,

@@ -25,9 +25,8 @@ from zsim.math import elementary as el
 from zsim.math import linear
 from zsim.math import rotation as rot
 from zsim.math.compiled import Field, columns, compiled, inlined, kernel
-from zsim.math.distributions import normal_probability
 from zsim.math.held import Held, hold
-from zsim.math.random_streams import stream
+from zsim.math.randomness import normal_probability, stream
 from zsim.math.rotation import (
     Quaternion,
     Vector,

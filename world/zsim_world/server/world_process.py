@@ -18,7 +18,7 @@ from zsim.contract.run_messages import ControlAnswer
 from zsim.contract.snapshot import restore
 from zsim.errors import DecodeError, RunError, SessionError
 from zsim.runtime.agent import Output
-from zsim.runtime.health import HealthMeter, rare_collections
+from zsim.runtime.membership import HealthMeter, rare_collections
 from zsim.scenario import roles
 from zsim.scenario.roles import WORLD
 from zsim.transport import connection

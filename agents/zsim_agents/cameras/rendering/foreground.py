@@ -1,7 +1,7 @@
 """The foreground of a camera's picture: drones, hats, obstacles and surfaces. Pure.
 
 Drones are hulls, arms, motors, rotors as their blades sweep, and hats; they look like the console's
-(zsim_bridges.console.airframe); lengths are the AR.Drone's, scaled by the arms. All of a picture are computed together.
+(zsim_bridges.console.scene); lengths are the AR.Drone's, scaled by the arms. All of a picture are computed together.
 
 A ray hits a ball, such as a hat, if it passes the centre within the radius. This is exact anywhere in the picture and
 for any lens, and antialiased over one pixel at the edge, so that the drawn centre is the projected centre. Faces of

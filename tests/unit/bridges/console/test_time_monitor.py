@@ -21,8 +21,7 @@ from zsim_bridges.console import console_tables
 from zsim_bridges.console.console_server import console_state
 from zsim_bridges.console.console_tables import TableRows
 from zsim_bridges.console.run_condition import RunCondition, page_head
-from zsim_bridges.console.run_monitor import FlightMeter
-from zsim_bridges.console.time_monitor import BEAT_S, SILENT_S, RecordPlayer, TimeMonitor
+from zsim_bridges.console.run_monitor import BEAT_S, SILENT_S, FlightMeter, RecordPlayer, TimeMonitor
 from zsim_bridges.console.view_buffer import ReceivedEstimate, ViewBuffer
 
 S = 1_000_000_000  # ns

@@ -15,7 +15,7 @@ from refused import has_terms, refused
 from zsim.contract import messages
 from zsim.math.frames import geodetic_to_enu, heading
 from zsim.scenario.scenario_file import resolve
-from zsim.vehicles import vehicle_catalogue
+from zsim.vehicles.vehicle import MODELS, vehicle_of
 from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, DivergedError, Fleet
 from zsim_world.fleet.publication import GatePublication
 from zsim_world.sensors.sensor_set import SENSORS, fleet_sensors, schedule
@@ -296,7 +296,7 @@ def test_a_hundred_drones_in_a_crowd_collide_and_stay_finite():
 
 GATE_S = 0.02
 six_rotors = pytest.mark.soak
-MODELS = [*vehicle_catalogue.STOCK, pytest.param("hexacopter", marks=six_rotors)]
+ALL_MODELS = [*MODELS, pytest.param("hexacopter", marks=six_rotors)]
 
 
 def fleet(*models: str, **environment: Any) -> Fleet:
@@ -331,10 +331,10 @@ def velocity_ahead(flight: Fleet, i: int) -> np.ndarray:
     return np.array([math.cos(psi) * vx + math.sin(psi) * vy, math.cos(psi) * vy - math.sin(psi) * vx, vz])
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", ALL_MODELS)
 def test_every_vehicle_takes_off_hovers_flies_a_velocity_and_lands(model: str):
     flight = airborne(model)
-    height = vehicle_catalogue.vehicle_of(model).takeoff_height_m
+    height = vehicle_of(model).takeoff_height_m
     start = flight.truth().position_m[0]
     fly(flight, 10.0)
     away = flight.truth().position_m[0] - start
@@ -353,14 +353,14 @@ def test_every_vehicle_takes_off_hovers_flies_a_velocity_and_lands(model: str):
     assert np.abs(flight.truth().velocity_m_s).max() < 0.01
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", ALL_MODELS)
 def test_hover_thrust_is_the_weight_shared_by_all_rotors(model: str):
     flight = airborne(model)
     speeds = []
     for _ in range(200):
         flight.advance()
         speeds.append((flight.truth().rotor_rad_s[0] ** 2).mean())
-    vehicle = vehicle_catalogue.vehicle_of(model)
+    vehicle = vehicle_of(model)
     weight = vehicle.mass_kg * 9.80665
     lift = len(vehicle.rotors) * vehicle.thrust_n_s2 * np.mean(speeds)
     assert lift == pytest.approx(weight, rel=0.02)

@@ -11,7 +11,7 @@ from fake_link import FakeLink
 
 from zsim.contract import keys, messages
 from zsim.contract.run_messages import ControlRequest, Done, Event, Health, Join
-from zsim.runtime.health import HealthMeter
+from zsim.runtime.membership import HealthMeter
 from zsim.scenario import scenario_file
 from zsim.scenario.roles import WORLD
 from zsim.transport.link_watch import ClosedLink, SessionTokens

@@ -14,7 +14,7 @@ from zsim.contract.flight_messages import ClusterState, Estimate, Velocity
 from zsim.contract.framing import decode_batch
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Done, Event, Health, Join
 from zsim.errors import DecodeError
-from zsim.runtime.health import HealthMeter
+from zsim.runtime.membership import HealthMeter
 from zsim.scenario import roles, scenario_file
 from zsim.schema.message import Message
 from zsim_world.fleet.fleet import DivergedError

@@ -9,10 +9,9 @@ from msgspec.structs import replace
 from refused import has_terms
 
 from zsim.contract import keys
-from zsim.contract.agent_messages import AgentMessage
 from zsim.contract.flight_messages import Estimate, Mode, Status
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.messages import ClusterInfo, DroneInfo, Imu, Info, Origin, encode, register_messages
+from zsim.contract.messages import AgentMessage, ClusterInfo, DroneInfo, Imu, Info, Origin, encode, register_messages
 from zsim.contract.run_messages import ControlRequest, Fault, Faults, RadioLinks
 from zsim.contract.snapshot import pack, unpack
 from zsim.runtime.agent import Agent, Output
