@@ -15,7 +15,7 @@ import numpy as np
 from zsim.errors import DocumentError, NotTrustedError, RunError, UserCodeError
 from zsim.math import elementary as el
 from zsim.scenario.scenario import Scenario
-from zsim.vehicles.vehicle_catalogue import vehicle_of
+from zsim.vehicles.vehicle import vehicle_of
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.formation.trajectory import Reference
 from zsim_agents.references.path import peaks_of

@@ -21,7 +21,7 @@ from msgspec import Struct
 from scipy.spatial import KDTree
 
 from zsim.errors import OTHER_OUT, ReportError, file_fault
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
 from zsim.presentation import Column, FittedTable
 from zsim_agents.laws.bearing_only import bearing_only
 from zsim_agents.laws.consensus import consensus

@@ -23,7 +23,7 @@ from zsim.contract.fingerprint import TruthHash
 from zsim.errors import RecordError, printable
 from zsim.presentation import Column, FittedTable
 from zsim.scenario.scenario import Cluster, ClusterPlan, Drone, Scenario
-from zsim.scenario.triangles import Surroundings
+from zsim.scenario.surroundings import Surroundings
 from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, STOCK
 from zsim_agents.formation.expression import Expression, ExpressionError
 from zsim_agents.formation.spaces.cluster_space import unit

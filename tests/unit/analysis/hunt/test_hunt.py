@@ -13,7 +13,7 @@ from refused import has_terms
 from rich.console import Console
 
 from zsim.errors import RunError, ScenarioError
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
 from zsim.scenario.scenario import Scenario
 from zsim.schema import yaml_file
 from zsim_analysis.hunt import hunt as hunting

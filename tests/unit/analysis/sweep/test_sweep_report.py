@@ -15,7 +15,7 @@ from refused import has_terms, without_tags
 from sweep_rows import made, plan, printed, well
 
 from zsim.errors import ReportError
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
 from zsim_analysis.report import indented_json
 from zsim_analysis.sweep.design import SweepDesign, SweepPlan
 from zsim_analysis.sweep.sweep import locked, read_table
