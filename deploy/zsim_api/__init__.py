@@ -7,7 +7,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for editors, which do not read _WHERE
-    from zsim.contract.agent_messages import AgentMessage as AgentMessage
+    from zsim.contract.messages import AgentMessage as AgentMessage
     from zsim.errors import ZsimError as ZsimError
     from zsim.runtime.agent import Agent as Agent
     from zsim.runtime.agent import Output as Output
@@ -45,7 +45,7 @@ if TYPE_CHECKING:  # for editors, which do not read _WHERE
     from zsim_bridges.fmu.agent import Fmu as Fmu
 
 _WHERE = {
-    "zsim.contract.agent_messages": ("AgentMessage",),
+    "zsim.contract.messages": ("AgentMessage",),
     "zsim.errors": ("ZsimError",),
     "zsim.runtime.agent": ("Agent", "Output"),
     "zsim.schema.parameters": ("Parameters",),

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.math.frames import rotation_matrix
-from zsim.math.random_streams import stream
-from zsim.scenario.obstacle import nearest
+from zsim.math.randomness import stream
+from zsim.scenario.surroundings import nearest
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import Lens, camera_pose, lens_of
 from zsim_agents.cameras.foreground import SEEN_M, DroneImager, SurfaceImager, draw_obstacle, fixed

@@ -31,13 +31,13 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from zsim.contract import keys
-from zsim.contract.agent_messages import AgentMessage
 from zsim.contract.flight_messages import Estimate, Mode, Status, Velocity
+from zsim.contract.messages import AgentMessage
 from zsim.contract.snapshot import State
 from zsim.errors import UserCodeError
 from zsim.math import elementary as el
 from zsim.runtime.agent import Agent, Output
-from zsim.scenario import obstacle
+from zsim.scenario import surroundings
 from zsim.scenario.scenario import SURFACES_MAX, Scenario, Surface, Value
 from zsim.schema.checker import Fault
 from zsim.schema.parameters import Parameters
@@ -138,7 +138,7 @@ class Pilot(Agent):
         self._gate_ns = round(scenario.time.gate_ms * 1e6)
         self._message_ns = max(self._gate_ns, round(1e9 / own.message_rate_hz))
         self._silence_ns = round(own.silence_s * 1e9)
-        self._obstacles = [obstacle.row_of(each) for each in scenario.environment.obstacles]
+        self._obstacles = [surroundings.row_of(each) for each in scenario.environment.obstacles]
         self._surfaces = [_sheet(each) for each in scenario.environment.surfaces or ()]
         self._reference = self.reference_of(own)
         self._heard: dict[str, Motion] = {}
@@ -238,7 +238,7 @@ class Pilot(Agent):
         """
         found = []
         for row in self._obstacles:
-            distance, x, y, _ = obstacle.nearest(row, float(p_W[0]), float(p_W[1]), float(self._p_W[2]))
+            distance, x, y, _ = surroundings.nearest(row, float(p_W[0]), float(p_W[1]), float(self._p_W[2]))
             if distance < reach_m and (x or y):
                 found.append((distance, unit(np.array([x, y]))))
         for nearest in self._surfaces:
@@ -273,7 +273,11 @@ def _sheet(surface: Surface) -> Callable[[Sequence[float], float], tuple[float, 
 
     It returns the reach and the point itself if the surface is no nearer than the reach.
     """
-    from zsim.scenario.triangles import hold, nearest_points, sheet_of  # here: without a surface, numba is not loaded
+    from zsim.scenario.surroundings import (  # here: without a surface, numba is not loaded
+        hold,
+        nearest_points,
+        sheet_of,
+    )
 
     sheet = hold(sheet_of(SimpleNamespace(surfaces=[surface])))
 

@@ -21,7 +21,7 @@ from zsim.contract.flight_messages import ReferencePhase
 from zsim.errors import DocumentError, NotTrustedError, RunError, UserCodeError
 from zsim.math import elementary as el
 from zsim.scenario.scenario import STAGES_MAX, Drone, DroneReference, Exchange, PathPoint, Piloted, Scenario
-from zsim.vehicles.vehicle_catalogue import vehicle_of
+from zsim.vehicles.vehicle import vehicle_of
 from zsim_agents.formation.assembly import assign
 from zsim_agents.formation.expression import ExpressionError
 from zsim_agents.formation.spaces.cluster_space import Array

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from zsim.contract.messages import Info
     from zsim.transport.session import Session
     from zsim.transport.tls import Identity
-    from zsim_bridges.vehicle_links.failsafe import FlightLimits
+    from zsim_bridges.vehicle_links.vehicle_session import FlightLimits
     from zsim_deploy.roles.roles import Remain, Serve
 
 FIRST_ADDRESS = "127.0.0.2"  # of the first AR.Drone; programs on this host send from 127.0.0.1
@@ -375,7 +375,7 @@ def ros2(
     """Show the drones to ROS 2 (RMW_IMPLEMENTATION=rmw_zenoh_cpp) as topics and services, without ROS here."""
     require("ros2", ROS2_NEEDS)
     if write_package is not None:
-        from zsim_bridges.ros2.ros_types import PACKAGE
+        from zsim_bridges.ros2.rmw_zenoh import PACKAGE
 
         folder = write_package / "zsim_msgs"
         with file_fault(folder, "cannot be written", "give --write-package another folder"):
@@ -495,15 +495,14 @@ def serve_ardrone(
     name: Annotated[str, opt.process_option("ardrone.main")] = "",
 ) -> None:
     """Offer each drone as an AR.Drone 2.0 on its own address."""
-    from zsim_bridges.ardrone.ardrone_server import ArdroneOptions, ArdroneServer
-    from zsim_bridges.ardrone.ports import peer_addresses
+    from zsim_bridges.ardrone.ardrone_server import ArdroneOptions, ArdroneServer, peer_addresses
 
     options = ArdroneOptions(addresses, peer_addresses(peer or ()), rate)
     serve_as("ardrone", name, partial(ArdroneServer.serve, options=options), reach)
 
 
 def _bounds(armed: bool, speed: float, climb: float, radius: float, ceiling: float) -> "tuple[FlightLimits, bool]":
-    from zsim_bridges.vehicle_links.failsafe import FlightLimits
+    from zsim_bridges.vehicle_links.vehicle_session import FlightLimits
 
     return FlightLimits(speed, climb, radius_m=radius or math.inf, ceiling_m=ceiling or math.inf), armed
 

@@ -9,8 +9,8 @@ from msgspec.structs import replace
 from pictures import BOTTOM, CLEAN, FRONT, bodies, has_magenta, hat_pixel, looks, magenta_centre, renderer, scene
 
 from zsim.math.frames import quaternion_from_rpy, rotation_matrix
-from zsim.scenario.obstacle import row_of
 from zsim.scenario.scenario import Obstacle
+from zsim.scenario.surroundings import row_of
 from zsim.sensors.camera import FrontCamera, Hats
 from zsim.sensors.camera_model import lens_of
 from zsim.sensors.sensor import Mount

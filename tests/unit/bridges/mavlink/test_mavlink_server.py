@@ -17,7 +17,7 @@ from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import NoWorldError, RunError
 from zsim.transport.session import Unanswered
 from zsim_bridges.mavlink import dialect
-from zsim_bridges.mavlink.frame import Link, Parser, Received
+from zsim_bridges.mavlink.dialect import Link, Parser, Received
 from zsim_bridges.mavlink.mavlink_server import (
     DATAGRAM_MAX,
     LEARNT_MAX,

@@ -11,7 +11,7 @@ from refused import has_terms, refused
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from zsim.errors import RunError, install_command
-from zsim_bridges.ros2.ros_types import MESSAGES, type_hash
+from zsim_bridges.ros2.rmw_zenoh import MESSAGES, type_hash
 from zsim_deploy.cli.role_commands import console, gateway, ros1, ros2
 
 
