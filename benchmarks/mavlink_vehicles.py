@@ -24,7 +24,7 @@ import zenoh
 from benchmarks.child import Server
 from benchmarks.exchange.lap import free_port
 from zsim_bridges.mavlink import dialect
-from zsim_bridges.mavlink.frame import Link, Parser
+from zsim_bridges.mavlink.dialect import Link, Parser
 
 HEIGHT_M = 3.0
 SETPOINTS_HZ = 20.0  # what MAVSDK sends

@@ -32,7 +32,7 @@ from zsim.schema.checker import show
 from zsim.schema.message import Message
 from zsim_agents.hosting import hosted
 from zsim_analysis.reading import recorded_run
-from zsim_analysis.reading.output_hashes import OutputHashes, content_of
+from zsim_analysis.reading.recorded_run import OutputHashes, content_of
 from zsim_world.run.coordinator import FLIGHT_REQUESTS
 from zsim_world.run.world import World
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from zsim_bridges.mavlink import dialect
-from zsim_bridges.mavlink.frame import Link, Parser, Signing
+from zsim_bridges.mavlink.dialect import Link, Parser, Signing
 
 PX4, ARDUPILOT = 12, 3
 ON_GROUND, IN_AIR, TAKING_OFF, LANDING = 1, 2, 3, 4

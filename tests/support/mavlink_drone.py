@@ -6,8 +6,7 @@ from zsim.contract import flight_messages
 from zsim.contract.messages import Origin
 from zsim.scenario import scenario_file
 from zsim_bridges.mavlink import dialect
-from zsim_bridges.mavlink.dialect import WireMessage
-from zsim_bridges.mavlink.frame import Received
+from zsim_bridges.mavlink.dialect import Received, WireMessage
 from zsim_bridges.mavlink.mavlink_vehicle import MavlinkVehicle, Options
 from zsim_bridges.mavlink.personality import PERSONALITIES
 from zsim_bridges.vehicle_links.drone_link import CommandSender

@@ -7,7 +7,7 @@ import msgspec
 from zsim.contract import flight_messages
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
-from zsim_bridges.ros1 import tcpros
+from zsim_bridges.ros1 import node as wire
 from zsim_bridges.ros1.node import Ros1Node
 from zsim_bridges.ros1.ros1_bridge import DroneTopics
 
@@ -34,7 +34,7 @@ class Subscriber:
         published.links.append(cast(Any, self))
 
     def put(self, framed: bytes) -> None:
-        self.ros_messages.append(tcpros.deserialize(self._kind, framed[4:]))
+        self.ros_messages.append(wire.deserialize(self._kind, framed[4:]))
 
 
 class Drone:

@@ -17,7 +17,7 @@ import pytest
 from federation import Federation, Role
 from wire import PATIENCE_S
 
-from zsim_bridges.ardrone import at_commands, configuration, navdata
+from zsim_bridges.ardrone import at_commands, navdata
 from zsim_bridges.ardrone.at_commands import Command
 from zsim_bridges.ardrone.navdata import Navdata, StateBit
 
@@ -185,7 +185,7 @@ class PlainPilot:
 
     def configuration(self, mode: int = at_commands.SEND_CONFIGURATION) -> bytes:
         """Return what the control port sends for a CTRL."""
-        with socket.create_connection((self.address, configuration.PORT), PATIENCE_S) as control:
+        with socket.create_connection((self.address, at_commands.CONTROL_PORT), PATIENCE_S) as control:
             data = b""
             while not data.endswith(b"\0"):
                 self.send(at_commands.Control(0, mode))  # it may come before the connection has been accepted

@@ -14,7 +14,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 from wire import PATIENCE_S
 
-from zsim_bridges.ros2.ros_types import MESSAGES
+from zsim_bridges.ros2.rmw_zenoh import MESSAGES
 
 HERE = Path(__file__).parent
 TRIGGER = {

@@ -9,7 +9,7 @@ from ardrone_clients import PlainPilot, addresses, serve
 from federation import ONE, Federation
 from wire import PATIENCE_S
 
-from zsim_bridges.ardrone import at_commands, configuration, navdata
+from zsim_bridges.ardrone import at_commands, navdata
 
 BURST = 64  # datagrams that a socket's buffer surely holds
 AUTHENTICATION_PORT, FTP_PORT, VIDEO_PORT = 5552, 5551, 5555
@@ -84,7 +84,7 @@ def test_nothing_flies_and_all_is_counted(federation: Federation, count: int) ->
 def _fuzz_commands(pilot: PlainPilot, chance: random.Random, count: int) -> int:
     """Send malformed datagrams to the AT port, and strange ones between; return how many the former are."""
     datagrams = malformed(chance)
-    with socket.create_connection((pilot.address, configuration.PORT), PATIENCE_S) as control:
+    with socket.create_connection((pilot.address, at_commands.CONTROL_PORT), PATIENCE_S) as control:
         pilot.send(at_commands.ResetWatchdog(0))
         for _ in range(count // BURST):
             for _ in range(BURST):
@@ -98,7 +98,7 @@ def _await_configuration(pilot: PlainPilot, control: socket.socket) -> None:
     """Wait until all that was sent to the AT port is dealt with: the answer to a request behind it comes."""
     pilot.send(at_commands.Control(0, at_commands.SEND_CONFIGURATION))
     data = b""
-    while not data.endswith(configuration.END):
+    while not data.endswith(at_commands.END):
         received = control.recv(65_536)
         assert received, "the control port has been closed"
         data += received
@@ -119,7 +119,7 @@ def _fuzz_requests(pilot: PlainPilot, chance: random.Random, count: int) -> int:
 
 def _fuzz_streams(address: str, chance: random.Random, count: int) -> None:
     """Send bytes to the TCP ports, and leave or stay."""
-    for port in (configuration.PORT, FTP_PORT, VIDEO_PORT):
+    for port in (at_commands.CONTROL_PORT, FTP_PORT, VIDEO_PORT):
         for _ in range(count):
             with socket.create_connection((address, port), PATIENCE_S) as stream:
                 lines = [chance.randbytes(chance.randrange(700)) for _ in range(chance.randrange(4))]

@@ -8,8 +8,7 @@ import synthetic_record
 from chromium import needs_browser
 from synthetic_record import Flown
 
-from zsim_analysis.report.comparison import comparison_page
-from zsim_analysis.report.comparison_figures import ComparedRun
+from zsim_analysis.report.comparison import ComparedRun, comparison_page
 from zsim_analysis.report.summary import judge
 
 WIDTH_PX = 1280

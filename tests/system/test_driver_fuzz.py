@@ -17,7 +17,7 @@ from wire import PATIENCE_S
 
 from zsim_bridges.ardrone import at_commands, navdata
 from zsim_bridges.mavlink import dialect
-from zsim_bridges.mavlink.frame import Link
+from zsim_bridges.mavlink.dialect import Link
 
 pytestmark = pytest.mark.soak
 

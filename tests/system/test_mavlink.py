@@ -13,7 +13,7 @@ from mavlink_programs import Program, free_udp_ports
 from wire import Client
 
 from zsim_bridges.mavlink import dialect
-from zsim_bridges.mavlink.frame import Link, Parser, Signing
+from zsim_bridges.mavlink.dialect import Link, Parser, Signing
 
 DRONES = 6
 FLEET = f"""

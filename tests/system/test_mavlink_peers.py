@@ -14,7 +14,7 @@ from mixed_formation import UNFLOWN
 from wire import PATIENCE_S
 
 from zsim_bridges.mavlink import dialect
-from zsim_bridges.mavlink.frame import Link, Parser, Received
+from zsim_bridges.mavlink.dialect import Link, Parser, Received
 
 PROGRAM, VEHICLE = 14540, 14580  # ports of the first program, and of the first vehicle
 ARM, TAKE_OFF = 400, 22

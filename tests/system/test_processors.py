@@ -13,7 +13,7 @@ import yaml
 from forked_commands import run_here
 
 import zsim
-from zsim_deploy.hosts.processor_check import older_processor
+from zsim_deploy.cli.hosts_commands import older_processor
 
 GOLDEN: dict[str, str] = yaml.safe_load(golden_flights.GOLDEN.read_text())
 OLDER = older_processor()

@@ -20,7 +20,7 @@ from ros2_lab import TRIGGER, Peer, Router, write_definitions
 from secured import Certificates, tls_endpoint
 
 from zsim.scenario import scenario_file
-from zsim_bridges.ros2 import rmw_zenoh, ros_types
+from zsim_bridges.ros2 import rmw_zenoh
 from zsim_deploy.certificates import access_control
 
 TWIST, EMPTY = "geometry_msgs/msg/Twist", "std_msgs/msg/Empty"
@@ -295,10 +295,10 @@ def test_wire_of_what_we_send_and_what_we_refuse(federation: Federation, ros: RO
     stamps = [seconds(message["header"]) for message in node.received["/drone1/imu"]]
     assert [after - before for before, after in pairwise(stamps)] == pytest.approx([0.005] * (len(stamps) - 1))
 
-    key = rmw_zenoh.data_key(0, "/drone1/cmd_vel", rmw_zenoh.dds_name(TWIST), ros_types.type_hash(TWIST))
-    vector = ros_types.message_class("geometry_msgs/msg/Vector3")
-    good = ros_types.encode(ros_types.message_class(TWIST)(vector(1.0, 0.0, 0.0), vector(0.0, 0.0, 0.0)), TWIST)
-    bad = ros_types.encode(ros_types.message_class(TWIST)(vector(math.nan, 0.0, 0.0), vector(0.0, 0.0, 0.0)), TWIST)
+    key = rmw_zenoh.data_key(0, "/drone1/cmd_vel", rmw_zenoh.dds_name(TWIST), rmw_zenoh.type_hash(TWIST))
+    vector = rmw_zenoh.message_class("geometry_msgs/msg/Vector3")
+    good = rmw_zenoh.encode(rmw_zenoh.message_class(TWIST)(vector(1.0, 0.0, 0.0), vector(0.0, 0.0, 0.0)), TWIST)
+    bad = rmw_zenoh.encode(rmw_zenoh.message_class(TWIST)(vector(math.nan, 0.0, 0.0), vector(0.0, 0.0, 0.0)), TWIST)
     beside = rmw_zenoh.Attachment(1, 1, bytes(16)).packed()
     for payload, attachment in ((b"\x00\x01\x00\x00garbage", beside), (good, b""), (good, beside[:-1]), (bad, beside)):
         raw.session.put(key, payload, attachment=attachment)
@@ -306,7 +306,7 @@ def test_wire_of_what_we_send_and_what_we_refuse(federation: Federation, ros: RO
     started.line("/drone1/cmd_vel: refused")
     assert started.text().count("/drone1/cmd_vel: refused") == 1
     service = rmw_zenoh.data_key(
-        0, "/drone1/release", rmw_zenoh.dds_name(TRIGGER["kind"]), ros_types.type_hash(TRIGGER["kind"])
+        0, "/drone1/release", rmw_zenoh.dds_name(TRIGGER["kind"]), rmw_zenoh.type_hash(TRIGGER["kind"])
     )
     assert list(raw.session.get(service, payload=b"\x00\x01\x00\x00", attachment=beside)) == []
     raw.subscribe("process/ros2.main/health").until(lambda m: m["refused"] >= 5)

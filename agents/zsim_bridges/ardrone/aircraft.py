@@ -1,37 +1,34 @@
 """One drone of a run as an AR.Drone 2.0: messages and datagrams in, commands and datagrams out. Pure.
 
-The session of one aircraft: AT commands, configuration, watchdogs and state, between a run and pilots' programs.
+`Aircraft` is the session of one aircraft, its configuration, watchdogs and state, between a run and pilots' programs.
+`Pilot` is the effect of their REF and PCMD: modes, repeated until obeyed, and a setpoint as long as it holds, which
+`SetpointSender` converts for the drone. Source: AR.Drone Developer Guide SDK 2.0, 6.6; what clients of it send.
 """
 
 import math
-import struct
 from collections.abc import Callable, Hashable
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 from zsim.contract import flight_messages, messages
+from zsim.contract.flight_messages import Status
+from zsim.math import elementary as el
 from zsim.math import frames as rotations
-from zsim.math.rotation import Quaternion, Vector
 from zsim.scenario.scenario import Drone
-from zsim.schema.quantities import G_M_S2
 from zsim.sensors.camera import CAMERAS
-from zsim_bridges.ardrone import at_commands, configuration, navdata
-from zsim_bridges.ardrone.at_commands import Command
-from zsim_bridges.ardrone.configuration import Configuration, ConfigurationError
+from zsim.vehicles.vehicle import Limits
+from zsim_bridges.ardrone import at_commands
+from zsim_bridges.ardrone.at_commands import Command, Configuration, ConfigurationError, Pcmd, PcmdMag, Ref
 from zsim_bridges.ardrone.navdata import (
-    FULL_TAGS,
-    GPS_TAG,
-    LAYOUTS,
     LOST_COM,
     MAGNETO_CALIBRATION,
-    SECONDS_SHIFT,
-    TAG_OF,
+    SECOND_NS,
     ControlState,
-    NavdataTemplate,
+    NavdataContent,
+    NavdataSender,
+    Send,
     StateBit,
 )
-from zsim_bridges.ardrone.pilot import IN_THE_AIR, Pilot, SetpointSender
-from zsim_bridges.vehicle_links.drone_link import CommandSender, OnboardState
+from zsim_bridges.vehicle_links.drone_link import CommandSender, ModeName, OnboardState
 
 WATCHDOG_NS = 50_000_000  # ns without an AT command until the watchdog's bit (Developer Guide 6.6, COMWDG)
 LAND_AFTER_NS = 2_000_000_000  # ns of hovering without a pilot's program before it lands, chosen
@@ -50,28 +47,16 @@ CONTROL_STATES = {
 }
 FRONT_CHANNELS = (0, 2)  # video_channel: 0 front, 1 bottom, 2 and 3 with the other one small, 4 the next one
 NEXT_CHANNEL = 4
+AGAIN_NS = 500_000_000  # ns, chosen: a mode that is not entered is asked for again, as the pilot's REF is repeated
+ASKED_MAX = 3  # times that a mode is asked for before it is given up, chosen
+PER_GATE = 3  # setpoints that are sent at once within a gate, chosen: the world takes one at each
+AIRBORNE = ("hovering", "flying")
+IN_THE_AIR = ("taking_off", *AIRBORNE)
+REPEAT_NS = 100_000_000  # ns; a commander that is silent for 0.5 s counts as dead, scenario `silence.hover_s`
+NO_ALTITUDE_LIMIT_MM = 100_000  # altitude_max that means none (ARDroneLib)
+CLIMB_1_S = 1.5  # 1/s, as the firmware nears its own greatest height
+CALIBRATION_YAW_RAD_S = 1.0  # rad/s, chosen: a turn takes 6 s, as on the aircraft
 FIGURES = "figures are not flown here; the aircraft's flips are its firmware's"
-CLIENTS_MAX = 8  # programs that receive navdata, chosen; beyond it the oldest one is dropped
-REQUESTS = (b"\x01", b"Init")  # how a request for navdata begins (ARDroneLib; its Windows client)
-SECOND_NS = 1_000_000_000
-ACCEL_LSB_PER_G, ACCEL_ZERO_LSB = 512, 2048  # of the raw accelerometer, nominal (measured: 516 to 518, 2031 to 2038)
-GYRO_LSB_PER_DEG_S = 16.4  # of the raw gyro (measured on an aircraft)
-MAG_UT_PER_LSB = 0.3  # uT (AK8975 datasheet)
-MG_PER_UT = 10.0  # milligauss
-PWM_MAX = 255  # of a motor at its greatest speed; below, in proportion, chosen: the curve is not published
-VOLTAGE_MV = ((0.0, 9000.0), (10.0, 10_500.0), (50.0, 11_686.0), (100.0, 12_500.0))
-"""Battery [mV] by charge [%]: vbat_min of the SDK, two chosen, and 50 % as an aircraft showed it."""
-SECONDS_MASK = 0x7FF  # 11 bits
-FIX_3D = 3  # of a GPS receiver, as in NMEA
-_INT16 = 32_767
-_UNUSED_OF_DEMO = (0, *(0.0,) * 12, 0, 0, *(0.0,) * 12)  # frames, and what the cameras detect
-PWM, ALTITUDE, PRESSURE, MAGNETO, KALMAN_PRESSURE = (
-    TAG_OF[name] for name in ("pwm", "altitude", "pressure_raw", "magneto", "kalman_pressure")
-)
-Send = Callable[[bytes, Hashable], None]
-"""Sends a datagram to an address."""
-Putters = dict[str, Callable[..., None]]
-"""By the name of an option, what writes its numbers."""
 
 
 class Outlets(NamedTuple):
@@ -189,10 +174,10 @@ class Aircraft:
             case at_commands.Control(mode=at_commands.ACKNOWLEDGE):
                 self._ack = False
             case at_commands.Control(mode=at_commands.SEND_CONFIGURATION):
-                self._outlets.send_control(configuration.format_configuration(self.configuration.all()))
+                self._outlets.send_control(at_commands.format_configuration(self.configuration.all()))
                 self._ack = True
             case at_commands.Control(mode=at_commands.SEND_CUSTOM_LIST):
-                self._outlets.send_control(configuration.format_custom_list(self.configuration.custom_list()))
+                self._outlets.send_control(at_commands.format_custom_list(self.configuration.custom_list()))
                 self._ack = True
             case at_commands.Calibrate():
                 self.pilot.calibrate()
@@ -256,244 +241,270 @@ class Aircraft:
         return state
 
 
-class NavdataSender:
-    """Sends an aircraft's navdata: when packets are due, their options, receivers and contents.
-
-    The SDK's body axes are x forward, y right, z down; its angles theta nose up, phi to the right, psi clockwise, 0
-    where the aircraft was switched on. What no sensor of the drone measures is zero.
-
-    Args:
-        state_bits: returns the state word without the bits of the mode of navdata.
-        ctrl_state: returns the state of the flight.
-        refuse: counts what cannot be sent, with the reason.
+class TiltSetpoint(NamedTuple):
+    """A PCMD within its limits: shares of the largest tilt, climb and yaw rate.
 
     Attributes:
-        clients: addresses to which navdata is sent, the first that asked first.
-        is_bootstrap: whether packets have no options yet.
+        hover: in place, whatever the shares are.
+        right, back, up, clockwise: in [-1, 1].
+        pilot_heading_rad: clockwise from north, if right and back are those of the pilot, not of the drone.
+    """
+
+    hover: bool
+    right: float = 0.0
+    back: float = 0.0
+    up: float = 0.0
+    clockwise: float = 0.0
+    pilot_heading_rad: float | None = None
+
+
+HOVER = TiltSetpoint(hover=True)
+
+
+class Pilot:
+    """The pilot of one drone.
+
+    Attributes:
+        setpoint: that is flown; None for none.
+        has_flown: whether the flight is this pilot's; stopped_by_pilot: whether the emergency is.
     """
 
     def __init__(
-        self,
-        content: "NavdataContent",
-        configuration: Configuration,
-        send: Send,
-        state_bits: Callable[[], int],
-        ctrl_state: Callable[[], int],
-        refuse: Callable[[str], None],
+        self, sender: CommandSender, setpoints: "SetpointSender", source: str, refuse: Callable[[str], None]
     ) -> None:
-        self._content = content
-        self._configuration = configuration
-        self._send = send
-        self._state_bits = state_bits
-        self._ctrl_state = ctrl_state
+        self._sender = sender
+        self._setpoints = setpoints
+        self._source = source
         self._refuse = refuse
-        self._last: tuple[int, int] | None = None  # rate [Hz], and number of the packet within the simulated time
-        self.clients: dict[Hashable, None] = {}
-        self._sequence = 0
-        self._prepare(())
-        self.is_bootstrap = True
+        self._status: Status | None = None
+        self._held_take_off = self._held_emergency = False  # bits of the last REF
+        self._mode: ModeName | None = None  # that is to be entered
+        self._mode_ns, self._mode_count = 0, 0
+        self.setpoint: TiltSetpoint | None = None
+        self._sent_ns: int | None = None  # when the setpoint was last sent; None while it is new
+        self._gate_ns, self._gate_count = -1, 0
+        self._psi_rad: float | None = None  # of the last PCMD_MAG
+        self._calibrated_ns: int | None = None  # until then it turns
+        self.has_flown = False
+        self.stopped_by_pilot = False
 
-    def on_request(self, datagram: bytes, address: Hashable, t_ns: int) -> bool:
-        """Send navdata to an address from now on; return False for a datagram that does not ask for it."""
-        if not datagram.startswith(REQUESTS):
+    @property
+    def calibrates(self) -> bool:
+        """Whether it turns to calibrate its magnetometer."""
+        return self._calibrated_ns is not None
+
+    @property
+    def state(self) -> str:
+        return self._status.state if self._status else "landed"
+
+    @property
+    def _now_ns(self) -> int:
+        return self._status.t_ns if self._status else 0
+
+    def flown_by(self) -> str | None:
+        """Return the name of another process that flies the drone."""
+        commander = self._status.commander if self._status else None
+        return None if commander in (None, self._source) else commander
+
+    def _is_refused(self, name: str) -> bool:
+        """Return whether a command is not obeyed, and count it."""
+        if self._status is None:
+            self._refuse(f"{name} is not obeyed: the drone has sent no status yet")
+        elif other := self.flown_by():
+            self._refuse(f"{name} is not obeyed: {other} flies the drone")
+        else:
             return False
-        if address not in self.clients:
-            while len(self.clients) >= CLIENTS_MAX:
-                del self.clients[next(iter(self.clients))]
-            self.clients[address] = None
-            self._send(self._packet(t_ns), address)
         return True
 
-    def on_instant(self, t_ns: int) -> None:
-        """Send the packet that is due: a fixed number in each simulated second, without drift."""
-        is_full = not (self.is_bootstrap or self._configuration.flag("general:navdata_demo"))
-        rate_hz = navdata.FULL_RATE_HZ if is_full else navdata.DEMO_RATE_HZ
-        number = rate_hz, t_ns * rate_hz // SECOND_NS
-        if self.clients and number != self._last:
-            self._last = number
-            packet = self._packet(t_ns)
-            for address in tuple(self.clients):
-                self._send(packet, address)
+    # Commands
 
-    def on_gate(self) -> None:
-        """Update the values that change at gates."""
-        self._is_gate_new = True
+    def on_ref(self, ref: Ref) -> None:
+        """Take off or land, and toggle the emergency.
 
-    def _packet(self, t_ns: int) -> bytes:
-        tags = self._tags()
-        if tags != self._template.tags:
-            self._prepare(tags)
-        try:
-            if self._is_gate_new:
-                self._is_gate_new = False
-                self._content.fill_gate(self._put, tags)
-            self._content.fill_packet(self._put, self._ctrl_state(), t_ns)
-        except (struct.error, ArithmeticError, ValueError) as error:
-            self._refuse(f"navdata has a value beyond what its field can hold ({error})")
-        self._sequence += 1
-        bits = self._state_bits()
-        if self.is_bootstrap:
-            bits += navdata.StateBit.NAVDATA_BOOTSTRAP + navdata.StateBit.NAVDATA_DEMO
-        elif self._configuration.flag("general:navdata_demo"):
-            bits += navdata.StateBit.NAVDATA_DEMO
-        return self._template.packet(bits, self._sequence & 0xFFFF_FFFF, 0)
+        The bits are levels that a pilot's program repeats; a take-off and the toggle follow from their rise.
+        """
+        rises = ref.takes_off and not self._held_take_off
+        toggles = ref.emergency and not self._held_emergency
+        self._held_take_off, self._held_emergency = ref.takes_off, ref.emergency
+        if not (rises or toggles or (not ref.takes_off and self.state in IN_THE_AIR)):
+            if not ref.takes_off and self._mode == "takeoff":  # withdrawn
+                if self._mode_count:  # it is under way, and is followed by a landing
+                    self._sender.mode(self._now_ns, "land")
+                self._mode = None
+            return
+        if self._is_refused("REF"):
+            return
+        if toggles:
+            self._ask("reset" if self.state == "emergency" else "emergency")
+        elif self._mode in ("emergency", "reset"):
+            return
+        elif rises and self.state in ("landed", "landing"):
+            self._ask("takeoff")
+        elif not ref.takes_off and self._mode != "land":
+            self._ask("land")
 
-    def _prepare(self, tags: tuple[int, ...]) -> None:
-        self._template = NavdataTemplate(tags)
-        self._put = {name: self._template.filler(tag) for name, tag in TAG_OF.items()}
-        self._is_gate_new = True
+    def on_pcmd(self, pcmd: Pcmd | PcmdMag) -> None:
+        """Fly it from now on, until another PCMD."""
+        if isinstance(pcmd, PcmdMag):
+            self._psi_rad = math.pi * share(pcmd.psi)
+        if self.state not in IN_THE_AIR or self._mode in ("land", "emergency") or self._is_refused("PCMD"):
+            return
+        setpoint = HOVER
+        if pcmd.flag & at_commands.PROGRESSIVE:
+            heading_rad = self._psi_rad if pcmd.flag & at_commands.ABSOLUTE else None
+            shares = map(share, (pcmd.roll, pcmd.pitch, pcmd.gaz, pcmd.yaw))
+            setpoint = TiltSetpoint(False, *shares, pilot_heading_rad=heading_rad)
+        elif self.calibrates:
+            return
+        self._calibrated_ns = None
+        self._follow(setpoint)
 
-    def _tags(self) -> tuple[int, ...]:
-        """Return the options of a packet; the GPS only if it was requested by its bit."""
-        if self.is_bootstrap:
-            return ()
-        options = int(self._configuration.number("general:navdata_options"))
-        gps = (GPS_TAG,) if options >> GPS_TAG & 1 else ()
-        if not self._configuration.flag("general:navdata_demo"):
-            return (*FULL_TAGS, *gps)
-        return (*(tag for tag in FULL_TAGS if tag == 0 or options >> tag & 1), *gps)
+    def calibrate(self) -> None:
+        """Turn once, in place."""
+        if self.state not in AIRBORNE:
+            self._refuse(f"CALIB is not obeyed: the drone is {self.state}; must be in the air")
+        elif not self._is_refused("CALIB"):
+            self._follow(HOVER)
+            self._calibrated_ns = self._now_ns + self._setpoints.turn_ns
 
+    def on_lost(self) -> None:
+        """Hover in place: the pilot's program is silent; its next REF counts as its first."""
+        self._held_take_off = self._held_emergency = False
+        if self._is_own_flight():
+            self._calibrated_ns = None
+            self._follow(HOVER)
 
-class NavdataContent:
-    """Fills packets with the state of one aircraft."""
+    def land(self) -> None:
+        """Land, since the pilot's program remains silent."""
+        if self._is_own_flight() and self._mode != "land":
+            self._ask("land")
 
-    def __init__(self, state: OnboardState, rotor_max_rad_s: float) -> None:
-        self._state = state
-        self._rotor_max_rad_s = rotor_max_rad_s
-        self._gps: messages.Gps | None = None
-        self._rotors_rad_s: tuple[float, ...] = ()
-        self._sonar: messages.Sonar | None = None
-        self._attitude: Quaternion | None = None
-        self._angles_deg = (0.0, 0.0, 0.0)
-        self._unwrapped_deg = 0.0
+    def _is_own_flight(self) -> bool:
+        return self.state in IN_THE_AIR and self.has_flown and not self.flown_by()
 
-    def update(self, message: Any) -> None:
-        """Keep a message of the drone that the onboard state does not keep."""
-        match message:
-            case messages.Gps():
-                self._gps = message
-            case messages.Sonar():
-                self._sonar = message
-            case flight_messages.Truth():
-                self._rotors_rad_s = message.rotor_rad_s
+    # Gates
 
-    @property
-    def is_sonar_deaf(self) -> bool:
-        """Whether the sonar had no echo last."""
-        return self._sonar is not None and not self._sonar.valid
+    def on_status(self, status: Status) -> None:
+        self._status = status
+        if status.state == "emergency" and self._mode == "takeoff":
+            self._mode = None
+        if status.state != "emergency" and self._mode != "emergency":
+            self.stopped_by_pilot = False
+        if status.state in ("landed", "emergency", "landing"):
+            self.setpoint = self._calibrated_ns = None
+        if status.state in ("landed", "emergency") and self._mode != "takeoff":
+            self.has_flown = False
+        if self._mode is not None:
+            self._pursue(self._mode)
+        if self._calibrated_ns is not None and status.t_ns >= self._calibrated_ns:
+            self._calibrated_ns, self._sent_ns = None, None
+        if self.flown_by():
+            self.setpoint = None
+        self._send_due()
 
-    @property
-    def heading_deg(self) -> float:
-        """Heading by the magnetometer, clockwise from magnetic north, in (-180, 180]; 0 without one."""
-        mag = self._state.mag
-        if mag is None:
-            return 0.0
-        theta_deg, phi_deg, _ = self.angles_deg
-        roll, pitch = math.radians(phi_deg), math.radians(-theta_deg)  # right side down, nose down
-        x, y, z = mag.field_ut
-        sine_roll, cosine_roll = math.sin(roll), math.cos(roll)
-        forward = x * math.cos(pitch) + math.sin(pitch) * (sine_roll * y + cosine_roll * z)
-        left = cosine_roll * y - sine_roll * z
-        return math.degrees(math.atan2(left, forward))
+    def _ask(self, mode: ModeName) -> None:
+        self._mode, self._mode_count = mode, 0
+        self.setpoint = self._calibrated_ns = None
+        self.stopped_by_pilot = mode == "emergency"
+        self._pursue(mode)
 
-    @property
-    def angles_deg(self) -> Vector:
-        """Theta nose up, phi to the right, psi clockwise."""
-        if self._attitude is not self._state.attitude:
-            self._attitude = self._state.attitude
-            last_psi_deg = self._angles_deg[2]
-            self._angles_deg = angles_deg(self._attitude)
-            self._unwrapped_deg += (self._angles_deg[2] - last_psi_deg + 180.0) % 360.0 - 180.0
-        return self._angles_deg
+    def _pursue(self, mode: ModeName) -> None:
+        """Request a mode until it is entered, abandoned, or no longer possible."""
+        entered = {
+            "takeoff": self.state in (*IN_THE_AIR, "emergency"),
+            "land": self.state not in IN_THE_AIR,
+            "emergency": self.state == "emergency",
+            "reset": self.state != "emergency",
+        }
+        if entered[mode]:
+            self._mode = None
+        elif mode == "takeoff" and self.state != "landed":
+            return  # it lands first
+        elif not self._mode_count or self._now_ns - self._mode_ns >= AGAIN_NS:
+            if self._mode_count == ASKED_MAX:
+                self._mode = None
+                return
+            self._mode_ns, self._mode_count = self._now_ns, self._mode_count + 1
+            self.has_flown = self.has_flown or mode == "takeoff"
+            self._sender.mode(self._now_ns, mode)
 
-    def fill_packet(self, put: Putters, ctrl_state: int, t_ns: int) -> None:
-        state = self._state
-        theta, phi, psi = (1e3 * angle for angle in self.angles_deg)
-        charge = state.status.battery_percent if state.status else 0.0
-        velocity = state.flow.velocity_m_s if state.flow else (0.0, 0.0, 0.0)
-        vx, vy, vz = 1e3 * velocity[0], -1e3 * velocity[1], -1e3 * velocity[2]
-        altitude_mm = max(0, round(1e3 * state.altitude_m))
-        put["demo"](ctrl_state, round(charge), theta, phi, psi, altitude_mm, vx, vy, vz, *_UNUSED_OF_DEMO)
-        seconds, rest_ns = divmod(max(0, t_ns), SECOND_NS)
-        put["time"]((seconds & SECONDS_MASK) << SECONDS_SHIFT | rest_ns // 1000)  # begins again after 2048 s
-        put["euler_angles"](theta, phi)
-        if state.imu is not None:
-            fx, fy, fz = (accel / G_M_S2 for accel in state.imu.accel_m_s2)
-            p, q, r = (math.degrees(rate) for rate in state.imu.gyro_rad_s)
-            put["phys_measures"](0.0, 0, 1e3 * fx, -1e3 * fy, -1e3 * fz, p, -q, -r, 0, 0, 0)
-            accs = [round(min(max(ACCEL_ZERO_LSB + ACCEL_LSB_PER_G * f, 0), 2 * _INT16)) for f in (fx, -fy, fz)]
-            gyros = [_int16(GYRO_LSB_PER_DEG_S * rate) for rate in (p, -q, -r)]
-            put["raw_measures"](*accs, *gyros, 0, 0, round(voltage_mv(charge)), *(0,) * 10, self._echo_mm(), 0)
+    def _follow(self, setpoint: TiltSetpoint) -> None:
+        """Set the setpoint, and send it at once if it differs from the last one."""
+        if setpoint != self.setpoint:
+            self.setpoint, self._sent_ns = setpoint, None
+        self._send_due()
 
-    def _echo_mm(self) -> int:
-        return round(1e3 * self._sonar.range_m) if self._sonar and self._sonar.valid else 0
-
-    def fill_gate(self, put: Putters, tags: tuple[int, ...]) -> None:
-        """Fill the values that change with a gate; omitted options cost nothing."""
-        state = self._state
-        climb_mm_s = 1e3 * state.flow.velocity_m_s[2] if state.flow else 0.0
-        if PWM in tags:
-            motors = [0, 0, 0, 0]
-            for i, speed in enumerate(self._rotors_rad_s[:4]):
-                motors[i] = min(PWM_MAX, max(0, round(PWM_MAX * speed / self._rotor_max_rad_s)))
-            put["pwm"](*motors, *(0,) * 4, *(0.0,) * 4, *(0,) * 3, 0.0, *(0,) * 3, 0.0, *(0,) * 4, 0.0, 0.0)
-        if ALTITUDE in tags:
-            altitude_mm = max(0, round(1e3 * state.altitude_m))
-            put["altitude"](altitude_mm, climb_mm_s, 0, self._echo_mm(), *(0.0,) * 5, 0, 0.0, 0.0, 0)
-        if PRESSURE in tags:
-            put["pressure_raw"](0, 0, 0, round(state.baro.pressure_pa) if state.baro else 0)
-        if MAGNETO in tags:
-            x, y, z = state.mag.field_ut if state.mag else (0.0, 0.0, 0.0)
-            field_ut = (x, -y, -z)
-            lsb = [_int16(each / MAG_UT_PER_LSB) for each in field_ut]
-            field_mg = [MG_PER_UT * each for each in field_ut]
-            heading_deg, radius = self.heading_deg, math.hypot(*field_ut) / MAG_UT_PER_LSB
-            headings = (heading_deg, self._unwrapped_deg, heading_deg)
-            is_calibrated = int(state.mag is not None)
-            put["magneto"](*lsb, *field_mg, *field_mg, 0.0, 0.0, 0.0, *headings, is_calibrated, 0, radius, 0.0, 0.0)
-        if KALMAN_PRESSURE in tags:
-            height_mm = 1e3 * state.altitude_m
-            put["kalman_pressure"](0.0, height_mm, climb_mm_s, *(0.0,) * 7, 0, 0.0, 0, 0.0, 0.0, 0, 0)
-        if GPS_TAG in tags and self._gps is not None:
-            self._fill_gps(put["gps"], self._gps)
-
-    def _fill_gps(self, put: Callable[..., None], gps: messages.Gps) -> None:
-        has_fix = int(gps.fix >= FIX_3D)
-        option = LAYOUTS[GPS_TAG].zeros()
-        option = option._replace(
-            latitude_deg=gps.latitude_deg,
-            longitude_deg=gps.longitude_deg,
-            elevation_m=gps.altitude_m,
-            hdop=1.0,
-            data_available=has_fix,
-            zero_validated=has_fix,
-            lat_fused_deg=gps.latitude_deg,
-            lon_fused_deg=gps.longitude_deg,
-            gps_state=has_fix,
-            speed_m_s=math.hypot(gps.velocity_m_s[0], gps.velocity_m_s[1]),
-            degree=math.degrees(math.atan2(gps.velocity_m_s[0], gps.velocity_m_s[1])) % 360.0,
-            ehpe_m=gps.sigma_m,
-            satellites=gps.satellites,
-            plugged=1,
-        )
-        put(*LAYOUTS[GPS_TAG].flat(option))
+    def _send_due(self) -> None:
+        if self.setpoint is None or self.state not in AIRBORNE:
+            return
+        now_ns = self._now_ns
+        if now_ns != self._gate_ns:
+            self._gate_ns, self._gate_count = now_ns, 0
+        is_due = self._sent_ns is None or now_ns - self._sent_ns >= self._setpoints.repeat_ns(self.setpoint)
+        if is_due and self._gate_count < PER_GATE:
+            self._sent_ns, self._gate_count, self.has_flown = now_ns, self._gate_count + 1, True
+            if self.calibrates:
+                self._setpoints.send_turn(now_ns)
+            else:
+                self._setpoints.send(now_ns, self.setpoint)
 
 
-def angles_deg(q_WB: Quaternion) -> Vector:
-    """Return theta nose up, phi to the right and psi clockwise [deg] of an attitude; psi is 0 towards east."""
-    w, x, y, z = q_WB
-    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    pitch = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
-    yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    return -math.degrees(pitch), math.degrees(roll), -math.degrees(yaw)
+class SetpointSender:
+    """Sends setpoints to one drone: shares of the firmware's limits, below a height, in the drone's frame.
+
+    Args:
+        limits: the values of zsim's shares of 1.
+        configuration: has the values of the pilot's shares of 1.
+
+    Attributes:
+        altitude_m, heading_rad: over the ground, and clockwise from magnetic north, to be kept up to date.
+        turn_ns: time of a whole turn of the calibration.
+    """
+
+    def __init__(self, sender: CommandSender, limits: Limits, configuration: Configuration) -> None:
+        self._sender = sender
+        self._configuration = configuration
+        self._tilt_slope = el.tan(math.radians(limits.tilt_deg))
+        self._climb_m_s, self._yaw_rad_s = limits.vertical_speed_m_s, math.radians(limits.yaw_rate_deg_s)
+        self._turn_rad_s = min(CALIBRATION_YAW_RAD_S, self._yaw_rad_s)
+        self.turn_ns = round(2e9 * math.pi / self._turn_rad_s)
+        self.altitude_m = 0.0
+        self.heading_rad = 0.0
+
+    def repeat_ns(self, setpoint: TiltSetpoint) -> int:
+        """Return after how long a setpoint is sent again; at every gate if it depends on height or heading."""
+        if setpoint.pilot_heading_rad is not None:
+            return 0
+        climb_m_s = self._configuration.number("control:control_vz_max") / 1e3 if setpoint.up > 0.0 else -math.inf
+        return 0 if self._climb_left_m_s() < climb_m_s else REPEAT_NS
+
+    def send(self, t_ns: int, setpoint: TiltSetpoint) -> None:
+        if setpoint.hover:
+            self._sender.tilt(t_ns, 0.0, 0.0, 0.0, 0.0, hover=True)
+            return
+        number = self._configuration.number
+        right, back = setpoint.right, setpoint.back
+        if setpoint.pilot_heading_rad is not None:
+            turn = setpoint.pilot_heading_rad - self.heading_rad
+            sine, cosine = el.sin(turn), el.cos(turn)
+            right, back = cosine * right - sine * back, sine * right + cosine * back
+        tilt_rad = number("control:euler_angle_max")
+        right, back = (share(el.tan(part * tilt_rad) / self._tilt_slope) for part in (right, back))
+        climb_m_s = min(setpoint.up * number("control:control_vz_max") / 1e3, self._climb_left_m_s())
+        yaw_left = share(-setpoint.clockwise * number("control:control_yaw") / self._yaw_rad_s)
+        self._sender.tilt(t_ns, -back, -right, share(climb_m_s / self._climb_m_s), yaw_left, hover=False)
+
+    def send_turn(self, t_ns: int) -> None:
+        self._sender.velocity(t_ns, (0.0, 0.0, 0.0), -self._turn_rad_s)
+
+    def _climb_left_m_s(self) -> float:
+        """Return how fast it may climb below altitude_max."""
+        highest_mm = self._configuration.number("control:altitude_max")
+        if highest_mm >= NO_ALTITUDE_LIMIT_MM:
+            return math.inf
+        return CLIMB_1_S * (highest_mm / 1e3 - self.altitude_m)
 
 
-def voltage_mv(charge_percent: float) -> float:
-    for (low, low_mv), (high, high_mv) in pairwise(VOLTAGE_MV):
-        if charge_percent <= high:
-            return low_mv + (high_mv - low_mv) * max(0.0, charge_percent - low) / (high - low)
-    return VOLTAGE_MV[-1][1]
-
-
-def _int16(value: float) -> int:
-    return round(min(max(value, -_INT16), _INT16))
+def share(value: float) -> float:
+    """Return a share of a limit, clipped to [-1, 1]."""
+    return min(1.0, max(-1.0, value))

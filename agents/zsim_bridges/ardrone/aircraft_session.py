@@ -18,11 +18,18 @@ from zsim.schema.quantities import G_M_S2
 from zsim_bridges.ardrone import at_commands, navdata
 from zsim_bridges.ardrone.at_commands import Command, Config, Control, Pcmd, ResetWatchdog
 from zsim_bridges.ardrone.navdata import (
+    ALTITUDE,
+    DEMO,
+    FIX_3D,
     FULL_TAGS,
     GPS_TAG,
+    MAG_UT_PER_LSB,
+    MAGNETO,
     MICROSECONDS,
+    PHYS,
+    PRESSURE,
     SECONDS_SHIFT,
-    TAG_OF,
+    TIME,
     ControlState,
     Navdata,
     NavdataError,
@@ -63,14 +70,10 @@ STATES: dict[int, DroneState] = {
     ControlState.LOOPING: "flying",
 }
 OPTIONS_MASK = sum(1 << tag for tag in (*FULL_TAGS, GPS_TAG))
-DEMO, TIME, PHYS, ALTITUDE = (TAG_OF[name] for name in ("demo", "time", "phys_measures", "altitude"))
-PRESSURE, MAGNETO = TAG_OF["pressure_raw"], TAG_OF["magneto"]
-UT_PER_LSB = 0.3  # uT, AK8975 data sheet
 SONAR_MM = range(30, 6000)  # mm; outside there was no echo
 GPS_1_S = 0.1  # 1/s, chosen: how fast the position follows the GPS, whose noise is 2 m at 5 Hz, for 0.3 m
 YAW_1_S = 0.1  # 1/s, chosen: how fast the heading follows the magnetometer
 GAP_S_MAX = 0.5  # s; over longer gaps nothing is integrated
-GPS_FIX = 3  # three-dimensional
 
 
 # What the aircraft is given; the limits are the SDK's own: of tilt and climb outdoors, of yaw rate indoors
@@ -312,7 +315,7 @@ class NavdataReadings(AircraftReadings):
             gyro = tuple(map(math.radians, _flipped(phys.phys_gyros_deg_s)))
             self.read("imu", taken_ns, accel, gyro)
         if mag := options.get(MAGNETO):
-            self.read("mag", taken_ns, tuple(UT_PER_LSB * part for part in _flipped((mag.mx, mag.my, mag.mz))))
+            self.read("mag", taken_ns, tuple(MAG_UT_PER_LSB * part for part in _flipped((mag.mx, mag.my, mag.mz))))
         if (pressure := options.get(PRESSURE)) and pressure.pressure_pa > 0:
             height_m = self.pose.position_m[2] if self.pose else self._ground_m
             self.read_pressure(taken_ns, float(pressure.pressure_pa), height_m)
@@ -358,7 +361,7 @@ class NavdataReadings(AircraftReadings):
     def _on_gps(self, gps: Any, taken_ns: int) -> None:
         """Process each fix once, and let the position follow it."""
         place = gps.latitude_deg, gps.longitude_deg, gps.elevation_m
-        values = self.gps_values(place, gps.speed_m_s, math.radians(gps.degree), gps.ehpe_m, GPS_FIX, gps.satellites)
+        values = self.gps_values(place, gps.speed_m_s, math.radians(gps.degree), gps.ehpe_m, FIX_3D, gps.satellites)
         before_ns, fix = self._gps_ns, (place, gps.speed_m_s, gps.degree)
         if fix != self._fix and self.read("gps", taken_ns, *values):
             self._gps_ns, self._fix = taken_ns, fix

@@ -1,16 +1,23 @@
-r"""AT commands, which a pilot's program sends to UDP port 5556.
+r"""What a pilot's program sends to an AR.Drone 2.0: AT commands on UDP port 5556, and with them its configuration.
 
 A datagram holds one or more `AT*NAME=sequence,argument,...\r`, whole. Integers are decimal, strings are quoted, a float
 is written as the signed integer that has the same 32 bits.
 
-Source: AR.Drone Developer Guide SDK 2.0, chapter 6; ARDroneLib, ardrone_api.c.
+Beside the common values of the configuration, an application, a user (`profile`) and a session have values of their
+own, each under an identifier, for the entries of their category. Whoever writes an identifier of `custom` makes it the
+current one; an unknown one begins with the defaults. The aircraft sends its configuration on the control port, TCP
+5559: a line `section:key = value\n` for each entry, and a zero byte. The list of custom configurations has blocks
+`[applis]`, `[profiles]`, `[sessions]`, with a line `id,description` for each, all ended by `\r`, and a zero byte.
+
+Source: AR.Drone Developer Guide SDK 2.0, chapters 6 and 8; ARDroneLib (SDK 2.0.1), ardrone_api.c, config_keys.h,
+ardrone_control.c and ardrone_control_configuration.c.
 """
 
 import math
 import re
 import struct
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal, NamedTuple
 
 PORT = 5556  # UDP (ARDroneLib, config.h)
 DATAGRAM_MAX = 8192  # bytes, chosen: eight commands of the greatest length
@@ -256,3 +263,278 @@ def ref(sequence: int, takes_off: bool, emergency: bool = False) -> Ref:
     """Return a REF with the bits that are always set."""
     bits = REF_CONSTANT | (TAKE_OFF_BIT if takes_off else 0) | (EMERGENCY_BIT if emergency else 0)
     return Ref(sequence, bits)
+
+
+CONTROL_PORT = 5559  # TCP (ARDroneLib, config.h)
+TEXT_MAX = 128  # characters of a value (Developer Guide 8.1)
+DEFAULT_ID = "00000000"  # of each level (Developer Guide 8.1)
+KEPT_MAX = 64  # configurations of a level, chosen: identifiers cost their sender nothing
+END = b"\0"
+_BLOCKS = ("applis", "profiles", "sessions")
+_ID = re.compile(r"[0-9A-Za-z]{1,32}")
+Category = Literal["common", "application", "user", "session"]
+_LEVELS: dict[str, Category] = {"application": "application", "profile": "user", "session": "session"}
+"""Categories by the name that `custom` has for them."""
+
+
+class ConfigurationEntry(NamedTuple):
+    """An entry of the configuration; `fixed` cannot be written."""
+
+    kind: Literal["flag", "whole", "number", "text", "fixed"]
+    category: Category
+    default: str
+    low: float = 0.0
+    high: float = 0.0
+
+
+LIMITS = ("euler_angle_max", "control_vz_max", "control_yaw")
+"""Of tilt [rad], climb [mm/s] and yaw rate [rad/s]: the aircraft keeps a set for indoors and one for outdoors."""
+_ALTITUDE = "20|100000"  # mm; the highest means that there is no limit (ARDroneLib)
+_TILT, _CLIMB, _YAW = "0|0.52", "200|2000", "0.7|6.11"  # rad, mm/s, rad/s (Developer Guide 8.6)
+_CODE = "0|255"  # codecs, modes and channels, as numbers of a byte
+_MASK = "0|4294967295"
+_RATE = "0|20000"  # kbit/s
+_MOTORS = "\n".join(
+    f"general:motor{i}_{part}|fixed|common|0.0" for i in range(1, 5) for part in ("soft", "hard", "supplier")
+)
+_TABLE = f"""
+general:num_version_config|fixed|common|1
+general:num_version_mb|fixed|common|33
+general:num_version_soft|fixed|common|2.4.8
+general:drone_serial|fixed|common|XXXXXXXXXX
+general:soft_build_date|fixed|common|2014-01-01 00:00
+{_MOTORS}
+general:flying_time|fixed|common|0
+general:vbat_min|fixed|common|9000
+control:accs_offset|fixed|common|{{ -2.0480000e+03 2.0480000e+03 2.0480000e+03 }}
+control:accs_gains|fixed|common|{{ 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0 }}
+control:gyros_offset|fixed|common|{{ 1.6625000e+03 1.6625000e+03 1.6625000e+03 }}
+control:gyros_gains|fixed|common|{{ 6.8940529e-03 -6.8940529e-03 -3.6215587e-03 }}
+control:gyros110_offset|fixed|common|{{ 1.6625000e+03 1.6625000e+03 }}
+control:gyros110_gains|fixed|common|{{ 1.5271631e-03 -1.5271631e-03 }}
+control:magneto_offset|fixed|common|{{ 0.0 0.0 0.0 }}
+control:magneto_radius|fixed|common|0.0
+control:gyro_offset_thr_x|fixed|common|4.0
+control:gyro_offset_thr_y|fixed|common|4.0
+control:gyro_offset_thr_z|fixed|common|0.5
+control:pwm_ref_gyros|fixed|common|500
+control:osctun_value|fixed|common|0
+control:osctun_test|fixed|common|FALSE
+pic:ultrasound_watchdog|fixed|common|3
+pic:pic_version|fixed|common|262192
+video:camif_fps|fixed|common|30
+video:camif_buffers|fixed|common|2
+video:num_trackers|fixed|common|12
+video:video_storage_space|fixed|common|0
+general:ardrone_name|text|common|My ARDrone
+general:navdata_demo|flag|common|FALSE
+general:navdata_options|whole|application|65537|{_MASK}
+general:com_watchdog|whole|common|2|1|60
+general:video_enable|flag|common|TRUE
+general:vision_enable|flag|common|TRUE
+control:control_level|whole|application|0|{_CODE}
+control:euler_angle_max|number|user|0.20944|{_TILT}
+control:control_vz_max|number|user|700|{_CLIMB}
+control:control_yaw|number|user|1.7453|{_YAW}
+control:indoor_euler_angle_max|number|user|0.20944|{_TILT}
+control:indoor_control_vz_max|number|user|700|{_CLIMB}
+control:indoor_control_yaw|number|user|1.7453|{_YAW}
+control:outdoor_euler_angle_max|number|user|0.34907|{_TILT}
+control:outdoor_control_vz_max|number|user|1000|{_CLIMB}
+control:outdoor_control_yaw|number|user|3.4907|{_YAW}
+control:altitude_max|whole|common|3000|{_ALTITUDE}
+control:altitude_min|whole|common|50|{_ALTITUDE}
+control:control_iphone_tilt|number|user|0.34907|{_TILT}
+control:outdoor|flag|common|FALSE
+control:flight_without_shell|flag|common|FALSE
+control:autonomous_flight|flag|common|FALSE
+control:manual_trim|flag|user|FALSE
+control:flying_mode|whole|session|0|0|2
+control:hovering_range|whole|session|1000|0|100000
+control:flight_anim|text|common|0,0
+control:flying_camera_enable|flag|session|FALSE
+control:flying_camera_mode|text|session|
+network:ssid_single_player|text|common|ardrone2
+network:ssid_multi_player|text|common|ardrone2
+network:wifi_mode|whole|common|0|0|2
+network:wifi_rate|whole|common|0|{_CODE}
+network:owner_mac|text|common|00:00:00:00:00:00
+pic:ultrasound_freq|whole|common|8|7|8
+video:codec_fps|whole|session|30|1|30
+video:video_codec|whole|session|129|{_CODE}
+video:video_slices|whole|session|0|{_CODE}
+video:video_live_socket|whole|session|0|{_CODE}
+video:bitrate|whole|application|1000|{_RATE}
+video:max_bitrate|whole|session|1000|{_RATE}
+video:bitrate_ctrl_mode|whole|application|0|0|2
+video:bitrate_storage|whole|application|4000|{_RATE}
+video:video_channel|whole|session|0|0|4
+video:video_on_usb|flag|common|TRUE
+video:video_file_index|whole|common|1|{_MASK}
+leds:leds_anim|text|common|0,0,0
+detect:enemy_colors|whole|session|1|{_CODE}
+detect:groundstripe_colors|whole|session|16|{_CODE}
+detect:enemy_without_shell|whole|session|0|{_CODE}
+detect:detect_type|whole|session|3|{_CODE}
+detect:detections_select_h|whole|session|0|{_MASK}
+detect:detections_select_v_hsync|whole|session|0|{_MASK}
+detect:detections_select_v|whole|session|0|{_MASK}
+syslog:output|whole|common|7|{_MASK}
+syslog:max_size|whole|common|102400|{_MASK}
+syslog:nb_files|whole|common|5|{_CODE}
+userbox:userbox_cmd|text|session|0
+gps:latitude|number|session|500|-1000|1000
+gps:longitude|number|session|500|-1000|1000
+gps:altitude|number|session|0|-1e5|1e5
+"""
+ENTRIES: dict[str, ConfigurationEntry] = {}
+"""By `section:key`; in addition, there are the identifiers and descriptions of `custom`."""
+for _name, _kind, _category, _default, *_range in (line.split("|") for line in _TABLE.split("\n") if line):
+    ENTRIES[_name] = ConfigurationEntry(_kind, _category, _default, *map(float, _range))  # type: ignore[arg-type]
+
+
+class ConfigurationError(ValueError):
+    """An entry is refused; the text says why."""
+
+
+class Configuration:
+    """The values of all entries.
+
+    Args:
+        highest: the greatest value that the aircraft flies by, for entries where it is below the SDK's.
+        fixed: values of entries that are the aircraft's own.
+    """
+
+    def __init__(self, highest: Mapping[str, float], fixed: Mapping[str, str]) -> None:
+        self._highest = highest
+        self._common: dict[str, str] = dict(fixed)
+        self._kept: dict[Category, dict[str, dict[str, str]]] = {level: {DEFAULT_ID: {}} for level in _LEVELS.values()}
+        self._described: dict[Category, dict[str, str]] = {level: {DEFAULT_ID: "default"} for level in _LEVELS.values()}
+        self._current: dict[Category, str] = dict.fromkeys(_LEVELS.values(), DEFAULT_ID)
+
+    def text(self, key: str) -> str:
+        """Return the value of an entry as it is written."""
+        entry = ENTRIES[key]
+        value = self._values(entry).get(key, entry.default)
+        high = self._highest.get(key)
+        return value if high is None or float(value) <= high else f"{high:g}"
+
+    def number(self, key: str) -> float:
+        return float(self.text(key))
+
+    def flag(self, key: str) -> bool:
+        return self.text(key) == "TRUE"
+
+    def all(self) -> dict[str, str]:
+        """Return all entries, those of `custom` last."""
+        custom: dict[str, str] = {}
+        for name, level in _LEVELS.items():
+            current = self._current[level]
+            custom[f"custom:{name}_id"] = current
+            custom[f"custom:{name}_desc"] = self._described[level][current]
+        return {**{key: self.text(key) for key in ENTRIES}, **custom}
+
+    def custom_list(self) -> dict[str, dict[str, str]]:
+        """Return the custom configurations that are kept: descriptions by identifier, by the block of their level."""
+        return {block: dict(self._described[level]) for block, level in zip(_BLOCKS, _LEVELS.values(), strict=True)}
+
+    def is_current(self, session: str, user: str, application: str) -> bool:
+        current = self._current
+        return (session, user, application) == (current["session"], current["user"], current["application"])
+
+    def set(self, key: str, value: str) -> None:
+        """Set an entry.
+
+        Raises:
+            ConfigurationError: there is no such entry, it cannot be written, or it cannot have the value.
+        """
+        key = key.lower()
+        section, _, name = key.partition(":")
+        if section == "custom":
+            self._set_custom(name, value)
+            return
+        entry = ENTRIES.get(key)
+        if entry is None:
+            raise ConfigurationError(f"{key[:60]!r} is not an entry of the configuration")
+        self._values(entry)[key] = _checked(key, entry, value)
+        # the limits in force are those of the set in use
+        place = "outdoor" if self.flag("control:outdoor") else "indoor"
+        if key == "control:outdoor":
+            for limit in LIMITS:
+                self._copy(f"control:{place}_{limit}", f"control:{limit}")
+        elif section == "control" and name in LIMITS:
+            self._copy(key, f"control:{place}_{name}")
+        elif section == "control" and name.removeprefix(f"{place}_") in LIMITS:
+            self._copy(key, f"control:{name.removeprefix(f'{place}_')}")
+
+    def _values(self, entry: ConfigurationEntry) -> dict[str, str]:
+        if entry.category == "common":
+            return self._common
+        return self._kept[entry.category][self._current[entry.category]]
+
+    def _copy(self, key: str, to_key: str) -> None:
+        values = self._values(ENTRIES[to_key])
+        values[to_key] = self._values(ENTRIES[key]).get(key, ENTRIES[key].default)
+
+    def _set_custom(self, name: str, value: str) -> None:
+        prefix, _, what = name.rpartition("_")
+        level = _LEVELS.get(prefix)
+        if level is None or what not in ("id", "desc"):
+            raise ConfigurationError(f"'custom:{name[:40]}' is not an entry of the configuration")
+        if what == "desc":
+            self._described[level][self._current[level]] = _checked_text(f"custom:{name}", value)
+        elif value.startswith("-"):
+            identifier = value[1:]
+            deleted = [each for each in self._kept[level] if each != DEFAULT_ID and identifier in ("all", each)]
+            if not deleted and identifier != "all":
+                raise ConfigurationError(f"there is no configuration {identifier[:40]!r} of the level {level}")
+            for each in deleted:
+                del self._kept[level][each], self._described[level][each]
+            if self._current[level] not in self._kept[level]:
+                self._current[level] = DEFAULT_ID
+        else:
+            if not _ID.fullmatch(value):
+                raise ConfigurationError(f"the identifier {value[:40]!r} must be letters and digits, at most 32")
+            if value not in self._kept[level]:
+                if len(self._kept[level]) >= KEPT_MAX:
+                    raise ConfigurationError(f"there are {KEPT_MAX} configurations of the level {level}; delete some")
+                self._kept[level][value], self._described[level][value] = {}, ""
+            self._current[level] = value
+
+
+def _checked(key: str, entry: ConfigurationEntry, value: str) -> str:
+    """Return a value as it is stored: a number is clipped to its range."""
+    if entry.kind == "fixed":
+        raise ConfigurationError(f"{key} is read only")
+    if entry.kind == "text":
+        return _checked_text(key, value)
+    if entry.kind == "flag":
+        flag = {"TRUE": "TRUE", "1": "TRUE", "FALSE": "FALSE", "0": "FALSE"}.get(value.strip().upper())
+        if flag is None:
+            raise ConfigurationError(f"{key} is set to {value[:40]!r}; must be TRUE or FALSE")
+        return flag
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise ConfigurationError(f"{key} is set to {value[:40]!r}; must be a number")
+    number = min(max(number, entry.low), entry.high)
+    return str(round(number)) if entry.kind == "whole" else f"{number:g}"
+
+
+def _checked_text(key: str, value: str) -> str:
+    if len(value) > TEXT_MAX or not value.isprintable():
+        raise ConfigurationError(f"{key} is set to {value[:40]!r}; must be printable, at most {TEXT_MAX} characters")
+    return value
+
+
+def format_configuration(entries: Mapping[str, str]) -> bytes:
+    return "".join(f"{key} = {value}\n" for key, value in entries.items()).encode("ascii", "replace") + END
+
+
+def format_custom_list(kept: Mapping[str, Mapping[str, str]]) -> bytes:
+    parts: list[str] = []
+    for block, entries in kept.items():
+        parts += [f"[{block}]", *(f"{identifier},{text}" for identifier, text in entries.items())]
+    return "".join(f"{part}\r" for part in parts).encode("ascii", "replace") + END

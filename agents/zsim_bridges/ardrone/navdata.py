@@ -1,22 +1,30 @@
-"""Navdata: the packets that an aircraft sends from UDP port 5554, and their options as a table.
+"""Navdata: the packets that an aircraft sends from UDP port 5554, their options as a table, and what they contain.
 
 A packet is a header (magic, state bits, sequence number, vision flag; uint32 each), options, and last the checksum
 option, the sum of all bytes before it. An option begins with its tag and its size in bytes, both uint16, these four
 bytes included. All is little-endian and packed. The table has the form that `wire_table` describes: angles are in
 millidegrees where a name says so, theta nose up, phi to the right, psi clockwise; axes x forward, y right, z down.
 
+Order of this file: the packets; then `NavdataSender`, when they are sent, and `NavdataContent`, their values. Pure.
 Source: AR.Drone Developer Guide SDK 2.0, chapter 7; ARDroneLib (SDK 2.0.1), navdata_common.h and config.h; the GPS
 option of firmware 2.4 and later: its branch `gps`.
 """
 
+import math
 import struct
 from collections import namedtuple
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from enum import IntEnum, IntFlag
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from zsim.contract import flight_messages, messages
+from zsim.math.rotation import Quaternion, Vector
+from zsim.schema.quantities import G_M_S2
+from zsim_bridges.ardrone.at_commands import Configuration
+from zsim_bridges.vehicle_links.drone_link import OnboardState
 from zsim_bridges.vehicle_links.wire_table import Entry, WireLayout, read_table
 
 PORT = 5554  # UDP (ARDroneLib, config.h)
@@ -28,6 +36,24 @@ SECONDS_SHIFT, MICROSECONDS = 21, (1 << 21) - 1  # of option time: seconds above
 HEADER = struct.Struct("<HH")  # tag, size
 CHECKSUM_TAG = 0xFFFF
 GPS_TAG = 27  # zimmu_3000 of 12 bytes in older SDKs
+CLIENTS_MAX = 8  # programs that receive navdata, chosen; beyond it the oldest one is dropped
+REQUESTS = (b"\x01", b"Init")  # how a request for navdata begins (ARDroneLib; its Windows client)
+SECOND_NS = 1_000_000_000
+ACCEL_LSB_PER_G, ACCEL_ZERO_LSB = 512, 2048  # of the raw accelerometer, nominal (measured: 516 to 518, 2031 to 2038)
+GYRO_LSB_PER_DEG_S = 16.4  # of the raw gyro (measured on an aircraft)
+MAG_UT_PER_LSB = 0.3  # uT (AK8975 datasheet)
+MG_PER_UT = 10.0  # milligauss
+PWM_MAX = 255  # of a motor at its greatest speed; below, in proportion, chosen: the curve is not published
+VOLTAGE_MV = ((0.0, 9000.0), (10.0, 10_500.0), (50.0, 11_686.0), (100.0, 12_500.0))
+"""Battery [mV] by charge [%]: vbat_min of the SDK, two chosen, and 50 % as an aircraft showed it."""
+SECONDS_MASK = 0x7FF  # 11 bits
+FIX_3D = 3  # of a GPS receiver, as in NMEA
+_INT16 = 32_767
+_UNUSED_OF_DEMO = (0, *(0.0,) * 12, 0, 0, *(0.0,) * 12)  # frames, and what the cameras detect
+Send = Callable[[bytes, Hashable], None]
+"""Sends a datagram to an address."""
+Putters = dict[str, Callable[..., None]]
+"""By the name of an option, what writes its numbers."""
 _START = struct.Struct("<IIII")
 _SUM = struct.Struct("<HHI")
 _MOST = 1 << 32
@@ -109,6 +135,9 @@ TAG_OF = {layout.name: tag for tag, layout in LAYOUTS.items()}
 FULL_TAGS = tuple(tag for tag in LAYOUTS if tag < GPS_TAG)
 """The options of a packet of all options: 1904 bytes. The GPS is sent only on request, because readers differ in what
 its tag means."""
+DEMO, TIME, PHYS, PWM = (TAG_OF[name] for name in ("demo", "time", "phys_measures", "pwm"))
+ALTITUDE, PRESSURE, MAGNETO = (TAG_OF[name] for name in ("altitude", "pressure_raw", "magneto"))
+KALMAN_PRESSURE = TAG_OF["kalman_pressure"]
 
 
 StateBit = IntFlag(
@@ -237,3 +266,246 @@ class NavdataTemplate:
         total = int(self._body.sum(dtype=np.uint64)) % _MOST
         _SUM.pack_into(self._packet, self._end, CHECKSUM_TAG, _SUM.size, total)
         return bytes(self._packet)
+
+
+class NavdataSender:
+    """Sends an aircraft's navdata: when packets are due, their options, receivers and contents.
+
+    The SDK's body axes are x forward, y right, z down; its angles theta nose up, phi to the right, psi clockwise, 0
+    where the aircraft was switched on. What no sensor of the drone measures is zero.
+
+    Args:
+        state_bits: returns the state word without the bits of the mode of navdata.
+        ctrl_state: returns the state of the flight.
+        refuse: counts what cannot be sent, with the reason.
+
+    Attributes:
+        clients: addresses to which navdata is sent, the first that asked first.
+        is_bootstrap: whether packets have no options yet.
+    """
+
+    def __init__(
+        self,
+        content: "NavdataContent",
+        configuration: Configuration,
+        send: Send,
+        state_bits: Callable[[], int],
+        ctrl_state: Callable[[], int],
+        refuse: Callable[[str], None],
+    ) -> None:
+        self._content = content
+        self._configuration = configuration
+        self._send = send
+        self._state_bits = state_bits
+        self._ctrl_state = ctrl_state
+        self._refuse = refuse
+        self._last: tuple[int, int] | None = None  # rate [Hz], and number of the packet within the simulated time
+        self.clients: dict[Hashable, None] = {}
+        self._sequence = 0
+        self._prepare(())
+        self.is_bootstrap = True
+
+    def on_request(self, datagram: bytes, address: Hashable, t_ns: int) -> bool:
+        """Send navdata to an address from now on; return False for a datagram that does not ask for it."""
+        if not datagram.startswith(REQUESTS):
+            return False
+        if address not in self.clients:
+            while len(self.clients) >= CLIENTS_MAX:
+                del self.clients[next(iter(self.clients))]
+            self.clients[address] = None
+            self._send(self._packet(t_ns), address)
+        return True
+
+    def on_instant(self, t_ns: int) -> None:
+        """Send the packet that is due: a fixed number in each simulated second, without drift."""
+        is_full = not (self.is_bootstrap or self._configuration.flag("general:navdata_demo"))
+        rate_hz = FULL_RATE_HZ if is_full else DEMO_RATE_HZ
+        number = rate_hz, t_ns * rate_hz // SECOND_NS
+        if self.clients and number != self._last:
+            self._last = number
+            packet = self._packet(t_ns)
+            for address in tuple(self.clients):
+                self._send(packet, address)
+
+    def on_gate(self) -> None:
+        """Update the values that change at gates."""
+        self._is_gate_new = True
+
+    def _packet(self, t_ns: int) -> bytes:
+        tags = self._tags()
+        if tags != self._template.tags:
+            self._prepare(tags)
+        try:
+            if self._is_gate_new:
+                self._is_gate_new = False
+                self._content.fill_gate(self._put, tags)
+            self._content.fill_packet(self._put, self._ctrl_state(), t_ns)
+        except (struct.error, ArithmeticError, ValueError) as error:
+            self._refuse(f"navdata has a value beyond what its field can hold ({error})")
+        self._sequence += 1
+        bits = self._state_bits()
+        if self.is_bootstrap:
+            bits += StateBit.NAVDATA_BOOTSTRAP + StateBit.NAVDATA_DEMO
+        elif self._configuration.flag("general:navdata_demo"):
+            bits += StateBit.NAVDATA_DEMO
+        return self._template.packet(bits, self._sequence & 0xFFFF_FFFF, 0)
+
+    def _prepare(self, tags: tuple[int, ...]) -> None:
+        self._template = NavdataTemplate(tags)
+        self._put = {name: self._template.filler(tag) for name, tag in TAG_OF.items()}
+        self._is_gate_new = True
+
+    def _tags(self) -> tuple[int, ...]:
+        """Return the options of a packet; the GPS only if it was requested by its bit."""
+        if self.is_bootstrap:
+            return ()
+        options = int(self._configuration.number("general:navdata_options"))
+        gps = (GPS_TAG,) if options >> GPS_TAG & 1 else ()
+        if not self._configuration.flag("general:navdata_demo"):
+            return (*FULL_TAGS, *gps)
+        return (*(tag for tag in FULL_TAGS if tag == 0 or options >> tag & 1), *gps)
+
+
+class NavdataContent:
+    """Fills packets with the state of one aircraft."""
+
+    def __init__(self, state: OnboardState, rotor_max_rad_s: float) -> None:
+        self._state = state
+        self._rotor_max_rad_s = rotor_max_rad_s
+        self._gps: messages.Gps | None = None
+        self._rotors_rad_s: tuple[float, ...] = ()
+        self._sonar: messages.Sonar | None = None
+        self._attitude: Quaternion | None = None
+        self._angles_deg = (0.0, 0.0, 0.0)
+        self._unwrapped_deg = 0.0
+
+    def update(self, message: Any) -> None:
+        """Keep a message of the drone that the onboard state does not keep."""
+        match message:
+            case messages.Gps():
+                self._gps = message
+            case messages.Sonar():
+                self._sonar = message
+            case flight_messages.Truth():
+                self._rotors_rad_s = message.rotor_rad_s
+
+    @property
+    def is_sonar_deaf(self) -> bool:
+        """Whether the sonar had no echo last."""
+        return self._sonar is not None and not self._sonar.valid
+
+    @property
+    def heading_deg(self) -> float:
+        """Heading by the magnetometer, clockwise from magnetic north, in (-180, 180]; 0 without one."""
+        mag = self._state.mag
+        if mag is None:
+            return 0.0
+        theta_deg, phi_deg, _ = self.angles_deg
+        roll, pitch = math.radians(phi_deg), math.radians(-theta_deg)  # right side down, nose down
+        x, y, z = mag.field_ut
+        sine_roll, cosine_roll = math.sin(roll), math.cos(roll)
+        forward = x * math.cos(pitch) + math.sin(pitch) * (sine_roll * y + cosine_roll * z)
+        left = cosine_roll * y - sine_roll * z
+        return math.degrees(math.atan2(left, forward))
+
+    @property
+    def angles_deg(self) -> Vector:
+        """Theta nose up, phi to the right, psi clockwise."""
+        if self._attitude is not self._state.attitude:
+            self._attitude = self._state.attitude
+            last_psi_deg = self._angles_deg[2]
+            self._angles_deg = angles_deg(self._attitude)
+            self._unwrapped_deg += (self._angles_deg[2] - last_psi_deg + 180.0) % 360.0 - 180.0
+        return self._angles_deg
+
+    def fill_packet(self, put: Putters, ctrl_state: int, t_ns: int) -> None:
+        state = self._state
+        theta, phi, psi = (1e3 * angle for angle in self.angles_deg)
+        charge = state.status.battery_percent if state.status else 0.0
+        velocity = state.flow.velocity_m_s if state.flow else (0.0, 0.0, 0.0)
+        vx, vy, vz = 1e3 * velocity[0], -1e3 * velocity[1], -1e3 * velocity[2]
+        altitude_mm = max(0, round(1e3 * state.altitude_m))
+        put["demo"](ctrl_state, round(charge), theta, phi, psi, altitude_mm, vx, vy, vz, *_UNUSED_OF_DEMO)
+        seconds, rest_ns = divmod(max(0, t_ns), SECOND_NS)
+        put["time"]((seconds & SECONDS_MASK) << SECONDS_SHIFT | rest_ns // 1000)  # begins again after 2048 s
+        put["euler_angles"](theta, phi)
+        if state.imu is not None:
+            fx, fy, fz = (accel / G_M_S2 for accel in state.imu.accel_m_s2)
+            p, q, r = (math.degrees(rate) for rate in state.imu.gyro_rad_s)
+            put["phys_measures"](0.0, 0, 1e3 * fx, -1e3 * fy, -1e3 * fz, p, -q, -r, 0, 0, 0)
+            accs = [round(min(max(ACCEL_ZERO_LSB + ACCEL_LSB_PER_G * f, 0), 2 * _INT16)) for f in (fx, -fy, fz)]
+            gyros = [_int16(GYRO_LSB_PER_DEG_S * rate) for rate in (p, -q, -r)]
+            put["raw_measures"](*accs, *gyros, 0, 0, round(voltage_mv(charge)), *(0,) * 10, self._echo_mm(), 0)
+
+    def _echo_mm(self) -> int:
+        return round(1e3 * self._sonar.range_m) if self._sonar and self._sonar.valid else 0
+
+    def fill_gate(self, put: Putters, tags: tuple[int, ...]) -> None:
+        """Fill the values that change with a gate; omitted options cost nothing."""
+        state = self._state
+        climb_mm_s = 1e3 * state.flow.velocity_m_s[2] if state.flow else 0.0
+        if PWM in tags:
+            motors = [0, 0, 0, 0]
+            for i, speed in enumerate(self._rotors_rad_s[:4]):
+                motors[i] = min(PWM_MAX, max(0, round(PWM_MAX * speed / self._rotor_max_rad_s)))
+            put["pwm"](*motors, *(0,) * 4, *(0.0,) * 4, *(0,) * 3, 0.0, *(0,) * 3, 0.0, *(0,) * 4, 0.0, 0.0)
+        if ALTITUDE in tags:
+            altitude_mm = max(0, round(1e3 * state.altitude_m))
+            put["altitude"](altitude_mm, climb_mm_s, 0, self._echo_mm(), *(0.0,) * 5, 0, 0.0, 0.0, 0)
+        if PRESSURE in tags:
+            put["pressure_raw"](0, 0, 0, round(state.baro.pressure_pa) if state.baro else 0)
+        if MAGNETO in tags:
+            x, y, z = state.mag.field_ut if state.mag else (0.0, 0.0, 0.0)
+            field_ut = (x, -y, -z)
+            lsb = [_int16(each / MAG_UT_PER_LSB) for each in field_ut]
+            field_mg = [MG_PER_UT * each for each in field_ut]
+            heading_deg, radius = self.heading_deg, math.hypot(*field_ut) / MAG_UT_PER_LSB
+            headings = (heading_deg, self._unwrapped_deg, heading_deg)
+            is_calibrated = int(state.mag is not None)
+            put["magneto"](*lsb, *field_mg, *field_mg, 0.0, 0.0, 0.0, *headings, is_calibrated, 0, radius, 0.0, 0.0)
+        if KALMAN_PRESSURE in tags:
+            height_mm = 1e3 * state.altitude_m
+            put["kalman_pressure"](0.0, height_mm, climb_mm_s, *(0.0,) * 7, 0, 0.0, 0, 0.0, 0.0, 0, 0)
+        if GPS_TAG in tags and self._gps is not None:
+            self._fill_gps(put["gps"], self._gps)
+
+    def _fill_gps(self, put: Callable[..., None], gps: messages.Gps) -> None:
+        has_fix = int(gps.fix >= FIX_3D)
+        option = LAYOUTS[GPS_TAG].zeros()
+        option = option._replace(
+            latitude_deg=gps.latitude_deg,
+            longitude_deg=gps.longitude_deg,
+            elevation_m=gps.altitude_m,
+            hdop=1.0,
+            data_available=has_fix,
+            zero_validated=has_fix,
+            lat_fused_deg=gps.latitude_deg,
+            lon_fused_deg=gps.longitude_deg,
+            gps_state=has_fix,
+            speed_m_s=math.hypot(gps.velocity_m_s[0], gps.velocity_m_s[1]),
+            degree=math.degrees(math.atan2(gps.velocity_m_s[0], gps.velocity_m_s[1])) % 360.0,
+            ehpe_m=gps.sigma_m,
+            satellites=gps.satellites,
+            plugged=1,
+        )
+        put(*LAYOUTS[GPS_TAG].flat(option))
+
+
+def angles_deg(q_WB: Quaternion) -> Vector:
+    """Return theta nose up, phi to the right and psi clockwise [deg] of an attitude; psi is 0 towards east."""
+    w, x, y, z = q_WB
+    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
+    yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return -math.degrees(pitch), math.degrees(roll), -math.degrees(yaw)
+
+
+def voltage_mv(charge_percent: float) -> float:
+    for (low, low_mv), (high, high_mv) in pairwise(VOLTAGE_MV):
+        if charge_percent <= high:
+            return low_mv + (high_mv - low_mv) * max(0.0, charge_percent - low) / (high - low)
+    return VOLTAGE_MV[-1][1]
+
+
+def _int16(value: float) -> int:
+    return round(min(max(value, -_INT16), _INT16))

@@ -1,17 +1,12 @@
-"""The live video of a drone: a camera's pictures as H.264 frames behind PaVE headers, to everybody connected.
+"""The live video of a drone: a camera's pictures as H.264 frames behind PaVE headers. Pure.
 
 PaVE is Parrot's video encapsulation, on TCP port 5555. Source: ARDroneLib (SDK 2.0.1), video_encapsulation.h.
 """
 
-import asyncio
 import struct
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from fractions import Fraction
 from typing import Any, NamedTuple
-
-from zsim.contract.flight_messages import CameraImage
-from zsim_bridges.ardrone.ports import AllowedHosts, StreamPort, read_until_end
 
 PORT = 5555  # TCP (ARDroneLib, config.h)
 SIGNATURE = b"PaVE"
@@ -25,74 +20,7 @@ BIT_RATE = 1_000_000  # bit/s: video:bitrate of the SDK, 1000 kbit/s
 IDR_FRAME, P_FRAME = 1, 3  # of a header; an IDR frame has SPS and PPS before it
 IDR, SPS, PPS = 5, 7, 8  # types of NAL units (ITU-T H.264, table 7-1)
 PRESET = {"preset": "ultrafast", "tune": "zerolatency", "profile": "baseline", "x264-params": "annexb=1"}
-BACKLOG_MAX = 500_000  # chosen; backlog of a connection in bytes, some seconds; beyond it it waits for an IDR frame
 _HEADER = struct.Struct("<4sBBHIHHHHIIBBBBIIHBBBB2xI12x")
-
-
-class VideoServer:
-    """Streams the pictures of one drone on its `port`, which is to be opened."""
-
-    def __init__(self, peers: AllowedHosts, refuse: Callable[[str], None]) -> None:
-        self._refuse = refuse
-        self.port = StreamPort(peers, self._serve, refuse)
-        self._ready: set[asyncio.StreamWriter] = set()  # have had an IDR frame, and all since
-        self._newest: CameraImage | None = None
-        self._busy: asyncio.Task[None] | None = None
-        self._encoder: VideoEncoder | None = None
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="video")
-        self._frames = self._sent = 0
-
-    @property
-    def is_watched(self) -> bool:
-        return bool(self.port.writers)
-
-    def close(self) -> None:
-        if self._busy is not None:
-            self._busy.cancel()
-        self._thread.shutdown(wait=False, cancel_futures=True)
-
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        try:
-            await read_until_end(reader, writer)
-        finally:
-            self._ready.discard(writer)
-
-    def on_picture(self, image: CameraImage) -> None:
-        """Stream a picture; while another is encoded, only the newest waits."""
-        self._newest = image
-        if self.is_watched and self._busy is None:
-            self._busy = asyncio.get_running_loop().create_task(self._stream())
-
-    async def _stream(self) -> None:
-        loop = asyncio.get_running_loop()
-        try:
-            while self._newest is not None and self.is_watched:
-                image, self._newest = self._newest, None
-                begins = any(writer not in self._ready for writer in self.port.writers)
-                try:
-                    frame = await loop.run_in_executor(self._thread, self._encode, image, begins)
-                except ValueError as error:
-                    self._refuse(f"a picture cannot be streamed: {error}")
-                    continue
-                if frame is not None:
-                    self._send(image, frame)
-        finally:
-            self._busy = None
-
-    def _encode(self, image: CameraImage, begins: bool) -> "VideoFrame | None":
-        self._encoder = self._encoder or VideoEncoder()
-        return self._encoder.encode(image.data, begins)
-
-    def _send(self, image: CameraImage, frame: "VideoFrame") -> None:
-        """Send a frame to every connection that can decode it and keeps up."""
-        packet = pave_header(frame, self._frames, image.t_sample_ns // 1_000_000, self._sent) + frame.data
-        self._frames, self._sent = self._frames + 1, self._sent + len(frame.data)
-        for writer in tuple(self.port.writers):
-            if writer.transport.get_write_buffer_size() > BACKLOG_MAX:
-                self._ready.discard(writer)
-            elif frame.is_idr or writer in self._ready:
-                self._ready.add(writer)
-                writer.write(packet)
 
 
 class VideoError(ValueError):

@@ -17,8 +17,18 @@ from zsim.math.rotation import LEVEL, Vector
 from zsim.scenario.scenario import Scenario
 from zsim.schema.quantities import G_M_S2
 from zsim_bridges.mavlink import dialect
-from zsim_bridges.mavlink.dialect import Autopilot, Cmd, LandedState, TypeMask, frd, ned
-from zsim_bridges.mavlink.frame import Link, Parser, Received, Signing
+from zsim_bridges.mavlink.dialect import (
+    Autopilot,
+    Cmd,
+    LandedState,
+    Link,
+    Parser,
+    Received,
+    Signing,
+    TypeMask,
+    frd,
+    ned,
+)
 from zsim_bridges.mavlink.personality import COPTER_MODES, PX4_MODES, FlightMode
 from zsim_bridges.vehicle_links.driver import DriverOptions
 from zsim_bridges.vehicle_links.vehicle_session import (

@@ -24,8 +24,7 @@ from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Drone
 from zsim.transport.session import Session
-from zsim_bridges.mavlink.dialect import COMPONENT_AUTOPILOT, WireMessage
-from zsim_bridges.mavlink.frame import Link, Parser, Received, Signing, Version
+from zsim_bridges.mavlink.dialect import COMPONENT_AUTOPILOT, Link, Parser, Received, Signing, Version, WireMessage
 from zsim_bridges.mavlink.mavlink_vehicle import MavlinkVehicle, Options
 from zsim_bridges.mavlink.personality import PERSONALITIES
 from zsim_bridges.mavlink.telemetry import Level

@@ -16,14 +16,15 @@ from zsim.math.frames import turned_about_up
 from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Drone, Piloted
 from zsim.schema.quantities import G_M_S2
+from zsim_agents.references.cruise import Course
 from zsim_agents.references.flight import limits_of
-from zsim_agents.references.tracking import Course
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import (
     DEGREES,
     AttitudeMask,
     Cmd,
     MavFrame,
+    Received,
     Result,
     Severity,
     TypeMask,
@@ -32,8 +33,6 @@ from zsim_bridges.mavlink.dialect import (
     ned,
     yaw_ned,
 )
-from zsim_bridges.mavlink.flight_control import NOWHERE, Target, TiltTarget, is_place
-from zsim_bridges.mavlink.frame import Received
 from zsim_bridges.mavlink.mission import (
     ABSOLUTE,
     FRAMES,
@@ -58,7 +57,7 @@ from zsim_bridges.mavlink.telemetry import (
     mission_current,
 )
 from zsim_bridges.mavlink.vehicle_flight import Flight, Report
-from zsim_bridges.mavlink.vehicle_state import VehicleState
+from zsim_bridges.mavlink.vehicle_state import NOWHERE, Target, TiltTarget, VehicleState, is_place
 from zsim_bridges.vehicle_links.drone_link import CommandSender
 
 ALONG_HEADING = (MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED, MavFrame.BODY_FRD)

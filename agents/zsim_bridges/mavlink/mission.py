@@ -12,9 +12,8 @@ from typing import Any, Literal, NamedTuple
 from zsim.math.rotation import Vector
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import FENCE, MISSION, Cmd, MavFrame, MissionResult
-from zsim_bridges.mavlink.flight_control import Target, is_place
 from zsim_bridges.mavlink.personality import Parameters
-from zsim_bridges.mavlink.vehicle_state import VehicleState
+from zsim_bridges.mavlink.vehicle_state import Target, VehicleState, is_place
 
 JUMPS_MAX = 1000  # in succession without a waypoint between them: a circle of jumps
 ABSOLUTE = (MavFrame.GLOBAL, MavFrame.GLOBAL_INT)

@@ -13,7 +13,7 @@ from zsim.math import frames
 from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Drone
 from zsim.schema.quantities import G_M_S2
-from zsim.vehicles.vehicle_catalogue import vehicle_of
+from zsim.vehicles.vehicle import vehicle_of
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import (
     UINT16_UNKNOWN,
@@ -28,10 +28,9 @@ from zsim_bridges.mavlink.dialect import (
     int16,
     ned,
 )
-from zsim_bridges.mavlink.flight_control import Target
 from zsim_bridges.mavlink.personality import BY_STICKS, FlightMode, Personality
 from zsim_bridges.mavlink.vehicle_flight import Flight
-from zsim_bridges.mavlink.vehicle_state import ALL_HEALTHY, VehicleState
+from zsim_bridges.mavlink.vehicle_state import ALL_HEALTHY, Target, VehicleState
 
 Level = Literal["normal", "full"]
 SECOND_NS = 1_000_000_000

@@ -1,15 +1,16 @@
-"""The state of a vehicle: the estimate, or the truth where no estimator runs, and the health of its sensors."""
+"""The state of a vehicle, estimated or true where no estimator runs, its sensors' health; and targets for it."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from zsim.contract import flight_messages, messages
 from zsim.contract.messages import Origin
+from zsim.math import elementary as el
 from zsim.math import frames
 from zsim.math.frames import anchor, geodetic
-from zsim.math.rotation import LEVEL, Vector
+from zsim.math.rotation import LEVEL, Quaternion, Vector
 from zsim.scenario.scenario import Drone
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import SensorBit
@@ -28,6 +29,9 @@ SENSORS = {
     "flow": SensorBit.FLOW,
 }
 ALL_HEALTHY = SensorBit(sum(SensorBit))
+PLACE_MAX_M = 1e6  # m; positions farther away are refused
+Axes = tuple[float | None, float | None, float | None]
+NOWHERE: Axes = (None, None, None)
 
 
 class VehicleState:
@@ -157,3 +161,39 @@ class VehicleState:
         """Roll, pitch and yaw in MAVLink's axes."""
         roll, pitch, yaw = frames.rpy_from_quaternion(dialect.attitude_ned(self.q_WB)).tolist()
         return roll, pitch, yaw
+
+
+class Target(NamedTuple):
+    """A position or velocity to be held.
+
+    Attributes:
+        position_m: in W, None in axes where only the velocity counts.
+        velocity_m_s: flown, added to the velocity towards the position.
+        yaw_rad: counter-clockwise from east; None to turn at the rate.
+        yaw_rate_rad_s: counter-clockwise.
+        along_heading: the velocity is forward, left, up instead of in W.
+        speed_m_s: limit of the horizontal speed; None for the vehicle's.
+    """
+
+    position_m: Axes = NOWHERE
+    velocity_m_s: Vector = (0.0, 0.0, 0.0)
+    yaw_rad: float | None = None
+    yaw_rate_rad_s: float = 0.0
+    along_heading: bool = False
+    speed_m_s: float | None = None
+
+    def distance_m(self, position_m: Vector) -> float:
+        pairs = zip(self.position_m, position_m, strict=True)
+        return el.length((0.0 if p is None else p - own for p, own in pairs))
+
+
+class TiltTarget(NamedTuple):
+    """A tilt to be held: attitude B to W, thrust [N], yaw rate [rad/s] counter-clockwise."""
+
+    q_WB: Quaternion
+    thrust_n: float
+    yaw_rate_rad_s: float
+
+
+def is_place(position_m: Axes) -> bool:
+    return all(p is None or (math.isfinite(p) and abs(p) < PLACE_MAX_M) for p in position_m)

@@ -1,16 +1,24 @@
-"""A ROS 1 node: its slave API (wiki.ros.org/ROS/Slave_API), and TCPROS connections of its topics and services."""
+"""A ROS 1 node: its slave API, and TCPROS, the connections of its topics and services.
+
+A connection of TCPROS begins with a header of each side; then come frames: a length and so many bytes. All lengths are
+little-endian uint32. Sources: wiki.ros.org/ROS/Slave_API, wiki.ros.org/ROS/TCPROS, wiki.ros.org/ROS/Connection Header.
+"""
 
 import asyncio
 import contextlib
 import os
+import socket
+import struct
 import threading
-from asyncio import StreamReader, StreamWriter, Task
+from asyncio import IncompleteReadError, StreamReader, StreamWriter, Task
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
+
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from zsim.errors import ZsimError
-from zsim_bridges.ros1 import master_api, tcpros
+from zsim_bridges.ros1 import master_api
 from zsim_bridges.ros1.master_api import GraphEntry, Registration
 
 Answer = list[Any]
@@ -19,6 +27,13 @@ EVERYWHERE, LOOPBACK = "0.0.0.0", "127.0.0.1"
 STOP_POLL_S = 0.1  # how soon the XML-RPC server ends
 RETRY_S, RETRY_MAX_S = 0.5, 8.0  # wall time between attempts to reach a publisher, doubling
 DONE, FAILED = b"\x01", b"\x00"  # of a service
+HEADER_MAX = 1_000_000  # bytes; definitions of the largest messages have some 10 000
+FRAME_MAX = 1_000_000  # bytes; nodes send commands alone
+HANDSHAKE_S = 10.0  # within which a header must come
+ANY_TYPE = "*"  # md5sum or type of a node that takes any
+CONNECTION_ERRORS = (OSError, IncompleteReadError, TimeoutError, ValueError, OverflowError)
+"""Errors that end a connection: it is gone, silent, or not TCPROS."""
+_LENGTH = struct.Struct("<I")
 Say = Callable[[str], None]
 
 
@@ -46,16 +61,16 @@ class Ros1Node:
 
     def publish(self, topic: str, kind: str, queue_size: int) -> "PublishedTopic":
         """Publish a topic; before `running`."""
-        published = self.published[topic] = PublishedTopic(tcpros.topic_type_of(topic, kind), queue_size)
+        published = self.published[topic] = PublishedTopic(topic_type_of(topic, kind), queue_size)
         return published
 
     def subscribe(self, topic: str, kind: str, callback: Callable[[Any], None]) -> None:
         """Subscribe to a topic; before `running`. `callback` raises ValueError for a message that it refuses."""
-        self.subscribed[topic] = SubscribedTopic(tcpros.topic_type_of(topic, kind), self.name, callback, self._say)
+        self.subscribed[topic] = SubscribedTopic(topic_type_of(topic, kind), self.name, callback, self._say)
 
     def serve(self, name: str, act: Callable[[], str | None]) -> None:
         """Serve a std_srvs/Empty service; before `running`. `act` returns why it failed, None where it did not."""
-        self.services[name] = EmptyService(tcpros.EMPTY_SERVICE._replace(name=name), act)
+        self.services[name] = EmptyService(EMPTY_SERVICE._replace(name=name), act)
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
@@ -109,15 +124,18 @@ class Ros1Node:
         assert task is not None
         self._connections.add(task)
         try:
-            with contextlib.suppress(*tcpros.CONNECTION_ERRORS):
-                header = await tcpros.read_header(reader)
+            with contextlib.suppress(*CONNECTION_ERRORS):
+                header = await read_header(reader)
                 by_name = self.services if "service" in header else self.published
                 name = header.get("service") or header.get("topic", "")
                 endpoint = by_name.get(name)
                 if endpoint is None:
-                    await tcpros.send_error(writer, f"[{self.name}] has no topic or service [{name[:200]}]")
-                elif refusal := tcpros.mismatch(endpoint.topic_type, header, self.name):
-                    await tcpros.send_error(writer, refusal)
+                    refusal = f"[{self.name}] has no topic or service [{name[:200]}]"
+                else:
+                    refusal = mismatch(endpoint.topic_type, header, self.name)
+                if endpoint is None or refusal:
+                    writer.write(encode_header({"error": refusal or ""}))
+                    await writer.drain()
                 else:
                     await endpoint.serve(reader, writer, header, self.name)
         except asyncio.CancelledError:
@@ -197,7 +215,7 @@ class SlaveApi:
 class PublishedTopic:
     """A topic that the node publishes; a slow subscriber may be `queue_size` messages behind."""
 
-    def __init__(self, topic_type: tcpros.TopicType, queue_size: int) -> None:
+    def __init__(self, topic_type: "TopicType", queue_size: int) -> None:
         self.topic_type = topic_type
         self._queue_size = queue_size
         self.links: list[SubscriberLink] = []
@@ -207,15 +225,15 @@ class PublishedTopic:
         """Send the message that `make` returns for a sequence number; it is called only where there are subscribers."""
         if not self.links:
             return
-        framed = tcpros.frame(tcpros.serialize(self.topic_type.type, make(self.sent)))
+        framed = frame(serialize(self.topic_type.type, make(self.sent)))
         self.sent += 1
         for link in self.links:
             link.put(framed)
 
     async def serve(self, reader: StreamReader, writer: StreamWriter, header: Mapping[str, str], caller: str) -> None:
         """Serve a subscriber whose header fits until it goes; `caller` is this node's name."""
-        tcpros.configure(writer, header.get("tcp_nodelay") == "1")
-        writer.write(tcpros.encode_header(tcpros.publisher_header(self.topic_type, caller)))
+        configure(writer, header.get("tcp_nodelay") == "1")
+        writer.write(encode_header(publisher_header(self.topic_type, caller)))
         link = SubscriberLink(writer, header["callerid"], self._queue_size)
         sender = asyncio.create_task(link.run())
         self.links.append(link)
@@ -245,7 +263,7 @@ class SubscriberLink:
 
     async def run(self) -> None:
         """Send queued messages, until the connection ends."""
-        with contextlib.suppress(*tcpros.CONNECTION_ERRORS):
+        with contextlib.suppress(*CONNECTION_ERRORS):
             while True:
                 await self._news.wait()
                 self._news.clear()
@@ -259,20 +277,22 @@ class SubscriberLink:
 class EmptyService:
     """A service of type std_srvs/Empty; `act` returns why a request failed, None if it succeeded."""
 
-    def __init__(self, topic_type: tcpros.TopicType, act: Callable[[], str | None]) -> None:
+    def __init__(self, topic_type: "TopicType", act: Callable[[], str | None]) -> None:
         self.topic_type = topic_type
         self.act = act
 
     async def serve(self, reader: StreamReader, writer: StreamWriter, header: Mapping[str, str], caller: str) -> None:
         """Serve a client whose header fits until it goes; `caller` is this node's name."""
-        tcpros.configure(writer, True)
-        writer.write(tcpros.encode_header(tcpros.service_header(self.topic_type, caller)))
+        configure(writer, True)
+        kind = self.topic_type.type
+        kinds = {"type": kind, "request_type": f"{kind}Request", "response_type": f"{kind}Response"}
+        writer.write(encode_header({"callerid": caller, "md5sum": self.topic_type.md5, **kinds}))
         await writer.drain()
         expects_request = header.get("probe") != "1"
         while expects_request:
-            request = await tcpros.read_frame(reader)
+            request = await read_frame(reader)
             reason = f"the request has {len(request)} bytes; must have none" if request else self.act()
-            writer.write(FAILED + tcpros.frame(reason.encode()) if reason else DONE + tcpros.frame(b""))
+            writer.write(FAILED + frame(reason.encode()) if reason else DONE + frame(b""))
             await writer.drain()
             expects_request = header.get("persistent") == "1"
 
@@ -289,7 +309,7 @@ class SubscribedTopic:
     """
 
     def __init__(
-        self, topic_type: tcpros.TopicType, caller: str, callback: Callable[[Any], None], say: Callable[[str], None]
+        self, topic_type: "TopicType", caller: str, callback: Callable[[Any], None], say: Callable[[str], None]
     ) -> None:
         self.topic_type = topic_type
         self.callback = callback
@@ -325,15 +345,15 @@ class SubscribedTopic:
                 async with self._connection(uri) as reader:
                     pause_s = RETRY_S
                     while True:
-                        data = await tcpros.read_frame(reader)
+                        data = await read_frame(reader)
                         try:
-                            self.callback(tcpros.deserialize(self.topic_type.type, data))
+                            self.callback(deserialize(self.topic_type.type, data))
                         except (ValueError, ZsimError) as error:
                             self._report_once(uri, str(error))
             except RefusedError as error:
                 self._report_once(uri, str(error))
                 return
-            except (*tcpros.CONNECTION_ERRORS, *master_api.CALL_ERRORS):
+            except (*CONNECTION_ERRORS, *master_api.CALL_ERRORS):
                 if uri in self._wanted:
                     await asyncio.sleep(pause_s)
                 pause_s = min(2 * pause_s, RETRY_MAX_S)
@@ -346,12 +366,12 @@ class SubscribedTopic:
         protocol, host, port = await asyncio.to_thread(master_api.call_api, uri, "requestTopic", *arguments)
         if protocol != "TCPROS":
             raise RefusedError(f"protocol is {str(protocol)[:20]!r}; must be TCPROS")
-        reader, writer = await asyncio.wait_for(asyncio.open_connection(host, port), tcpros.HANDSHAKE_S)
+        reader, writer = await asyncio.wait_for(asyncio.open_connection(host, port), HANDSHAKE_S)
         try:
-            tcpros.configure(writer, True)
-            writer.write(tcpros.encode_header(tcpros.subscriber_header(self.topic_type, self._caller)))
-            header = await tcpros.read_header(reader)
-            error = header.get("error") or tcpros.mismatch(self.topic_type, {"callerid": "?", **header}, self._caller)
+            configure(writer, True)
+            writer.write(encode_header(subscriber_header(self.topic_type, self._caller)))
+            header = await read_header(reader)
+            error = header.get("error") or mismatch(self.topic_type, {"callerid": "?", **header}, self._caller)
             if error:
                 raise RefusedError(error[:300])
             self.connected[uri] = header.get("callerid", "?")
@@ -364,3 +384,186 @@ class SubscribedTopic:
         if uri not in self._reported:
             self._reported.add(uri)
             self._say(f"{self.topic_type.name}: what {self.connected.get(uri, uri)} sends is refused: {reason}")
+
+
+class TopicType(NamedTuple):
+    """Name, type, MD5 sum and definition of a topic or service, which must agree on both sides."""
+
+    name: str
+    type: str
+    md5: str
+    definition: str
+
+
+def frame(payload: bytes) -> bytes:
+    """Return a payload behind its length."""
+    return _LENGTH.pack(len(payload)) + payload
+
+
+def encode_header(fields: Mapping[str, str]) -> bytes:
+    """Return a header, its own length first."""
+    return frame(b"".join(frame(f"{key}={value}".encode()) for key, value in fields.items()))
+
+
+def decode_header(body: bytes) -> dict[str, str]:
+    """Return the fields of a header without its own length.
+
+    Raises:
+        ValueError: it is none.
+    """
+    fields: dict[str, str] = {}
+    start = 0
+    while start < len(body):
+        first = start + _LENGTH.size
+        if first > len(body) or (end := first + _LENGTH.unpack_from(body, start)[0]) > len(body):
+            raise ValueError("a field is longer than the header")
+        key, separator, value = body[first:end].decode(errors="replace").partition("=")
+        if not separator:
+            raise ValueError(f"a field is {key[:40]!r}; must be key=value")
+        fields[key] = value
+        start = end
+    return fields
+
+
+def publisher_header(topic_type: TopicType, caller: str) -> dict[str, str]:
+    """Return the header that a publisher answers to a subscriber."""
+    return {
+        "callerid": caller,
+        "latching": "0",
+        "md5sum": topic_type.md5,
+        "message_definition": topic_type.definition,
+        "topic": topic_type.name,
+        "type": topic_type.type,
+    }
+
+
+def subscriber_header(topic_type: TopicType, caller: str) -> dict[str, str]:
+    """Return the header that a subscriber sends to a publisher."""
+    header = publisher_header(topic_type, caller) | {"tcp_nodelay": "1"}
+    del header["latching"]
+    return header
+
+
+def mismatch(topic_type: TopicType, header: Mapping[str, str], caller: str) -> str | None:
+    """Return why the type of a header differs from that of `caller`; None if they agree."""
+    missing = [field for field in ("callerid", "md5sum") if field not in header]
+    if missing:
+        return f"missing required {missing[0]!r} field"
+    if header["md5sum"] in (ANY_TYPE, topic_type.md5):
+        return None
+    requested = f"{header.get('type', topic_type.type)}/{header['md5sum']}"
+    return (
+        f"[{header['callerid']}] wants [{topic_type.name}] to have datatype/md5sum [{requested}], "
+        f"but [{caller}] has [{topic_type.type}/{topic_type.md5}]"
+    )
+
+
+async def read_frame(reader: StreamReader, limit: int = FRAME_MAX) -> bytes:
+    """Return the next frame's payload.
+
+    Raises:
+        ValueError: it is longer than the limit.
+        IncompleteReadError: the connection ended.
+    """
+    (size,) = _LENGTH.unpack(await reader.readexactly(_LENGTH.size))
+    if size > limit:
+        raise ValueError(f"a frame has {size} bytes; must have at most {limit}")
+    return await reader.readexactly(size)
+
+
+async def read_header(reader: StreamReader) -> dict[str, str]:
+    """Return the header with which a connection begins.
+
+    Raises:
+        ValueError: it is none.
+        TimeoutError: it does not arrive.
+    """
+    return decode_header(await asyncio.wait_for(read_frame(reader, HEADER_MAX), HANDSHAKE_S))
+
+
+def configure(writer: StreamWriter, nodelay: bool) -> None:
+    """Set whether small messages are sent at once, and notice a host that is gone."""
+    raw: socket.socket = writer.get_extra_info("socket")
+    raw.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, nodelay)
+    raw.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+
+
+NAVDATA = """
+Header header
+float32 batteryPercent  # 0 to 100
+uint32 state            # 0 unknown, 1 init, 2 landed, 3 and 7 flying, 4 hovering, 5 test, 6 taking off, 8 landing
+int32 magX
+int32 magY
+int32 magZ
+int32 pressure          # Pa
+int32 temp              # 0.1 deg C
+float32 wind_speed      # m/s
+float32 wind_angle
+float32 wind_comp_angle
+float32 rotX            # deg, to the right positive
+float32 rotY            # deg, nose down positive
+float32 rotZ            # deg, counter-clockwise positive
+int32 altd              # mm
+float32 vx              # mm/s
+float32 vy
+float32 vz
+float32 ax              # g
+float32 ay
+float32 az
+uint8 motor1
+uint8 motor2
+uint8 motor3
+uint8 motor4
+uint32 tags_count
+uint32[] tags_type
+uint32[] tags_xc
+uint32[] tags_yc
+uint32[] tags_width
+uint32[] tags_height
+float32[] tags_orientation
+float32[] tags_distance
+float32 tm              # us
+"""  # fields of ardrone_autonomy 1.4.1, msg/Navdata.msg; the MD5 sum leaves comments out
+EMPTY_SERVICE = TopicType("", "std_srvs/Empty", "d41d8cd98f00b204e9800998ecf8427e", "")  # MD5 of no text at all
+
+_store = get_typestore(Stores.ROS1_NOETIC)
+_store.register(get_types_from_msg(NAVDATA, "ardrone_autonomy/msg/Navdata"))
+_store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", "tf2_msgs/msg/TFMessage"))
+
+
+def topic_type_of(topic: str, kind: str) -> TopicType:
+    """Return a topic of a type such as "sensor_msgs/Imu"."""
+    definition, md5 = _store.generate_msgdef(_full_name(kind), ros_version=1)
+    return TopicType(topic, kind, md5, definition)
+
+
+def message_class(kind: str) -> Callable[..., Any]:
+    return _store.types[_full_name(kind)]
+
+
+def serialize(kind: str, message: Any) -> bytes:
+    """Return the bytes of a message.
+
+    Raises:
+        ValueError: a number does not go into its field.
+    """
+    try:
+        return bytes(_store.serialize_ros1(message, _full_name(kind)))
+    except Exception as error:  # the generated writer raises anything for invalid numbers
+        raise ValueError(f"is no {kind}: {error}") from error
+
+
+def deserialize(kind: str, data: bytes) -> Any:
+    """Return the message in bytes.
+
+    Raises:
+        ValueError: they are no such message.
+    """
+    try:
+        return _store.deserialize_ros1(data, _full_name(kind))
+    except Exception as error:  # the generated reader raises anything for invalid bytes
+        raise ValueError(f"{len(data)} bytes are no {kind}") from error
+
+
+def _full_name(kind: str) -> str:
+    return kind.replace("/", "/msg/")

@@ -29,8 +29,7 @@ from zsim.schema.quantities import G_M_S2
 from zsim.sensors.camera import CAMERAS
 from zsim.transport.session import Session
 from zsim_bridges import ros_messages as ros
-from zsim_bridges.ros1.node import PublishedTopic, Ros1Node
-from zsim_bridges.ros1.tcpros import message_class
+from zsim_bridges.ros1.node import PublishedTopic, Ros1Node, message_class
 from zsim_bridges.vehicle_links import drone_link
 from zsim_bridges.vehicle_links.drone_link import CommandSender, ModeName, OnboardState
 from zsim_bridges.vehicle_links.server import PictureIntake, Say, TrafficIntake, VehicleServer

@@ -23,7 +23,7 @@ from zsim.transport import connection
 from zsim.transport.session import RawSample, Session, Subscription
 from zsim.transport.tls import Identity
 from zsim_bridges import ros_messages as ros
-from zsim_bridges.ros2 import rmw_zenoh, ros_types, topics
+from zsim_bridges.ros2 import rmw_zenoh, topics
 from zsim_bridges.ros2.rmw_zenoh import Publisher, Ros2Node, RosContext, ros_names
 from zsim_bridges.ros2.topics import DRIVER, DroneCameras, RosNames, Topic
 from zsim_bridges.vehicle_links.drone_link import CommandSender
@@ -212,7 +212,7 @@ class RosCommands:
     def __init__(self, link: Session, observer: Participant, drones: Iterable[str]) -> None:
         self._link = link
         self._observer = observer
-        self._response = ros_types.message_class(f"{TRIGGER}_Response")
+        self._response = rmw_zenoh.message_class(f"{TRIGGER}_Response")
         self._senders = {drone: CommandSender(drone, observer.name, link.put) for drone in drones}
         self._lock = threading.Lock()
 

@@ -31,7 +31,7 @@ from zsim.sensors.camera_model import camera_pose
 from zsim.sensors.sensor import ErrorModel, Mount, noise_sigma
 from zsim.sensors.sensor_catalogue import Sensors
 from zsim_bridges import ros_messages as ros
-from zsim_bridges.ros2 import ros_types
+from zsim_bridges.ros2 import rmw_zenoh
 from zsim_bridges.ros2.rmw_zenoh import CLOCK, DEFAULT, SENSOR, TF, Qos
 from zsim_bridges.ros_messages import NS_PER_S
 
@@ -259,7 +259,7 @@ class NavdataSummary:
     """A drone's newest samples as ardrone_autonomy's navdata, in that driver's units, with each status."""
 
     def __init__(self, frame: str) -> None:
-        self._kind = ros_types.message_class("zsim_msgs/msg/Navdata")
+        self._kind = rmw_zenoh.message_class("zsim_msgs/msg/Navdata")
         self._frame = frame
         self._last: dict[str, Any] = {}
 
@@ -307,7 +307,7 @@ class DroneCameras:
     def toggle(self, _: Any) -> Any:
         """Let the next camera be the active one, for a service of type std_srvs/Trigger."""
         self.active = CAMERAS[(CAMERAS.index(self.active) + 1) % len(CAMERAS)]
-        return ros_types.message_class("std_srvs/srv/Trigger_Response")(True, f"the active camera is {self.active}")
+        return rmw_zenoh.message_class("std_srvs/srv/Trigger_Response")(True, f"the active camera is {self.active}")
 
     def topics(self) -> Iterator[Topic]:
         for camera in CAMERAS:
@@ -346,7 +346,7 @@ class DroneCameras:
 
 def cluster_topics(cluster: str, name: str) -> Iterator[Topic]:
     source = (keys.cluster_state(cluster),)
-    kind = ros_types.message_class("zsim_msgs/msg/ClusterState")
+    kind = rmw_zenoh.message_class("zsim_msgs/msg/ClusterState")
 
     def state(_: str, message: ClusterState) -> Any:
         return kind(

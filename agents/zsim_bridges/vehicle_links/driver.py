@@ -30,12 +30,14 @@ from zsim.scenario.scenario import Drone, Scenario
 from zsim.sensors.sensor_catalogue import STOCK
 from zsim.transport.session import Query, RawSample, Session
 from zsim.vehicles.vehicle import ROTORS_MIN
-from zsim_bridges.vehicle_links.failsafe import LINK_LOST_S, Failsafe, FlightLimits
 from zsim_bridges.vehicle_links.vehicle_session import (
+    LINK_LOST_S,
     STANDING,
     STILL,
     AircraftState,
     ClockOffset,
+    Failsafe,
+    FlightLimits,
     Reading,
     UdpChannel,
     VehicleSession,

@@ -7,19 +7,25 @@ The folder of a board:
     board.md         their means over the seeds, a row for each law in each scenario
     summary.json     the same, for programs
     report.html      the table and the figures
+
+A law is `cluster_space`, the stock controller with a template; one of `zsim.scenario.scenario.LAWS`; or a subclass of
+`zsim_agents.laws.pilot.Pilot` of a user's, `package.module:Class`. All fly the same drones from the same places with
+the same sensors, wind and seeds; a law has the parameters that are its defaults.
 """
 
+import copy
 import csv
 import hashlib
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from functools import partial
+from functools import cache, partial
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
+import yaml
 from msgspec import Struct
 from rich.console import Console
 
@@ -27,9 +33,9 @@ from zsim import __version__
 from zsim.errors import ReportError, ScenarioError
 from zsim.output_folder import held_folder
 from zsim.scenario import scenario_file
+from zsim.scenario.scenario import LAWS, Scenario
 from zsim_agents.hosting import check_classes
-from zsim_agents.laws.reference import FormationReference, polygon
-from zsim_analysis.board.entries import CLUSTER_SPACE, about, resolved, shipped
+from zsim_agents.laws.pilot import FormationReference, polygon
 from zsim_analysis.board.measures import Figure, flown_of, measures, shape_errors
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.sweep.process_pool import ProcessPool, cores
@@ -40,6 +46,9 @@ JOURNAL, CSV, MARKDOWN = "journal.jsonl", "board.csv", "board.md"
 OWN_FILES = (JOURNAL, CSV, MARKDOWN, "summary.json", "report.html", "figures", ".lock")
 TRACK_S = 0.5  # between the instants of a flight that are kept for the figures
 DECIMALS = 3  # of the places that are kept: a millimetre
+CLUSTER_SPACE = "cluster_space"
+LAW_NAMES = (CLUSTER_SPACE, *LAWS)
+PILOT, CONTROLLER = "pilot", "main"
 SERIES = ("track_t_s", "track_m", "track_shape_m")  # columns of a row that are no figure
 
 
@@ -198,11 +207,6 @@ def heads() -> list[str]:
     return [f"{each.title} ({each.unit})" if each.unit else each.title for each in MEASURES]
 
 
-def markdown(board: Board) -> str:
-    """Return the table of the board."""
-    return "".join(_markdown(board))
-
-
 def _markdown(board: Board) -> Iterator[str]:
     for scenario in board.scenarios:
         yield f"### {scenario}\n\n{about(scenario)[0].upper()}{about(scenario)[1:]}.\n\n"
@@ -221,10 +225,76 @@ def write_tables(out: Path, board: Board, rows: Sequence[Row]) -> None:
     writer.writerows(rows)
     try:
         (out / CSV).write_text(text.getvalue(), encoding="utf-8")
-        (out / MARKDOWN).write_text(markdown(board), encoding="utf-8")
+        (out / MARKDOWN).write_text("".join(_markdown(board)), encoding="utf-8")
     except OSError as error:
         raise ReportError(f"{out}: cannot be written ({error.strerror})") from error
 
 
-def summary_of(board: Board) -> bytes:
-    return msgspec.json.format(msgspec.json.encode(board), indent=2) + b"\n"
+@cache
+def shipped() -> Mapping[str, Any]:
+    return yaml.safe_load(files("zsim_analysis.board").joinpath("scenarios.yaml").read_text(encoding="utf-8"))
+
+
+def scenario_names() -> list[str]:
+    return [*shipped()["scenarios"]]
+
+
+def about(scenario: str) -> str:
+    return shipped()["scenarios"][scenario]["about"]
+
+
+def chosen(given: str | None, known: Sequence[str], option: str, open_to_classes: bool = False) -> list[str]:
+    """Return the names of a list with commas, each once; all that are known for None.
+
+    Raises:
+        ScenarioError: with a line for each that is unknown.
+    """
+    names = [*dict.fromkeys(name.strip() for name in given.split(",") if name.strip())] if given else [*known]
+    allowed = f"must be of {', '.join(known)}{', or package.module:Class' if open_to_classes else ''}"
+    unknown = [name for name in names if name not in known and not (open_to_classes and ":" in name)]
+    if not names:
+        raise ScenarioError([f"{option} is {given!r}; {allowed}"])
+    if unknown:
+        raise ScenarioError([f"{option} has {name!r}; {allowed}" for name in unknown])
+    return names
+
+
+def resolved(law: str, scenario: str, seed: int) -> Scenario:
+    """Return the scenario of a flight; ScenarioError: a user's class cannot be flown."""
+    return scenario_file.resolve(document(law, scenario, seed), f"board, {law} in {scenario}")
+
+
+def document(law: str, scenario: str, seed: int) -> dict[str, Any]:
+    """Return the scenario of a law, as a file holds it."""
+    entry, flight = shipped()["scenarios"][scenario], shipped()["flight"]
+    found = copy.deepcopy(shipped()["base"])
+    found |= {"name": f"board-{scenario.replace('_', '-')}", "seed": seed, "report": {"window_s": entry["window_s"]}}
+    for path, value in entry.get("set", {}).items():
+        *sections, last = path.split(".")
+        inner = found
+        for section in sections:
+            inner = inner.setdefault(section, {})
+        inner[last] = copy.deepcopy(value)
+    names = [drone["name"] for drone in found["drones"]]
+    lost = entry.get("radio", {}).get("loss", 0.0)
+    if law == CLUSTER_SPACE:
+        found["clusters"] = [_cluster(names, entry["centre_m"], flight)]
+        links = [f"estimator.{name}/controller.{CONTROLLER}" for name in names] + [f"world/controller.{CONTROLLER}"]
+        losses = [{"kind": "link_loss", "target": link, "probability": lost} for link in links] if lost else []
+        found["faults"] = [*found.get("faults", []), *losses]
+        return found
+    parameters = {"takeoff_s": flight["takeoff_s"], "height_m": flight["height_m"], "start_s": flight["start_s"]}
+    found["agents"] = {PILOT: {"class": law, "parameters": {**parameters, "centre_m": entry["centre_m"]}}}
+    if lost:
+        found["radio"] = {"loss": lost}
+    return found
+
+
+def _cluster(names: list[str], centre_m: list[float | str], flight: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the cluster that flies the same: a template of the pentagon, gathered, then led along the centre."""
+    places = [[*place, 0.0] for place in polygon(len(names), flight["radius_m"]).tolist()]
+    start = {"x_c": 0, "y_c": 0, "z_c": flight["height_m"], "yaw": 0}
+    expressions = {"x_c": centre_m[0], "y_c": centre_m[1]}
+    trajectory = {"start_s": flight["start_s"], "expressions": expressions}
+    plan = {"takeoff_s": flight["takeoff_s"], "target": start, "trajectory": trajectory}
+    return {"name": CONTROLLER, "drones": names, "space": "template", "template_m": places, "plan": plan}

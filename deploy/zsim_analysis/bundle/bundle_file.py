@@ -6,11 +6,12 @@ itself. That finds what was changed, by accident or by hand; it is no signature.
 """
 
 import hashlib
+import importlib.metadata
 import re
 import shutil
 import stat
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -20,6 +21,7 @@ from msgspec import Struct
 
 from zsim.errors import OTHER_OUT, RunError, file_fault
 from zsim.output_folder import temporary_folder
+from zsim_analysis.report import indented_json
 
 SUFFIX = ".zsim"
 MANIFEST, README, SCENARIO, LOCK = "bundle.json", "README.md", "scenario.yaml", "lock.txt"
@@ -33,6 +35,8 @@ PIECE_BYTES = 1 << 20
 DATE = (1980, 1, 1, 0, 0, 0)  # of every member: the first that a zip archive can state
 MODE = (stat.S_IFREG | 0o644) << 16
 UNIX = 3  # as the system that made it, wherever that was
+PIN = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]*[A-Za-z0-9])?==[A-Za-z0-9][A-Za-z0-9.!+_]*")  # a line of the lock
+EXTRAS = ("agents", "record", "report", "world")  # of zsim: what flies a bundle again, and draws its figures
 PART = re.compile(r"\w[\w.+@ -]*(?<![ .])")  # of a member's path: no `..`, no drive, nothing hidden
 
 
@@ -69,7 +73,7 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return msgspec.structs.replace(self, seal=hashlib.sha256(blank.text()).hexdigest())
 
     def text(self) -> bytes:
-        return msgspec.json.format(msgspec.json.encode(self, order="sorted"), indent=2) + b"\n"
+        return indented_json(self, "sorted")
 
 
 class WrittenBundle(NamedTuple):
@@ -145,6 +149,29 @@ def opened(path: Path) -> Iterator[tuple[Manifest, Path]]:
 
 def is_bundle(path: Path) -> bool:
     return path.is_file() and (path.suffix == SUFFIX or zipfile.is_zipfile(path))
+
+
+def other_versions(lock: Iterable[str]) -> list[str]:
+    """Return which packages of a lock are installed here in another version, or not at all."""
+    differing = []
+    for line in lock:
+        name, _, version = line.partition("==")
+        try:
+            here = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            here = "none"
+        if here != version:
+            differing.append(f"{name} {version}, here {here}")
+    return differing
+
+
+def pins_of(text: str, where: str) -> list[str]:
+    """Return the lines of a lock; RunError if one is anything but NAME==VERSION, such as an option or an address."""
+    lines = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    for line in lines:
+        if not PIN.fullmatch(line):
+            raise RunError(f"{where}: has the line {line[:80]!r}; must be NAME==VERSION")
+    return lines
 
 
 def _manifest(path: Path, archive: zipfile.ZipFile) -> Manifest:

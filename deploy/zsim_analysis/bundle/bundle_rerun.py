@@ -19,11 +19,10 @@ from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim_agents.hosting import agents_of
 from zsim_analysis.bundle import bundle_file as names
-from zsim_analysis.bundle.bundle_file import Manifest, opened
-from zsim_analysis.bundle.own_code import other_versions, pins_of
+from zsim_analysis.bundle.bundle_file import Manifest, opened, other_versions, pins_of
 from zsim_analysis.in_process import InProcessFlight
 from zsim_analysis.reading import recorded_run
-from zsim_analysis.reading.output_hashes import GateDigests, OutputHashes, content_of, first_difference
+from zsim_analysis.reading.recorded_run import GateDigests, OutputHashes, content_of, first_difference
 from zsim_analysis.rerun import rerun_record
 
 Say = Callable[[str], None]

@@ -1,22 +1,29 @@
 """Makes the bundle of a run from its record: no absolute path and no name of a host is in it."""
 
+import ast
+import base64
 import csv
+import importlib.metadata
 import io
+import json
+import pickletools
 import re
 import socket
-from collections.abc import Callable, Iterator, Mapping
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgpack
 import msgspec
 from msgspec import UNSET
+from packaging.requirements import Requirement
 
 import zsim
 from zsim import __version__
 from zsim.contract import flight_messages, keys, messages
 from zsim.contract.fingerprint import fingerprint, machine, parts
-from zsim.errors import RunError
+from zsim.errors import PACKAGES, DocumentError, RunError
 from zsim.output_folder import record_at, temporary_folder
 from zsim.record import RecordReader, RecordWriter
 from zsim.record.completeness import record_completeness
@@ -24,15 +31,25 @@ from zsim.scenario import scenario_file
 from zsim.scenario.faults import listed
 from zsim.schema import plugin, yaml_file
 from zsim_analysis.bundle import bundle_file as names
-from zsim_analysis.bundle.bundle_file import Manifest, WrittenBundle, refuse_existing, write_bundle
-from zsim_analysis.bundle.own_code import locked, own_modules
+from zsim_analysis.bundle.bundle_file import (
+    EXTRAS,
+    MODULES,
+    PART,
+    Manifest,
+    WrittenBundle,
+    refuse_existing,
+    write_bundle,
+)
 from zsim_analysis.reading import recorded_run
-from zsim_analysis.reading.output_hashes import GateDigests, OutputHashes, content_of
-from zsim_analysis.reading.recorded_run import RecordedAgents, RecordedRun
+from zsim_analysis.reading.recorded_run import GateDigests, OutputHashes, RecordedAgents, RecordedRun, content_of
+from zsim_analysis.report import indented_json
 from zsim_analysis.report.make_report import figures
-from zsim_analysis.report.summary import RunSummary, judge
+from zsim_analysis.report.summary import judge
 from zsim_world.run.coordinator import FLIGHT_REQUESTS
 
+PROJECT = "zsim"
+BYTES_MAX = 50_000_000  # of all users' modules: code, not data
+MODULE = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
 PATH = re.compile(r"(?<![\w./~-])(?:[A-Za-z]:)?[/\\](?:[^\s/\\:;,'\"()]+[/\\])+")  # the folders of an absolute path
 FREE_TEXT = ("text", "reason", "error", "failure")  # fields in which a message says anything
 OF_THE_WALL_CLOCK = (
@@ -238,6 +255,130 @@ def _without_folders(payload: bytes, has_modules: bool) -> bytes:
     return messages.encode(msgspec.structs.replace(info, module_folders=folders, changed=changed))
 
 
+# What it needs of this machine: users' modules, and the packages, with their versions
+#
+# Nothing of it is imported: modules are found as Python finds them, and what they import is read in their text. A name
+# that is put together while a program runs is not found there.
+
+
+class OwnModules(NamedTuple):
+    """Modules of users that are no installed packages, by their path in a bundle; and packages that they import."""
+
+    files: dict[str, Path]
+    packages: set[str]  # as they are imported, the first part of the name
+
+
+def own_modules(names: Iterable[str]) -> OwnModules:
+    """Return the modules of some classes, functions and modules of users, and of all that these import of the like.
+
+    Args:
+        names: as `Scenario.own_code` has them.
+
+    Raises:
+        DocumentError: one is nowhere.
+        RunError: they are too large, or cannot be read.
+    """
+    found = OwnModules({}, set())
+    wanted = [(name.partition(":")[0], True) for name in names]
+    seen = set(PACKAGES) | set(sys.stdlib_module_names)
+    while wanted:
+        name, is_needed = wanted.pop()
+        package = name.partition(".")[0]
+        if package in seen:
+            continue
+        seen.add(package)
+        try:
+            spec = plugin.located(package, f"module {package}")
+        except DocumentError:
+            if is_needed:
+                raise
+            continue  # what is imported only where it is there
+        places = [Path(spec.origin)] if spec.origin else [Path(each) for each in spec.submodule_search_locations or ()]
+        if spec.origin in ("built-in", "frozen") or any(plugin.is_library(f"{place}") for place in places):
+            found.packages.add(package)
+            continue
+        for path, inside in _sources(package, places):
+            found.files[f"{MODULES}/{inside}"] = path
+            if path.suffix == ".py":
+                wanted += [(each, False) for each in _imports(path)]
+    size = sum(path.stat().st_size for path in found.files.values())
+    if size > BYTES_MAX:
+        raise RunError(f"the scenario's own modules have {size} bytes; must have <= {BYTES_MAX}: keep data elsewhere")
+    return found
+
+
+def _sources(package: str, places: Iterable[Path]) -> Iterator[tuple[Path, str]]:
+    """Yield the files of a module or a package, and their paths below the folder that holds it."""
+    for place in places:
+        if place.is_file() and place.name != "__init__.py":
+            yield place, place.name
+            continue
+        folder = place if place.is_dir() else place.parent
+        for path in sorted(folder.rglob("*")):
+            inside = path.relative_to(folder)
+            named = all(PART.fullmatch(part) for part in inside.parts)
+            if named and "__pycache__" not in inside.parts and path.is_file():
+                yield path, f"{package}/{inside.as_posix()}"
+
+
+def _imports(path: Path) -> set[str]:
+    """Return the modules that a module imports; of one made for a class of a notebook, what its pickle names."""
+    try:
+        tree = ast.parse(path.read_bytes())
+    except (OSError, SyntaxError, ValueError) as error:
+        raise RunError(f"{path}: cannot be read ({error})") from error
+    names: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names.add(node.module)
+    if path.name.startswith(plugin.MADE):
+        texts = [
+            node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)
+        ]
+        pickled = base64.b64decode(max(texts, key=len))
+        named = {arg for _, arg, _ in pickletools.genops(pickled) if isinstance(arg, str)}
+        names |= set(filter(MODULE.fullmatch, named))
+    return names
+
+
+def locked(packages: Iterable[str] = ()) -> tuple[list[str], list[str]]:
+    """Return what is installed here, as lines NAME==VERSION: all that flies, with what some packages need; and these.
+
+    A package that came from elsewhere than an index has no such line.
+
+    Args:
+        packages: as they are imported.
+    """
+    by_import = importlib.metadata.packages_distributions()
+    own = {_canonical(name) for each in packages for name in by_import.get(each, ())}
+    pins: dict[str, str] = {}
+    wanted = [(PROJECT, frozenset(EXTRAS)), *((name, frozenset[str]()) for name in sorted(own))]
+    seen: set[tuple[str, frozenset[str]]] = set()
+    while wanted:
+        name, extras = wanted.pop()
+        if (name, extras) in seen:
+            continue
+        seen.add((name, extras))
+        try:
+            installed = importlib.metadata.distribution(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+        of_index = "+" not in installed.version and not json.loads(installed.read_text("direct_url.json") or "{}")
+        if name != PROJECT and of_index:
+            pins[name] = f"{name}=={installed.version}"
+        for line in installed.requires or ():
+            needed = Requirement(line)
+            if needed.marker is None or any(needed.marker.evaluate({"extra": extra}) for extra in extras or ("",)):
+                wanted.append((_canonical(needed.name), frozenset(needed.extras)))
+    return sorted(pins.values()), sorted(pins[name] for name in own if name in pins)
+
+
+def _canonical(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()  # PEP 503
+
+
 # Figures, results, README
 
 
@@ -247,7 +388,8 @@ def _add_figures(members: dict[str, Path | bytes], record: Path) -> None:
     for figure in figures(flight, formations, summary):
         members[f"{names.FIGURES}/{figure.name}"] = figure.png()
         members[f"{names.FIGURES}/{Path(figure.name).stem}.csv"] = _drawn(figure.drawing)
-    members[names.RESULTS] = _results(summary)
+    kept = {name: value for name, value in msgspec.to_builtins(summary).items() if name not in OF_THE_WALL_CLOCK}
+    members[names.RESULTS] = indented_json(kept, "sorted")
 
 
 def _drawn(drawing: Any) -> bytes:
@@ -262,11 +404,6 @@ def _drawn(drawing: Any) -> bytes:
             name = str(count) if label.startswith("_") else label
             writer.writerows([panel, name, f"{x:.9g}", f"{y:.9g}"] for x, y in zip(*curve.get_data(), strict=True))
     return file.getvalue().encode()
-
-
-def _results(summary: RunSummary) -> bytes:
-    kept = {name: value for name, value in msgspec.to_builtins(summary).items() if name not in OF_THE_WALL_CLOCK}
-    return msgspec.json.format(msgspec.json.encode(kept, order="sorted"), indent=2) + b"\n"
 
 
 README = """# {name}

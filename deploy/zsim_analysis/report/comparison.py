@@ -1,6 +1,10 @@
-"""The comparison of several runs: the differences of their scenarios and results, and their page."""
+"""The comparison of several runs: the differences of their scenarios and results, their page, and its figures.
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+In the figures runs are overlaid where lines remain distinguishable, otherwise side by side.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from os.path import relpath
@@ -8,20 +12,58 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from zsim.errors import ReportError
 from zsim.output_folder import RECORD
+from zsim.presentation import colours_of
 from zsim_agents.formation.spaces.cluster_space import unit
+from zsim_analysis.reading.formation import Formation
+from zsim_analysis.reading.recorded_flight import Array, RecordedFlight
 from zsim_analysis.reading.shortfall import span_text
-from zsim_analysis.report.comparison_figures import UNPLANNED, ComparedRun, clusters, comparison_figures, parameters
-from zsim_analysis.report.make_report import Picture, facts, sources, template, write_page
-from zsim_analysis.report.summary import STATISTICS, judge
+from zsim_analysis.report import figure_style as style
+from zsim_analysis.report.flight_figures import (
+    DRONE_PANELS,
+    NAMED_MAX,
+    curves,
+    draw_drone_panels,
+    draw_error,
+    draw_obstacles,
+    draw_path,
+    drone_panel_heights,
+    name_states,
+    numbered,
+    parameter_groups,
+)
+from zsim_analysis.report.make_report import Picture, facts, rendered, write_page
+from zsim_analysis.report.summary import STATISTICS, RunSummary, flies_paper_test, judge
 
 ABSENT = "–"
 RUNS_PER_TABLE = 2  # side by side with all their statistics: as many as fit the page
 THERE = "there"  # cell of a named item, such as a drone, that another run does not have
 NAMED, NAMES_MAX = 3, 100  # runs in the page's file name, and characters of their names
 MARK, MARK_WITHIN = b": comparison</title>", 4_000  # identifies our pages, within their first bytes
+UNPLANNED = "†"  # after the name of a run that was not flown as planned
+
+
+@dataclass
+class ComparedRun:
+    name: str  # unique among the runs
+    directory: Path
+    flight: RecordedFlight
+    formations: list[Formation]
+    summary: RunSummary
+
+    @property
+    def label(self) -> str:
+        """Its name in tables and figures, marked unless it was flown as planned."""
+        return self.name if self.summary.as_planned else f"{self.name} {UNPLANNED}"
+
+    def formation(self, cluster: str) -> Formation | None:
+        """Return a cluster's formation, None if this run has none that can be judged."""
+        return next((formation for formation in self.formations if formation.name == cluster), None)
 
 
 def compare(
@@ -94,7 +136,9 @@ def runs_id(directories: Sequence[Path]) -> str:
 
 def comparison_page(runs: Sequence[ComparedRun], pictures: Sequence[Picture]) -> str:
     groups = [runs[start : start + RUNS_PER_TABLE] for start in range(0, len(runs), RUNS_PER_TABLE)]
-    return template("comparison.html.j2").render(
+    return rendered(
+        "comparison.html.j2",
+        pictures,
         runs=runs,
         runs_id=runs_id([run.directory for run in runs]),
         facts=fact_rows(runs),
@@ -104,7 +148,6 @@ def comparison_page(runs: Sequence[ComparedRun], pictures: Sequence[Picture]) ->
         tables={name: [(group, statistics_rows(group, name)) for group in groups] for name in clusters(runs)},
         scenario=scenario_rows(runs),
         without=[run.name for run in runs if run.flight.scenario is None],
-        figures=sources(pictures),
     )
 
 
@@ -226,3 +269,334 @@ def _missing(what: str, there: Mapping[str, Sequence[str]]) -> list[str]:
 
 def _listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+# Figures
+
+COLUMNS = 3  # greatest number of runs in a row of a figure
+ROOM = 0.03  # margin beyond the greatest RMS, so that its mark is not cut
+ROWS_MAX = 24  # parameters in one figure; 6 drones
+DESIRED: dict[str, Any] = {"color": style.BLACK, "lw": 1.0, "ls": (0, (1, 2)), "zorder": 6}
+LANE_IN = 0.24  # height of a run's lane of marks
+HATCHES = {"assembly": "////", "held": "xxxx", "landing": "....", style.FAULT: "", style.TAKE_OVER: "\\\\\\\\"}
+POINTS = {"take-off": "^", "engagement": "D", "collision": "X"}
+FACE, FAULT_FACE = 0.35, 0.65
+EMPTY, GREY_FACE = "#e6eaee", "#b6bfc9"  # of an empty lane, and of a bar in the legend
+NAME_MAX = 20  # characters of a run's name beside its lane
+
+
+def clusters(runs: Iterable[ComparedRun]) -> list[str]:
+    """Return the names of the clusters of all runs."""
+    return list(dict.fromkeys(formation.name for run in runs for formation in run.formations))
+
+
+def parameters(runs: Iterable[ComparedRun], cluster: str) -> list[str]:
+    """Return the variables of a cluster in all runs."""
+    judged = (run.summary.clusters.get(cluster) for run in runs)
+    return list(dict.fromkeys(name for each in judged if each for name in each.errors))
+
+
+class RunStyle(NamedTuple):
+    """Colour, dashes and marker of a run, distinguishable in black and white as well."""
+
+    color: str
+    dashes: Any
+    marker: str
+
+
+STYLES = (
+    RunStyle(style.BLUE, "-", "o"),
+    RunStyle(style.VERMILION, (0, (6, 2)), "s"),
+    RunStyle(style.GREEN, (0, (6, 2, 1.5, 2)), "^"),
+    RunStyle(style.PURPLE, (0, (2.5, 1.5)), "D"),
+    RunStyle(style.ORANGE, (0, (10, 3)), "v"),
+    RunStyle(style.SKY, (0, (6, 2, 1.5, 2, 1.5, 2)), "P"),
+)
+
+
+def run_style(index: int) -> RunStyle:
+    """Return the style of a run; from the seventh run on, colours repeat with other dashes."""
+    repeats, place = divmod(index, len(STYLES))
+    return STYLES[place]._replace(dashes=STYLES[(index + repeats) % len(STYLES)].dashes)
+
+
+def comparison_figures(runs: Sequence[ComparedRun]) -> Iterator[style.ReportFigure]:
+    """Yield the figures for which the records have data."""
+    for cluster in clusters(runs):
+        yield from _of_cluster(runs, cluster)
+    if any(len(track.t_ns) for run in runs for track in run.flight.tracks):
+        yield style.ReportFigure(
+            "plan_view.png",
+            "Plan view",
+            "True paths from above, on one scale; squares: start, dots: end.",
+            _draw_plans(runs),
+        )
+        yield style.ReportFigure(
+            "drones.png",
+            "Drones",
+            "True altitude, state of the firmware and battery of every drone, run by run on the same axes.",
+            _draw_drones(runs),
+        )
+
+
+def _across(runs: Sequence[ComparedRun]) -> int:
+    """Return the number of runs in a row, balanced over the rows."""
+    rows = -(-len(runs) // COLUMNS)
+    return -(-len(runs) // rows)
+
+
+def _of_cluster(runs: Sequence[ComparedRun], cluster: str) -> Iterator[style.ReportFigure]:
+    names = parameters(runs, cluster)
+    paper = all(
+        flies_paper_test(run.flight, cluster) and not style.time_marks(run.flight).has(style.TAKE_OVER) for run in runs
+    )
+    suffix = f", cluster {cluster}" if len(clusters(runs)) > 1 else ""
+    yield style.ReportFigure(
+        f"rms_{cluster}.png",
+        f"Errors of the formation's parameters{suffix}",
+        "Root of the mean square of truth − desired (full marks) and of estimate − desired (hollow marks) within the "
+        "window of each run.",
+        _draw_rms(runs, cluster, names[:ROWS_MAX]),
+    )
+    for number, start in enumerate(range(0, len(runs), _across(runs))):
+        some = runs[start : start + _across(runs)]
+        if any(run.formation(cluster) for run in some):
+            yield style.ReportFigure(
+                f"figure_5_errors_{cluster}_{number}.png",
+                f"Formation parameters' errors{numbered(5, paper)}{suffix}",
+                "Runs side by side, each row on one scale, that of the windows (shaded), which larger errors leave.",
+                _draw_errors(some, runs, cluster, names[:ROWS_MAX]),
+            )
+    for file, number, what, group in parameter_groups(names):
+        if shown := group[:ROWS_MAX]:
+            yield style.ReportFigure(
+                f"{file}_{cluster}.png",
+                f"{what}{numbered(number, paper)}{suffix}",
+                f"(a) True and (b) measured (from the estimates) {', '.join(shown)}; dotted: desired. "
+                "Above: each run's marks.",
+                _draw_parameters(runs, cluster, shown),
+            )
+
+
+def _draw_rms(runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -> Figure:
+    """Draw the RMS errors, with a panel for metres and one for radians."""
+    groups = {each: [name for name in names if unit(name) == each] for each in dict.fromkeys(map(unit, names))}
+    figure = style.new_figure(style.PAGE_IN, 1.0 + len(groups) * 0.4 + 0.16 * (len(runs) + 1) * len(names))
+    heights = [len(group) for group in groups.values()]
+    panels = figure.subplots(len(groups), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for axes, (measure, group) in zip(panels, groups.items(), strict=True):
+        style.dress(axes)
+        lane = 1.0 / (len(runs) + 1)
+        for i, run in enumerate(runs):
+            judged, look = run.summary.clusters.get(cluster), run_style(i)
+            for row, name in enumerate(group):
+                errors = judged.errors.get(name) if judged else None
+                y = row + (i - (len(runs) - 1) / 2) * lane
+                for value, face in ((errors and errors.true_rms, look.color), (errors and errors.est_rms, "white")):
+                    if value is not None:
+                        axes.plot(value, y, look.marker, color=look.color, mfc=face, ms=7, zorder=3, clip_on=False)
+        axes.set_yticks(range(len(group)), [style.label(name) for name in group])
+        axes.set_ylim(len(group) - 0.5, -0.5)
+        axes.margins(x=ROOM)
+        axes.set_xlim(left=0)
+        for row in range(1, len(group)):
+            axes.axhline(row - 0.5, color=style.GRID, lw=0.6, zorder=1)
+        axes.grid(False, axis="y")
+        axes.set_xlabel(f"RMS error ({measure})", fontsize=style.PAPER_PT)
+    style.letter_panels(panels)
+    for i, run in enumerate(runs):
+        look = run_style(i)
+        panels[0].plot([], [], look.marker, color=look.color, ms=7, label=run.label)
+    style.legend_above(figure, panels[0])
+    return figure
+
+
+def _draw_errors(
+    some: Sequence[ComparedRun], runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]
+) -> Figure:
+    """Draw the errors of a few runs side by side; all runs determine the scale of a row."""
+    figure = style.new_figure(style.PAGE_IN, 0.9 + 0.7 * len(names))
+    grid = figure.subplots(len(names), len(some), squeeze=False, sharex=True, sharey="row")
+    for run, column in zip(some, grid.T, strict=True):
+        formation = run.formation(cluster)
+        column[0].set_title(run.label, fontsize=style.PAPER_PT)
+        style.label_time(column[-1:])
+        for name, axes in zip(names, column, strict=True):
+            if formation and name in formation.names:
+                draw_error(axes, formation, name, np.ones(len(formation.t_s), bool))
+                style.shade_window(axes, run.summary.window_s)
+                style.draw_marks([axes], style.time_marks(run.flight, formation))
+            else:
+                style.dress(axes)
+                look: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": style.PAPER_PT - 1}
+                axes.text(0.5, 0.5, "not in this run", transform=axes.transAxes, color="#57606a", **look)
+    style.letter_panels(grid[0])
+    for name, axes in zip(names, grid[:, 0], strict=True):
+        axes.set_ylabel(style.label(name), fontsize=style.PAPER_PT)
+        limit = 0.0  # the greatest error within the window of any run
+        for run in runs:
+            formation = run.formation(cluster)
+            if formation and name in formation.names:
+                rows, i = formation.within(run.summary.window_s), formation.column(name)
+                errors = np.abs(np.r_[formation.true_error[rows, i], formation.est_error[rows, i]])
+                limit = max(limit, float(np.max(errors[np.isfinite(errors)], initial=0.0)))
+        if limit:
+            axes.set_ylim(-1.15 * limit, 1.15 * limit)
+    figure.align_ylabels(grid[:, 0])
+    style.legend_above(figure, next((axes for axes in grid[0] if axes.lines), grid[0, 0]))
+    return figure
+
+
+def _draw_parameters(runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -> Figure:
+    """Draw variables over time: true on the left, measured on the right, with the runs overlaid."""
+    lanes_in, marks = LANE_IN * len(runs), []
+    for run in runs:
+        times = style.time_marks(run.flight, run.formation(cluster))
+        once = (("take-off", times.takeoff_s), ("engagement", times.engaged_s))
+        points = [(kind, t_s) for kind, t_s in once if t_s is not None]
+        points += [("collision", event.t_ns / 1e9) for event in run.flight.events if event.kind == "collision"]
+        marks.append(RunMarks(run.label, times, points))
+    figure = style.new_figure(style.PAGE_IN, 0.9 + 1.4 * len(names) + lanes_in)
+    heights = [lanes_in, *[1.35] * len(names)]
+    lanes, *grid = figure.subplots(len(heights), 2, squeeze=False, sharex=True, sharey="row", height_ratios=heights)
+    for name, (true_axes, measured_axes) in zip(names, grid, strict=True):
+        style.dress(true_axes, style.label(name))
+        style.dress(measured_axes)
+        drawn: list[Array] = []
+        for i, run in enumerate(runs):
+            formation = run.formation(cluster)
+            if formation is None or name not in formation.names:
+                continue
+            desired, measured, true = curves(formation, name)
+            look: dict[str, Any] = {"color": run_style(i).color, "ls": run_style(i).dashes, "lw": 1.3, "zorder": 3}
+            style.line(true_axes, formation.t_s, true, label=run.label, **look)
+            style.line(measured_axes, formation.t_s, measured, **look)
+            for axes in (true_axes, measured_axes):
+                style.line(axes, formation.t_s, np.where(formation.engaged, desired, np.nan), **DESIRED)
+            since = formation.since_engaged
+            drawn += [true, measured[since], desired[since]]
+        if drawn:
+            style.scale(true_axes, *drawn)
+        for place, each in enumerate(marks):  # take-off, engagement and collisions, in the colour of the run
+            for kind, t_s in each.points:
+                dashes = {"take-off": ":", "engagement": "-."}.get(kind, "-")
+                for axes in (true_axes, measured_axes):
+                    axes.axvline(t_s, color=run_style(place).color, lw=0.9, ls=dashes, alpha=0.7, zorder=1.5)
+    for axes, title in zip(lanes, ("true", "measured (estimates)"), strict=True):
+        _draw_lanes(axes, marks, named=axes is lanes[0])
+        axes.set_title(title, fontsize=style.PAPER_PT)
+    style.letter_panels(lanes)
+    first = grid[0][0]
+    first.plot([], [], label="desired, while engaged", **DESIRED)
+    for kind in dict.fromkeys(band.kind for each in marks for band in each.marks.bands):  # without a run's colour
+        face = style.DARK if kind == style.FAULT else GREY_FACE
+        first.fill_between(
+            [], [], facecolor=face, edgecolor=style.DARK, hatch=HATCHES.get(kind, ""), lw=0.8, label=kind
+        )
+    for kind in dict.fromkeys(kind for each in marks for kind, _ in each.points):
+        first.plot([], [], POINTS[kind], color=style.DARK, ms=7, label=kind)
+    style.label_time(grid[-1])
+    figure.align_ylabels([row[0] for row in grid])
+    style.legend_above(figure, first)
+    return figure
+
+
+class RunMarks(NamedTuple):
+    """The marks of a run: bands, and kind and time [s] of instantaneous events."""
+
+    name: str
+    marks: style.TimeMarks
+    points: list[tuple[str, float]]
+
+
+def _draw_lanes(lanes: Axes, marks: Sequence[RunMarks], named: bool) -> None:
+    """Draw a lane for each run, the first at the top: bars for bands, markers for instants."""
+    for place, run in enumerate(marks):
+        colour = run_style(place).color
+        lanes.axhline(place, color=EMPTY, lw=1.0, zorder=1)
+        for band in run.marks.bands:
+            face, hatch = FAULT_FACE if band.kind == style.FAULT else FACE, HATCHES.get(band.kind, "")
+            span, look = (band.from_s, band.to_s - band.from_s), {"edgecolor": colour, "lw": 0.8, "zorder": 2}
+            lanes.broken_barh([span], (place - 0.36, 0.72), facecolor=(colour, face), hatch=hatch, **look)
+        for kind, t_s in run.points:
+            lanes.plot([t_s], [place], POINTS[kind], color=colour, ms=8, mec="white", mew=0.8, zorder=4, clip_on=False)
+    lanes.set_ylim(len(marks) - 0.5, -0.5)
+    short = [each.name if len(each.name) <= NAME_MAX else f"…{each.name[1 - NAME_MAX :]}" for each in marks]
+    lanes.set_yticks(range(len(marks)), short)
+    for place, text in enumerate(lanes.get_yticklabels()):
+        text.set_color(run_style(place).color)
+    lanes.tick_params(axis="y", length=0, labelsize=style.PAPER_PT - 1, labelleft=named)
+    lanes.tick_params(axis="x", length=0, labelbottom=False)
+    lanes.spines[:].set_visible(False)
+
+
+def _draw_plans(runs: Sequence[ComparedRun]) -> Figure:
+    """Draw the true paths from above, a plan per run, all on one scale."""
+    across, colours = _across(runs), _drone_colours(runs)
+    rows = -(-len(runs) // across)
+    figure = style.new_figure(style.PAGE_IN, 0.8 + rows * style.PAGE_IN / across)
+    grid = figure.subplots(rows, across, squeeze=False, sharex=True, sharey=True)
+    for axes in grid.flat[len(runs) :]:
+        axes.set_axis_off()
+    for run, axes in zip(runs, grid.flat, strict=False):
+        style.dress(axes)
+        axes.set_title(run.label, fontsize=style.PAPER_PT)
+        axes.set_aspect("equal", adjustable="box")
+        draw_obstacles(axes, run.flight.scenario)
+        for track in run.flight.tracks:
+            draw_path(axes, track, colours[track.name], named=False)
+    for axes in grid.flat[len(runs) - across : len(runs)]:
+        axes.set_xlabel("east x (m)", fontsize=style.PAPER_PT)
+        axes.tick_params(labelbottom=True)
+    for axes in grid[:, 0]:
+        axes.set_ylabel("north y (m)", fontsize=style.PAPER_PT)
+    (left, right), (low, high) = grid[0, 0].get_xlim(), grid[0, 0].get_ylim()
+    half = 0.52 * max(right - left, high - low)  # of the square range that all plans have
+    grid[0, 0].set_xlim((left + right) / 2 - half, (left + right) / 2 + half)
+    grid[0, 0].set_ylim((low + high) / 2 - half, (low + high) / 2 + half)
+    style.letter_panels(grid.flat[: len(runs)])
+    _name_drones(figure, grid[0, 0], colours)
+    return figure
+
+
+def _draw_drones(runs: Sequence[ComparedRun]) -> Figure:
+    """Draw true altitude, state and battery of every drone, a column per run."""
+    heights = drone_panel_heights(max(len(run.flight.tracks) for run in runs))
+    across, colours = _across(runs), _drone_colours(runs)
+    rows = -(-len(runs) // across)
+    figure = style.new_figure(style.PAGE_IN, (1.0 + 0.6 * sum(heights)) * rows)
+    grid = figure.subplots(3 * rows, across, squeeze=False, sharex=True, height_ratios=heights * rows)
+    for axes in grid.flat:
+        axes.set_axis_off()
+    for index, run in enumerate(runs):
+        row, column = divmod(index, across)
+        panels = list(grid[3 * row : 3 * row + 3, column])
+        for axes, quantity in zip(panels, DRONE_PANELS, strict=True):
+            axes.set_axis_on()
+            style.dress(axes, quantity if column == 0 and quantity != "state" else "")
+        panels[0].set_title(run.label, fontsize=style.PAPER_PT)
+        draw_drone_panels(panels, run.flight.tracks, colours, named=0)
+        panels[-1].tick_params(labelbottom=True)
+        style.draw_marks(panels, style.time_marks(run.flight, run.formations[0] if run.formations else None))
+    style.letter_panels([grid[3 * (index // across), index % across] for index in range(len(runs))])
+    for kind in (0, 2):  # one range of altitudes, and one of charges
+        drawn = [each for each in grid[kind::3].flat if each.lines]
+        limits = [each.get_ylim() for each in drawn]
+        for each in drawn:
+            each.set_ylim(min(low for low, _ in limits), max(high for _, high in limits))
+    name_states(figure, [track for run in runs for track in run.flight.tracks])
+    _name_drones(figure, grid[0, 0], colours)
+    return figure
+
+
+def _drone_colours(runs: Sequence[ComparedRun]) -> dict[str, str]:
+    """Return a colour for each drone name of all runs."""
+    return colours_of(list(dict.fromkeys(track.name for run in runs for track in run.flight.tracks)))
+
+
+def _name_drones(figure: Figure, axes: Axes, colours: Mapping[str, str]) -> None:
+    """Add the drones to the legend; of many only the first and the last."""
+    named = list(colours.items())
+    for name, colour in named if len(named) <= NAMED_MAX else (named[0], named[-1]):
+        axes.plot([], [], color=colour, lw=1.1, label=name)
+    style.legend_above(figure, axes)

@@ -10,9 +10,9 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from zsim.errors import ReportError
@@ -26,15 +26,34 @@ from zsim_analysis.reading.drone_errors import (
     velocity_responses,
 )
 from zsim_analysis.reading.formation import Formation, goal_errors
-from zsim_analysis.reading.radio_links import RadioSummary
-from zsim_analysis.reading.recorded_flight import RecordedFlight
+from zsim_analysis.reading.recorded_flight import RadioSummary, RecordedFlight
 from zsim_analysis.reading.shortfall import percent_text, seconds_text, span_text
-from zsim_analysis.report import FORMATS
-from zsim_analysis.report import drone_figures as drones
+from zsim_analysis.report import FORMATS, indented_json
 from zsim_analysis.report.figure_style import DARK, TAKE_OVER, VERMILION, ReportFigure, mark_figure, time_marks
-from zsim_analysis.report.formation_figures import ROWS_MAX, draw_errors, draw_parameters, numbered, parameter_groups
-from zsim_analysis.report.paper import PAPER_NOTE, flies_paper_test
-from zsim_analysis.report.summary import PAPER_COLUMN, RunSummary, error_table, judge, tracking_table
+from zsim_analysis.report.flight_figures import (
+    PAIRS_MAX,
+    ROWS_MAX,
+    draw_distances,
+    draw_drones,
+    draw_errors,
+    draw_estimates,
+    draw_parameters,
+    draw_plan,
+    draw_radio,
+    draw_references,
+    draw_velocities,
+    numbered,
+    parameter_groups,
+)
+from zsim_analysis.report.summary import (
+    PAPER_COLUMN,
+    PAPER_NOTE,
+    RunSummary,
+    error_table,
+    flies_paper_test,
+    judge,
+    tracking_table,
+)
 
 FAULTS_MAX = 6  # at the head of a page
 REFERENCE = (
@@ -58,7 +77,7 @@ def make_report(
     """
     flight, formations, summary = judge(directory / RECORD, progress, answers=True)
     drawings = figures(flight, formations, summary)
-    write_report(directory, summary.json(), drawings, partial(page, summary), progress, formats)
+    write_report(directory, summary, drawings, partial(page, summary), progress, formats)
     return summary
 
 
@@ -105,15 +124,15 @@ def planned_figures(
             "Plan view",
             "True paths from above, squares where they begin and dots where they end; black: desired centroid; grey: "
             "the formation at some instants of simulated time.",
-            partial(drones.draw_plan, flight, formations),
+            partial(draw_plan, flight, formations),
         )
-    if apart := distances(flight, drones.PAIRS_MAX):
+    if apart := distances(flight, PAIRS_MAX):
         what = "every two drones" if apart.pairs else "each drone to the nearest other one: median, 5 to 95 %, extremes"
         yield PlannedFigure(
             "distances.png",
             "Distances between drones",
             f"True distance of {what}; below the first line the controller's guard parts them.",
-            partial(drones.draw_distances, apart, separations(flight), colours, marks),
+            partial(draw_distances, apart, separations(flight), colours, marks),
         )
     if off := reference_errors(flight):
         yield PlannedFigure(
@@ -121,7 +140,7 @@ def planned_figures(
             "Errors against the drones' references",
             "Truth − reference of every drone that flies by itself, in the air: thick on its path, thin on the way "
             "to it or holding a place. Of many drones: median, 5 to 95 % and extremes.",
-            partial(drones.draw_references, off, colours, marks),
+            partial(draw_references, off, colours, marks),
         )
     if flight.radio:
         yield PlannedFigure(
@@ -130,14 +149,14 @@ def planned_figures(
             "(a) Share of the messages of a drone that arrive at another, over the whole run, by range and loss. (b) "
             "Drones heard, those whose messages arrive in part counted in part. Grey: not every drone reaches all by "
             "links that carry half of the messages or more, not even over others.",
-            partial(drones.draw_radio, flight.radio, [track.name for track in flight.tracks], marks),
+            partial(draw_radio, flight.radio, [track.name for track in flight.tracks], marks),
         )
     if has_truth:
         yield PlannedFigure(
             "drones.png",
             "Drones",
             "True altitude, state of the firmware and battery of every drone.",
-            partial(drones.draw_drones, flight, marks),
+            partial(draw_drones, flight, marks),
         )
     if errors := estimate_errors(flight):
         yield PlannedFigure(
@@ -147,7 +166,7 @@ def planned_figures(
             "of position and velocity squared and divided by its covariance: 6 on average where that is true. Shares "
             "and means, above the panels, are those of the window; the axes hold all since the engagement, and what is "
             "larger before it leaves them.",
-            partial(drones.draw_estimates, errors, colours, window_s, marks),
+            partial(draw_estimates, errors, colours, window_s, marks),
         )
     if responses := velocity_responses(flight):
         yield PlannedFigure(
@@ -155,7 +174,7 @@ def planned_figures(
             "Commanded and flown velocity",
             "By the drone's heading. Flown: in truth; commanded: as sent by whoever flew the drone, without the delay "
             "of the link. Of many drones: median, 5 to 95 % and extremes of the difference.",
-            partial(drones.draw_velocities, responses, colours, marks),
+            partial(draw_velocities, responses, colours, marks),
         )
 
 
@@ -187,7 +206,14 @@ def _of_cluster(
 
 
 def page(summary: RunSummary, pictures: Sequence[Picture]) -> str:
-    return template("page.html.j2").render(
+    events = [(f"{each.t_s:.2f}", each.kind, each.source, each.subject, each.text) for each in summary.events]
+    participants = [
+        (p["name"], p["host"], p["pid"], summary.versions.get(p["name"], ""), p["incarnations"], p["left"])
+        for p in summary.participants
+    ]
+    return rendered(
+        "page.html.j2",
+        pictures,
         summary=summary,
         facts=facts(summary),
         window=span_text(summary.window_s),
@@ -195,7 +221,8 @@ def page(summary: RunSummary, pictures: Sequence[Picture]) -> str:
         tables={name: error_table(cluster) for name, cluster in summary.clusters.items()},
         tracking=tracking_table(summary) if summary.tracking else None,
         paper_note=PAPER_NOTE if any(cluster.paper_std for cluster in summary.clusters.values()) else "",
-        figures=sources(pictures),
+        events=events,
+        participants=participants,
     )
 
 
@@ -263,19 +290,16 @@ def date_text(date: str | None) -> str:
     return f"{date[:16].replace('T', ' ')} UTC" if date else "not known"
 
 
-def template(name: str, package: str = "zsim_analysis.report") -> Template:
-    """Return a page's template; it may include templates of its own package and of this one."""
-    return Environment(
+def rendered(name: str, pictures: Iterable[Picture], package: str = "zsim_analysis.report", **values: Any) -> str:
+    """Return a page: a template of a package, which may use those of this one, with `figures` and other values."""
+    environment = Environment(
         loader=ChoiceLoader([PackageLoader(package, "."), PackageLoader("zsim_analysis.report", ".")]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
-    ).get_template(name)
-
-
-def sources(pictures: Iterable[Picture]) -> list[tuple[ReportFigure, str]]:
-    """Return each figure with its PNG file as a data URI."""
-    return [(figure, "data:image/png;base64," + base64.b64encode(png).decode()) for figure, png in pictures]
+    )
+    sources = [(figure, "data:image/png;base64," + base64.b64encode(png).decode()) for figure, png in pictures]
+    return environment.get_template(name).render(figures=sources, **values)
 
 
 # Files
@@ -283,7 +307,7 @@ def sources(pictures: Iterable[Picture]) -> list[tuple[ReportFigure, str]]:
 
 def write_report(
     directory: Path,
-    summary: bytes,
+    summary: object,
     figures: Iterable[ReportFigure],
     page: Callable[[Sequence[Picture]], str],
     progress: Callable[[str], None],
@@ -308,7 +332,7 @@ def write_report(
         pictures = _render(figures, new / "figures", progress, formats)
         for figure, png in pictures:
             (new / "figures" / figure.name).write_bytes(png)
-        (new / "summary.json").write_bytes(summary)
+        (new / "summary.json").write_bytes(indented_json(summary))
         (new / "report.html").write_text(page(pictures), encoding="utf-8")
     _remove_others(pictures, directory / "figures", formats)
 

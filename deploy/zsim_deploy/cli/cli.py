@@ -22,14 +22,7 @@ from zsim.errors import (
 )
 from zsim_deploy import INTERRUPTED, USER_FAULT
 from zsim_deploy.arguments import HOSTS, POKE, TRANSLATE, endpoint_origin, note, say
-from zsim_deploy.cli import (
-    bridge_commands,
-    federation_commands,
-    hosts_commands,
-    role_commands,
-    run_commands,
-    study_commands,
-)
+from zsim_deploy.cli import federation_commands, hosts_commands, role_commands, run_commands
 from zsim_deploy.roles.closed_output import STREAMS, is_unread
 
 UsageError: Any = importlib.import_module(typer.BadParameter.__module__).UsageError  # of the click that typer uses
@@ -51,13 +44,18 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-_FAMILIES = (run_commands, study_commands, role_commands, hosts_commands, federation_commands, bridge_commands)
-for _family in _FAMILIES:
-    app.add_typer(_family.app)
+for _family in (
+    run_commands.app,
+    role_commands.app,
+    hosts_commands.app,
+    federation_commands.app,
+    role_commands.bridges,
+):
+    app.add_typer(_family)
 for _panel, _group in (
     (POKE, federation_commands.faults),
-    (TRANSLATE, bridge_commands.ardrone),
-    (TRANSLATE, bridge_commands.mavlink),
+    (TRANSLATE, role_commands.ardrone),
+    (TRANSLATE, role_commands.mavlink),
     (HOSTS, hosts_commands.certs),
     (HOSTS, hosts_commands.rendering),
 ):

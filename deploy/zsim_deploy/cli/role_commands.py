@@ -1,24 +1,63 @@
-"""The commands that each run one role of a federation."""
+"""The commands that each run one process of a federation: its roles, and the bridges to other programs.
 
+Roles    `world`, those of agents, `host`, `agent`, `record`, `router`, `camera`, `detect`
+Bridges  `console`, `gateway`, `ros1`, `ros2`, `mavlink`, `ardrone`, `fmu`
+"""
+
+import math
+import time
 from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
-from typer import Argument, Option
+from typer import Argument, BadParameter, Option
 
+from zsim.errors import RunError, SessionError, file_fault
 from zsim.scenario.roles import AGENTS, Role
+from zsim_bridges.ros1.master_api import DEFAULT_MASTER, own_address
 from zsim_deploy import arguments as opt
-from zsim_deploy.arguments import require
+from zsim_deploy.arguments import require, say
 
 if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
+    from zsim.contract.messages import Info
+    from zsim.transport.session import Session
     from zsim.transport.tls import Identity
+    from zsim_bridges.vehicle_links.vehicle_session import FlightLimits
     from zsim_deploy.roles.roles import Remain, Serve
 
+FIRST_ADDRESS = "127.0.0.2"  # of the first AR.Drone; programs on this host send from 127.0.0.1
+TOKEN = "ZSIM_TOKEN"  # environment variable, because a command line is visible to all users of the machine
+DOMAIN_MAX = 232  # the highest ROS_DOMAIN_ID of ROS 2
+KEY_BYTES = 32
+GCS_PORT, GCS_LOCAL_PORT = 14550, 18570  # of PX4's simulation: the ground station, and the first local port
+API_PORT, API_LOCAL_PORT = 14540, 14580  # likewise for programs
+GATEWAY_NEEDS = {"gateway": ("aiohttp",)}
+FMU_NEEDS = {"fmu": ("fmpy",)}
+ROS1_NEEDS = {"ros1": ("rosbags",)}
+ROS2_NEEDS = {"ros2": ("rosbags", "xxhash")}
 
 app = typer.Typer()
+bridges = typer.Typer()
+mavlink = typer.Typer(
+    name="mavlink", no_args_is_help=True, help="MAVLink: the drones of a run as vehicles of PX4 or ArduPilot."
+)
+ardrone = typer.Typer(name="ardrone", help="Programs for the AR.Drone fly drones of a run.", no_args_is_help=True)
+
 SOME_DRONES = "Drones, or patterns: 'drone*'; all that have cameras if not given."
 Drones = Annotated[list[str] | None, Argument(metavar="[DRONE]...", help=SOME_DRONES, show_default=False)]
+PaceAsked = Annotated[
+    float | None, opt.positive_option("Simulated per wall second, asked of the world.", show_default=False)
+]
+SigningKey = Annotated[
+    Path | None, Option(help="File with the key of MAVLink 2 signatures; unsigned messages are refused.")
+]
+DroneName = Annotated[str, Argument(help="Its drone in the run, with `body: external` in the scenario.")]
+Armed = Annotated[bool, Option("--armed", help="Obey from the start; otherwise an operator must ask `arm` first.")]
 
 
 @app.command(rich_help_panel=opt.ROLES)
@@ -214,3 +253,380 @@ def serve_as(
     if lowered:
         lower_priority()
     roles.serve_runs(process_name(role, name, reach.who, thing), serve, reach, remain=remain)
+
+
+@bridges.command(rich_help_panel=opt.WATCH)
+@opt.participant_options
+def console(
+    reach: opt.WorldAccess,
+    listen: Annotated[str, Option(help="Address on which the page is served.")] = "127.0.0.1",
+    port: Annotated[
+        int | None,
+        opt.port_option(f"Port of the page ({opt.CONSOLE_PORT}, or another if that is in use).", show_default=False),
+    ] = None,
+    token: Annotated[str | None, Option(envvar=TOKEN, help="What operators must show; needed off loopback.")] = None,
+    rate_hz: Annotated[
+        float | None,
+        opt.positive_option("Pictures a second (20; 10 from 20 drones or 4 × real time on).", show_default=False),
+    ] = None,
+    name: Annotated[str, Option(help="Process name (default the certificate's, or console.1, .2, …).")] = "",
+    folder: Annotated[
+        Path | None, Option(help="Folder of the run, shown on the page when it is over.", show_default=False)
+    ] = None,
+) -> None:
+    """Show a run in the browser, and steer it: scene, plots, events, faults."""
+    require("console", opt.CONSOLE_NEEDS)
+    from zsim.runtime.progress import JsonProgress
+    from zsim.transport.zenoh_settings import SERVER_FILES, require_files
+    from zsim_bridges.console.console_server import Console
+    from zsim_bridges.console.page_server import ListenAddress
+    from zsim_deploy.roles.roles import log_printer, process_name
+
+    # Of normal priority, because an operator's emergency stop goes through it.
+    own_name = process_name("console", name, reach.who, "*")
+    tell = JsonProgress().say if reach.launched else log_printer(None)
+    require_files(SERVER_FILES, "a console and its pages")
+    world = f"federation {reach.federation!r} on {reach.endpoint}"
+    address = ListenAddress(listen, port or opt.CONSOLE_PORT, or_any=port is None)
+    shown = Console(address, own_name.removesuffix(".*"), token, rate_hz, tell, world, folder)
+    with shown.open():
+        serve_as("console", own_name, shown.serve, reach, remain=shown.remain)
+
+
+@bridges.command(rich_help_panel=opt.TRANSLATE)
+@opt.participant_options
+def gateway(
+    reach: opt.WorldAccess,
+    listen: Annotated[str, Option(help="Address on which clients connect.")] = "127.0.0.1",
+    http: Annotated[int, opt.port_option("Port of HTTP and WebSocket.")] = 8000,
+    lines: Annotated[int, opt.port_option("Port of JSON lines on TCP.")] = 7470,
+    token: Annotated[str | None, Option(envvar=TOKEN, help="What clients must show; needed off loopback.")] = None,
+    name: Annotated[str, opt.process_option("gateway.main")] = "",
+) -> None:
+    """Let in MATLAB, Octave, C, JavaScript, scripts: JSON lines, WebSocket, REST."""
+    require("gateway", GATEWAY_NEEDS)
+    from zsim.transport.connection import find_world
+    from zsim.transport.zenoh_settings import SERVER_FILES, allow_files, require_files
+    from zsim_bridges.gateway.gateway_server import CLIENTS_MAX, Gateway, GatewayPorts
+    from zsim_bridges.web.web_server import CONNECTIONS_MAX
+    from zsim_deploy.roles.roles import log_printer, process_name
+    from zsim_deploy.roles.stop_channel import lower_priority
+
+    lower_priority()  # before its threads are started
+    own_name = process_name("gateway", name, reach.who)
+
+    def connect_as(process: str) -> "AbstractContextManager[tuple[Session, Info]]":
+        who = reach.who
+        if who.tls is not None:  # a client's certificate is beside the gateway's
+            folder = who.tls.parent / process
+            if not folder.is_dir():
+                remedy = "name it in the scenario and in the inventory"
+                raise SessionError(f"{process}: has no certificate here ({folder}); {remedy}")
+            who = who._replace(tls=folder, process=process)
+        return find_world(reach.endpoint, reach.federation, opt.LOOK_S, identity=who)
+
+    require_files(SERVER_FILES, "a gateway and its clients")
+    allow_files(SERVER_FILES + CONNECTIONS_MAX + CLIENTS_MAX)
+    ports = GatewayPorts(listen, http, lines)
+    served = Gateway(ports, own_name, token, connect_as, log_printer(reach.launched), secured=reach.tls is not None)
+    with served.open():
+        serve_as("gateway", own_name, served.serve, reach)
+
+
+@bridges.command(rich_help_panel=opt.TRANSLATE)
+@opt.participant_options
+def ros1(
+    reach: opt.WorldAccess,
+    master: Annotated[str, Option(envvar="ROS_MASTER_URI", help="The ROS master.")] = DEFAULT_MASTER,
+    ros_host: Annotated[
+        str | None,
+        Option(
+            "--ros-host",
+            "--ip",
+            help="Name or address under which ROS nodes reach this host (default $ROS_HOSTNAME, $ROS_IP, or found).",
+        ),
+    ] = None,
+    name: Annotated[str, opt.process_option("ros1.main")] = "",
+) -> None:
+    """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
+    require("ros1", ROS1_NEEDS)
+    from zsim_bridges.ros1.ros1_bridge import NodeShutdownError, serve
+
+    bridge = partial(serve, master_uri=master, host=ros_host or own_address(master))
+    try:
+        serve_as("ros1", name, bridge, reach, lowered=True)
+    except NodeShutdownError as error:
+        say(str(error))
+
+
+@bridges.command(rich_help_panel=opt.TRANSLATE)
+@opt.participant_options
+def ros2(
+    reach: opt.WorldAccess,
+    domain: Annotated[int, Option(envvar="ROS_DOMAIN_ID", min=0, max=DOMAIN_MAX, help="ROS_DOMAIN_ID.")] = 0,
+    router: Annotated[
+        str | None, Option(help="Where ROS's own router (rmw_zenohd) listens; the world's hub if not given.")
+    ] = None,
+    name: Annotated[str, opt.process_option("ros2.main")] = "",
+    write_package: Annotated[
+        Path | None, Option(help="Only write the ROS package zsim_msgs into this folder, for a ROS workspace.")
+    ] = None,
+) -> None:
+    """Show the drones to ROS 2 (RMW_IMPLEMENTATION=rmw_zenoh_cpp) as topics and services, without ROS here."""
+    require("ros2", ROS2_NEEDS)
+    if write_package is not None:
+        from zsim_bridges.ros2.rmw_zenoh import PACKAGE
+
+        folder = write_package / "zsim_msgs"
+        with file_fault(folder, "cannot be written", "give --write-package another folder"):
+            for file, text in PACKAGE.items():
+                path = folder / file
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(text)
+        say(f"wrote {folder}; build it with colcon in a ROS workspace")
+        return
+    from zsim.transport.tls import Identity, is_tls
+    from zsim_bridges.ros2.ros2_bridge import RosNetwork, serve
+
+    if reach.tls and router is None:
+        why = "the world's access control lets no ROS keys pass"
+        raise BadParameter(f"--tls needs --router, the endpoint of a rmw_zenohd: {why}")
+    who = reach.who
+    to_router = who if router and is_tls(router) else Identity(host=who.host, insecure=reach.insecure)
+    network = RosNetwork(domain, router, to_router)
+    serve_as("ros2", name, partial(serve, network=network, wall_ns=time.time_ns), reach, lowered=True)
+
+
+@mavlink.command("serve")
+@opt.participant_options
+def serve_mavlink(
+    reach: opt.WorldAccess,
+    autopilot: Annotated[Literal["px4", "ardupilot"], Option(help="Whose modes and parameters.")] = "px4",
+    gcs: Annotated[str, Option(help="The ground station, HOST:PORT.")] = f"127.0.0.1:{GCS_PORT}",
+    api: Annotated[
+        str | None, Option(help=f"Programs, HOST:PORT of the first; +1 each (default 127.0.0.1:{API_PORT}).")
+    ] = None,
+    listen: Annotated[str, Option(help="Address on which the vehicles' ports are opened.")] = "127.0.0.1",
+    gcs_local: Annotated[
+        int | None,
+        opt.port_option(f"First port that talks with the ground station; +1 each (default {GCS_LOCAL_PORT})."),
+    ] = None,
+    api_local: Annotated[
+        int | None, opt.port_option(f"First port that talks with programs; +1 each (default {API_LOCAL_PORT}).")
+    ] = None,
+    first_system_id: Annotated[
+        int, Option(min=1, max=254, help="Of the first drone; +1 each. The default ports move with it.")
+    ] = 1,
+    signing_key: SigningKey = None,
+    rate: PaceAsked = None,
+    telemetry: Annotated[Literal["normal", "full"], Option(help="Rates of the messages.")] = "normal",
+    protocol: Annotated[int, Option(min=1, max=2, help="Version of MAVLink that is sent; both are read.")] = 2,
+    name: Annotated[str, opt.process_option("mavlink.main")] = "",
+) -> None:
+    """Offer each drone as a vehicle: QGroundControl, MAVSDK, DroneKit, MAVProxy fly it."""
+    from zsim_bridges.mavlink.mavlink_server import MavlinkOptions, MavlinkServer
+
+    ahead = first_system_id - 1  # PX4's simulation derives its ports from the system id, too
+    options = MavlinkOptions(
+        autopilot=autopilot,
+        level=telemetry,
+        listen=listen,
+        gcs=_endpoint("--gcs", gcs, listen),
+        gcs_local=gcs_local or GCS_LOCAL_PORT + ahead,
+        api=_endpoint("--api", api or f"127.0.0.1:{API_PORT + ahead}", listen),
+        api_local=api_local or API_LOCAL_PORT + ahead,
+        key=read_key(signing_key) if signing_key else None,
+        version=1 if protocol == 1 else 2,
+        rate=rate,
+        first_system_id=first_system_id,
+    )
+    if options.key and options.version == 1:
+        raise BadParameter("--signing-key needs MAVLink 2; leave out --protocol 1")
+    serve_as("mavlink", name, partial(MavlinkServer.serve, options=options), reach)
+
+
+def _endpoint(option: str, text: str, listen: str) -> tuple[str, int]:
+    from socket import gaierror, gethostbyname
+
+    from zsim_bridges.web import is_loopback
+
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) <= opt.PORT_MAX:
+        raise BadParameter(f"{option} is {text!r}; must be HOST:PORT")
+    try:
+        address = gethostbyname(host)
+    except (gaierror, UnicodeError) as error:
+        raise BadParameter(f"{option} is {text!r}; host {host} is not known here") from error
+    if is_loopback(listen) and not is_loopback(address):
+        raise BadParameter(f"{option} is {text!r}, which {listen} does not reach; give --listen an address")
+    return address, int(port)
+
+
+def read_key(path: Path) -> bytes:
+    """Read a key from a file: 32 bytes, 64 hexadecimal digits, or a passphrase, of which it is the SHA-256."""
+    from hashlib import sha256
+
+    with file_fault(path, "cannot be read", "give --signing-key a file with the key"):
+        content = path.read_bytes()
+    if len(content) == KEY_BYTES:
+        return content
+    text = content.strip()
+    if not text:
+        allowed = f"{KEY_BYTES} bytes, {2 * KEY_BYTES} hexadecimal digits, or a passphrase"
+        raise RunError(f"{path}: is empty; must contain {allowed}")
+    with suppress(ValueError):
+        if len(key := bytes.fromhex(text.decode())) == KEY_BYTES:
+            return key
+    return sha256(text).digest()
+
+
+@ardrone.command("serve")
+@opt.participant_options
+def serve_ardrone(
+    reach: opt.WorldAccess,
+    addresses: Annotated[
+        str, Option(help="Address of the first drone, +1 each; or DRONE=ADDRESS,DRONE=ADDRESS.")
+    ] = FIRST_ADDRESS,
+    peer: Annotated[
+        list[str] | None,
+        Option(help="Host that may command drones on non-loopback addresses. Repeatable.", show_default=False),
+    ] = None,
+    rate: PaceAsked = None,
+    name: Annotated[str, opt.process_option("ardrone.main")] = "",
+) -> None:
+    """Offer each drone as an AR.Drone 2.0 on its own address."""
+    from zsim_bridges.ardrone.ardrone_server import ArdroneOptions, ArdroneServer, peer_addresses
+
+    options = ArdroneOptions(addresses, peer_addresses(peer or ()), rate)
+    serve_as("ardrone", name, partial(ArdroneServer.serve, options=options), reach)
+
+
+def _bounds(armed: bool, speed: float, climb: float, radius: float, ceiling: float) -> "tuple[FlightLimits, bool]":
+    from zsim_bridges.vehicle_links.vehicle_session import FlightLimits
+
+    return FlightLimits(speed, climb, radius_m=radius or math.inf, ceiling_m=ceiling or math.inf), armed
+
+
+driver_options = opt.option_group(
+    "bounds",
+    _bounds,
+    {
+        "armed": (Armed, False),
+        "speed": (Annotated[float, opt.positive_option("Greatest horizontal speed, m/s.")], 2.0),
+        "climb": (Annotated[float, opt.positive_option("Greatest vertical speed, m/s.")], 1.0),
+        "radius": (Annotated[float | None, opt.positive_option("Fence about the origin of W, m.")], None),
+        "ceiling": (Annotated[float | None, opt.positive_option("Greatest height over the origin of W, m.")], None),
+    },
+)
+
+
+@mavlink.command("drive")
+@opt.participant_options
+@driver_options
+def drive_mavlink(
+    reach: opt.WorldAccess,
+    bounds: "tuple[FlightLimits, bool]",
+    drone: DroneName,
+    address: Annotated[str, Argument(help="UDP port of the vehicle: udp://HOST:PORT.")],
+    local_port: Annotated[int, opt.port_option("UDP port here; 0 for any.", least=0)] = 0,
+    system: Annotated[int, Option(min=0, max=255, help="Its system id; 0 for the first that sends.")] = 0,
+    signing_key: SigningKey = None,
+    origin: Annotated[
+        str | None, Option(help="Origin of its local frame, X,Y,Z m in W (default: as it reports).")
+    ] = None,
+) -> None:
+    """Let a MAVLink vehicle (PX4, ArduPilot, or its simulator) fly as a drone of the run."""
+    from zsim_bridges.mavlink.autopilot_session import AutopilotSession
+    from zsim_bridges.vehicle_links.driver import DriverOptions, check_host, drive, position, udp_channel
+
+    options = DriverOptions(drone, *bounds, position(origin) if origin else None, None)
+    channel = udp_channel(address, local_port)
+    check_host(channel.host)
+    key = read_key(signing_key) if signing_key else None
+    make_session = partial(AutopilotSession.of_run, channel=channel, system=system, key=key)
+    serve_as("driver", "", partial(drive, options=options, make_session=make_session), reach, drone)
+
+
+@ardrone.command("drive")
+@opt.participant_options
+@driver_options
+def drive_ardrone(
+    reach: opt.WorldAccess,
+    bounds: "tuple[FlightLimits, bool]",
+    drone: DroneName,
+    address: Annotated[str, Argument(help="Address of the aircraft, such as 192.168.1.12.")],
+    origin: Annotated[
+        str | None, Option(help="Its position at the start, X,Y,Z m in W (default: the scenario's).")
+    ] = None,
+    yaw: Annotated[
+        float | None,
+        Option(callback=opt.finite, help="Its heading at the start, deg from east (default: by its magnetometer)."),
+    ] = None,
+    ultrasound: Annotated[
+        int, Option(min=7, max=8, help="Channel of its sonar; different channels interfere less.")
+    ] = 8,
+) -> None:
+    """Let an AR.Drone 2.0 fly as a drone of the run."""
+    from zsim_bridges.ardrone.aircraft_session import AircraftSession
+    from zsim_bridges.vehicle_links.driver import DriverOptions, aircraft_host, check_host, drive, position
+
+    options = DriverOptions(drone, *bounds, position(origin) if origin else None, yaw)
+    check_host(aircraft_host(address))
+    make_session = partial(AircraftSession.of_run, host=address, ultrasound=ultrasound)
+    serve_as("driver", "", partial(drive, options=options, make_session=make_session), reach, drone)
+
+
+@bridges.command(rich_help_panel=opt.TRANSLATE)
+@opt.participant_options
+def fmu(
+    reach: opt.WorldAccess,
+    path: Annotated[Path, Argument(metavar="FILE", help="The FMU: FMI 2 or 3, for co-simulation. Its code is run.")],
+    drone: Annotated[str | None, Option(help="Drone of the places that name none.", show_default=False)] = None,
+    map_: Annotated[
+        list[str] | None,
+        Option("--map", metavar="NAME=PLACE", help="vx=velocity_m_s.0, or z=drone2/estimate.position_m.2. Repeatable."),
+    ] = None,
+    param: Annotated[
+        list[str] | None, Option(metavar="NAME=VALUE", help="Start value of a parameter or an input. Repeatable.")
+    ] = None,
+    period: Annotated[
+        float | None,
+        opt.positive_option("Communication step, s (default the FMU's, or the gate).", show_default=False),
+    ] = None,
+    takeoff: Annotated[
+        float | None,
+        Option(callback=opt.not_negative, help="When the drones that it commands take off, s; by default not by it."),
+    ] = None,
+    frame: Annotated[Literal["heading", "world"], Option(help="Of velocity commands.")] = "heading",
+    log: Annotated[
+        bool, Option("--log", help="Print all log messages of the FMU, not only warnings and errors.")
+    ] = False,
+    name: Annotated[
+        str, Option(help="Process name (default fmu.DRONE, or the certificate's); controller.main replaces that one.")
+    ] = "",
+) -> None:
+    """Let an FMU of Simulink, Modelica, Dymola or pythonfmu control drones, or estimate."""
+    require("fmu", FMU_NEEDS)
+    from zsim_bridges.fmu.agent import Fmu
+    from zsim_deploy.roles import roles
+
+    params = {}
+    for text in param or ():
+        variable, equals, value = text.partition("=")
+        if not equals or not variable:
+            raise BadParameter(f"--param is {text!r}; must be NAME=VALUE")
+        params[variable] = value
+    own_name = roles.process_name("fmu", name, reach.who, drone or "main")
+    made = Fmu(
+        path,
+        drone,
+        map_ or (),
+        name=own_name,
+        period_s=period,
+        param=params,
+        takeoff_s=takeoff,
+        frame=frame,
+        log=log,
+        say=roles.log_printer(reach.launched),
+    )
+    roles.agent(made, reach, own_name)

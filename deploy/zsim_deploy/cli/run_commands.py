@@ -1,4 +1,10 @@
-"""`zsim run`, `validate` and `sweep`; commands on records: `report`, `export`, `replay`, `rerun`, `bundle`."""
+"""Flights on this machine, and their records.
+
+run       one flight                              validate  checks a scenario
+sweep     many, with different seeds and values   hunt      searches for one that breaks a requirement
+board     compares formation laws
+report, export, replay, bundle, rerun             work on the record of a flight
+"""
 
 import shlex
 import signal
@@ -6,6 +12,7 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,7 +24,7 @@ from zsim.errors import ZsimError, printable
 from zsim_analysis.export import Format
 from zsim_deploy import INTERRUPTED
 from zsim_deploy import arguments as opt
-from zsim_deploy.arguments import failed, note, require, say
+from zsim_deploy.arguments import failed, note, require, say, working
 from zsim_deploy.roles.stop_channel import interruptible
 
 if TYPE_CHECKING:
@@ -29,6 +36,8 @@ DASK_NEEDS = {**SWEEP_NEEDS, "dask": ("distributed",)}
 BUNDLE_NEEDS = {**opt.FLIGHT_NEEDS, "report": ("matplotlib", "jinja2", "packaging")}
 REPLAY_NEEDS = {"record": ("mcap", "zstandard")}
 WRITERS = {Format.CSV: "pyarrow", Format.PARQUET: "pyarrow", Format.MAT: "scipy", Format.FOXGLOVE: "foxglove"}
+BUDGET_S = 600.0  # of a hunt, if neither --budget nor --flights is given
+MOST = 3  # faults of one flight, chosen: software failures seldom need more conditions
 GATE = "a gate: an instant at which the processes meet"
 OF_PROCESSES = ("--realtime", "--rate", "--listen", "--hosted", "--console", "--cameras", "--detect")
 OF_A_NEW_RUN = (
@@ -76,7 +85,7 @@ def run(
     from zsim_agents.hosting import AgentSpec, check_plans, with_own_agents
     from zsim_api.run_folder import locked, new_launch, run_directory
     from zsim_deploy.hosts.control_socket import seen_by_ps
-    from zsim_deploy.launch.console_process import RunConsole
+    from zsim_deploy.launch.role_launcher import RunConsole
     from zsim_deploy.launch.run import RunOptions, check_endpoint, check_open_files, fly, options_of, with_cameras
 
     if in_process and (useless := _given(context, OF_PROCESSES)):
@@ -211,9 +220,6 @@ def report(
     wanted = opt.figure_formats(formats)
     with plugin.names_only(not trust) as skipped:
         if len(directories) > 1:
-            from rich.console import Console
-
-            from zsim.runtime.progress import cell
             from zsim_analysis.report.comparison import compare, comparison_path
 
             for directory in directories:
@@ -221,8 +227,8 @@ def report(
                     raise BadParameter(f"{directory} is a sweep; only runs can be compared")
                 record_in(directory)
             page = out or comparison_path(directories)
-            with Console(stderr=True).status("reading the records …") as status:
-                compare(directories, page, lambda text: status.update(cell(text)), wanted)
+            with working("reading the records …") as progress:
+                compare(directories, page, progress, wanted)
             say(f"report: {page}")
         elif out is not None:
             raise BadParameter("--out is for the comparison of several runs; leave it out")
@@ -235,17 +241,11 @@ def report(
 
 def _report(folder: Path, formats: Sequence[str] = ()) -> str:
     """Make the report of a run or a sweep, and print its table; return the fault of a run as `_fault_of`."""
-    from rich.console import Console
-
-    from zsim.runtime.progress import PipedConsole, cell
+    from zsim.runtime.progress import PipedConsole
     from zsim_analysis.sweep.design import is_sweep
 
     summary = None
-    with Console(stderr=True).status("reading …") as status:
-
-        def progress(text: str) -> None:
-            status.update(cell(text))
-
+    with working("reading …") as progress:
         if is_sweep(folder):
             from zsim_analysis.sweep.sweep_report import TerminalText, make_sweep_report
 
@@ -406,7 +406,7 @@ def replay(
     if console:
         require("console", opt.CONSOLE_NEEDS)
     from zsim.schema import plugin
-    from zsim_deploy.launch.console_process import console_beside
+    from zsim_deploy.launch.role_launcher import console_beside
     from zsim_deploy.roles.world_role import ReplayOptions, play
     from zsim_world.run.playback import PlaybackRange
 
@@ -434,15 +434,13 @@ def bundle(
 ) -> None:
     """Pack a flight into one file, with all that is needed to fly it again on another machine."""
     require("bundle", BUNDLE_NEEDS)
-    from rich.console import Console
-
     from zsim.schema import plugin
     from zsim_analysis.bundle.bundle_file import SUFFIX
     from zsim_analysis.bundle.make_bundle import make_bundle
 
     if out is not None and out.suffix != SUFFIX:
         raise BadParameter(f"--out is {out}; must end in {SUFFIX}")
-    with plugin.names_only(not trust) as skipped, Console(stderr=True).status("reading the record …"):
+    with plugin.names_only(not trust) as skipped, working("reading the record …"):
         written = make_bundle(run, out, not no_record, force, note)
     for name in skipped:
         note(f"note: {name} was found but not imported; --trust imports it, for the errors in its figures")
@@ -491,3 +489,148 @@ def rerun(
             fault = rerun_record(place, commands_only, say, note)
     if fault:
         raise failed(fault)
+
+
+@app.command(rich_help_panel=opt.RUN)
+def hunt(
+    scenario: opt.ScenarioPath,
+    require_: Annotated[
+        list[str] | None,
+        Option("--require", help="What must hold: 'min_separation_m > 1.5', or module:function. Repeatable."),
+    ] = None,
+    budget: Annotated[str | None, Option(help="Wall time of the search, as 90s or 10min (default 10min).")] = None,
+    flights: Annotated[int | None, Option(min=1, max=10**9, help="Flights of the search.", show_default=False)] = None,
+    fault: Annotated[
+        list[str] | None,
+        Option(help="A kind to draw, and its ranges: 'gust velocity_m_s=1..6' (default all). Repeatable."),
+    ] = None,
+    without: Annotated[list[str] | None, Option(help="A kind not to draw. Repeatable.")] = None,
+    most: Annotated[int, Option(min=0, max=6, help="Faults in one flight.")] = MOST,
+    vary: Annotated[
+        list[str] | None,
+        Option(help="a.b.c=uniform(low,high), … as of a sweep (default wind.gust_m_s=uniform(0,2)). Repeatable."),
+    ] = None,
+    draws: Annotated[int, Option("--draws", min=0, max=2**62, help="Seed of the draws.")] = 1,
+    set_: opt.Set = None,
+    seed: opt.Seed = None,
+    duration: opt.Duration = None,
+    out: Annotated[Path | None, Option(help="Folder (default runs/NAME-hunt-TIME).", show_default=False)] = None,
+    workers: opt.Workers = None,
+    force: Annotated[
+        bool, Option("--force", help="Replace an earlier hunt; accept a folder with other files.")
+    ] = False,
+) -> None:
+    """Search for faults, wind and delays that break a requirement, and shrink them; exit code 1 if any are found."""
+    require("hunt", SWEEP_NEEDS)
+    from zsim.errors import ScenarioError
+    from zsim.runtime.progress import PipedConsole
+    from zsim.scenario.faults import typed_duration_s
+    from zsim_analysis.hunt.hunt import HuntRequest, hunt
+    from zsim_analysis.hunt.hunt_report import make_hunt_report, terminal_text
+    from zsim_analysis.hunt.space import WIND
+    from zsim_analysis.sweep.design import read_document
+    from zsim_api.flight import fly_as_processes
+    from zsim_api.recorded import load
+
+    try:
+        budget_s = None if budget is None else typed_duration_s(budget)
+    except ValueError as error:
+        raise BadParameter(f"--budget {error}") from None
+    document, faults = read_document(scenario, set_ or [], seed=seed, duration_s=duration)
+    if faults:
+        raise ScenarioError(faults)
+    name = str(document.get("name", scenario.stem))
+    request = HuntRequest(
+        document=document,
+        source=str(scenario),
+        requirements=tuple(require_ or ()),
+        out=out or Path("runs") / f"{name}-hunt-{time.strftime('%Y%m%d-%H%M%S')}",
+        seed=draws,
+        flights=flights,
+        budget_s=BUDGET_S if budget_s is None and flights is None else budget_s,
+        faults=tuple(fault or ()),
+        without=tuple(without or ()),
+        vary=tuple(vary or (WIND,)),
+        changed=tuple(opt.changed_fields(set_, seed, duration)),
+        most=most,
+        workers=workers,
+        force=force,
+        open_run=partial(load, trust=True),
+        processes=fly_as_processes,
+    )
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    hunted = hunt(request)
+    summary = hunted.summary
+    with working("drawing …") as progress:
+        notes = make_hunt_report(hunted, progress)
+    for text in notes:
+        note(f"note: {text}")
+    PipedConsole().print(terminal_text(hunted))
+    say(f"report: {request.out / 'report.html'}")
+    if summary.interrupted:
+        note(f"interrupted; what was found so far is in {request.out}")
+        sys.exit(INTERRUPTED)
+    if summary.violation:
+        raise failed(f"{summary.violation.requirement}: broken; the flight is {request.out / 'violation'}")
+
+
+@app.command(rich_help_panel=opt.RUN)
+def board(
+    laws: Annotated[
+        str | None,
+        Option(help="Names with commas, or package.module:Class of your own (default all).", show_default=False),
+    ] = None,
+    scenarios: Annotated[str | None, Option(help="Names with commas (default all).", show_default=False)] = None,
+    seeds: Annotated[int, Option(min=1, max=1000, help="Flights of each law in each scenario.")] = 3,
+    out: Annotated[
+        Path | None, Option("--out", "-o", help="Folder (default runs/board-TIME); an unfinished one is continued.")
+    ] = None,
+    workers: opt.Workers = None,
+    formats: opt.Formats = None,
+    force: Annotated[bool, Option("--force", help="Use a folder that holds other files, too.")] = False,
+    papers: Annotated[
+        bool, Option("--papers", help="Instead of flying, reproduce figures of the laws' papers and compare numbers.")
+    ] = False,
+) -> None:
+    """Fly formation laws in the same scenarios with the same seeds and sensors: one table, with figures."""
+    require("sweep", SWEEP_NEEDS)
+    from zsim.runtime.progress import PipedConsole
+
+    if papers:
+        if laws or scenarios or formats:
+            raise BadParameter("--papers flies no law in a scenario; leave --laws, --scenarios and --format out")
+        from zsim_analysis.board.papers import terminal_table, write_papers
+
+        place = out or Path("runs") / "papers"
+        with working("computing …") as progress:
+            found = write_papers(place, progress)
+        PipedConsole().print(terminal_table(found))
+        say(f"figures: {place}")
+        return
+    from zsim_analysis.board.board import LAW_NAMES, BoardRequest, chosen, fly_board, scenario_names
+    from zsim_analysis.board.board_report import make_board_report, terminal_text
+
+    wanted = opt.figure_formats(formats)
+    folder = out or Path("runs") / f"board-{time.strftime('%Y%m%d-%H%M%S')}"
+    request = BoardRequest(
+        chosen(laws, LAW_NAMES, "--laws", open_to_classes=True),
+        chosen(scenarios, scenario_names(), "--scenarios"),
+        seeds,
+        folder,
+        workers,
+        force,
+    )
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        rows = fly_board(request)
+    except KeyboardInterrupt:
+        note(f"interrupted; the same command with --out {folder} continues")
+        sys.exit(INTERRUPTED)
+    with working("drawing …") as progress:
+        made = make_board_report(request, rows, progress, wanted)
+    PipedConsole().print(terminal_text(made))
+    say(f"report: {folder / 'report.html'}")
+    say(f"table: {folder / 'board.csv'}")
+    failures = [row["failure"] for row in rows if row["failure"]]
+    if failures:
+        raise failed(f"{len(failures)} of {len(rows)} flights failed: {failures[0]}")

@@ -3,6 +3,8 @@
 On Linux they are forked from a process that has imported everything, which is much faster; on other systems, and if
 this fork server is gone or does not answer, they are started as normal programs. Either way they are children of this
 process.
+
+Beside them: the users' programs that are started and supervised like roles, and the console, which outlives the run.
 """
 
 import ctypes
@@ -14,14 +16,19 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Protocol
 
+from zsim.errors import printable
 from zsim.runtime.progress import SlowStart
+from zsim.scenario.scenario import Scenario
+from zsim_api.programs import Program, environment_of, filled
+from zsim_api.run_folder import Launch
 from zsim_deploy import SAFE_PATH
-from zsim_deploy.launch.supervisor import end_text, last_line
+from zsim_deploy.launch.supervisor import Outcome, RunProcess, end_text, last_line
+from zsim_deploy.roles.stop_channel import interruptible
 
 SINGLE_THREADED = {
     "OPENBLAS_NUM_THREADS": "1",
@@ -31,6 +38,7 @@ SINGLE_THREADED = {
 }  # threads slow matrices of a dozen rows down, and would compete with the other roles
 FORKSERVER = (sys.executable, SAFE_PATH, "-m", "zsim_deploy.cli.forkserver")
 COMMAND = (sys.executable, SAFE_PATH, "-m", "zsim_deploy.cli")
+ZSIM = (sys.executable, SAFE_PATH, "-m", "zsim_deploy")  # as a user starts it: Ctrl-C while it loads is a line, too
 ROOM = " " * 1024  # padding of the fork server's command line, over which each role writes its own
 PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # linux/prctl.h
 PACKET_MAX = 1 << 17  # bytes, of a command line; a thousand names of drones are half of it
@@ -38,6 +46,12 @@ REPLY_MAX = 32  # bytes, of an answer: READY, or a process id
 ANSWER_S = 5.0  # the fork server answers within 20 ms, unless it is stopped
 POLL_S = 0.01  # polling interval of a process's end
 UNKNOWN = 0  # exit code, as in Popen, if the status was collected elsewhere
+HERE = "here"  # host of a program that `zsim up` starts itself
+LEAVES_S = 2.0  # wall time for a program to notice the end of the run before it is interrupted
+END_S = 10.0  # wall time for a console to end beside a replay
+COPIED_S = 22.0  # wall time for a console to end after a run: its pages may copy for 20 s
+INTERRUPTED_S = 1.0  # the same after Ctrl-C: the run may take 2 s, and in all 3 s are promised
+SLOW_S = 2.0  # wall time for a console to end after which a notice is shown
 
 
 class RoleProcess(Protocol):
@@ -287,3 +301,155 @@ def _subreaper() -> Iterator[None]:
         yield
     finally:
         libc.prctl(PR_SET_CHILD_SUBREAPER, former.value, 0, 0, 0)
+
+
+class ProgramProcess:
+    """A program, its output in the log of its name; see `RunProcess`.
+
+    Args:
+        folder: in which it runs; None: the current one.
+    """
+
+    is_program = True
+    host = HERE
+
+    def __init__(
+        self, name: str, words: Sequence[str], logs: Path, environment: Mapping[str, str], folder: Path | None
+    ) -> None:
+        self.name = name
+        self.role = name.partition(".")[0]
+        self.restarts = 0
+        self._words, self._environment, self._folder = words, environment, folder
+        self._log = logs / f"{name}.log"
+        self._program: Program | None = None
+        self._asked: threading.Timer | None = None
+
+    def start(self) -> None:
+        if self._program is not None:
+            self._program.close()
+        self._program = Program(self._words, self._environment, self._log, self._folder)
+
+    @property
+    def state(self) -> str:
+        return "ended" if self.code is not None else "running" if self._program else "starting"
+
+    @property
+    def pid(self) -> int:
+        return self._program.pid if self._program else 0
+
+    @property
+    def code(self) -> int | None:
+        """Return its exit code, None while it lives; negative for a signal."""
+        code = self._program.code if self._program else None
+        return code if code is None or code <= 128 else 128 - code
+
+    def outcome(self) -> str:
+        return end_text(self.code, self.last_log_line())
+
+    def last_log_line(self) -> str:
+        return last_line(self._log)
+
+    def request_stop(self, reason: str) -> None:
+        """Interrupt it, as Ctrl-C does, unless it ends by itself within LEAVES_S."""
+        if self._program is not None and self._asked is None:
+            self._asked = threading.Timer(LEAVES_S, self._program.interrupt)
+            self._asked.daemon = True
+            self._asked.start()
+
+    def wait(self, timeout_s: float) -> bool:
+        return self._program is None or self._program.wait(max(0.0, timeout_s)) is not None
+
+    def kill(self) -> None:
+        if self._program is not None:
+            self._program.kill()
+
+    def close(self) -> None:
+        if self._asked is not None:
+            self._asked.cancel()
+        if self._program is not None:
+            self._program.close()
+
+
+def programs_of(
+    scenario: Scenario, names: Iterable[str], endpoint: str, out: Path, launch: Launch
+) -> list[ProgramProcess]:
+    """Return some of the users' programs of a scenario; they run in the folder of its modules, beside its file.
+
+    Args:
+        endpoint: of the run.
+        out: folder of the run.
+    """
+    folder, environment = next(map(Path, launch.modules), None), environment_of(endpoint, scenario.federation)
+    values = {"endpoint": endpoint, "federation": scenario.federation, "folder": str(out.absolute())}
+    return [
+        ProgramProcess(
+            name,
+            filled(scenario.own_programs[name].command, {**values, "name": name}),
+            out / "logs",
+            environment,
+            folder,
+        )
+        for name in names
+    ]
+
+
+class RunConsole:
+    """Owns the console of a run, which continues until the report is made and its pages have copied it.
+
+    Must be entered before the run, so that the console always ends. Ctrl-C ends the wait for its pages.
+    """
+
+    def __init__(self) -> None:
+        self.process: RunProcess | None = None
+        self.outcome = Outcome("interrupted", interrupted=True)  # of the run; set by the caller
+
+    def own(self, process: RunProcess) -> None:
+        """Take a process that has not been started; end a former one."""
+        if self.process is not None:
+            self.process.close()
+        self.process = process
+
+    def __enter__(self) -> "RunConsole":
+        return self
+
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        if self.process is None:
+            return
+        hurries = self.outcome.interrupted or isinstance(error, (KeyboardInterrupt, SystemExit))
+        limit_s = INTERRUPTED_S if hurries else COPIED_S
+        try:
+            with interruptible():
+                self.process.request_stop(self.outcome.reason)
+                if not self.process.wait(min(SLOW_S, limit_s)) and limit_s > SLOW_S:
+                    text = f"{self.process.name}: its pages may copy the report and the record; Ctrl-C ends that"
+                    print(printable(text), file=sys.stderr)
+                    self.process.wait(limit_s - SLOW_S)
+        except KeyboardInterrupt:
+            pass  # the run is over already
+        finally:
+            self.process.close()
+
+
+@contextmanager
+def console_beside(endpoint: str, record: Path, federation: str | None, tls: Path | None) -> Iterator[None]:
+    """Run a console for the duration of the block, which waits for the world and prints its links.
+
+    It connects to the world's endpoint, on this machine if that is all addresses; the default federation is the
+    record's.
+    """
+    if federation is None:
+        from zsim_analysis.reading.recorded_run import open_run
+
+        with open_run(record) as (_, _, scenario):
+            federation = scenario.federation
+    reach = ["--connect", endpoint.replace("0.0.0.0", "127.0.0.1"), "--federation", federation]
+    process = subprocess.Popen([*ZSIM, "console", *reach, *(["--tls", str(tls)] if tls else [])])
+    try:
+        yield
+    finally:
+        process.terminate()
+        try:
+            process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

@@ -27,9 +27,7 @@ from zsim_api import run_folder
 from zsim_api.run_folder import JOURNAL, Launch
 from zsim_deploy.arguments import changed_options, load_scenario, pace_options
 from zsim_deploy.inventory import COMMANDS
-from zsim_deploy.launch.console_process import RunConsole
-from zsim_deploy.launch.program_process import programs_of
-from zsim_deploy.launch.role_launcher import ChildProcess, RoleLauncher
+from zsim_deploy.launch.role_launcher import ChildProcess, RoleLauncher, RunConsole, programs_of
 from zsim_deploy.launch.supervisor import EndSignals, Outcome, RunProcess, Supervisor, status_row
 from zsim_deploy.roles.stop_channel import REASONS, StopChannel, handled_by
 

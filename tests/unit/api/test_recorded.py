@@ -25,8 +25,8 @@ from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_analysis.export import Format
 from zsim_analysis.export.columns import MessageSelection
 from zsim_analysis.export.make_export import export
-from zsim_analysis.report import drone_figures, make_report
-from zsim_api import recorded, tables
+from zsim_analysis.report import flight_figures, make_report
+from zsim_api import recorded
 from zsim_world.run.world import DURATION_OVER
 
 DRONE = "a-b.c"
@@ -120,7 +120,7 @@ def test_own_messages_have_a_column_for_each_field(run: zsim.Run) -> None:
     ],
 )
 def test_own_fields_become_numbers_where_all_are(values: list[Any], columns: dict[str, list[Any]]) -> None:
-    made = tables._own_columns("f", values)
+    made = recorded._own_columns("f", values)
     assert {*made} == {*columns}
     for name, expected in columns.items():
         np.testing.assert_array_equal(made[name], np.array(expected, made[name].dtype))
@@ -155,10 +155,11 @@ def test_without_pandas_a_frame_is_a_dict_of_arrays(folder: Path, without_pandas
 def passes(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """The keys of each pass over a record."""
     made: list[list[str]] = []
+    read = recorded.read_tables
 
-    def read_tables(record: Path, wanted: Collection[str]) -> dict[str, tables.Table]:
+    def read_tables(record: Path, wanted: Collection[str]) -> dict[str, recorded.Table]:
         made.append([*wanted])
-        return tables.read_tables(record, wanted)
+        return read(record, wanted)
 
     monkeypatch.setattr(recorded, "read_tables", read_tables)
     return made
@@ -285,7 +286,7 @@ def test_all_drones_are_one_dataset(run: zsim.Run) -> None:
 
 def test_a_figure_is_that_of_the_report(step: zsim.Run, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = []
-    monkeypatch.setattr(drone_figures, "draw_plan", lambda *_: drawn.append("plan"))
+    monkeypatch.setattr(flight_figures, "draw_plan", lambda *_: drawn.append("plan"))
     monkeypatch.setattr(make_report, "draw_errors", lambda *_: drawn.append("errors"))
     shape: Any = step.figure("shape")
     assert "$p$" in shape.axes[0].get_ylabel()

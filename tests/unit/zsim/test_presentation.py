@@ -68,8 +68,8 @@ HOME = Path(__file__).parents[3]
 DRAWN_IN = (
     "agents/zsim_bridges/console/scene.py",
     "deploy/zsim_analysis/export/foxglove_messages.py",
-    "deploy/zsim_analysis/report/drone_figures.py",
-    "deploy/zsim_analysis/report/comparison_figures.py",
+    "deploy/zsim_analysis/report/flight_figures.py",
+    "deploy/zsim_analysis/report/comparison.py",
 )
 # Linear RGB as dichromats see it [Viénot, Brettel, Mollon 1999]: without L cones, and without M cones.
 DICHROMATS = (

@@ -34,10 +34,9 @@ from zsim.contract.flight_messages import CameraImage, Sightings
 from zsim.errors import ReportError, RunError
 from zsim.record import RecordReader, RecordWriter
 from zsim.sensors.sensor import message_type
-from zsim_analysis.export import Format, table_files
+from zsim_analysis.export import Format, make_export
 from zsim_analysis.export.columns import MessageSelection, Sighting, table_columns, table_name
-from zsim_analysis.export.make_export import export, placed
-from zsim_analysis.export.table_files import matlab_names
+from zsim_analysis.export.make_export import export, matlab_names, placed
 from zsim_deploy import arguments
 from zsim_deploy.cli.cli import app
 
@@ -179,13 +178,13 @@ def test_matlab_names_are_valid_and_never_the_same() -> None:
     made = set(matlab_names(names).values())
     assert len(made) == len(names)
     assert all(valid.isascii() and valid.isidentifier() and valid[0] != "_" and len(valid) <= 63 for valid in made)
-    assert not made & table_files.KEYWORDS
+    assert not made & make_export.KEYWORDS
 
 
 def test_a_variable_that_matlab_would_not_load_is_refused_unless_times_make_it_small_enough(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(table_files, "VARIABLE_MAX", 100_000)
+    monkeypatch.setattr(make_export, "VARIABLE_MAX", 100_000)
     estimates = MessageSelection(("drone/*/estimate",))
     with refused(ReportError, "estimate", "GB", "MATLAB", "--keys", "--from", "--to"):
         export(run, Format.MAT, tmp_path / "all.mat", estimates)

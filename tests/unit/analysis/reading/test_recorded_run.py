@@ -26,8 +26,7 @@ from zsim_analysis.reading.recorded_run import (
     gates,
     recorded_agents,
 )
-from zsim_analysis.report.comparison import ABSENT, fact_rows
-from zsim_analysis.report.comparison_figures import ComparedRun
+from zsim_analysis.report.comparison import ABSENT, ComparedRun, fact_rows
 from zsim_analysis.report.make_report import facts
 from zsim_analysis.report.summary import judge
 from zsim_world.run.world import World

@@ -20,22 +20,11 @@ from zsim.contract.flight_messages import ClusterState
 from zsim.contract.run_messages import Event, RadioLinks
 from zsim.presentation import drone_colours
 from zsim.scenario.scenario_file import resolve
-from zsim.scenario.surface_file import packed
+from zsim.scenario.surroundings import packed
 from zsim_analysis.reading.drone_errors import Distances, EstimateErrors, Separations, VelocityResponse
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of, goal_errors
-from zsim_analysis.reading.radio_links import RadioHistory
-from zsim_analysis.reading.recorded_flight import RecordedFlight
+from zsim_analysis.reading.recorded_flight import RadioHistory, RecordedFlight
 from zsim_analysis.report import FORMATS, make_report
-from zsim_analysis.report.drone_figures import (
-    BAND_GREY,
-    draw_distances,
-    draw_drones,
-    draw_estimates,
-    draw_obstacles,
-    draw_plan,
-    draw_radio,
-    draw_velocities,
-)
 from zsim_analysis.report.figure_style import (
     ALPHA,
     COLOURS,
@@ -54,7 +43,20 @@ from zsim_analysis.report.figure_style import (
     new_figure,
     time_marks,
 )
-from zsim_analysis.report.formation_figures import ROWS_MAX, curves, draw_errors, draw_parameters
+from zsim_analysis.report.flight_figures import (
+    BAND_GREY,
+    ROWS_MAX,
+    curves,
+    draw_distances,
+    draw_drones,
+    draw_errors,
+    draw_estimates,
+    draw_obstacles,
+    draw_parameters,
+    draw_plan,
+    draw_radio,
+    draw_velocities,
+)
 from zsim_analysis.report.make_report import figures, page
 from zsim_analysis.report.summary import ClusterErrors, error_table, summarise
 

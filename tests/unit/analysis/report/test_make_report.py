@@ -28,8 +28,7 @@ from zsim.scenario import scenario_file
 from zsim_analysis.reading.shortfall import percent_text, span_text
 from zsim_analysis.report.figure_style import thinned
 from zsim_analysis.report.make_report import make_report, page, write_page, write_report
-from zsim_analysis.report.paper import PAPER_TABLE_1
-from zsim_analysis.report.summary import COLUMNS, PAPER_COLUMN, RunSummary, judge, table, terminal_text
+from zsim_analysis.report.summary import COLUMNS, PAPER_COLUMN, PAPER_TABLE_1, RunSummary, judge, table, terminal_text
 
 NAMES = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", "phi_1", "phi_2", "phi_3", "p", "q", "beta"]
 AMPLITUDE = np.array([0.12, 0.13, 0.03, 0.02, 0.01, 0.07, 0.05, 0.06, 0.04, 0.28, 0.3, 0.08])
@@ -390,7 +389,7 @@ def test_a_report_is_not_written_through_a_link(tmp_path: Path, name: str) -> No
     link.symlink_to(elsewhere)
     with refused(ReportError, str(link), "link"):
         if name == "figures":
-            write_report(folder, b"{}", (), lambda _: "", lambda _: None)
+            write_report(folder, {}, (), lambda _: "", lambda _: None)
         else:
             write_page(folder / "report.html", (), lambda _: "", lambda _: None)
     assert [path.name for path in elsewhere.iterdir()] == ["drones.svg"]

@@ -11,7 +11,7 @@ from in_loop import in_loop
 
 from zsim.contract.flight_messages import CameraImage
 from zsim_bridges.ardrone import video
-from zsim_bridges.ardrone.ports import AllowedHosts
+from zsim_bridges.ardrone.ardrone_server import AllowedHosts, VideoServer
 from zsim_bridges.ardrone.video import (
     IDR_EVERY,
     IDR_FRAME,
@@ -19,7 +19,6 @@ from zsim_bridges.ardrone.video import (
     VideoEncoder,
     VideoError,
     VideoFrame,
-    VideoServer,
     nal_units,
     pave_header,
 )

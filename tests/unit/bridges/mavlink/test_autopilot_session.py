@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from zsim.math.frames import heading
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.autopilot_session import AutopilotSession, TelemetryReadings
-from zsim_bridges.mavlink.frame import Link, Parser, Signing
+from zsim_bridges.mavlink.dialect import Link, Parser, Signing
 from zsim_bridges.vehicle_links.vehicle_session import AircraftPose, Demand, UdpChannel
 
 ORIGIN = (-34.603, -58.368, 25.0)

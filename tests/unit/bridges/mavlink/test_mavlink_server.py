@@ -17,7 +17,7 @@ from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import NoWorldError, RunError
 from zsim.transport.session import Unanswered
 from zsim_bridges.mavlink import dialect
-from zsim_bridges.mavlink.frame import Link, Parser, Received
+from zsim_bridges.mavlink.dialect import Link, Parser, Received
 from zsim_bridges.mavlink.mavlink_server import (
     DATAGRAM_MAX,
     LEARNT_MAX,
@@ -30,7 +30,7 @@ from zsim_bridges.mavlink.mavlink_server import (
 )
 from zsim_bridges.mavlink.mission import MissionReport
 from zsim_bridges.vehicle_links.server import set_pace
-from zsim_deploy.cli.bridge_commands import _endpoint, read_key
+from zsim_deploy.cli.role_commands import _endpoint, read_key
 
 GCS = ("192.0.2.7", 14550)
 

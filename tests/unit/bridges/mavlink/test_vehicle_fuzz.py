@@ -10,8 +10,7 @@ from mavlink_values import field_value
 
 from zsim.contract import messages
 from zsim.contract.flight_messages import Attitude, Velocity
-from zsim_bridges.mavlink.dialect import BY_ID, WireMessage
-from zsim_bridges.mavlink.frame import Link, Parser
+from zsim_bridges.mavlink.dialect import BY_ID, Link, Parser, WireMessage
 
 ODD = (math.nan, math.inf, -math.inf, 0.0, 1.0, -1.0, 1e30, -1e30, 400.0, 3.0)
 BITS = {"B": 8, "b": 7, "H": 16, "h": 15, "I": 32, "i": 31, "Q": 64, "q": 63}

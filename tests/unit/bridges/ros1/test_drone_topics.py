@@ -9,14 +9,15 @@ from refused import has_terms
 from scipy.spatial.transform import Rotation
 
 from zsim.contract import flight_messages, messages
-from zsim_bridges.ros1 import ros1_bridge, tcpros
+from zsim_bridges.ros1 import node as wire
+from zsim_bridges.ros1 import ros1_bridge
 from zsim_bridges.ros1.ros1_bridge import REPEAT_NS, DriverCommands, DriverFrames, TiltCommand, ros1_name, tilt_of
 from zsim_bridges.vehicle_links.drone_link import OnboardState
 
 T_NS, GATE_NS = 61_040_000_000, 20_000_000
 FRAMES = DriverFrames("drone1")
 ZERO, STILL = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
-Vector3 = tcpros.message_class("geometry_msgs/Vector3")
+Vector3 = wire.message_class("geometry_msgs/Vector3")
 
 
 def xyz(vector: Any) -> tuple[float, float, float]:
@@ -55,7 +56,7 @@ def without_sensors() -> OnboardState:
 
 def on_wire(kind: str, message: Any) -> Any:
     """Return a message as a node reads it."""
-    return tcpros.deserialize(kind, tcpros.serialize(kind, message))
+    return wire.deserialize(kind, wire.serialize(kind, message))
 
 
 def navdata(state: Any = "hovering", **angles: float) -> Any:
@@ -167,7 +168,7 @@ def test_transforms_without_an_estimator_end_at_odom():
 
 
 def twist(*, x: float = 0.0, y: float = 0.0, z: float = 0.0, wx: float = 0.0, wy: float = 0.0, wz: float = 0.0) -> Any:
-    return tcpros.message_class("geometry_msgs/Twist")(linear=Vector3(x, y, z), angular=Vector3(wx, wy, wz))
+    return wire.message_class("geometry_msgs/Twist")(linear=Vector3(x, y, z), angular=Vector3(wx, wy, wz))
 
 
 class Pilot:

@@ -1,28 +1,129 @@
-"""Nodes of ours among each other, and among those that talk nonsense, at a master in this process."""
+"""Nodes of ours among each other, among those that talk nonsense, and on the wire: bytes, published sums, garbage."""
 
 import asyncio
 import socket
+import struct
 import xmlrpc.client
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from in_loop import in_loop
 from refused import has_terms
 from ros1_master import Master
 
 from zsim.errors import RunError
-from zsim_bridges.ros1 import master_api, tcpros
+from zsim_bridges.ros1 import master_api
+from zsim_bridges.ros1 import node as wire
 from zsim_bridges.ros1.master_api import own_address
-from zsim_bridges.ros1.node import PublishedTopic, Ros1Node
+from zsim_bridges.ros1.node import PublishedTopic, Ros1Node, TopicType
+
+CMD_VEL = TopicType("/drone1/cmd_vel", "geometry_msgs/Twist", "9f195f881246fdfa2798d1d3eebca84a", "float64 x\n")
+MD5 = {  # as `rosmsg md5` of Noetic prints them; of Navdata as ardrone_autonomy's generated code has it
+    "std_msgs/String": "992ce8a1687cec8c8bd883ec73ca41d1",
+    "std_msgs/Empty": "d41d8cd98f00b204e9800998ecf8427e",
+    "geometry_msgs/Twist": "9f195f881246fdfa2798d1d3eebca84a",
+    "geometry_msgs/Vector3Stamped": "7b324c7325e683bf02a9b14b01090ec7",
+    "sensor_msgs/Imu": "6a62c6daae103f4ff57a132d6f95cec2",
+    "sensor_msgs/CameraInfo": "c9a58c1b0b154e0e6da7578cb991d214",
+    "sensor_msgs/CompressedImage": "8f7a12909da2c9d3332d540a0977563f",
+    "sensor_msgs/NavSatFix": "2d3a8cd499b9b4a0249fb98fd05cfa48",
+    "nav_msgs/Odometry": "cd5e73d190d741a2f92e81eda573aca7",
+    "rosgraph_msgs/Clock": "a9c97c1d230cfc112e270351a944ee47",
+    "tf2_msgs/TFMessage": "94810edda583a504dfda3829e70d7eec",
+    "ardrone_autonomy/Navdata": "e1169f766234363125ac62c9a3f87eeb",
+}
+
+
+def test_a_header_is_its_length_and_fields_behind_their_lengths():
+    encoded = wire.encode_header({"topic": "/chat", "md5sum": "*"})
+    assert encoded == b"\x1b\0\0\0" + b"\x0b\0\0\0topic=/chat" + b"\x08\0\0\0md5sum=*"
+    assert wire.decode_header(encoded[4:]) == {"topic": "/chat", "md5sum": "*"}
+
+
+@pytest.mark.parametrize(
+    "body", [b"\x05", b"\xff\xff\xff\xff", b"\x05\0\0\0abc", b"\x03\0\0\0abc", struct.pack("<I", 2**31) + b"a=b"]
+)
+def test_no_header_is_refused(body):
+    with pytest.raises(ValueError, match=r"header|key=value"):
+        wire.decode_header(body)
+
+
+@given(st.binary(max_size=200))
+def test_garbage_is_a_header_or_refused(body):
+    try:
+        fields = wire.decode_header(body)
+    except ValueError:
+        return
+    assert all(isinstance(key, str) and isinstance(value, str) for key, value in fields.items())
+
+
+@given(st.dictionaries(st.text("abc_", min_size=1, max_size=8), st.text("=\nA#ä ", max_size=20), max_size=6))
+def test_what_is_encoded_is_decoded(fields):
+    assert wire.decode_header(wire.encode_header(fields)[4:]) == fields
+
+
+@pytest.mark.parametrize(
+    ("header", "terms"),
+    [
+        ({"callerid": "/me", "md5sum": "*"}, ()),
+        ({"callerid": "/me", "md5sum": CMD_VEL.md5}, ()),
+        ({"callerid": "/me", "md5sum": "0" * 32, "type": "geometry_msgs/Pose"}, ("geometry_msgs/Pose", CMD_VEL.type)),
+        ({}, ("missing",)),
+        ({"callerid": "/me"}, ("missing",)),
+        ({"md5sum": "*"}, ("missing",)),
+    ],
+)
+def test_the_type_of_a_header_fits_or_the_reason_names_both(header, terms):
+    reason = wire.mismatch(CMD_VEL, header, "/zsim")
+    assert (reason is None) == (not terms)
+    assert all(term in (reason or "") for term in terms)
+
+
+def test_both_sides_of_our_own_connections_understand_each_other():
+    subscriber = wire.subscriber_header(CMD_VEL, "/a")
+    publisher = wire.publisher_header(CMD_VEL, "/b")
+    assert wire.mismatch(CMD_VEL, subscriber, "/b") is None
+    assert wire.mismatch(CMD_VEL, publisher, "/a") is None
+    assert subscriber["tcp_nodelay"] == "1"
+    assert publisher["latching"] == "0"
+
+
+@pytest.mark.parametrize(("kind", "md5"), MD5.items())
+def test_md5_sums_are_those_of_ros(kind, md5):
+    assert wire.topic_type_of("/topic", kind).md5 == md5
+
+
+def test_a_definition_brings_those_of_its_fields():
+    definition = wire.topic_type_of("/topic", "ardrone_autonomy/Navdata").definition
+    assert "float32 batteryPercent\n" in definition
+    assert "MSG: std_msgs/Header" in definition
+
+
+def test_a_number_that_does_not_go_into_its_field_is_refused():
+    point = wire.message_class("geometry_msgs/Point32")(x=1e300, y=0.0, z=0.0)
+    with pytest.raises(ValueError, match="geometry_msgs/Point32"):
+        wire.serialize("geometry_msgs/Point32", point)
+
+
+@pytest.mark.parametrize("kind", ["geometry_msgs/Twist", "std_msgs/Empty", "std_msgs/String"])
+@given(data=st.binary(min_size=1, max_size=60).filter(lambda data: len(data) != 48))
+def test_other_bytes_are_refused(kind, data):
+    if kind == "std_msgs/String" and len(data) - 4 == int.from_bytes(data[:4], "little"):
+        return
+    with pytest.raises(ValueError, match=kind):
+        wire.deserialize(kind, data)
+
 
 PATIENCE_S = 120.0
 TWIST, EMPTY = "geometry_msgs/Twist", "std_msgs/Empty"
-Vector3 = tcpros.message_class("geometry_msgs/Vector3")
+Vector3 = wire.message_class("geometry_msgs/Vector3")
 
 
 def twist(x: float) -> Any:
-    return tcpros.message_class(TWIST)(linear=Vector3(x, 0.0, 0.0), angular=Vector3(0.0, 0.0, 0.0))
+    return wire.message_class(TWIST)(linear=Vector3(x, 0.0, 0.0), angular=Vector3(0.0, 0.0, 0.0))
 
 
 class Graph:
@@ -87,7 +188,7 @@ def graph(monkeypatch: pytest.MonkeyPatch) -> Iterator[Graph]:
 
 async def connect(port: int, header: dict[str, str]) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
     reader, writer = await asyncio.open_connection("127.0.0.1", port)
-    writer.write(tcpros.encode_header(header))
+    writer.write(wire.encode_header(header))
     return reader, writer
 
 
@@ -135,7 +236,7 @@ async def test_a_subscriber_is_told_type_and_definition(graph) -> None:
     a, _ = graph.publishing()
     async with a.running():
         reader, writer = await connect(await graph.port("/t"), subscriber("/t"))
-        header = await tcpros.read_header(reader)
+        header = await wire.read_header(reader)
         writer.close()
     assert header["type"] == TWIST
     assert header["md5sum"] == "9f195f881246fdfa2798d1d3eebca84a"
@@ -158,7 +259,7 @@ async def test_who_wants_something_else_is_refused_as_ros_does(graph, header, te
     a, _ = graph.publishing()
     async with a.running():
         reader, writer = await connect(await graph.port("/t"), header)
-        answer = await tcpros.read_header(reader)
+        answer = await wire.read_header(reader)
         assert await reader.read() == b""  # and hung up
         writer.close()
     assert has_terms(answer["error"], *terms)
@@ -171,32 +272,32 @@ async def test_garbage_ends_its_own_connection_only(graph, garbage) -> None:
     async with a.running():
         port = await graph.port("/t")
         reader, writer = await connect(port, subscriber("/t"))
-        await tcpros.read_header(reader)
+        await wire.read_header(reader)
         other, nonsense = await asyncio.open_connection("127.0.0.1", port)
         nonsense.write(garbage)
         nonsense.write_eof()
         await other.read()
         nonsense.close()
         topic.publish(lambda _: twist(7.0))
-        assert tcpros.deserialize(TWIST, await tcpros.read_frame(reader)).linear.x == 7.0
+        assert wire.deserialize(TWIST, await wire.read_frame(reader)).linear.x == 7.0
         writer.close()
 
 
 @in_loop
 async def test_a_subscriber_that_does_not_read_loses_the_oldest_and_holds_up_nobody(graph) -> None:
-    text, string = "x" * 100_000, tcpros.message_class("std_msgs/String")
+    text, string = "x" * 100_000, wire.message_class("std_msgs/String")
     a = graph.node("/a")
     topic = a.publish("/t", "std_msgs/String", 5)
     async with a.running():
         port = await graph.port("/t")
         lazy = socket.create_connection(("127.0.0.1", port))
-        lazy.sendall(tcpros.encode_header(subscriber("/t")))
+        lazy.sendall(wire.encode_header(subscriber("/t")))
         reader, writer = await connect(port, subscriber("/t"))
-        await tcpros.read_header(reader)
+        await wire.read_header(reader)
         await until(lambda: len(topic.links) == 2)
         for n in range(200):
             topic.publish(lambda _, n=n: string(data=f"{n:04d}{text}"))
-            assert (await tcpros.read_frame(reader))[4:8] == b"%04d" % n
+            assert (await wire.read_frame(reader))[4:8] == b"%04d" % n
         stuck = max(topic.links, key=lambda outlet: outlet.lost)
         assert stuck.lost > 0
         assert sum(outlet.lost for outlet in topic.links) == stuck.lost  # the other lost nothing
@@ -218,11 +319,11 @@ async def test_a_publisher_that_sends_garbage_is_told_of_once_and_heard_again(gr
     node.subscribe("/t", TWIST, take)
 
     async def publish(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await tcpros.read_header(reader)
-        writer.write(tcpros.encode_header(tcpros.publisher_header(tcpros.topic_type_of("/t", TWIST), "/bad")))
-        negative, good = (tcpros.serialize(TWIST, twist(x)) for x in (-1.0, 5.0))
+        await wire.read_header(reader)
+        writer.write(wire.encode_header(wire.publisher_header(wire.topic_type_of("/t", TWIST), "/bad")))
+        negative, good = (wire.serialize(TWIST, twist(x)) for x in (-1.0, 5.0))
         for payload in (b"short", negative, b"x" * 49, good):
-            writer.write(tcpros.frame(payload))
+            writer.write(wire.frame(payload))
         await writer.drain()
         await reader.read()
         writer.close()
@@ -314,10 +415,10 @@ async def test_what_a_node_said_just_before_it_left_is_heard(graph) -> None:
     left = asyncio.Event()
 
     async def publish(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await tcpros.read_header(reader)
-        writer.write(tcpros.encode_header(tcpros.publisher_header(tcpros.topic_type_of("/t", TWIST), "/a")))
+        await wire.read_header(reader)
+        writer.write(wire.encode_header(wire.publisher_header(wire.topic_type_of("/t", TWIST), "/a")))
         await left.wait()
-        writer.write(tcpros.frame(tcpros.serialize(TWIST, twist(3.0))))
+        writer.write(wire.frame(wire.serialize(TWIST, twist(3.0))))
         writer.close()
 
     server = await asyncio.start_server(publish, "127.0.0.1", 0)
@@ -350,10 +451,10 @@ async def test_a_service_answers_and_refuses(graph) -> None:
 
     async def ask(port: int, request: bytes = b"") -> tuple[int, bytes]:
         reader, writer = await connect(port, {"callerid": "/tester", "service": "/s", "md5sum": "*"})
-        assert (await tcpros.read_header(reader))["type"] == "std_srvs/Empty"
-        writer.write(tcpros.frame(request))
+        assert (await wire.read_header(reader))["type"] == "std_srvs/Empty"
+        writer.write(wire.frame(request))
         (ok,) = await reader.readexactly(1)
-        answer = await tcpros.read_frame(reader)
+        answer = await wire.read_frame(reader)
         assert await reader.read() == b""
         writer.close()
         return ok, answer
@@ -378,13 +479,13 @@ async def test_a_service_can_be_asked_for_its_type_and_asked_again_and_again(gra
         port = int(graph.master.graph.services["/s"].rsplit(":", 1)[1])
         asked = {"callerid": "/tester", "service": "/s", "md5sum": "*"}
         reader, writer = await connect(port, asked | {"probe": "1"})
-        assert (await tcpros.read_header(reader))["request_type"] == "std_srvs/EmptyRequest"
+        assert (await wire.read_header(reader))["request_type"] == "std_srvs/EmptyRequest"
         assert await reader.read() == b""
         writer.close()
         reader, writer = await connect(port, asked | {"persistent": "1"})
-        await tcpros.read_header(reader)
+        await wire.read_header(reader)
         for _ in range(3):
-            writer.write(tcpros.frame(b""))
+            writer.write(wire.frame(b""))
             assert await reader.readexactly(5) == b"\x01\0\0\0\0"
         writer.close()
 
@@ -396,9 +497,9 @@ async def test_the_slave_api_tells_what_ros_s_tools_ask(graph) -> None:
     async with a.running():
         uri = await graph.uri("/t")
         reader, writer = await connect(await graph.port("/t"), subscriber("/t"))
-        await tcpros.read_header(reader)
+        await wire.read_header(reader)
         topic.publish(lambda _: twist(1.0))
-        await tcpros.read_frame(reader)
+        await wire.read_frame(reader)
         await until(lambda: topic.links[0].sent > 0)
         assert (await call(uri, "getPublications"))[2] == [["/t", TWIST]]
         assert (await call(uri, "getSubscriptions"))[2] == [["/in", EMPTY]]

@@ -13,11 +13,11 @@ from synthetic_pictures import AHEAD, FRONT_P_BK, NO_JPEG, image, info, jpeg
 from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.framing import GateMessages, encode_batch, key_table
 from zsim.errors import RunError, SessionError
-from zsim.runtime.health import HealthMeter
+from zsim.runtime.membership import HealthMeter
 from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.transport.session import RawSample, ReceivedSample
-from zsim_bridges.ros1 import tcpros
+from zsim_bridges.ros1 import node as wire
 from zsim_bridges.ros1.node import Ros1Node
 from zsim_bridges.ros1.ros1_bridge import Ros1Bridge
 from zsim_bridges.vehicle_links.server import WAITING_MAX, PictureIntake, TrafficIntake
@@ -91,7 +91,7 @@ def test_truth_is_on_ground_truth_alone():
 def test_a_take_off_that_a_node_publishes_is_sent_to_the_drone():
     drone = Drone()
     drone.deliver(status(GATE_NS))
-    drone.node.subscribed["/quad_1/ardrone/takeoff"].callback(tcpros.message_class("std_msgs/Empty")())
+    drone.node.subscribed["/quad_1/ardrone/takeoff"].callback(wire.message_class("std_msgs/Empty")())
     ((key, command),) = drone.sent
     assert key == "drone/quad-1/cmd/mode"
     assert (command.mode, command.source, command.t_ns) == ("takeoff", "ros1.main", GATE_NS)

@@ -18,7 +18,7 @@ from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.transport.session import RawSample, ReceivedSample
 from zsim.transport.zenoh_settings import Mode
-from zsim_bridges.ros2 import rmw_zenoh, ros_types, topics
+from zsim_bridges.ros2 import rmw_zenoh, topics
 from zsim_bridges.ros2.rmw_zenoh import Attachment, Endpoint, NodeId, RosContext
 from zsim_bridges.ros2.ros2_bridge import SAMPLES_MAX, CallbackQueue, Ros2Bridge
 
@@ -142,16 +142,16 @@ class Bench:
 
     def reader(self, topic: str, kind: str, alive: bool = True) -> None:
         """Let a subscription come or go."""
-        endpoint = Endpoint("MS", topic, rmw_zenoh.dds_name(kind), ros_types.type_hash(kind))
+        endpoint = Endpoint("MS", topic, rmw_zenoh.dds_name(kind), rmw_zenoh.type_hash(kind))
         self.link.on_token_of(rmw_zenoh.endpoint_token(READER, 2, endpoint, rmw_zenoh.DEFAULT), alive)
         self.turn()
 
     def key(self, topic: str, kind: str) -> str:
-        return rmw_zenoh.data_key(0, topic, rmw_zenoh.dds_name(kind), ros_types.type_hash(kind))
+        return rmw_zenoh.data_key(0, topic, rmw_zenoh.dds_name(kind), rmw_zenoh.type_hash(kind))
 
     def publish(self, topic: str, kind: str, message: Any, attachment: bytes = BESIDE) -> None:
         """Let a ROS node publish."""
-        payload = message if isinstance(message, bytes) else ros_types.encode(message, kind)
+        payload = message if isinstance(message, bytes) else rmw_zenoh.encode(message, kind)
         self.link.deliver(self.key(topic, kind), payload, attachment)
         self.turn()
 
@@ -167,8 +167,8 @@ def wall_ns() -> int:
 
 
 def twist(*numbers: float) -> Any:
-    vector = ros_types.message_class("geometry_msgs/msg/Vector3")
-    return ros_types.message_class(TWIST)(vector(*numbers[:3]), vector(*numbers[3:]))
+    vector = rmw_zenoh.message_class("geometry_msgs/msg/Vector3")
+    return rmw_zenoh.message_class(TWIST)(vector(*numbers[:3]), vector(*numbers[3:]))
 
 
 def imu(t_ns: int) -> bytes:
@@ -185,7 +185,7 @@ def test_a_topic_is_read_and_converted_only_while_somebody_subscribes() -> None:
     bench.turn()
     (first, payload, beside), (_, _, later) = bench.link.sent
     assert first == bench.key("/drone_1/imu", IMU)
-    assert ros_types.decode(payload, IMU).header.frame_id == "drone_1/imu_link"
+    assert rmw_zenoh.decode(payload, IMU).header.frame_id == "drone_1/imu_link"
     (token,) = (each for each in bench.link.tokens if "/%drone_1%imu/" in each)
     sent = rmw_zenoh.attachment_of(beside)
     assert sent == (1, WALL_NS, rmw_zenoh.gid_of(token))
@@ -234,7 +234,7 @@ def test_a_twist_becomes_a_velocity_in_the_heading_frame_at_the_newest_gate() ->
 
 
 def test_modes_and_the_emergency_button() -> None:
-    bench, empty = Bench(), ros_types.message_class(EMPTY)()
+    bench, empty = Bench(), rmw_zenoh.message_class(EMPTY)()
     status = keys.status("drone-1")
     bench.publish("/drone_1/takeoff", EMPTY, empty)
     bench.publish("/drone_1/land", EMPTY, empty)
@@ -291,7 +291,7 @@ def test_a_service_asks_the_controller_and_echoes_who_asked() -> None:
     assert bench.link.asked == [("cluster/m.x/control", "engage", "ros2.main", {})]
     ((key, payload, beside),) = query.replies
     assert key == bench.key("/cluster/m_x/engage", TRIGGER)
-    response = ros_types.decode(payload, "std_srvs/srv/Trigger_Response")
+    response = rmw_zenoh.decode(payload, "std_srvs/srv/Trigger_Response")
     assert not response.success
     assert has_terms(response.message, "phase", "idle", "engaged")
     assert rmw_zenoh.attachment_of(beside) == (7, WALL_NS, bytes(range(16)))
@@ -318,15 +318,15 @@ def test_a_summary_of_a_gate_has_what_was_told_up_to_it() -> None:
         bench.link.deliver(status_key, messages.encode(status))
     bench.turn()
     navdata = [payload for key, payload, _ in bench.link.sent if "Navdata" in key]
-    assert [ros_types.decode(each, "zsim_msgs/msg/Navdata").az for each in navdata] == pytest.approx([0.0, 1.0, 2.0])
+    assert [rmw_zenoh.decode(each, "zsim_msgs/msg/Navdata").az for each in navdata] == pytest.approx([0.0, 1.0, 2.0])
 
 
 def test_frames_that_never_move_are_kept_for_who_comes_later() -> None:
     ((key, payload, _),) = Bench().link.kept
     assert key == rmw_zenoh.data_key(
-        0, "/tf_static", "tf2_msgs::msg::dds_::TFMessage_", ros_types.type_hash("tf2_msgs/msg/TFMessage")
+        0, "/tf_static", "tf2_msgs::msg::dds_::TFMessage_", rmw_zenoh.type_hash("tf2_msgs/msg/TFMessage")
     )
-    children = {each.child_frame_id for each in ros_types.decode(payload, "tf2_msgs/msg/TFMessage").transforms}
+    children = {each.child_frame_id for each in rmw_zenoh.decode(payload, "tf2_msgs/msg/TFMessage").transforms}
     assert {"drone_1/odom", "drone2/odom", "drone_1/sonar_link", "drone2/imu_link"} <= children
 
 
@@ -373,7 +373,7 @@ FRONT_INFO = keys.camera_info("drone-1", "front")
 def published(bench: Bench, topic: str, kind: str) -> list[Any]:
     """Return what was published on a topic."""
     key = bench.key(topic, kind)
-    return [ros_types.decode(payload, kind) for at, payload, _ in bench.link.sent if at == key]
+    return [rmw_zenoh.decode(payload, kind) for at, payload, _ in bench.link.sent if at == key]
 
 
 def test_a_picture_is_on_its_camera_s_topic_with_its_bytes_and_the_time_of_exposure() -> None:
@@ -412,7 +412,7 @@ def test_togglecam_makes_the_other_camera_the_active_one() -> None:
             bench.link.deliver(key, messages.encode(image(20_000_000)))
         bench.turn()
         (reply,) = bench.ask("/drone_1/ardrone/togglecam").replies
-        assert ros_types.decode(reply[1], f"{TRIGGER}_Response").success
+        assert rmw_zenoh.decode(reply[1], f"{TRIGGER}_Response").success
     frames = [m.header.frame_id for m in published(bench, "/drone_1/ardrone/image_raw/compressed", IMAGE)]
     assert frames == ["drone_1/front_camera_optical_frame", "drone_1/bottom_camera_optical_frame"]
 

@@ -15,7 +15,7 @@ from zsim.scenario import scenario_file
 from zsim.schema.message import Vector3
 from zsim.sensors.sensor import ErrorModel, Mount
 from zsim.sensors.sensor_catalogue import Sensors
-from zsim_bridges.ros2 import rmw_zenoh, ros_types, topics
+from zsim_bridges.ros2 import rmw_zenoh, topics
 from zsim_bridges.ros2.topics import DroneCameras, NavdataSummary
 
 SENSORS = scenario_file.from_text(ONE).drones[0].sensors
@@ -57,7 +57,7 @@ def convert(topic: str, message: Any) -> Any:
     """Return what a topic makes of a message on its first source, after a way through CDR."""
     found = all_topics()[topic]
     converted = found.convert(found.sources[0], message)
-    return ros_types.decode(ros_types.encode(converted, found.kind), found.kind)
+    return rmw_zenoh.decode(rmw_zenoh.encode(converted, found.kind), found.kind)
 
 
 def test_samples_are_stamped_with_the_time_for_which_they_hold() -> None:
@@ -221,7 +221,7 @@ def test_navdata_is_in_the_drivers_units_and_signs() -> None:
     assert (made.rot_x, made.rot_y, made.rot_z) == pytest.approx(tuple(np.degrees([0.1, 0.2, 0.3])))
     assert (made.ax, made.ay, made.az) == pytest.approx((0.0, -0.5, 1.0))
     assert (made.vx, made.vy, made.tm) == (1500.0, -500.0, 3_020_000.0)
-    assert ros_types.encode(made, "zsim_msgs/msg/Navdata")
+    assert rmw_zenoh.encode(made, "zsim_msgs/msg/Navdata")
 
 
 def test_navdata_of_a_drone_that_has_told_nothing_yet() -> None:

@@ -1,0 +1,563 @@
+"""The foreground of a camera's picture: drones, hats, obstacles and surfaces. Pure.
+
+Drones are hulls, arms, motors, rotors as their blades sweep, and hats; they look like the console's
+(zsim_bridges.console.scene); lengths are the AR.Drone's, scaled by the arms. All of a picture are computed together.
+
+A ray hits a ball, such as a hat, if it passes the centre within the radius. This is exact anywhere in the picture and
+for any lens, and antialiased over one pixel at the edge, so that the drawn centre is the projected centre. Faces of
+obstacles are clipped in front of the camera, curved by the lens, and shaded by the sun.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from functools import lru_cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim.scenario.surroundings import BOX, CENTRE, COSINE, HALF, SHAPE, SINE, SPHERE, corners_of
+from zsim_agents.cameras.scene import (
+    ARM_M,
+    BLUR_MAX_PX,
+    SHIFT,
+    SUN_W,
+    CameraMotion,
+    DroneLook,
+    DroneStates,
+    Kernel,
+    Scene,
+    View,
+    has_pixels,
+    motion_blur_kernels,
+    skew,
+)
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+Fixed = NDArray[np.int32]
+Colour = tuple[float, float, float, float]  # B, G, R, and an opaque fourth
+
+MAGENTA = np.array([134.0, 0.0, 226.0])  # B, G, R of the paper's marker
+COLOURS = {  # B, G, R; those of the console, the lower side of the hull in its own shade
+    "cross": np.array([48.0, 44.0, 42.0]),
+    "hull": np.array([96.0, 88.0, 84.0]),
+    "hull_low": np.array([62.0, 57.0, 54.0]),
+    "nose": np.array([24.0, 108.0, 240.0]),
+    "rotor": np.array([30.0, 28.0, 28.0]),
+}
+RING = 1.31  # rotor radii, outer radius of a hull ring
+RING_POINTS = 16
+RING_Z_M, RING_HIGH_M = 0.022, 0.042  # m, middle and height of a ring
+ARM_Z_M, ARM_WIDE_M = 0.004, 0.014  # m
+ROTOR_Z_M, ROTOR_CHORD_M = 0.030, 0.016  # m
+LENS_M = 0.013  # m, radius
+MOTOR_WIDE_M = 0.034  # m
+REACH_M = 0.36  # m, farthest point of the AR.Drone from its middle, rotors and hull
+BODY_POINTS, NOSE_POINTS = 40, 20
+SECTOR = 5  # points of a blade's sweep along the circle
+BLADES = 2
+BLADE_RAD = 0.3  # rad of the circle that a blade covers, at two thirds of its radius
+OPACITY = 0.16, 0.9  # of a blade's sweep, least and most; chosen
+DETAIL_PX = 14.0  # across; smaller drones are drawn without lens, motors and rotors
+THICKNESS_MAX_PX = 80
+SEEN_M = 300.0  # m; farther drones are less than a pixel
+ROOM_M = 0.5  # m; no part is farther from the middle of a drone with arms of 0.18 m
+BLURRED_PX = 2.0  # px of motion from which drones are blurred; hulls need not be as exact as hats
+EDGE_PX = 3.0  # px by which smooth edges and the blur may exceed the lines
+Levels = NDArray[np.float32]
+AMBIENT, DIFFUSE = 0.72, 0.28  # shares of the light from the sky and from the sun; chosen: matt foam outdoors
+STEPS_MAX = 6  # instants of an exposure that are drawn of a moving ball
+STEP_PX = 0.8  # px between two of them
+ROUNDING = np.float32(0.5)
+AXIS = np.array([0.0, 0.0, 1.0])
+NEAR_M = 0.05  # nothing nearer is drawn
+FAR_PX = 16_000.0  # px; coordinates beyond are clipped: they have 32 bits with the fraction, and lines have to end
+SIDES = 24  # of a cylinder
+PIECES = 8  # of an edge that the lens bends
+OBSTACLE = np.array([92.0, 118.0, 146.0])  # B, G, R, chosen: weathered wood; never magenta
+SURFACE = np.array([102.0, 116.0, 124.0])  # B, G, R, chosen: stone; never magenta
+BENT_PX = 24.0  # px, chosen: the lens bends the edges of larger triangles visibly
+
+
+class DroneImager:
+    """Images of the drones of a scene in a camera on the drone `carrier`, over an exposure [s].
+
+    `brightness` is that of the light, as the sensor has it.
+    """
+
+    def __init__(self, view: View, scene: Scene, carrier: int, exposure_s: float, brightness: float) -> None:
+        self._view, self._looks, self._carrier = view, scene.drones, carrier
+        self._exposure_s, self._brightness = exposure_s, brightness
+        self._models = [_model(look, brightness) for look in scene.drones]
+        self._hat, self._radius_m = np.array(scene.hats.position_m), scene.hats.diameter_m / 2
+        self._kinds: list[int] = []  # for each drone, the first one that looks the same
+        firsts: dict[tuple[bytes, bytes, float], int] = {}
+        for i, look in enumerate(scene.drones):
+            key = look.hubs_B.tobytes(), look.turns.tobytes(), look.radius_m
+            self._kinds.append(firsts.setdefault(key, i))
+        lens = view.lens
+        slack = 1.5 if view.distorts else 1.05
+        self._across = slack * (max(lens.cx, lens.width - lens.cx) / lens.fx)
+        self._down = slack * (max(lens.cy, lens.height - lens.cy) / lens.fy)
+
+    def images(
+        self, motion: CameraMotion, t_s: float, bodies: DroneStates, R_WB: Array
+    ) -> dict[int, tuple[float, list[BallImage | DroneImage]]]:
+        """Return the drones that may be in the picture over an exposure about t_s [s], by their index.
+
+        Returns:
+            The distance from the camera [m], and the images of the drone (if it is wholly in front of the camera) and
+            of its hat (if visible), in drawing order.
+        """
+        R_KB = motion.R_WK.T @ R_WB
+        centres = motion.points_K(bodies.p_WB)
+        ways = motion.rates_K(centres, bodies.v_WB) * self._exposure_s
+        cameras_B = np.einsum("nji,nj->ni", R_KB, -centres)
+        distances = np.sqrt((centres * centres).sum(axis=-1))
+        room = ROOM_M * max(model.size for model in self._models)
+        ahead = centres[:, 2] + room
+        near = np.abs(centres[:, 0]) - 2 * room < self._across * ahead
+        near &= np.abs(centres[:, 1]) - 2 * room < self._down * ahead
+        near &= (distances < SEEN_M) & (ahead > 0)
+        near[self._carrier] = False  # its own parts are not in its picture
+        in_view: list[int] = np.flatnonzero(near).tolist()
+        kinds: defaultdict[int, list[int]] = defaultdict(list)
+        for i in in_view:
+            kinds[self._kinds[i]].append(i)
+        drones: dict[int, DroneImage] = {}
+        for kind, which in kinds.items():
+            drones |= self._images(kind, which, _Poses(R_KB, centres, ways, cameras_B), t_s, bodies)
+        hats = centres + R_KB @ self._hat
+        hat_velocities = bodies.v_WB + np.einsum("nij,nj->ni", R_WB, bodies.w_WB_B @ -skew(self._hat).T)
+        hat_ways = motion.rates_K(hats, hat_velocities) * self._exposure_s
+        shown = [i for i in in_view if self._looks[i].has_hat and hats[i, 2] > NEAR_M]
+        seen = {shown[k]: image for k, image in self.hats(hats[shown], hat_ways[shown], motion).items()}
+        images: dict[int, tuple[float, list[BallImage | DroneImage]]] = {}
+        for i in in_view:
+            layers = [image for image in (drones.get(i), seen.get(i)) if image is not None]
+            hat_is_behind = not cameras_B[i, 2] > self._hat[2] - self._radius_m
+            images[i] = float(distances[i]), layers[::-1] if hat_is_behind else layers
+        return images
+
+    def hats(self, centres_K: Array, ways_K: Array, motion: CameraMotion) -> dict[int, BallImage]:
+        """Return the images of hats in front of the camera by their index; arguments as of `ball_images`."""
+        colour = self._brightness * MAGENTA
+        return ball_images(self._view, centres_K, ways_K, self._radius_m, colour, SUN_W @ motion.R_WK)
+
+    def _images(
+        self, kind: int, which: list[int], poses: _Poses, t_s: float, bodies: DroneStates
+    ) -> dict[int, DroneImage]:
+        """Return the images of drones of one look, of those that are wholly in front of the camera."""
+        look, model = self._looks[kind], self._models[kind]
+        speeds = np.array([bodies.rotors[i] for i in which], float)
+        blades = _blade_points(look, model.size, t_s, self._exposure_s, speeds)
+        of_model = np.broadcast_to(model.points, (len(which), *model.points.shape))
+        points_B = np.concatenate([of_model, blades], axis=1).transpose(0, 2, 1)
+        points = poses.R_KB[which] @ points_B + poses.centres[which, :, None]
+        whole = np.flatnonzero(points[:, 2].min(axis=1) > NEAR_M)
+        if not len(whole):
+            return {}
+        near = np.array(which)[whole]
+        pixels = fixed(self._view.pixels(points[whole].transpose(0, 2, 1)))
+        ways_px = self._view.flow_px(poses.centres[near], poses.ways[near])
+        scales = self._view.lens.fx * model.size / poses.centres[near, 2]
+        turned = np.abs(speeds[whole]) * self._exposure_s  # rad, of each rotor
+        blurs: list[Kernel | None] = [None] * len(near)
+        moved = np.flatnonzero(np.hypot(*ways_px.T) > BLURRED_PX).tolist()
+        for i, kernel in zip(moved, motion_blur_kernels(ways_px[moved]) if moved else [], strict=True):
+            blurs[i] = kernel
+        rows = zip(
+            self._boxes(pixels, ways_px, scales),
+            pixels,
+            scales.tolist(),
+            blurs,
+            (poses.cameras_B[near, 2] > 0.03 * model.size).tolist(),
+            (poses.cameras_B[near, 0] > 0.1 * model.size).tolist(),
+            np.clip(BLADE_RAD / np.maximum(turned.mean(axis=1), BLADE_RAD), *OPACITY).tolist(),
+            (turned.min(axis=1) * BLADES >= 2 * math.pi).tolist(),
+            strict=True,
+        )
+        return {i: DroneImage(model, *row) for i, row in zip(near.tolist(), rows, strict=True) if has_pixels(row[0])}
+
+    def _boxes(self, pixels: Fixed, ways_px: Array, scales: Array) -> list[list[int]]:
+        """Return the parts of the picture that contain drones, by the pixels of all their points in sixteenths."""
+        u, v, wide, high = np.array([cv2.boundingRect(each) for each in pixels]).T / (1 << SHIFT)
+        lowest, highest = np.stack([u, v], axis=-1), np.stack([u + wide, v + high], axis=-1)
+        half_way = np.minimum(np.abs(ways_px), BLUR_MAX_PX) / 2
+        room = EDGE_PX + half_way + np.minimum(MOTOR_WIDE_M * scales, THICKNESS_MAX_PX)[:, None] / 2
+        return self._view.boxes(lowest - room, highest + room)
+
+
+class _Poses(NamedTuple):
+    """All drones in K: rotations B to K (N, 3, 3), centres and their motion over the exposure [m; K], cameras in B."""
+
+    R_KB: Array
+    centres: Array
+    ways: Array
+    cameras_B: Array
+
+
+class _DroneModel(NamedTuple):
+    """Points (P, 3) [m; B] of a drone part by part, its size relative to the AR.Drone, and its colours in the light."""
+
+    points: Array
+    parts: dict[str, slice]
+    size: float
+    colours: dict[str, Colour]
+
+
+def _model(look: DroneLook, brightness: float) -> _DroneModel:
+    size = float(np.hypot(*look.hubs_B.T).max()) / ARM_M
+    angles = 2 * math.pi * np.arange(RING_POINTS) / RING_POINTS
+    circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(RING_POINTS)], axis=-1)
+    hubs = np.column_stack([look.hubs_B, np.zeros(len(look.hubs_B))])
+    rings = hubs[:, None] + RING * look.radius_m * circle + np.array([0.0, 0.0, RING_Z_M * size])
+    arms = np.stack([np.zeros_like(hubs), hubs], axis=1) + np.array([0.0, 0.0, ARM_Z_M * size])
+    motors = np.stack([hubs, hubs + np.array([0.0, 0.0, ROTOR_Z_M * size])], axis=1)
+    points = {
+        "body": size * _ellipsoid(0.0, 0.28, 0.09, 0.065, BODY_POINTS),
+        "nose": size * _ellipsoid(0.115, 0.105, 0.084, 0.065, NOSE_POINTS),
+        "lens": size * np.array([[0.165, 0.0, 0.012]]),
+        "arms": arms.reshape(-1, 3),
+        "motors": motors.reshape(-1, 3),
+        "rings": rings.reshape(-1, 3),
+    }
+    ends = np.cumsum([len(part) for part in points.values()]).tolist()
+    parts = {name: slice(end - len(points[name]), end) for name, end in zip(points, ends, strict=True)}
+    colours = {name: (*bgr(brightness * each), 255.0) for name, each in COLOURS.items()}
+    return _DroneModel(np.concatenate([*points.values()]), parts, size, colours)
+
+
+def _ellipsoid(middle: float, length: float, width: float, height: float, points: int) -> Array:
+    """Return points of an ellipsoid that give its outline from any direction."""
+    k = np.arange(points) + 0.5
+    z = 1 - 2 * k / points  # Fibonacci's lattice
+    r, angle = np.sqrt(1 - z * z), math.pi * (3 - math.sqrt(5)) * k
+    unit = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=-1)
+    return unit * (length / 2, width / 2, height / 2) + (middle, 0.0, 0.012)
+
+
+def _blade_points(look: DroneLook, size: float, t_s: float, exposure_s: float, speeds: Array) -> Array:
+    """Return the sweeps of blades over an exposure, (..., R BLADES (SECTOR + 1), 3) [m; B]: hub, then the arc.
+
+    The truth has no rotor angles: speed times time is used, which cannot be distinguished.
+
+    Args:
+        speeds: of the rotors, (..., R) [rad/s].
+    """
+    middle = np.remainder(-look.turns * speeds * t_s, 2 * math.pi)
+    sweep = np.clip(np.abs(speeds) * exposure_s, 2 * ROTOR_CHORD_M * size / look.radius_m, math.pi)
+    blades, along = math.pi * np.arange(BLADES), np.linspace(-0.5, 0.5, SECTOR)
+    angles = (middle[..., None] + blades)[..., None] + sweep[..., None, None] * along
+    points = np.zeros((*angles.shape[:-1], SECTOR + 1, 3))
+    points[..., 1:, 0] = look.radius_m * np.cos(angles)
+    points[..., 1:, 1] = look.radius_m * np.sin(angles)
+    points[..., :2] += look.hubs_B[:, None, None]
+    points[..., 2] = ROTOR_Z_M * size
+    return points.reshape(*speeds.shape[:-1], -1, 3)
+
+
+class DroneImage(NamedTuple):
+    """A drone to be drawn.
+
+    Attributes:
+        box: the part of the picture that contains it, u0, v0, u1, v1.
+        pixels: of the model's points, then of its blades' sweeps, in sixteenths, (P + R BLADES (SECTOR + 1), 2).
+        scale: px/m of the AR.Drone.
+        blur: kernel of its motion during the exposure; None if it does not move.
+        from_above: whether the camera is above its rotors; shows_lens: in front of it.
+        opacity: of a blade's sweep; whole_turns: whether the blades of each rotor cover its whole circle.
+    """
+
+    model: _DroneModel
+    box: list[int]
+    pixels: Fixed
+    scale: float
+    blur: Kernel | None
+    from_above: bool
+    shows_lens: bool
+    opacity: float
+    whole_turns: bool
+
+    def draw(self, picture: Picture) -> None:
+        """Draw the drone without its hat; a moving one in a separate layer, so that the background stays sharp."""
+        u0, v0, u1, v1 = self.box
+        part = picture[v0:v1, u0:u1]
+        pixels = self.pixels - np.array([u0, v0], np.int32) * (1 << SHIFT)
+        if self.blur is None:
+            self._draw(part, pixels)
+            return
+        layer = np.zeros((*part.shape[:2], 4), np.uint8)  # the fourth channel is what the drone covers
+        self._draw(layer, pixels)
+        cv2.filter2D(layer, -1, self.blur, dst=layer, borderType=cv2.BORDER_REPLICATE)
+        passes = cv2.bitwise_not(cv2.extractChannel(layer, 3))
+        cv2.multiply(part, cv2.merge([passes] * 3), dst=part, scale=1 / 255)
+        cv2.add(part, cv2.cvtColor(layer, cv2.COLOR_BGRA2BGR), dst=part)
+
+    def _draw(self, picture: Picture, pixels: Fixed) -> None:
+        scale, parts, colours = self.scale, self.model.parts, self.model.colours
+        hull = colours["hull" if self.from_above else "hull_low"]
+        detailed = 2 * REACH_M * scale > DETAIL_PX
+        if detailed and not self.from_above:
+            self._draw_rotors(picture, pixels)
+        _lines(picture, pixels[parts["rings"]].reshape(-1, RING_POINTS, 2), True, hull, 0.6 * RING_HIGH_M * scale)
+        _lines(picture, pixels[parts["arms"]].reshape(-1, 2, 2), False, colours["cross"], ARM_WIDE_M * scale)
+        if detailed:
+            _lines(picture, pixels[parts["motors"]].reshape(-1, 2, 2), False, colours["cross"], MOTOR_WIDE_M * scale)
+        _fill_hull(picture, pixels[parts["body"]], hull)
+        if self.shows_lens:
+            _fill_hull(picture, pixels[parts["nose"]], colours["nose"])
+            if detailed:
+                u, v = pixels[parts["lens"]][0].tolist()
+                radius = round(max(LENS_M * scale, 0.5) * (1 << SHIFT))
+                cv2.circle(picture, (u, v), radius, colours["cross"], cv2.FILLED, cv2.LINE_AA, SHIFT)
+        if detailed and self.from_above:
+            self._draw_rotors(picture, pixels)
+
+    def _draw_rotors(self, picture: Picture, pixels: Fixed) -> None:
+        """Darken the sweeps of the blades."""
+        swept = picture.copy()
+        sectors = pixels[len(self.model.points) :].reshape(-1, SECTOR + 1, 2)
+        circles = sectors[:, 1:].reshape(-1, BLADES * SECTOR, 2)
+        for sweep in circles if self.whole_turns else sectors:
+            cv2.fillConvexPoly(swept, sweep, self.model.colours["rotor"], cv2.LINE_AA, SHIFT)
+        cv2.addWeighted(swept, self.opacity, picture, 1 - self.opacity, 0.0, dst=picture)
+
+
+def _lines(picture: Picture, lines: Fixed, closed: bool, colour: Colour, wide_px: float) -> None:
+    thickness = min(max(1, round(wide_px)), THICKNESS_MAX_PX)
+    cv2.polylines(picture, [*lines], closed, colour, thickness, cv2.LINE_AA, SHIFT)
+
+
+def _fill_hull(picture: Picture, pixels: Fixed, colour: Colour) -> None:
+    cv2.fillConvexPoly(picture, cv2.convexHull(pixels), colour, cv2.LINE_AA, SHIFT)
+
+
+class BallImage(NamedTuple):
+    """A ball in a part of the picture.
+
+    Attributes:
+        box: the part, u0, v0, u1, v1.
+        light: from the ball, plus a half for rounding, (h, w, 3).
+        passes: the share of light from behind, (h, w, 1).
+    """
+
+    box: list[int]
+    light: Levels
+    passes: Levels
+
+    def draw(self, picture: Picture) -> None:
+        u0, v0, u1, v1 = self.box
+        part = picture[v0:v1, u0:u1]
+        part[:] = part * self.passes + self.light
+
+
+def ball_images(
+    view: View, centres_K: Array, ways_K: Array, radius_m: float, colour: Array, sun_K: Array
+) -> dict[int, BallImage]:
+    """Return the images over an exposure of those balls that are in the picture, by their index.
+
+    All pixels that may be covered are computed in one array, at the instants of the ball that moves most, because balls
+    are many and small.
+
+    Args:
+        centres_K, ways_K: centres and their motion during the exposure, (M, 3) [m; K].
+        radius_m: of all balls.
+        colour: B, G, R of all balls, (3,).
+        sun_K: unit vector to the sun, (3,).
+    """
+    if not len(centres_K):
+        return {}
+    ways_px = np.hypot(*view.flow_px(centres_K, ways_K).T)
+    boxes = _boxes(view, centres_K, ways_px, radius_m)
+    if not boxes:
+        return {}
+    shown = list(boxes)
+    centres, ways = centres_K[shown], ways_K[shown]
+    vectors = np.empty((len(shown), 3, 4), np.float32)
+    vectors[..., 0], vectors[..., 1], vectors[..., 2], vectors[..., 3] = centres, ways, sun_K, AXIS
+    parts = [
+        view.rays[v0:v1, u0:u1].reshape(-1, 3) @ each
+        for (u0, v0, u1, v1), each in zip(boxes.values(), vectors, strict=True)
+    ]
+    along, to_way, to_sun, to_axis = np.concatenate(parts).T
+    pixels = _Pixels(along, to_way, to_sun, to_axis, [len(part) for part in parts])
+    steps = min(STEPS_MAX, max(1, math.ceil(ways_px[shown].max() / STEP_PX)))
+    covered = _covered(pixels, centres, ways, radius_m, view.lens.fx, steps)
+    rest = pixels.of_ball(radius_m**2 - (centres * centres).sum(axis=-1))  # brightness: 1 directly under the sun
+    meets = pixels.along - np.sqrt(np.maximum(pixels.along * pixels.along + rest, 0))
+    cosine = (meets * pixels.to_sun - pixels.of_ball(centres @ sun_K)) * np.float32(DIFFUSE / radius_m)
+    shade = np.float32(AMBIENT) + np.minimum(np.maximum(cosine, 0), np.float32(DIFFUSE))
+    light = (covered * shade)[:, None] * colour.astype(np.float32) + ROUNDING
+    passes = (1 - covered)[:, None]
+    images: dict[int, BallImage] = {}
+    start = 0
+    for (i, box), count in zip(boxes.items(), pixels.counts, strict=True):
+        size, part = (box[3] - box[1], box[2] - box[0]), slice(start, start + count)
+        images[i] = BallImage(box, light[part].reshape(*size, 3), passes[part].reshape(*size, 1))
+        start += count
+    return images
+
+
+def _boxes(view: View, centres_K: Array, ways_px: Array, radius_m: float) -> dict[int, list[int]]:
+    """Return the parts of the picture that contain balls, by their index."""
+    x, y, z = centres_K.T
+    before = z >= radius_m + NEAR_M
+    wide_px = view.lens.fx * radius_m / np.where(before, z - radius_m, np.inf) * (1 + np.hypot(x, y) / z)
+    reach, pixels = (1.5 + ways_px / 2 + wide_px)[:, None], view.pixels(centres_K)
+    boxes = view.boxes(pixels - reach, pixels + reach)
+    return {i: box for i, box in enumerate(boxes) if before[i] and has_pixels(box)}
+
+
+class _Pixels(NamedTuple):
+    """Components of the rays of all balls' pixels, one ball after the other, along four vectors, (P,) each."""
+
+    along: Levels
+    to_way: Levels
+    to_sun: Levels
+    to_axis: Levels
+    counts: list[int]
+
+    def of_ball(self, values: Array) -> Levels:
+        """Return values of the balls (..., M) for each pixel, (..., P)."""
+        return np.repeat(values.astype(np.float32), self.counts, axis=-1)
+
+
+def _covered(pixels: _Pixels, centres: Array, ways: Array, radius: float, focal_px: float, steps: int) -> Levels:
+    """Return the share of each pixel that is covered: how far its ray passes within the radius, averaged over time."""
+    shares = ((np.arange(steps) + 0.5) / steps - 0.5)[:, None]  # of the exposure, from its middle
+    moved = centres + shares[..., None] * ways
+    away2 = (moved * moved).sum(axis=-1)
+    along = pixels.along + shares.astype(np.float32) * pixels.to_way
+    beside2 = pixels.of_ball(away2) - along * along
+    px_per_m = pixels.of_ball(focal_px / np.sqrt((centres * centres).sum(axis=-1)))
+    px_per_m /= pixels.to_axis * np.sqrt(pixels.to_axis)  # mean of both directions
+    within = (np.float32(radius) - np.sqrt(np.maximum(beside2, 0))) * px_per_m
+    return np.minimum(np.maximum(within + ROUNDING, 0), 1).mean(axis=0)
+
+
+def draw_obstacle(
+    picture: Picture, view: View, row: tuple[float, ...], motion: CameraMotion, brightness: float
+) -> None:
+    """Draw an obstacle, a row of zsim.scenario.surroundings."""
+    if row[SHAPE] == SPHERE:
+        centre_K = motion.points_K(np.array([row[CENTRE : CENTRE + 3]]))
+        if centre_K[0, 2] > 0:
+            still, colour = np.zeros((1, 3)), brightness * OBSTACLE
+            for image in ball_images(view, centre_K, still, row[HALF], colour, SUN_W @ motion.R_WK).values():
+                image.draw(picture)
+        return
+    for corners, normal in _faces(row):
+        if normal @ (motion.p_WK - corners[0]) > 0:
+            shade = brightness * (AMBIENT - 0.15 + (DIFFUSE + 0.15) * max(0.0, float(normal @ SUN_W)))
+            fill_face(picture, view, motion.points_K(corners), shade * OBSTACLE)
+
+
+@lru_cache(maxsize=1000)
+def _faces(row: tuple[float, ...]) -> tuple[tuple[Array, Array], ...]:
+    """Return the upright faces and the top of a box or cylinder: corners (M, 3) and normal (3,) in W."""
+    if row[SHAPE] == BOX:
+        outline = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)]) * row[HALF : HALF + 2]
+    else:
+        angles = 2 * math.pi * np.arange(SIDES) / SIDES
+        outline = row[HALF] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    c, s = row[COSINE], row[SINE]
+    foot = outline @ np.array([[c, s], [-s, c]]) + row[CENTRE : CENTRE + 2]
+    low, high = row[CENTRE + 2] - row[HALF + 2], row[CENTRE + 2] + row[HALF + 2]
+    faces = [(np.column_stack([foot, np.full(len(foot), high)]), AXIS)]
+    for a, b in zip(foot, np.roll(foot, -1, axis=0), strict=True):
+        corners = np.array([(*a, low), (*b, low), (*b, high), (*a, high)])
+        dx, dy = b - a
+        faces.append((corners, np.array([dy, -dx, 0.0]) / math.hypot(dx, dy)))
+    return tuple(faces)
+
+
+def fill_face(picture: Picture, view: View, corners_K: Array, colour: Array) -> None:
+    """Fill a convex face, given by its corners (M, 3) [m; K]."""
+    seen = _in_front(corners_K)
+    if len(seen) < 3:
+        return
+    if view.distorts:  # edges are curves
+        steps = (np.roll(seen, -1, axis=0) - seen)[:, None]
+        seen = (seen[:, None] + np.arange(PIECES)[:, None] / PIECES * steps).reshape(-1, 3)
+    outline = view.pixels(seen)
+    lowest, highest = outline.min(axis=0), outline.max(axis=0)
+    if (highest < 0).any() or lowest[0] > view.lens.width or lowest[1] > view.lens.height:
+        return
+    cv2.fillPoly(picture, [fixed(outline)], bgr(colour), cv2.LINE_AA, SHIFT)
+
+
+def _in_front(corners: Array) -> Array:
+    """Return the part of a convex face in front of the camera, as corners (M, 3) [m; K]."""
+    depth = corners[:, 2] - NEAR_M
+    if (depth > 0).all():
+        return corners
+    kept: list[Array] = []
+    for i, here in enumerate(depth):
+        j = (i + 1) % len(corners)
+        if here > 0:
+            kept.append(corners[i])
+        if (here > 0) != (depth[j] > 0):
+            kept.append(corners[i] + (corners[j] - corners[i]) * (here / (here - depth[j])))
+    return np.array(kept).reshape(-1, 3)
+
+
+def fixed(pixels: Array) -> NDArray[np.int32]:
+    """Return pixels as OpenCV's fixed-point numbers with SHIFT fractional bits."""
+    return np.rint(np.clip(pixels, -FAR_PX, FAR_PX) * (1 << SHIFT)).astype(np.int32)
+
+
+def bgr(colour: Array) -> tuple[float, float, float]:
+    """Return a colour as OpenCV's scalar."""
+    b, g, r = colour.tolist()
+    return round(b), round(g), round(r)
+
+
+class SurfaceImager:
+    """The surfaces before one camera, (T, 9) as in zsim.scenario.surroundings: of one shade, seen from both sides.
+
+    They are drawn from the farthest to the nearest by their middles, among drones and obstacles, without smoothed
+    edges, so that no gap shows between neighbours.
+    """
+
+    def __init__(self, view: View, triangle: Array, brightness: float) -> None:
+        self._view = view
+        self._corners_W = corners_of(triangle)
+        self._middles_W = self._corners_W.mean(axis=1)
+        normals = np.cross(triangle[:, 3:6], triangle[:, 6:])
+        self._normals_W = normals / np.linalg.norm(normals, axis=1)[:, None]
+        self._brightness = brightness
+
+    def shown(self, motion: CameraMotion) -> list[tuple[float, int]]:
+        """Return distance [m] and number of each triangle of which something may be in the picture, and keep them."""
+        self._points_K = motion.points_K(self._corners_W)
+        z = self._points_K[..., 2]
+        ahead = (z > NEAR_M).all(axis=1)
+        self._pixels = np.zeros((len(z), 3, 2))
+        if ahead.any():
+            self._pixels[ahead] = self._view.pixels(self._points_K[ahead])
+        low, high = self._pixels.min(axis=1), self._pixels.max(axis=1)
+        size = self._view.lens.width, self._view.lens.height
+        inside = ahead & (high >= 0.0).all(axis=1) & (low <= size).all(axis=1)
+        bent = self._view.distorts & ((high - low).max(axis=1) > BENT_PX)
+        self._is_plain = inside & ~bent
+        chosen = np.flatnonzero(inside | (~ahead & (z > NEAR_M).any(axis=1)))
+        away = self._middles_W[chosen] - motion.p_WK
+        faces = np.where((self._normals_W[chosen] * away).sum(axis=1) > 0.0, -1.0, 1.0)  # the side that is seen
+        lit = np.maximum(faces * (self._normals_W[chosen] @ SUN_W), 0.0)
+        self._shade = np.zeros(len(z))
+        self._shade[chosen] = self._brightness * (AMBIENT - 0.15 + (DIFFUSE + 0.15) * lit)
+        distance = np.linalg.norm(away, axis=1)
+        return list(zip(distance.tolist(), chosen.tolist(), strict=True))
+
+    def draw(self, picture: NDArray[np.uint8], number: int) -> None:
+        """Draw one of the triangles that are shown."""
+        colour = self._shade[number] * SURFACE
+        if self._is_plain[number]:
+            cv2.fillConvexPoly(picture, fixed(self._pixels[number]), bgr(colour), cv2.LINE_8, SHIFT)
+        else:
+            fill_face(picture, self._view, self._points_K[number], colour)

@@ -1,0 +1,358 @@
+"""Renders the picture of a drone's camera from the true poses of all drones. Pure: equal inputs give equal bits.
+
+The backdrop, ground and sky, is one grey picture, which a map converts to colours: warping one channel costs a third of
+three. Greys up to 150 are ground, from HAZE on sky. The ground is a repeated square tile around W's origin, in levels
+of decreasing resolution: coarser ones are drawn far away to avoid aliasing.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Sequence
+from functools import cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim.math.frames import rotation_matrix
+from zsim.math.randomness import stream
+from zsim.scenario.surroundings import nearest
+from zsim.sensors.camera import Camera
+from zsim.sensors.camera_model import Lens, camera_pose, lens_of
+from zsim_agents.cameras.foreground import SEEN_M, DroneImager, SurfaceImager, draw_obstacle, fixed
+from zsim_agents.cameras.scene import SHIFT, CameraMotion, DroneStates, Scene, View, camera_motion, motion_blur_kernels
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+BLURRED_PX = 0.8  # px of motion from which the ground is blurred
+WIDER_MAX = 2.0  # of the pinhole picture that a lens bends, over its own; rays beyond it repeat the edge
+MARGIN = 64  # px, by which the noise is larger than the picture
+NOISE_MAX = 48.0  # grey levels, standard deviation: the limit of the amplified noise
+FULL_COLOUR = cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444  # hats are a few pixels wide
+MIX = 0x9E3779B97F4A7C15  # 2^64 over the golden ratio, whose multiples spread (Knuth, TAOCP 3, 6.4)
+view_of = cache(View)
+Grey = NDArray[np.uint8]
+Points = list[tuple[float, float]]
+TEXEL_M = 0.02  # m, of the finest level, chosen: a blade of grass is not seen, a line of 6 cm is
+TILE = 1000  # texels of a side: 20 m, so that lines every metre go on over the seam
+FACTORS = (1, 4, 20, 100)  # of the texels of each level over the finest
+WINDOW = (3000, 2000, 1500, 1000)  # texels of a side that are kept of each level: 60 m, 160 m, 600 m, 2 km
+MINIFIED_MAX = 2.0  # texels that a pixel may be deep on the ground before a coarser level is drawn
+HEIGHT_MIN_M = 0.03  # m, of a camera over the ground
+HAZE = 176  # grey
+ZENITH = 0.6  # sine of the elevation from which on the sky is the bluest; chosen
+SKY_SLOPE = (255 - HAZE) / ZENITH  # greys of the sky for a sine of 1
+COLOURS = {  # B, G, R by grey; chosen: dry grass, white lines, a hazy blue sky
+    0: (24, 36, 30),
+    60: (52, 104, 92),
+    100: (84, 138, 134),
+    150: (226, 234, 232),
+    176: (232, 222, 208),
+    255: (214, 158, 98),
+}
+
+
+class Renderer:
+    """One camera of one drone, the scene's `carrier`.
+
+    Args:
+        seed, name: of the noise's random stream, e.g. "drone1/front".
+        ground: None for a meadow with lines every metre.
+    """
+
+    def __init__(
+        self, camera: Camera, scene: Scene, carrier: int, seed: int, name: str, ground: Ground | None = None
+    ) -> None:
+        gain = 1.0 / math.sqrt(scene.light)  # makes up for half of the stops below a clear day; chosen
+        self._camera, self._scene, self._carrier = camera, scene, carrier
+        self._exposure_s = camera.exposure_ms * 1e-3
+        self._pose = camera_pose(camera)
+        self._view = view_of(lens_of(camera))
+        self._brightness = scene.light * gain
+        self._colours = colour_map(self._brightness)
+        self._surfaces = SurfaceImager(self._view, scene.surfaces, self._brightness)
+        self._imager = DroneImager(self._view, scene, carrier, self._exposure_s, self._brightness)
+        shape = self._view.lens.height, self._view.lens.width
+        self._noise = _Noise(seed, f"{name}/noise", shape, camera.noise * gain) if camera.noise > 0 else None
+        self._bend: tuple[Picture, Picture] | None = None
+        flat = self._view
+        if self._view.distorts:
+            flat, self._bend = _pinhole(self._view)
+        self._backdrop = Backdrop(flat, ground or meadow())
+
+    def jpeg(self, number: int, t_s: float, bodies: DroneStates) -> bytes:
+        """Return the picture of an exposure as JPEG; see `picture`."""
+        options = [cv2.IMWRITE_JPEG_QUALITY, self._camera.jpeg_quality, *FULL_COLOUR]
+        return cv2.imencode(".jpg", self.picture(number, t_s, bodies), options)[1].tobytes()
+
+    def picture(self, number: int, t_s: float, bodies: DroneStates) -> Picture:
+        """Return the picture of an exposure as B, G, R, (height, width, 3).
+
+        Args:
+            number: of the picture; selects its noise.
+            t_s: the middle of the exposure [s].
+            bodies: all drones at that time, in the scene's order.
+        """
+        R_WB = rotation_matrix(bodies.q_WB)
+        motion = camera_motion(self._pose, bodies, R_WB[self._carrier], self._carrier)
+        grey = self._backdrop.draw(motion)
+        self._blur_ground(grey, motion)
+        if self._bend is not None:
+            grey = cv2.remap(grey, *self._bend, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        picture: Picture = cv2.applyColorMap(grey, self._colours)  # type: ignore[assignment]
+        drones, p_W = self._imager.images(motion, t_s, bodies, R_WB), motion.p_WK.tolist()
+        things = [(distance_m, "drone", i) for i, (distance_m, _) in drones.items()]
+        things += [(nearest(row, *p_W)[0], "obstacle", i) for i, row in enumerate(self._scene.obstacles)]
+        things += [(math.dist(place, p_W), "hat", i) for i, place in enumerate(self._scene.hats.false_m)]
+        if len(self._scene.surfaces):
+            things += [(distance_m, "surface", i) for distance_m, i in self._surfaces.shown(motion)]
+        for _, kind, which in sorted(things, reverse=True):  # the farthest first
+            if kind == "obstacle":
+                draw_obstacle(picture, self._view, self._scene.obstacles[which], motion, self._brightness)
+            elif kind == "surface":
+                self._surfaces.draw(picture, which)
+            elif kind == "hat":
+                centre_K = motion.points_K(np.array([self._scene.hats.false_m[which]]))
+                if centre_K[0, 2] > 0:
+                    way_K = motion.rates_K(centre_K, np.zeros(3)) * self._exposure_s
+                    for image in self._imager.hats(centre_K, way_K, motion).values():
+                        image.draw(picture)
+            else:
+                for layer in drones[which][1]:
+                    layer.draw(picture)
+        sigma_px = self._camera.blur_px
+        if sigma_px >= 0.2:  # less is less than a pixel's own width
+            side = 3 if sigma_px <= 0.7 else 2 * math.ceil(2.5 * sigma_px) + 1
+            kernel = cv2.getGaussianKernel(side, sigma_px)
+            cv2.sepFilter2D(picture, -1, kernel, kernel, dst=picture, borderType=cv2.BORDER_REPLICATE)
+        if self._noise is not None:
+            self._noise.add(picture, number)
+        return picture
+
+    def _blur_ground(self, grey: Picture, motion: CameraMotion) -> None:
+        """Blur the ground by the motion at the centre of the picture's lower half over the exposure.
+
+        The sky is smooth: its rows are skipped, except those near the horizon.
+        """
+        ray_K = np.array([0.0, self._view.lens.height / 4 / self._view.lens.fy, 1.0])
+        down = -float(motion.R_WK[2] @ ray_K)
+        point_K = ray_K * (max(float(motion.p_WK[2]), 0.1) / down if down > 1e-3 else SEEN_M)
+        way_px = self._view.flow_px(point_K, motion.rates_K(point_K, np.zeros(3))) * self._exposure_s
+        if np.hypot(*way_px) < BLURRED_PX:
+            return
+        kernel = motion_blur_kernels(way_px[None])[0]
+        part = grey[self._backdrop.ground_rows(motion, len(kernel))]
+        if len(part):
+            cv2.filter2D(part, -1, kernel, dst=part, borderType=cv2.BORDER_REPLICATE)
+
+
+class _Noise:
+    """The noise of a sensor, made once and added to each picture at another offset; sigma in grey levels."""
+
+    def __init__(self, seed: int, name: str, shape: tuple[int, int], sigma: float) -> None:
+        height, width = shape
+        drawn = stream(seed, name).standard_normal((height + MARGIN, width + MARGIN, 3), np.float32)
+        levels = np.rint(min(sigma, NOISE_MAX) * drawn)
+        self._shape = shape
+        self._key = zlib.crc32(name.encode()) ^ (seed & 0xFFFFFFFF)
+        self._over = np.clip(levels, 0, 255).astype(np.uint8)
+        self._under = np.clip(-levels, 0, 255).astype(np.uint8)
+
+    def add(self, picture: Picture, number: int) -> None:
+        bits = ((number * 4 + 1) * MIX ^ self._key * MIX >> 7) & (2**64 - 1)
+        v, u = bits >> 40 & (MARGIN - 1), bits >> 52 & (MARGIN - 1)
+        height, width = self._shape
+        over, under = self._over[v : v + height, u : u + width], self._under[v : v + height, u : u + width]
+        if bits >> 60 & 1:
+            over, under = under, over
+        cv2.add(picture, over, dst=picture)
+        cv2.subtract(picture, under, dst=picture)
+
+
+def _pinhole(view: View) -> tuple[View, tuple[Picture, Picture]]:
+    """Return a view without distortion that covers the lens's field of view, and the map that distorts its picture."""
+    lens = view.lens
+    half = np.abs(view.plane).max(axis=(0, 1)) * (lens.fx, lens.fy)
+    most = np.array([lens.width, lens.height]) * WIDER_MAX / 2
+    width, height = (int(2 * math.ceil(side + 2)) for side in np.minimum(half, most))
+    flat = Lens(lens.fx, lens.fy, (width - 1) / 2, (height - 1) / 2, 0.0, 0.0, 0.0, 0.0, 0.0, width, height)
+    at = (view.plane * (lens.fx, lens.fy) + (flat.cx, flat.cy)).astype(np.float32)
+    return view_of(flat), cv2.convertMaps(at[..., 0], at[..., 1], cv2.CV_16SC2)  # type: ignore[return-value]
+
+
+class Level(NamedTuple):
+    """A level of the ground: its texels, the side of one, and how far it is drawn [m].
+
+    `place` is the homography (3, 3) from (x, y, 1) of W [m] to texels, whose centres are at whole numbers.
+    """
+
+    texels: Grey
+    texel_m: float
+    reach_m: float
+    place: Array
+
+
+class Ground:
+    """A ground in levels.
+
+    Args:
+        tile: greys up to 150, a square whose side is a multiple of 100; its middle is W's origin, its top north.
+        texel_m: the side of one of its texels.
+    """
+
+    def __init__(self, tile: Grey, texel_m: float = TEXEL_M) -> None:
+        self.tile_m = texel_m * len(tile)
+        self.mean = round(float(tile.mean()))
+        self.levels: list[Level] = []
+        for factor, window in zip(FACTORS, WINDOW, strict=True):
+            side = len(tile) // factor
+            mean = tile.reshape(side, factor, side, factor).mean(axis=(1, 3))
+            repeats = max(3, 2 * (window // side // 2) + 1)  # odd: W's origin stays in the middle
+            texels = np.tile(np.rint(mean).astype(np.uint8), (repeats, repeats))
+            scale, middle = 1 / (texel_m * factor), len(texels) / 2 - 0.5
+            place = np.array([[scale, 0, middle], [0, -scale, middle], [0, 0, 1.0]])
+            self.levels.append(Level(texels, texel_m * factor, self.tile_m * (repeats - 1) / 2, place))
+
+
+@cache
+def meadow() -> Ground:
+    """Return a meadow with a line every metre, a wider one every fifth."""
+    rng = np.random.default_rng(1)
+    patches = sum(_patches(rng, cells) * share for cells, share in ((10, 12.0), (50, 10.0), (250, 8.0), (1000, 9.0)))
+    tile = np.clip(70.0 + patches, 15, 110)
+    step = round(1 / TEXEL_M)
+    for every, width, grey in ((1, 1, 112.0), (5, 3, 144.0)):
+        for start in range(0, TILE, every * step):
+            at = [(start + k - width // 2) % TILE for k in range(width)]
+            tile[at, :] = tile[:, at] = grey
+    return Ground(np.rint(tile).astype(np.uint8))
+
+
+def _patches(rng: np.random.Generator, cells: int) -> Array:
+    """Return smooth periodic noise of unit variance over the tile."""
+    coarse = np.pad(rng.standard_normal((cells, cells)), 2, mode="wrap")
+    wide = TILE // cells
+    fine = coarse if wide == 1 else cv2.resize(coarse, None, fx=wide, fy=wide, interpolation=cv2.INTER_CUBIC)
+    inner = fine[2 * wide : 2 * wide + TILE, 2 * wide : 2 * wide + TILE]
+    return inner / inner.std()
+
+
+def colour_map(brightness: float) -> Grey:
+    """Return B, G, R of each grey, (256, 1, 3)."""
+    at = np.arange(256)
+    channels = [np.interp(at, list(COLOURS), [colour[k] for colour in COLOURS.values()]) for k in range(3)]
+    return np.rint(brightness * np.stack(channels, axis=-1)).astype(np.uint8)[:, None, :]
+
+
+class Backdrop:
+    """Draws ground and sky as a pinhole camera sees them; `view` is without distortion."""
+
+    def __init__(self, view: View, ground: Ground) -> None:
+        lens = view.lens
+        self._ground = ground
+        self._size = lens.width, lens.height
+        self._focal_px = lens.fx
+        self._K_inv = np.array(
+            [[1 / lens.fx, 0, -lens.cx / lens.fx], [0, 1 / lens.fy, -lens.cy / lens.fy], [0, 0, 1.0]]
+        )
+        self._columns = np.arange(lens.width, dtype=np.float32)
+        self._row_numbers = np.arange(lens.height, dtype=np.float32)[:, None]
+        self.grey: Grey = np.empty((lens.height, lens.width), np.uint8)
+        self._scratch = np.empty_like(self.grey)
+        self._mask = np.empty_like(self.grey)
+
+    def draw(self, motion: CameraMotion) -> Grey:
+        """Return the picture, owned by this object."""
+        height_m = max(float(motion.p_WK[2]), HEIGHT_MIN_M)
+        to_W = motion.R_WK @ self._K_inv  # a pixel (u, v, 1) to its ray in W
+        down = (-to_W[2]).tolist()  # descent of a ray with z = 1 in K
+        limits = [math.inf]
+        for level in self._ground.levels:  # a pixel at distance s covers a depth of s^2 / (f h) on the ground
+            reach_m = math.sqrt(MINIFIED_MAX * level.texel_m * self._focal_px * height_m)
+            limits.append(height_m / min(reach_m, 0.7 * level.reach_m))
+        least, most = _extremes(self._size, down)
+        first = next((i for i, limit in enumerate(limits[1:]) if least >= limit), None)
+        if first is None:
+            a, b, c = (-SKY_SLOPE * each for each in down)  # the sky, bluer the higher
+            rows = _rows(half_plane(self._size, (a, b, c), 0.0), self._size)
+            if rows is not None:
+                upwards = np.float32(b) * self._row_numbers[slice(*rows)] + np.float32(c + HAZE)
+                cv2.convertScaleAbs(upwards + np.float32(a) * self._columns, dst=self.grey[slice(*rows)])
+            ground = half_plane(self._size, down, 0.0)
+            if len(ground) >= 3:
+                cv2.fillConvexPoly(self.grey, fixed(np.array(ground)), self._ground.mean, cv2.LINE_AA, SHIFT)
+            first = len(self._ground.levels) - 1
+        # homography from pixels to (x, y, 1) on the ground [m], in the nearest of the repeated tiles
+        x, y = (p - self._ground.tile_m * round(p / self._ground.tile_m) for p in motion.p_WK[:2].tolist())
+        to_ground = np.array([[height_m, 0, -x], [0, height_m, -y], [0, 0, -1.0]]) @ to_W
+        for i in range(first, -1, -1):  # limits of `down` for a level and for the finer one
+            if most > limits[i + 1]:
+                self._draw_level(self._ground.levels[i], to_ground, down, limits[i + 1], limits[i])
+        return self.grey
+
+    def ground_rows(self, motion: CameraMotion, room: int) -> slice:
+        """Return the rows that show ground, plus `room` rows on either side."""
+        down = (-motion.R_WK[2] @ self._K_inv).tolist()
+        first, end = _rows(half_plane(self._size, down, 0.0), self._size) or (0, 0)
+        return slice(max(0, first - room), min(self._size[1], end + room)) if first < end else slice(0, 0)
+
+    def _draw_level(self, level: Level, to_ground: Array, down: Sequence[float], least: float, most: float) -> None:
+        """Draw a level in the rows near enough for it and not entirely near enough for a finer one."""
+        part = half_plane(self._size, down, least)
+        rows = _rows(part, self._size)
+        coarse = _rows(half_plane(self._size, [-each for each in down], -most), self._size) if most < math.inf else rows
+        if rows is None or coarse is None:
+            return
+        v0, v1 = max(rows[0], coarse[0]), min(rows[1], coarse[1])
+        if v1 - v0 < 1:
+            return
+        warp = level.place @ to_ground
+        warp[:, 2] += v0 * warp[:, 1]
+        is_all = _extremes(self._size, down)[0] >= least
+        out, mask = self.grey[v0:v1], self._mask[v0:v1]
+        drawn, flags = out if is_all else self._scratch[v0:v1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        size = self._size[0], v1 - v0
+        cv2.warpPerspective(level.texels, warp, size, drawn, flags, cv2.BORDER_CONSTANT, self._ground.mean)
+        if is_all:
+            return
+        mask.fill(0)
+        cv2.fillConvexPoly(mask, fixed(np.array(part) - (0, v0)), 255, cv2.LINE_8, SHIFT)
+        cv2.copyTo(drawn, mask, out)
+
+
+def _rows(part: Points, size: tuple[int, int]) -> tuple[int, int] | None:
+    """Return the first row of a part of the picture, and the one after its last."""
+    if len(part) < 3:
+        return None
+    heights = [v for _, v in part]
+    return max(0, math.floor(min(heights))), min(size[1], math.ceil(max(heights)) + 1)
+
+
+def _rectangle(width: int, height: int) -> Points:
+    return [(-0.5, -0.5), (width - 0.5, -0.5), (width - 0.5, height - 0.5), (-0.5, height - 0.5)]
+
+
+def _extremes(size: tuple[int, int], linear: Sequence[float]) -> tuple[float, float]:
+    """Return the least and the greatest a u + b v + c in a picture."""
+    a, b, c = linear
+    at_corners = [a * u + b * v + c for u, v in _rectangle(*size)]
+    return min(at_corners), max(at_corners)
+
+
+def half_plane(size: tuple[int, int], linear: Sequence[float], least: float) -> Points:
+    """Return the part of a picture where a u + b v + c >= least as a polygon, empty with fewer than three points."""
+    a, b, c = linear
+    corners = _rectangle(*size)
+    over = [a * u + b * v + c - least for u, v in corners]
+    points: Points = []
+    for i in range(4):
+        (u, v), (u1, v1), here, there = corners[i], corners[i - 3], over[i], over[i - 3]
+        if here >= 0:
+            points.append((u, v))
+        if (here >= 0) != (there >= 0):
+            share = here / (here - there)
+            points.append((u + (u1 - u) * share, v + (v1 - v) * share))
+    return points

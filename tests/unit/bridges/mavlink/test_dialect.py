@@ -1,0 +1,265 @@
+"""Frames: whole, cut, damaged, foreign, signed; the codec against pymavlink's generated dialect, the authority."""
+
+import os
+import random
+import struct
+from typing import Any
+
+import pytest
+
+os.environ["MAVLINK20"] = "1"  # pymavlink reads it when it is imported
+from mavlink_values import random_message
+from pymavlink.dialects.v10 import ardupilotmega as dialect_1
+from pymavlink.dialects.v20 import ardupilotmega as dialect_2
+
+from zsim_bridges.mavlink import dialect
+from zsim_bridges.mavlink.dialect import (
+    BEHIND_MAX,
+    BY_ID,
+    EPOCH_S,
+    Link,
+    MessageLayout,
+    Parser,
+    Signing,
+    Version,
+    WireMessage,
+    checksum,
+)
+
+HEARTBEAT_EXTRA = bytes([50])  # its CRC_EXTRA
+KEY, OTHER = b"k" * 32, b"o" * 32
+HEARTBEAT = dialect.Heartbeat(type=2)
+MESSAGES = [HEARTBEAT, dialect.Statustext(6, "hello"), dialect.Attitude(1, 0.5), dialect.Ping()]
+SEED = 17
+COMMAND_CANCEL = 80  # in common.xml, not in the authority's release
+COMMAND_CANCEL_CRC_EXTRA = 14  # of the C library's table
+LAYOUTS = [BY_ID[id_] for id_ in sorted(BY_ID) if id_ != COMMAND_CANCEL]
+LAYOUTS_1 = [layout for layout in LAYOUTS if layout.id <= dialect.ID_MAX_1]
+
+
+def test_the_checksum_is_mcrf4xx() -> None:
+    assert checksum(b"123456789") == 0x6F91  # check value of CRC-16/MCRF4XX
+
+
+def test_all_frames_of_a_datagram_are_read() -> None:
+    link, parser = Link(1, 1), Parser()
+    data = b"".join(link.pack(message) for message in MESSAGES) + Link(1, 1, version=1).pack(MESSAGES[0])
+    assert [each.message for each in parser.feed(data)] == [*MESSAGES, MESSAGES[0]]
+    assert not +parser.refused
+
+
+def test_sequence_numbers_wrap_after_255() -> None:
+    link, parser = Link(1, 1), Parser()
+    seqs = [received.seq for _ in range(257) for received in parser.feed(link.pack(MESSAGES[0]))]
+    assert seqs == [*range(256), 0]
+
+
+def framed(body: bytes, crc_extra: bytes = b"") -> bytes:
+    return b"\xfd" + body + checksum(body + crc_extra).to_bytes(2, "little")
+
+
+def damaged(version: Version) -> bytes:
+    frame = Link(1, 1, version=version).pack(MESSAGES[2])
+    return frame[:-3] + bytes([frame[-3] ^ 1]) + frame[-2:]
+
+
+@pytest.mark.parametrize(
+    ("data", "reason", "count"),
+    [
+        (damaged(1), "bad_crc", 1),
+        (damaged(2), "bad_crc", 1),
+        (framed(bytes((1, 0, 0, 0, 1, 1)) + (50_000).to_bytes(3, "little") + b"\x07"), "unknown", 1),
+        (framed(bytes((1, 0x02, 0, 0, 1, 1, 0, 0, 0, 7)), HEARTBEAT_EXTRA), "incompatible", 1),
+        (b"hello", "noise", 8),
+    ],
+)
+def test_what_is_no_frame_of_ours_is_counted_and_the_next_one_is_read(data: bytes, reason: str, count: int) -> None:
+    parser = Parser()
+    datagram = data + Link(1, 1).pack(MESSAGES[0]) + b"bye"
+    assert [received.message for received in parser.feed(datagram)] == [MESSAGES[0]]
+    assert parser.refused[reason] == count
+
+
+def test_a_cut_datagram_is_counted_and_does_not_reach_into_the_next() -> None:
+    link, parser = Link(1, 1), Parser()
+    assert parser.feed(link.pack(MESSAGES[1])[:-1]) == []
+    assert parser.refused["truncated"] >= 1
+    assert [received.message for received in parser.feed(link.pack(MESSAGES[0]))] == [MESSAGES[0]]
+
+
+def test_a_payload_longer_than_known_is_read_as_far_as_known() -> None:
+    payload = bytes(9) + b"extension to come"
+    body = bytes((len(payload), 0, 0, 0, 1, 1, 0, 0, 0)) + payload
+    (received,) = Parser().feed(framed(body, HEARTBEAT_EXTRA))
+    assert received.message == dialect.Heartbeat()
+
+
+def test_a_value_out_of_range_is_refused() -> None:
+    with pytest.raises(struct.error):
+        Link(1, 1).pack(dialect.Heartbeat(type=256))
+    with pytest.raises(ValueError, match="SETUP_SIGNING has the id 256"):
+        Link(1, 1, version=1).pack(dialect.SetupSigning())
+
+
+def test_garbage_yields_nothing_but_what_is_in_it() -> None:
+    rng = random.Random(5)
+    parser = Parser()
+    for _ in range(2000):
+        assert parser.feed(rng.randbytes(rng.randint(0, 300))) == []
+    assert sum(parser.refused.values()) > 0
+
+
+def test_a_key_has_32_bytes() -> None:
+    with pytest.raises(ValueError, match=r"5.*32"):
+        Signing(b"short")
+
+
+def test_a_frame_is_accepted_once() -> None:
+    parser, signed = Parser(Signing(KEY)), Link(1, 1, Signing(KEY)).pack(HEARTBEAT)
+    assert [(each.message, each.signed) for each in parser.feed(signed)] == [(HEARTBEAT, True)]
+    assert parser.feed(signed) == []
+    assert parser.refused["replayed"] == 1
+
+
+def test_a_frame_of_another_key_or_with_a_changed_signature_is_refused() -> None:
+    parser = Parser(Signing(KEY))
+    assert parser.feed(Link(1, 1, Signing(OTHER)).pack(HEARTBEAT)) == []
+    changed = Link(1, 1, Signing(KEY)).pack(HEARTBEAT)
+    assert parser.feed(changed[:-1] + bytes([changed[-1] ^ 1])) == []
+    assert parser.refused["bad_signature"] == 2
+
+
+def test_an_unsigned_frame_is_refused() -> None:
+    parser = Parser(Signing(KEY))
+    assert parser.feed(Link(1, 1).pack(HEARTBEAT)) == []
+    assert parser.refused["unsigned"] == 1
+
+
+def test_a_stream_that_begins_more_than_a_minute_ago_is_refused() -> None:
+    receiver, sender = Signing(KEY), Signing(KEY)
+    receiver.advance(EPOCH_S + 3600.0)
+    sender.timestamp = receiver.timestamp - BEHIND_MAX - 2
+    parser, link = Parser(receiver), Link(1, 1, sender)
+    assert parser.feed(link.pack(HEARTBEAT)) == []
+    assert len(parser.feed(link.pack(HEARTBEAT))) == 1
+    assert parser.refused["replayed"] == 1
+
+
+def test_timestamps_follow_the_clock_and_the_newest_frame_and_never_go_back() -> None:
+    signing = Signing(KEY)
+    signing.advance(EPOCH_S + 1.0)
+    assert signing.timestamp == 100_000
+    signing.advance(EPOCH_S + 0.5)
+    assert signing.timestamp == 100_000
+    ahead = Signing(KEY)
+    ahead.timestamp = 500_000
+    assert Parser(signing).feed(Link(2, 1, ahead).pack(HEARTBEAT))
+    assert signing.timestamp == 500_001
+
+
+def test_without_a_key_signed_frames_are_read_unchecked() -> None:
+    (received,) = Parser().feed(Link(1, 1, Signing(KEY)).pack(HEARTBEAT))
+    assert received.signed
+
+
+def their_message(module: Any, layout: MessageLayout, ours: WireMessage) -> Any:
+    """Return the authority's message with the same values."""
+    kind = module.mavlink_map[layout.id]
+    return kind(**{name: their_value(getattr(ours, name)) for name in kind.fieldnames})
+
+
+def their_value(value: Any) -> Any:
+    if isinstance(value, str):
+        return value.encode()
+    return list(value) if isinstance(value, bytes | tuple) else value
+
+
+def their_link(module: Any) -> Any:
+    link = module.MAVLink(None, srcSystem=7, srcComponent=1)
+    link.robust_parsing = True
+    return link
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.name)
+def test_a_definition_is_the_authority_s(layout: MessageLayout) -> None:
+    theirs = dialect_2.mavlink_map[layout.id]
+    assert (layout.name, layout.crc_extra, layout.size) == (theirs.msgname, theirs.crc_extra, theirs.unpacker.size)
+    assert list(layout.kind.__struct_fields__) == theirs.fieldnames
+    assert layout.wire_order == tuple(theirs.ordered_fieldnames)
+
+
+def test_command_cancel_sums_up_to_the_known_crc_extra() -> None:
+    assert BY_ID[COMMAND_CANCEL].crc_extra == COMMAND_CANCEL_CRC_EXTRA
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.name)
+def test_a_frame_of_mavlink_2_is_the_authority_s_byte_for_byte(layout: MessageLayout) -> None:
+    rng = random.Random(SEED + layout.id)
+    ours, theirs = Link(7, 1), their_link(dialect_2)
+    parser, reader = Parser(), their_link(dialect_2)
+    for message in [layout.unpack(b""), *(random_message(layout, rng) for _ in range(20))]:
+        packed = ours.pack(message)
+        assert packed == theirs_packed(theirs, their_message(dialect_2, layout, message))
+        (received,) = parser.feed(packed)
+        assert layout.pack(received.message) == layout.pack(message)
+        (read,) = reader.parse_buffer(packed)
+        assert (read.get_type(), read.get_srcSystem()) == (layout.name, 7)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS_1, ids=lambda layout: layout.name)
+def test_a_frame_of_mavlink_1_is_the_authority_s_byte_for_byte(layout: MessageLayout) -> None:
+    rng = random.Random(SEED + layout.id)
+    ours, theirs, parser = Link(7, 1, version=1), their_link(dialect_1), Parser()
+    for _ in range(5):
+        message = random_message(layout, rng)
+        packed = ours.pack(message)
+        assert packed == theirs_packed(theirs, their_message(dialect_1, layout, message))
+        (received,) = parser.feed(packed)
+        assert layout.pack(received.message)[: layout.base_size] == layout.pack(message)[: layout.base_size]
+
+
+def theirs_packed(link: Any, message: Any) -> bytes:
+    packed = message.pack(link)
+    link.seq = link.seq + 1 & 0xFF
+    return bytes(packed)
+
+
+def test_the_authority_s_frames_are_read_as_they_were_meant() -> None:
+    link = their_link(dialect_2)
+    sent = link.statustext_encode(4, b"low battery")
+    (received,) = Parser().feed(bytes(sent.pack(link)))
+    assert received == dialect.Received(dialect.Statustext(4, "low battery"), 7, 1, 0, False)
+
+
+def test_signatures_are_the_authority_s() -> None:
+    key = bytes(range(32))
+    link = their_link(dialect_2)
+    link.signing.secret_key, link.signing.sign_outgoing, link.signing.timestamp = key, True, 1000
+    signing = Signing(key)
+    signing.timestamp = 999
+    ours = Link(7, 1, signing).pack(dialect.Heartbeat(type=2, custom_mode=5))
+    theirs = bytes(link.heartbeat_encode(2, 0, 0, 5, 0, mavlink_version=0).pack(link))
+    assert ours == theirs
+    (received,) = Parser(Signing(key)).feed(theirs)
+    assert received.signed
+
+
+def read_by_the_authority(count: int) -> None:
+    """Let the authority's parser read a stream of random messages, cut anywhere; each is there once, in order."""
+    rng, ours, theirs = random.Random(SEED), Link(7, 1), their_link(dialect_2)
+    while count > 0:
+        layouts = rng.choices(LAYOUTS, k=min(count, 500))
+        data = b"".join(ours.pack(random_message(layout, rng)) for layout in layouts)
+        cut = rng.randrange(len(data))
+        read = [message for part in (data[:cut], data[cut:]) for message in theirs.parse_buffer(part) or []]
+        assert [message.get_msgId() for message in read] == [layout.id for layout in layouts]
+        count -= len(layouts)
+
+
+def test_the_authority_reads_ten_thousand_messages() -> None:
+    read_by_the_authority(10_000)
+
+
+@pytest.mark.soak
+def test_the_authority_reads_a_million_messages() -> None:
+    read_by_the_authority(1_000_000)
