@@ -16,8 +16,8 @@ from zsim.math.frames import quaternion_from_rpy
 from zsim.sensors.camera import BottomCamera, Camera, FrontCamera, Hats
 from zsim.sensors.camera_model import camera_pose, lens_of
 from zsim_agents.cameras.detector import HatDetector, decoded
-from zsim_agents.cameras.rendering.renderer import Renderer
-from zsim_agents.cameras.rendering.scene import DroneStates, Scene, default_look
+from zsim_agents.cameras.renderer import Renderer
+from zsim_agents.cameras.scene import DroneStates, Scene, default_look
 
 DRONES = 11  # one looks at ten
 REPEATS, CALLS = 30, 20  # the smallest of this many means, which excludes other load

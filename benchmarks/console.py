@@ -32,7 +32,7 @@ from benchmarks.table import figure, spread, table
 from zsim.contract import keys, messages
 from zsim.transport import connection
 from zsim.transport.session import Session
-from zsim_bridges.console.private_viser import ViewerCamera
+from zsim_bridges.console.page_server import ViewerCamera
 
 CLI = (sys.executable, "-m", "zsim_deploy.cli")
 SIZES = (3, 50)  # drones

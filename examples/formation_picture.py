@@ -27,8 +27,8 @@ from zsim.scenario import scenario_file
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import camera_pose, lens_of
 from zsim.sensors.sensor import Mount
-from zsim_agents.cameras.rendering.renderer import Picture, Renderer
-from zsim_agents.cameras.rendering.scene import DroneStates, Scene, View, camera_motion, default_look, scene_of
+from zsim_agents.cameras.renderer import Picture, Renderer
+from zsim_agents.cameras.scene import DroneStates, Scene, View, camera_motion, default_look, scene_of
 
 Array = NDArray[np.float64]
 SIDE = Mount(position_m=(1.0, 0.0, 0.0))  # m; ahead of its carrier, which is therefore not in the picture

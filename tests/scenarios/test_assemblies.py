@@ -16,7 +16,7 @@ from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Cluster
 from zsim.sensors.scanner import Range
-from zsim_agents.formation.grants import Grants
+from zsim_agents.formation.control_law import Grants
 from zsim_agents.hosting import check_plans
 
 PENTAGON = [[4, 0, 0], [1.2, 3.8, 0], [-3.2, 2.4, 0], [-3.2, -2.4, 0], [1.2, -3.8, 0]]

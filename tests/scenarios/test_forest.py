@@ -10,7 +10,7 @@ import yaml
 import zsim
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
-from zsim.scenario.obstacle import nearest, row_of
+from zsim.scenario.surroundings import nearest, row_of
 from zsim.vehicles.ardrone2 import VEHICLE
 from zsim_agents.hosting import hosted
 from zsim_world.run.world import World

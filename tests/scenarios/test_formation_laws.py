@@ -11,7 +11,7 @@ from refused import has_terms
 import zsim
 from zsim.errors import ScenarioError, UserCodeError
 from zsim.scenario import scenario_file
-from zsim.scenario.surface_file import packed
+from zsim.scenario.surroundings import packed
 from zsim_analysis.board.measures import measures
 from zsim_analysis.sweep.sweep_run import fly_scenario
 

@@ -7,7 +7,7 @@ import pytest
 from federation import PAIR, Federation
 from forked_commands import ROOT
 
-from zsim.vehicles import vehicle_catalogue
+from zsim.vehicles.vehicle import vehicle_of
 
 EXAMPLES = str(ROOT / "examples")
 
@@ -49,5 +49,5 @@ def test_a_fault_of_a_rotor_that_is_not_there_is_one_line(federation: Federation
     )
     role.ends(with_code=2)
     (line,) = [line.text for line in role.lines if line.text.strip()]
-    for part in ("faults[0].rotor", repr(rotor), *vehicle_catalogue.vehicle_of(model).rotor_names):
+    for part in ("faults[0].rotor", repr(rotor), *vehicle_of(model).rotor_names):
         assert part in line

@@ -20,6 +20,7 @@ from forked_commands import USER_FAULT
 from refused import has_terms
 from wire import PATIENCE_S
 
+from zsim_analysis.report import indented_json
 from zsim_analysis.report.summary import judge
 from zsim_analysis.sweep.sweep import load, locked
 
@@ -79,7 +80,7 @@ def test_a_run_of_a_sweep_has_the_bits_of_a_single_run(federation: Federation, u
     row = rows(undisturbed)[3]
     options = ("--in-process", "--duration", str(DURATION_S), *FLIGHT, "--seed", str(row["seed"]))
     federation.run(PAIR, *options, "--set", f"{GUST}={row[GUST]}").ends(with_code=0)
-    summary = json.loads(judge(federation.out / "run.mcap")[2].json())  # as `zsim report` writes it
+    summary = json.loads(indented_json(judge(federation.out / "run.mcap")[2]))  # as `zsim report` writes it
     assert row["truth_sha256"] == summary["truth_sha256"] == federation.record().sha256()
     assert row["min_separation_m"] == summary["min_separation_m"]
     for parameter, errors in summary["errors"].items():
