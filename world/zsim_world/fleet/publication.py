@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from zsim.contract import flight_messages, framing, messages
 from zsim.contract.framing import GAP, GateMessages, Layouts, Program, TextTable, key_table
+from zsim.contract.snapshot import IN_PLACE, Saved
 from zsim.errors import UserCodeError, reason_of
 from zsim.math.compiled import compiled, inlined, kernel
 from zsim.math.held import Held, hold
@@ -22,7 +23,6 @@ from zsim.vehicles.vehicle import ROTORS_MAX, ROTORS_MIN
 from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, Fleet
 from zsim_world.physics.fleet_arrays import STATE
 from zsim_world.physics.rigid_body import charge_percent
-from zsim_world.run_state import IN_PLACE, Saved
 from zsim_world.sensors import sampler, sensor_set
 from zsim_world.sensors.sampler import WHOSE, Sampled
 from zsim_world.vehicles import firmware
