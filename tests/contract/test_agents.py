@@ -5,7 +5,7 @@ The inputs are synthetic: drones that stand, take off when they are asked to, an
 
 import random
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -187,28 +187,36 @@ def inputs(agent: Agent) -> list[KeyedMessages]:
     return [[(key, m) for key, m in gate if any(keys.matches(e, key) for e in agent.reads)] for gate in flight()]
 
 
-def run(agent: Agent, gates: list[KeyedMessages], inbox: Inbox | None = None) -> list[tuple[int, list[Output]]]:
-    """Drive an agent as the runners do; return its outputs by gate."""
+Stepped = tuple[int, list[Output]]  # a gate, and what the agent said in it
+
+
+def stepped(
+    agent: Agent, gates: list[KeyedMessages], inbox: Inbox | None = None, before: Callable[[], None] = lambda: None
+) -> Iterator[Stepped]:
+    """Drive an agent as the runners do; `before` is called before each gate."""
     inbox = inbox or Inbox(agent.gate_keys, agent.counted)
-    outputs = []
     for sent in gates:
+        before()
         for key, message in sent:
             assert inbox.put(key, message)
         while (t_ns := inbox.next_gate_ns()) is not None and inbox.missing(t_ns) is None:
             for key, message in inbox.take(t_ns):
                 agent.receive(key, message)
             if t_ns % agent.period_ns == 0:
-                outputs.append((t_ns, list(agent.step(t_ns))))
-    return outputs
+                yield t_ns, list(agent.step(t_ns))
+
+
+def run(agent: Agent, gates: list[KeyedMessages], inbox: Inbox | None = None) -> list[Stepped]:
+    return list(stepped(agent, gates, inbox))
 
 
 @cache
-def flown(name: str) -> list[tuple[int, list[Output]]]:
+def flown(name: str) -> list[Stepped]:
     agent = make(name)
     return run(agent, inputs(agent))
 
 
-def wire(outputs: list[tuple[int, list[Output]]]) -> list[tuple[int, str, bytes]]:
+def wire(outputs: list[Stepped]) -> list[tuple[int, str, bytes]]:
     return [(t_ns, key, messages.encode(message)) for t_ns, gate in outputs for key, message in gate]
 
 
@@ -381,17 +389,8 @@ def _again(key: str, message: Struct) -> Any:
 def test_two_agents_of_one_process_do_not_touch_each_other(name: str):
     first, second = make(name), make(name)
     gates = inputs(first)
-    both: list[list[tuple[int, list[Output]]]] = [[], []]
-    inboxes = [Inbox(agent.gate_keys, agent.counted) for agent in (first, second)]
-    for sent in gates:
-        for agent, inbox, outputs in zip((first, second), inboxes, both, strict=True):
-            for key, message in sent:
-                inbox.put(key, message)
-            t_ns = sent[-1][1].t_ns
-            for key, message in inbox.take(t_ns):
-                agent.receive(key, message)
-            outputs.append((t_ns, list(agent.step(t_ns))))
-    assert wire(both[0]) == wire(both[1])
+    by_turns = list(zip(stepped(first, gates), stepped(second, gates), strict=True))
+    assert wire([one for one, _ in by_turns]) == wire([other for _, other in by_turns])
 
 
 # Restart
@@ -460,23 +459,18 @@ def test_a_request_that_makes_no_sense_is_refused_in_a_line(name: str, request_:
 @every_agent
 def test_a_refused_request_changes_no_bit(name: str):
     agent = make(name)
-    gates = inputs(agent)
-    outputs = []
-    inbox = Inbox(agent.gate_keys, agent.counted)
-    for sent in gates:
+
+    def ask() -> None:
         for key in agent.control_keys():
             agent.control(key, ControlRequest("target", {"values": {"no_such_variable": 1.0}}))
-        for key, message in sent:
-            inbox.put(key, message)
-        t_ns = sent[-1][1].t_ns
-        for key, message in inbox.take(t_ns):
-            agent.receive(key, message)
-        estimates_sent = agent.step(t_ns)
-        asked = [output.message for output in estimates_sent if isinstance(output.message, run_messages.ClusterRequest)]
+
+    outputs = []
+    for t_ns, said in stepped(agent, inputs(agent), before=ask):
+        asked = [output.message for output in said if isinstance(output.message, run_messages.ClusterRequest)]
         assert [(a.t_ns, a.op, a.ok, a.controller) for a in asked] == [
             (t_ns, "target", False, name) for _ in agent.control_keys()
         ]
-        outputs.append((t_ns, [output for output in estimates_sent if output.message not in asked]))
+        outputs.append((t_ns, [output for output in said if output.message not in asked]))
     assert wire(outputs) == wire(flown(name))
 
 
