@@ -21,6 +21,7 @@ from zsim.scenario.scenario_file import whole_path
 from zsim.schema import plugin
 from zsim.schema.checker import show
 from zsim_analysis.reading.recorded_flight import RecordedFlight
+from zsim_analysis.report import indented_json
 from zsim_analysis.sweep.design import METRICS, SweepDesign, SweepPlan, distinct, make_plan, text_of
 from zsim_analysis.sweep.sweep import TABLE, SweepFolder, SweepRequest, read_table
 from zsim_analysis.sweep.sweep import sweep as swept
@@ -124,7 +125,7 @@ def sweep(
         if labels := _labels(values, varied):
             column = whole_path(path, plan.document)
             frame[column] = frame[column].replace(labels)
-    frame.attrs = {"folder": str(folder), "summary": json.loads(SweepResults(design, rows).summary().json())}
+    frame.attrs = {"folder": str(folder), "summary": json.loads(indented_json(SweepResults(design, rows).summary()))}
     return frame
 
 

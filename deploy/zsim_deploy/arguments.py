@@ -3,7 +3,8 @@
 import inspect
 import math
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from enum import StrEnum
 from functools import wraps
 from importlib.util import find_spec
@@ -52,6 +53,17 @@ def failed(cause: str) -> Exit:
     """Print the cause of exit code 1 as the last line of a command; return the exception to raise."""
     note(cause)
     return Exit(1)
+
+
+@contextmanager
+def working(text: str) -> Iterator[Callable[[str], None]]:
+    """Show on a terminal what is being done for the duration of the block; yield a function that changes the text."""
+    from rich.console import Console
+
+    from zsim.runtime.progress import cell
+
+    with Console(stderr=True).status(text) as status:
+        yield lambda text: status.update(cell(text))
 
 
 def require(command: str, needs: Mapping[str, Sequence[str]]) -> None:

@@ -22,8 +22,7 @@ from zsim_analysis.bundle import bundle_file as names
 from zsim_analysis.bundle.bundle_file import EXTRAS, opened, pins_of
 from zsim_analysis.bundle.bundle_rerun import check_content
 from zsim_deploy import SAFE_PATH
-from zsim_deploy.hosts.push import default_cache
-from zsim_deploy.hosts.wheelhouse import PROJECT, checkout, requirement
+from zsim_deploy.hosts.wheelhouse import PROJECT, checkout, default_cache, requirement
 
 KEY_DIGITS = 16
 READY = "ready"  # marks a complete environment

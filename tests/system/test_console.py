@@ -28,7 +28,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from wire import PATIENCE_S
 
-from zsim_bridges.console.private_viser import ViewerCamera
+from zsim_bridges.console.page_server import ViewerCamera
 
 STRIP = {"width": 860, "height": 120}  # of a page whose picture nobody looks at
 STEER = "a-good-token"

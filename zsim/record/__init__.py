@@ -10,8 +10,7 @@ time = wall clock of the recorder. Other MCAP tools open it. Imports contract.
 """
 
 from zsim.record.completeness import Completeness, completeness
-from zsim.record.record_end import repair
 from zsim.record.record_reader import Recorded, RecordReader
-from zsim.record.record_writer import RecordWriter
+from zsim.record.record_writer import RecordWriter, repair
 
 __all__ = ["Completeness", "RecordReader", "RecordWriter", "Recorded", "completeness", "repair"]

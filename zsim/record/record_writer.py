@@ -1,5 +1,11 @@
-"""Writes a record during a run."""
+"""Writes a record during a run, closes it, and repairs one whose writer died.
 
+The end of a record (data end, summary and footer) is derived from the file, by the same code for closing and repair,
+so the writer needs no index in memory.
+"""
+
+import struct
+import zlib
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -10,28 +16,17 @@ from typing import Any, NoReturn
 
 import msgspec
 import numpy as np
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import Channel, Schema
+from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Schema, Statistics, SummaryOffset
 from numpy.typing import NDArray
 
 from zsim.contract import messages
 from zsim.contract.framing import GateMessages, PerPattern
 from zsim.errors import RecordError
 from zsim.output_folder import take_lock
-from zsim.record.mcap_layout import (
-    HEAD,
-    INDEX_ENTRY,
-    INDEX_HEAD,
-    MESSAGE,
-    MESSAGE_HEAD,
-    chunk,
-    groups,
-    opening,
-    packed,
-    unpacked,
-    write_all,
-)
-from zsim.record.record_end import cut_off, finish, finish_bare
+from zsim.record import mcap_layout as layout
+from zsim.record.mcap_layout import HEAD, INDEX_ENTRY, INDEX_HEAD, MESSAGE, MESSAGE_HEAD
 from zsim.record.record_reader import RecordReader
 
 CHUNK_BYTES = 1024 * 1024  # not yet on disk at most, besides the last message
@@ -39,6 +34,8 @@ CHUNK_AGE_NS = 250_000_000  # wall time; with a tick every 0.1 s nothing waits l
 CHANNELS_MAX = 65_535  # MCAP counts channels in 16 bits
 _TIME_MAX = 2**64 - 1
 _MEDIA = {"": "msgpack", "application/msgpack": "msgpack", "application/json": "json", "text/json": "json"}  # in MCAP
+_FOOTER_CRC = struct.Struct("<BQQQ")  # the part of the footer that its check sum covers
+_FOOTER_LENGTH = 20
 _encode = messages.encode
 
 
@@ -68,7 +65,7 @@ class RecordWriter:
         self._error = ""
         self._file = _opened(self.path, "r+" if goes_on else "x+")
         if not goes_on:
-            self._append(opening())
+            self._append(layout.opening())
             return
         try:
             self._take_up()
@@ -81,17 +78,17 @@ class RecordWriter:
 
     def _take_up(self) -> None:
         """Read the channels and schemas of the file as far as it is whole."""
-        cut_off(self._file, self.path)
+        _cut_off(self._file, self.path)
         counts: Counter[int] = Counter()
         self._end = self._file.seek(0, 2)
         with mmap(self._file.fileno(), 0, access=ACCESS_READ) as source:
-            for group in groups(source):
+            for group in layout.groups(source):
                 opcode = group.place.opcode
                 if opcode == Opcode.SCHEMA:
-                    schema = unpacked(Schema, source, group.place)
+                    schema = layout.unpacked(Schema, source, group.place)
                     self._schemas[schema.name] = schema.id
                 elif opcode == Opcode.CHANNEL:
-                    channel = unpacked(Channel, source, group.place)
+                    channel = layout.unpacked(Channel, source, group.place)
                     self._channels[channel.topic] = channel.id
                 counts.update({index.channel: index.messages for index in group.indexes})
         self.has_former = counts.total() > 0
@@ -166,7 +163,7 @@ class RecordWriter:
             return
         self.flush()
         try:
-            finish(self._file)
+            _finish(self._file)
         except OSError as error:
             self._give_up(error)
         self._file.close()
@@ -184,7 +181,7 @@ class RecordWriter:
         self._channels[key] = number = len(self._channels) + 1
         media, _, name = encoding.partition(";")
         record = Channel(number, key, _MEDIA.get(media, media), {}, self._schema(key, name))
-        self._ahead.append(packed(record))
+        self._ahead.append(layout.packed(record))
         return number
 
     def _schema(self, key: str, name: str) -> int:
@@ -195,27 +192,27 @@ class RecordWriter:
             self._schemas[name] = number = len(self._schemas) + 1
             known = kind is not None and kind.__name__ == name
             text = msgspec.json.encode(msgspec.json.schema(kind)) if known else b""
-            self._ahead.append(packed(Schema(number, text, "jsonschema" if known else "", name)))
+            self._ahead.append(layout.packed(Schema(number, text, "jsonschema" if known else "", name)))
         return self._schemas.get(name, 0)
 
     def _end_chunk(self) -> None:
         content = self._open.take()
         if self._error:
             raise RecordError(self._error)
-        record = chunk(content.data, content.first_ns, content.last_ns)
+        record = layout.chunk(content.data, content.first_ns, content.last_ns)
         self._append(b"".join([*self._ahead, *record, *content.indexes()]))
         self._ahead.clear()
 
     def _append(self, data: bytes) -> None:
         try:
-            write_all(self._file, data)
+            layout.write_all(self._file, data)
         except OSError as error:
             self._give_up(error)
         self._end += len(data)
 
     def _give_up(self, error: OSError) -> NoReturn:
         """Close the file at its last whole chunk, with as much of a summary as fits on the disk."""
-        for ending in (finish, finish_bare, None) if self._end else (None,):
+        for ending in (_finish, _finish_bare, None) if self._end else (None,):
             try:
                 self._file.truncate(self._end)
                 self._file.seek(self._end)
@@ -397,3 +394,124 @@ def cut_at_last(path: Path, key: str, is_it: Callable[[bytes], bool]) -> bool:
         for each in before:
             writer.add(each.key, each.payload, messages.encoding(each.key), each.t_ns, each.wall_ns)
     return True
+
+
+def repair(path: str | Path) -> bool:
+    """Finish a record whose writer died, in place; return whether it was unfinished.
+
+    The record is kept up to its last whole chunk. No process may be writing it. An interruption does no harm: the file
+    is then an unfinished record as before.
+
+    Raises:
+        RecordError: the file is not a record, or cannot be written.
+    """
+    path = Path(path)
+    try:
+        with open(path, "r+b", buffering=0) as file:
+            if file.seek(0, 2):
+                with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
+                    if layout.is_complete(source):
+                        return False
+            _cut_off(file, path)
+            _finish(file)
+            return True
+    except OSError as error:
+        raise RecordError(f"{path}: cannot be repaired ({error.strerror})") from error
+
+
+def _cut_off(file: FileIO, path: Path) -> None:
+    """Truncate a record after its last whole chunk, or else its header, so that it can be continued from there.
+
+    RecordError if the file is not a record; OSError if it cannot be written.
+    """
+    end, tail = 0, layout.opening()
+    if file.seek(0, 2):
+        with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
+            layout.check_magic(source, path)
+            last: layout.RecordSpan | None = None
+            for place in layout.places(source):
+                if place.opcode == Opcode.DATA_END:
+                    break
+                if last is None or place.opcode == Opcode.CHUNK:
+                    last = place
+            if last is not None:  # the cut may have taken the indexes of its chunk
+                content = layout.content_of(source, last) if last.opcode == Opcode.CHUNK else None
+                found = layout.indexes_of(content or b"").items()
+                end = last.end
+                tail = b"".join(layout.index_record(channel, np.array(own, "<u8").tobytes()) for channel, own in found)
+    file.truncate(end)
+    file.seek(end)
+    layout.write_all(file, tail)
+
+
+def _finish(file: FileIO) -> None:
+    """Write summary and footer at the end of a file opened for unbuffered reading and writing; OSError without room."""
+    with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
+        summary = _summary(source)
+        data_end = layout.packed(DataEnd(layout.crc_until(source, len(source))))
+    start = file.seek(0, 2) + len(data_end)
+    at, offsets = start, b""
+    for opcode, records in summary.items():
+        if records:
+            offsets += layout.packed(SummaryOffset(opcode, at, len(records)))
+        at += len(records)
+    body = b"".join(summary.values()) + offsets
+    covered = _FOOTER_CRC.pack(Opcode.FOOTER, _FOOTER_LENGTH, start, at)
+    footer = layout.packed(Footer(start, at, zlib.crc32(covered, zlib.crc32(body))))
+    layout.write_all(file, data_end + body + footer + layout.MAGIC)
+
+
+def _summary(source: layout.Source) -> dict[Opcode, bytes]:
+    """Return the records of the summary of a data section, by kind, in the order of the file."""
+    schemas, channels, chunks = RecordBuilder(), RecordBuilder(), RecordBuilder()
+    numbers: Counter[Opcode] = Counter()
+    messages: Counter[int] = Counter()
+    first_ns, last_ns = 2**64 - 1, 0
+    for group in layout.groups(source):
+        place, opcode = group.place, Opcode(group.place.opcode)
+        if opcode == Opcode.SCHEMA:
+            layout.unpacked(Schema, source, place).write(schemas)
+        elif opcode == Opcode.CHANNEL:
+            layout.unpacked(Channel, source, place).write(channels)
+        else:
+            head = layout.chunk_head(source, place)
+            if head.content > place.end:
+                continue  # readers of the summary would be sent to what they cannot read
+            for index in group.indexes:
+                messages[index.channel] += index.messages
+            first_ns, last_ns = min(first_ns, head.first_ns), max(last_ns, head.last_ns)
+            ChunkIndex(
+                chunk_length=place.end - place.start,
+                chunk_start_offset=place.start,
+                compression=head.compression,
+                compressed_size=place.end - head.content,
+                message_end_time=head.last_ns,
+                message_index_length=group.end - place.end,
+                message_index_offsets={index.channel: index.start for index in group.indexes},
+                message_start_time=head.first_ns,
+                uncompressed_size=head.size,
+            ).write(chunks)
+        numbers[opcode] += 1
+    statistics = Statistics(
+        attachment_count=0,
+        channel_count=numbers[Opcode.CHANNEL],
+        channel_message_counts=dict(messages),
+        chunk_count=numbers[Opcode.CHUNK],
+        message_count=messages.total(),
+        message_end_time=last_ns,
+        message_start_time=min(first_ns, last_ns),
+        metadata_count=0,
+        schema_count=numbers[Opcode.SCHEMA],
+    )
+    return {
+        Opcode.SCHEMA: schemas.end(),
+        Opcode.CHANNEL: channels.end(),
+        Opcode.STATISTICS: layout.packed(statistics),
+        Opcode.CHUNK_INDEX: chunks.end(),
+    }
+
+
+def _finish_bare(file: FileIO) -> None:
+    """Write the shortest end that MCAP allows, 50 bytes without a summary; OSError without room."""
+    file.seek(0, 2)
+    layout.write_all(file, layout.packed(DataEnd(0)) + layout.packed(Footer(0, 0, 0)) + layout.MAGIC)

@@ -21,15 +21,13 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from zsim.contract import keys, messages
-from zsim.contract.agent_messages import AgentMessage
 from zsim.contract.framing import GateMessages
-from zsim.contract.messages import Info, decode, encode
+from zsim.contract.messages import AgentMessage, Info, decode, encode
 from zsim.contract.run_messages import ClusterRequest, ControlAnswer, ControlRequest, Faults
 from zsim.contract.snapshot import State, checked
 from zsim.errors import DecodeError, RunError, UserCodeError
-from zsim.runtime.agent_radio import Transmitter
 from zsim.runtime.inbox import GateRouter, Input, RoutingTable, canonical, is_held
-from zsim.runtime.links import Links
+from zsim.runtime.links import Links, Transmitter
 from zsim.scenario.roles import MAIN
 from zsim.scenario.scenario import Radio
 from zsim.schema import plugin

@@ -1,8 +1,9 @@
-"""The effect of links on the messages of a gate at the receiver: delivery, delay or loss. Pure.
+"""The effect of links on the messages of a gate: of its radio at the sender, of all links at the receiver. Pure.
 
-    inbox ──all messages of a gate──▶ Links ──▶ agent
+    agent ──messages──▶ Transmitter ──as many as its bandwidth lets out──▶ … ──▶ Links ──now, later, never──▶ agent
 
-The radio acts on messages between users' agents, injected link faults on all messages.
+The radio acts on messages between users' agents, by the connectivity that the world publishes at every gate
+(`RadioLinks`); injected link faults act on all messages.
 
 The barrier counts the messages regardless; only the agent receives them late or never. Loss and delay of a message are
 drawn from the stream of its link by the identity of the message (key, t_ns, seq), so that neither the order of arrival
@@ -10,117 +11,32 @@ nor a restart of the receiver changes a draw.
 """
 
 import math
+from collections import deque
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from typing import Any
 
+import msgspec
+
 from zsim.contract import keys, messages
-from zsim.contract.agent_messages import AgentMessage
 from zsim.contract.flight_messages import Estimate
-from zsim.contract.messages import Info
-from zsim.contract.run_messages import Fault, Faults
+from zsim.contract.messages import AgentMessage, Info, decode, encode
+from zsim.contract.run_messages import Fault, Faults, RadioLinks
 from zsim.contract.snapshot import State
 from zsim.math import elementary as el
-from zsim.math.random_streams import uniform
-from zsim.runtime.agent_radio import NEVER, Receiver
+from zsim.math.randomness import uniform
 from zsim.runtime.inbox import Input, canonical
 from zsim.scenario import faults as fault_kinds
 from zsim.scenario.roles import ROLES
 from zsim.scenario.scenario import Radio
 
+LISTS_KEPT = 50  # of links: a second of them, in realtime; in lockstep two are needed
+NEVER = None  # as a delay: the message is lost
+ENVELOPE = frozenset(AgentMessage.__struct_fields__)  # which a real radio would not carry
+
+
 WORLD, RADIO = "world", "radio"
 KINDS = frozenset(name for name, kind in fault_kinds.KINDS.items() if kind.strikes in ("link", RADIO))
 Point = Sequence[float]
-
-
-def senders(key: str, message: Any, roles: Mapping[str, str] = {}) -> tuple[str, ...]:
-    """Return the names of the processes that count as the sender of a message.
-
-    Agents may share a process under one name: they are named after the drone or cluster in the key.
-
-    Args:
-        roles: of users' agents, by the shape of the keys of their messages.
-    """
-    if role := roles.get(messages.shape_of(key)):
-        return (f"{role}.{keys.thing(key)}",)
-    kind, whose, what = keys.parts(key)
-    source = getattr(message, "source", "")
-    if kind == "drone" and what.startswith("cmd/"):
-        return (source,)
-    if kind == "drone" and what == "estimate":
-        named = f"estimator.{whose}"
-    elif kind == "drone" and what in ("reference", "request"):
-        named = f"reference.{whose}"
-    elif kind == "cluster":
-        named = f"controller.{whose}"
-    else:
-        return (whose,) if kind == "process" else (WORLD,)
-    is_shared = source.partition(".")[0] in ("estimator", "controller", "reference")
-    return (named,) if is_shared or not source else (named, source)  # another process that does its work
-
-
-def joins(fault: Fault, froms: Sequence[str], to: str) -> bool:
-    """Tell whether a fault concerns the link from one of the senders to a receiver."""
-    first, _, second = fault.target.partition("/")
-    if second == to and first in froms:
-        return True
-    return first == to and second in froms and not fault.parameters["one_way"]
-
-
-def drone_of(process: str, drones: Container[str]) -> str | None:
-    """Return the drone that carries a process, for roles (also of users) with one process per drone."""
-    role, _, thing = process.partition(".")
-    about = ROLES[role].about if role in ROLES else "drone"
-    return thing if about == "drone" and thing in drones else None
-
-
-def place_of(
-    process: str, places: Mapping[str, Any], drones: Container[str], where: Callable[[str], Point | None]
-) -> Point | None:
-    """Return the position of a process [m; W]: from `places`, that of its drone, or the origin.
-
-    `where`: returns the position of a drone [m; W], None if unknown.
-    """
-    place = places.get(process, drone_of(process, drones) or fault_kinds.ORIGIN)
-    return where(place) if isinstance(place, str) else place
-
-
-def total_delay_ns(
-    faults: Iterable[Fault],  # that act on its link
-    seed: int,  # of the scenario
-    link: str,  # name of the link's stream: its receiver
-    key: str,  # which is sent
-    message: Any,
-    # returns that between sender and receiver for a radio, None where it is not known
-    distance_m: Callable[[Fault], float | None] = lambda fault: None,
-) -> int | None:
-    """Return the total delay of a message by several faults [ns]; NEVER if one of them loses it.
-
-    A radio delivers a message with the probability 1 / (1 + exp((d - range) / spread)).
-    """
-    total_ns = 0
-    for fault in faults:
-        p, stream = fault.parameters, (fault.kind, fault.target, fault.from_ns, fault.rank)
-        draw = uniform(seed, link, *stream, key, message.t_ns, message.seq)
-        if fault.kind == "link_delay":
-            total_ns += math.ceil(p["delay_ms"] * 1e6)
-        elif fault.kind == "link_jitter":
-            total_ns += math.ceil(draw * p["jitter_ms"] * 1e6)
-        elif fault.kind == "link_loss":
-            if draw < p["probability"]:
-                return NEVER
-        elif fault.kind == RADIO:
-            d_m = distance_m(fault)
-            if d_m is not None:
-                exponent = min((d_m - p["range_m"]) / p["spread_m"], 700.0)  # exp(700) is the last finite one
-                if draw >= 1.0 / (1.0 + el.exp(exponent)):
-                    return NEVER
-        else:  # link_cut
-            return NEVER
-    return total_ns
-
-
-def distance_between(a: Point | None, b: Point | None) -> float | None:
-    return el.distance(a, b) if a is not None and b is not None else None
 
 
 class Links:
@@ -225,3 +141,189 @@ class Links:
         self._positions = state["positions"]
         if self._radio:
             self._radio.restore(state["radio"])
+
+
+def total_delay_ns(
+    faults: Iterable[Fault],  # that act on its link
+    seed: int,  # of the scenario
+    link: str,  # name of the link's stream: its receiver
+    key: str,  # which is sent
+    message: Any,
+    # returns that between sender and receiver for a radio, None where it is not known
+    distance_m: Callable[[Fault], float | None] = lambda fault: None,
+) -> int | None:
+    """Return the total delay of a message by several faults [ns]; NEVER if one of them loses it.
+
+    A radio delivers a message with the probability 1 / (1 + exp((d - range) / spread)).
+    """
+    total_ns = 0
+    for fault in faults:
+        p, stream = fault.parameters, (fault.kind, fault.target, fault.from_ns, fault.rank)
+        draw = uniform(seed, link, *stream, key, message.t_ns, message.seq)
+        if fault.kind == "link_delay":
+            total_ns += math.ceil(p["delay_ms"] * 1e6)
+        elif fault.kind == "link_jitter":
+            total_ns += math.ceil(draw * p["jitter_ms"] * 1e6)
+        elif fault.kind == "link_loss":
+            if draw < p["probability"]:
+                return NEVER
+        elif fault.kind == RADIO:
+            d_m = distance_m(fault)
+            if d_m is not None:
+                exponent = min((d_m - p["range_m"]) / p["spread_m"], 700.0)  # exp(700) is the last finite one
+                if draw >= 1.0 / (1.0 + el.exp(exponent)):
+                    return NEVER
+        else:  # link_cut
+            return NEVER
+    return total_ns
+
+
+def joins(fault: Fault, froms: Sequence[str], to: str) -> bool:
+    """Tell whether a fault concerns the link from one of the senders to a receiver."""
+    first, _, second = fault.target.partition("/")
+    if second == to and first in froms:
+        return True
+    return first == to and second in froms and not fault.parameters["one_way"]
+
+
+def place_of(
+    process: str, places: Mapping[str, Any], drones: Container[str], where: Callable[[str], Point | None]
+) -> Point | None:
+    """Return the position of a process [m; W]: from `places`, that of its drone, or the origin.
+
+    `where`: returns the position of a drone [m; W], None if unknown.
+    """
+    place = places.get(process, drone_of(process, drones) or fault_kinds.ORIGIN)
+    return where(place) if isinstance(place, str) else place
+
+
+def distance_between(a: Point | None, b: Point | None) -> float | None:
+    return el.distance(a, b) if a is not None and b is not None else None
+
+
+def drone_of(process: str, drones: Container[str]) -> str | None:
+    """Return the drone that carries a process, for roles (also of users) with one process per drone."""
+    role, _, thing = process.partition(".")
+    about = ROLES[role].about if role in ROLES else "drone"
+    return thing if about == "drone" and thing in drones else None
+
+
+def senders(key: str, message: Any, roles: Mapping[str, str] = {}) -> tuple[str, ...]:
+    """Return the names of the processes that count as the sender of a message.
+
+    Agents may share a process under one name: they are named after the drone or cluster in the key.
+
+    Args:
+        roles: of users' agents, by the shape of the keys of their messages.
+    """
+    if role := roles.get(messages.shape_of(key)):
+        return (f"{role}.{keys.thing(key)}",)
+    kind, whose, what = keys.parts(key)
+    source = getattr(message, "source", "")
+    if kind == "drone" and what.startswith("cmd/"):
+        return (source,)
+    if kind == "drone" and what == "estimate":
+        named = f"estimator.{whose}"
+    elif kind == "drone" and what in ("reference", "request"):
+        named = f"reference.{whose}"
+    elif kind == "cluster":
+        named = f"controller.{whose}"
+    else:
+        return (whose,) if kind == "process" else (WORLD,)
+    is_shared = source.partition(".")[0] in ("estimator", "controller", "reference")
+    return (named,) if is_shared or not source else (named, source)  # another process that does its work
+
+
+class Receiver:
+    """Decides which messages of other agents reach one agent, and when.
+
+    Args:
+        process: name of the receiver.
+    """
+
+    def __init__(self, info: Info, radio: Radio, process: str) -> None:
+        self._seed, self._radio, self._process = info.seed, radio, process
+        self._places = {drone.name: place for place, drone in enumerate(info.drones)}
+        self._place = self._place_of(process.partition(".")[2])
+        self._lists: deque[RadioLinks] = deque(maxlen=LISTS_KEPT)
+
+    def _place_of(self, thing: str) -> int | None:
+        """Return the index of a drone or the ground station; None if the agent is wired to all."""
+        station = None if self._radio.station_m is None else len(self._places)
+        return self._places.get(thing, station)
+
+    def take(self, links: RadioLinks) -> None:
+        self._lists.append(links)
+
+    def delay_ns(self, key: str, message: AgentMessage) -> int | None:
+        """Return the delay of a message [ns]; NEVER if it is lost."""
+        sender, radio = self._place_of(keys.thing(key)), self._radio
+        if sender == self._place or sender is None or self._place is None:
+            return 0
+        links = next((each for each in reversed(self._lists) if each.t_ns <= message.t_ns), None)
+        draw = (self._seed, self._process, key, message.t_ns, message.seq)
+        if links is None or uniform("radio", *draw) >= (1.0 - radio.loss) * _reception(links, self._place, sender):
+            return NEVER
+        delay_ms = radio.delay_ms + (radio.jitter_ms * uniform("radio_jitter", *draw) if radio.jitter_ms else 0.0)
+        return math.ceil(delay_ms * 1e6)
+
+    def snapshot(self) -> State:
+        return {"lists": [encode(each) for each in self._lists]}
+
+    def restore(self, state: State) -> None:
+        self._lists.clear()
+        self._lists.extend(decode(keys.RADIO, payload) for payload in state["lists"])
+
+
+def _reception(links: RadioLinks, receiver: int, sender: int) -> float:
+    """Return the probability with which a message arrives, 0 where the receiver does not hear the sender."""
+    hears = links.hears[receiver] if receiver < len(links.hears) else ()
+    if sender not in hears:
+        return 0.0
+    chances = links.reception[receiver] if receiver < len(links.reception) else ()
+    place = hears.index(sender)
+    return chances[place] if place < len(chances) else 1.0
+
+
+class Transmitter:
+    """Sends the messages of an agent one after the other, within its bandwidth.
+
+    A message whose transmission begins before the next gate is published at this one. Others wait for a later gate,
+    whose stamp they get; beyond `queue_max` the oldest is lost.
+    """
+
+    def __init__(self, radio: Radio, gate_ns: int) -> None:
+        self._gate_ns, self._queue_max, self._header_bytes = gate_ns, radio.queue_max, radio.header_bytes
+        self._ns_per_byte = 8e6 / radio.bandwidth_kbit_s if radio.bandwidth_kbit_s else 0.0
+        self._waiting: deque[tuple[str, AgentMessage]] = deque()
+        self._free_ns = 0  # when the last message has been sent
+
+    def send(self, t_ns: int, outputs: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
+        """Return the outputs of an agent to publish at a gate; outputs other than messages do not wait."""
+        if not self._ns_per_byte:
+            return [*outputs]
+        published = []
+        for key, message in outputs:
+            if isinstance(message, AgentMessage):
+                self._waiting.append((key, message))
+            else:
+                published.append((key, message))
+        while len(self._waiting) > self._queue_max:
+            self._waiting.popleft()
+        while self._waiting and self._free_ns < t_ns + self._gate_ns:
+            key, message = self._waiting.popleft()
+            self._free_ns = max(self._free_ns, t_ns) + math.ceil(self.size_bytes(message) * self._ns_per_byte)
+            published.append((key, msgspec.structs.replace(message, t_ns=t_ns)))
+        return published
+
+    def size_bytes(self, message: AgentMessage) -> int:
+        """Return the transmitted size of a message [bytes]: a header, and the values of its fields in msgpack."""
+        values = [getattr(message, name) for name in messages.fields(type(message)) if name not in ENVELOPE]
+        return self._header_bytes + len(msgspec.msgpack.encode(values))
+
+    def snapshot(self) -> State:
+        return {"waiting": [[key, encode(message)] for key, message in self._waiting], "free_ns": self._free_ns}
+
+    def restore(self, state: State) -> None:
+        self._waiting = deque((key, decode(key, payload)) for key, payload in state["waiting"])
+        self._free_ns = state["free_ns"]

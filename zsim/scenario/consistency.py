@@ -17,7 +17,6 @@ from zsim.math import elementary as el
 from zsim.math.held import hold
 from zsim.math.linear import singular_values
 from zsim.scenario.faults import Known, flaws, kinds_of
-from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
 from zsim.scenario.own_classes import agent_faults, law_faults
 from zsim.scenario.roles import AGENTS, MAIN, OPERATOR, PILOT, ROLES
 from zsim.scenario.scenario import (
@@ -29,7 +28,7 @@ from zsim.scenario.scenario import (
     Scenario,
     space_name,
 )
-from zsim.scenario.triangles import nearest_points, sheet_of
+from zsim.scenario.surroundings import CENTRE, HALF, nearest, nearest_points, row_of, sheet_of
 from zsim.schema.checker import Fault, listed, show, suggestion
 from zsim.schema.quantities import COULOMB_PER_MAH, G_M_S2, SEA_LEVEL_KG_M3
 from zsim.sensors.camera_model import folds, lens_of

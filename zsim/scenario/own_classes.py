@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 from msgspec import UNSET
 
-from zsim.contract.agent_messages import AgentMessage, about, message_info
+from zsim.contract.messages import AgentMessage, about, message_info
 from zsim.errors import DocumentError, NotTrustedError
 from zsim.scenario.scenario import LAWS, OwnAgent
 from zsim.schema import parameters, plugin

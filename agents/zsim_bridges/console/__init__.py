@@ -1,10 +1,10 @@
 """The console: one run on a web page that viser draws, for operators, who control it, and viewers, who only watch.
 
 From the code that a browser reaches to the pure code:
-- serving: `page_server` (HTTP, tokens), `page_sockets` (actions, pictures), `private_viser`;
+- serving: `page_server` (HTTP, tokens, viser), `page_sockets` (actions, pictures);
 - one run: `console_server` ties it together; `console_page` and the forms are its panels, `scene`, `page_cameras` its
-  scene, `page_flying` and `manual_flight` fly single drones;
-- requests: `command_client` sends them, `orders` tracks them, `control_desk` decides which page may send them;
-- state of the run: `view_buffer`, `time_monitor`, `run_monitor`, `run_condition`, `alarms`, `camera_feed`, `histories`.
+  scene, `manual_flight` flies single drones;
+- requests: `orders` sends and tracks them, `control_desk` decides which page may send them;
+- state of the run: `view_buffer`, `run_monitor`, `run_condition`, `camera_feed`, `histories`.
 The parts of the page that are not viser's are HTML files in `frame`. Imports viser and aiohttp.
 """

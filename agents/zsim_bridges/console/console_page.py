@@ -12,16 +12,14 @@ from typing import Any, NamedTuple
 import viser
 
 from zsim_agents.formation.flight_check import DOWN
-from zsim_bridges.console.alarms import BATTERY_LOW_PERCENT
-from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.console_tables import DroneRow, drone_table, event_table, figure_lines, preflight_lines
 from zsim_bridges.console.control_desk import EVERY, RUN, ControlDesk, ControlForm
 from zsim_bridges.console.formation_form import FormationForm
 from zsim_bridges.console.histories import TRAIL_S, TRAILS_S, FlightHistory, VariablePlots
-from zsim_bridges.console.operator_input import slider_ranges
+from zsim_bridges.console.orders import CommandClient, RequestOutcome
+from zsim_bridges.console.page_server import control_id, control_ids
 from zsim_bridges.console.picture import Array, DronePoses, FlightPreview
-from zsim_bridges.console.private_viser import control_id, control_ids
-from zsim_bridges.console.run_condition import RunCondition, ShownRun, drone_refusals
+from zsim_bridges.console.run_condition import BATTERY_LOW_PERCENT, RunCondition, ShownRun, drone_refusals
 from zsim_bridges.console.run_forms import (
     ORDERS,
     FaultForm,
@@ -158,17 +156,16 @@ class ConsolePage:
         fly, plots = tabs.add_tab("Fly"), tabs.add_tab("Plots")
         for cluster in self._run.scenario.clusters:
             name, space = cluster.name, self._run.spaces[cluster.name]
-            ranges = slider_ranges(space, cluster, self._run.scenario)
             preview = partial(self._show_preview, name)
             with fly, gui.add_folder(None, visible=name == self.chosen) as form_folder, self._part(gui, name):
                 form = FormationForm(
-                    gui, self._client, self._report, cluster, space, ranges, self._request_return, preview
+                    gui, self._client, self._report, cluster, space, self._run.scenario, self._request_return, preview
                 )
             self.forms[name] = form
             for control in form.safe:
                 self.parts.pop(control_id(control), None)
             with plots, gui.add_folder(None, visible=name == self.chosen) as plot_folder:
-                self.plots[name] = VariablePlots(gui, cluster, ranges, self.flights, self._run.is_replay)
+                self.plots[name] = VariablePlots(gui, cluster, space.names, self.flights, self._run.is_replay)
             self._folders[name] = [form_folder, plot_folder]
 
     @contextmanager

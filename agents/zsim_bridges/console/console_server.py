@@ -27,21 +27,26 @@ from zsim.transport.session import Session
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.camera_feed import CameraFeed
-from zsim_bridges.console.command_client import CommandClient, PastInstant, RequestOutcome
 from zsim_bridges.console.console_page import ConsolePage, PageForms
 from zsim_bridges.console.console_tables import TableRows
 from zsim_bridges.console.control_desk import OPERATOR, RUN, VIEWER, ControlDesk
-from zsim_bridges.console.orders import OrderBook, OrderRequest
+from zsim_bridges.console.manual_flight import PageFlying
+from zsim_bridges.console.orders import CommandClient, OrderBook, OrderRequest, PastInstant, RequestOutcome
 from zsim_bridges.console.page_cameras import PageCameras
-from zsim_bridges.console.page_flying import PageFlying
-from zsim_bridges.console.page_server import HttpProxy, ListenAddress, RunFiles, ViserBackend
+from zsim_bridges.console.page_server import (
+    HttpProxy,
+    ListenAddress,
+    PageControls,
+    PrivateViser,
+    RunFiles,
+    ViserBackend,
+    is_permitted,
+)
 from zsim_bridges.console.page_sockets import ActionSockets, CameraSockets
 from zsim_bridges.console.picture import DronePoses, FormationShape, drone_poses
-from zsim_bridges.console.private_viser import PageControls, PrivateViser, is_permitted
 from zsim_bridges.console.run_condition import ShownRun, no_run_head
-from zsim_bridges.console.run_monitor import RunMonitor
+from zsim_bridges.console.run_monitor import KEPT_S, RecordPlayer, RunMonitor, TimeMonitor
 from zsim_bridges.console.scene import RunScene
-from zsim_bridges.console.time_monitor import KEPT_S, RecordPlayer, TimeMonitor
 from zsim_bridges.console.view_buffer import ViewBuffer
 
 REASON_S = 0.1  # wall; between two checks for a reason to end

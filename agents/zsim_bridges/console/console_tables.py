@@ -7,15 +7,16 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from html import escape
 from typing import NamedTuple
 
-from zsim_bridges.console.alarms import (
+from zsim_bridges.console.run_condition import (
     LATE_MS,
     LINK_LOSS_PERCENT,
     LINK_OLD_MS,
+    LINK_SILENT_S,
+    Check,
     DroneCondition,
     Severity,
     battery_severity,
 )
-from zsim_bridges.console.run_condition import LINK_SILENT_S, Check
 from zsim_bridges.console.run_monitor import FlightFigures
 from zsim_bridges.console.view_buffer import EventRow, ReceivedLink, ViewBuffer
 

@@ -18,8 +18,8 @@ from viser import uplot
 from zsim.contract.flight_messages import EstimateView
 from zsim.math import frames
 from zsim.scenario.scenario import Cluster
-from zsim_bridges.console.operator_input import SliderRange
-from zsim_bridges.console.picture import Array, DronePoses
+from zsim_agents.formation.spaces.cluster_space import unit
+from zsim_bridges.console.picture import PLAN_DIGITS, Array, DronePoses
 
 Row = TypeVar("Row")
 
@@ -143,6 +143,12 @@ class CanvasTrails:
         drawn &= (np.diff(times) < RECORD_GAP_S) | (not self._around)
         owners, instants = np.nonzero(drawn)
         return lines[drawn], owners, times[instants]
+
+    def lines(self, t_s: float, p_W: Array) -> list[list[list[float]]]:
+        """Return the segments of each drone's trail in plan: x and y [m; W] and time [s] at which each begins."""
+        segments, owners, times = self.segments(t_s, p_W)
+        points = np.round(np.column_stack((segments[:, 0, :2], times)), PLAN_DIGITS)
+        return [points[owners == i].tolist() for i in range(self._count)]
 
 
 class VariableHistory:
@@ -268,14 +274,15 @@ class VariablePlots:
         self,
         gui: viser.GuiApi,
         cluster: Cluster,
-        ranges: list[SliderRange],
+        names: Sequence[str],
         flights: FlightHistory,
         replayed: bool = False,
     ) -> None:
-        self.history = VariableHistory(len(ranges), around=replayed)
+        self.history = VariableHistory(len(names), around=replayed)
         self._cursor_s: float | None = 0.0 if replayed else None
         of_all = [
-            PlottedVariable(self.history, k, each.label, each.unit == "deg", DESIRED) for k, each in enumerate(ranges)
+            PlottedVariable(self.history, k, f"{name} [{shown_unit(name)}]", shown_unit(name) == "deg", DESIRED)
+            for k, name in enumerate(names)
         ]
         self._choices = _triples("", of_all)
         for name in cluster.drones:
@@ -333,6 +340,11 @@ class VariablePlots:
         if scales != self._scales.get(index):
             self._scales[index] = plot.scales = scales
         plot.data = curves
+
+
+def shown_unit(variable: str) -> str:
+    """Return the unit in which pages show a variable of a formation: m, or deg of an angle."""
+    return "deg" if unit(variable) == "rad" else "m"
 
 
 class AxisRange(NamedTuple):

@@ -17,8 +17,8 @@ import viser
 from zsim.contract.flight_messages import CameraInfo
 from zsim.math import frames, rotation
 from zsim_bridges.console.camera_feed import CameraPicture, field_of_view
+from zsim_bridges.console.page_server import show_jpeg
 from zsim_bridges.console.picture import Array, DronePoses
-from zsim_bridges.console.private_viser import show_jpeg
 
 OFFSET_M = np.array([-2.3, -3.9, 1.7])  # of a page's camera from its target, unless more is needed
 DISTANCE_MIN_M = float(np.linalg.norm(OFFSET_M))

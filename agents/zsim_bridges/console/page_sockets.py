@@ -13,11 +13,10 @@ from aiohttp import WSMsgType, web
 from msgspec import Meta, Struct
 
 from zsim_bridges.console.camera_feed import CameraFeed
-from zsim_bridges.console.manual_flight import FlightAnswer, Stick
+from zsim_bridges.console.manual_flight import FlightAnswer, PageFlying, Stick
 from zsim_bridges.console.page_cameras import PageCameras
-from zsim_bridges.console.page_flying import PageFlying
 from zsim_bridges.console.page_server import HEARTBEAT_S, OPERATOR
-from zsim_bridges.console.time_monitor import RecordPlayer
+from zsim_bridges.console.run_monitor import RecordPlayer
 
 ACTION_MAX = 2_000  # bytes
 NAME_MAX = 64  # characters of the name of a drone or camera, or of a page's key

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import EstimateView, ViewCluster, ViewDrones
 from zsim.math import frames
+from zsim.presentation import drone_colours
 from zsim.scenario.scenario import Scenario
+from zsim.scenario.surroundings import outline_of
 from zsim.vehicles.vehicle import ROTORS_MAX
 from zsim_agents.formation.flight_plan import REFUSALS, Follow, MoveTo, read_request
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
@@ -30,6 +32,9 @@ PATH_POINTS = 120  # of a part of a drone's reference: smooth at the size of a p
 SHAPED_PHASES = frozenset({"assembling", "engaged", "held"})  # phases in which a formation has a desired shape
 CORNER_SHARE = 0.25  # of the way from a corner to the opposite side: position of its angle's label, clear of names
 CLICK_RAD = 0.012  # half the angle within which a click hits a small, far drone; chosen: about five pixels
+LARGE_MAX = 12  # drones with full names at full size; more have short, smaller names
+PLAN_DIGITS = 2  # of a metre: finer than a pixel
+HEADING_DIGITS = 3  # of a radian
 SIDES = {"p": (0, 1), "q": (0, 2)}  # robots at their ends; docs/conventions.md
 
 
@@ -120,8 +125,10 @@ def drone_on_ray(
     return drones.names[int(np.argmin(np.where(hit, distances_m, math.inf)))] if hit.any() else None
 
 
-def short_names(names: Sequence[str]) -> list[str]:
-    """Return names without their common prefix; in full if one would become empty."""
+def shown_names(names: Sequence[str]) -> list[str]:
+    """Return names; of more than LARGE_MAX without their common prefix, unless one would become empty."""
+    if len(names) <= LARGE_MAX:
+        return list(names)
     alike = takewhile(lambda column: len(set(column)) == 1 and not column[0].isdigit(), zip(*names, strict=False))
     stem = len(list(alike))
     short = [name[stem:] for name in names]
@@ -205,6 +212,56 @@ def formation_shape(space: ClusterSpace, p_W: Array, yaw: Array) -> FormationSha
             f"β {math.degrees(c[space.index('beta')]):.1f}°",
         )
     return FormationShape(c, c[:3], frames.quaternion_from_rpy((roll, pitch, turn)), tuple(sides), corner)
+
+
+# The plan view, from above
+
+
+def surroundings(scenario: Scenario) -> dict[str, Any]:
+    """Return what does not change: names, labels and colours of drones, outlines of obstacles."""
+    names = [drone.name for drone in scenario.drones]
+    return {
+        "names": names,
+        "labels": shown_names(names),
+        "colours": list(drone_colours(len(names))),
+        "obstacles": [
+            {
+                "name": each.name,
+                "x_m": each.position_m[0],
+                "y_m": each.position_m[1],
+                "yaw_deg": each.yaw_deg,
+                "radius_m": each.radius_m,  # of a disc; None for a box
+                "size_m": list(each.size_m[:2]) if each.size_m is not None else None,
+            }
+            for each in scenario.environment.obstacles
+        ],
+        "surfaces": [
+            {"name": each.name, "outline_m": outline_of(each)} for each in scenario.environment.surfaces or ()
+        ],
+    }
+
+
+def plan_positions(drones: DronePoses, states: Mapping[str, str]) -> list[list[Any] | None]:
+    """Return x, y, z [m; W], heading [rad] and state of each drone; None for one that is not in the view."""
+    yaw = frames.heading(drones.q_WB)
+    return [
+        [*np.round(p_W, PLAN_DIGITS).tolist(), round(float(yaw[i]), HEADING_DIGITS), states.get(drones.names[i], "")]
+        if drones.present[i]
+        else None
+        for i, p_W in enumerate(drones.p_W)
+    ]
+
+
+def plan_formations(
+    spaces: Mapping[str, ClusterSpace], members: Mapping[str, list[int]], views: Mapping[str, ViewCluster]
+) -> list[dict[str, Any]]:
+    """Return phase, indices of drones, and desired places [m; W] of each formation."""
+    shown = []
+    for name, view in views.items():
+        desired = ghosts(spaces[name], view)
+        places = [] if desired is None else np.round(desired[0][:, :2], PLAN_DIGITS).tolist()
+        shown.append({"name": name, "phase": view.phase, "drones": members[name], "places": places})
+    return shown
 
 
 # What a formation would fly

@@ -11,11 +11,10 @@ import viser
 
 from zsim.contract.messages import DroneInfo
 from zsim.contract.run_messages import GATES_MAX, RATE_MAX
-from zsim.scenario.faults import PROCESS_KILL, ROTORS, expected, kinds_of, unstated
+from zsim.scenario.faults import PROCESS_KILL, ROTORS, FaultKind, expected, kinds_of, typed_rest, unstated
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor_catalogue import declarations
-from zsim_bridges.console.command_client import CommandClient, RequestOutcome
-from zsim_bridges.console.operator_input import InputError, parse_fault, range_refusal
+from zsim_bridges.console.orders import CommandClient, RequestOutcome
 from zsim_bridges.console.run_condition import (
     RunCondition,
     fleet_refusals,
@@ -235,6 +234,30 @@ class FaultForm:
             gui.add_button("Inject it", color="orange").on_click(lambda _: inject())
 
 
+def parse_fault(text: str, name: str, kind: FaultKind) -> dict[str, Any]:
+    """Return the parameters and times of a fault, typed as after TARGET KIND in a terminal.
+
+    Every magnitude must be given, even one with a default: an empty text must not affect all samples.
+
+    Raises:
+        InputError: the text is not such a list, names something unknown to the kind, or omits a magnitude.
+    """
+    where = f"parameters are {text[:40]!r}"
+    try:
+        values = typed_rest(text)
+    except ValueError as error:
+        raise InputError(f"{where}: {error}") from None
+    known = [p.name for p in kind.parameters]
+    for given in values:
+        if given not in (*known, "at_s", "for_s"):
+            allowed = ", ".join([*(f"{each}=VALUE" for each in known), "--at", "--for"])
+            raise InputError(f"{where}; {given[:40]!r} is not known, allowed: {allowed}")
+    missing = [f"{p.name} is missing; must be {expected(p)}" for p in unstated(kind, values)]
+    if missing:
+        raise InputError(f"{'; '.join(missing)} ({name})")
+    return {given: value for given, value in values.items() if value is not None}
+
+
 # Elements of forms
 
 
@@ -268,6 +291,18 @@ class OrderButton:
         attributes = " ".join(f'{key}="{escape(value)}"' for key, value in data.items())
         off = " disabled" if self.disabled else ""
         return f'<div class="zsim-order"><button type="button" {attributes}{off}>{escape(self._label)}</button></div>'
+
+
+class InputError(ValueError):
+    """An operator's text that cannot be parsed; the message has the line and what is allowed."""
+
+
+def range_refusal(name: str, value: float, low: float, high: float, unit: str = "") -> str | None:
+    """Return why a typed number may not be requested, None if it may; it is never clipped to a limit."""
+    if low <= value <= high:
+        return None
+    in_unit = f" {unit}" if unit else ""
+    return f"{name} is {value:g}{in_unit}; must be from {low:g} to {high:g}{in_unit}"
 
 
 def assign(control: Any, **properties: Any) -> None:

@@ -2,28 +2,37 @@
 
 `RunScene` decides what is drawn, `SceneNodes` draws it for all pages; the ground follows each page's own theme, and the
 ring around the chosen drone belongs to one page.
+
+Multirotors are meshes of simple solids in B: x ahead, y left, z up, its origin at the centre of mass. They look like
+the AR.Drone, scaled by the length of their arms, with their own rotors. Lengths are in metres; those of solids are the
+AR.Drone's. They are for display only and enter no computation.
 """
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
+import trimesh
 import viser
 from numpy.typing import NDArray
+from trimesh.creation import annulus, box, capsule, cylinder, icosphere
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 from zsim.contract.flight_messages import ViewDrones
 from zsim.contract.messages import DroneInfo
 from zsim.math import frames
 from zsim.presentation import drone_colours, rgb
 from zsim.scenario.scenario import Obstacle, Surface
-from zsim.scenario.surface_file import placed
-from zsim.scenario.triangles import corners_of
+from zsim.scenario.surroundings import corners_of, placed
+from zsim.sensors.camera import Hats
 from zsim.vehicles.vehicle import cross_layout
-from zsim_bridges.console import airframe
 from zsim_bridges.console.histories import CanvasTrails
 from zsim_bridges.console.page_cameras import PageCameras
 from zsim_bridges.console.picture import (
+    LARGE_MAX,
     Array,
     DronePoses,
     Ellipsoids,
@@ -38,13 +47,12 @@ from zsim_bridges.console.picture import (
     reference_lines,
     rotor_angles,
     rotor_poses,
-    short_names,
+    shown_names,
 )
 from zsim_bridges.console.run_condition import ShownRun
 from zsim_bridges.console.view_buffer import ViewBuffer
 
 NAMED_MAX = 60  # drones with names beside them; more would overlap
-LARGE_MAX = 12  # drones with full names at full size; more have short, smaller names
 SMALL = 0.8  # of the size of a name
 SOLID = (134, 142, 150)
 EDGE = (96, 102, 118)  # of the triangles of a surface, whose slopes differ little in shading
@@ -68,6 +76,17 @@ THICK_M = 0.02
 LIGHT = ((206, 219, 196), (190, 200, 184), (138, 150, 132))  # of the field, of the grid's cells and of its sections
 DARK = ((30, 35, 30), (84, 94, 82), (122, 134, 118))
 CHOSEN = (25, 113, 194)
+ARM_M = 0.1785  # from the centre to a rotor's axis
+ROTOR_RADIUS_M = 0.10  # 8 inch propellers of the AR.Drone
+RING = 1.31  # rotor radii, outer radius of a hull ring: half of the 0.515 m of the hull, less 0.126 m to its centre
+ROTOR_Z_M = 0.030  # height of the rotors above the centre of mass, as drawn
+COLOURS = {  # sRGB, 0 to 255; the greys are lighter than the AR.Drone's, to stand out in the dark theme too
+    "cross": (104, 108, 116),
+    "hull": (124, 129, 138),
+    "nose": (240, 108, 24),  # the orange of the outdoor hull's nose
+    "hat": (226, 0, 134),  # the paper's magenta marker
+    "rotor": (96, 99, 105),
+}
 
 
 class RunScene:
@@ -177,19 +196,19 @@ class SceneNodes:
         scene.add_frame("/origin", axes_length=1.0, axes_radius=0.02, position=(0.0, 0.0, 0.01))
         scene.add_label("/origin/e", "east", position=(1.1, 0.0, 0.0))
         scene.add_label("/origin/n", "north", position=(0.0, 1.1, 0.0))
-        looks = [airframe.shape_of(*each) for each in zip(drones, arms_m, strict=True)]
+        looks = [shape_of(*each) for each in zip(drones, arms_m, strict=True)]
         self.radii_m: Array = np.array([look.reach_m for look in looks])  # (N,), from the centre
 
         self._airframes: list[tuple[NDArray[np.int64], Any]] = []  # one node for all drones that look alike
         for k, look in enumerate(dict.fromkeys(looks)):
             owners = np.array([i for i, other in enumerate(looks) if other == look])
             p, q, _ = _padded(len(owners))
-            node = scene.add_batched_glb(f"/drones/{k}" if k else "/drones", airframe.coloured(look), q, p, lod="off")
+            node = scene.add_batched_glb(f"/drones/{k}" if k else "/drones", coloured_glb(look), q, p, lod="off")
             self._airframes.append((owners, node))
         self._rotors = _RotorNodes(drones, looks, self._batch)
-        ghost = airframe.whole(looks[0])
+        ghost = whole_mesh(looks[0])
         self._ghosts = self._batch("/ghosts", ghost, robots, GHOST, opacity=0.5) if robots else None
-        self._ellipsoids = self._batch("/estimates", airframe.ball(), len(names), ELLIPSOID, opacity=0.35)
+        self._ellipsoids = self._batch("/estimates", ball_mesh(), len(names), ELLIPSOID, opacity=0.35)
         if robots:
             self._preview_ends = self._batch("/preview_ends", ghost, robots, PREVIEW, opacity=0.6)
             self._preview_lines: Any = scene.add_line_segments(
@@ -198,9 +217,8 @@ class SceneNodes:
             )  # fmt: skip
         self._names: list[Any] = []
         if len(names) <= NAMED_MAX:
-            many = len(names) > LARGE_MAX
-            style: Any = {"anchor": "bottom-center", "font_screen_scale": SMALL if many else 1.0}
-            texts = zip(names, short_names(names) if many else names, strict=True)
+            style: Any = {"anchor": "bottom-center", "font_screen_scale": SMALL if len(names) > LARGE_MAX else 1.0}
+            texts = zip(names, shown_names(names), strict=True)
             self._names = [scene.add_label(f"/names/{name}", text, **style) for name, text in texts]
         self._wind = scene.add_arrows(
             "/wind", np.array([[(0, 0, 0), (1, 0, 0)]], float), WIND, shaft_radius=0.035, head_radius=0.1,
@@ -217,7 +235,7 @@ class SceneNodes:
                 scene.add_label(f"/formations/label{i}", "", visible=False, anchor=MIDDLE) for i in range(LABELS_MAX)
             ]
 
-    def _batch(self, name: str, mesh: airframe.Mesh, count: int, colour: Any, opacity: float | None = None) -> Any:
+    def _batch(self, name: str, mesh: "Mesh", count: int, colour: Any, opacity: float | None = None) -> Any:
         p, q, scales = _padded(count)
         return self._scene.add_batched_meshes_simple(
             name, mesh.vertices, mesh.faces, q, p, batched_scales=scales, batched_colors=colour, opacity=opacity,
@@ -360,15 +378,15 @@ class SceneNodes:
 class _RotorNodes:
     """The rotors of all drones as one node, each at its size."""
 
-    def __init__(self, drones: Sequence[DroneInfo], looks: Sequence[airframe.DroneShape], batch: Any) -> None:
+    def __init__(self, drones: Sequence[DroneInfo], looks: Sequence["DroneShape"], batch: Any) -> None:
         self._owners = np.repeat(np.arange(len(looks)), [len(look.hubs_B) for look in looks])
         self._places = np.concatenate([np.arange(len(look.hubs_B)) for look in looks])
-        hubs = [(x, y, airframe.ROTOR_Z_M * look.size) for look in looks for x, y in look.hubs_B]
-        rotors = [drone.rotors or cross_layout(airframe.ARM_M) for drone in drones]
+        hubs = [(x, y, ROTOR_Z_M * look.size) for look in looks for x, y in look.hubs_B]
+        rotors = [drone.rotors or cross_layout(ARM_M) for drone in drones]
         self._turns = np.array([float(rotor.turn) for of_one in rotors for rotor in of_one])
         self._hubs_B, self._angles = np.array(hubs), np.zeros(len(hubs))
-        self._node = batch("/rotors", airframe.rotor(), len(hubs), airframe.COLOURS["rotor"])
-        scales = [look.radius_m / airframe.ROTOR_RADIUS_M for look in looks]
+        self._node = batch("/rotors", rotor_mesh(), len(hubs), COLOURS["rotor"])
+        scales = [look.radius_m / ROTOR_RADIUS_M for look in looks]
         self._node.batched_scales = np.tile(np.array(scales)[self._owners, None], (1, 3))
 
     def move(self, drones: DronePoses, dt_s: float) -> None:
@@ -398,7 +416,7 @@ class ChosenRing:
     def __init__(self, scene: viser.SceneApi, radii_m: Array) -> None:
         self._radii_m = radii_m
         self._chosen = -1
-        mesh = airframe.ring()
+        mesh = ring_mesh()
         level, nowhere = np.array([[1.0, 0.0, 0.0, 0.0]]), np.array(HIDDEN).reshape(1, 3)
         self._node: Any = scene.add_batched_meshes_simple(
             "/chosen", mesh.vertices, mesh.faces, level, nowhere, batched_scales=np.ones((1, 3)),
@@ -443,3 +461,121 @@ def linear(colours: Array) -> NDArray[np.uint8]:
     """Return sRGB colours, 0 to 255, in linear light, as viser takes the colours of lines; IEC 61966-2-1, 5.3."""
     share = colours / 255
     return np.round(255 * np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)).astype(np.uint8)
+
+
+class Mesh(NamedTuple):
+    """A surface: vertices (V, 3) [m; B], faces (F, 3)."""
+
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.uint32]
+
+
+class DroneShape(NamedTuple):
+    """The appearance of a drone: the axes (x, y) of its rotors and their radius [m]."""
+
+    hubs_B: tuple[tuple[float, float], ...]
+    radius_m: float
+
+    @property
+    def size(self) -> float:
+        """Size relative to the AR.Drone, by the longest arm."""
+        return max(math.hypot(x, y) for x, y in self.hubs_B) / ARM_M
+
+    @property
+    def reach_m(self) -> float:
+        """Distance of its hull's outer edge from the centre [m]."""
+        return self.size * ARM_M + RING * self.radius_m
+
+
+def shape_of(drone: DroneInfo, arm_m: float) -> DroneShape:
+    """Return the appearance of a drone; one without named rotors has four, on arms of this length [m]."""
+    if not drone.rotors:
+        hubs = tuple((rotor.x_m, rotor.y_m) for rotor in cross_layout(arm_m))
+        return DroneShape(hubs, ROTOR_RADIUS_M * arm_m / ARM_M)
+    return DroneShape(tuple((rotor.x_m, rotor.y_m) for rotor in drone.rotors), drone.rotors[0].radius_m)
+
+
+@cache
+def coloured_glb(shape: DroneShape) -> bytes:
+    """Return a drone without rotors as GLB, with one surface for each colour."""
+    scene = trimesh.Scene()
+    for name, solids in _solids(shape).items():
+        solid = _joined(solids)
+        solid.unmerge_vertices()  # otherwise shading would blur the edges
+        look = PBRMaterial(baseColorFactor=(*COLOURS[name], 255), metallicFactor=0.0, roughnessFactor=0.75)
+        solid.visual = TextureVisuals(material=look)
+        scene.add_geometry(solid, geom_name=name)
+    return bytes(scene.export(file_type="glb"))  # type: ignore[arg-type]
+
+
+@cache
+def whole_mesh(shape: DroneShape) -> Mesh:
+    return _mesh([solid for solids in _solids(shape).values() for solid in solids])
+
+
+def _solids(shape: DroneShape) -> dict[str, list[trimesh.Trimesh]]:
+    """Return the solids of a drone by colour: drawn as large as the AR.Drone, then scaled."""
+    hubs = [(x / shape.size, y / shape.size) for x, y in shape.hubs_B]
+    radius = RING * shape.radius_m / shape.size
+    cross = []
+    for x, y in hubs:
+        beam = box((math.hypot(x, y), 0.014, 0.012))
+        motor, foot = cylinder(0.017, 0.034, sections=12), cylinder(0.006, 0.058, sections=8)
+        cross.append(_moved(beam, (x / 2, y / 2, 0.004), math.atan2(y, x)))
+        cross += [_moved(motor, (x, y, ROTOR_Z_M / 2)), _moved(foot, (0.92 * x, 0.92 * y, -0.029))]
+    ahead = trimesh.transformations.rotation_matrix(math.pi / 2, (0, 1, 0))
+    lens = cylinder(0.013, 0.03, sections=14)  # of the front camera
+    lens.apply_transform(ahead)
+    rings = [annulus(radius - 0.016, radius, 0.042, sections=28) for _ in hubs]  # foam, of the indoor hull
+    body = capsule(height=0.19, radius=0.045, count=[14, 14])  # with the battery, from nose to tail
+    body.apply_transform(ahead)
+    body.apply_scale((1.0, 1.0, 0.72))
+    nose = icosphere(subdivisions=2, radius=0.042)
+    nose.apply_scale((1.25, 1.0, 0.78))
+    solids = {
+        "cross": [*cross, _moved(lens, (0.162, 0, 0.012))],
+        "hull": [
+            *(_moved(ring, (*hub, 0.022)) for ring, hub in zip(rings, hubs, strict=True)),
+            _moved(body, (-body.centroid[0], 0, 0.012)),
+        ],
+        "nose": [_moved(nose, (0.115, 0, 0.012))],
+    }
+    for solid in (solid for of_one in solids.values() for solid in of_one):
+        solid.apply_scale(shape.size)
+    hats = Hats()  # by which drones detect each other, in the size that the cameras assume
+    return {**solids, "hat": [_moved(icosphere(subdivisions=3, radius=hats.diameter_m / 2), hats.position_m)]}
+
+
+@cache
+def rotor_mesh() -> Mesh:
+    blades = [_moved(box((ROTOR_RADIUS_M, 0.016, 0.002)), (side * ROTOR_RADIUS_M / 2, 0, 0)) for side in (-1, 1)]
+    for side, blade in zip((-1, 1), blades, strict=True):
+        blade.apply_transform(trimesh.transformations.rotation_matrix(side * 0.2, (1, 0, 0)))
+    return _mesh([*blades, cylinder(0.012, 0.012, sections=10)])
+
+
+@cache
+def ring_mesh() -> Mesh:
+    return _mesh([annulus(0.93, 1.0, 0.03, sections=40)])
+
+
+@cache
+def ball_mesh() -> Mesh:
+    return _mesh([icosphere(subdivisions=2)])
+
+
+def _mesh(solids: list[trimesh.Trimesh]) -> Mesh:
+    joined = _joined(solids)
+    return Mesh(np.asarray(joined.vertices, np.float32), np.asarray(joined.faces, np.uint32))
+
+
+def _joined(solids: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    joined = trimesh.util.concatenate(solids)
+    assert isinstance(joined, trimesh.Trimesh)
+    return joined
+
+
+def _moved(solid: trimesh.Trimesh, by_m: tuple[float, float, float], yaw: float = 0.0) -> trimesh.Trimesh:
+    solid.apply_transform(trimesh.transformations.rotation_matrix(yaw, (0, 0, 1)))
+    solid.apply_translation(by_m)
+    return solid

@@ -19,7 +19,7 @@ from zsim.contract.run_messages import Event, Fault, Health
 from zsim.errors import DecodeError
 from zsim.runtime.participant import Participant
 from zsim.transport.session import RawSample, Session
-from zsim_bridges.console.alarms import BACK, LOST, DroneCondition, Losses
+from zsim_bridges.console.run_condition import BACK, LOST, DroneCondition, Losses
 
 FRESH_S = 1.0  # simulated, or wall; views come 20 times a wall second: if one is older, its estimator is dead or stuck
 FAULTS_KEPT = 8  # number of the last faults that have begun

@@ -33,8 +33,7 @@ from zsim_bridges.gateway.client_messages import (
 )
 from zsim_bridges.gateway.client_streams import LINE_MAX, OUTBOX_BYTES_MAX, Outbox, PictureFeeds, serve_lines
 from zsim_bridges.gateway.http_server import AccessCheck, CameraTree, JsonTree, RestTree, application
-from zsim_bridges.gateway.lockstep_session import LockstepSession
-from zsim_bridges.gateway.run_access import RunAccess, SharedSubscriptions
+from zsim_bridges.gateway.run_access import LockstepSession, RunAccess, SharedSubscriptions
 from zsim_bridges.web.web_server import (
     ServedSite,
     cancel_other_tasks,

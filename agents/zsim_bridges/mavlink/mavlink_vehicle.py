@@ -16,8 +16,8 @@ from zsim.math.frames import turned_about_up
 from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Drone, Piloted
 from zsim.schema.quantities import G_M_S2
+from zsim_agents.references.cruise import Course
 from zsim_agents.references.flight import limits_of
-from zsim_agents.references.tracking import Course
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import (
     DEGREES,

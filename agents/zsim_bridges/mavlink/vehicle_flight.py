@@ -1,7 +1,7 @@
 """The flight of one vehicle: its arming state, its mode, its targets, and the commands that make it hold them.
 
 A landed drone of zsim has no separate armed state: armed means that it takes off on command. Places are approached like
-references of drones: `zsim_agents.references.tracking`.
+references of drones: `zsim_agents.references.cruise`.
 """
 
 import math
@@ -9,8 +9,7 @@ from collections.abc import Callable
 from typing import Literal
 
 from zsim.math.rotation import Vector
-from zsim_agents.references.cruise import Cruise
-from zsim_agents.references.tracking import Course
+from zsim_agents.references.cruise import Course, Cruise
 from zsim_bridges.mavlink.dialect import Severity
 from zsim_bridges.mavlink.mission import Mission
 from zsim_bridges.mavlink.personality import HOLDING, FlightMode, Parameters, Personality

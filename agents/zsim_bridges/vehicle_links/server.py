@@ -13,7 +13,7 @@ from zsim.contract.framing import run_key_table
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
 from zsim.errors import DecodeError, NoWorldError, RunError, SessionError, without_figures
-from zsim.runtime.health import HealthMeter
+from zsim.runtime.membership import HealthMeter
 from zsim.runtime.participant import Participant
 from zsim.transport.session import RawSample, ReceivedSample, Session, Unanswered
 from zsim.transport.traffic import Passed, Traffic, samples

@@ -27,7 +27,7 @@ from msgspec import Struct
 from numpy.random import Generator
 
 from zsim.errors import ScenarioError
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
 from zsim.scenario import scenario_file
 from zsim.scenario.faults import COMMON, FaultKind, FaultParameter, allowed_kinds, kinds_of
 from zsim.scenario.roles import PILOT, WORLD, agent_names

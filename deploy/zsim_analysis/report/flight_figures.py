@@ -21,10 +21,8 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.special import chdtri
 
 from zsim.presentation import colours_of, drone_colours
-from zsim.scenario.obstacle import BOX, CENTRE, COSINE, HALF, SHAPE, SINE, row_of
 from zsim.scenario.scenario import Scenario, Surface
-from zsim.scenario.surface_file import placed
-from zsim.scenario.triangles import corners_of
+from zsim.scenario.surroundings import BOX, CENTRE, COSINE, HALF, SHAPE, SINE, corners_of, placed, row_of
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading import drone_errors
 from zsim_analysis.reading.formation import Formation, GoalErrors, common_instants
@@ -247,7 +245,7 @@ def draw_plan(flight: RecordedFlight, formations: Sequence[Formation]) -> Figure
 
 
 def draw_obstacles(axes: Axes, scenario: Scenario | None) -> None:
-    """Draw the outlines of a scenario's obstacles from above, rows as in `zsim.scenario.obstacle`, and its surfaces."""
+    """Draw the outlines of a scenario's obstacles (`zsim.scenario.surroundings`) and surfaces from above."""
     for number, surface in enumerate((scenario and scenario.environment.surfaces) or ()):
         _draw_surface(axes, surface, None if number else "surface, the darker the higher")
     look: dict[str, Any] = {"facecolor": "#8c959f99", "edgecolor": style.DARK, "hatch": "///", "lw": 1.0, "zorder": 1.5}

@@ -23,7 +23,7 @@ from zsim.contract.fingerprint import TruthHash
 from zsim.errors import RecordError, printable
 from zsim.presentation import Column, FittedTable
 from zsim.scenario.scenario import Cluster, ClusterPlan, Drone, Scenario
-from zsim.scenario.triangles import Surroundings
+from zsim.scenario.surroundings import Surroundings
 from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, STOCK
 from zsim_agents.formation.expression import Expression, ExpressionError
 from zsim_agents.formation.spaces.cluster_space import unit
@@ -132,9 +132,6 @@ class RunSummary(Struct, frozen=True):
     truth_sha256: str
     record: RecordFacts
     notes: list[str]
-
-    def json(self) -> bytes:
-        return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
 
 
 def judge(

@@ -24,7 +24,7 @@ from zsim.errors import ZsimError, printable
 from zsim_analysis.export import Format
 from zsim_deploy import INTERRUPTED
 from zsim_deploy import arguments as opt
-from zsim_deploy.arguments import failed, note, require, say
+from zsim_deploy.arguments import failed, note, require, say, working
 from zsim_deploy.roles.stop_channel import interruptible
 
 if TYPE_CHECKING:
@@ -220,9 +220,6 @@ def report(
     wanted = opt.figure_formats(formats)
     with plugin.names_only(not trust) as skipped:
         if len(directories) > 1:
-            from rich.console import Console
-
-            from zsim.runtime.progress import cell
             from zsim_analysis.report.comparison import compare, comparison_path
 
             for directory in directories:
@@ -230,8 +227,8 @@ def report(
                     raise BadParameter(f"{directory} is a sweep; only runs can be compared")
                 record_in(directory)
             page = out or comparison_path(directories)
-            with Console(stderr=True).status("reading the records …") as status:
-                compare(directories, page, lambda text: status.update(cell(text)), wanted)
+            with working("reading the records …") as progress:
+                compare(directories, page, progress, wanted)
             say(f"report: {page}")
         elif out is not None:
             raise BadParameter("--out is for the comparison of several runs; leave it out")
@@ -244,17 +241,11 @@ def report(
 
 def _report(folder: Path, formats: Sequence[str] = ()) -> str:
     """Make the report of a run or a sweep, and print its table; return the fault of a run as `_fault_of`."""
-    from rich.console import Console
-
-    from zsim.runtime.progress import PipedConsole, cell
+    from zsim.runtime.progress import PipedConsole
     from zsim_analysis.sweep.design import is_sweep
 
     summary = None
-    with Console(stderr=True).status("reading …") as status:
-
-        def progress(text: str) -> None:
-            status.update(cell(text))
-
+    with working("reading …") as progress:
         if is_sweep(folder):
             from zsim_analysis.sweep.sweep_report import TerminalText, make_sweep_report
 
@@ -443,15 +434,13 @@ def bundle(
 ) -> None:
     """Pack a flight into one file, with all that is needed to fly it again on another machine."""
     require("bundle", BUNDLE_NEEDS)
-    from rich.console import Console
-
     from zsim.schema import plugin
     from zsim_analysis.bundle.bundle_file import SUFFIX
     from zsim_analysis.bundle.make_bundle import make_bundle
 
     if out is not None and out.suffix != SUFFIX:
         raise BadParameter(f"--out is {out}; must end in {SUFFIX}")
-    with plugin.names_only(not trust) as skipped, Console(stderr=True).status("reading the record …"):
+    with plugin.names_only(not trust) as skipped, working("reading the record …"):
         written = make_bundle(run, out, not no_record, force, note)
     for name in skipped:
         note(f"note: {name} was found but not imported; --trust imports it, for the errors in its figures")
@@ -533,10 +522,8 @@ def hunt(
 ) -> None:
     """Search for faults, wind and delays that break a requirement, and shrink them; exit code 1 if any are found."""
     require("hunt", SWEEP_NEEDS)
-    from rich.console import Console
-
     from zsim.errors import ScenarioError
-    from zsim.runtime.progress import PipedConsole, cell
+    from zsim.runtime.progress import PipedConsole
     from zsim.scenario.faults import typed_duration_s
     from zsim_analysis.hunt.hunt import HuntRequest, hunt
     from zsim_analysis.hunt.hunt_report import make_hunt_report, terminal_text
@@ -574,8 +561,8 @@ def hunt(
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     hunted = hunt(request)
     summary = hunted.summary
-    with Console(stderr=True).status("drawing …") as status:
-        notes = make_hunt_report(hunted, lambda text: status.update(cell(text)))
+    with working("drawing …") as progress:
+        notes = make_hunt_report(hunted, progress)
     for text in notes:
         note(f"note: {text}")
     PipedConsole().print(terminal_text(hunted))
@@ -607,9 +594,7 @@ def board(
 ) -> None:
     """Fly formation laws in the same scenarios with the same seeds and sensors: one table, with figures."""
     require("sweep", SWEEP_NEEDS)
-    from rich.console import Console
-
-    from zsim.runtime.progress import PipedConsole, cell
+    from zsim.runtime.progress import PipedConsole
 
     if papers:
         if laws or scenarios or formats:
@@ -617,8 +602,8 @@ def board(
         from zsim_analysis.board.papers import terminal_table, write_papers
 
         place = out or Path("runs") / "papers"
-        with Console(stderr=True).status("computing …") as status:
-            found = write_papers(place, lambda text: status.update(cell(text)))
+        with working("computing …") as progress:
+            found = write_papers(place, progress)
         PipedConsole().print(terminal_table(found))
         say(f"figures: {place}")
         return
@@ -641,8 +626,8 @@ def board(
     except KeyboardInterrupt:
         note(f"interrupted; the same command with --out {folder} continues")
         sys.exit(INTERRUPTED)
-    with Console(stderr=True).status("drawing …") as status:
-        made = make_board_report(request, rows, lambda text: status.update(cell(text)), wanted)
+    with working("drawing …") as progress:
+        made = make_board_report(request, rows, progress, wanted)
     PipedConsole().print(terminal_text(made))
     say(f"report: {folder / 'report.html'}")
     say(f"table: {folder / 'board.csv'}")

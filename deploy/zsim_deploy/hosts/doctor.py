@@ -1,20 +1,35 @@
-"""`zsim doctor`: check whether the hosts of an inventory can fly together, without starting a run."""
+"""`zsim doctor`: check whether the hosts of an inventory can fly together, without starting a run.
+
+`zsim up` makes the same checks, and tries the ports of the run.
+"""
 
 import asyncio
+import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from zsim import __version__
 from zsim.errors import HostsError, ZsimError
+from zsim.output_folder import RECORD
 from zsim.presentation import Column, FittedTable
+from zsim.transport.tls import KEY
 from zsim_deploy import SAFE_PATH, certificates
 from zsim_deploy import inventory as inv
-from zsim_deploy.hosts.host_link import HostLink, ProgramEndedError, RemoteProgram, open_program, shell_line, shell_word
-from zsim_deploy.hosts.host_plan import leftovers, port_in_use
-from zsim_deploy.inventory import InventoryFile
+from zsim_deploy.hosts.host_link import (
+    HostLink,
+    ProgramEndedError,
+    RemoteProgram,
+    json_answer,
+    open_program,
+    shell_line,
+    shell_word,
+)
+from zsim_deploy.inventory import SSH_PORT, Host, InventoryFile
+from zsim_deploy.roles.stop_channel import FOLDER
 
 CLOCK_OFFSET_MAX_S = 1.0  # certificates are back-dated by a day and logs are compared; time on the wire is simulated
 LOAD_MAX = 0.5  # share of the cores; a busy host slows all the others in lockstep
@@ -47,6 +62,33 @@ PATH_COLUMNS = (
     Column("round trip", "text"),
     Column("bandwidth", worth=1, right=True),
 )
+RUNS = "runs"  # below the folder of zsim on a host: a folder per run
+# A run whose processes are still running is not listed; without ps all are.
+LIST_RUNS = f"""
+alive=$(ps -A -ww -o args 2>/dev/null || ps -A -o args 2>/dev/null)
+for run in *; do
+  case "$alive" in *"--launched $run "*) continue;; esac
+  [ -f "$run/{RECORD}" ] && echo "{RECORD} $run"
+  [ -n "$(find "$run/{FOLDER}" -name {KEY} 2>/dev/null)" ] && echo "{KEY} $run"
+done
+true
+"""
+# Run by the host's Python: `- ADDRESS PORT...`. Other faults of a port are in the log of the process that uses it.
+TRY_PORTS = """
+import errno, json, socket, sys
+address, taken = sys.argv[1], []
+for port in map(int, sys.argv[2:]):
+    family, kind, _, _, place = socket.getaddrinfo(address, port, type=socket.SOCK_STREAM)[0]
+    with socket.socket(family, kind) as tried:
+        tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            tried.bind(place)
+            tried.listen()
+        except OSError as error:
+            taken += [port] if error.errno == errno.EADDRINUSE else []
+print(json.dumps({"taken": taken}))
+"""
+TRY_PORTS_S = 20.0  # wall time to start Python on a small computer
 
 
 class HostReport(NamedTuple):
@@ -247,3 +289,59 @@ def paths_table(paths: Sequence[NetworkPath]) -> FittedTable:
             cells = (f"{1e3 * figures['round_trip_s']:.2f} ms", f"{figures['bits_per_s'] / 1e6:.0f} Mbit/s")
         rows.append((path.source, path.target, str(path.port), *cells))
     return FittedTable(PATH_COLUMNS, rows)
+
+
+def runs_folder(host: Host) -> str:
+    """Return the folder of runs on a host, absolute or relative to the home (~/)."""
+    return f"{inv.below_home(host.folder)}/{RUNS}"
+
+
+async def leftovers(link: HostLink, base: Path) -> list[str]:
+    """Describe the leftovers of earlier runs on a host: at most a line on records, and one on private keys.
+
+    A greeting of the login shell is skipped. HostsError if the host cannot be asked.
+    """
+    name, folder = link.name, runs_folder(link.host)
+    script = f"cd {shell_word(folder)} 2>/dev/null || exit 0{LIST_RUNS}"
+    output = (await link.run(script, what=f"looking into {folder}")).decode(errors="replace")
+    words = [line.split(" ", 1) for line in output.splitlines()]
+    runs = {kind: [word[1] for word in words if word[0] == kind and len(word) > 1] for kind in (RECORD, KEY)}
+    lines = []
+    if records := [f"{folder}/{run}/{RECORD}" for run in runs[RECORD]]:
+        lines.append(
+            f"{name}: records of earlier runs were not fetched: {', '.join(f'{name}:{path}' for path in records)}; "
+            f"fetch with `{scp(link.host, base, records[0])}`, then remove the folder of the run there"
+        )
+    if keys := [f"{folder}/{run}/{FOLDER}" for run in runs[KEY]]:
+        lines.append(
+            f"{name}: private keys of earlier runs remain: {', '.join(f'{name}:{path}' for path in keys)}; "
+            f"remove them there with `rm -r {shell_line(keys)}`"
+        )
+    return lines
+
+
+def scp(host: Host, base: Path, path: str) -> str:
+    """Return the scp command that copies a file from a host to here, with the ssh settings of `zsim up`."""
+    address = host.ssh or host.address
+    shown = f"[{address}]" if ":" in address else address
+    words = ["scp", *(["-P", str(host.port)] if host.port != SSH_PORT else [])]
+    words += ["-i", str(base / Path(host.key).expanduser())] if host.key else []
+    if host.known_hosts:
+        words += ["-o", f"UserKnownHostsFile={base / Path(host.known_hosts).expanduser()}"]
+    user = f"{host.user}@" if host.user else ""
+    return shlex.join([*words, f"{user}{shown}:{path.removeprefix('~/')}", "."])
+
+
+async def port_faults(link: HostLink, python: str, ports: Sequence[int]) -> list[str]:
+    """Return a line for each port of a host that another program uses; HostsError if the host cannot be asked."""
+    if not ports:
+        return []
+    command = f"{shell_word(python)} - {shell_line([link.host.address, *map(str, ports)])}"
+    output = await link.run(command, TRY_PORTS.encode(), TRY_PORTS_S, "looking for free ports")
+    taken = (json_answer(output.decode(errors="replace").splitlines()) or {}).get("taken", [])
+    return [port_in_use(link.name, port) for port in taken]
+
+
+def port_in_use(host: str, port: int) -> str:
+    remedy = "end that (`ss -ltnp` there shows it), or give another port in the inventory"
+    return f"{host}: port {port} is in use there, perhaps by another run; {remedy}"

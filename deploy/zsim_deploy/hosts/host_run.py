@@ -1,7 +1,7 @@
 """A run on several hosts: checked, prepared, started over ssh, watched, ended, and its record brought home.
 
 The requests of `zsim ps`, `logs`, `restart`, `move` and `down` are carried out here, each in a thread of the control
-socket.
+socket. A `HostPlan` says which process runs where, with which command line and files.
 """
 
 from __future__ import annotations
@@ -19,23 +19,35 @@ from pathlib import Path
 from typing import Any
 
 import asyncssh
+from msgspec import structs
 
 from zsim.errors import OTHER_OUT, HostsError, RunError, ZsimError, file_fault
+from zsim.output_folder import RECORD
 from zsim.record import repair
 from zsim.scenario import scenario_file
 from zsim.scenario.roles import RECORDER, ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
-from zsim_api.run_folder import Launch
+from zsim.transport.tls import CERTIFICATES
+from zsim_api.run_folder import JOURNAL, Launch
+from zsim_deploy import certificates
+from zsim_deploy import inventory as inv
 from zsim_deploy.arguments import changed_options, pace_options
-from zsim_deploy.certificates import exposed_keys
 from zsim_deploy.hosts.control_socket import ControlSocket
-from zsim_deploy.hosts.doctor import HostReport, compare_reports, host_report
+from zsim_deploy.hosts.doctor import (
+    HostReport,
+    compare_reports,
+    host_report,
+    leftovers,
+    port_faults,
+    runs_folder,
+    scp,
+)
 from zsim_deploy.hosts.host_link import EventLoopThread, HostLink, HostLinks, fetch, shell_line, shell_word
-from zsim_deploy.hosts.host_plan import RECORD, HostPlan, leftovers, port_faults
 from zsim_deploy.hosts.status_table import StatusTable
-from zsim_deploy.inventory import MODULE, MODULES, InventoryFile, extras
+from zsim_deploy.inventory import MODULE, MODULES, InventoryFile, ProcessFiles, extras
 from zsim_deploy.launch.role_launcher import SINGLE_THREADED, programs_of
 from zsim_deploy.launch.supervisor import EndSignals, Outcome, Supervisor, end_text
+from zsim_deploy.roles.stop_channel import FOLDER
 
 CONNECT_S = 30.0  # how long all hosts together may take to accept the login, …
 CHECK_S = 60.0  # … to be checked: a small computer takes 5 s to import numpy, a poor link adds a dozen round trips, …
@@ -52,6 +64,7 @@ ORPHAN_S = 60.0  # a process ends itself after this long without a heartbeat; sh
 LEND_S = 60.0  # how long its files may take to reach the host again; as long as a link may be cut
 KILL_S = 5.0  # how long a kill may take to reach the host: a few round trips
 LOST = -1000  # code of a process whose end is not known
+ACCESS = "access.json"
 PID = "zsim-pid "  # prefix of the line with the process id; a login shell may print something before it
 
 
@@ -91,7 +104,7 @@ class HostRun:
             with self._signals, ControlSocket(self._scenario.federation, requests):
                 if faults := self._plan.certificate_faults(datetime.now(UTC)):
                     raise HostsError("\n".join(faults))
-                if warning := exposed_keys(self._placed):
+                if warning := certificates.exposed_keys(self._placed):
                     self._status.say(f"warning: {warning}")
                 with self._timed("connect"):
                     self._links.on_all(HostLink.open, CONNECT_S)
@@ -290,6 +303,101 @@ async def _refuse_unless_able(link: HostLink, python: str, role: str) -> None:
         except HostsError as error:
             remedy = f"install its extra {extra} there, as `zsim push --extra {extra}` does"
             raise HostsError(f"{error}; {role} cannot run on {link.name}; {remedy}") from error
+
+
+class HostPlan:
+    """The processes of one run that zsim starts, and their hosts; immutable. InventoryError if one has no place."""
+
+    def __init__(self, placed: InventoryFile, scenario: Scenario, run_id: str, pace: Sequence[str] = ()) -> None:
+        self.placed = placed
+        self._scenario = scenario
+        self._run_id = run_id  # names the run's folder on each host
+        self._pace = pace  # options of the world
+        in_order = sorted(inv.processes(placed, scenario, pace), key=lambda process: process.role != ROUTER)
+        self.processes = {process.name: process for process in in_order}  # each after the one that it connects to
+        self.programs = inv.programs_here(placed, scenario)  # the user's own, started on this machine
+        # on the user's programs that are placed on a host: zsim does not start those
+        self.remarks = [line for host in placed.inventory.hosts for line in inv.own_programs(placed, scenario, host)]
+
+    def moved(self, name: str, host: str) -> HostPlan:
+        """Return a plan with another host for one process."""
+        places = {**inv.placement(self.placed, self._scenario), name: host}
+        placed = self.placed._replace(inventory=structs.replace(self.placed.inventory, roles=places))
+        return HostPlan(placed, self._scenario, self._run_id, self._pace)
+
+    def hosts(self) -> list[str]:
+        return sorted({process.host for process in self.processes.values()})
+
+    def host(self, name: str) -> str:
+        return self.processes[name].host
+
+    def folder(self, host: str) -> str:
+        return f"{runs_folder(self.placed.inventory.hosts[host])}/{self._run_id}"
+
+    def keys(self, host: str) -> str:
+        """Return the folder on a host that holds the private keys of this run's processes."""
+        return f"{self.folder(host)}/{FOLDER}"
+
+    def endpoint(self) -> str:
+        """Return the endpoint to which programs on this machine connect."""
+        return inv.endpoint(self.placed, inv.placement(self.placed, self._scenario), self.host(WORLD))
+
+    def record(self) -> str:
+        return f"{self.folder(self.host(RECORDER))}/{RECORD}"
+
+    def way_to_record(self) -> str:
+        """Return the location of the record, with the command that fetches it."""
+        name = self.host(RECORDER)
+        command = scp(self.placed.inventory.hosts[name], self.placed.folder, self.record())
+        return f"{name}:{self.record()} (fetch it with `{command}`)"
+
+    def ports(self, host: str) -> list[int]:
+        return [process.port for process in self.processes.values() if process.host == host and process.port]
+
+    def certificate_faults(self, now: datetime) -> list[str]:
+        return certificates.certificate_faults(self.placed, {name: self.host(name) for name in self.processes}, now)
+
+    def python(self, host: str) -> str:
+        return inv.python(self.placed.inventory.hosts[host])
+
+    def arguments(self, name: str) -> list[str]:
+        """Return the arguments of `zsim` that start a process."""
+        process, folder = self.processes[name], self.folder(self.host(name))
+        identity = f"{self.keys(process.host)}/{name}"
+        files = ProcessFiles(f"{folder}/scenario.yaml", identity, f"{identity}/{ACCESS}", folder)
+        role, *options = inv.command(process, files)[len(MODULE) :]
+        journal = ["--journal", f"{folder}/{JOURNAL}"] if name == WORLD else []
+        return [role, "--launched", self._run_id, *journal, *options]
+
+    def files(self, host: str) -> dict[str, bytes]:
+        """Return the files that a host needs, by path below the run's folder; HostsError as in `identity`."""
+        contents: dict[str, bytes] = {}
+        for name, process in self.processes.items():
+            if process.host == host:
+                contents |= self.identity(name)
+        if self.host(WORLD) == host:
+            contents["scenario.yaml"] = scenario_file.to_text(self._scenario).encode()
+        return contents
+
+    def identity(self, name: str) -> dict[str, bytes]:
+        """Return certificate, key and access control of a process, by path below the run's folder.
+
+        HostsError if one is missing.
+        """
+        process = self.processes[name]
+        if not process.secure:
+            return {}
+        source = certificates.folder_of(self.placed) / process.host
+        paths = {file: source / name / file for file in CERTIFICATES}
+        if process.port is not None:
+            paths[ACCESS] = source / inv.access_file(process)
+        init = certificates.init_command(self.placed)
+        remedy = f"make certificates with `{init}`, or set security.insecure on a network of your own"
+        contents = {}
+        for file, path in paths.items():
+            with file_fault(path, "cannot be read", remedy, HostsError):
+                contents[f"{FOLDER}/{name}/{file}"] = path.read_bytes()
+        return contents
 
 
 class RemoteProcess:

@@ -5,7 +5,6 @@ import contextlib
 import getpass
 import importlib.metadata
 import json
-import os
 import re
 import socket
 import sys
@@ -169,15 +168,6 @@ async def _copy(link: HostLink, folder: str, wheels: Sequence[Wheel], progress: 
     except (asyncssh.Error, OSError) as error:
         why = f"copying to {folder} failed ({error}); is there space, is the link up?"
         raise HostsError(f"{link.name}: {why}") from error
-
-
-def default_cache() -> Path:
-    """Return the folder of the wheelhouse on this machine (XDG Base Directory Specification)."""
-    try:
-        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zsim"
-    except RuntimeError as error:  # HOME is not set, and the system does not know the user
-        why = "this user has no home folder for the cache; set XDG_CACHE_HOME to a folder"
-        raise HostsError(f"push: {why}") from error
 
 
 class Interpreter(NamedTuple):

@@ -269,6 +269,15 @@ def _key(content: Any) -> str:
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:KEY_DIGITS]
 
 
+def default_cache() -> Path:
+    """Return the folder of the wheelhouse on this machine (XDG Base Directory Specification)."""
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zsim"
+    except RuntimeError as error:  # HOME is not set, and the system does not know the user
+        why = "this user has no home folder for the cache; set XDG_CACHE_HOME to a folder"
+        raise HostsError(f"push: {why}") from error
+
+
 # Running pip
 
 

@@ -48,6 +48,7 @@ CONNECTS = {"recorder": WORLD, "estimator.drone1": WORLD, "estimator.drone2": YA
 LISTENS = {"world": WORLD, "router.yard": YARD}
 TARGETS = {"systemd": systemd, "compose": compose, "kubernetes": kubernetes}
 Words = dict[str, tuple[str, list[str]]]
+Texts = dict[str, dict[str, str]]  # by target
 
 
 def placed(folder: Path, text: str = HOSTS) -> InventoryFile:
@@ -55,7 +56,7 @@ def placed(folder: Path, text: str = HOSTS) -> InventoryFile:
     return inventory.load(folder / "hosts.yaml")
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def step() -> Scenario:
     return scenario_file.load(STEP)
 
@@ -63,6 +64,13 @@ def step() -> Scenario:
 @pytest.fixture
 def hosts(tmp_path: Path) -> InventoryFile:
     return placed(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def usual(step: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Texts:
+    """Return the texts of each target."""
+    hosts = placed(tmp_path_factory.mktemp("usual"))
+    return {name: target(hosts, step) for name, target in TARGETS.items()}
 
 
 # What all targets have in common: {process: (host, words of its command after `python -m zsim_deploy.cli`)}
@@ -121,25 +129,31 @@ def option(words: list[str], name: str) -> str | None:
     return words[words.index(name) + 1] if name in words else None
 
 
-def rendered(target: str, hosts: InventoryFile, scenario: Scenario, *pace: str) -> Words:
-    return READ[target](TARGETS[target](hosts, scenario, pace))
-
-
 @ALL
 @pytest.mark.parametrize("insecure", [False, True])
-def test_every_process_is_there_once_on_its_host_with_its_endpoints(
+def test_every_process_is_there_once_on_its_host_with_its_endpoints_and_certificates(
     target: str, insecure: bool, tmp_path: Path
 ) -> None:
-    text = HOSTS + "security: {insecure: true}" if insecure else HOSTS
-    found = rendered(target, placed(tmp_path, text), scenario_file.load(STEP, ["federation=lab.2"]))
-    assert {name: host for name, (host, _) in found.items()} == PLACES
-    assert {name: option(words, "--host") for name, (_, words) in found.items()} == PLACES
-    assert {option(words, "--federation") for name, (_, words) in found.items() if name != "world"} == {"lab.2"}
+    """Certificates are for who has TLS, access control for who listens; the pace is the world's."""
+    hosts = placed(tmp_path, HOSTS + "security: {insecure: true}" if insecure else HOSTS)
+    texts = TARGETS[target](hosts, scenario_file.load(STEP, ["federation=lab.2"]), ("--realtime", "--rate", "2.0"))
+    found = READ[target](texts)
+
+    def given(name: str) -> dict[str, str | None]:
+        return {process: option(words, name) for process, (_, words) in found.items()}
+
+    def told(name: str) -> set[str]:
+        return {process for process, (_, words) in found.items() if name in words}
+
+    assert {name: host for name, (host, _) in found.items()} == given("--host") == PLACES
+    assert given("--federation") == {**dict.fromkeys(PLACES, "lab.2"), "world": None}
     scheme = "tcp" if insecure else "tls"
-    connects = {name: option(words, "--connect") for name, (_, words) in found.items()}
-    assert connects == {"world": None, **{name: f"{scheme}/{at}" for name, at in CONNECTS.items()}}
-    listens = {name: option(words, "--listen") for name, (_, words) in found.items() if "--listen" in words}
-    assert listens == {name: f"{scheme}/{at}" for name, at in LISTENS.items()}
+    assert given("--connect") == {"world": None, **{name: f"{scheme}/{at}" for name, at in CONNECTS.items()}}
+    assert given("--listen") == {**dict.fromkeys(PLACES), **{name: f"{scheme}/{at}" for name, at in LISTENS.items()}}
+    assert told("--realtime") == set(LISTENS)  # it shortens the lease of routers
+    assert given("--rate") == {**dict.fromkeys(PLACES), "world": "2.0"}
+    assert (told("--tls"), told("--access")) == ((set(), set()) if insecure else (set(PLACES), set(LISTENS)))
+    assert not insecure or not any("certs" in text or "secret" in text.lower() for text in texts.values())
 
 
 @ALL
@@ -148,7 +162,7 @@ def test_names_that_begin_with_a_dash_are_names(target: str, tmp_path: Path) -> 
     text = STEP.read_text().replace("name: drone1", "name: -d1").replace("[drone1,", "[-d1,").replace("main", "-c")
     (tmp_path / "dashes.yaml").write_text(text)
     dashes = placed(tmp_path, HOSTS.replace("yard", "-r"))
-    found = rendered(target, dashes, scenario_file.load(tmp_path / "dashes.yaml"))
+    found = READ[target](TARGETS[target](dashes, scenario_file.load(tmp_path / "dashes.yaml")))
     assert {"estimator.-d1", "controller.-c", "router.-r"} <= set(found)
     commands: Any = typer.main.get_command(app)
     for name, (host, words) in found.items():
@@ -159,32 +173,8 @@ def test_names_that_begin_with_a_dash_are_names(target: str, tmp_path: Path) -> 
 
 
 @ALL
-def test_certificates_are_for_who_has_tls_and_access_control_for_who_listens(
-    target: str, hosts: InventoryFile, tmp_path: Path, step: Scenario
-) -> None:
-    found = rendered(target, hosts, step)
-    assert all("--tls" in words for _, words in found.values())
-    assert {name for name, (_, words) in found.items() if "--access" in words} == set(LISTENS)
-    texts = TARGETS[target](placed(tmp_path, HOSTS + "security: {insecure: true}"), step)
-    assert not any({"--tls", "--access"} & set(words) for _, words in READ[target](texts).values())
-    assert not any("certs" in text or "secret" in text.lower() for text in texts.values())
-
-
-@ALL
-def test_the_pace_is_the_world_s_and_routers_know_of_realtime(
-    target: str, hosts: InventoryFile, step: Scenario
-) -> None:
-    found = rendered(target, hosts, step, "--realtime", "--rate", "2.0")
-    assert {name for name, (_, words) in found.items() if "--realtime" in words} == {"world", "router.yard"}
-    rates = {name: option(words, "--rate") for name, (_, words) in found.items()}
-    assert rates == {**dict.fromkeys(PLACES), "world": "2.0"}
-
-
-@ALL
-def test_the_world_has_the_scenario_and_waits_for_the_recorder(
-    target: str, hosts: InventoryFile, step: Scenario
-) -> None:
-    texts = TARGETS[target](hosts, step)
+def test_the_world_has_the_scenario_and_waits_for_the_recorder(target: str, hosts: InventoryFile, usual: Texts) -> None:
+    texts, step = usual[target], scenario_file.load(STEP)
     words = READ[target](texts)["world"][1]
     assert words[0] == "world"
     assert words[-2] == "--"
@@ -196,6 +186,7 @@ def test_the_world_has_the_scenario_and_waits_for_the_recorder(
     )
     assert given == scenario_file.to_text(step)
     assert [path for path in texts if path.endswith("/scenario.yaml")] in ([], ["lab/scenario.yaml"])
+    assert list(TARGETS[target](hosts, step).items()) == list(texts.items())  # deterministic
 
 
 @ALL
@@ -208,12 +199,6 @@ def test_no_key_and_no_launcher_s_access_is_in_a_text(target: str, tmp_path: Pat
     together = "\n".join(texts.values())
     assert not re.search(r"PRIVATE KEY|MC4CAQ|BEGIN|launcher|10\.0\.0\.1", together)
     assert not [one for one in manifests(texts) if one.get("kind") == "Secret"]
-
-
-@ALL
-def test_the_same_input_gives_the_same_text(target: str, tmp_path: Path) -> None:
-    first, second = (TARGETS[target](placed(tmp_path), scenario_file.load(STEP)) for _ in range(2))
-    assert list(first.items()) == list(second.items())
 
 
 @ALL
@@ -256,8 +241,19 @@ def options_of(text: str) -> dict[str, list[str]]:
     return found
 
 
-def test_units_run_the_host_s_python_as_its_user_and_write_nowhere_else(hosts: InventoryFile, step: Scenario) -> None:
-    texts = systemd(hosts, step)
+LOCKED_UNIT = {
+    "ProtectSystem": ["strict"],
+    "ProtectHome": ["read-only"],
+    "NoNewPrivileges": ["yes"],
+    "PrivateTmp": ["yes"],
+    "CapabilityBoundingSet": [""],
+    "StateDirectory": ["zsim"],
+    "CacheDirectory": ["zsim"],
+}
+
+
+def test_units_run_the_host_s_python_as_its_user_and_write_nowhere_else(usual: Texts) -> None:
+    texts = usual["systemd"]
     for path, user, python in [
         ("lab/zsim-world.service", "lab", "/opt/zsim/venv/bin/python"),
         ("one/zsim-estimator.drone1.service", "pi", "/home/pi/.zsim/venv/bin/python"),
@@ -268,11 +264,7 @@ def test_units_run_the_host_s_python_as_its_user_and_write_nowhere_else(hosts: I
         assert options["ExecStart"][0].split()[0] == f":{python}"
     for text in (text for path, text in texts.items() if path.endswith(".service")):
         options = options_of(text)
-        assert options["ProtectSystem"] == ["strict"]
-        assert options["ProtectHome"] == ["read-only"]
-        assert options["NoNewPrivileges"] == options["PrivateTmp"] == ["yes"]
-        assert options["CapabilityBoundingSet"] == [""]
-        assert options["StateDirectory"] == options["CacheDirectory"] == ["zsim"]
+        assert LOCKED_UNIT.items() <= options.items()
         assert "ReadWritePaths" not in options
     words = of_systemd(texts)
     assert option(words["world"][1], "--tls") == "/opt/zsim/certs/world"
@@ -280,11 +272,14 @@ def test_units_run_the_host_s_python_as_its_user_and_write_nowhere_else(hosts: I
     assert option(words["router.yard"][1], "--access") == "/home/pi/.zsim/certs/router.yard.access.json"
 
 
-def test_a_recorder_that_is_started_again_has_the_folder_of_its_run(hosts: InventoryFile, step: Scenario) -> None:
+def test_a_recorder_that_is_started_again_has_the_folder_of_its_run(usual: Texts) -> None:
     """Nothing in it changes with a start: neither an invocation's id nor a Pod's name."""
-    assert option(of_systemd(systemd(hosts, step))["recorder"][1], "--out") == "/var/lib/zsim/runs/step-{run}"
-    assert option(of_kubernetes(kubernetes(hosts, step))["recorder"][1], "--out") == "/runs/{run}"
-    assert option(of_compose(compose(hosts, step))["recorder"][1], "--out") == "/runs/${ZSIM_RUN:-step}"
+    found = {target: option(READ[target](texts)["recorder"][1], "--out") for target, texts in usual.items()}
+    assert found == {
+        "systemd": "/var/lib/zsim/runs/step-{run}",
+        "compose": "/runs/${ZSIM_RUN:-step}",
+        "kubernetes": "/runs/{run}",
+    }
 
 
 def test_systemd_restarts_what_on_death_says(hosts: InventoryFile) -> None:
@@ -313,8 +308,8 @@ def test_the_world_is_stopped_first_and_a_router_last(tmp_path: Path, step: Scen
     assert {*others, "zsim-recorder.service", "zsim-router.yard.service"} <= set(order["zsim-world.service"])
 
 
-def test_the_target_wants_every_unit_of_its_host_and_they_stop_with_it(hosts: InventoryFile, step: Scenario) -> None:
-    texts = systemd(hosts, step)
+def test_the_target_wants_every_unit_of_its_host_and_they_stop_with_it(usual: Texts) -> None:
+    texts = usual["systemd"]
     for host in ("lab", "one", "two"):
         units = {path.split("/")[1] for path in texts if path.startswith(f"{host}/") and path.endswith(".service")}
         assert set(options_of(texts[f"{host}/zsim.target"])["Wants"][0].split()) == units
@@ -350,10 +345,18 @@ def test_no_line_of_an_inventory_becomes_an_option(field: str, tmp_path: Path, s
         systemd(placed(tmp_path, HOSTS.replace("folder: /opt/zsim", f"{field}: /opt/zsim{'/' + 3999 * 'n'}")), step)
 
 
-def test_containers_may_write_records_and_nothing_else_and_end_as_roles_do(
-    hosts: InventoryFile, step: Scenario
-) -> None:
-    for path, project in projects(compose(hosts, step)).items():
+LOCKED_SERVICE = {
+    "read_only": True,
+    "init": True,
+    "cap_drop": ["ALL"],
+    "security_opt": ["no-new-privileges:true"],
+    "network_mode": "host",
+    "stop_signal": "SIGTERM",
+}
+
+
+def test_containers_may_write_records_and_nothing_else_and_end_as_roles_do(usual: Texts) -> None:
+    for path, project in projects(usual["compose"]).items():
         for name, service in project["services"].items():
             binds = {v["target"]: v["read_only"] for v in service["volumes"] if v["type"] == "bind"}
             assert binds.pop("/certs") is True, (path, name)
@@ -363,50 +366,47 @@ def test_containers_may_write_records_and_nothing_else_and_end_as_roles_do(
                 *(["/scenario/scenario.yaml"] if name == "world" else []),
                 *(["/access/access.json"] if name in LISTENS else []),
             }
-            assert service["read_only"] is service["init"] is True
-            assert service["cap_drop"] == ["ALL"]
-            assert service["security_opt"] == ["no-new-privileges:true"]
-            assert service["network_mode"] == "host"
-            assert service["stop_signal"] == "SIGTERM"
-            assert service["restart"] == ("no" if name == "world" else "on-failure:5")
+            restart = "no" if name == "world" else "on-failure:5"
+            assert {**LOCKED_SERVICE, "restart": restart}.items() <= service.items()
 
 
-def test_an_image_has_the_extras_that_its_host_needs(hosts: InventoryFile, step: Scenario, tmp_path: Path) -> None:
-    texts = compose(hosts, step)
+def test_an_image_has_the_extras_that_its_host_needs(usual: Texts, step: Scenario, tmp_path: Path) -> None:
+    texts = usual["compose"]
     extras = {path.split("/")[0]: re.findall(r"whl\[(.*)\]", text) for path, text in texts.items() if "Docker" in path}
     assert extras == {"lab": ["record,world"], "one": ["agents"], "two": ["agents"]}
     wanted = ["agents", "record", "world"]
-    assert re.findall(r"whl\[(.*)\]", kubernetes(hosts, step)["Dockerfile"]) == [",".join(wanted)]
+    assert re.findall(r"whl\[(.*)\]", usual["kubernetes"]["Dockerfile"]) == [",".join(wanted)]
     given = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert set(wanted) <= set(given)
     router_alone = compose(placed(tmp_path, HOSTS.replace("[one, two]", "two")), step)["one/Dockerfile"]
     assert "py3-none-any.whl\"" in router_alone  # fmt: skip
 
 
-def test_what_containers_do_not_need_of_the_inventory_is_said(hosts: InventoryFile, step: Scenario) -> None:
-    texts = compose(hosts, step)
+def test_what_containers_do_not_need_of_the_inventory_is_said(usual: Texts) -> None:
+    texts = usual["compose"]
     assert has_terms(texts["two/compose.yaml"], "# hosts.two", "python", "not used")
     assert "not used" not in texts["one/compose.yaml"]
 
 
-def test_pods_are_locked_and_end_as_roles_do(hosts: InventoryFile, step: Scenario) -> None:
-    for one in pods(kubernetes(hosts, step)):
+LOCKED_BOX = {
+    "readOnlyRootFilesystem": True,
+    "allowPrivilegeEscalation": False,
+    "capabilities": {"drop": ["ALL"]},
+}
+
+
+def test_pods_are_locked_and_have_their_own_certificate_read_only(usual: Texts) -> None:
+    texts = usual["kubernetes"]
+    seen = []
+    for one in pods(texts):
         (box,) = one["containers"]
         assert one["securityContext"]["runAsNonRoot"] is True
         assert one["securityContext"]["runAsUser"] != 0
         assert one["automountServiceAccountToken"] is False
         assert one["terminationGracePeriodSeconds"] >= 10
-        assert box["securityContext"]["readOnlyRootFilesystem"] is True
-        assert box["securityContext"]["allowPrivilegeEscalation"] is False
-        assert box["securityContext"]["capabilities"] == {"drop": ["ALL"]}
+        assert LOCKED_BOX.items() <= box["securityContext"].items()
         assert {"requests", "limits"} == set(box["resources"])
-
-
-def test_pods_have_their_own_certificate_read_only(hosts: InventoryFile, step: Scenario) -> None:
-    texts = kubernetes(hosts, step)
-    seen = []
-    for one in pods(texts):
-        mounts = {m["name"]: m for m in one["containers"][0]["volumeMounts"]}
+        mounts = {m["name"]: m for m in box["volumeMounts"]}
         volumes = {v["name"]: v for v in one["volumes"]}
         assert set(mounts) == set(volumes)
         assert mounts["certs"]["readOnly"] is True
@@ -421,8 +421,8 @@ def test_pods_have_their_own_certificate_read_only(hosts: InventoryFile, step: S
     assert {process: host for _, host, process in made} == PLACES
 
 
-def test_roles_are_jobs_and_routers_deployments(hosts: InventoryFile, step: Scenario) -> None:
-    found = manifests(kubernetes(hosts, step))
+def test_roles_are_jobs_and_routers_deployments(usual: Texts) -> None:
+    found = manifests(usual["kubernetes"])
     jobs = {one["metadata"]["name"]: one["spec"]["backoffLimit"] for one in found if one["kind"] == "Job"}
     restarted = [name.replace(".", "-") for name in PLACES if name not in ("world", "router.yard")]
     assert jobs == {"world": 0, **dict.fromkeys(restarted, 5)}
@@ -469,13 +469,12 @@ def call(folder: Path, target: str, *options: str) -> Any:
 
 
 @ALL
-def test_the_command_writes_what_is_rendered(target: str, hosts: InventoryFile, step: Scenario, tmp_path: Path) -> None:
-    done = call(tmp_path, target)
+@pytest.mark.usefixtures("hosts")
+def test_the_command_writes_what_is_rendered(target: str, usual: Texts, tmp_path: Path) -> None:
+    done, out = call(tmp_path, target), tmp_path / "out"
     assert done.exit_code == 0, done.output
-    texts = TARGETS[target](hosts, step)
-    out = tmp_path / "out"
-    assert files(out) == texts
-    assert done.stdout == f"{len(texts)} files in {out}\n"
+    assert files(out) == usual[target]
+    assert done.stdout == f"{len(usual[target])} files in {out}\n"
 
 
 def files(out: Path) -> dict[str, str]:
@@ -501,7 +500,8 @@ def test_nothing_of_an_earlier_rendering_is_left(
     assert any(name.startswith("lab/") for name in gone)
 
 
-def test_what_somebody_else_put_there_stays(hosts: InventoryFile, step: Scenario, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("hosts")
+def test_what_somebody_else_put_there_stays(usual: Texts, step: Scenario, tmp_path: Path) -> None:
     """A file beside the rendered ones, one that has a rendered one's text, and the files of another target."""
     out = tmp_path / "out"
     call(tmp_path, "systemd")
@@ -509,7 +509,7 @@ def test_what_somebody_else_put_there_stays(hosts: InventoryFile, step: Scenario
     (out / "lab/notes.txt").write_text("mine")
     (out / "copy").mkdir()
     (out / "copy/zsim-world.service").write_text((out / "lab/zsim-world.service").read_text())
-    kept = {"lab/notes.txt", "copy/zsim-world.service", *kubernetes(hosts, step)}
+    kept = {"lab/notes.txt", "copy/zsim-world.service", *usual["kubernetes"]}
     moved = placed(tmp_path, HOSTS.replace("world: lab", "world: one"))
     assert call(tmp_path, "systemd").exit_code == 0
     assert set(files(out)) == kept | set(systemd(moved, step))

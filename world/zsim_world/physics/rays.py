@@ -15,8 +15,21 @@ from numpy.typing import NDArray
 
 from zsim.math.compiled import inlined, noinline
 from zsim.math.rotation import Quaternion, Vector, dot, rotate_back, subtract
-from zsim.scenario.obstacle import BOX, CENTRE, COLUMNS, COSINE, CYLINDER, HALF, SHAPE, SINE, SPHERE
-from zsim.scenario.triangles import TRIANGLE, Tree, corners_of, tree_over
+from zsim.scenario.surroundings import (
+    BOX,
+    CENTRE,
+    COLUMNS,
+    COSINE,
+    CYLINDER,
+    HALF,
+    SHAPE,
+    SINE,
+    SPHERE,
+    TRIANGLE,
+    Tree,
+    corners_of,
+    tree_over,
+)
 
 HUGE = 1e300  # in place of 1 / 0: a product with it is never 0 times infinity
 HULL_FLATNESS = 0.25  # height over width of a hull, the AR.Drone's rounded: 0.13 m of 0.52 m
@@ -27,7 +40,7 @@ Array = NDArray[np.float64]
 class Scene(NamedTuple):
     """The static scene: M obstacles, T triangles, and the tree over both."""
 
-    solid: NDArray  # (M, COLUMNS), rows of zsim.scenario.obstacle
+    solid: NDArray  # (M, COLUMNS), rows of zsim.scenario.surroundings
     triangle: NDArray  # (T, TRIANGLE), m, in W
     tree: Tree  # its parts are obstacles by their number, triangles by M plus theirs
 

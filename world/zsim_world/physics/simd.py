@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from zsim.math.compiled import Field, columns, inlined, noinline
 from zsim.math.rotation import Quaternion, Vector
 from zsim_world.physics import rigid_body as body
-from zsim_world.physics.fleet_arrays import AERO, ROTOR, STATE, VEHICLE, Aero, Bodies, PerRotor, Row
-from zsim_world.physics.rigid_body import four, put, vector
+from zsim_world.physics.fleet_arrays import AERO, ROTOR, STATE, VEHICLE, Aero, Bodies, PerRotor, Row, four, put, vector
 from zsim_world.physics.surfaces import Touch, drag_anchors
 
 LANES = 8  # doubles in a register of 512 bit, or in two of 256

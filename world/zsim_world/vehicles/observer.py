@@ -29,8 +29,18 @@ from zsim.scenario.scenario import Drone, Environment
 from zsim.sensors.sensor import ErrorModel, Sensor, noise_sigma, scaled
 from zsim.sensors.stock_sensors import BOARD_RATE_HZ
 from zsim.vehicles.vehicle import Vehicle
-from zsim_world.physics.fleet_arrays import REFERENCE_DENSITY_KG_M3, VEHICLE, PerRotor, of, put_of
-from zsim_world.physics.rigid_body import four, free_thrust, lagged, put, put_four, vector
+from zsim_world.physics.fleet_arrays import (
+    REFERENCE_DENSITY_KG_M3,
+    VEHICLE,
+    PerRotor,
+    four,
+    of,
+    put,
+    put_four,
+    put_of,
+    vector,
+)
+from zsim_world.physics.rigid_body import free_thrust, lagged
 from zsim_world.sensors.sensor_set import FIELD_MIN_UT, heading_sigma
 
 STEP_S = 1.0 / BOARD_RATE_HZ  # s
@@ -138,7 +148,7 @@ def observe(
 ) -> Quaternion:
     """Advance the estimate by one step of 5 ms and process the new samples of the devices.
 
-    Body rate, attitude and heading are at the end of the step already, as the gyro has them (simd_firmware.py).
+    Body rate, attitude and heading are at the end of the step already, as the gyro has them (firmware.py).
 
     Args:
         belief: (BELIEF.size + R,) in place.

@@ -8,7 +8,7 @@ import pytest
 
 from zsim.contract.flight_messages import Estimate
 from zsim.scenario import scenario_file
-from zsim.scenario.surface_file import packed
+from zsim.scenario.surroundings import packed
 from zsim_agents.laws.pilot import Motion
 from zsim_agents.laws.virtual_structure import VirtualStructure
 

@@ -20,7 +20,7 @@ from zsim.contract.flight_messages import ClusterState
 from zsim.contract.run_messages import Event, RadioLinks
 from zsim.presentation import drone_colours
 from zsim.scenario.scenario_file import resolve
-from zsim.scenario.surface_file import packed
+from zsim.scenario.surroundings import packed
 from zsim_analysis.reading.drone_errors import Distances, EstimateErrors, Separations, VelocityResponse
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of, goal_errors
 from zsim_analysis.reading.recorded_flight import RadioHistory, RecordedFlight

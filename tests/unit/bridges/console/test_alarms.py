@@ -7,17 +7,21 @@ from refused import has_terms, without_tags
 
 from zsim.contract.flight_messages import ViewCluster
 from zsim.contract.run_messages import Event, Fault, Health
-from zsim_bridges.console import alarms
-from zsim_bridges.console.alarms import KEPT, Alarm, AlarmBoard, DroneCondition, FaultWatch, Losses
+from zsim_bridges.console import run_condition
 from zsim_bridges.console.console_tables import preflight_lines
 from zsim_bridges.console.run_condition import (
+    Alarm,
+    AlarmBoard,
     Check,
+    DroneCondition,
+    Losses,
     RunCondition,
     drone_refusals,
     fleet_refusals,
     formation_refusals,
     preflight_checks,
 )
+from zsim_bridges.console.run_monitor import FAULTS_KEPT, FaultWatch
 
 DEAD, LOW = Alarm("red", "estimator.drone1", "dead"), Alarm("amber", "drone1", "battery", "17 %")
 MEMBERS = ("drone1", "drone2", "drone3")
@@ -80,8 +84,8 @@ def test_an_acknowledged_alarm_that_becomes_red_is_new(board: AlarmBoard):
 # What is lost
 
 
-@pytest.mark.parametrize("kind", sorted(alarms.LOST))
-@pytest.mark.parametrize("back", sorted(alarms.BACK))
+@pytest.mark.parametrize("kind", sorted(run_condition.LOST))
+@pytest.mark.parametrize("back", sorted(run_condition.BACK))
 def test_what_is_lost_is_so_until_it_is_back(kind: str, back: str, losses: Losses):
     losses.note(event(kind, "detector.main", host="lab", pid=7))
     assert list(losses.now) == ["detector.main"]
@@ -126,9 +130,9 @@ def test_a_join_behind_which_nobody_is_makes_nobody_missing(losses: Losses):
     ],
 )
 def test_a_failsafe_and_a_drone_on_its_back_are_alarms_with_their_cause(change: dict[str, Any], alarm: tuple[str, str]):
-    assert alarms.drone_alarms(FIT._replace(state="flying")) == []
-    assert alarms.drone_alarms(FIT._replace(**change)) == [Alarm("red", "drone1", *alarm)]
-    assert alarms.drone_alarms(FIT._replace(state="landing")) == []  # as somebody has commanded
+    assert run_condition.drone_alarms(FIT._replace(state="flying")) == []
+    assert run_condition.drone_alarms(FIT._replace(**change)) == [Alarm("red", "drone1", *alarm)]
+    assert run_condition.drone_alarms(FIT._replace(state="landing")) == []  # as somebody has commanded
 
 
 @pytest.mark.parametrize(
@@ -146,23 +150,23 @@ def test_who_flies_a_drone_instead_of_its_formation_s_controller(
     commanders: tuple[str | None, ...], roles: dict[str, str], found: dict[str, str]
 ):
     of_drones: dict[str, str | None] = dict(zip(MEMBERS, commanders, strict=True))
-    assert alarms.foreign_commanders("controller.main", MEMBERS, of_drones, roles) == found
+    assert run_condition.foreign_commanders("controller.main", MEMBERS, of_drones, roles) == found
 
 
 def test_an_engaged_formation_with_a_drone_flown_by_hand_is_an_alarm_with_its_figures():
     view = ViewCluster(0, 0, "engaged", ("p", "yaw"), (11.6, 3.0), (4.0, 0.0), "")
     foreign = {"main": {"drone2": "console.run"}}
-    found = alarms.formation_alarms({"main": ("engaged", "")}, foreign, {"main": view})
+    found = run_condition.formation_alarms({"main": ("engaged", "")}, foreign, {"main": view})
     assert [(each.severity, each.name) for each in found] == [("amber", "not flown whole"), ("red", "off reference")]
     assert has_terms(found[0].text, "drone2", "console.run")
     assert has_terms(found[1].text, "p", "11.6 m", "4.0 m")
     near = ViewCluster(0, 0, "engaged", ("p", "yaw"), (5.9, 3.0), (4.0, 0.0), "")
-    assert alarms.formation_alarms({"main": ("engaged", "")}, {}, {"main": near}) == []
+    assert run_condition.formation_alarms({"main": ("engaged", "")}, {}, {"main": near}) == []
 
 
 def test_an_alarm_of_a_fault_has_its_magnitudes_as_the_terminal_writes_them():
     fault = Fault(1, "link_loss", "world/a", {"probability": 0.3, "one_way": False, "place": {}}, 0)
-    assert alarms.run_alarms({}, [fault], 0.0) == [
+    assert run_condition.run_alarms({}, [fault], 0.0) == [
         Alarm("amber", "world/a", "link_loss", "probability=0.3 one_way=False")
     ]
 
@@ -295,9 +299,9 @@ def test_a_kill_tells_the_death_and_the_return_of_its_process():
 
 def test_many_faults_that_are_over_are_not_kept():
     watch = FaultWatch()
-    for number in range(3 * KEPT):
+    for number in range(3 * FAULTS_KEPT):
         fault = Fault(number, "gps_stuck", "drone1", {}, 0)
         watch.update([], [fault], {"drone1": FIT}, {}, (), 0.0)
     watch.update([], [], {"drone1": FIT}, {}, (), 0.0)
-    assert len(watch.lines(is_over=True)) == KEPT
+    assert len(watch.lines(is_over=True)) == FAULTS_KEPT
     assert watch.lines() == []

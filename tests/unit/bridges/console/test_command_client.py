@@ -10,7 +10,7 @@ from refused import has_terms
 
 from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import SessionError
-from zsim_bridges.console.command_client import (
+from zsim_bridges.console.orders import (
     OVERTAKEN,
     PRIORITY,
     PRIORITY_EMERGENCY,

@@ -9,9 +9,9 @@ from refused import has_terms, without_tags
 
 from zsim.contract.run_messages import Event
 from zsim_bridges.console import console_tables
-from zsim_bridges.console.alarms import DroneCondition, drone_alarms
 from zsim_bridges.console.console_page import FILTERS, MANY, NO_ROW, SORTINGS, FleetTable, filtered_rows
 from zsim_bridges.console.console_tables import DroneRow, SensorRates, drone_table
+from zsim_bridges.console.run_condition import DroneCondition, drone_alarms
 from zsim_bridges.console.view_buffer import ALL, OWN, ROWS_KEPT, EventLog, EventRow, chosen_rows
 
 S = 1_000_000_000

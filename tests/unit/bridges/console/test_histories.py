@@ -26,11 +26,10 @@ from zsim_bridges.console.histories import (
     VariableHistory,
     VariablePlots,
 )
-from zsim_bridges.console.operator_input import SliderRange
 from zsim_bridges.console.picture import DronePoses
 
 CLUSTER = scenario_file.load(Path(__file__).parents[4] / "scenarios" / "step.yaml").clusters[0]
-RANGES = [SliderRange(name, "m", 0.0, 9.0, 0.1) for name in ("x_c", "y_c", "z_c", "p")]
+NAMES = ("x_c", "y_c", "z_c", "p")
 
 # Trails
 
@@ -174,7 +173,7 @@ class Plotted:
     def __init__(self, seconds: int = 100) -> None:
         self.gui: Any = Gui()
         self.flights = filled(seconds)
-        self.plots = VariablePlots(self.gui, CLUSTER, RANGES, self.flights)
+        self.plots = VariablePlots(self.gui, CLUSTER, NAMES, self.flights)
         self.choice = self.gui.at["variables"]
 
     def choose(self, drone: str) -> None:

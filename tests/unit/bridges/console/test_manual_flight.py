@@ -1,7 +1,10 @@
-"""Drones that are flown from pages: who may, what is sent when, and what a page that is silent or gone leaves behind. The geofence of drones that are flown from a page, and velocities within it."""
+"""Drones flown from pages: who may, what is sent when, the geofence, what a silent page leaves behind, and returns."""
 
 import math
+from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -9,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from refused import has_terms
 
+from zsim.contract.flight_messages import ViewCluster
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Piloted
 from zsim.vehicles.vehicle import Limits
+from zsim_agents.references.cruise import Course
 from zsim_agents.references.path import SHARE, PathLimits
-from zsim_agents.references.tracking import Course
-from zsim_bridges.console.command_client import NoAnswer
 from zsim_bridges.console.manual_flight import (
     GONE_S,
     PERIOD_S,
@@ -22,13 +25,16 @@ from zsim_bridges.console.manual_flight import (
     STALE_S,
     DronePose,
     DroneSight,
+    FlightAnswer,
     Geofence,
     ManualFlight,
+    ReturnFlights,
     RunSight,
     Stick,
     geofence_of,
     stick_velocity,
 )
+from zsim_bridges.console.orders import NoAnswer
 
 NAME = "console.1"
 ACCEL_M_S2, LAW = 2.5, Piloted()
@@ -385,3 +391,117 @@ def test_a_velocity_is_in_the_heading_frame_and_within_the_fence():
     # it looks north at the fence in the north: nothing is left of forward, all of left
     flown = stick_velocity(Stick(1.0, 1.0, 0.0, 0.0, 1.0), DronePose((0.0, 50.0, 5.0), math.pi / 2), LIMITS, FENCE)
     assert flown.velocity_m_s == pytest.approx((0.0, math.sqrt(0.5), 0.0), abs=1e-9)
+
+
+SCENARIO = scenario_file.load(Path(__file__).parents[4] / "scenarios" / "step.yaml")
+NAMES = ("x_c", "y_c", "z_c")
+
+
+class Returns:
+    """Returns in a run that only the test performs."""
+
+    def __init__(self) -> None:
+        self.said: list[Any] = []
+        self.notes: list[tuple[str, str]] = []
+        self.requests: Counter[str] = Counter()
+        self.answer = FlightAnswer("drone1", "taking")
+        self.is_sent = False
+        self.sight = DroneSight("flying", "console.1", DronePose((5.0, 5.0, 10.0), 0.0))
+        self.view = ViewCluster(0, 0, "engaged", NAMES, (5.0, -5.0, 15.0), (5.0, -5.0, 15.0), "")
+        client: Any = SimpleNamespace(
+            request_cluster=self._request, cluster_requests=self.requests,
+            send_mode=lambda drones, mode: self.said.append((mode, drones)),
+        )  # fmt: skip
+        control: Any = SimpleNamespace(
+            take=lambda page, drone, over: self.answer, steer=lambda page, stick: self.answer,
+            leave=lambda page: self.said.append("leave"), go=self._go, is_on_way=lambda page: self.is_sent,
+        )  # fmt: skip
+        self.flights = ReturnFlights(
+            SCENARIO,
+            client,
+            control,
+            lambda _: self.sight,
+            lambda: {"main": self.view},
+            lambda *n: self.notes.append(n),
+        )
+
+    def _request(self, cluster: str, op: str, **args: Any) -> None:
+        self.requests[cluster] += 1
+        self.said.append((op, args))
+
+    def _go(self, page: Any, x_m: float, y_m: float) -> None:
+        self.is_sent = True
+        self.said.append(("go", x_m, y_m))
+
+    def tick(self) -> list[Any]:
+        self.said.clear()
+        self.flights.tick()
+        return list(self.said)
+
+    def fly_to(self, x_m: float, y_m: float, desired: tuple[float, float] | None = None) -> None:
+        value = (x_m, y_m, 15.0)
+        goal = value if desired is None else (*desired, 15.0)
+        self.view = ViewCluster(0, 0, "engaged", NAMES, value, goal, "")
+
+
+@pytest.fixture
+def returns() -> Returns:
+    return Returns()
+
+
+def test_a_drone_is_sent_over_its_start_and_lands_there(returns: Returns):
+    returns.flights.request_drones(["drone1"])
+    assert returns.tick() == []  # it is being taken
+    returns.answer = FlightAnswer("drone1", "flying")
+    assert returns.tick() == [("go", 0.0, 1.5)]
+    assert returns.tick() == []
+    returns.sight = DroneSight("flying", "console.1", DronePose((0.2, 1.3, 10.0), 0.0))
+    assert returns.tick() == ["leave", ("land", ["drone1"])]
+    assert returns.tick() == []
+    assert returns.notes == []
+
+
+def test_a_drone_that_somebody_else_takes_does_not_land(returns: Returns):
+    returns.flights.request_drones(["drone1"])
+    returns.answer = FlightAnswer("drone1", "none", "drone1 is flown by driver.x now")
+    assert returns.tick() == []
+    assert [subject for subject, _ in returns.notes] == ["drone1"]
+    returns.sight = DroneSight("flying", "driver.x", DronePose((0.0, 1.5, 10.0), 0.0))
+    assert returns.tick() == []
+
+
+def test_a_drone_that_may_not_be_taken_says_why(returns: Returns):
+    returns.answer = FlightAnswer("drone1", "none", "drone1 is landed")
+    returns.flights.request_drones(["drone1"])
+    assert returns.notes == [("drone1", "drone1 is landed")]
+    assert returns.tick() == []
+
+
+def test_a_formation_is_led_over_the_middle_of_its_starts_and_lands_there(returns: Returns):
+    returns.flights.request_formation("main")
+    assert returns.said == [("target", {"values": {"x_c": 0.0, "y_c": -0.5}})]
+    assert returns.tick() == []
+    returns.fly_to(0.0, -0.5, desired=(2.0, -2.0))  # it happens to be there, on its way
+    assert returns.tick() == []
+    returns.fly_to(0.1, -0.4, desired=(0.0, -0.5))
+    assert returns.tick() == [("land", {})]
+    assert returns.tick() == []
+
+
+@pytest.mark.parametrize("how", ["request", "elsewhere", "held", "refused"])
+def test_a_formation_that_does_not_return_any_more_does_not_land(returns: Returns, how: str):
+    returns.flights.request_formation("main")
+    returns.fly_to(1.0, -1.0)
+    assert returns.tick() == []
+    if how == "request":
+        returns.requests["main"] += 1
+    elif how == "elsewhere":
+        returns.fly_to(4.0, -4.0)
+    elif how == "held":
+        returns.view = ViewCluster(0, 0, "held", NAMES, (0.0, -0.5, 15.0), (0.0, -0.5, 15.0), "")
+    else:
+        returns.flights.refused("main")
+    assert returns.tick() == []
+    returns.fly_to(0.0, -0.5)
+    assert returns.tick() == []
+    assert bool(returns.notes) == (how in ("elsewhere", "held"))

@@ -7,8 +7,7 @@ import pytest
 from refused import has_terms
 
 from zsim.contract.run_messages import Event
-from zsim_bridges.console.command_client import RequestOutcome
-from zsim_bridges.console.orders import REPEAT_S, SHOWN_S, OrderBook, OrderRequest
+from zsim_bridges.console.orders import REPEAT_S, SHOWN_S, OrderBook, OrderRequest, RequestOutcome
 
 DRONES = ("drone1", "drone2", "drone3")
 S = 1_000_000_000  # ns

@@ -1,7 +1,9 @@
-"""The picture of a run as arrays. What a formation would fly: the ways of its drones, from where it is."""
+"""The picture of a run as arrays: poses, the plan view, and the ways that a formation would fly."""
 
+import json
 import math
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -12,9 +14,12 @@ from zsim.contract.flight_messages import DroneView, EstimateView, ViewCluster, 
 from zsim.math import frames
 from zsim.presentation import drone_colours, rgb
 from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Surface
+from zsim.scenario.surroundings import outline_of, packed
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
-from zsim_bridges.console import airframe
 from zsim_bridges.console import picture as pic
+from zsim_bridges.console import scene
+from zsim_bridges.console.histories import CanvasTrails
 from zsim_bridges.console.picture import PreviewError, preview_of
 from zsim_bridges.console.scene import DARK, LIGHT, LUMINANCE_MIN, lightened, linear, luminance
 
@@ -56,10 +61,11 @@ def test_links_of_the_radio_are_lines_between_drones_that_are_there():
 
 
 def test_many_names_are_shown_by_what_tells_them_apart():
-    assert pic.short_names(["drone1", "drone2", "drone30"]) == ["1", "2", "30"]
-    assert pic.short_names(["drone10", "drone11"]) == ["10", "11"]
-    assert pic.short_names(["north", "south"]) == ["north", "south"]
-    assert pic.short_names(["drone", "drone2"]) == ["drone", "drone2"]
+    many = range(10, 10 + pic.LARGE_MAX + 1)
+    assert pic.shown_names([f"drone{i}" for i in many]) == [str(i) for i in many]
+    assert pic.shown_names(["drone1", "drone2"]) == ["drone1", "drone2"]  # there is room
+    for names in (["drone", *(f"drone{i}" for i in many)], [*(f"{'abcdefghijklmn'[i % 14]}{i}" for i in many)]):
+        assert pic.shown_names(names) == names
 
 
 def test_rotors_stand_on_their_drone_and_turn_about_its_axis():
@@ -197,7 +203,7 @@ def test_colours_of_lines_are_in_linear_light() -> None:
 @pytest.mark.parametrize("ground", [LIGHT[0], DARK[0]])
 @pytest.mark.parametrize("part", ["cross", "hull", "rotor"])
 def test_drones_are_seen_on_the_ground_of_both_themes(ground: tuple[int, int, int], part: str):
-    light, dark = sorted((luminance(airframe.COLOURS[part]), luminance(ground)), reverse=True)
+    light, dark = sorted((luminance(scene.COLOURS[part]), luminance(ground)), reverse=True)
     assert (light + 0.05) / (dark + 0.05) > CONTRAST_MIN
 
 
@@ -220,3 +226,75 @@ def test_paths_of_drones_that_fly_by_themselves_are_lines_from_their_hover_to_th
     ends = np.array(scenario.exchanges[0].stages[0].places_m)
     assert np.linalg.norm(ends - first[-1, 1], axis=1).min() < 1e-9
     assert len(pic.reference_lines(scenario_file.load(SCENARIOS / "step.yaml"))) == 0
+
+
+# The plan view
+
+
+FIELD = """
+name: field
+duration_s: 1
+drones: [{name: drone1, position_m: [0, 0, 0]}, {name: drone2, position_m: [3, 0, 0]}]
+environment:
+  obstacles:
+    - {name: wall, shape: box, position_m: [5, 1, 0], size_m: [1, 4, 3], yaw_deg: 30}
+    - {name: mast, shape: cylinder, position_m: [9, 0, 0], radius_m: 0.2, height_m: 6}
+"""
+NORTH = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
+
+
+def drone_view(name: str, x: float = 0.0) -> DroneView:
+    return DroneView(name, (x, 2.0, 5.0), NORTH, (0.0,) * 4, "flying", 90.0)
+
+
+def test_what_stands_around_the_drones():
+    scenario = scenario_file.from_text(FIELD)
+    around = pic.surroundings(scenario)
+    assert around["names"] == around["labels"] == ["drone1", "drone2"]
+    assert len(set(around["colours"])) == 2
+    wall, mast = around["obstacles"]
+    assert wall == {"name": "wall", "x_m": 5.0, "y_m": 1.0, "yaw_deg": 30.0, "radius_m": None, "size_m": [1.0, 4.0]}
+    assert (mast["x_m"], mast["radius_m"], mast["size_m"]) == (9.0, 0.2, None)
+    assert around["surfaces"] == []
+    corners = np.array([[0, 0, 0, 2, 0, 3, 2, 1, 0], [0, 0, 0, 2, 1, 0, 0, 1, 1], [1, 0.5, 9, 0, 0, 0, 1, 0, 0]], float)
+    stone = Surface(name="stone", triangles=packed(corners), position_m=(5, 6, 0), yaw_deg=90)
+    outline = [[4.0, 6.0], [5.0, 6.0], [5.0, 8.0], [4.0, 8.0]]
+    assert outline_of(stone) == outline
+
+
+def test_drones_by_place_heading_and_state_and_none_where_one_is_not_seen():
+    poses = pic.drone_poses(ViewDrones(0, 0, (drone_view("drone2", 3.456),), ()), ("drone1", "drone2"))
+    nobody, seen = pic.plan_positions(poses, {"drone2": "flying"})
+    assert nobody is None
+    assert seen == [3.46, 2.0, 5.0, 1.571, "flying"]
+
+
+def test_a_formation_has_its_places_while_it_has_somewhere_to_be():
+    space = cluster_space(3)
+    p_W = np.array([(0.0, 1.5, 5.0), (-1.5, -1.5, 5.0), (1.5, -1.5, 5.0)])
+    c = tuple(space.forward(p_W, np.zeros(3)).tolist())
+    views = {phase: ViewCluster(0, 0, phase, space.names, c, c, "") for phase in ("idle", "engaged")}
+    shown: list[dict[str, Any]] = pic.plan_formations(
+        {"idle": space, "engaged": space}, {"idle": [0, 1, 2], "engaged": [0, 1, 2]}, views
+    )
+    assert [each["phase"] for each in shown] == ["idle", "engaged"]
+    assert shown[0]["places"] == []
+    assert np.allclose(shown[1]["places"], p_W[:, :2])
+
+
+def test_trails_are_the_last_stretch_of_each_way():
+    names, trails = ("drone1", "drone2"), CanvasTrails(2)
+    poses = pic.drone_poses(ViewDrones(0, 0, (drone_view("drone1"),), ()), names)
+    for x in range(4):
+        poses = pic.drone_poses(ViewDrones(x * 10**9, 0, (drone_view("drone1", float(x)),), ()), names)
+        trails.add(float(x), poses.p_W)
+    way, nothing = trails.lines(3.0, poses.p_W)
+    assert way == [[0.0, 2.0, 0.0], [1.0, 2.0, 1.0], [2.0, 2.0, 2.0]]  # and from there to where it is
+    assert nothing == []
+
+
+def test_a_look_at_a_hundred_drones_is_small():
+    """Ten looks a second of a page: a few kilobytes each."""
+    names = tuple(f"drone{i}" for i in range(1, 101))
+    poses = pic.drone_poses(ViewDrones(0, 0, tuple(drone_view(name, 123.456) for name in names), ()), names)
+    assert len(json.dumps(pic.plan_positions(poses, dict.fromkeys(names, "flying")))) < 6_000

@@ -10,8 +10,9 @@ import msgspec
 import pytest
 from viser._messages import GuiUpdateMessage
 
-from zsim_bridges.console.page_server import OPERATOR, VIEWER
-from zsim_bridges.console.private_viser import (
+from zsim_bridges.console.page_server import (
+    OPERATOR,
+    VIEWER,
     AnyThreadEvent,
     Buffer,
     PageControls,

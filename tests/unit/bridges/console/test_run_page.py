@@ -17,18 +17,17 @@ from zsim.contract.messages import DroneInfo, RotorInfo
 from zsim.contract.run_messages import ControlAnswer, Event
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Surface
-from zsim.scenario.surface_file import packed
+from zsim.scenario.surroundings import packed
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import console_tables
 from zsim_bridges.console import scene as stages
-from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.console_server import RunPage, picture_rate_hz
-from zsim_bridges.console.orders import OrderRequest
+from zsim_bridges.console.orders import OrderRequest, RequestOutcome
 from zsim_bridges.console.page_cameras import PageCameras
+from zsim_bridges.console.page_server import PrivateViser
 from zsim_bridges.console.picture import drone_poses
-from zsim_bridges.console.private_viser import PrivateViser
 from zsim_bridges.console.run_condition import drone_refusals
-from zsim_bridges.console.time_monitor import TimeMonitor
+from zsim_bridges.console.run_monitor import TimeMonitor
 
 STEP = Path(__file__).parents[4] / "scenarios" / "step.yaml"
 SCENARIO = scenario_file.load(STEP)

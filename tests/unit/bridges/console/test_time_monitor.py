@@ -16,13 +16,12 @@ from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health, Wait
 from zsim.math import frames
 from zsim.runtime.participant import Participant
 from zsim.scenario.scenario import Environment, Obstacle, Surface
-from zsim.scenario.surface_file import packed
+from zsim.scenario.surroundings import packed
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.console_server import console_state
 from zsim_bridges.console.console_tables import TableRows
 from zsim_bridges.console.run_condition import RunCondition, page_head
-from zsim_bridges.console.run_monitor import FlightMeter
-from zsim_bridges.console.time_monitor import BEAT_S, SILENT_S, RecordPlayer, TimeMonitor
+from zsim_bridges.console.run_monitor import BEAT_S, SILENT_S, FlightMeter, RecordPlayer, TimeMonitor
 from zsim_bridges.console.view_buffer import ReceivedEstimate, ViewBuffer
 
 S = 1_000_000_000  # ns

@@ -41,8 +41,7 @@ from zsim_bridges.gateway.client_messages import (
 from zsim_bridges.gateway.client_streams import Outbox
 from zsim_bridges.gateway.gateway_server import Client
 from zsim_bridges.gateway.http_server import AccessCheck, described_sample, description, methods_of, value_event
-from zsim_bridges.gateway.lockstep_session import LockstepSession, gate_keys_of
-from zsim_bridges.gateway.run_access import EchoFilter, LastValues
+from zsim_bridges.gateway.run_access import EchoFilter, LastValues, LockstepSession, gate_keys_of
 
 VELOCITY = "drone/drone1/cmd/velocity"
 GATE_NS = 20_000_000

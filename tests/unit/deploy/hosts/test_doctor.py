@@ -6,18 +6,21 @@ import io
 import itertools
 import json
 import os
-import pathlib
 import platform
+import shutil
 import socket
+import subprocess
+import sys
 import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, contextmanager, nullcontext
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from local_host import Text
+from local_host import LocalHost, Text
 from refused import has_terms, refused
 
 from zsim import __version__
@@ -31,7 +34,10 @@ from zsim_deploy.hosts.doctor import (
     NetworkPath,
     check_hosts,
     compare_reports,
+    leftovers,
     path_faults,
+    port_faults,
+    scp,
 )
 from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.inventory import Host, Inventory, InventoryFile
@@ -123,7 +129,7 @@ def test_a_port_on_which_nothing_can_listen_is_not_called_unreachable(found, ter
     assert warnings == []
 
 
-def checked_up(folder: pathlib.Path) -> CheckResult:
+def checked_up(folder: Path) -> CheckResult:
     """Check up a host that does not answer, of an inventory in a folder."""
     host = Host(address="127.0.0.1", port=1, user="nobody")  # tcpmux; nobody has it
     return check_hosts(InventoryFile(Inventory(hosts={"h1": host}, roles={"world": "h1"}), folder, "lab.yaml"), None)
@@ -149,7 +155,7 @@ class Silent(HostLink):
     """A host that takes commands and never says anything, or says some lines and ends with a code."""
 
     def __init__(self, out: str | None = None, error: str = "", code: int = 1, python: str | None = None) -> None:
-        super().__init__("h1", Host(address="192.0.2.1", python=python), pathlib.Path())
+        super().__init__("h1", Host(address="192.0.2.1", python=python), Path())
         self._said = (out, error)
         self._code = code
 
@@ -302,3 +308,60 @@ def test_a_folder_is_asked_for_where_it_would_be_made(tmp_path, monkeypatch):
     assert has_terms(probe.unwritable(tmp_path / "file" / "zsim"), f"{tmp_path}/file", "not a folder")
     monkeypatch.setattr(probe.os, "access", lambda path, _mode: path != tmp_path)
     assert has_terms(probe.unwritable(tmp_path / "zsim"), str(tmp_path), "written")
+
+
+WAITS = "import sys; print('there', flush=True); sys.stdin.read()"
+
+
+def local(folder: Path) -> LocalHost:
+    return LocalHost(base=Path("/inventory"), folder=str(folder), user="pi", port=2222)
+
+
+def run_of(folder: Path, run: str, *files: str) -> None:
+    for file in files:
+        path = folder / "runs" / run / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+
+
+def test_records_and_keys_are_told_in_a_line_each(tmp_path: Path) -> None:
+    assert asyncio.run(leftovers(local(tmp_path / "not there"), tmp_path)) == []
+    folder = tmp_path / "our zsim"
+    run_of(folder, "ghi", "scenario.yaml", "identity/world/ca.pem")
+    assert asyncio.run(leftovers(local(folder), tmp_path)) == []
+    run_of(folder, "abc", "run.mcap")
+    run_of(folder, "def", "run.mcap", "identity/world/key.pem")
+    records, keys = asyncio.run(leftovers(local(folder), Path("/inventory")))
+    assert f"h1:{folder}/runs/abc/run.mcap, h1:{folder}/runs/def/run.mcap;" in records
+    assert f"`scp -P 2222 'pi@127.0.0.1:{folder}/runs/abc/run.mcap' .`" in records
+    assert f"`rm -r '{folder}/runs/def/identity'`" in keys
+
+
+@pytest.mark.skipif(shutil.which("ps") is None, reason="needs ps (apt-get install procps)")
+def test_a_run_that_goes_on_is_no_earlier_one(tmp_path: Path) -> None:
+    run_of(tmp_path, "abcdef", "run.mcap", "identity/world/key.pem")
+    words = [sys.executable, "-c", WAITS, "world", "--launched", "abcdef", "--host", "h1"]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout
+        process.stdout.readline()
+        assert asyncio.run(leftovers(local(tmp_path), tmp_path)) == []
+        process.communicate()
+    assert len(asyncio.run(leftovers(local(tmp_path), tmp_path))) == 2
+
+
+def test_the_way_of_a_copy_is_that_of_the_launcher() -> None:
+    host = Host(address="::1", ssh="fe80::1", key="keys/a b", known_hosts="/etc/known")
+    command = "scp -i '/lab/keys/a b' -o UserKnownHostsFile=/etc/known '[fe80::1]:.zsim/runs/1/run.mcap' ."
+    assert scp(host, Path("/lab"), "~/.zsim/runs/1/run.mcap") == command
+    assert scp(Host(address="h1"), Path(), "~/.zsim/runs/1/run.mcap") == "scp h1:.zsim/runs/1/run.mcap ."
+
+
+def test_a_port_on_which_somebody_listens_is_a_line() -> None:
+    link = LocalHost()
+    with socket.create_server(("127.0.0.1", 0)) as taken, socket.create_server(("127.0.0.1", 0)) as free:
+        numbers = [found.getsockname()[1] for found in (taken, free)]
+        free.close()
+        (line,) = asyncio.run(port_faults(link, sys.executable, numbers))
+    assert has_terms(line, "h1", f"port {numbers[0]}", "in use")
+    assert asyncio.run(port_faults(link, sys.executable, numbers[1:])) == []
+    assert asyncio.run(port_faults(link, "/no/python", [])) == []

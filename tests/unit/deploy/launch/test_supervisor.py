@@ -138,11 +138,77 @@ def test_who_fails_after_the_end_is_why_the_run_failed(name: str):
     assert has_terms(outcome.reason, name, "143")
 
 
-def test_a_dead_estimator_is_started_again():
-    team = Team(Member("estimator.d1", 1, None))
+# (name, exit codes, settings of the processes, whether the run fails, restarts)
+DEATHS: list[tuple[str, list[int], dict[str, Any], bool, int]] = [
+    ("estimator.d1", [1], {}, False, 1),
+    ("estimator.d1", [USER_FAULT], {}, True, 0),
+    ("estimator.d1", [1], {"on_death": {"estimator": "drop"}}, False, 0),
+    ("estimator.d1", [1], {"on_death": {"estimator.d1": "end", "estimator": "drop"}}, True, 0),
+    ("estimator.d1", [SUPERSEDED], {"on_death": {"estimator": "end"}}, False, 0),
+    ("estimator.d1", [0], {"on_death": {"estimator": "end"}}, False, 0),
+    ("recorder2", [1], {}, False, 0),
+    ("camera.main", [USER_FAULT], {}, False, 0),
+    ("camera.main", [1], {"on_death": {"camera": "end"}}, True, 0),
+    ("camera.main", [USER_FAULT], {"on_death": {"camera": "end"}}, True, 0),
+    ("console.run", [USER_FAULT], {}, False, 0),
+    # too many in a row
+    ("estimator.d1", [1] * 20, {}, True, RESTARTS_MAX),
+    ("estimator.d1", [1] * 20, {"return_s": 1, "on_overdue": {"estimator": "drop"}}, False, RESTARTS_MAX),
+    ("camera.main", [1] * 20, {}, False, RESTARTS_MAX),  # no gate waits for it
+    ("camera.drone1", [1] * 20, {}, False, RESTARTS_MAX),
+    ("detector.main", [1] * 20, {}, False, RESTARTS_MAX),
+    ("camera.main", [1] * 20, {"return_s": 1, "on_overdue": {"camera": "end"}}, True, RESTARTS_MAX),
+    ("camera.d1", [1] * 20, {"expect": ["camera.d1"]}, True, RESTARTS_MAX),  # the run cannot begin without it
+    ("world", [-signal.SIGKILL, -signal.SIGKILL, 0], {}, False, 2),
+    ("world", [-signal.SIGKILL] * 20, {}, True, RESTARTS_MAX),
+    ("world", [USER_FAULT, 0], {}, True, 0),  # it cannot begin
+    ("world", [1, 0], {}, True, 0),
+]
+
+
+@pytest.mark.parametrize(("name", "codes", "processes", "fails", "restarts"), DEATHS)
+def test_what_a_death_means(name: str, codes: list[int], processes: dict[str, Any], fails: bool, restarts: int):
+    if name == "world":
+        team = Team(Member("estimator.d1"), world=codes, looks=1)
+    else:
+        team = Team(Member(name, *codes), looks=100, **processes)
+    outcome = team.go()
+    dead = next(member for member in team.members if member.name == name)
+    assert (outcome.failed, dead.restarts) == (fails, restarts)
+    if len(codes) > RESTARTS_MAX and name != "world":
+        assert outcome.reason.startswith(f"{name} ended") == fails
+        assert fails or has_terms(team.show.lines[-1], name, "exit code 1", f"{RESTARTS_MAX} restarts", "dropped")
+    elif restarts and name != "world":
+        assert "on_death: restart" in team.show.lines[0]
+
+
+def test_a_run_that_has_begun_goes_on_without_a_camera_that_it_expected():
+    team = Team(Member("camera.d1", *[1] * 20), looks=100, expect=["camera.d1"])
+    team.watch.handle_line('{"clock": {"state": "running"}}')
     assert not team.go().failed
-    assert team.others[0].restarts == 1
-    assert "on_death: restart" in team.show.lines[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "processes", "flies", "action"),
+    [
+        ("controller.main", {}, True, "end"),
+        ("controller.main", {"on_death": {"controller": "restart"}}, True, "end"),
+        ("controller.main", {"on_death": {"controller": "drop"}}, True, "drop"),
+        ("controller.main", {"on_death": {"controller.main": "wait"}}, True, "wait"),
+        ("controller.main", {"on_death": {"controller": "drop"}}, False, "end"),  # a world that has not begun waits
+        ("controller.main", {"on_death": {"controller.main": "wait"}}, False, "end"),
+        ("camera.main", {}, True, "drop"),
+        ("camera.main", {"expect": ["camera.main"]}, True, "drop"),  # the run has begun
+        ("camera.main", {"gating": ["camera"]}, True, "end"),
+        ("camera.drone1", {"gating": ["camera"]}, True, "end"),
+    ],
+)
+def test_what_follows_where_no_restart_helps(name: str, processes: dict[str, Any], flies: bool, action: str):
+    """As the world decides of one whose class has raised: what it goes on without, its launcher does not end."""
+    assert DeathPolicy(Processes(**processes)).decide(name, USER_FAULT, flies).action == action
+    policy = DeathPolicy(Processes(gating=["camera"]))
+    decisions = [policy.decide("camera.main", 1, flies=True).action for _ in range(RESTARTS_MAX + 1)]
+    assert decisions == ["restart"] * RESTARTS_MAX + ["end"]
 
 
 def test_who_has_left_its_place_takes_it_back_when_its_successor_is_dead():
@@ -177,34 +243,6 @@ def test_nobody_is_started_twice_for_one_death():
     assert team.others[0].restarts == 0
 
 
-@pytest.mark.parametrize(
-    ("name", "processes", "ends"),
-    [
-        ("estimator.d1", {}, True),
-        ("estimator.d1", {"return_s": 1, "on_overdue": {"estimator": "drop"}}, False),  # left to the world
-        ("camera.main", {}, False),  # no gate waits for it
-        ("camera.drone1", {}, False),
-        ("detector.main", {}, False),
-        ("camera.main", {"return_s": 1, "on_overdue": {"camera": "end"}}, True),
-    ],
-)
-def test_too_many_deaths_in_a_row_end_the_run_where_it_cannot_go_on(name: str, processes: dict[str, Any], ends: bool):
-    team = Team(Member(name, *[1] * 20), looks=100, **processes)
-    outcome = team.go()
-    assert (outcome.failed, outcome.reason.startswith(f"{name} ended")) == (ends, ends)
-    assert team.others[0].restarts == RESTARTS_MAX
-    if not ends:
-        assert has_terms(team.show.lines[-1], name, "exit code 1", f"{RESTARTS_MAX} restarts", "dropped")
-
-
-@pytest.mark.parametrize(("flies", "fails"), [(False, True), (True, False)])
-def test_a_run_that_cannot_begin_without_a_camera_ends(flies: bool, fails: bool):
-    team = Team(Member("camera.d1", *[1] * 20), looks=100, expect=["camera.d1"])
-    if flies:
-        team.watch.handle_line('{"clock": {"state": "running"}}')
-    assert team.go().failed == fails
-
-
 @pytest.mark.parametrize(("action", "fails"), [("drop", False), ("end", True)])
 def test_who_does_not_come_back_in_its_time(action: str, fails: bool):
     team = Team(Member("estimator.d1"))
@@ -221,73 +259,12 @@ def test_deaths_far_apart_do_not_add_up(monkeypatch):
     assert team.others[0].restarts == 8
 
 
-@pytest.mark.parametrize(
-    ("name", "code", "on_death", "fails"),
-    [
-        ("estimator.d1", USER_FAULT, {}, True),
-        ("recorder2", 1, {}, False),
-        ("camera.main", USER_FAULT, {}, False),
-        ("camera.main", 1, {"camera": "end"}, True),
-        ("camera.main", USER_FAULT, {"camera": "end"}, True),
-        ("console.run", USER_FAULT, {}, False),
-        ("estimator.d1", 1, {"estimator": "drop"}, False),
-        ("estimator.d1", 1, {"estimator.d1": "end", "estimator": "drop"}, True),
-        ("estimator.d1", SUPERSEDED, {"estimator": "end"}, False),
-        ("estimator.d1", 0, {"estimator": "end"}, False),
-    ],
-)
-def test_what_a_death_means(name, code, on_death, fails):
-    team = Team(Member(name, code), on_death=on_death)
-    assert team.go().failed == fails
-
-
-@pytest.mark.parametrize("name", ["camera.main", "camera.drone1"])
-def test_a_camera_that_gates_ends_the_run_where_no_restart_helps(name: str):
-    policy = DeathPolicy(Processes(gating=["camera"]))
-    decisions = [policy.decide(name, 1, flies=True).action for _ in range(RESTARTS_MAX + 1)]
-    assert decisions == ["restart"] * RESTARTS_MAX + ["end"]
-    assert DeathPolicy(Processes(gating=["camera"])).decide(name, USER_FAULT, flies=True).action == "end"
-    assert DeathPolicy(Processes()).decide(name, USER_FAULT, flies=True).action == "drop"
-
-
-@pytest.mark.parametrize(
-    ("on_death", "flies", "action"),
-    [
-        ({}, True, "end"),
-        ({"controller": "restart"}, True, "end"),
-        ({"controller": "drop"}, True, "drop"),
-        ({"controller.main": "wait"}, True, "wait"),
-        ({"controller": "drop"}, False, "end"),  # a world that has not begun waits for it
-        ({"controller.main": "wait"}, False, "end"),
-    ],
-)
-def test_a_scenario_may_let_a_run_go_on_without_who_cannot(on_death: dict[str, Any], flies: bool, action: str):
-    """As the world decides of one whose class has raised: what it goes on without, its launcher does not end."""
-    policy = DeathPolicy(Processes(on_death=on_death))
-    assert policy.decide("controller.main", USER_FAULT, flies).action == action
-
-
 def test_a_dead_world_fails_the_run_and_stops_the_rest():
     team = Team(Member("estimator.d1"), world=[-signal.SIGKILL], on_death={"world": "end"})
     outcome = team.go()
     assert outcome.failed
     assert has_terms(outcome.reason, "world", "died", "code -9")
     assert team.others[0].stopped_for == outcome.reason
-
-
-@pytest.mark.parametrize(
-    ("codes", "looks", "fails", "restarts"),
-    [
-        ([-signal.SIGKILL, -signal.SIGKILL, 0], 20, False, 2),
-        ([-signal.SIGKILL] * 20, 1, True, RESTARTS_MAX),
-        ([USER_FAULT, 0], 20, True, 0),  # it cannot begin
-        ([1, 0], 20, True, 0),
-    ],
-)
-def test_a_dead_world_is_started_again(codes: list[int], looks: int, fails: bool, restarts: int):
-    team = Team(Member("estimator.d1"), world=codes, looks=looks)
-    assert team.go().failed == fails
-    assert team.world.restarts == restarts
 
 
 def test_an_interrupt_ends_everybody():

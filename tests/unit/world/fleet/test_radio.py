@@ -12,8 +12,7 @@ from zsim.contract.run_messages import Fault, RadioLinks
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import RECEPTION_MIN
-from zsim.scenario.surface_file import packed
-from zsim.scenario.triangles import sheet_of
+from zsim.scenario.surroundings import packed, sheet_of
 from zsim_world.fleet.radio import RadioChannel
 from zsim_world.physics.rays import scene
 from zsim_world.physics.surfaces import obstacle_rows

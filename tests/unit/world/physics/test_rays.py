@@ -8,8 +8,8 @@ import pytest
 
 from zsim.math.frames import quaternion_from_rpy
 from zsim.math.rotation import Vector
-from zsim.scenario.obstacle import COLUMNS, nearest, row_of
 from zsim.scenario.scenario import Obstacle
+from zsim.scenario.surroundings import COLUMNS, nearest, row_of
 from zsim_world.physics import rays
 from zsim_world.physics.rays import TRIANGLE, cast, scene
 

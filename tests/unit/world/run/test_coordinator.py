@@ -10,7 +10,7 @@ from refused import has_terms
 from zsim.contract import keys
 from zsim.contract.run_messages import Bye, ControlRequest, Done, Event, Join
 from zsim.errors import RunFailedError, ScenarioError
-from zsim.runtime.health import HealthMeter
+from zsim.runtime.membership import HealthMeter
 from zsim.scenario import scenario_file
 from zsim_world.run import inputs
 from zsim_world.run.coordinator import DataFlow

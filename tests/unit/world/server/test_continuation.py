@@ -12,7 +12,7 @@ from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Mode
 from zsim.contract.run_messages import Event
 from zsim.errors import RunError
-from zsim.runtime.health import HealthMeter
+from zsim.runtime.membership import HealthMeter
 from zsim.scenario import scenario_file
 from zsim.scenario.roles import WORLD
 from zsim_world.run.inputs import Entry, Published, Run

@@ -1,6 +1,7 @@
-"""Faults of a link: what an agent is handed of the messages of a gate, and when."""
+"""Links: what an agent is handed of the messages of a gate, and when; and both ends of the agents' radio."""
 
 import math
+from collections import Counter
 from typing import Any
 
 import pytest
@@ -8,16 +9,16 @@ from msgspec.structs import replace
 from refused import has_terms
 
 from zsim.contract import keys
-from zsim.contract.agent_messages import AgentMessage
 from zsim.contract.flight_messages import Estimate, Mode, Status
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.messages import ClusterInfo, DroneInfo, Imu, Info, Origin, encode
-from zsim.contract.run_messages import ControlRequest, Fault, Faults
+from zsim.contract.messages import AgentMessage, ClusterInfo, DroneInfo, Imu, Info, Origin, encode, register_messages
+from zsim.contract.run_messages import ControlRequest, Fault, Faults, RadioLinks
 from zsim.contract.snapshot import pack, unpack
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.links import Links, place_of, senders
+from zsim.runtime.links import Links, Receiver, Transmitter, place_of, senders
 from zsim.scenario import scenario_file
 from zsim.scenario.faults import planned
+from zsim.scenario.scenario import Radio
 from zsim_agents.formation.controller import REQUESTS_MAX, Controller
 from zsim_world.run.world import World
 
@@ -291,3 +292,102 @@ def test_one_that_is_restored_hands_over_the_same_at_the_same_gates():
         handed = handed_over(made, gate * GATE_NS, inputs)
         assert handed_over(again, gate * GATE_NS, inputs) == handed
         assert handed
+
+
+class Said(AgentMessage, frozen=True):
+    key = "radiotest/{drone}/said"
+    number: int
+    text: str = ""
+
+
+def said(gate: int, by: str = "d1", text: str = "") -> tuple[str, Said]:
+    return Said.of(by), Said(t_ns=gate * GATE_NS, seq=gate, source=f"pilot.{by}", number=gate, text=text)
+
+
+@pytest.fixture(autouse=True)
+def known() -> None:
+    register_messages([Said])
+
+
+def receiver(name: str = "pilot.d2", **radio: Any) -> Receiver:
+    return Receiver(RUN, Radio(**radio), name)
+
+
+def heard(gate: int, *hears: tuple[int, ...], reception: tuple[tuple[float, ...], ...] = ()) -> RadioLinks:
+    return RadioLinks(gate * GATE_NS, gate, hears, reception)
+
+
+def test_the_links_at_the_time_of_sending_count() -> None:
+    made = receiver()
+    assert made.delay_ns(*said(0)) is None  # no links known
+    made.take(heard(1, (), (0,)))
+    made.take(heard(2, (), ()))
+    assert [made.delay_ns(*said(gate)) for gate in (0, 1, 2, 3)] == [None, 0, None, None]
+
+
+def test_what_comes_from_the_same_drone_or_a_wired_station_passes_no_radio() -> None:
+    made = receiver(loss=1.0)
+    made.take(heard(0, (), ()))
+    assert made.delay_ns(*said(0, "d2")) == 0
+    assert made.delay_ns(*said(0, "main")) == 0
+    placed = receiver(station_m=(0.0, 0.0, 0.0))
+    placed.take(heard(0, (), (2,), ()))
+    assert placed.delay_ns(*said(0, "main")) == 0
+    placed.take(heard(1, (), (0,), ()))
+    assert placed.delay_ns(*said(1, "main")) is None
+
+
+def test_loss_and_reception_multiply() -> None:
+    made = receiver(loss=0.2)
+    made.take(heard(0, (), (0,), reception=((), (0.5,))))
+    received = sum(made.delay_ns(*said(gate)) == 0 for gate in range(4000))
+    assert received / 4000 == pytest.approx(0.4, abs=4 * math.sqrt(0.24 / 4000))
+
+
+def test_draws_are_of_each_receiver_and_message() -> None:
+    one, other = receiver(loss=0.5), receiver("watch.d2", loss=0.5)
+    for made in (one, other):
+        made.take(heard(0, (), (0,)))
+    first = [one.delay_ns(*said(gate)) for gate in range(50)]
+    assert [one.delay_ns(*said(gate)) for gate in range(50)] == first
+    assert [other.delay_ns(*said(gate)) for gate in range(50)] != first
+
+
+def test_delay_and_jitter_add_up() -> None:
+    made = receiver(delay_ms=30, jitter_ms=10)
+    made.take(heard(0, (), (0,)))
+    delays = [made.delay_ns(*said(gate)) or 0 for gate in range(1000)]
+    assert 30_000_000 <= min(delays) < 31_000_000
+    assert 39_000_000 < max(delays) <= 40_000_000
+
+
+def test_bandwidth_spreads_messages_over_gates() -> None:
+    """16 + 16 bytes at 6.4 kbit/s take 40 ms: one at every second gate; beyond two waiting, the oldest is lost."""
+    made = Transmitter(Radio(bandwidth_kbit_s=6.4, queue_max=2), GATE_NS)
+    assert made.size_bytes(said(0, text="x" * 13)[1]) == 32  # 1 for the list, 1 and 14 for its values
+    sent = {gate: made.send(gate * GATE_NS, [said(gate, text="x" * 13)]) for gate in range(9)}
+    assert [[message.number for _, message in each] for each in sent.values()] == [
+        [0], [], [1], [], [3], [], [5], [], [7],
+    ]  # fmt: skip
+    assert all(message.t_ns == gate * GATE_NS for gate, each in sent.items() for _, message in each)
+
+
+def test_what_is_no_message_waits_for_none() -> None:
+    made = Transmitter(Radio(bandwidth_kbit_s=0.1), GATE_NS)
+    command = ("drone/d1/cmd/mode", object())
+    assert made.send(0, [said(0), command]) == [command, said(0)]
+    assert made.send(GATE_NS, [said(1), command]) == [command]
+
+
+def test_a_snapshot_has_what_is_known_and_what_waits() -> None:
+    radio: dict[str, Any] = {"loss": 0.5, "bandwidth_kbit_s": 6.4}
+    one, sends = receiver(**radio), Transmitter(Radio(**radio), GATE_NS)
+    one.take(heard(0, (), (0,)))
+    sends.send(0, [said(0, text="x" * 13), said(0, text="y" * 13)])
+    again, sends_again = receiver(**radio), Transmitter(Radio(**radio), GATE_NS)
+    again.restore(unpack(pack(one.snapshot())))
+    sends_again.restore(unpack(pack(sends.snapshot())))
+    assert Counter(again.delay_ns(*said(g)) for g in range(9)) == Counter(one.delay_ns(*said(g)) for g in range(9))
+    assert [sends_again.send(t, []) for t in range(0, 5 * GATE_NS, GATE_NS)] == [
+        sends.send(t, []) for t in range(0, 5 * GATE_NS, GATE_NS)
+    ]

@@ -1,4 +1,4 @@
-"""Forests and corridors: free where they are to be, the same for the same seed, and refused where they cannot be."""
+"""Forests, corridors, meshes, height maps and clouds: what becomes of them, and what is refused."""
 
 from itertools import combinations, pairwise
 from typing import Any
@@ -8,8 +8,8 @@ import pytest
 
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
-from zsim.scenario.obstacle import nearest, row_of
 from zsim.scenario.scenario_file import resolve
+from zsim.scenario.surroundings import nearest, row_of
 
 FOREST = {"trees": 60, "area_m": [-15, -15, 15, 15], "gap_m": 1.0, "clear_m": 3.0}
 CORRIDOR = {"segments": 8, "turn_deg": 60, "start_m": [-2, 0]}

@@ -10,8 +10,8 @@ from refused import has_terms
 
 from zsim.errors import DocumentError, ScenarioError
 from zsim.scenario import scenario_file
-from zsim.scenario.obstacle import COLUMNS
-from zsim.scenario.surface_file import packed, placed, triangles_of
+from zsim.scenario.generated import triangles_of
+from zsim.scenario.surroundings import COLUMNS, packed, placed
 from zsim.schema import plugin
 from zsim_world.physics.rays import cast, scene
 

@@ -1,7 +1,7 @@
 """The foreground of a camera's picture: drones, hats, obstacles and surfaces. Pure.
 
 Drones are hulls, arms, motors, rotors as their blades sweep, and hats; they look like the console's
-(zsim_bridges.console.airframe); lengths are the AR.Drone's, scaled by the arms. All of a picture are computed together.
+(zsim_bridges.console.scene); lengths are the AR.Drone's, scaled by the arms. All of a picture are computed together.
 
 A ray hits a ball, such as a hat, if it passes the centre within the radius. This is exact anywhere in the picture and
 for any lens, and antialiased over one pixel at the edge, so that the drawn centre is the projected centre. Faces of
@@ -19,9 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.scenario.obstacle import BOX, CENTRE, COSINE, HALF, SHAPE, SINE, SPHERE
-from zsim.scenario.triangles import corners_of
-from zsim_agents.cameras.rendering.scene import (
+from zsim.scenario.surroundings import BOX, CENTRE, COSINE, HALF, SHAPE, SINE, SPHERE, corners_of
+from zsim_agents.cameras.scene import (
     ARM_M,
     BLUR_MAX_PX,
     SHIFT,
@@ -444,7 +443,7 @@ def _covered(pixels: _Pixels, centres: Array, ways: Array, radius: float, focal_
 def draw_obstacle(
     picture: Picture, view: View, row: tuple[float, ...], motion: CameraMotion, brightness: float
 ) -> None:
-    """Draw an obstacle, a row of zsim.scenario.obstacle."""
+    """Draw an obstacle, a row of zsim.scenario.surroundings."""
     if row[SHAPE] == SPHERE:
         centre_K = motion.points_K(np.array([row[CENTRE : CENTRE + 3]]))
         if centre_K[0, 2] > 0:
@@ -519,7 +518,7 @@ def bgr(colour: Array) -> tuple[float, float, float]:
 
 
 class SurfaceImager:
-    """The surfaces before one camera, (T, 9) as in zsim.scenario.triangles: of one shade, seen from both sides.
+    """The surfaces before one camera, (T, 9) as in zsim.scenario.surroundings: of one shade, seen from both sides.
 
     They are drawn from the farthest to the nearest by their middles, among drones and obstacles, without smoothed
     edges, so that no gap shows between neighbours.

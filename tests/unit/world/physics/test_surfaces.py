@@ -1,4 +1,4 @@
-"""Obstacles and hulls as bodies: drones stand, slide, tip and rebound on them, and gain no energy from them."""
+"""Ground, obstacles, surfaces and hulls: drones stand, slide, tip and rebound on them, and gain no energy from them."""
 
 import math
 from typing import Any
@@ -8,21 +8,112 @@ import pytest
 from falling import check_slide, energy, fly, tilt_deg
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from vehicle_rows import one_drone
 
-from zsim.math.frames import quaternion_from_rpy
-from zsim.scenario.obstacle import SHAPES, nearest
+from zsim.contract.snapshot import pack, restore, saved_state, unpack
+from zsim.math.frames import quaternion_from_rpy, rpy_from_quaternion
 from zsim.scenario.scenario_file import resolve
+from zsim.scenario.surroundings import SHAPES, nearest, packed
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.crazyflie2 import VEHICLE as CRAZYFLIE2
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.physics.fleet_arrays import STATE, VEHICLE
-from zsim_world.physics.surfaces import Touch, touched
+from zsim_world.physics import rigid_body as body
+from zsim_world.physics.fleet_arrays import STATE, VEHICLE, four, vector
+from zsim_world.physics.surfaces import Touch, contact, drag_anchors, touched
 
+OFF, CALM = np.zeros(4), (0.0, 0.0, 0.0)
+DT = 0.0025
 FRAME = ARDRONE2.airframe
+STAND_HEIGHT_M = FRAME.foot_depth_m - FRAME.foot_sag_m
+ROTORS = one_drone()[1]
 ROOF_M = 1.0
 BOX = {"name": "box", "shape": "box", "position_m": [0, 0, 0], "size_m": [6, 6, ROOF_M]}
 PILLAR = {"name": "pillar", "shape": "cylinder", "position_m": [0, 0, 0], "radius_m": 3, "height_m": ROOF_M}
 HILL_M = 200.0  # radius of a ball, large against a drone
+FLOOR_M = 1.0
+WIDE_M = 4.0  # as far as anything gets here; a wider sheet takes half a second to be made
+ANGLE, UNIT = st.floats(-3.2, 3.2), st.floats(-1.0, 1.0)
+
+
+@pytest.fixture
+def row():
+    return one_drone()[0]
+
+
+def placed(height=STAND_HEIGHT_M, rpy=(0.0, 0.0, 0.0)):
+    state = np.zeros(STATE.size + 4)
+    state[2], state[6:10] = height, quaternion_from_rpy(rpy)
+    return state
+
+
+def stand(row, state, seconds, push=CALM):
+    anchor = np.zeros((8, 2))
+    drag_anchors(row, anchor, vector(state, 0), four(state, 6))
+    track = []
+    for _ in range(round(seconds / DT)):
+        body.step(row, ROTORS, anchor, state, OFF, CALM, push, DT)
+        drag_anchors(row, anchor, vector(state, 0), four(state, 6))
+        track.append(state.copy())
+    return np.array(track)
+
+
+def test_on_the_ground_feet_carry_the_weight_at_their_sag(row):
+    state = placed()
+    stand(row, state, 2.0)
+    np.testing.assert_allclose(state[:3], (0.0, 0.0, STAND_HEIGHT_M), atol=1e-6)
+    np.testing.assert_allclose(state[3:6], 0.0, atol=1e-6)
+
+
+def test_a_drop_settles_and_never_gains_energy(row):
+    state = placed(0.5, (0.2, -0.3, 1.0))
+    track = stand(row, state, 4.0)
+    inertia = row[VEHICLE.inertia : VEHICLE.inertia + 3]
+    kinetic = 0.5 * row[VEHICLE.mass] * (track[:, 3:6] ** 2).sum(1) + 0.5 * (inertia * track[:, 10:13] ** 2).sum(1)
+    energy = kinetic + row[VEHICLE.mass] * row[VEHICLE.gravity] * track[:, 2]
+    assert energy.max() <= row[VEHICLE.mass] * row[VEHICLE.gravity] * 0.5 * 1.001
+    assert kinetic[-1] < 1e-6
+    assert abs(state[2] - STAND_HEIGHT_M) < 1e-3
+    np.testing.assert_allclose(rpy_from_quaternion(state[6:10])[:2], 0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize(("share", "moves"), [(0.9, False), (1.1, True)])
+def test_friction_holds_up_to_the_cone(row, share, moves):
+    weight = row[VEHICLE.mass] * row[VEHICLE.gravity]
+    state = placed()
+    stand(row, state, 2.0, (share * FRAME.friction * weight, 0.0, 0.0))
+    if moves:  # slides with what friction leaves, against the drag of still air
+        left = (share - 1.0) * FRAME.friction * weight
+        tau = row[VEHICLE.mass] / row[VEHICLE.drag]
+        expected = left / row[VEHICLE.drag] * (1 - math.exp(-2.0 / tau))
+        assert math.isclose(state[3], expected, rel_tol=0.1)
+    else:
+        assert abs(state[0]) < 0.01
+        assert abs(state[3]) < 1e-6
+
+
+def test_a_held_push_does_not_creep(row):
+    state = placed()
+    track = stand(row, state, 20.0, (0.15, -0.1, 0.0))
+    np.testing.assert_allclose(track[-1, :2], track[2000, :2], atol=1e-9)
+
+
+def test_lying_on_its_back_it_rests_on_its_rim(row):
+    state = placed(0.3, (math.pi, 0.0, 0.0))
+    stand(row, state, 3.0)
+    assert abs(state[2] - (FRAME.rim_height_m - FRAME.foot_sag_m)) < 2e-3
+
+
+def test_no_force_in_the_air(row):
+    anchor = np.zeros((8, 2))
+    force, moment = contact(row, anchor, (0.0, 0.0, 0.2), CALM, (1.0, 0.0, 0.0, 0.0), CALM)
+    assert force == CALM
+    assert moment == CALM
+
+
+def test_ground_never_pulls(row):
+    anchor = np.zeros((8, 2))
+    force, _ = contact(row, anchor, (0.0, 0.0, 0.0599), (0.0, 0.0, 5.0), (1.0, 0.0, 0.0, 0.0), CALM)
+    assert force == CALM
 
 
 def on(*obstacles: Any, drones: int = 1, **drone: Any) -> Fleet:
@@ -42,6 +133,7 @@ def put(fleet: Fleet, p: Any, q: Any = (1, 0, 0, 0), v: Any = (0, 0, 0), w: Any 
     state[: STATE.size] = *p, *v, *q, *w
     fleet.bodies.held[i] = np.nan  # what is left of the place before must not matter
     fleet.bodies.solid[i] = -1
+    fleet.bodies.plane[i] = 0.0
     fleet.bodies.braced[i], fleet.bodies.twist[i] = 1, 0.0
 
 
@@ -160,9 +252,6 @@ def test_a_thin_slab_bears_a_fall(fall_m: float) -> None:
     fleet = on({"name": "table", "shape": "box", "position_m": [0, 0, 10], "size_m": [3, 3, 0.05]})
     put(fleet, (0.0, 0.0, 10.05 + FRAME.foot_depth_m + fall_m))
     assert fly(fleet, 3.0)[-1, 0, 2] == pytest.approx(10.05 + FRAME.foot_depth_m - FRAME.foot_sag_m, abs=1e-3)
-
-
-ANGLE, UNIT = st.floats(-3.2, 3.2), st.floats(-1.0, 1.0)
 
 
 def solid_of(shape: str, size: tuple[float, ...], yaw_deg: float) -> dict[str, Any]:
@@ -284,3 +373,130 @@ def test_more_solids_than_slots_are_those_in_reach() -> None:
     put(fleet, (0.02, 0.0, ROOF_M + FRAME.foot_depth_m + 0.02))
     end = fly(fleet, 3.0)[-1, 0]
     assert end[2] == pytest.approx(ROOF_M + FRAME.foot_depth_m - FRAME.foot_sag_m, abs=1e-4)
+
+
+def plane(slope: float = 0.0, cell_m: float = 0.5, half_m: float = WIDE_M, z_m: float = FLOOR_M) -> np.ndarray:
+    """Return the triangles of a plane that rises to the west, in cells, (T, 9)."""
+    x = np.arange(-half_m, half_m + 1e-9, cell_m)
+    points = np.stack(np.broadcast_arrays(x[None, :], x[:, None], z_m - math.tan(slope) * x[None, :]), axis=2)
+    a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
+    return np.concatenate([np.concatenate(three, axis=2).reshape(-1, 9) for three in ((a, b, c), (a, c, d))])
+
+
+def block(*size_m: float) -> np.ndarray:
+    """Return the triangles of a box about x = y = 0 that stands on the ground, in no order and of no direction."""
+    wide, long, high = size_m
+    p = np.array([[x * wide / 2, y * long / 2, z * high] for x in (-1, 1) for y in (-1, 1) for z in (0, 1)])
+    faces = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
+    return np.array([p[list(three)] for a, b, c, d in faces for three in ((a, b, c), (c, a, d))]).reshape(-1, 9)
+
+
+def over(
+    triangles: np.ndarray | None = None, position_m: Any = (0, 0, 0), start_m: float = 0.0, **environment: Any
+) -> Fleet:
+    """Return one drone with still rotors, far away, in calm air."""
+    if triangles is not None:
+        environment["surfaces"] = [{"name": "sheet", "triangles": packed(triangles), "position_m": [*position_m]}]
+    drone = {"name": "d0", "position_m": [0, 900, start_m], "drag_n_s_m": 1e-9}
+    return Fleet(resolve({"name": "t", "duration_s": 1, "drones": [drone], "environment": environment}))
+
+
+@pytest.mark.parametrize("cell_m", [0.05, 0.1, 7.0])
+def test_it_rests_on_a_flat_sheet_as_on_the_ground(cell_m: float) -> None:
+    """The same fall, to the ground and to a sheet: the same slide, the same place; at 0.1 m feet fall on its edges."""
+    low, high = over(), over(plane(cell_m=cell_m, half_m=7.0 if cell_m > 1.0 else 1.0))
+    for q, v in (((1, 0, 0, 0), (0, 0, 0)), (quaternion_from_rpy((0.05, -0.03, 1.0)), (0.4, -0.2, 0.0))):
+        put(low, (0.0, 0.0, 0.1), q, v)
+        put(high, (0.0, 0.0, 0.1 + FLOOR_M), q, v)
+        one, other = fly(low, 2.0)[-1, 0], fly(high, 2.0)[-1, 0]
+        np.testing.assert_allclose(other[:3] - one[:3], (0.0, 0.0, FLOOR_M), atol=1e-7)
+        np.testing.assert_allclose(other[6:10], one[6:10], atol=1e-7)
+        assert one[2] == pytest.approx(FRAME.foot_depth_m - FRAME.foot_sag_m, abs=1e-6)
+        assert not high.touching[0]  # it stands on its feet: no collision
+
+
+def test_a_drone_that_starts_upon_a_sheet_stays() -> None:
+    fleet = over(plane(), position_m=(0, 900, 0), start_m=FLOOR_M)
+    track = fly(fleet, 1.0)[:, 0]
+    assert np.abs(track[:, 2] - FLOOR_M - FRAME.foot_depth_m + FRAME.foot_sag_m).max() < 1e-6
+
+
+@pytest.mark.parametrize(("share", "slides"), [(0.95, False), (1.05, True)])
+@pytest.mark.parametrize("cell_m", [0.5, 40.0])
+def test_on_a_sloping_sheet_it_slides_where_the_tangent_exceeds_the_friction(
+    share: float, slides: bool, cell_m: float
+) -> None:
+    """Coulomb: on a plane of slope s a block slides if and only if tan s > mu, and then at g (sin s - mu cos s)."""
+    slope = math.atan(share * FRAME.friction)
+    fleet, away = over(plane(slope, cell_m, max(WIDE_M, cell_m / 2))), FRAME.foot_depth_m - FRAME.foot_sag_m
+    put(fleet, (away * math.sin(slope), 0.0, FLOOR_M + away * math.cos(slope)), quaternion_from_rpy((0.0, slope, 0.0)))
+    check_slide(fleet, slope, FRAME.friction if slides else None, rel=0.05)
+
+
+@pytest.mark.parametrize("speed_m_s", [1.0, 6.0, 15.0])
+@pytest.mark.parametrize("rpy_deg", [(0, 0, 0), (180, 0, 0), (70, 20, 0)], ids=["feet", "back", "side"])
+def test_a_sheet_is_not_passed_from_either_side_and_gives_no_energy(speed_m_s: float, rpy_deg: Any) -> None:
+    for below in (False, True):
+        fleet = over(plane(z_m=20.0))
+        toward = 1.0 if below else -1.0
+        put(
+            fleet,
+            (0.03, 0.02, 20.0 - 0.5 * toward),
+            quaternion_from_rpy(np.radians(rpy_deg)),
+            (0, 0, toward * speed_m_s),
+        )
+        before = energy(fleet, fleet.bodies.state[:, : STATE.size])[0]
+        track = fly(fleet, 1.0)
+        beyond = toward * (track[:, 0, 2] - 20.0)
+        assert beyond.max() < FRAME.hull_radius_m  # its centre, dented by 15 m/s
+        assert beyond[-1] < 0.0
+        assert energy(fleet, track).max() <= before * (1.0 + 1e-3)
+
+
+def test_a_block_of_triangles_is_as_the_box() -> None:
+    """Falls upon its top, its side and its edge, of triangles whose directions are mixed: the paths differ by 2 cm."""
+    mesh = over(block(4.0, 4.0, FLOOR_M))
+    solid = over(obstacles=[{"name": "b", "shape": "box", "position_m": [0, 0, 0], "size_m": [4, 4, FLOOR_M]}])
+    falls = [
+        ((0.5, 0.3, 1.6), (0.3, 0.0, 0.0), (0, 0, 0)),
+        ((2.6, 0.2, 0.7), (-2.0, 0.0, 0.0), (0, 0, 0)),
+        ((1.5, -0.4, 1.4), (0.0, 0.0, 0.0), (0.5, 0.3, 0.1)),
+    ]
+    for p, v, rpy in falls:
+        for fleet in (mesh, solid):
+            put(fleet, p, quaternion_from_rpy(rpy), v)
+        one, other = fly(mesh, 0.8)[:, 0], fly(solid, 0.8)[:, 0]
+        np.testing.assert_allclose(one[:, :3], other[:, :3], atol=0.02)
+        assert tilt_deg(other[-1]) == pytest.approx(tilt_deg(one[-1]), abs=5.0)
+
+
+def test_beside_the_rim_it_falls_off_and_nothing_holds_it() -> None:
+    """It slides over the edge of a table without sides, and falls to the ground as from one."""
+    fleet = over(plane(half_m=1.0))
+    put(fleet, (0.5, 0.0, FLOOR_M + FRAME.foot_depth_m), v=(3.0, 0.0, 0.0))
+    track = fly(fleet, 3.0)[:, 0]
+    assert track[-1, 0] > 1.2
+    assert track[-1, 2] < 0.2
+    assert np.linalg.norm(track[:, 3:6], axis=1).max() < 6.0  # of a fall of 1 m, 4.4 m/s
+
+
+def test_a_contact_goes_on_to_the_same_bits_from_a_saved_state() -> None:
+    one, other = over(plane(0.3)), over(plane(0.3))
+    put(one, (0.0, 0.0, FLOOR_M + 0.2), quaternion_from_rpy((0.4, 0.2, 0.1)), (0.5, 0.3, 0.0))
+    fly(one, 0.3)
+    restore(other, unpack(pack(saved_state(one))))
+    assert one.bodies.plane[..., 0].any()
+    np.testing.assert_array_equal(fly(one, 0.3), fly(other, 0.3))
+
+
+def test_a_hull_that_hits_a_surface_bumps_once_into_what_has_its_name() -> None:
+    fleet, bumps = (
+        over(plane(), obstacles=[{"name": "far", "shape": "sphere", "position_m": [0, 0, 90], "radius_m": 1}]),
+        [],
+    )
+    put(fleet, (0.0, 0.0, FLOOR_M + 0.3), quaternion_from_rpy((math.pi, 0.0, 0.0)))
+    for _ in range(100):
+        fleet.advance()
+        bumps += fleet.bumps()
+    assert [fleet.things[thing] for _, thing in bumps][:1] == ["sheet"]
+    assert fleet.touching[0]

@@ -13,13 +13,13 @@ from msgspec import UNSET
 from numpy.typing import NDArray
 
 from zsim.contract.messages import DroneInfo, Info
-from zsim.scenario.obstacle import row_of
 from zsim.scenario.scenario import Scenario
-from zsim.scenario.triangles import TRIANGLE, sheet_of
+from zsim.scenario.surroundings import TRIANGLE, row_of, sheet_of
 from zsim.sensors.camera import Hats
 from zsim.sensors.camera_model import CameraPose, Lens, camera_matrix, undistorted
 from zsim.vehicles.vehicle import cross_layout
 
+cv2.setNumThreads(1)  # other cores belong to the world and the agents; one thread gives the same bits everywhere
 Array = NDArray[np.float64]
 Kernel = NDArray[np.float32]
 ARM_M = 0.1785  # m, of the AR.Drone, for records whose drones name no rotors
@@ -53,7 +53,7 @@ NO_TRIANGLE = np.empty((0, TRIANGLE))
 class Scene(NamedTuple):
     """The constant scene of a run.
 
-    Obstacles are rows of zsim.scenario.obstacle, surfaces those of zsim.scenario.triangles; light 1 is a clear day.
+    Obstacles and surfaces are rows of zsim.scenario.surroundings; light 1 is a clear day.
     """
 
     drones: tuple[DroneLook, ...]

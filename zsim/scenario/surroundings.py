@@ -1,0 +1,420 @@
+"""The obstacles and surfaces around the drones: distances, directions, nearest points and crossings. Pure.
+
+An obstacle is a solid and a row of numbers: its shape, centre in W, cosine and sine of its yaw, and half of its size
+along its own axes (of a cylinder: radius, nothing, half of the height; of a sphere: radius). Distances from it are
+below 0 inside.
+
+A surface is a sheet of triangles without thickness: distances from it are unsigned. An edge of a single triangle is on
+its rim. All is exact, in a fixed order of plain operations, and compiled if numba is installed.
+"""
+
+import base64
+import binascii
+import math
+import zlib
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zsim.math import elementary as el
+from zsim.math.compiled import inlined, kernel, noinline
+from zsim.math.held import Held, hold
+from zsim.math.rotation import Vector, add, axpy, cross, dot, scaled, subtract
+
+# of an obstacle's row: its shape, centre in W, cosine and sine of its yaw, half of its size, see `row_of`
+BOX, CYLINDER, SPHERE = range(3)
+SHAPES = ("box", "cylinder", "sphere")
+SHAPE, CENTRE, COSINE, SINE, HALF = 0, 1, 4, 5, 6
+COLUMNS = 9
+TINY = 1e-12  # m, so that a point on an axis has a direction
+PAIRS_MAX = 1_000_000  # of points and obstacles that are compared at once
+WIDE = 1e9  # m, half of the side that a cylinder does not have
+
+TRIANGLES_MAX = 40_000  # of all surfaces: with them a resolved scenario stays below the 4 MB of a file
+SINGLE = np.dtype("<f4")  # of the text that it holds
+TRIANGLE = 9  # numbers of a triangle: a corner and the two edges from it [m; W]
+LEAF = 4  # parts of a leaf at most, chosen: a box costs about as much as a cylinder
+DEPTH = 64  # boxes that may wait while the tree is walked; each step down halves the parts
+MARGIN_M = 1e-6  # m, by which boxes are larger than what is in them, against rounding
+AREA_MIN_M2 = 1e-12  # m^2, twice the area; a smaller triangle has no direction and is left out
+WELD_M = 1e-6  # m, chosen: so near to each other two corners are one; a resolved scenario has single precision
+EDGE = 1e-9  # by which a triangle is wider for what crosses it, of its sides, so that nothing slips between two
+FIRST_EDGE, FIRST_CORNER, FACE = 0, 3, 6  # features of a triangle: edges ab, bc, ca; corners a, b, c; what is within
+
+Array = NDArray[np.float64]
+
+
+class Tree(NamedTuple):
+    """Boxes over P parts; the first is on top."""
+
+    bounds: NDArray  # (K, 6), least and greatest x, y, z [m]
+    link: NDArray  # int32 (K, 2): the second child (the first follows) and 0; of a leaf its first part and their count
+    part: NDArray  # int32 (P,)
+    waiting: NDArray  # int32 (DEPTH,), boxes that wait while it is walked
+    away: NDArray  # (DEPTH,), what is known of them
+
+
+class Sheet(NamedTuple):
+    """The triangles of all surfaces."""
+
+    triangle: NDArray  # (T, TRIANGLE)
+    rim: NDArray  # int8 (T, 6), 1 where an edge or corner is on the rim
+    surface: NDArray  # int32 (T,), whose it is
+    tree: Tree
+
+
+class Surroundings:
+    """The obstacles and surfaces of a scenario's environment.
+
+    Attributes:
+        is_empty: whether there are none.
+    """
+
+    def __init__(self, environment: Any) -> None:
+        self._obstacles, sheet = environment.obstacles, sheet_of(environment)
+        self._sheet = hold(sheet) if len(sheet.triangle) else None
+        self.is_empty = not self._obstacles and self._sheet is None
+
+    def distances_m(self, p_W: ArrayLike) -> Array:
+        """Return the distance [m] of each point (P, 3) to the nearest one, below 0 in an obstacle; inf without any."""
+        least = least_distances(self._obstacles, p_W)
+        if self._sheet is not None:
+            least = np.minimum(least, nearest_points(self._sheet, p_W, np.maximum(least, 0.0))[0])
+        return least
+
+
+def row_of(obstacle: Any) -> list[float]:
+    """Return the row of an obstacle of a scenario, whose position is that of its base, or the centre of a sphere."""
+    x, y, z = obstacle.position_m
+    if obstacle.shape == "box":
+        half = [0.5 * side for side in obstacle.size_m]
+    elif obstacle.shape == "cylinder":
+        half = [obstacle.radius_m, 0.0, 0.5 * obstacle.height_m]
+    else:
+        half = [obstacle.radius_m, 0.0, 0.0]
+    yaw = math.radians(obstacle.yaw_deg)
+    return [float(SHAPES.index(obstacle.shape)), x, y, z + half[2], el.cos(yaw), el.sin(yaw), *half]
+
+
+def nearest(row: Sequence[float], x: float, y: float, z: float) -> tuple[float, float, float, float]:
+    """Return the distance of a point from the surface [m], below 0 inside, and the outward unit vector in W."""
+    dx, dy, qz = x - row[CENTRE], y - row[CENTRE + 1], z - row[CENTRE + 2]
+    c, s = row[COSINE], row[SINE]
+    qx, qy = c * dx + s * dy, c * dy - s * dx
+    r = max(math.sqrt(qx * qx + qy * qy), TINY)
+    if row[SHAPE] == SPHERE:
+        away = max(math.sqrt(qx * qx + qy * qy + qz * qz), TINY)
+        distance, nx, ny, nz = away - row[HALF], qx / away, qy / away, qz / away
+    else:
+        round_ = row[SHAPE] == CYLINDER
+        ax, ay = (r, 0.0) if round_ else (qx, qy)
+        ox, oy, oz = abs(ax) - row[HALF], abs(ay) - (WIDE if round_ else row[HALF + 1]), abs(qz) - row[HALF + 2]
+        most = max(ox, oy, oz)
+        if most > 0.0:
+            ox, oy, oz = max(ox, 0.0), max(oy, 0.0), max(oz, 0.0)
+            distance = math.sqrt(ox * ox + oy * oy + oz * oz)
+        else:  # inside: out by the nearest face
+            distance = most
+            ox, oy, oz = 1.0 if ox == most else 0.0, 1.0 if oy == most else 0.0, 1.0 if oz == most else 0.0
+        length = max(math.sqrt(ox * ox + oy * oy + oz * oz), TINY)
+        nx, ny, nz = math.copysign(ox, ax) / length, math.copysign(oy, ay) / length, math.copysign(oz, qz) / length
+        if round_:
+            nx, ny = nx * qx / r, nx * qy / r
+    return distance, c * nx - s * ny, s * nx + c * ny, nz
+
+
+def least_distances(obstacles: Iterable[Any], p_W: ArrayLike) -> NDArray[np.float64]:
+    """Return the distance [m] of each point (T, 3) from the nearest of some obstacles of a scenario, as `nearest` does.
+
+    inf where there are none.
+    """
+    points, rows = np.asarray(p_W, dtype=float).reshape(-1, 3), np.array([*map(row_of, obstacles)]).reshape(-1, COLUMNS)
+    least, step = np.full(len(points), np.inf), max(1, PAIRS_MAX // max(len(rows), 1))
+    for first in range(0, len(points) if len(rows) else 0, step):
+        x, y, z = (points[first : first + step, None, k] - rows[:, CENTRE + k] for k in range(3))
+        c, s, shape, half = rows[:, COSINE], rows[:, SINE], rows[:, SHAPE], rows[:, HALF:]
+        r = np.sqrt(x * x + y * y)
+        across = np.where(shape == BOX, np.abs(c * x + s * y), r) - half[:, 0]
+        along = np.where(shape == BOX, np.abs(c * y - s * x) - half[:, 1], -np.inf)
+        over = np.abs(z) - half[:, 2]
+        most = np.maximum(np.maximum(across, along), over)
+        outside = np.sqrt(np.maximum(across, 0.0) ** 2 + np.maximum(along, 0.0) ** 2 + np.maximum(over, 0.0) ** 2)
+        solid = np.where(most > 0.0, outside, most)
+        least[first : first + step] = np.where(shape == SPHERE, np.sqrt(r * r + z * z) - half[:, 0], solid).min(axis=1)
+    return least
+
+
+def sheet_of(environment: Any) -> Sheet:
+    """Return the triangles of the surfaces of a scenario's environment."""
+    each = [placed(surface) for surface in environment.surfaces or ()]
+    triangle = np.concatenate([np.empty((0, TRIANGLE)), *each])
+    whose = np.repeat(np.arange(len(each), dtype=np.int32), [len(part) for part in each])
+    normal = np.stack([triangle[:, 4] * triangle[:, 8] - triangle[:, 5] * triangle[:, 7],
+                       triangle[:, 5] * triangle[:, 6] - triangle[:, 3] * triangle[:, 8],
+                       triangle[:, 3] * triangle[:, 7] - triangle[:, 4] * triangle[:, 6]], axis=1)  # fmt: skip
+    sound = np.sqrt((normal * normal).sum(axis=1)) > AREA_MIN_M2
+    triangle, whose = triangle[sound], whose[sound]
+    corners = corners_of(triangle)
+    tree = tree_over(corners.min(axis=1), corners.max(axis=1))
+    return Sheet(triangle, _rim(corners), whose, tree)
+
+
+def placed(surface: Any) -> Array:
+    """Return the triangles of a surface of a scenario in W, (T, 9): a corner, and the two edges from it [m]."""
+    s, c = el.sin_cos(math.radians(surface.yaw_deg))
+    x, y, z = np.moveaxis(surface.scale * unpacked(surface.triangles).reshape(-1, 3, 3), 2, 0)
+    corners = np.stack([c * x - s * y, s * x + c * y, z], axis=2) + np.array(surface.position_m)
+    first = corners[:, 0]
+    return np.concatenate([first, corners[:, 1] - first, corners[:, 2] - first], axis=1)
+
+
+def packed(triangles: Array) -> str:
+    """Return triangles as text: float32, compressed, in base 64."""
+    return base64.b64encode(zlib.compress(triangles.astype(SINGLE).tobytes(), 9)).decode()
+
+
+def unpacked(text: str) -> Array:
+    """Return the triangles of a text made by `packed`, (T, 9).
+
+    Raises:
+        ValueError: the text is invalid.
+    """
+    each = TRIANGLE * SINGLE.itemsize
+    reader = zlib.decompressobj()
+    try:
+        data = reader.decompress(base64.b64decode(text, validate=True), TRIANGLES_MAX * each + 1)
+    except (binascii.Error, zlib.error) as error:
+        raise ValueError(f"is no triangles ({error})") from error
+    if len(data) > TRIANGLES_MAX * each:  # a short text may be of any number of bytes
+        raise ValueError(f"has more than {TRIANGLES_MAX} triangles; must have at most {TRIANGLES_MAX}")
+    if not reader.eof:
+        raise ValueError("is no triangles (cut short)")
+    if not data or len(data) % each:
+        raise ValueError(f"has {len(data)} bytes; must have {each} for each triangle")
+    triangles = np.frombuffer(data, SINGLE).astype(float).reshape(-1, TRIANGLE)
+    if not np.isfinite(triangles).all():
+        raise ValueError("has a number that is not finite; must be finite")
+    return triangles
+
+
+def corners_of(triangle: Array) -> Array:
+    """Return the three corners of each triangle, (T, 3, 3) [m; W]."""
+    first = triangle[:, :3]
+    return np.stack([first, first + triangle[:, 3:6], first + triangle[:, 6:]], axis=1)
+
+
+def outline_of(surface: Any) -> list[list[float]]:
+    """Return the convex outline of a surface from above, counter-clockwise, as [x, y] [m; W].
+
+    By a monotone chain (A. M. Andrew, Information Processing Letters 9, 1979).
+    """
+    points = np.unique(np.round(corners_of(placed(surface))[..., :2].reshape(-1, 2), 2), axis=0).tolist()
+
+    def chain(ordered: Iterable[list[float]]) -> list[list[float]]:
+        kept: list[list[float]] = []
+        for x, y in ordered:
+            while len(kept) > 1:
+                (ax, ay), (bx, by) = kept[-2:]
+                if (bx - ax) * (y - ay) > (by - ay) * (x - ax):
+                    break
+                kept.pop()
+            kept.append([x, y])
+        return kept
+
+    return [*chain(points)[:-1], *chain(reversed(points))[:-1]]
+
+
+def _rim(corners: Array) -> NDArray[np.int8]:
+    """Return which edges and corners of triangles are on the rim, (T, 6)."""
+    count = len(corners)
+    if not count:
+        return np.zeros((0, 6), dtype=np.int8)
+    _, number = np.unique(np.rint(corners.reshape(-1, 3) / WELD_M), axis=0, return_inverse=True)
+    number = number.reshape(count, 3)
+    edges = np.sort(np.stack([number, np.roll(number, -1, axis=1)], axis=2), axis=2).reshape(-1, 2)
+    _, which, uses = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
+    alone = uses[which.ravel()] == 1
+    on_rim = np.zeros(number.max() + 1, dtype=bool)
+    on_rim[edges[alone].ravel()] = True
+    return np.concatenate([alone.reshape(count, 3), on_rim[number]], axis=1).astype(np.int8)
+
+
+def tree_over(low: Array, high: Array) -> Tree:
+    """Return the tree over P boxes, given their minimum and maximum corners (P, 3), halved along the longest side."""
+    low, high = low - MARGIN_M, high + MARGIN_M
+    part, middle = np.arange(len(low), dtype=np.int32), 0.5 * (low + high)
+    bounds: list[Array] = []
+    link: list[tuple[int, int]] = []
+    waiting = [(0, len(part), -1)] if len(part) else []
+    while waiting:
+        first, end, parent = waiting.pop()
+        if parent >= 0:
+            link[parent] = (len(link), 0)
+        own = part[first:end]
+        bounds.append(np.concatenate([low[own].min(axis=0), high[own].max(axis=0)]))
+        if end - first <= LEAF:
+            link.append((first, end - first))
+            continue
+        axis = int(np.ptp(middle[own], axis=0).argmax())
+        part[first:end] = own[np.argsort(middle[own, axis], kind="stable")]
+        half = (first + end) // 2
+        waiting += [(half, end, len(link)), (first, half, -1)]
+        link.append((0, 0))
+    links = np.array(link, dtype=np.int32).reshape(-1, 2)
+    return Tree(np.array(bounds).reshape(-1, 6), links, part, np.empty(DEPTH, dtype=np.int32), np.empty(DEPTH))
+
+
+class Nearest(NamedTuple):
+    """The nearest point of some triangles."""
+
+    distance: float  # m
+    triangle: int  # -1: none is so near
+    feature: int  # of it
+    point: Vector
+
+
+def nearest_points(sheet: Held, p_W: ArrayLike, far_m: ArrayLike) -> tuple[Array, Array]:
+    """Return distances (P,) [m] and positions (P, 3) of the nearest points of a sheet, by `hold`, to points (P, 3).
+
+    They are `far_m` and the point itself if nothing is closer.
+    """
+    points = np.ascontiguousarray(p_W, dtype=float).reshape(-1, 3)
+    least, found = np.array(np.broadcast_to(far_m, len(points)), dtype=float), np.empty_like(points)
+    _find_nearest(sheet, points, least, found)
+    return least, found
+
+
+@kernel()
+def _find_nearest(held: Held, points: NDArray, least: NDArray, found: NDArray) -> None:
+    """Set the nearest point (P, 3) to each point (P, 3), and the distance (P,), where this is less than it was."""
+    for k in range(points.shape[0]):
+        nearest = nearest_point(held.content, (points[k, 0], points[k, 1], points[k, 2]), least[k])
+        least[k] = nearest.distance
+        for axis in range(3):
+            found[k, axis] = nearest.point[axis]
+
+
+@noinline
+def nearest_point(sheet: Sheet, x: Vector, far: float) -> Nearest:
+    """Return the nearest point closer than `far` [m]; of equally near points the first found."""
+    tree = sheet.tree
+    best, which, feature, point = far * far, -1, FACE, x
+    if tree.bounds.shape[0] > 0 and _square(tree.bounds[0], x) < best:
+        tree.waiting[0], tree.away[0], depth = 0, 0.0, 1
+        while depth > 0:
+            depth -= 1
+            node = tree.waiting[depth]
+            if not tree.away[depth] < best:
+                continue
+            first, parts = tree.link[node, 0], tree.link[node, 1]
+            if parts == 0:
+                near, other = node + 1, first
+                at, beyond = _square(tree.bounds[near], x), _square(tree.bounds[other], x)
+                if beyond < at:
+                    near, other, at, beyond = other, near, beyond, at
+                if beyond < best:
+                    tree.waiting[depth], tree.away[depth] = other, beyond
+                    depth += 1
+                if at < best:
+                    tree.waiting[depth], tree.away[depth] = near, at
+                    depth += 1
+                continue
+            for n in range(first, first + parts):
+                t = tree.part[n]
+                found, of = nearest_on(sheet.triangle[t], x)
+                away = subtract(x, found)
+                square = dot(away, away)
+                if square < best:
+                    best, which, feature, point = square, t, of, found
+    return Nearest(math.sqrt(best) if which >= 0 else far, which, feature, point)
+
+
+@inlined
+def nearest_on(row: NDArray, x: Vector) -> tuple[Vector, int]:
+    """Return the point of a triangle that is nearest to x, and the feature that it is on.
+
+    By the regions of Voronoi (C. Ericson, "Real-Time Collision Detection", 2005, section 5.1.5).
+    """
+    a, ab, ac = (row[0], row[1], row[2]), (row[3], row[4], row[5]), (row[6], row[7], row[8])
+    ax = subtract(x, a)
+    a1, a2 = dot(ab, ax), dot(ac, ax)
+    if a1 <= 0.0 and a2 <= 0.0:
+        return a, FIRST_CORNER
+    bx = subtract(ax, ab)
+    b1, b2 = dot(ab, bx), dot(ac, bx)
+    if b1 >= 0.0 and b2 <= b1:
+        return add(a, ab), FIRST_CORNER + 1
+    beside_ab = a1 * b2 - b1 * a2
+    if beside_ab <= 0.0 and a1 >= 0.0 and b1 <= 0.0:
+        return axpy(a, a1 / (a1 - b1), ab), FIRST_EDGE
+    cx = subtract(ax, ac)
+    c1, c2 = dot(ab, cx), dot(ac, cx)
+    if c2 >= 0.0 and c1 <= c2:
+        return add(a, ac), FIRST_CORNER + 2
+    beside_ca = c1 * a2 - a1 * c2
+    if beside_ca <= 0.0 and a2 >= 0.0 and c2 <= 0.0:
+        return axpy(a, a2 / (a2 - c2), ac), FIRST_EDGE + 2
+    beside_bc = b1 * c2 - c1 * b2
+    if beside_bc <= 0.0 and b2 - b1 >= 0.0 and c1 - c2 >= 0.0:
+        along = (b2 - b1) / ((b2 - b1) + (c1 - c2))
+        return axpy(add(a, ab), along, subtract(ac, ab)), FIRST_EDGE + 1
+    per = 1.0 / (beside_ab + beside_bc + beside_ca)
+    return add(a, axpy(scaled(ab, beside_ca * per), beside_ab * per, ac)), FACE
+
+
+@inlined
+def _square(bounds: NDArray, x: Vector) -> float:
+    """Return the square of a point's distance from a box [m^2]."""
+    square = 0.0
+    for k in range(3):
+        over = max(bounds[k] - x[k], x[k] - bounds[k + 3], 0.0)
+        square += over * over
+    return square
+
+
+@noinline
+def crosses(sheet: Sheet, start: Vector, end: Vector) -> bool:
+    """Tell whether the path from one point to another crosses a triangle; a point in its plane is in front of it."""
+    tree = sheet.tree
+    if tree.bounds.shape[0] == 0:
+        return False
+    tree.waiting[0], depth = 0, 1
+    while depth > 0:
+        depth -= 1
+        node = tree.waiting[depth]
+        apart = False
+        for k in range(3):
+            low, high = min(start[k], end[k]), max(start[k], end[k])
+            apart |= high < tree.bounds[node, k] or low > tree.bounds[node, k + 3]
+        if apart:
+            continue
+        first, parts = tree.link[node, 0], tree.link[node, 1]
+        if parts == 0:
+            tree.waiting[depth], tree.waiting[depth + 1] = first, node + 1
+            depth += 2
+            continue
+        for n in range(first, first + parts):
+            if _crosses_one(sheet.triangle[tree.part[n]], start, end):
+                return True
+    return False
+
+
+@inlined
+def _crosses_one(row: NDArray, start: Vector, end: Vector) -> bool:
+    (was, normal), (now, _) = side_of(row, start), side_of(row, end)
+    if (was >= 0.0) == (now >= 0.0):
+        return False
+    ab, ac = (row[3], row[4], row[5]), (row[6], row[7], row[8])
+    at = subtract(axpy(start, was / (was - now), subtract(end, start)), (row[0], row[1], row[2]))
+    square = dot(normal, normal)
+    u, v = dot(cross(at, ac), normal) / square, dot(cross(ab, at), normal) / square
+    return u >= -EDGE and v >= -EDGE and u + v <= 1.0 + EDGE
+
+
+@inlined
+def side_of(row: NDArray, x: Vector) -> tuple[float, Vector]:
+    """Return the volume that x spans with a triangle, above 0 in front of it, and its normal; neither of unit size."""
+    normal = cross((row[3], row[4], row[5]), (row[6], row[7], row[8]))
+    return dot(normal, subtract(x, (row[0], row[1], row[2]))), normal
