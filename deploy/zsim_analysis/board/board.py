@@ -35,7 +35,7 @@ from zsim.output_folder import held_folder
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import LAWS, Scenario
 from zsim_agents.hosting import check_classes
-from zsim_agents.laws.reference import FormationReference, polygon
+from zsim_agents.laws.pilot import FormationReference, polygon
 from zsim_analysis.board.measures import Figure, flown_of, measures, shape_errors
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.sweep.process_pool import ProcessPool, cores

@@ -18,8 +18,7 @@ import numpy as np
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim_agents.laws.olfati_saber import OlfatiSaber
-from zsim_agents.laws.pilot import AIRBORNE, Motion, Pilot
-from zsim_agents.laws.reference import FormationReference, polygon
+from zsim_agents.laws.pilot import AIRBORNE, FormationReference, Motion, Pilot, polygon
 from zsim_agents.laws.shape import ShapePilot
 from zsim_analysis.reading.formation import common_instants, min_separation_m
 from zsim_analysis.reading.recorded_flight import Array, RecordedFlight, Track

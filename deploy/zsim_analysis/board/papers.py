@@ -26,8 +26,7 @@ from zsim.presentation import Column, FittedTable
 from zsim_agents.laws.bearing_only import bearing_only
 from zsim_agents.laws.consensus import consensus
 from zsim_agents.laws.olfati_saber import alpha_force, deviation_energy, gamma_force
-from zsim_agents.laws.pilot import Heard
-from zsim_agents.laws.reference import polygon
+from zsim_agents.laws.pilot import Heard, polygon
 from zsim_analysis.reading.recorded_flight import Array
 from zsim_analysis.report import figure_style as style
 
