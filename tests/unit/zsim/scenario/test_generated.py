@@ -84,12 +84,12 @@ def test_a_corridor_is_as_wide_as_told_and_closed_at_its_bends():
     ],
 )
 def test_what_is_refused(section: str, change: dict[str, Any], field: str):
-    base = {"forest": FOREST, "corridor": CORRIDOR}[section]
-    assert faulty_fields(document(**{section: base | change}), "environment.") == [f"{section}.{field}"]
+    changed: Any = {section: {"forest": FOREST, "corridor": CORRIDOR}[section] | change}
+    assert faulty_fields(document(**changed), "environment.") == [f"{section}.{field}"]
 
 
 def test_together_they_are_no_more_than_a_world_takes():
-    big = {"forest": FOREST | {"trees": 999, "area_m": [-300, -300, 300, 300]}, "corridor": CORRIDOR}
+    big: Any = {"forest": FOREST | {"trees": 999, "area_m": [-300, -300, 300, 300]}, "corridor": CORRIDOR}
     assert faulty_fields(document(**big), "environment.") == ["obstacles"]
 
 
