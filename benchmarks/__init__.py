@@ -1,1 +1,1 @@
-"""Measurements against others: every row is a ratio within one run, on the same work, the contenders in turn."""
+"""Comparisons with other simulators: each row is a ratio within one run; contenders do the same work, in turn."""

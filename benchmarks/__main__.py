@@ -1,9 +1,9 @@
-"""Measure, and put what was measured into benchmarks/README.md.
+"""Measure, and write the results into benchmarks/README.md.
 
-make bench                                        everything; makes the peers' environment first
+make bench                                        all parts; makes the peers' environment first
 .venv/bin/python -m benchmarks a b --repeats 7    some parts
 .venv/bin/python -m benchmarks c --against REV    this working tree beside another commit
-.venv/bin/python -m benchmarks a --page           write the page from results/a.json again, measuring nothing
+.venv/bin/python -m benchmarks a --page           write the page again from results/a.json, without measuring
 """
 
 import argparse
@@ -43,7 +43,7 @@ BESIDE = frozenset("abf")  # parts with peers
 
 
 class Part(NamedTuple):
-    """A part: measures so many repeats into a sheet, and tells a sheet in Markdown."""
+    """A part: measures a number of repeats into a sheet, and renders a sheet as Markdown."""
 
     measure: Callable[[int], Sheet]
     page: Callable[[Sheet], str]

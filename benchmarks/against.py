@@ -1,8 +1,8 @@
-"""Part c with `--against REV`: this working tree beside another commit of zsim, turn by turn on one machine.
+"""Part c with `--against REV`: this working tree beside another commit of zsim, in turn on one machine.
 
 Both fly their own Test 1 with the same seed and duration, and a grid of 99 drones. Processor time is that of a long
-flight less that of a short one, so that start-up, loading and the end of a run are left out of it. Above 1 a ratio says
-that this tree is the better one: real-time factor here / there, processor time and memory there / here.
+flight minus that of a short one, which excludes the start and the end of a run. A ratio above 1 means that this tree
+is better: real-time factor here / there, processor time and memory there / here.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ from benchmarks.run import end_event, spent
 from benchmarks.sheet import Progress, Sheet
 from benchmarks.table import spread, table
 
-GRID = 99  # drones: 33 clusters of three, so that nobody is left over and stands by
+GRID = 99  # drones: 33 clusters of three, so that none is left over
 SEED = 1
 FLOWN = ("world", "agents", "record")  # extras that a flight needs
 
@@ -36,7 +36,7 @@ class Flight(NamedTuple):
     label: str  # for people
     drones: int  # number of drones
     options: tuple[str, ...]  # of `zsim run`
-    short_s: float  # duration of the short flight, simulated; its processor time is taken from that of the long one
+    short_s: float  # simulated; the processor time of this flight is subtracted from that of the long one
     long_s: float  # duration of the long flight, simulated
 
 
@@ -56,11 +56,11 @@ class Side(NamedTuple):
 
 
 def measure(repeats: int, revision: str, names: Sequence[str] = tuple(FLIGHTS)) -> Sheet:
-    """Fly both revisions in turn, so often.
+    """Fly both revisions in turn.
 
     Args:
         repeats: turns.
-        revision: commit that git knows: a hash, a tag, a branch, `HEAD~3`.
+        revision: a commit: a hash, a tag, a branch, `HEAD~3`.
         names: of `FLIGHTS`.
 
     RefusedError if git does not know the revision, or a package that it needs cannot be installed.
@@ -77,7 +77,7 @@ def measure(repeats: int, revision: str, names: Sequence[str] = tuple(FLIGHTS)) 
             progress.tell(f"{described(side.root)}: compiled")
         for turn in range(repeats):
             for name, flight in flights.items():
-                for mine in sorted(sides, reverse=bool(turn % 2)):  # who was first is second in the next turn
+                for mine in sorted(sides, reverse=bool(turn % 2)):  # the order alternates
                     side = sides[mine]
                     path = Path(temporary) / "grid.yaml" if name == "grid" else side.root / "scenarios" / "step.yaml"
                     progress.tell(f"{mine}, {flight.label}: {_measured(sheet, mine, name, flight, side, path)}")
@@ -148,7 +148,7 @@ def described(root: Path) -> str:
 
 
 def _measured(sheet: Sheet, mine: str, name: str, flight: Flight, side: Side, path: Path) -> str:
-    """Fly a short and a long flight, and take their figures; return them for people."""
+    """Fly a short and a long flight, and add their figures; return these as text."""
     try:
         _, short_cpu_s, _ = _flown(side, flight, flight.short_s, path)
         factor, long_cpu_s, peak_mb = _flown(side, flight, flight.long_s, path)

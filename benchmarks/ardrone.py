@@ -1,10 +1,10 @@
-"""What `zsim ardrone serve` costs: its processor at full navdata, and the age that it adds to a command.
+"""What `zsim ardrone serve` costs: processor time at full navdata, and the age that it adds to a command.
 
     python -m benchmarks.ardrone [--drones 20] [--seconds 10]
 
 A world in realtime; each drone has a pilot that is sent full navdata and sends REF and PCMD every 30 ms, as the SDK
-does. The age is from the sending of a PCMD that differs to its command at a client of Zenoh; beside it, the way of a
-message of the same size from one client of Zenoh to another.
+does. The age is measured from the sending of a PCMD that differs from the last one to the arrival of its command at
+a Zenoh client; for comparison, the time of a message of the same size from one Zenoh client to another.
 """
 
 import argparse
@@ -28,7 +28,7 @@ from zsim_bridges.ardrone import at_commands, navdata
 PERIOD_S = 0.03  # of the SDK
 FIRST = "127.9.0.2"
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
-PROBE_S = 0.05  # wall time between two messages whose way is measured
+PROBE_S = 0.05  # wall time between two messages that are timed
 READY_S = 60.0
 INDOOR_RAD = 0.20944  # control:euler_angle_max
 
@@ -66,7 +66,7 @@ class Pilots:
         self._socket.sendto(datagram, (address, at_commands.PORT))
 
     def steer(self, share: float = 0.0, only: str = "") -> None:
-        """Send what the SDK sends each 30 ms."""
+        """Send what the SDK sends every 30 ms."""
         for address in [only] if only else self.addresses:
             pcmd = at_commands.Pcmd(0, int(share != 0.0), 0.0, share, 0.0, 0.0)
             self._send(address, at_commands.ref(0, self.flies), pcmd)
@@ -144,7 +144,7 @@ def _await_navdata(pilots: Pilots) -> None:
 
 
 def _ages_ms(session: zenoh.Session, pilots: Pilots, seconds: float) -> list[float]:
-    """Steer for so long; return how long each command that differed took to its key [ms]."""
+    """Steer for a time; return how long each command that differed took to its key [ms]."""
     sent_s: dict[float, float] = {}
     ages_ms: list[float] = []
 
@@ -168,7 +168,7 @@ def _ages_ms(session: zenoh.Session, pilots: Pilots, seconds: float) -> list[flo
 
 
 def _forward(tilt_rad: float) -> float:
-    """Return the share of zsim's tilt by which the command is known again."""
+    """Return the share of zsim's tilt by which the command is recognised."""
     sent = at_commands.float_of_bits(at_commands.bits_of_float(tilt_rad / INDOOR_RAD))
     return math.tan(sent * INDOOR_RAD) / math.tan(math.radians(20.0))
 

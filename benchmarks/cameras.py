@@ -1,7 +1,7 @@
-"""CPU time of a picture and of looking for hats in it, on one thread: python -m benchmarks.cameras [PICTURES]
+"""CPU time of drawing a picture and of finding hats in it, on one thread: python -m benchmarks.cameras [PICTURES]
 
-A front camera of 640 x 360 with ten drones in view, hovering and in motion; with PICTURES, a folder, the pictures of
-docs/cameras.md are written into it.
+A front camera of 640 x 360 with ten drones in view, hovering and in motion; if PICTURES, a folder, is given, the
+pictures of docs/cameras.md are written into it.
 """
 
 import sys
@@ -16,11 +16,11 @@ from zsim.math.frames import quaternion_from_rpy
 from zsim.sensors.camera import BottomCamera, Camera, FrontCamera, Hats
 from zsim.sensors.camera_model import camera_pose, lens_of
 from zsim_agents.cameras.detector import HatDetector, decoded
-from zsim_agents.cameras.rendering.renderer import Renderer
-from zsim_agents.cameras.rendering.scene import DroneStates, Scene, default_look
+from zsim_agents.cameras.renderer import Renderer
+from zsim_agents.cameras.scene import DroneStates, Scene, default_look
 
 DRONES = 11  # one looks at ten
-REPEATS, CALLS = 30, 20  # the least of so many means: what other load adds is left out
+REPEATS, CALLS = 30, 20  # the smallest of this many means, which excludes other load
 ROTOR_RAD_S = 400.0  # rad/s, about a hover
 
 

@@ -1,6 +1,6 @@
-"""Processes of the benchmarks: one that prints a result and ends, or one that is asked again and again.
+"""Processes of the benchmarks: one that prints a result and ends, or one that answers repeatedly.
 
-Each has a process group of its own, so that nothing of it is left, however it ends.
+Each has its own process group, so that nothing of it remains, however it ends.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ class RefusedError(Exception):
 def result(command: Sequence[str], timeout_s: float) -> dict[str, Any]:
     """Run a command in the project's folder and return the JSON of the last line that it prints.
 
-    RefusedError if it failed, or was not through in time.
+    RefusedError if it failed, or did not end in time.
     """
     with tempfile.TemporaryFile("w+") as errors:
         process = _started(command, errors, stdin=subprocess.DEVNULL)
@@ -40,7 +40,7 @@ def result(command: Sequence[str], timeout_s: float) -> dict[str, Any]:
 
 
 class Server:
-    """A contender that stays up and answers lines of JSON."""
+    """A contender that keeps running and answers lines of JSON."""
 
     def __init__(self, command: Sequence[str]) -> None:
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - open as long as the process
@@ -81,7 +81,7 @@ def _started(command: Sequence[str], errors: Any, stdin: int) -> subprocess.Pope
 
 
 def _end(process: subprocess.Popen[str]) -> None:
-    """Kill whatever is left of it and of its children."""
+    """Kill what remains of it and of its children."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()

@@ -1,7 +1,7 @@
-"""Part d: how old a command is at the world, since the samples that it answers were published, in realtime.
+"""Part d: the age of a command at the world in realtime, since the publication of the samples that it answers.
 
-Beside it, in the same run and with as many processes, what Zenoh alone needs: there and back, and the way of a command
-(hub, N clients, through the hub one more that waits for all, back).
+For comparison, in the same run and with as many processes, what Zenoh alone needs: a round trip, and the path of a
+command (from the hub to N clients, through the hub to one more that waits for all, and back).
 """
 
 import sys
@@ -29,7 +29,7 @@ LABELS = {
 
 
 def measure(repeats: int) -> Sheet:
-    """Fly in realtime and run the bare exchanges, in turn, so often at every size."""
+    """Fly in realtime and run the bare exchanges, in turn, at every size."""
     sheet = Sheet("d", "ms")
     progress = Progress("d", repeats * len(SIZES) * len(LABELS))
     with tempfile.TemporaryDirectory() as folder:

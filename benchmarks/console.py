@@ -1,8 +1,8 @@
-"""Part h: what the console costs: its share of a core, and what a run in lockstep loses by it.
+"""Part h: what the console costs: its share of a core, and by how much it slows a run in lockstep.
 
-The share is processor time by wall time of the console's process, with one page open: a client that reads all that a
-page is sent. The run's loss is its real-time factor while there is a console, and such a client, by the mean of those
-just before and just after, in one run, again and again: machines drift.
+The share is processor time divided by wall time of the console's process, with one page open: a client that reads all
+that a page is sent. The loss is the real-time factor with a console and such a client, divided by the mean of those
+just before and just after; this is repeated within one run, because machines drift.
 """
 
 import json
@@ -36,41 +36,41 @@ from zsim_bridges.console.page_server import ViewerCamera
 
 CLI = (sys.executable, "-m", "zsim_deploy.cli")
 SIZES = (3, 50)  # drones
-SECONDS = 15.0  # wall time over which a share is taken
-SETTLE_S = 5.0  # wall time before it: a page that is opened is sent everything at once
-FLIGHT_S = 100_000.0  # simulated, of a run whose real-time factor is taken: it is ended before
-WINDOW_S = 8.0  # wall time over which it is taken
-PAIRS = 8  # of windows with a console, in one run, each between two without
+SECONDS = 15.0  # wall time over which a share is measured
+SETTLE_S = 5.0  # wall time before that: a page that is opened is sent everything at once
+FLIGHT_S = 100_000.0  # simulated, of a run whose real-time factor is measured: it is ended before
+WINDOW_S = 8.0  # wall time over which that is measured
+PAIRS = 8  # windows with a console in one run, each between two without
 TIMEOUT_S = 300.0
 LOOK_S = 0.2
 GOALS = {3: 15.0, 50: 60.0}  # percent of a core
 LEAST_RATIO = 0.9
 PICTURES_HZ = {3: 20.0, 50: 10.0}  # of the console, by its number of drones
-LEAST_PICTURES = 0.8  # share of them; below it the console was starved, and looks cheap
-LEAST_RATE = 0.9  # of real time; below it the run was starved, and gave the console less to draw
+LEAST_PICTURES = 0.8  # share of them; with fewer the console was starved, and seems cheap
+LEAST_RATE = 0.9  # of real time; a slower run gave the console less to draw
 DRONES = "/drones"  # the node of the scene
-CAMERA = ViewerCamera(  # what a page says first; before it, viser heeds no control of it
+CAMERA = ViewerCamera(  # the first message of a page; viser ignores its controls before that
     (1.0, 0.0, 0.0, 0.0), (0.0, -5.0, 3.0), 1.0, 0.01, 1000.0, 600, 800, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 )
 
 
 class Share(NamedTuple):
-    """What was seen of a console meanwhile."""
+    """What was measured of a console in a window."""
 
     percent: float  # of a core
-    read_per_s: float  # what was counted at the page
-    factor: float  # simulated by wall time
+    read_per_s: float  # count at the page
+    factor: float  # simulated / wall time
 
 
 class Reader:
-    """A page without a picture: reads all that viser sends.
+    """A page that draws nothing: it reads all that viser sends.
 
     Args:
         port: of the console.
 
     Attributes:
         received: bytes.
-        pictures: how often the drones have been drawn anew.
+        pictures: how often the drones have been redrawn.
     """
 
     def __init__(self, port: int) -> None:
@@ -96,7 +96,7 @@ class Reader:
 
 
 def _has_drones(said: str | bytes) -> bool:
-    """Tell whether what viser sends puts the drones elsewhere: lengths, then what is packed, then arrays."""
+    """Return whether a message of viser moves the drones; it has lengths, then a packed part, then arrays."""
     assert isinstance(said, bytes)
     packed = said[16 : 16 + int.from_bytes(said[8:16], "little")]
     told = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(packed), strict=False)["messages"]
@@ -123,7 +123,7 @@ def _await(condition: Callable[[], bool], what: str) -> None:
 
 
 def _runs(port: int) -> bool:
-    """Tell whether a console shows drones that move on."""
+    """Return whether a console shows drones that move."""
     with suppress(OSError, KeyError):  # the page is there before it shows a run
         return _shown_s(port) > 3.0
     return False
@@ -131,7 +131,7 @@ def _runs(port: int) -> bool:
 
 @contextmanager
 def _flying(folder: Path, count: int) -> Iterator[tuple[int, psutil.Process]]:
-    """Fly so many drones at 1 x real time; yield the console's port and process."""
+    """Fly a number of drones at 1 x real time; yield the console's port and process."""
     scenario, world, port = folder / f"grid{count}.yaml", free_port(), free_port()
     grid.write(scenario, count, 3600.0)
     endpoint = f"tcp/127.0.0.1:{world}"
@@ -145,7 +145,7 @@ def _flying(folder: Path, count: int) -> Iterator[tuple[int, psutil.Process]]:
 
 
 def _share(console: psutil.Process, port: int, read: Callable[[], int] = lambda: 0) -> Share:
-    """Return what the console spends, and what a page is sent and sees, over SECONDS."""
+    """Return the console's processor time, and what a page is sent, over SECONDS."""
     time.sleep(SETTLE_S)
     before, sent, simulated_s, start_s = console.cpu_times(), read(), _shown_s(port), time.monotonic()
     time.sleep(SECONDS)
@@ -176,14 +176,14 @@ def _measure_shares(sheet: Sheet, folder: Path, count: int) -> str:
 
 
 def _check_kept_up(count: int, drawn: Share) -> None:
-    """Refuse what was measured if too few pictures were drawn meanwhile, or the run did not keep up with real time."""
+    """Refuse a measurement if too few pictures were drawn, or the run did not keep up with real time."""
     if drawn.read_per_s < LEAST_PICTURES * PICTURES_HZ[count] or drawn.factor < LEAST_RATE:
         found = f"{drawn.read_per_s:.1f} pictures a second at × {drawn.factor:.2f}"
         raise RefusedError(f"{count} drones: {found}; must be about {PICTURES_HZ[count]:g} at × 1")
 
 
 def _measure_factors(sheet: Sheet, folder: Path, count: int) -> str:
-    """Fly one run as fast as it goes; let a console that is looked at come and go, and note how fast it goes."""
+    """Fly one run unpaced, with a console and a page from time to time, and add its real-time factors."""
     scenario, world = folder / f"fast{count}.yaml", free_port()
     endpoint = f"tcp/127.0.0.1:{world}"
     grid.write(scenario, count, FLIGHT_S)
@@ -203,7 +203,7 @@ def _measure_factors(sheet: Sheet, folder: Path, count: int) -> str:
 
 @contextmanager
 def _looked_at(endpoint: str) -> Iterator[None]:
-    """Let there be a console, and a page that reads all that it is sent."""
+    """Run a console, and a page that reads all that it is sent."""
     port = free_port()
     with _started("console", "--connect", endpoint, "--port", str(port)):
         _await(lambda: _runs(port), "a run on the console")
@@ -222,7 +222,7 @@ def _factor(link: Session) -> float:
 
 
 def _now_s(link: Session) -> float:
-    """Return the simulated time of a run; 0 where nobody says it."""
+    """Return the simulated time of a run; 0 if it is not published."""
     found = link.get(keys.CLOCK)
     return messages.decode(keys.CLOCK, found[0].payload).t_ns / 1e9 if found else 0.0
 

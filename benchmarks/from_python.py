@@ -1,7 +1,7 @@
-"""Part j: what Python costs: a whole flight by zsim.run beside the command's, and flights that are stepped.
+"""Part j: what the Python interface costs: a flight by zsim.run compared with `zsim run`, and stepped flights.
 
-The flights are whole processes, from their start to their end, in turn; both record, and neither makes a report. Steps
-are counted by the CPU time of their process, from the second simulated second on, truth alone being looked at.
+The flights are whole processes, in turn; both record, and neither makes a report. Steps are counted by the CPU time of
+their process, from the second simulated second on; only the truth is observed.
 """
 
 import gc
@@ -84,7 +84,7 @@ def _said(command: list[str]) -> str:
 
 
 def stepped(agents: Any, is_commanded: bool, wrap: Callable[[Callable[[], None]], None] = lambda fly: fly()) -> float:
-    """Return gates per CPU second of a stepped flight; `wrap` calls what is measured, under a profiler for instance."""
+    """Return gates per CPU second of a stepped flight; `wrap` calls the measured function, as under a profiler."""
     import zsim
 
     sim = zsim.Simulation(SCENARIO, agents=agents, duration_s=3600)

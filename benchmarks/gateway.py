@@ -1,4 +1,4 @@
-"""Part g: what the gateway costs: beside a bare aiohttp server, and beside Zenoh itself."""
+"""Part g: what the gateway costs, compared with a bare aiohttp server and with Zenoh itself."""
 
 import json
 import sys
@@ -78,7 +78,7 @@ def _client(what: str, port: int, *more: str) -> dict[str, float]:
 
 @contextmanager
 def _standing() -> Iterator[Ports]:
-    """Yield the ports of a world that stands, its gateway, and a bare server."""
+    """Yield the ports of a paused world, its gateway, and a bare server."""
     ports = Ports(*(free_port() for _ in Ports._fields))
     zsim, endpoint = (sys.executable, "-m", "zsim_deploy.cli"), f"tcp/127.0.0.1:{ports.world}"
     doors = ("--http", str(ports.http), "--lines", str(ports.lines), "--connect", endpoint)

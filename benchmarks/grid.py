@@ -1,7 +1,7 @@
 """Scenarios of any number of drones: a grid on the ground, GPS and all sensors, an estimator for each.
 
-Three drones in a row are no triangle, and would not take off: those of a cluster of three stand at three corners of a
-square, and the squares on a grid.
+Three drones in a row are not a triangle and would not take off, so those of a cluster of three stand at three corners
+of a square, and the squares on a grid.
 """
 
 import math
@@ -27,8 +27,8 @@ def document(
     Args:
         count: number of drones.
         duration_s: simulated.
-        cluster: drones per cluster, each of which takes off; who is left over stands by. 0: none.
-        drone: what every drone has beside its place.
+        cluster: drones per cluster, each of which takes off; drones left over stand by. 0: no clusters.
+        drone: fields of every drone in addition to its position.
     """
     places = _triangles(count) if cluster == CLUSTER else _rows(count, SPACING_M)
     names = [f"drone{k + 1}" for k in range(count)]

@@ -60,7 +60,7 @@ PEERS = [name for name in CONTENDERS if not name.startswith("zsim")]
 
 
 def measure(repeats: int, sizes: tuple[int, ...] = SIZES, cpu_s: float = CPU_S) -> Sheet:
-    """Start all contenders, and ask them in turn, so often at every size."""
+    """Start all contenders, and measure them in turn at every size."""
     sheet = Sheet("b", "drone-seconds per CPU second")
     sheet.refused = {name: why for name, c in CONTENDERS.items() if c.peer and (why := peers.missing(c.peer))}
     running = [name for name in CONTENDERS if name not in sheet.refused]

@@ -1,4 +1,4 @@
-"""CPU time of lidars: ten drones in a forest, 16 x 360 rays of each at 10 Hz, beside the same flight without them.
+"""CPU time of lidars: ten drones in a forest, each with 16 x 360 rays at 10 Hz, and the same flight without them.
 
 .venv/bin/python -m benchmarks.lidar
 """

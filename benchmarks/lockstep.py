@@ -1,4 +1,4 @@
-"""Part a: how many steps a second a world and N agents make that do nothing but wait for each other."""
+"""Part a: steps per second of a world and N agents that only wait for each other."""
 
 import sys
 from typing import NamedTuple

@@ -1,10 +1,10 @@
-"""What `zsim mavlink serve` costs, and by how much it makes a command later.
+"""What `zsim mavlink serve` costs, and by how much it delays a command.
 
 .venv/bin/python -m benchmarks.mavlink_vehicles [--drones 20] [--seconds 10]
 
 All drones of a realtime run fly as ArduPilot vehicles at the full rates of telemetry, to a ground station and a program
-each. The age is from a datagram with a setpoint to its command at a subscriber of Zenoh; beside it a put of Zenoh's own
-on a key beside it, to the same subscriber: what is between the two is added.
+each. The age is from a datagram with a setpoint to its command at a Zenoh subscriber; for comparison, a plain put on
+another key to the same subscriber is timed: the difference is the delay.
 """
 
 import argparse
@@ -140,7 +140,7 @@ def subscribed(endpoint: str, arrivals: dict[str, list[float]]) -> zenoh.Session
 
 
 def age_ms(arrived: list[float], send: Callable[[], None]) -> list[float]:
-    """Return after how long what is sent arrives [ms]; nothing where it does not until the next is due."""
+    """Return the latency of each message [ms], without those that have not arrived when the next is due."""
     arrived.clear()
     sent_s = time.perf_counter()
     send()

@@ -1,7 +1,7 @@
 """What an onboard computer of one drone needs: an estimator installed alone, with and without numba.
 
-Each variant is installed from this project into an environment of its own in .venv-bench, and flies one drone against
-a world of zsim's own environment, as fast as they go.
+Each variant is installed from this project into an environment of its own in .venv-bench, and flies one drone with
+a world in zsim's own environment, unpaced.
 """
 
 import subprocess

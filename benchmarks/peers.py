@@ -1,4 +1,4 @@
-"""The peers' own environment: made, and asked who could be installed."""
+"""The peers' own environment: making it, and finding out which peers could be installed."""
 
 import json
 import subprocess
@@ -12,7 +12,7 @@ PYTHON = FOLDER / "bin" / "python"
 PINS = Path(__file__).parent / "requirements.txt"
 STATE = FOLDER / "peers.json"
 CPU_TORCH = ("--extra-index-url", "https://download.pytorch.org/whl/cpu")  # the index's own brings gigabytes of CUDA
-# peer: (what pip is told, module that shows that it is there)
+# peer: (arguments of pip, module that is imported as a check)
 PEERS: dict[str, tuple[tuple[str, ...], str]] = {
     "helics": (("helics",), "helics"),
     "mosaik": (("mosaik",), "mosaik"),
@@ -26,7 +26,7 @@ PEERS: dict[str, tuple[tuple[str, ...], str]] = {
 
 
 def ensure(say: Callable[[str], None]) -> None:
-    """Make the environment and install what is not there yet; who cannot be installed is noted with the reason."""
+    """Make the environment and install missing peers; for those that cannot be installed, note the reason."""
     if not PYTHON.exists():
         say(f"making {FOLDER.name} for the peers")
         subprocess.run([sys.executable, "-m", "venv", str(FOLDER)], check=True)

@@ -1,4 +1,4 @@
-"""Part i: the recorder beside a federation of 50 drones: whether it writes everything, and its share of a core.
+"""Part i: the recorder of a federation of 50 drones: whether it writes everything, and its share of a core.
 
 Everything is counted by `seq`, which every key has from 0 without gaps. The share is processor time by wall time from
 the first megabyte on record to the end of the run, so that start-up is left out.
@@ -45,11 +45,11 @@ class Flown(NamedTuple):
 
     Attributes:
         cpu_s: its processor time while the run was under way.
-        wall_s: that while.
+        wall_s: the length of that time.
         sim_s: simulated in all.
         messages: on record.
         size_bytes: of the record.
-        faults: by key, where its count is broken; of views, which may skip, only what comes twice or backwards.
+        faults: by key, where its count is broken; for views, which may skip, only repetitions and steps back.
         missing: numbers that are not on record, views left out.
     """
 
@@ -90,7 +90,7 @@ def fly(drones: int, seconds: float, *options: str) -> Flown:
 
 
 def _looks(launcher: subprocess.Popen[str], record: Path) -> Iterator[tuple[float, float]]:
-    """Yield wall time and the recorder's processor time [s] now and then while a run is under way."""
+    """Yield wall time and the recorder's processor time [s] at intervals during a run."""
     recorder: psutil.Process | None = None
     until_s = time.monotonic() + TIMEOUT_S
     while launcher.poll() is None and time.monotonic() < until_s:
@@ -136,14 +136,14 @@ def counted(path: Path) -> tuple[dict[str, str], int, int, int]:
 
 
 def _cut_short(ends_ns: Mapping[str, int], last_ns: int) -> dict[str, str]:
-    """Return the keys of drones that stop before the run does: what is lost at the end leaves no gap."""
+    """Return the keys of drones that end before the run does: a loss at the end leaves no gap."""
     early = {key: (last_ns - end_ns) / 1e9 for key, end_ns in ends_ns.items() if key.startswith("drone/")}
     of_a_rate = {key: by_s for key, by_s in early.items() if "/sensor/" in key or key.endswith(("/truth", "/estimate"))}
     return {key: f"ends {by_s:g} s before the run" for key, by_s in of_a_rate.items() if by_s > SLOWEST_S}
 
 
 def measure(repeats: int) -> Sheet:
-    """Fly in both modes, in turn, so often."""
+    """Fly in both modes, in turn."""
     sheet = Sheet("i", "of a core")
     progress = Progress("i", repeats * len(LABELS))
     run.fly(TEST_1, 2.0, "--in-process")  # compiles what is not compiled yet

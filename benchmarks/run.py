@@ -1,4 +1,4 @@
-"""One run of `zsim run`: what the world measured of it, and what its processes spent."""
+"""One run of `zsim run`: the world's figures, and the processor time of its processes."""
 
 import contextlib
 import os
@@ -21,8 +21,8 @@ from zsim_deploy.inventory import MODULE
 
 CLI = (sys.executable, "-m", "zsim_deploy.cli")
 TIMEOUT_S = 600.0
-WAIT_S = 0.05  # wall time between two looks whether a command has ended
-LOOK_S = 0.5  # wall time between two looks at what processes have spent; a look takes milliseconds
+WAIT_S = 0.05  # polling interval of a command's end
+LOOK_S = 0.5  # polling interval of processor times, which takes milliseconds
 
 
 def fly(scenario: Path, seconds: float, *options: str) -> tuple[dict[str, float], dict[str, float]]:
@@ -57,7 +57,7 @@ class Spent(NamedTuple):
 
 
 def spent(command: Sequence[str], folder: Path) -> Spent:
-    """Run a command in a folder and return what it spent; RefusedError if it failed, or was not through in time."""
+    """Run a command in a folder and return what it spent; RefusedError if it failed, or did not end in time."""
     with tempfile.TemporaryFile("w+") as said:
         process = subprocess.Popen(
             command, cwd=folder, stdin=subprocess.DEVNULL, stdout=said, stderr=said, start_new_session=True

@@ -1,4 +1,4 @@
-"""Part f: how many flights of Test 1 two cores make in an hour."""
+"""Part f: flights of Test 1 per hour on two cores."""
 
 import sys
 import tempfile
@@ -58,7 +58,7 @@ NOT_FLOWN = {"MuJoCo": "it has no controller of a multirotor; its bodies alone a
 
 
 def measure(repeats: int) -> Sheet:
-    """Fly Test 1 once for its ways, start the peers, and let all fly in turn, so often."""
+    """Fly Test 1 once for its paths, start the peers, and let all fly in turn."""
     sheet = Sheet("f", f"runs per hour on {WORKERS} cores", notes={"sweep_runs": RUNS})
     sheet.refused = {name: why for name, c in CONTENDERS.items() if c.peer and (why := peers.missing(c.peer))}
     running = [name for name in CONTENDERS if name not in sheet.refused]
@@ -95,7 +95,7 @@ def _swept(sheet: Sheet) -> str:
 
 
 def _flown(sheet: Sheet, name: str, crew: list[Server], seed: int) -> str:
-    """Ask all processes of a contender at once, and wait for the last; who once gave no answer is not asked again."""
+    """Ask all processes of a contender at once, and wait for the last; one that failed once is not asked again."""
     if why := sheet.refused.get(f"{name}@{WORKERS}"):
         return sheet.refuse(name, WORKERS, why, [name, f"{name}_cpu_s"])
     start_s = time.perf_counter()
@@ -140,7 +140,7 @@ def _row(sheet: Sheet, name: str, label: str, flown: str) -> list[str]:
 
 
 def _ratios(sheet: Sheet) -> str:
-    """Return how zsim stands to the only peer with an estimator, and its world alone to those without."""
+    """Return the ratios of zsim to the only peer with an estimator, and of its world alone to those without."""
     pairs = {
         "`zsim sweep` / RotorPy with its estimator": ("zsim", "rotorpy"),
         "zsim's world alone / gym-pybullet-drones": ("zsim_fleet", "pybullet"),

@@ -27,9 +27,9 @@ class Sheet:
     Attributes:
         part: letter.
         unit: of the values.
-        values: by contender, by size, in order of the repeats; None for a repeat that gave none.
+        values: by contender, by size, in order of the repeats; None for a repeat without a value.
         refused: why a contender, or a contender at a size, has no value.
-        notes: whatever else is to be kept.
+        notes: anything else to be kept.
         machine: where and with what it ran.
     """
 
@@ -41,7 +41,7 @@ class Sheet:
     machine: dict[str, Any] = field(default_factory=dict)
 
     def add(self, contender: str, size: int, value: float | None) -> None:
-        """Take the value of one more repeat, None if there is none."""
+        """Add the value of a further repeat, None if there is none."""
         self.values.setdefault(contender, {}).setdefault(size, []).append(value)
 
     def refuse(self, contender: str, size: int, reason: str, rows: Sequence[str]) -> str:
@@ -59,7 +59,7 @@ class Sheet:
         return spread(self.values.get(contender, {}).get(size, []))
 
     def ratio(self, contender: str, reference: str, size: int) -> Spread | None:
-        """Return how many times the reference a contender is, each repeat against the same repeat; None if unknown."""
+        """Return the ratio of a contender to the reference, repeat by repeat; None if unknown."""
         mine = self.values.get(contender, {}).get(size, [])
         its = self.values.get(reference, {}).get(size, [])
         return spread([a / b if a is not None and b else None for a, b in zip(mine, its, strict=False)])
@@ -81,7 +81,7 @@ def read(path: Path) -> Sheet:
 
 
 def spread(values: Sequence[float | None]) -> Spread | None:
-    """Return median, least and greatest of what there is; None of nothing."""
+    """Return median, least and greatest of the values; None if there are none."""
     found = [value for value in values if value is not None]
     return Spread(statistics.median(found), min(found), max(found)) if found else None
 

@@ -1,4 +1,4 @@
-"""How long a role takes from its command to being ready, and what it takes up then."""
+"""The time from a role's command until it is ready, and its memory then."""
 
 import socket
 import subprocess
@@ -18,7 +18,7 @@ from zsim.transport.connection import find_world
 
 FEDERATION = "zsim"
 PATIENCE_S = 60.0
-LOOK_S = 0.002  # wall time between two looks
+LOOK_S = 0.002  # polling interval
 ROLES = {
     "world": "zsim world",
     "estimator": "zsim estimator",
@@ -87,7 +87,7 @@ def _running(command: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def _until(ready: Callable[[], bool], process: subprocess.Popen[bytes]) -> None:
-    """Look until it is ready; RefusedError if it ended, or was not ready in time."""
+    """Wait until it is ready; RefusedError if it ended, or was not ready in time."""
     until_s = time.perf_counter() + PATIENCE_S
     while not ready():
         if process.poll() is not None:

@@ -1,4 +1,4 @@
-"""A formation law of one's own: cyclic pursuit, in which each drone flies after the next one, turned by an angle.
+"""A custom formation law: cyclic pursuit, in which each drone follows the next one, turned by an angle.
 
 zsim run examples/laws.yaml --set agents.pilot.class=cyclic_pursuit:CyclicPursuit
 PYTHONPATH=examples zsim board --laws consensus,cyclic_pursuit:CyclicPursuit --scenarios trajectory --seeds 1
@@ -7,7 +7,7 @@ PYTHONPATH=examples zsim board --laws consensus,cyclic_pursuit:CyclicPursuit --s
 
 Marshall, Broucke, Francis, Formations of vehicles in cyclic pursuit, IEEE Trans. Automatic Control 49 (2004). Turned
 outwards by pi / n the drones neither close in nor spread, and circle; here the circle also follows the reference's
-velocity. Drones are to be in the order in which they stand around their centre, counter-clockwise.
+velocity. The drones must be listed in their order around the centre, counter-clockwise.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Metrics of a user's own for a sweep: the control effort of a formation, and whether its estimators state the truth.
+"""Custom metrics of a sweep: the control effort of a formation, and the consistency of its estimators.
 
     PYTHONPATH=examples zsim sweep scenarios/step.yaml --vary gains.proportional_1_s=0.4,0.8 --vary seed=paired \
         --runs 8 --set report.metrics=effort:effort
@@ -16,7 +16,7 @@ from zsim_analysis.reading.recorded_flight import RecordedFlight
 def effort(flight: RecordedFlight) -> dict[str, float | None]:
     """Return the RMS over drones and time of the commanded velocity [m/s], and the mean NEES of their estimates.
 
-    Both from the engagement on; None where the formation never engaged. The NEES of an estimator that states its true
+    Both from the engagement on; None if the formation never engaged. The NEES of an estimator that reports its true
     covariance is 6 on average.
     """
     engaged_s = formations_of(flight)[0].engaged_s

@@ -18,11 +18,11 @@ ENDPOINT = WORDS.pop(0) if WORDS and "/" in WORDS[0] else "tcp/127.0.0.1:7447"
 _ = len(WORDS) in (1, 4) or sys.exit("usage: python examples/external_drone.py [ENDPOINT] DRONE [X Y Z]")
 DRONE, PLACE = WORDS[0], [float(x) for x in WORDS[1:]] or [0.0, 0.0, 0.05]
 ME, G_M_S2, LAG_S, TAKEOFF_M, CLIMB_M_S = f"driver.{DRONE}", 9.80665, 0.3, 1.0, 0.7
-HOVER_S, LAND_S = 0.5, 2.0  # after which silence it hovers, and then lands
+HOVER_S, LAND_S = 0.5, 2.0  # of silence, after which it hovers, and then lands
 
 
 class Aircraft:
-    """Where it is, how fast, and in which state; level at all times."""
+    """Its position, velocity and state; level at all times."""
 
     def __init__(self, p, yaw, state="landed"):
         self.p, self.v, self.a, self.yaw, self.yaw_rate, self.state = [*p], [0.0] * 3, [0.0] * 3, yaw, 0.0, state
@@ -32,7 +32,7 @@ class Aircraft:
         if kind == "mode":
             target = {"takeoff": "taking_off", "land": "landing", "emergency": "emergency", "reset": "landed"}
             self.state, self.wanted = target[m["mode"]], (0.0, 0.0, 0.0, 0.0)
-        elif m["source"] == "world":  # nobody flies it any more: it hovers, and stays
+        elif m["source"] == "world":  # it is no longer commanded: it hovers
             self.state, self.wanted, self.commander, self.set_s = "hovering", (0.0, 0.0, 0.0, 0.0), None, math.inf
         elif kind == "velocity":
             (x, y, z), yaw = m["velocity_m_s"], 0.0 if m.get("frame") == "world" else self.yaw
@@ -117,7 +117,7 @@ with zenoh.open(config) as session:
             if is_stop:
                 armed.clear()
         if t_ns <= last_ns:
-            continue  # time stands
+            continue  # time stands still
         if last_ns >= 0:
             aircraft.step(t_ns / 1e9, (t_ns - last_ns) / 1e9)
         a, p, v, yaw, last_ns = aircraft.a, aircraft.p, aircraft.v, aircraft.yaw, t_ns

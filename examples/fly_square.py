@@ -3,7 +3,7 @@
     zsim run scenarios/step.yaml --set clusters.main.plan={} --duration 120
     python examples/fly_square.py
 
-The cluster has no plan of its own there; this program takes it off, engages it, and lands it when it is through.
+The cluster has no plan of its own there; this program takes it off, engages it, and lands it at the end.
 """
 
 import argparse
@@ -49,7 +49,7 @@ def states(subscription: Subscription) -> Iterator[flight_messages.ClusterState]
 
 
 def newest(subscription: Subscription) -> flight_messages.ClusterState:
-    """Return a state that has not come yet, and forget those before."""
+    """Return the next state, and discard earlier ones."""
     for _ in subscription.drain():
         pass
     return next(states(subscription))
@@ -71,7 +71,7 @@ def fly(link: Session) -> None:
 
 
 def show(subscription: Subscription) -> None:
-    """Print where the formation is at every corner; return at the last, when the trajectory ends."""
+    """Print the position of the formation at every corner; return when the trajectory ends."""
     due_s = 0.0
     for state in states(subscription):
         t_s = state.trajectory_t_s

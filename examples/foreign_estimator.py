@@ -1,4 +1,4 @@
-"""An estimator without zsim: answers for drone1 in the lockstep, with zenoh and msgpack alone.
+"""An estimator without zsim: estimates drone1 in lockstep, with only zenoh and msgpack.
 
     zsim world scenarios/step.yaml --set 'processes.expect=[foreign.drone1]' --duration 60
     python examples/foreign_estimator.py tcp/127.0.0.1:7447
@@ -20,14 +20,14 @@ ENDPOINT = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447"
 ME, DRONE = "foreign.drone1", "zsim/drone/drone1"
 BEARING = math.atan2(17.8, -2.8)  # rad, of the default environment.magnetic_field_ut
 START_S = 60.0  # wall; a world that is still starting, and compiling its kernel
-SILENCE_S = 10.0  # wall; even while simulated time stands, the world publishes its clock once a second
+SILENCE_S = 10.0  # wall; even while simulated time stands still, the world publishes its clock once a second
 FIX_GAIN, HEIGHT_GAIN = 0.02, 0.1
 SIGMAS = (0.2, 0.2, 0.05, 0.1, 0.1, 0.1)  # m, m/s: what the gains leave of the noise of preset `paper`
 YAW_SIGMA_RAD = 0.06
 
 
 class State:
-    """What it believes of the drone."""
+    """Its estimate of the drone."""
 
     def __init__(self) -> None:
         self.p, self.v, self.yaw, self.fixes = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0, 0
@@ -46,7 +46,7 @@ class State:
             self.v = [c * x - s * y, s * x + c * y, z]
 
     def estimate(self, dt: float) -> dict[str, Any]:
-        """Move on by dt and return the fields of `Estimate`."""
+        """Advance by dt and return the fields of `Estimate`."""
         self.p = [p + v * dt for p, v in zip(self.p, self.v, strict=True)]
         yaw = math.remainder(self.yaw, math.tau)
         return {
@@ -72,7 +72,7 @@ class Participant:
         self._gate_ns = info["gate_ns"]
         self._run = {"run_id": info["run_id"], "incarnation": int.from_bytes(os.urandom(7), "big")}
         self._inbox: SimpleQueue[zenoh.Sample] = SimpleQueue()
-        # by default each subscriber has a thread of its own, and two of them no common order
+        # by default each subscriber has its own thread, without a common order of messages
         in_order = zenoh.handlers.Callback(self._inbox.put, indirect=False)
         self._kept = [
             session.declare_subscriber(f"{DRONE}/sensor/*", in_order),
@@ -98,7 +98,7 @@ class Participant:
             sample = self._next(gates)
             kind, m = str(sample.key_expr).rsplit("/", 1)[1], msgpack.unpackb(sample.payload.to_bytes())
             state.take(kind, m)
-            if kind == "status":  # the last sensor message of a gate: everything before it has come
+            if kind == "status":  # the last sensor message of a gate: all others have arrived
                 gates += 1
                 self._answer(m["t_ns"], state)
             elif m.get("state") == "stopped":

@@ -1,14 +1,14 @@
-"""Five drones cross a forest without a map, decentralised: a pilot knows its lidar, its estimate, and what others say.
+"""Five drones cross a forest without a map, decentralised: a pilot knows its lidar, its estimate, and what others send.
 
 zsim run examples/forest.yaml
 zsim run examples/forest.yaml --seed 2
 python examples/forest.py
 
-Each pilot flies in the free direction that costs least: near to the way to its goal, and to where it flies already
+Each pilot flies in the free direction that costs least: close to the direction of its goal, and to its present one
 (after Borenstein and Koren, The vector field histogram, IEEE Trans. Robotics and Automation 7(3), 1991). A direction
 is free as far as a tube as wide as the drone and its margins meets no return of the lidar. The speed is such that it
-can stop in what is free; from what is too near, and from drones that it hears nearby, it backs off. Obstacles are
-taken in the axes of the drone, in which they were seen, so that errors of the estimate do not move them.
+can stop within the free distance; it retreats from obstacles that are too near, and from drones that it hears nearby.
+Obstacles stay in the axes of the drone in which they were seen, so that errors of the estimate do not move them.
 """
 
 import math
@@ -20,16 +20,16 @@ from msgspec import Meta
 
 import zsim
 
-SILENT_NS = 500_000_000  # whoever has not been heard for that long is left out
+SILENT_NS = 500_000_000  # drones that have not been heard for this long are ignored
 DIRECTIONS = np.arange(72) * (2.0 * math.pi / 72)
 UNIT = np.stack([np.cos(DIRECTIONS), np.sin(DIRECTIONS)], axis=1)
 HEED_M = 5.0  # of drones that are heard
-DOUBT_M = 0.7  # by which a drone that is heard is taken to be nearer: estimates err
-FLOOR_M = 0.7  # returns from below a plane that is so far under the drone are of the ground
+DOUBT_M = 0.7  # by which drones that are heard are assumed to be nearer: estimates err
+FLOOR_M = 0.7  # returns from more than this below the drone are of the ground
 
 
 class Where(zsim.AgentMessage, frozen=True):
-    """Where a drone estimates itself, in W."""
+    """A drone's estimate of its position, in W."""
 
     key = "forest/{drone}/where"
 
@@ -37,7 +37,7 @@ class Where(zsim.AgentMessage, frozen=True):
 
 
 class Pilot(zsim.Agent):
-    """Flies one drone east, through whatever its lidar sees."""
+    """Flies one drone east, past everything that its lidar sees."""
 
     class Parameters(zsim.Parameters):
         east_m: Annotated[float, Meta(ge=-1000, le=1000)] = 30.0  # where it stops
@@ -120,7 +120,7 @@ class Pilot(zsim.Agent):
         return v
 
     def _others(self, t_ns: int) -> list[tuple[np.ndarray, float]]:
-        """Return the way in W, and the distance [m], to the drones that were heard and are near."""
+        """Return the direction in W, and the distance [m], to the near drones that were heard."""
         heard = [p_W for _, (at_ns, p_W) in sorted(self._heard.items()) if t_ns - at_ns <= SILENT_NS]
         ways = [np.subtract(p_W, self._p_W)[:2] for p_W in heard]
         return [(way, away) for way in ways if 0.0 < (away := float(np.hypot(*way))) < HEED_M]

@@ -2,7 +2,7 @@
 
     python examples/formation_picture.py runs/first formation.jpg 60
 
-The camera is carried by a drone that nobody sees: it hangs behind the formation and above it, and looks at its middle.
+The camera is carried by an invisible drone, behind and above the formation, and looks at its centre.
 """
 
 import math
@@ -27,18 +27,18 @@ from zsim.scenario import scenario_file
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import camera_pose, lens_of
 from zsim.sensors.sensor import Mount
-from zsim_agents.cameras.rendering.renderer import Picture, Renderer
-from zsim_agents.cameras.rendering.scene import DroneStates, Scene, View, camera_motion, default_look, scene_of
+from zsim_agents.cameras.renderer import Picture, Renderer
+from zsim_agents.cameras.scene import DroneStates, Scene, View, camera_motion, default_look, scene_of
 
 Array = NDArray[np.float64]
-SIDE = Mount(position_m=(1.0, 0.0, 0.0))  # m; ahead of its carrier, which is not in the picture then
+SIDE = Mount(position_m=(1.0, 0.0, 0.0))  # m; ahead of its carrier, which is therefore not in the picture
 CAMERA = Camera(width_px=1440, height_px=720, diagonal_deg=60, rate_hz=1, mount=SIDE, noise=0, exposure_ms=2)
 AWAY, YAW_RAD, DOWN_RAD = 2.2, 0.35, 0.42  # distance in widths of the formation, heading, and how far it looks down
 MAGENTA, INK, PAPER = (152, 17, 233), (40, 40, 40), (255, 255, 255)  # B, G, R
 
 
 class Instant(NamedTuple):
-    """What a record has of an instant: names, scene and states of its drones."""
+    """The contents of a record at an instant: names, scene and states of its drones."""
 
     names: list[str]
     scene: Scene
@@ -60,7 +60,7 @@ def recorded(record: Path, t_ns: int | None) -> Instant:
             payloads = {message.key: message.payload for message in last if message}
         else:
             come = (message for message in reader.messages(wanted, from_ns=t_ns) if message.t_ns >= t_ns)
-            payloads = {message.key: message.payload for message in islice(come, len(names))}  # a gate has one of each
+            payloads = {message.key: message.payload for message in islice(come, len(names))}  # one of each a gate
     if payloads.keys() != set(wanted):
         raise SystemExit(f"{record}: ends before that instant; look at an earlier one, or leave it out for the last")
     truths = [msgspec.msgpack.decode(payloads[key], type=Truth) for key in wanted]
@@ -68,7 +68,7 @@ def recorded(record: Path, t_ns: int | None) -> Instant:
 
 
 def states(truths: Sequence[Truth]) -> DroneStates:
-    """Return what drones are by their truths."""
+    """Return the drones, from their truths."""
     return DroneStates(
         np.array([truth.position_m for truth in truths]),
         np.array([truth.velocity_m_s for truth in truths]),

@@ -1,4 +1,4 @@
-"""An agent of one's own: lands every drone that leaves a circle around the origin, by its estimate.
+"""A custom agent: lands every drone that leaves a circle around the origin, by its estimate.
 
 zsim run scenarios/step.yaml --agent 'geofence:Geofence radius_m=4.0'   with a run
 zsim agent geofence:Geofence radius_m=4.0                               beside a running federation

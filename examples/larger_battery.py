@@ -1,4 +1,4 @@
-"""A vehicle of one's own: the AR.Drone with the larger battery, weighed. `model: larger_battery` names it.
+"""A custom vehicle: the AR.Drone with the larger battery, weighed. `model: larger_battery` names it.
 
     PYTHONPATH=examples zsim run scenarios/step.yaml --set drones.drone1.model=larger_battery
 

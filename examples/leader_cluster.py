@@ -1,4 +1,4 @@
-"""A cluster space of one's own: the paper's triangle, with the place of robot 1 instead of the centroid.
+"""A custom cluster space: the paper's triangle, with the position of robot 1 instead of the centroid.
 
     python examples/leader_cluster.py
     PYTHONPATH=examples zsim run scenarios/step.yaml --set clusters.main.space=leader_cluster:LeaderCluster
@@ -11,11 +11,11 @@ import numpy as np
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
 from zsim_agents.formation.spaces.triad_cluster import TriadCluster
 
-STEP = 1e-6  # m or rad, of the differences
+STEP = 1e-6  # m or rad, step of the differences
 
 
 class LeaderCluster(TriadCluster):
-    """c as in the paper, but (x_c, y_c, z_c) is where robot 1 is: its command does not ask the others."""
+    """c as in the paper, but (x_c, y_c, z_c) is robot 1's position: its command does not depend on the others."""
 
     def forward(self, p_W: Array, yaw: Array) -> Array:
         c = super().forward(p_W, yaw)

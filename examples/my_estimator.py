@@ -1,9 +1,9 @@
-"""An estimator of one's own, with fixed gains instead of a Kalman filter, in the place of the stock one.
+"""A custom estimator, with fixed gains instead of a Kalman filter, in place of the stock one.
 
     zsim run scenarios/step.yaml --set estimation.algorithm=my_estimator:MyEstimator
 
-The module is found on Python's path (`PYTHONPATH=examples`) or in the folder of the scenario's file. What its
-methods get and give: `zsim_agents.estimation.drone_estimator.DroneEstimator`.
+The module is found on Python's path (`PYTHONPATH=examples`) or in the folder of the scenario's file. Its methods are
+described in `zsim_agents.estimation.drone_estimator.DroneEstimator`.
 """
 
 import math
@@ -14,7 +14,7 @@ from zsim.contract.keys import SENSORS
 from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim_agents.estimation.drone_estimator import StateEstimate
 
-GPS_GAIN = 0.02  # of a fix, once that many have come
+GPS_GAIN = 0.02  # of a fix, after this many fixes
 HEIGHT_GAIN, HEADING_GAIN = 0.1, 0.05  # of a barometer and of a magnetometer sample
 GPS_SIGMA_M, HEIGHT_SIGMA_M, SPEED_SIGMA_M_S, YAW_SIGMA_RAD = 2.0, 0.03, 0.1, 0.02  # preset `paper`
 
@@ -73,7 +73,7 @@ class MyEstimator:
         )
 
     def snapshot(self) -> dict[str, Any]:
-        """Return all that it has come to know: with it another one goes on if this process dies."""
+        """Return its whole state, with which another one continues if this process dies."""
         return {"p": self._p, "v": self._v, "yaw": self._yaw, "rate": self._rate, "used": self._used}
 
     def restore(self, state: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Reads drone1's IMU, flies it by velocity commands, and keeps the lockstep: with zenoh and msgpack alone."""
+"""Reads drone1's IMU, flies it by velocity commands, and takes part in the lockstep, with only zenoh and msgpack."""
 
 import os
 import queue
@@ -15,7 +15,7 @@ seq, last, inbox, gates, t_ns = {}, {}, queue.SimpleQueue(), 0, 0
 
 with zenoh.open(zenoh.Config.from_json5(config)) as session:
 
-    def put(key, **fields):  # BLOCK: for a message that zenoh drops the world would wait
+    def put(key, **fields):  # BLOCK: the world would wait for a message that zenoh drops
         seq[key] = seq.get(key, -1) + 1
         session.put(key, msgpack.packb({"seq": seq[key], **fields}), congestion_control=zenoh.CongestionControl.BLOCK)
 
@@ -27,7 +27,7 @@ with zenoh.open(zenoh.Config.from_json5(config)) as session:
     put(f"zsim/process/{ME}/join", t_ns=0, **run, role="plain", host="here", pid=os.getpid(), period_ns=info["gate_ns"])
     while gates * info["gate_ns"] <= SECONDS * 1e9 and last.get("clock", {}).get("state") != "stopped":
         try:
-            sample = inbox.get(timeout=10)  # s: even while time stands, the clock comes once a second
+            sample = inbox.get(timeout=10)  # s: even while time stands still, the clock comes once a second
         except queue.Empty:
             sys.exit("the world is silent")
         last[kind := str(sample.key_expr).rsplit("/", 1)[1]] = msgpack.unpackb(sample.payload.to_bytes())

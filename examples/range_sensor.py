@@ -3,8 +3,8 @@
     zsim run scenarios/step.yaml --set 'processes.expect=[range.drone1]' --duration 60
     python examples/range_sensor.py tcp/127.0.0.1:7447
 
-Publishes `drone/drone1/range/drone2` five times a simulated second. The key is none of the contract's: nothing of zsim
-reads it besides `zsim echo` and the recorder, and `sent` counts only commands, estimates and cluster states.
+Publishes `drone/drone1/range/drone2` five times a simulated second. The key is not part of the contract: only
+`zsim echo` and the recorder read it, and `sent` counts only commands, estimates and cluster states.
 """
 
 import math
@@ -36,10 +36,10 @@ class RangeSensor:
         self._session = session
         self._seq: dict[str, int] = {}
         info = world_info(session)
-        self._rng = random.Random(f"{info['seed']}/{ME}")  # a stream of its own: same seed, same noise
+        self._rng = random.Random(f"{info['seed']}/{ME}")  # its own stream: same seed, same noise
         self._run = {"run_id": info["run_id"], "incarnation": int.from_bytes(os.urandom(7), "big")}
         self._inbox: SimpleQueue[zenoh.Sample] = SimpleQueue()
-        # by default each subscriber has a thread of its own, and two of them no common order
+        # by default each subscriber has its own thread, without a common order of messages
         in_order = zenoh.handlers.Callback(self._inbox.put, indirect=False)
         expressions = [*(f"zsim/drone/{drone}/truth" for drone in PAIR), "zsim/clock"]
         self._kept = [session.declare_subscriber(e, in_order) for e in expressions]

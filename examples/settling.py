@@ -1,4 +1,4 @@
-"""Figures of a user's own for a sweep: when the formation's shape had settled, and how far it overshot.
+"""Custom metrics of a sweep: when the formation's shape had settled, and how far it overshot.
 
     PYTHONPATH=examples zsim sweep scenarios/step.yaml --vary wind.gust_m_s=0,1 --set report.metrics=settling:settling
 
@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from zsim_analysis.reading.formation import formations_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 
-BAND_M = 0.5  # m: a side is settled from when on it stays so near to its desired length; chosen
+BAND_M = 0.5  # m: a side has settled once it stays this close to its desired length; chosen
 
 
 def settling(flight: RecordedFlight) -> dict[str, float | None]:
     """Return when the side p had settled [s after the engagement], and by how much it was too long at most [m].
 
-    None where the formation never engaged, or never settled.
+    None if the formation never engaged, or never settled.
     """
     formation = formations_of(flight)[0]
     if formation.engaged_s is None:

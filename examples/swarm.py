@@ -1,11 +1,11 @@
-"""A decentralised formation: every drone has a pilot that knows its own estimate and what the others tell it.
+"""A decentralised formation: every drone has a pilot that knows its own estimate and what the others send.
 
 zsim run examples/swarm.yaml
 zsim run examples/swarm.yaml --set agents.pilot.parameters.gain_1_s=0.6
 python examples/swarm.py
 
 Consensus on displacements (Olfati-Saber, Fax and Murray 2007, Proc. IEEE 95(1)): each pilot flies
-u_i = k sum_j ((p_j - c_j) - (p_i - c_i)) over those that it hears, where c is the place of a drone in the formation.
+u_i = k sum_j ((p_j - c_j) - (p_i - c_i)) over those that it hears, where c is the position of a drone in the formation.
 The error decays at the rate k lambda_2 of the graph; the centroid stays where it was.
 """
 
@@ -18,11 +18,11 @@ from msgspec import Meta
 
 import zsim
 
-SILENT_NS = 500_000_000  # whoever has not been heard for that long is left out
+SILENT_NS = 500_000_000  # drones that have not been heard for this long are ignored
 
 
 class Position(zsim.AgentMessage, frozen=True):
-    """Where a drone estimates itself, in W."""
+    """A drone's estimate of its position, in W."""
 
     key = "swarm/{drone}/position"
 

@@ -57,7 +57,7 @@ def velocities(action: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def learner(seed: int = 1) -> PPO:
-    """Return PPO with a policy that knows nothing yet."""
+    """Return PPO with an untrained policy."""
     settings: dict[str, Any] = {"n_steps": 1024, "gamma": 0.95, "learning_rate": 1e-3}
     return PPO("MlpPolicy", home_env(), **settings, policy_kwargs={"log_std_init": -0.5}, seed=seed, device="cpu")
 
@@ -87,14 +87,14 @@ class Trained(zsim.PolicyAgent):
         self.model = PPO.load(file, device="cpu")
 
     def policy(self, observations: dict[str, NDArray[np.float32]]) -> Mapping[str, ArrayLike]:
-        """Fly each drone by what it sees."""
+        """Fly each drone by its observation."""
         return {
             drone: velocities(self.model.predict(seen, deterministic=True)[0]) for drone, seen in observations.items()
         }
 
 
 def main() -> None:
-    """Train, save the policy and the scenario, and say what was gained."""
+    """Train, save the policy and the scenario, and print the gain."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--steps", type=int, default=30_000)
     parser.add_argument("--seed", type=int, default=1)

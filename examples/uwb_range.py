@@ -23,7 +23,7 @@ class UwbRange(Sample, frozen=True):
 
 
 class UwbConfig(Sensor, frozen=True, kw_only=True):
-    rate_hz: RateHz = 10.0  # Hz, chosen: a tag that takes its turn among ten
+    rate_hz: RateHz = 10.0  # Hz, chosen: one of ten tags that take turns
     range_m: ErrorModel = ErrorModel(noise=0.1)  # m, data sheet of the DWM1000: 10 cm
     anchor_m: Vector3 = (0.0, 0.0, 0.0)  # in W
 

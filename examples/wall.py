@@ -1,4 +1,4 @@
-"""A control law that keeps a formation off a wall that no map shows: by the `range` sensors of its drones.
+"""A control law that keeps a formation off an unmapped wall, by the `range` sensors of its drones.
 
 zsim run examples/wall.yaml
 python examples/wall.py
@@ -18,12 +18,12 @@ import zsim
 from zsim.sensors.scanner import Range
 from zsim_agents.formation.spaces.cluster_space import Array
 
-OLD_NS = 500_000_000  # a distance that was measured longer ago counts no more
+OLD_NS = 500_000_000  # older measurements are ignored
 TURNED = {"front": 0.0, "left": np.pi / 2, "back": np.pi, "right": -np.pi / 2}  # beams about a drone's heading [rad]
 
 
 class OffTheWall(zsim.ControlLaw):
-    """The proportional law, as far as the beams permit; without a state."""
+    """The proportional law, limited by the beams; without a state."""
 
     class Parameters(zsim.Parameters):
         keep_m: Annotated[float, Meta(gt=0, le=10)] = 2.0

@@ -20,7 +20,7 @@ CONNECTIONS = 4  # of HTTP, kept open
 KEY = "bench/value"
 MESSAGE = {"t_ns": 0, "seq": 0, "accel_m_s2": [0.1, 0.2, 9.81], "gyro_rad_s": [0.01, 0.02, 0.03]}
 AHEAD = 2_000  # messages; the gateway's queue for a client holds about 20 000 of these
-PACE_S = 0.002  # between two messages whose latency is taken: nothing waits for another
+PACE_S = 0.002  # between two messages whose latency is measured, so that none waits for another
 
 
 def quantiles(took_s: list[float]) -> dict[str, float]:
@@ -29,7 +29,7 @@ def quantiles(took_s: list[float]) -> dict[str, float]:
 
 
 async def rest(port: int, seconds: float, method: str) -> dict[str, float]:
-    """Ask again and again on some connections, and then on one: requests a second, and how long one takes."""
+    """Send requests on several connections, then on one: requests per second, and the latency of one."""
     url = f"http://127.0.0.1:{port}/json/{KEY}"
     body = json.dumps(MESSAGE).encode()
     took_s: list[float] = []
@@ -63,7 +63,7 @@ def trip(port: int, seconds: float) -> dict[str, float]:
 
 
 def zenoh_flow(port: int, endpoint: str, seconds: float) -> dict[str, float]:
-    """Publish on Zenoh, and take what comes on Zenoh: how many come in a second, and how long one takes."""
+    """Publish on Zenoh, and receive on Zenoh: messages per second, and the latency of one."""
     with zenoh.open(_config(endpoint)) as sender, zenoh.open(_config(endpoint)) as receiver:
         taker = Taker()
         declared = receiver.declare_subscriber(f"zsim/{KEY}", lambda sample: taker.take(sample.payload.to_bytes()))
@@ -73,7 +73,7 @@ def zenoh_flow(port: int, endpoint: str, seconds: float) -> dict[str, float]:
 
 
 def lines_flow(port: int, endpoint: str, seconds: float) -> dict[str, float]:
-    """Publish on Zenoh, and take what comes on the lines door."""
+    """Publish on Zenoh, and receive on the lines door."""
     with zenoh.open(_config(endpoint)) as sender:
         taker, stream = Taker(), Lines(port)
         stream.ask({"op": "subscribe", "key": KEY})
@@ -133,7 +133,7 @@ def _latency(publisher: zenoh.Publisher, taker: Taker, seconds: float) -> dict[s
 
 
 def _rate(publisher: zenoh.Publisher, taker: Taker, seconds: float) -> float:
-    """Publish without a pause, no more ahead of the taker than it may lose; return how many came in a second."""
+    """Publish without pauses, never farther ahead of the receiver than its queue allows; return messages per second."""
     taker.came_s.clear()
     start_s = time.perf_counter()
     sent = 0

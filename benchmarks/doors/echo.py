@@ -1,4 +1,4 @@
-"""A bare aiohttp server: GET gives back what PUT brought, and nothing else happens. Prints its port."""
+"""A bare aiohttp server: GET returns what PUT brought, and nothing else happens. Prints its port."""
 
 import sys
 

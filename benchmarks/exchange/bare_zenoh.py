@@ -48,19 +48,19 @@ def world(count: int, seconds: float, receive: str, express: bool, low_latency: 
 
 
 def _take(handler: zenoh.handlers.Handler, count: int) -> None:
-    """Take that many answers, sleeping for each."""
+    """Take a number of answers, sleeping for each."""
     for _ in range(count):
         handler.recv().payload.to_bytes()
 
 
 def _drain(handler: zenoh.handlers.Handler, count: int) -> None:
-    """Take that many answers, sleeping only when there is none."""
+    """Take a number of answers, sleeping only if there is none."""
     for _ in range(count):
         (handler.try_recv() or handler.recv()).payload.to_bytes()
 
 
 def agent(number: int, endpoint: str, express: bool, low_latency: bool) -> None:
-    """Say that it is there, then answer everything until the stop."""
+    """Announce itself, then answer everything until the stop."""
     chosen = zenoh_settings.common("client", "lockstep") | zenoh_settings.connecting(endpoint, Identity(), 10.0)
     with zenoh.open(config(chosen, low_latency)) as link:
         subscriber = link.declare_subscriber(f"bench/down/{number}", zenoh.handlers.FifoChannel(session.QUEUE_MAX))

@@ -1,4 +1,4 @@
-"""HELICS: a broker, the world as a federate, every agent as a federate in a process of its own.
+"""HELICS: a broker, the world as a federate, every agent as a federate in its own process.
 
 Equal semantics: the agents' time lies half a step after the world's, so that a value goes world, agent, world within
 one step, as in the other contenders; that takes two grants. `--one-grant` measures the exchange of neighbours
@@ -71,7 +71,7 @@ def _say(me: object, outs: list[object], text: str, until: float) -> float:
 
 @contextmanager
 def _federate(name: str, core: str, at: str, offset: float) -> Iterator[object]:
-    """Make a federate of period 1 on a core of its own, and take it out again."""
+    """Make a federate of period 1 with its own core, and finalize it afterwards."""
     info = helics.helicsCreateFederateInfo()
     helics.helicsFederateInfoSetCoreTypeFromString(info, core)
     place = f"--broker_address={at}" if core == "ipc" else f"--brokerport={at}"

@@ -9,13 +9,13 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-PAYLOAD = bytes(100)  # what goes each way per agent and step, about the size of a drone's status
+PAYLOAD = bytes(100)  # payload each way per agent and step, about the size of a drone's status
 WARM_S = 0.3  # wall time of steps that are not counted: caches fill, threads start
-PATIENCE_S = 60.0  # wall time in which an agent must leave once it is told to
+PATIENCE_S = 60.0  # wall time in which an agent must leave when told to
 
 
 class Lap:
-    """Counts steps for so many wall seconds after a warm-up.
+    """Counts steps for a number of wall seconds after a warm-up.
 
     Attributes:
         steps: counted so far.
@@ -30,7 +30,7 @@ class Lap:
         self.steps = 0
 
     def more(self) -> bool:
-        """Take note that a step begins (or, at the first call, that all is set up); tell whether it is to be made."""
+        """Note that a step begins (at the first call: that all is set up); return whether it is to be made."""
         self._last_s = now_s = time.perf_counter()
         if self._begin_s is None:
             self._begin_s = now_s
@@ -47,7 +47,7 @@ class Lap:
         return self.steps / (self._last_s - self._start_s)
 
     def report(self) -> None:
-        """Print the result as the runner of the benchmarks reads it."""
+        """Print the result in the form that the benchmarks read."""
         print(json.dumps({"steps_per_s": self.steps_per_s, "steps": self.steps}), flush=True)
 
 
@@ -77,7 +77,7 @@ def agents(module: str, count: int, *options: str) -> Iterator[Sequence[subproce
 
 
 def free_port() -> int:
-    """Return a TCP port on loopback that nobody listens on at this moment."""
+    """Return a TCP port on loopback that is free at this moment."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]

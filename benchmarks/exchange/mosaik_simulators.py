@@ -1,4 +1,4 @@
-"""mosaik: its scheduler steps the world, then every agent, each a simulator in a process of its own.
+"""mosaik: its scheduler steps the world, then every agent, each a simulator in its own process.
 
 The world's output goes to the agents within a step; their answers come back one step later, as everywhere here.
 mosaik cannot be told to stop at a wall time: the number of steps is given.
@@ -29,7 +29,7 @@ META: mosaik_api_v3.types.Meta = {
 
 
 class Node(mosaik_api_v3.Simulator):
-    """One entity that says the same text at every step."""
+    """One entity that sends the same text at every step."""
 
     def __init__(self) -> None:
         super().__init__(META)
@@ -85,7 +85,7 @@ def run(count: int, steps: int) -> None:
 
 
 def serve() -> None:
-    """Be an agent's simulator, as mosaik starts it."""
+    """Run an agent's simulator, as mosaik starts it."""
     logging.disable()
     mosaik_api_v3.start_simulation(Node())
 

@@ -1,7 +1,7 @@
-"""Bare Zenoh paced by the wall clock: how old an answer is when it is back at the hub.
+"""Bare Zenoh paced by the wall clock: the age of an answer on its return to the hub.
 
 `--path trip`: the hub puts one message to each of N clients every 20 ms, each puts one back.
-`--path command`: the way of a command: hub to N clients, each to one more client through the hub, which waits for all
+`--path command`: the path of a command: hub to N clients, each to one more client through the hub, which waits for all
 N and puts N messages back.
 """
 
@@ -20,7 +20,7 @@ from benchmarks.exchange.bare_zenoh import config
 from benchmarks.exchange.lap import PAYLOAD, agents, free_port, parser
 
 PERIOD_S = 0.02  # zsim's gate
-STOP = 2**62  # number of no step
+STOP = 2**62  # not the number of a step
 REST = PAYLOAD[8:]
 WARM_STEPS = 25
 Take = Callable[[int], None]
@@ -39,7 +39,7 @@ def main() -> None:
 
 
 def hub(count: int, seconds: float, path: str) -> None:
-    """Put a step every period, and note how old each answer is that comes."""
+    """Put a step every period, and note the age of each answer."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     steps = WARM_STEPS + round(seconds / PERIOD_S)
     sent_s: list[float] = []

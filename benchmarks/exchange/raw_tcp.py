@@ -1,4 +1,4 @@
-"""Raw TCP sockets: the bound of what an exchange over loopback can be from Python."""
+"""Raw TCP sockets: the upper bound of an exchange over loopback from Python."""
 
 import socket
 from contextlib import ExitStack

@@ -53,7 +53,7 @@ def _send(router: zmq.Socket, names: list[bytes]) -> None:
 
 
 def agent(number: int, endpoint: str) -> None:
-    """Say that it is there, then answer everything until the stop."""
+    """Announce itself, then answer everything until the stop."""
     with zmq.Context() as context, context.socket(zmq.DEALER) as dealer:
         dealer.setsockopt(zmq.IDENTITY, str(number).encode())
         dealer.connect(endpoint)

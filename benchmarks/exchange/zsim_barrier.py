@@ -41,11 +41,11 @@ def main() -> None:
 
 
 def run_world(count: int, seconds: float, lookahead: bool, low_latency: bool) -> Lap:
-    """Run gates for so many wall seconds; without lookahead every gate waits for the dones of the one before it."""
+    """Run gates for a number of wall seconds; without lookahead every gate waits for the dones of the one before it."""
     with mock.patch.object(world, "Fleet", NullFleet):
         made = world.World(_scenario(count))
     if not lookahead:
-        made.clock.delay_ns = 0  # no scenario can say so: a command would take effect at the instant that it answers
+        made.clock.delay_ns = 0  # no scenario allows this: a command would take effect at the instant that it answers
     lap, over = Lap(seconds), False
 
     def tell(kind: str, message: Any, phase: str) -> None:

@@ -79,7 +79,7 @@ def _load(count: int, client: int) -> list[int]:
 
 
 def _urdf() -> str:
-    """Return cf2x.urdf (MIT licence) without what is only seen."""
+    """Return cf2x.urdf (MIT licence) without its visual parts."""
     inertia = '<inertia ixx="1.4e-5" ixy="0" ixz="0" iyy="1.4e-5" iyz="0" izz="2.17e-5"/>'
     base = f'<inertial><mass value="{MASS_KG}"/>{inertia}</inertial>'
     hull = '<collision><geometry><cylinder radius=".06" length=".025"/></geometry></collision>'

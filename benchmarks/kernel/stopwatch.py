@@ -1,4 +1,4 @@
-"""What all contenders of the kernel share: measuring a step in CPU time of all threads, and being asked for it."""
+"""Shared by all contenders of the kernel: measuring a step in CPU time of all threads, and serving measurements."""
 
 import json
 import os
@@ -18,9 +18,9 @@ class Flight(NamedTuple):
 
 
 def answer(find: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
-    """Answer each line of JSON on stdin by one on stdout, until its end; an error is a refusal."""
+    """Answer each line of JSON on stdin with one on stdout until it ends; an error is a refusal."""
     answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what peers print is no answer
+    os.dup2(2, 1)  # output of the peers is not an answer
     for line in sys.stdin:
         try:
             found = find(json.loads(line))
@@ -44,7 +44,7 @@ def serve(build: Callable[[int], Flight]) -> None:
 
 
 def rate(flight: Flight, cpu_s: float) -> float:
-    """Return simulated seconds per CPU second, over at least so many CPU seconds."""
+    """Return simulated seconds per CPU second, over at least a number of CPU seconds."""
     for _ in range(WARM_CALLS):
         flight.advance()
     start, calls = time.process_time(), 0  # user and system time of all threads

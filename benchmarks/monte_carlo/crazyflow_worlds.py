@@ -19,7 +19,7 @@ from benchmarks.monte_carlo.way import Way
 from benchmarks.monte_carlo.worker import Flown, Fly, serve
 
 GATE_HZ = 50
-MASS_STD = 0.01  # of the mass; chosen, so that no flight is like another
+MASS_STD = 0.01  # of the mass; chosen so that flights differ
 
 
 def main() -> None:

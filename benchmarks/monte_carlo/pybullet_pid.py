@@ -18,7 +18,7 @@ from benchmarks.kernel import pybullet_drones as bodies
 from benchmarks.monte_carlo.way import Way
 from benchmarks.monte_carlo.worker import Flown, Fly, serve
 
-MASS_STD = 0.01  # of the mass; chosen, so that no flight is like another
+MASS_STD = 0.01  # of the mass; chosen so that flights differ
 # What follows is DSLPIDControl's for cf2x
 P_FORCE, I_FORCE, D_FORCE = np.array([0.4, 0.4, 1.25]), np.array([0.05, 0.05, 0.05]), np.array([0.2, 0.2, 0.5])
 P_TORQUE, D_TORQUE = np.array([70000.0, 70000.0, 60000.0]), np.array([20000.0, 20000.0, 12000.0])

@@ -1,6 +1,6 @@
-"""What all peers that fly Test 1's ways share: a process on a core of its own that is asked for flights.
+"""Shared by all peers that fly the paths of Test 1: a process with its own core that serves flights.
 
-It is asked by lines {"seed": n} on stdin and answers on stdout, until its end; what compiles does so at the first.
+It answers lines {"seed": n} of stdin on stdout until stdin ends; compilation happens at the first.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from benchmarks.monte_carlo.way import Way, read
 
 
 class Flown(NamedTuple):
-    """What came of flights."""
+    """Results of flights."""
 
     flights: float  # whole flights of three drones, or fractions
     rms_m: float  # root of the mean square distance from the ways, over all flights

@@ -61,6 +61,6 @@ def flown_way(duration_s: float | None = None) -> Way:
 
 
 def _children_cpu_s() -> float:
-    """Return user and system time of all processes that were started here and are through."""
+    """Return user and system time of all child processes that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime

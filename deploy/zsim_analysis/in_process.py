@@ -12,19 +12,18 @@ from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.framing import GateMessages
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
-from zsim.contract.snapshot import State, pack, unpack
+from zsim.contract.snapshot import State, pack, restore, unpack
 from zsim.errors import RunError, UserCodeError
 from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.bus import Bus
-from zsim.runtime.health import rare_collections
+from zsim.runtime.membership import rare_collections
 from zsim.runtime.progress import PERIOD_S, HoldReasons, ProgressSink, SlowStart
 from zsim.runtime.rate_limit import RateLimit
 from zsim.scenario.roles import agent_names, check_alone, expected_processes, lets_drop
 from zsim.scenario.scenario import Scenario
 from zsim.schema.checker import show
 from zsim_agents.hosting import hosted, own_agent, with_own_agents
-from zsim_world import run_state
 from zsim_world.run.world import World
 
 CALLER = "python.main"  # process name of whoever steps a flight
@@ -211,7 +210,7 @@ class InProcessFlight:
     def restore(self, snapshot: tuple[Any, ...]) -> None:
         """Continue from a snapshot of this flight, or of another one of the same scenario."""
         world, agents, inboxes, truth_hash = snapshot
-        run_state.restore(self.world, unpack(world))
+        restore(self.world, unpack(world))
         clock = self.world.clock  # the snapshot is of a flight that goes on
         clock.ended, clock.is_complete, self.world.failure = None, False, None
         self.world.truth_hash.restore(truth_hash)

@@ -7,14 +7,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for editors, which do not read _WHERE
-    from zsim.contract.agent_messages import AgentMessage as AgentMessage
+    from zsim.contract.messages import AgentMessage as AgentMessage
     from zsim.errors import ZsimError as ZsimError
     from zsim.runtime.agent import Agent as Agent
     from zsim.runtime.agent import Output as Output
     from zsim.schema.parameters import Parameters as Parameters
     from zsim_agents.estimation.drone_estimator import DroneEstimator as DroneEstimator
     from zsim_agents.estimation.drone_estimator import StateEstimate as StateEstimate
-    from zsim_agents.formation.assignment import assign as assign
+    from zsim_agents.formation.assembly import assign as assign
     from zsim_agents.formation.control_law import ControlLaw as ControlLaw
     from zsim_agents.formation.spaces.cluster_space import ClusterSpace as ClusterSpace
     from zsim_api.commands import Command as Command
@@ -45,14 +45,14 @@ if TYPE_CHECKING:  # for editors, which do not read _WHERE
     from zsim_bridges.fmu.agent import Fmu as Fmu
 
 _WHERE = {
-    "zsim.contract.agent_messages": ("AgentMessage",),
+    "zsim.contract.messages": ("AgentMessage",),
     "zsim.errors": ("ZsimError",),
     "zsim.runtime.agent": ("Agent", "Output"),
     "zsim.schema.parameters": ("Parameters",),
     "zsim_agents.estimation.drone_estimator": ("DroneEstimator", "StateEstimate"),
+    "zsim_agents.formation.assembly": ("assign",),
     "zsim_agents.formation.control_law": ("ControlLaw",),
     "zsim_agents.formation.spaces.cluster_space": ("ClusterSpace",),
-    "zsim_agents.formation.assignment": ("assign",),
     "zsim_api.commands": (
         *("Command", "ardrone", "attitude", "emergency", "land", "rotors", "takeoff", "velocity"),
         "PilotedDrone",

@@ -292,9 +292,10 @@ class Federation(Assertions):
         until_s = time.monotonic() + within_s
         self._check_name(process, within_s)
         with self._watch.news:
-            while (pid := self._pids.get(process)) is None or pid in self._killed:
-                if self._fault is not None or not self._watch.news.wait(max(0.0, until_s - time.monotonic())):
-                    raise RunFailedError(f"{self.folder.name}: {self._fault or f'{process} has not joined'}")
+            self._await(
+                lambda: self._pids.get(process, -1) not in {-1, *self._killed}, until_s, f"{process} has not joined"
+            )
+            pid = self._pids[process]
             if number not in HARMLESS:
                 self._killed[pid] = process
                 if process in self._programs:
@@ -336,12 +337,16 @@ class Federation(Assertions):
             )
 
     def _session(self, within_s: float) -> Session:
-        until_s = time.monotonic() + within_s
         with self._watch.news:
-            while self._link is None:
-                if self._fault is not None or not self._watch.news.wait(max(0.0, until_s - time.monotonic())):
-                    raise RunFailedError(f"{self.folder.name}: {self._fault or f'no world within {within_s:g} s'}")
+            self._await(lambda: self._link is not None, time.monotonic() + within_s, f"no world within {within_s:g} s")
+            assert self._link is not None
             return self._link
+
+    def _await(self, is_met: Callable[[], bool], until_s: float, failure: str) -> None:
+        """Wait for news by which a condition is met; RunFailedError if the run is over, or it takes longer."""
+        while not is_met():
+            if self._fault is not None or not self._watch.news.wait(max(0.0, until_s - time.monotonic())):
+                raise RunFailedError(f"{self.folder.name}: {self._fault or failure}")
 
     # Its end
 
@@ -414,18 +419,19 @@ class Federation(Assertions):
         if fault := self._program_fault():
             return fault
         if (code := self._launcher.code) is not None:
-            log = self.folder / run_folder.LOGS / f"{LAUNCHER}.log"
-            lines = log.read_text(errors="replace").splitlines()
-            return f"the run has ended with code {code}: {lines[-1] if lines else 'it printed nothing'}"
+            return f"the run has ended with code {code}: {self._last_line(LAUNCHER)}"
         return "the run has ended" if self._watch.left else None
 
     def _program_fault(self) -> str:
         for name, program in self._programs.items():
             if program.code and not program.asked:
-                lines = (self.folder / run_folder.LOGS / f"{name}.log").read_text(errors="replace").splitlines()
-                last = lines[-1] if lines else "it printed nothing"
-                return f"{name} ({shlex.join(program.words)}) ended with code {program.code}: {last}"
+                ended = f"ended with code {program.code}: {self._last_line(name)}"
+                return f"{name} ({shlex.join(program.words)}) {ended}"
         return ""
+
+    def _last_line(self, name: str) -> str:
+        lines = (self.folder / run_folder.LOGS / f"{name}.log").read_text(errors="replace").splitlines()
+        return lines[-1] if lines else "it printed nothing"
 
     def _await_end(self, program: Program) -> None:
         program.wait()

@@ -189,20 +189,25 @@ def _file_of(source: Scenario, folder: Path) -> Path:
 
 def raise_failure(folder: Path, code: int) -> None:
     """Raise what ended the processes of a run; nothing where all of it was flown, though not as planned."""
-    record, log = folder / RECORD, folder / run_folder.LOGS / f"{LAUNCHER}.log"
-    said = log.read_text(errors="replace").split("\n") if log.exists() else []
-    last = next((line for line in reversed(said) if line.strip()), f"`zsim run` ended with code {code}")
+    record = folder / RECORD
     if not record.exists():
-        raise RunFailedError(f"{folder}: nothing was recorded: {last}")
+        raise RunFailedError(f"{folder}: nothing was recorded: {_last_line(folder, code)}")
     failures = [each.text for each in verdict(record).shortfalls if each.kind == "process" and each.fails]
     flight = read_flight(record, motion=False)
     flew = any(len(track.t_ns) for track in flight.tracks)
     if not failures and (
         not flew or (folder / run_folder.JOURNAL).exists()
     ):  # it is kept of what ended before its time
-        failures = [str((flight.end or {}).get("reason", last))]
+        failures = [str((flight.end or {}).get("reason", _last_line(folder, code)))]
     if failures:
         raise RunFailedError(f"{failures[0]}; the record is {record}, the logs are in {folder / run_folder.LOGS}")
+
+
+def _last_line(folder: Path, code: int | None) -> str:
+    """Return the last line that `zsim run` printed into its log."""
+    log = folder / run_folder.LOGS / f"{LAUNCHER}.log"
+    said = log.read_text(errors="replace").split("\n") if log.exists() else []
+    return next((line for line in reversed(said) if line.strip()), f"`zsim run` ended with code {code}")
 
 
 # In this process
@@ -285,6 +290,4 @@ def fly_as_processes(scenario: Resolved, folder: Path) -> None:
     finally:
         program.close()
     if not (folder / RECORD).exists():
-        said = log.read_text(errors="replace").split("\n")
-        last = next((line for line in reversed(said) if line.strip()), f"`zsim run` ended with code {code}")
-        raise RunError(f"{folder}: nothing was recorded: {last}")
+        raise RunError(f"{folder}: nothing was recorded: {_last_line(folder, code)}")

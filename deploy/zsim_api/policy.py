@@ -27,7 +27,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Drone, Radio, Scenario
 from zsim.schema import plugin
 from zsim.sensors.sensor import Sample
-from zsim.vehicles.vehicle_catalogue import vehicle_of
+from zsim.vehicles.vehicle import vehicle_of
 from zsim_agents.formation.spaces.cluster_space import SingularClusterError, robot_rates, unit
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_api.commands import Command, attitude, rotors, takeoff, velocity

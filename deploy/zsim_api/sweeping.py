@@ -21,6 +21,7 @@ from zsim.scenario.scenario_file import whole_path
 from zsim.schema import plugin
 from zsim.schema.checker import show
 from zsim_analysis.reading.recorded_flight import RecordedFlight
+from zsim_analysis.report import indented_json
 from zsim_analysis.sweep.design import METRICS, SweepDesign, SweepPlan, distinct, make_plan, text_of
 from zsim_analysis.sweep.sweep import TABLE, SweepFolder, SweepRequest, read_table
 from zsim_analysis.sweep.sweep import sweep as swept
@@ -107,7 +108,8 @@ def sweep(
     except ScenarioError as error:
         raise ScenarioError([_in_python(fault) for fault in error.faults]) from None
     folder = Path(out) if out is not None else temporary_folder("sweep-")
-    modules = made_modules(_names(plan), [scratch_folder()])
+    named = re.findall(rf"{plugin.MADE}\w+", msgspec.json.encode(plan).decode())  # anywhere in the plan
+    modules = made_modules(named, [scratch_folder()])
     try:
         rows = flown(plan, folder, workers, client, console=console, modules=tuple(modules))
     except KeyboardInterrupt:
@@ -124,7 +126,7 @@ def sweep(
         if labels := _labels(values, varied):
             column = whole_path(path, plan.document)
             frame[column] = frame[column].replace(labels)
-    frame.attrs = {"folder": str(folder), "summary": json.loads(SweepResults(design, rows).summary().json())}
+    frame.attrs = {"folder": str(folder), "summary": json.loads(indented_json(SweepResults(design, rows).summary()))}
     return frame
 
 
@@ -193,11 +195,6 @@ def _labels(values: Any, scenario: Scenario) -> dict[str, str]:
     made = {place: value.__name__ for place, value in enumerate(given) if hasattr(value, "__name__")}
     labels = distinct(texts, made)
     return {texts[place]: labels[place] for place in made}
-
-
-def _names(plan: SweepPlan) -> list[str]:
-    """Return the names of modules, made for what a notebook or a script defines, anywhere in a plan."""
-    return re.findall(rf"{plugin.MADE}\w+", msgspec.json.encode(plan).decode())
 
 
 def _in_python(line: str) -> str:

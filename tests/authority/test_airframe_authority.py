@@ -13,8 +13,7 @@ import pytest
 from zsim.math.frames import quaternion_from_rpy
 from zsim.scenario.scenario import Scenario
 from zsim.scenario.scenario_file import resolve
-from zsim.vehicles.vehicle import allocation, lift_shares
-from zsim.vehicles.vehicle_catalogue import vehicle_of
+from zsim.vehicles.vehicle import allocation, lift_shares, vehicle_of
 from zsim_world.fleet.fleet import Fleet, _initial_arrays
 from zsim_world.physics import simd
 from zsim_world.physics.fleet_arrays import STATE, VEHICLE, Bodies

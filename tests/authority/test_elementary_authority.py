@@ -10,8 +10,8 @@ import pytest
 import scipy.linalg
 import scipy.special
 
-from zsim.math import distributions, linear
 from zsim.math import elementary as el
+from zsim.math import linear, randomness
 
 COUNT = 1500
 RNG = np.random.default_rng(7)
@@ -117,14 +117,14 @@ def test_where_exp_overflows_it_is_inf_also_as_plain_python(x: float) -> None:
 
 def test_distributions_are_those_of_scipy() -> None:
     x = np.linspace(-9, 9, 1001)
-    found = [distributions.normal_probability(each) for each in x.tolist()]
+    found = [randomness.normal_probability(each) for each in x.tolist()]
     np.testing.assert_allclose(found, scipy.special.ndtr(x), atol=1e-15)
     p = [1e-6, 1e-3, 0.02, 0.3, 0.5, 0.9, 0.999, 1.0 - 1e-9]
-    np.testing.assert_allclose([distributions.normal_quantile(each) for each in p], scipy.special.ndtri(p), atol=1e-7)
+    np.testing.assert_allclose([randomness.normal_quantile(each) for each in p], scipy.special.ndtri(p), atol=1e-7)
     for dof in (1, 2, 3, 6, 11, 24):
         wanted = scipy.special.chdtri(dof, 1.0 - np.array(p))
-        np.testing.assert_allclose([distributions.chi_square_quantile(each, dof) for each in p], wanted, rtol=1e-7)
-    ends = [distributions.normal_quantile(each) for each in (0.0, 1.0)]
+        np.testing.assert_allclose([randomness.chi_square_quantile(each, dof) for each in p], wanted, rtol=1e-7)
+    ends = [randomness.normal_quantile(each) for each in (0.0, 1.0)]
     assert ends == [-math.inf, math.inf]
 
 

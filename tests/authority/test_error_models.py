@@ -12,12 +12,11 @@ import pytest
 from fleet_samples import samples_of
 from numpy.typing import NDArray
 
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.sensors import sensor_set
-from zsim_world.sensors.equations import read
-from zsim_world.sensors.sensor_set import BARO, FAULT
+from zsim_world.sensors.sensor_set import BARO, FAULT, read
 
 Array = NDArray[np.float64]
 RATE_HZ = 50.0

@@ -6,8 +6,7 @@ import numpy as np
 from zsim.contract.flight_messages import Truth
 from zsim.math.frames import quaternion_from_rpy
 from zsim.scenario.scenario_file import resolve
-from zsim_world.fleet.external_drones import ExternalDrones
-from zsim_world.fleet.fleet import Fleet
+from zsim_world.fleet.fleet import ExternalDrones, Fleet
 
 HOVER_RAD_S = 361.6  # of the AR.Drone
 ZEROS = (0.0, 0.0, 0.0)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from zsim.scenario.scenario_file import pieces_of
-from zsim_agents.formation.assignment import assign, straight_separation
-from zsim_agents.references.approach import first_approach
+from zsim_agents.formation.assembly import assign, straight_separation
 from zsim_agents.references.cruise import RISE_S, Cruise, cruise, cruise_through
+from zsim_agents.references.flight import first_approach
 from zsim_agents.references.path import (
     Laps,
     PathLimits,

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.sensors.equations import BodyTruth, MountedSensor, Site, flow, gps, imu, mag, sonar
-from zsim_world.sensors.sensor_set import SENSORS
+from zsim_world.sensors.sensor_set import SENSORS, BodyTruth, MountedSensor, Site, flow, gps, imu, mag, sonar
 
 P_BS = (0.11, -0.07, 0.05)
 RPY_BS_DEG = (12.0, -25.0, 140.0)

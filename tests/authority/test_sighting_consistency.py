@@ -26,7 +26,7 @@ from zsim_world.sensors.sightings import DIAMETER_NOISE
 SCENARIO = Path(__file__).parents[2] / "scenarios" / "step.yaml"
 SIGHTED = ["sensors.front_camera={}", "sensors.sightings={}", "estimation.use_sightings=true"]
 SEEDS = range(1, 13)
-TAKEOFF_S, END_S, CONVERGED_S = 2.0, 45.0, 25.0
+TAKEOFF_S, END_S, CONVERGED_S = 1.0, 32.0, 18.0
 EVERY = 25  # gates between two that are compared
 GATE_S = 0.02
 ACCEL_M_S2, GYRO_RAD_S, IMU_S = 0.35, math.radians(0.01), 0.005  # per sample; preset paper

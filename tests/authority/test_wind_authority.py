@@ -9,8 +9,8 @@ from scipy import signal
 from zsim.math.compiled import kernel
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.physics import air
-from zsim_world.physics.air import WIND
+from zsim_world.physics import contacts
+from zsim_world.physics.contacts import WIND
 from zsim_world.sensors.noise import NoiseTable
 
 TAU_S = 5.0  # L / V0 = 10 m / 2 m/s while the airspeed is below 2 m/s
@@ -32,7 +32,7 @@ def blown(row, common, own, start):
         shared = (common[k, 0], common[k, 1], common[k, 2])
         for i in range(own.shape[1]):
             mine = (own[k, i, 0], own[k, i, 1], own[k, i, 2])
-            air.blow(row, (0.0, 0.0, 0.0), gust[i], shared, mine, DT)
+            contacts.blow(row, (0.0, 0.0, 0.0), gust[i], shared, mine, DT)
         out[k] = gust
     return out
 
@@ -116,7 +116,7 @@ def test_a_fleet_blows_the_same_filter_every_5_ms():
     common, own = noise.table[2, at:].reshape(-1, 3)[:40], noise.table[:2, at:].reshape(2, -1, 3)[:, :40]
     for k in range(40):
         for i in range(2):
-            air.blow(row, (0.0, 0.0, 0.0), gust[i], tuple(common[k]), tuple(own[i, k]), 0.005)
+            contacts.blow(row, (0.0, 0.0, 0.0), gust[i], tuple(common[k]), tuple(own[i, k]), 0.005)
     np.testing.assert_allclose(fleet.wind_m_s, gust, atol=1e-7)  # the standing drones sway by micrometres
 
 

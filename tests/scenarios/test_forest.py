@@ -25,7 +25,7 @@ def module(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_five_drones_fly_among_the_trunks_and_touch_none(tmp_path: Path, compiled: None) -> None:
     """Each hull keeps clear of every trunk and of every other hull; all have come a good way into the forest."""
-    run = zsim.run(EXAMPLES / "forest.yaml", duration_s=22, out=tmp_path / "run", progress=False)
+    run = zsim.run(EXAMPLES / "forest.yaml", duration_s=18, out=tmp_path / "run", progress=False)
     rows = [row_of(each) for each in scenario_file.load(EXAMPLES / "forest.yaml").environment.obstacles]
     hull_m = VEHICLE.airframe.hull_radius_m
     tracks = []
@@ -45,15 +45,15 @@ def test_five_drones_fly_among_the_trunks_and_touch_none(tmp_path: Path, compile
 def test_as_processes_they_have_the_same_bits_though_a_pilot_is_killed(tmp_path: Path, forked: None) -> None:
     document = yaml.safe_load((EXAMPLES / "forest.yaml").read_text())
     (tmp_path / "forest.yaml").write_text(yaml.safe_dump({**document, "drones": document["drones"][:3]}))
-    alone = zsim.run(tmp_path / "forest.yaml", duration_s=9, out=tmp_path / "alone", progress=False)
-    with zsim.Federation(tmp_path / "forest.yaml", duration=9, out=tmp_path / "many") as flight:
-        flight.wait_until(6.0)
+    alone = zsim.run(tmp_path / "forest.yaml", duration_s=7, out=tmp_path / "alone", progress=False)
+    with zsim.Federation(tmp_path / "forest.yaml", duration=7, out=tmp_path / "many") as flight:
+        flight.wait_until(5.5)
         flight.kill("pilot.drone3")
         run = flight.run()
     assert run.truth_sha256 == alone.truth_sha256
     assert "pilot.drone3" in [*run.events[run.events.kind == "restart"].subject]
     scans = [(each.messages("drone/drone3/sensor/lidar")).ranges_m.tolist() for each in (alone, run)]
-    assert len(scans[0]) == 91
+    assert len(scans[0]) == 71
     assert scans[0] == scans[1]
 
 

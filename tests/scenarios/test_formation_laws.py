@@ -77,6 +77,7 @@ def test_a_pilot_keeps_off_a_surface_that_it_knows_as_processes_and_after_a_kill
     a, b, c, d = [-3, 0, 0], [-3, 6, 0], [-3, 6, 4], [-3, 0, 4]
     wall = {"name": "wall", "triangles": packed(np.array([a + b + c, a + c + d]))}
     flock = {**scenario("olfati_saber"), "duration_s": 9, "report": {}, "environment": {"surfaces": [wall]}}
+    flock["drones"] = flock["drones"][:3]
     file = tmp_path / "flock.yaml"
     file.write_text(yaml.safe_dump(flock))
     alone = zsim.run(file, out=tmp_path / "alone", progress=False)

@@ -17,7 +17,7 @@ from zsim.record import RecordReader
 from zsim.scenario import scenario_file
 from zsim.schema import plugin
 from zsim.sensors.sensor_catalogue import sensor_type
-from zsim.vehicles.vehicle_catalogue import vehicle_of
+from zsim.vehicles.vehicle import vehicle_of
 from zsim_analysis.in_process import fly
 from zsim_analysis.reading.formation import formations_of
 from zsim_analysis.reading.recorded_flight import read_flight

@@ -2,8 +2,7 @@
 
 from typing import Any
 
-from zsim.contract.snapshot import pack, unpack
-from zsim_world.run_state import restore, saved_state
+from zsim.contract.snapshot import pack, restore, saved_state, unpack
 
 
 def continue_from(part: Any, successor: Any) -> None:

@@ -31,9 +31,13 @@ class NearWorker:
         self.link.close()
 
 
-@pytest.fixture
-def near(monkeypatch: pytest.MonkeyPatch) -> None:
+def sweep_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fly the runs in this process."""
     monkeypatch.setattr(process_pool, "WorkerProcess", NearWorker)
     monkeypatch.setenv(plugin.FOLDERS, "")
     monkeypatch.setattr(sys, "path", [*sys.path])
+
+
+@pytest.fixture
+def near(monkeypatch: pytest.MonkeyPatch) -> None:
+    sweep_here(monkeypatch)

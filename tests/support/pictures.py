@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from zsim.math.frames import quaternion_from_rpy, rotation_matrix
 from zsim.sensors.camera import BottomCamera, Camera, FrontCamera, Hats
 from zsim.sensors.camera_model import camera_pose, lens_of, pixel
-from zsim_agents.cameras.rendering.renderer import Renderer
-from zsim_agents.cameras.rendering.scene import DroneStates, Scene, default_look
+from zsim_agents.cameras.renderer import Renderer
+from zsim_agents.cameras.scene import DroneStates, Scene, default_look
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]

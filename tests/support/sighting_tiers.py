@@ -21,7 +21,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera_model import camera_pose, lens_of, undistorted
 from zsim_agents.cameras.detector import HatDetector, decoded
-from zsim_agents.cameras.rendering.scene import DroneStates
+from zsim_agents.cameras.scene import DroneStates
 from zsim_world.physics import rays
 from zsim_world.sensors.sightings import SightingSampler
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from rich.console import Console
 
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
 from zsim_analysis.sweep.design import SweepDesign, SweepPlan
 from zsim_analysis.sweep.sweep_run import Row, RunResult, make_row
 

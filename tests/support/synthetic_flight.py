@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from zsim.contract import messages
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor import ErrorModel, Sensor, noise_sigma

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.scenario.scenario_file import resolve
-from zsim.vehicles.vehicle_catalogue import vehicle_of
+from zsim.vehicles.vehicle import vehicle_of
 from zsim_world.physics.fleet_arrays import PerRotor, rotor_row, vehicle_row
 
 

@@ -11,6 +11,8 @@ from forked_commands import Completed, refusal, run_here
 from refused import has_terms
 from wire import PATIENCE_S
 
+from zsim_analysis.report.figure_style import ReportFigure
+
 COMMANDS = (
     *("run", "validate", "report", "sweep", "world", "estimator", "controller", "host", "record"),
     *("keys", "echo", "hz", "pub", "ask"),
@@ -153,7 +155,8 @@ def test_validate_prints_what_a_scenario_resolves_to(tmp_path: Path) -> None:
     assert again.stderr.splitlines() == ["one.yaml: no errors found"]
 
 
-def test_report_of_a_run(federation: Federation) -> None:
+def test_report_of_a_run(federation: Federation, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ReportFigure, "png", lambda _: b"\x89PNG")  # drawn by the tests of reports
     zsim("run", federation.write(PAIR), "--in-process", "--duration", "2", "--no-report", "--out", str(federation.out))
     output = zsim("report", str(federation.out)).stdout
     assert f"report: {federation.out / 'report.html'}" in output

@@ -44,6 +44,7 @@ import yaml
 from federation import free_port
 from forked_commands import run_here, start_in
 from msgspec import inspect as types
+from near_worker import sweep_here
 
 from zsim.contract import messages
 from zsim.contract.run_messages import EVENT_KINDS
@@ -237,6 +238,7 @@ class Checkout:
                     self._wait_for_flight(steered[1])
                 with chdir(self._folder), pytest.MonkeyPatch.context() as patch:
                     patch.setattr(ReportFigure, "png", lambda _: PNG)  # drawn by the tests of reports
+                    sweep_here(patch)
                     done = run_here(*shlex.split(line)[1:])
                 assert done.code == 0, f"{where}: {line}\n{done}\n{self._logs()}"
 
@@ -346,7 +348,7 @@ FOREIGN = (
 OURS = ("fly_square.py",)
 STEERED = re.compile(r"zsim pub .*\bdrone/(\w+)/cmd/velocity")
 PLAIN = re.compile(
-    r"zsim (validate|keys|echo|hz|ask|pub|fault|report|export|bundle|rerun|run .*--in-process) [^|<>;&]*"
+    r"zsim (validate|keys|echo|hz|ask|pub|fault|report|export|bundle|rerun|sweep(?!.*--dask)|run .*--in-process) [^|<>;&]*"
 )
 
 

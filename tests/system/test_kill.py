@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
-from federation import PAIR, Federation, Record, Role
+from federation import PAIR, PAIR_ROLES, Federation, Record, Role
 from forked_commands import ROOT
 from wire import PATIENCE_S, Client, Received, Subscription
 
@@ -180,9 +180,7 @@ def test_drop(federation: Federation, name: str) -> None:
     assert ("held for" in flight.run.text()) == is_held
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param("estimator.drone1", marks=pytest.mark.soak), "controller.main", "recorder"]
-)
+@pytest.mark.parametrize("name", [*(pytest.param(each, marks=pytest.mark.soak) for each in PAIR_ROLES[1:]), "recorder"])
 def test_end(federation: Federation, name: str) -> None:
     flight = Flight(federation, "--set", f"processes.on_death={{{name}: end}}")
     federation.kill(name)

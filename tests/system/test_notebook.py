@@ -54,10 +54,12 @@ class Notebook:
         self.manager.shutdown_kernel(now=True)
 
 
-@pytest.fixture
-def notebook(tmp_path: Path, compiled: None) -> Iterator[Notebook]:
-    (tmp_path / "pair.yaml").write_text(PAIR)
-    made = Notebook(tmp_path)
+@pytest.fixture(scope="module")
+def notebook(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Iterator[Notebook]:
+    """One kernel for all tests: each starts with the cells that it needs, and has folders of its own."""
+    folder = tmp_path_factory.mktemp("notebook")
+    (folder / "pair.yaml").write_text(PAIR)
+    made = Notebook(folder)
     made.run("import warnings; warnings.simplefilter('ignore')\nimport zsim")
     yield made
     made.close()
@@ -100,12 +102,12 @@ def test_a_class_of_a_cell_flies_here_and_as_processes(notebook: Notebook) -> No
 
 def test_what_a_cell_does_wrong_is_shown_with_its_line(notebook: Notebook) -> None:
     notebook.run(CELL.replace("FAILS = False", "FAILS = True"))
-    said = [*notebook.messages("zsim.run('pair.yaml', agents=[Lander], out='here', progress=False)")]
+    said = [*notebook.messages("zsim.run('pair.yaml', agents=[Lander], out='wrong', progress=False)")]
     before, error = said[-2:]
     assert "agent.lander at 6.00 s" in before["content"]["text"]
     assert error["content"]["ename"] == "NameError"
     assert "undefined_name" in "".join(error["content"]["traceback"])
-    assert notebook.run("print(zsim.load('here').duration_s >= 6)") == "True\n"
+    assert notebook.run("print(zsim.load('wrong').duration_s >= 6)") == "True\n"
 
 
 def test_a_mistake_is_shown_with_the_user_s_own_lines_alone(notebook: Notebook) -> None:
@@ -126,9 +128,8 @@ def test_a_mistake_is_shown_with_the_user_s_own_lines_alone(notebook: Notebook) 
 
 @pytest.mark.parametrize("processes", [False, pytest.param(True, marks=pytest.mark.soak)])
 def test_an_interrupt_ends_a_flight_with_its_record_whole(notebook: Notebook, processes: bool) -> None:
-    names = []
-    shown = 0
-    for said in notebook.messages(f"zsim.run('pair.yaml', duration_s=1e5, out='here', processes={processes})"):
+    names, out, shown = [], f"interrupted-{processes}", 0
+    for said in notebook.messages(f"zsim.run('pair.yaml', duration_s=1e5, out={out!r}, processes={processes})"):
         shown += said["msg_type"] == "update_display_data"
         if shown == 1:  # a second one would not wait for the record
             notebook.manager.interrupt_kernel()
@@ -136,4 +137,4 @@ def test_an_interrupt_ends_a_flight_with_its_record_whole(notebook: Notebook, pr
         if said["msg_type"] == "error":
             names.append(said["content"]["ename"])
     assert names == ["KeyboardInterrupt"]
-    assert notebook.run("print(zsim.load('here').summary.record.complete)") == "True\n"
+    assert notebook.run(f"print(zsim.load({out!r}).summary.record.complete)") == "True\n"

@@ -1,13 +1,14 @@
 """Vehicles by their model: a user's own out of examples/, and the Crazyflie, however a scenario is flown."""
 
 import json
+from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 from federation import PAIR, Federation
-from forked_commands import ROOT
+from forked_commands import ROOT, run_here
 
-from zsim.vehicles import vehicle_catalogue
+from zsim.vehicles.vehicle import vehicle_of
 
 EXAMPLES = str(ROOT / "examples")
 
@@ -20,10 +21,12 @@ def examples(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("examples")
-def test_a_sweep_compares_vehicles(federation: Federation) -> None:
-    path, out = federation.write(PAIR.replace("duration_s: 12", "duration_s: 4")), federation.folder / "sweep"
+def test_a_sweep_compares_vehicles(tmp_path: Path, near: None) -> None:
+    path, out = tmp_path / "pair.yaml", tmp_path / "sweep"
+    path.write_text(PAIR)
     vary = ("--vary", "drones.drone1.model=ardrone2,crazyflie2,larger_battery", "--workers", "1", "--no-report")
-    federation.start("sweep", path, *vary, "--out", str(out)).ends(with_code=0)
+    done = run_here("sweep", str(path), *vary, "--duration", "4", "--out", str(out))
+    assert done.code == 0, done
     rows = pq.read_table(out / "sweep.parquet").to_pylist()
     assert [row["failure"] for row in rows] == [None] * 3
     assert len({row["truth_sha256"] for row in rows}) == 3
@@ -49,5 +52,5 @@ def test_a_fault_of_a_rotor_that_is_not_there_is_one_line(federation: Federation
     )
     role.ends(with_code=2)
     (line,) = [line.text for line in role.lines if line.text.strip()]
-    for part in ("faults[0].rotor", repr(rotor), *vehicle_catalogue.vehicle_of(model).rotor_names):
+    for part in ("faults[0].rotor", repr(rotor), *vehicle_of(model).rotor_names):
         assert part in line

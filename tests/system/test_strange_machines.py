@@ -18,13 +18,14 @@ from typing import Any
 
 import pytest
 from federation import ONE, PAIR, Federation, compiled, free_port
-from forked_commands import COLUMNS, ROOT, USER_FAULT, ZSIM, refusal, run_here
+from forked_commands import ROOT, USER_FAULT, ZSIM, refusal, run, run_here
 from refused import has_terms
 from wire import PATIENCE_S
 
 from zsim.errors import RunError
 from zsim.math import compiled as kernels
 from zsim.record import RecordReader, completeness
+from zsim_analysis.bundle import make_bundle
 from zsim_api import federation as tested
 
 __all__ = ["compiled"]
@@ -39,22 +40,13 @@ fcntl.flock = flock
 """  # for what is started; run here, it is undone by monkeypatch
 
 
-def zsim(*arguments: str, **variables: str) -> "subprocess.CompletedProcess[str]":
-    """Run a command to its end as a user would start it, with these variables of the environment."""
-    environment = {**os.environ, **COLUMNS, **variables}
-    command = [*ZSIM, *arguments]
-    return subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False
-    )
-
-
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Path:
     """The folder of a run of a second that several tests look at; its scenario is beside it."""
     folder = tmp_path_factory.mktemp("flown")
     (folder / "pair.yaml").write_text(PAIR)
-    done = zsim("run", str(folder / "pair.yaml"), "--in-process", *SHORT, "--out", str(folder / "run"))
-    assert done.returncode == 0, done.stderr
+    done = run_here("run", str(folder / "pair.yaml"), "--in-process", *SHORT, "--out", str(folder / "run"))
+    assert done.code == 0, done
     return folder / "run"
 
 
@@ -64,11 +56,10 @@ STREAMED = (  # command, its exit code whatever becomes of its output, and what 
     ("validate {scenario}", 0, (FULL,)),
     ("validate nowhere.yaml", USER_FAULT, (CLOSED,)),
     ("nonsense", USER_FAULT, (FULL,)),
-    ("keys --connect tcp/127.0.0.1:9 --wait 0.1", USER_FAULT, (CLOSED,)),
     ("export {run} --format csv --out {out}/csv", 0, (CLOSED,)),
-    ("bundle {run} --no-record -o {out}/closed.zsim", 0, (CLOSED,)),
     ("replay {run} --rate 0 --listen tcp/127.0.0.1:{port}", 0, (CLOSED,)),
-    ("run {scenario} --duration 1 --no-report --out {out}/run", 0, (CLOSED, FULL)),
+    ("run {scenario} --duration 1 --no-report --out {out}/run", 0, (CLOSED,)),
+    ("run {scenario} --in-process --duration 1 --no-report --out {out}/run", 0, (FULL,)),
 )
 
 
@@ -100,29 +91,30 @@ ODD = os.fsdecode(b"lab:3 'a' \"b\" $HOME `x` [red]%s;&| \xc3\xbc\xe9\xa3\x9b \x
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Glyph")  # of the font
 @pytest.mark.parametrize("several", [False, pytest.param(True, marks=pytest.mark.soak)], ids=["a run", "several"])
-def test_any_path_will_do(tmp_path: Path, flown: Path, several: bool) -> None:
+def test_any_path_will_do(tmp_path: Path, flown: Path, several: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(make_bundle, "figures", lambda *_: iter(()))  # `report` writes them into such a folder
     folder = tmp_path / (ODD + "n" * 150)
     folder.mkdir()
-    scenario, run = folder / f"{ODD}.yaml", folder / "run"
+    scenario, out = folder / f"{ODD}.yaml", folder / "run"
     shutil.copy(flown.parent / "pair.yaml", scenario)
     varied = ("--vary", "seed=1,2", "--workers", "1", "--keep-records")
     outside = ("sweep", scenario, *SHORT, *varied, "--out", folder / "sweep")
-    here = [("report", run, flown, "--out", folder / f"{ODD}.html"), ("report", folder / "sweep")]
+    here = [("report", out, flown, "--out", folder / f"{ODD}.html"), ("report", folder / "sweep")]
     if not several:
-        outside = ("run", scenario, *SHORT, "--out", run)
-        here = [("export", run, "--format", form) for form in ("csv", "parquet", "mat", "foxglove")]
-        here += [("report", run, "--format", "svg"), ("rerun", run)]
-        here += [("bundle", run, "-o", folder / f"{ODD}.zsim"), ("rerun", folder / f"{ODD}.zsim")]
-    done = zsim(*map(str, outside))  # with processes that are given these paths
-    assert done.returncode == 0, done.stderr
+        outside = ("run", scenario, *SHORT, "--out", out)
+        here = [("export", out, "--format", form) for form in ("csv", "parquet", "mat", "foxglove")]
+        here += [("report", out, "--format", "svg"), ("rerun", out)]
+        here += [("bundle", out, "-o", folder / f"{ODD}.zsim"), ("rerun", folder / f"{ODD}.zsim")]
+    done = run(*map(str, outside))  # with processes that are given these paths
+    assert done.code == 0, done
     assert "Traceback" not in done.stderr
     if several:
-        shutil.copytree(flown, run)
+        shutil.copytree(flown, out)
     for arguments in here:
         ended = run_here(*map(str, arguments))
         assert ended.code == 0, (arguments, ended)
     files = ("csv/truth.csv", "parquet/truth.parquet", "run.mat", "foxglove.mcap", "foxglove.rbl", "report.html")
-    for path in [folder / f"{ODD}.html", folder / "sweep/report.html"] if several else [run / name for name in files]:
+    for path in [folder / f"{ODD}.html", folder / "sweep/report.html"] if several else [out / name for name in files]:
         assert path.stat().st_size > 1000, path
 
 
@@ -159,31 +151,20 @@ def test_a_table_of_each_drone_has_increasing_time(tmp_path: Path, flown: Path) 
     assert "--format csv" in refusal("export", str(flown), "--format", "mat", "--by-name")
 
 
-@needs_root
-@pytest.mark.parametrize("options", ["ro", pytest.param("size=64k", marks=pytest.mark.soak)])
-def test_shared_memory_is_not_needed(tmp_path: Path, flown: Path, options: str) -> None:
-    """Containers have little of it, or none that can be written."""
-    words = [*ZSIM, "run", str(flown.parent / "pair.yaml"), *SHORT, "--out", str(tmp_path / "run")]
-    line = f"mount -t tmpfs -o {options} tmpfs /dev/shm && {shlex.join(words)} && ls -A /dev/shm"
-    done = subprocess.run(
-        ["unshare", "-m", "sh", "-c", line], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert "Traceback" not in done.stderr
-    with RecordReader(tmp_path / "run" / "run.mcap") as record:
-        assert completeness(record).complete
-
-
-MOUNTED = "mkdir $OUT/small && mount -t tmpfs -o"
+READ_ONLY_TMPFS = "mount -t tmpfs -o ro tmpfs"
 LACKING = {  # what is before the command of a run, in a namespace of mounts; the run's exit code
-    "any variable": ("env -i", 0),
-    "a folder for temporary files": ("TMPDIR=/nowhere", 0),
-    "room for temporary files": (
-        f"{MOUNTED} size=4k tmpfs $OUT/small && ! head -c 9000 /dev/zero >$OUT/small/x && TMPDIR=$OUT/small", 0
+    "variables, folders that can be written and shared memory": (  # as in a container
+        f"{READ_ONLY_TMPFS} /dev/shm && mkdir $OUT/here && {READ_ONLY_TMPFS} $OUT/here && cd $OUT/here && "
+        "env -i TMPDIR=/nowhere",
+        0,
     ),
-    "a folder that can be written": (f"{MOUNTED} ro tmpfs $OUT/small && cd $OUT/small &&", 0),
+    "room for temporary files and in shared memory": (
+        "mount -t tmpfs -o size=64k tmpfs /dev/shm && mkdir $OUT/small && mount -t tmpfs -o size=4k tmpfs $OUT/small && "
+        "! head -c 9000 /dev/zero >$OUT/small/x && TMPDIR=$OUT/small",
+        0,
+    ),
     "a folder": ("mkdir $OUT/gone && cd $OUT/gone && rmdir $OUT/gone &&", USER_FAULT),
-}  # fmt: skip
+}
 
 
 @needs_root
@@ -289,8 +270,8 @@ def test_a_run_and_a_sweep_go_on_without_locks(tmp_path: Path) -> None:
     scenario = tmp_path / "pair.yaml"
     scenario.write_text(PAIR)
     reason = os.strerror(errno.EOPNOTSUPP)
-    run = ("run", "--in-process", *SHORT)
-    for command, *options in (run, (*run, "--force"), ("sweep", "--runs", "1", *SHORT)):
+    alone = ("run", "--in-process", *SHORT)
+    for command, *options in (alone, (*alone, "--force"), ("sweep", "--runs", "1", *SHORT)):
         out = tmp_path / f"{command}s"
         done = run_here(command, str(scenario), *options, "--out", str(out))
         assert done.code == 0, done.stderr

@@ -21,9 +21,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from zsim.contract import keys, messages
-from zsim.contract.agent_messages import AgentMessage
 from zsim.contract.framing import GateMessages
-from zsim.contract.messages import Info, decode, encode
+from zsim.contract.messages import AgentMessage, Info, decode, encode
 from zsim.contract.run_messages import ClusterRequest, ControlAnswer, ControlRequest, Faults
 from zsim.contract.snapshot import State, checked
 from zsim.errors import DecodeError, RunError, UserCodeError

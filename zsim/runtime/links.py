@@ -18,13 +18,12 @@ from typing import Any
 import msgspec
 
 from zsim.contract import keys, messages
-from zsim.contract.agent_messages import AgentMessage
 from zsim.contract.flight_messages import Estimate
-from zsim.contract.messages import Info, decode, encode
+from zsim.contract.messages import AgentMessage, Info, decode, encode
 from zsim.contract.run_messages import Fault, Faults, RadioLinks
 from zsim.contract.snapshot import State
 from zsim.math import elementary as el
-from zsim.math.random_streams import uniform
+from zsim.math.randomness import uniform
 from zsim.runtime.inbox import Input, canonical
 from zsim.scenario import faults as fault_kinds
 from zsim.scenario.roles import ROLES

@@ -1,14 +1,29 @@
-"""The join, done and bye messages of a process, for Zenoh and the in-memory bus."""
+"""What a process says of itself: join, done and bye, for Zenoh and the in-memory bus, and its health once per second.
 
+And garbage collection without delaying gates.
+"""
+
+import gc
 import os
-from collections.abc import Callable
+import socket
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 from msgspec import UNSET
 
 from zsim import __version__
 from zsim.contract.fingerprint import fingerprint
-from zsim.contract.run_messages import Bye, Done, Join
+from zsim.contract.run_messages import Bye, Done, Health, Join
+from zsim.runtime.rate_limit import RateLimit
+
+PERIOD_S = 1.0  # contract: 1 Hz wall
+STEPS_KEPT = 1000
+READS_MAX = 8  # expressions that are listed of a process that reads many
+ALLOCATIONS = 50_000  # between two collections, chosen: a gate allocates hundreds of objects and leaves no cycle
 
 
 @dataclass
@@ -47,3 +62,77 @@ class Membership:
 
     def bye(self, t_ns: int, reason: str, failed: bool = False) -> Bye:
         return Bye(t_ns, self.next_seq("bye"), reason, failed or UNSET, self.run_id, self.incarnation)
+
+
+class HealthMeter:
+    """Counters of one process.
+
+    Attributes:
+        received, refused, dropped: messages taken in, messages not decodable, and gates given up.
+    """
+
+    def __init__(
+        self,
+        role: str,
+        wall_s: Callable[[], float] = time.monotonic,
+        host: str | None = None,
+        reads: Sequence[str] = (),  # the expressions that it subscribes to, as its session keeps them
+    ) -> None:
+        self._role = role
+        self._host = host or socket.gethostname()
+        self._reads = reads
+        self._steps_us: deque[float] = deque(maxlen=STEPS_KEPT)
+        self._limit = RateLimit(PERIOD_S, now=wall_s)
+        self._limit.spend()  # the first is due in a second
+        self.received = self.refused = self.dropped = 0
+        self.lag_ns = 0  # how far the newest gate is ahead of the one just handled
+        self.link_lost = False  # whether the world cannot be reached now
+
+    def step(self, duration_ns: int) -> None:
+        self._steps_us.append(duration_ns / 1000)
+
+    def due(self) -> bool:
+        """Tell whether health is due, once per wall second."""
+        return self._limit.spend()
+
+    def message(self, t_ns: int, seq: int) -> Health:
+        steps = sorted(self._steps_us) or [0.0]
+        return Health(
+            t_ns=t_ns,
+            seq=seq,
+            role=self._role,
+            host=self._host,
+            pid=os.getpid(),
+            step_us={"p50": steps[len(steps) // 2], "p99": steps[int(len(steps) * 0.99)]},
+            lag_ns=self.lag_ns,
+            dropped=self.dropped,
+            refused=self.refused,
+            rss_bytes=resident_bytes(),
+            received=self.received,
+            reads=tuple(self._reads[:READS_MAX]),
+        )
+
+
+def resident_bytes() -> int:
+    """Return the resident memory of this process [bytes]; 0 if the system does not report it."""
+    if sys.platform == "linux":
+        with suppress(OSError), open("/proc/self/statm", encoding="ascii") as statm:  # no file may be left to open
+            return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return 0
+
+
+@contextmanager
+def rare_collections() -> Iterator[None]:
+    """Collect garbage rarely, and never examine the objects that already exist.
+
+    By default Python collects after 700 allocations, every few gates, and occasionally examines all objects.
+    """
+    gc.collect()
+    gc.freeze()
+    thresholds = gc.get_threshold()
+    gc.set_threshold(ALLOCATIONS, *thresholds[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*thresholds)
+        gc.unfreeze()

@@ -23,9 +23,8 @@ from zsim.contract.messages import ProcessEntry
 from zsim.contract.snapshot import VERSION, pack, unpack
 from zsim.errors import BehindError, DecodeError, NoWorldError, RunError, SupersededError
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.health import HealthMeter
 from zsim.runtime.inbox import output_hold_ns
-from zsim.runtime.membership import Membership
+from zsim.runtime.membership import HealthMeter, Membership
 from zsim.transport.connection import read_info
 from zsim.transport.session import ReceivedSample, Session
 from zsim.transport.traffic import replay

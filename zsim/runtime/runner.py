@@ -20,8 +20,8 @@ from zsim.contract.messages import ProcessEntry, RunEnd, WorldEvent
 from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError, SessionError
 from zsim.runtime.agent import Agent
-from zsim.runtime.health import HealthMeter, rare_collections
 from zsim.runtime.inbox import NEVER_NS, Inbox, RoutingTable, output_hold_ns
+from zsim.runtime.membership import HealthMeter, rare_collections
 from zsim.runtime.participant import AgentParticipant
 from zsim.scenario.faults import PROCESS_KILL
 from zsim.schema import plugin

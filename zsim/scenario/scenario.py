@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 from msgspec import UNSET, Meta, Struct, UnsetType, defstruct, field
 from msgspec.structs import replace
 
-from zsim.contract.agent_messages import MessageInfo
+from zsim.contract.messages import MessageInfo
 from zsim.errors import PACKAGES
 from zsim.schema.parameters import Given
 from zsim.schema.plugin import CLASS_NAME
@@ -17,8 +17,7 @@ from zsim.sensors.camera import Hats
 from zsim.sensors.sensor_catalogue import NAME as SENSOR_NAME
 from zsim.sensors.sensor_catalogue import Sensors
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
-from zsim.vehicles.vehicle import Aerodynamics, Arm, Limits, Mass, RotorLag, TakeoffHeight, Vehicle
-from zsim.vehicles.vehicle_catalogue import STOCK
+from zsim.vehicles.vehicle import MODELS, Aerodynamics, Arm, Limits, Mass, RotorLag, TakeoffHeight, Vehicle
 
 TEMPLATE_FROM = 5  # robots; below it the variables of the triad are fewer to name, and as well conditioned
 DRONES_MAX = 1000  # one world integrates them all
@@ -627,7 +626,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
         classes = [name for name in names if isinstance(name, str) and ":" in name]
         classes = [name for name in classes if name.partition(".")[0] not in PACKAGES]
         sensors = [each["module"] for drone in self.drones for each in (drone.sensors.own or {}).values()]
-        models = [drone.model for drone in self.drones if drone.model not in STOCK]
+        models = [drone.model for drone in self.drones if drone.model not in MODELS]
         return sorted({*classes, *sensors, *models})
 
     def external(self) -> list[str]:

@@ -20,12 +20,10 @@ from zsim.scenario.consistency import cross_faults
 from zsim.scenario.generated import with_generated
 from zsim.scenario.scenario import DRONES_MAX, VEHICLE_NUMBERS, Document, Scenario, SharedVehicle, Topology
 from zsim.schema import plugin, yaml_file
-from zsim.schema.checker import Fault, faults, first_lines, show, sound, suggestion
-from zsim.sensors.error_units import in_channel_units
-from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, Sensors, flattened, separate
-from zsim.vehicles import vehicle_catalogue
+from zsim.schema.checker import Fault, faults, faults_in, first_lines, show, sound, suggestion
+from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, Sensors, flattened, in_channel_units, separate
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
-from zsim.vehicles.vehicle import Aerodynamics, Vehicle
+from zsim.vehicles.vehicle import DEFAULT_MODEL, MODELS, Aerodynamics, Vehicle, vehicle_of
 
 EXAMPLE = "scenarios/step.yaml"  # named in errors
 SYNTAX = "a.b.c=value, e.g. drones.drone2.mass_kg=0.5 or environment.wind.gust_m_s=0.5"
@@ -100,7 +98,7 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
     unknown: list[Fault] = []  # models that are no vehicles
     unsound: list[Fault] = []  # sensors of users
     unread: set[str] = set()  # names of these that are faulty, or must not be imported
-    vehicles = dict(vehicle_catalogue.STOCK)  # by model, as far as drones need one
+    vehicles = {name: vehicle_of(name) for name in MODELS}  # by model, as far as drones need one
 
     given = _in_channel_units(document.get("sensors"), "sensors", misread)
     shared_sensors = given or {}
@@ -213,7 +211,7 @@ def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
     try:
         pieces = pieces_of(plugin.beside(name), f"{where}.file")
     except DocumentError as error:
-        unsound += [(path, text) for path, _, text in (line.partition(" ") for line in error.faults)]
+        unsound += faults_in(error)
         return reference
     return {**{key: value for key, value in reference.items() if key != "file"}, "pieces": pieces}
 
@@ -242,15 +240,15 @@ def _vehicle_of(
     A drone with all its numbers, as in a resolved scenario, needs no user's module: readers of `world/info` import
     nothing. A vehicle that must not be imported is left out.
     """
-    model = drone.get("model", vehicle_catalogue.DEFAULT)
+    model = drone.get("model", DEFAULT_MODEL)
     if not isinstance(model, str):
         return ARDRONE2
     if model not in vehicles and not all(name in drone for name in (*VEHICLE_NUMBERS, "limits", "sensors")):
         try:
             if not imports:
-                allowed = f"must be {', '.join(vehicle_catalogue.STOCK)}, or come with all its numbers"
+                allowed = f"must be {', '.join(MODELS)}, or come with all its numbers"
                 raise DocumentError([f"is {show(model)}; {allowed}"])
-            vehicles[model] = vehicle_catalogue.vehicle_of(model, "")
+            vehicles[model] = vehicle_of(model, "")
         except NotTrustedError:
             pass
         except DocumentError as error:

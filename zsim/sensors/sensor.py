@@ -27,7 +27,7 @@ UNSENSED = ("text", "number[]")  # no field of a sensor's message: what it measu
 
 
 class ErrorModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Error of one channel, in the channel's unit; units of data sheets and of Kalibr: zsim.sensors.error_units."""
+    """Error of one channel, in the channel's unit; units of data sheets and of Kalibr: `sensor_catalogue`."""
 
     noise: NonNegative = 0.0  # standard deviation of each sample; white, or with `correlation_s` a Gauss-Markov process
     density: NonNegative = 0.0  # white, per sqrt(Hz): density * sqrt(rate) of each sample

@@ -1,19 +1,26 @@
-"""The parameters of a vehicle: those that a scenario may override for a drone, and the others.
+"""A vehicle: its parameters, and how a scenario names one: `ardrone2`, `crazyflie2`, or a module with a VEHICLE.
 
-Geometry in B: x forward, y left, z up, origin at the centre of mass. Thrust, torque and drag hold at an air density of
-1.225 kg/m^3. A drone whose `arm_m`, `thrust_n_s2` or `torque_nm_s2` is overridden is taken as similar in shape: lengths
-of the airframe grow with the arm, a rotor's radius with the fourth root of its thrust coefficient, its inertia with
-its torque coefficient.
+Some parameters a scenario may override for a drone. Geometry in B: x forward, y left, z up, origin at the centre of
+mass. Thrust, torque and drag hold at an air density of 1.225 kg/m^3. A drone whose `arm_m`, `thrust_n_s2` or
+`torque_nm_s2` is overridden is taken as similar in shape: lengths of the airframe grow with the arm, a rotor's radius
+with the fourth root of its thrust coefficient, its inertia with its torque coefficient.
 """
 
+import importlib
 import math
+import re
+from functools import cache
 from typing import Annotated, Literal
 
+import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
+from zsim.errors import DocumentError, NotTrustedError, reason_of
 from zsim.math import elementary as el
 from zsim.math import linear
+from zsim.schema import plugin
+from zsim.schema.checker import faults, show
 from zsim.schema.quantities import Fraction, NonNegative, Positive, Real
 
 ROTORS_MIN, ROTORS_MAX = 4, 8  # fewer cannot hold a hover at every heading; more do not go into a message
@@ -21,6 +28,9 @@ ARM_MISS_MAX = 0.01  # of the arm, chosen: what rounding of a drawing leaves
 BALANCE_MAX = 1e-6  # of the arm, by which the centre of the rotors may miss that of mass
 LIFT_MIN = 0.2  # of the mean thrust, chosen: a rotor that bears less in hover has nothing left to steer with
 RANK_MIN = 1e-3  # least share that one of roll, pitch and yaw may have of the strongest
+
+DEFAULT_MODEL, MODELS = "ardrone2", ("ardrone2", "crazyflie2")  # of zsim, each a module of this package
+ALLOWED = f"{', '.join(MODELS)}, or package.module of your own that defines VEHICLE"
 
 Mass = Annotated[float, Meta(gt=0, le=100)]
 Arm = Annotated[float, Meta(gt=0, le=10)]
@@ -185,6 +195,35 @@ class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         if shares.min() < LIFT_MIN:
             weakest = f"{names[int(shares.argmin())]} of rotors bears {shares.min():.2f} of the mean thrust in a hover"
             raise ValueError(f"{weakest}; must be >= {LIFT_MIN:g}: place them about the centre of mass, turns balanced")
+
+
+@cache
+def vehicle_of(model: str, where: str = "model") -> Vehicle:
+    """Return the vehicle of a model.
+
+    Args:
+        model: a stock name, or the `package.module` of one that defines VEHICLE.
+        where: file and path of the field that names it.
+
+    Raises:
+        DocumentError: there is none, or its parameters are faulty; a line for each fault.
+    """
+    if model in MODELS:
+        return importlib.import_module(f"zsim.vehicles.{model}").VEHICLE
+    if not re.fullmatch(plugin.MODULE_NAME, model):
+        raise DocumentError([f"{where} is {show(model)}; must be one of {ALLOWED}"])
+    try:
+        plugin.load_module(model, where)
+    except NotTrustedError:
+        raise
+    except DocumentError as error:
+        reason = reason_of(error.__cause__) if error.__cause__ else "it cannot be found"
+        raise DocumentError([f"{where} is {show(model)}; must be one of {ALLOWED} ({reason})"]) from error
+    vehicle = plugin.load_object(model, where, "VEHICLE", Vehicle)
+    flaws = [*faults(msgspec.to_builtins(vehicle), Vehicle)]
+    if flaws:
+        raise DocumentError([f"{where} is {show(model)}: VEHICLE.{path} {text}" for path, text in flaws])
+    return vehicle
 
 
 def cross_layout(arm_m: float) -> tuple[Rotor, ...]:

@@ -1,64 +1,91 @@
-"""The cameras of one or several drones as a process: renders their pictures from the truth and publishes them.
+"""The processes of cameras and of detectors: one renders pictures from the truth, the other finds hats in pictures.
 
-If it is too slow it drops and counts pictures; if cameras gate in the scenario, the run waits.
+A process that is too slow drops and counts pictures; if cameras gate in the scenario, the run waits.
 """
 
+from __future__ import annotations
+
 import math
+import threading
 import time
-from collections import deque
+from collections import OrderedDict, defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
-from itertools import count
+from itertools import count, product
 from operator import attrgetter
 
 import numpy as np
 from msgspec.structs import replace
 
 from zsim.contract import keys, messages
-from zsim.contract.flight_messages import CameraImage, CameraInfo, Truth, moved_on, truth_fault
+from zsim.contract.flight_messages import CameraImage, CameraInfo, Sightings, Truth, moved_on, truth_fault
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import RUN_ENDED
 from zsim.errors import DecodeError
+from zsim.math.frames import rotation_matrix
 from zsim.math.rotation import pose_between
 from zsim.runtime.participant import Participant
 from zsim.scenario.scenario import Drone, Scenario
-from zsim.sensors.camera import Camera
-from zsim.sensors.camera_model import camera_matrix, camera_pose, lens_of
+from zsim.sensors.camera import CAMERAS, Camera, PictureError
+from zsim.sensors.camera_model import CameraPose, Lens, camera_matrix, camera_pose, folds, lens_of
 from zsim.transport.session import Query, RawSample, ReceivedSample, Session
 from zsim.vehicles.vehicle import ROTORS_MIN
-from zsim_agents.cameras.process import RunProcess
-from zsim_agents.cameras.rendering.renderer import Renderer
-from zsim_agents.cameras.rendering.scene import DroneStates, scene_of
+from zsim_agents.cameras.detector import PIXELS_MAX, HatDetector, decoded, rehearse
+from zsim_agents.cameras.renderer import Renderer
+from zsim_agents.cameras.scene import DroneStates, scene_of
 
+TICK_S = 0.1  # how often a stop is looked for while nothing arrives
 # gates that it may be behind the world, which may be ahead of everybody by the command delay, before it drops pictures:
 # messages that arrive in a burst are no reason yet; more than the slack of cameras that gate
 BEHIND_MAX = 5
-ASK_S = 0.5  # wall; the world answers in milliseconds
+ANSWER_S = 0.5  # wall; the world and cameras answer in milliseconds
 OVERTAKING_S = 0.1  # wall; a bye of higher priority would pass the last pictures, and a recorder close before them
 DRAIN_S = 1.0  # wall; how long to wait for the last truths of a run
 PENDING_MAX = 64  # gates of which the truth of a drone may be missing
+ASK_S = 2.0  # wall; how often a camera is asked what its pixels mean, while that is unknown
+REPORTS_MAX = 5  # lines about refused pictures; health has the count
 
 
-class _Eye:
-    """A camera of a drone: its renderer, and the next picture."""
+class RunProcess:
+    """A process that waits for messages from Zenoh's threads, and handles them in `turn`."""
 
-    def __init__(self, drone: str, name: str, camera: Camera, renderer: Renderer) -> None:
-        self.key, self.info_key = keys.camera(drone, name), keys.camera_info(drone, name)
-        self.camera, self.renderer = camera, renderer
-        self.latency_ns = round(camera.latency_ms * 1e6)
-        self.next = 0
-        self.seq = 0
-        self.last = -1  # number of its last picture among those of all cameras
+    def __init__(self, link: Session, participant: Participant) -> None:
+        self._link, self._participant = link, participant
+        self._wake_event = threading.Event()
+        self._was_lost = False
+        self._is_back = False  # whether a lost link has been restored
+        link.declare_subscriber(keys.CLOCK, self._on_clock)
+        link.on_link(self._on_link)
 
-    def exposure_ns(self, number: int) -> int:  # its middle
-        return round(number * 1e9 / self.camera.rate_hz)
+    def begin(self) -> None:
+        raise NotImplementedError
 
-    def last_due(self, t_ns: int) -> int:
-        """Return the number of the newest picture available at an instant; -1 before the first."""
-        due_ns = t_ns - self.latency_ns
-        number = int(due_ns * self.camera.rate_hz / 1e9) + 1
-        while number >= 0 and self.exposure_ns(number) > due_ns:
-            number -= 1
-        return number
+    def turn(self) -> None:
+        raise NotImplementedError
+
+    def run(self, stopped: Callable[[], bool]) -> None:
+        """Begin, and call `turn` until the run ends or the process is stopped."""
+        self.begin()
+        while not (self._participant.end_reason or stopped()):
+            self.turn()
+
+    def wake(self) -> None:
+        self._wake_event.set()
+
+    def wait(self) -> None:
+        """Return when a message has arrived, or after a tick."""
+        self._wake_event.wait(TICK_S)
+        self._wake_event.clear()
+        self._participant.tick()
+
+    def _on_clock(self, sample: RawSample) -> None:
+        self._participant.update_clock(sample.payload)
+        if self._participant.end_reason:
+            self.wake()
+
+    def _on_link(self, up: bool) -> None:
+        self._is_back = self._is_back or (up and self._was_lost)
+        self._was_lost = not up
+        self.wake()
 
 
 class CameraProcess(RunProcess):
@@ -89,16 +116,15 @@ class CameraProcess(RunProcess):
         super().__init__(link, participant)
 
     def begin(self) -> None:
-        """Subscribe to the truth, and publish the camera info."""
+        """Subscribe to the truth, publish the camera info, and join if the world waits for this process."""
         for eye in self._eyes:
             self._link.declare_queryable(eye.info_key, self._on_query)
         self._link.declare_subscriber(keys.truth("*"), self._on_truth)
         self._publish_infos()
-
-    def run(self, stopped: Callable[[], bool]) -> None:
-        self.begin()
         if self._participant.gates:
             self.join()
+
+    def run(self, stopped: Callable[[], bool]) -> None:
         super().run(stopped)
         if self._participant.end_reason == RUN_ENDED:
             self._finish()
@@ -108,15 +134,15 @@ class CameraProcess(RunProcess):
 
         Replies to a query may overtake earlier publications: a run that has not begun is not queried.
         """
-        has_begun = bool(self._link.get(keys.truth("*"), timeout_s=ASK_S))
+        has_begun = bool(self._link.get(keys.truth("*"), timeout_s=ANSWER_S))
         self._participant.announce()
         if has_begun:
             self._catch_up()
 
     def turn(self) -> None:
         self.wait()
-        if self.is_back:
-            self.is_back = False
+        if self._is_back:
+            self._is_back = False
             self._publish_infos()
             self._catch_up()
         self._draw()
@@ -133,7 +159,7 @@ class CameraProcess(RunProcess):
     def _catch_up(self) -> None:
         """Request the newest truth if the world waits for this process: it may have been published before."""
         if self._participant.gates:
-            self._arrived.extend(self._link.get(keys.truth("*"), timeout_s=ASK_S))
+            self._arrived.extend(self._link.get(keys.truth("*"), timeout_s=ANSWER_S))
             self.wake()
 
     def _on_truth(self, sample: RawSample) -> None:
@@ -237,6 +263,131 @@ class CameraProcess(RunProcess):
         )
 
 
+class DetectorProcess(RunProcess):
+    """Publishes the hats, of a diameter [m], in the pictures of some drones' cameras."""
+
+    def __init__(
+        self,
+        link: Session,
+        participant: Participant,
+        say: Callable[[str], None],
+        drones: Sequence[str],
+        diameter_m: float,
+    ) -> None:
+        self._say = say
+        self._drones, self._diameter_m = drones, diameter_m
+        self._pictures: OrderedDict[str, RawSample] = OrderedDict()  # the newest of each camera, longest waiting first
+        self._infos: dict[str, RawSample] = {}
+        self._detectors: dict[str, HatDetector] = {}  # by camera key, as the next two
+        self._known: dict[str, CameraInfo] = {}
+        self._asked_s: dict[str, float] = {}
+        self._seq: defaultdict[str, int] = defaultdict(int)
+        self._reported = 0
+        super().__init__(link, participant)
+
+    def begin(self) -> None:
+        """Subscribe to pictures and camera infos, for known names only, since any program could invent others."""
+        rehearse()
+        for drone, name in product(self._drones, CAMERAS):
+            self._link.declare_subscriber(keys.camera_info(drone, name), self._on_info)
+            self._link.declare_subscriber(keys.camera(drone, name), self._on_picture)
+
+    def turn(self) -> None:
+        """Search the newest picture of each camera, the longest waiting first."""
+        self.wait()
+        while self._infos:
+            self._learn(self._infos.popitem()[1])
+        for _ in range(len(self._pictures)):
+            self._look(self._pictures.popitem(last=False)[1])
+
+    def _on_info(self, sample: RawSample) -> None:
+        self._infos[sample.key] = sample
+        self.wake()
+
+    def _on_picture(self, sample: RawSample) -> None:
+        if sample.key in self._pictures:
+            self._participant.health.dropped += 1
+        self._pictures[sample.key] = sample
+        self.wake()
+
+    def _learn(self, sample: RawSample) -> None:
+        def meaning(info: CameraInfo | None) -> object:
+            return info and (info.width, info.height, info.K, info.D, info.orientation_wxyz)
+
+        try:
+            info: CameraInfo = messages.decode(sample.key, sample.payload)
+            key = sample.key.removesuffix("/info")
+            if meaning(self._known.get(key)) != meaning(info):
+                self._detectors[key] = _detector_of(info, self._diameter_m)
+            self._known[key] = info
+        except (DecodeError, PictureError) as error:
+            self._refuse(sample.key, error)
+
+    def _look(self, sample: RawSample) -> None:
+        start_ns = time.perf_counter_ns()
+        health = self._participant.health
+        try:
+            image: CameraImage = messages.decode(sample.key, sample.payload)
+            detector, info = self._detectors.get(sample.key), self._known.get(sample.key)
+            if detector is None or info is None:
+                health.dropped += 1
+                self._ask(sample.key)
+                return
+            seen = detector.seen(decoded(image.data, info.width, info.height))
+        except (DecodeError, PictureError) as error:
+            self._refuse(sample.key, error)
+            return
+        health.received += 1
+        _, drone, what = keys.parts(sample.key)
+        sightings = Sightings(
+            t_ns=image.t_ns,
+            seq=self._seq[drone],
+            t_sample_ns=image.t_sample_ns,
+            source=self._participant.name,
+            camera=what.removeprefix("camera/"),
+            seen=seen,
+        )
+        self._seq[drone] += 1
+        self._link.put(keys.detections(drone), sightings)
+        health.step(time.perf_counter_ns() - start_ns)
+
+    def _ask(self, key: str) -> None:
+        if time.monotonic() - self._asked_s.get(key, -ASK_S) < ASK_S:
+            return
+        self._asked_s[key] = time.monotonic()
+        for answer in self._link.get(f"{key}/info", timeout_s=ANSWER_S):
+            self._learn(RawSample("PUT", answer.key, answer.payload, "", None))
+
+    def _refuse(self, key: str, error: Exception) -> None:
+        self._participant.health.refused += 1
+        if self._reported < REPORTS_MAX:
+            self._reported += 1
+            self._say(f"{self._participant.name}: {key}: {messages.fault_at(key, error)}")
+
+
+class _Eye:
+    """A camera of a drone: its renderer, and the next picture."""
+
+    def __init__(self, drone: str, name: str, camera: Camera, renderer: Renderer) -> None:
+        self.key, self.info_key = keys.camera(drone, name), keys.camera_info(drone, name)
+        self.camera, self.renderer = camera, renderer
+        self.latency_ns = round(camera.latency_ms * 1e6)
+        self.next = 0
+        self.seq = 0
+        self.last = -1  # number of its last picture among those of all cameras
+
+    def exposure_ns(self, number: int) -> int:  # its middle
+        return round(number * 1e9 / self.camera.rate_hz)
+
+    def last_due(self, t_ns: int) -> int:
+        """Return the number of the newest picture available at an instant; -1 before the first."""
+        due_ns = t_ns - self.latency_ns
+        number = int(due_ns * self.camera.rate_hz / 1e9) + 1
+        while number >= 0 and self.exposure_ns(number) > due_ns:
+            number -= 1
+        return number
+
+
 class TruthHistory:
     """The true states of every simulated drone at the last gates, with interpolation between gates. Pure.
 
@@ -310,3 +461,17 @@ def _between(t_s: float, gate_s: float, before: Sequence[Truth], after: Sequence
         rotors.append(mean(a.rotor_rad_s, b.rotor_rad_s))
     p, v, q = (np.array([pose[k] for pose in poses]) for k in range(3))
     return DroneStates(p, v, q, np.array(rates), rotors)
+
+
+def _detector_of(info: CameraInfo, diameter_m: float) -> HatDetector:
+    """Return a camera's detector; PictureError: its pictures are too large, or its intrinsics invalid."""
+    if info.width * info.height > PIXELS_MAX:
+        raise PictureError(f"{info.width} x {info.height} are too many pixels; must be at most {PIXELS_MAX}")
+    fx, skew, cx, _, fy, cy, *_ = info.K
+    if fx <= 0 or fy <= 0 or skew:
+        raise PictureError(f"K has focal lengths {fx:g} and {fy:g}, and skew {skew:g}; must be > 0, > 0, and 0")
+    lens = Lens(fx, fy, cx, cy, *info.D, info.width, info.height)
+    if folds(lens):
+        raise PictureError(f"D is {list(info.D)}, which folds the picture; must give every pixel a ray of its own")
+    pose = CameraPose(np.array(info.position_m), rotation_matrix(info.orientation_wxyz))
+    return HatDetector(lens, pose, diameter_m)

@@ -23,7 +23,7 @@ from zsim.math.compiled import Field, columns, portable
 from zsim.math.rotation import Vector, add, cross, dot, norm, scaled
 from zsim.sensors.camera import PictureError, frame_of
 from zsim.sensors.camera_model import CameraPose, Lens, spread
-from zsim_agents.cameras.rendering.scene import View
+from zsim_agents.cameras.scene import View
 
 Picture = NDArray[np.uint8]
 Levels = NDArray[np.float32]

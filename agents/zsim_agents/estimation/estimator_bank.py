@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zsim.contract import encoding, keys, messages
-from zsim.contract.encoding import GAP, Layouts, Program
+from zsim.contract import framing, keys, messages
 from zsim.contract.flight_messages import Estimate
-from zsim.contract.framing import GateMessages
+from zsim.contract.framing import GAP, GateMessages, Layouts, Program
 from zsim.contract.keys import SENSORS
 from zsim.contract.snapshot import State
 from zsim.math import elementary as el
@@ -66,7 +65,7 @@ BARO_ALTITUDE, GPS_POSITION, GPS_SIGMA, FLOW_QUALITY = 1, 3, 9, 3  # positions a
 GPS_FIX, SONAR_VALID = 3, 3  # positions among the integers
 RANK = tuple(sorted(SENSORS).index(kind) for kind in SENSORS)  # of keys in the order in which runners deliver
 
-read = inlined(encoding.read)
+read = inlined(framing.read)
 
 _VALUES: dict[str, Callable[[Any], tuple[float, ...]]] = {  # values and extra of a reading
     "imu": lambda m: (*m.accel_m_s2, *m.gyro_rad_s, 0.0, 0.0),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from zsim.contract.keys import SENSORS
 from zsim.math import elementary as el
-from zsim.math.distributions import chi_square_quantile
+from zsim.math.randomness import chi_square_quantile
 from zsim.math.rotation import LEVEL, matrix_from_rpy
 from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim.scenario.surroundings import Surroundings

@@ -1,7 +1,11 @@
-"""Assembly of robots at arbitrary positions into a formation: all fly simultaneously to assigned places.
+"""Assembly of robots at arbitrary positions into a formation: all fly simultaneously to assigned places. Pure.
 
-They fly straight with a common function of time, so that the minimum distance of any two is known in advance (see
-`assignment`). This time is stopped while a robot is far behind.
+CAPT: Turpin, Michael and Kumar, Int. J. Robotics Research 33 (2014) 98-112. They fly straight from start to goal with
+a common function of time b, p_i = s_i + b (g_i - s_i). The assignment with the least sum of squared distances has
+(s_i - s_j).(g_i - g_j) >= 0 for every pair; with starts a and goals b apart, no pair then comes nearer than
+a b / sqrt(a^2 + b^2), which is at least the smaller of them over sqrt 2. A sum of distances has no such bound.
+
+The common time is stopped while a robot is far behind.
 """
 
 from __future__ import annotations
@@ -14,7 +18,6 @@ from numpy.typing import NDArray
 
 from zsim.contract.snapshot import State
 from zsim.math import elementary as el
-from zsim_agents.formation.assignment import assign, straight_separation
 from zsim_agents.formation.control_law import FormationGains
 from zsim_agents.formation.flight_check import ROUNDING_M, SHAPE, formation_fault
 from zsim_agents.formation.flight_plan import RefusalError
@@ -131,6 +134,34 @@ def planned_assembly(
         sure = f"sure where starts, and places, are {math.sqrt(2.0) * gains.separation_min_m:.2f} m apart"
         raise RefusalError(f"{near}; allowed: {least_m:g} m or more, {sure}")
     return Assembly(start_W, goal_W, c, _least_s(start_W, goal_W, gains), gains), order
+
+
+def assign(starts_m: Array, goals_m: Array) -> NDArray[np.intp]:
+    """Return the goal (n,) of each of n starts (n, 3), for the least sum of squared distances.
+
+    Raises:
+        ValueError: the numbers of goals and starts differ, or they are not finite places.
+    """
+    from scipy.optimize import linear_sum_assignment  # here, because scipy takes longer to load than all else
+
+    starts, goals = np.asarray(starts_m, float), np.asarray(goals_m, float)
+    if starts.ndim != 2 or starts.shape != goals.shape or starts.shape[1] not in (2, 3):
+        raise ValueError(f"found starts {starts.shape} and goals {goals.shape}; must both be (n, 3)")
+    if not (np.isfinite(starts).all() and np.isfinite(goals).all()):
+        raise ValueError("a place is not finite; must be")
+    return linear_sum_assignment(((starts[:, None] - goals[None]) ** 2).sum(axis=2))[1]
+
+
+def straight_separation(starts_m: Array, goals_m: Array) -> float:
+    """Return the least distance [m] of drones that fly straight from starts to goals (n, 3) with a common b."""
+    i, j = np.triu_indices(len(starts_m), 1)
+    if not len(i):
+        return math.inf
+    from_, to = starts_m[i] - starts_m[j], goals_m[i] - goals_m[j]
+    change = to - from_
+    squared = np.maximum((change**2).sum(axis=1), 1e-300)
+    b = np.clip(-(from_ * change).sum(axis=1) / squared, 0.0, 1.0)
+    return float(np.sqrt(((from_ + b[:, None] * change) ** 2).sum(axis=1)).min())
 
 
 def _least_s(start_W: Array, goal_W: Array, gains: FormationGains) -> float:

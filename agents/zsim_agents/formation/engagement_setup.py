@@ -26,6 +26,8 @@ from zsim_agents.formation.control_law import (
     ControlLaw,
     FormationGains,
     RobotLimits,
+    granted,
+    grants_of,
     guard,
     load,
 )
@@ -41,7 +43,6 @@ from zsim_agents.formation.flight_check import (
     shape_fault,
 )
 from zsim_agents.formation.flight_plan import REFUSALS, Assemble, FlightPlan, Follow, MoveTo, PlanError, plan_of
-from zsim_agents.formation.grants import granted, grants_of
 from zsim_agents.formation.guidance import HORIZON_S, LOAD_TOLERANCE, RampPlanner
 from zsim_agents.formation.spaces.cluster_space import (
     Array,

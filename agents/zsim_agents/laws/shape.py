@@ -19,8 +19,7 @@ from msgspec import Meta, field
 from zsim.scenario.scenario import DRONES_MAX, Scenario, Value
 from zsim.schema.checker import Fault
 from zsim.schema.quantities import NonNegative, Positive, Real
-from zsim_agents.laws.pilot import Array, Pilot, PilotParameters, Sight
-from zsim_agents.laws.reference import FormationReference, polygon
+from zsim_agents.laws.pilot import Array, FormationReference, Pilot, PilotParameters, Sight, polygon
 
 
 class ShapeParameters(PilotParameters):

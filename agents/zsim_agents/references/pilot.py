@@ -30,7 +30,7 @@ from zsim.schema.quantities import NonNegative, Positive, Real
 from zsim_agents.formation.flight_check import AGE_MAX_S, AIRBORNE, RESEND_S
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.formation.trajectory import TrajectoryError
-from zsim_agents.references.cruise import FREE, Cruise, cruise_through, cruise_to_rest
+from zsim_agents.references.cruise import FREE, Cruise, cruise_through, cruise_to_rest, velocity_towards
 from zsim_agents.references.flight import (
     HEIGHT_MIN_M,
     SHARE,
@@ -44,7 +44,6 @@ from zsim_agents.references.flight import (
     way_to,
 )
 from zsim_agents.references.path import EndMotion, PathLimits, move
-from zsim_agents.references.tracking import velocity_towards
 
 REQUESTS_MAX = 1000  # between two gates, as of a controller
 PLAIN = ("takeoff", "land", "hold")

@@ -23,9 +23,8 @@ from zsim.math.frames import turned_about_up
 from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Piloted, Scenario
 from zsim.vehicles.vehicle import Limits
-from zsim_agents.references.cruise import Cruise
+from zsim_agents.references.cruise import Course, Cruise
 from zsim_agents.references.flight import limits_of
-from zsim_agents.references.tracking import Course
 from zsim_bridges.console.console_page import PageForms
 from zsim_bridges.console.formation_form import SIDEWAYS_M, height_range_m
 from zsim_bridges.console.orders import CommandClient, NoAnswer

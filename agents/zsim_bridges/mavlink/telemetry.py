@@ -13,7 +13,7 @@ from zsim.math import frames
 from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Drone
 from zsim.schema.quantities import G_M_S2
-from zsim.vehicles.vehicle_catalogue import vehicle_of
+from zsim.vehicles.vehicle import vehicle_of
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import (
     UINT16_UNKNOWN,

@@ -24,7 +24,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import yaml
 from msgspec import Struct
@@ -36,7 +35,7 @@ from zsim.output_folder import held_folder
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import LAWS, Scenario
 from zsim_agents.hosting import check_classes
-from zsim_agents.laws.reference import FormationReference, polygon
+from zsim_agents.laws.pilot import FormationReference, polygon
 from zsim_analysis.board.measures import Figure, flown_of, measures, shape_errors
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.sweep.process_pool import ProcessPool, cores
@@ -208,11 +207,6 @@ def heads() -> list[str]:
     return [f"{each.title} ({each.unit})" if each.unit else each.title for each in MEASURES]
 
 
-def markdown(board: Board) -> str:
-    """Return the table of the board."""
-    return "".join(_markdown(board))
-
-
 def _markdown(board: Board) -> Iterator[str]:
     for scenario in board.scenarios:
         yield f"### {scenario}\n\n{about(scenario)[0].upper()}{about(scenario)[1:]}.\n\n"
@@ -231,13 +225,9 @@ def write_tables(out: Path, board: Board, rows: Sequence[Row]) -> None:
     writer.writerows(rows)
     try:
         (out / CSV).write_text(text.getvalue(), encoding="utf-8")
-        (out / MARKDOWN).write_text(markdown(board), encoding="utf-8")
+        (out / MARKDOWN).write_text("".join(_markdown(board)), encoding="utf-8")
     except OSError as error:
         raise ReportError(f"{out}: cannot be written ({error.strerror})") from error
-
-
-def summary_of(board: Board) -> bytes:
-    return msgspec.json.format(msgspec.json.encode(board), indent=2) + b"\n"
 
 
 @cache

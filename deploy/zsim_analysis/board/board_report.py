@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from matplotlib.patches import Rectangle
 from rich.console import Group
 
 from zsim.presentation import Column, FittedTable, drone_colours
@@ -18,35 +17,18 @@ from zsim_analysis.board.board import (
     about,
     board_of,
     cells,
-    document,
     heads,
     planned_figure,
-    summary_of,
+    resolved,
     write_tables,
 )
 from zsim_analysis.board.board import BoardRequest as Request
-from zsim_analysis.report.figure_style import (
-    BLACK,
-    BLUE,
-    DARK,
-    GREEN,
-    GREY,
-    ORANGE,
-    PAGE_IN,
-    PAPER_PT,
-    PURPLE,
-    SKY,
-    VERMILION,
-    ReportFigure,
-    dress,
-    legend_above,
-    letter_panels,
-    new_figure,
-)
-from zsim_analysis.report.make_report import Picture, sources, template, write_report
+from zsim_analysis.report import figure_style as style
+from zsim_analysis.report.flight_figures import draw_obstacles
+from zsim_analysis.report.make_report import Picture, rendered, write_report
 from zsim_analysis.sweep.sweep_run import Row
 
-COLOURS = (BLUE, ORANGE, GREEN, VERMILION, SKY, PURPLE, BLACK, GREY)
+COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.VERMILION, style.SKY, style.PURPLE, style.BLACK, style.GREY)
 MARKS = "osD^vP*X"
 ROW_IN, MARGIN_IN = 0.42, 0.9  # height of a law, and of what stands around the axes
 LEAST_IN = 0.5  # height of a row of ways
@@ -62,18 +44,17 @@ def make_board_report(
     board = board_of(request, rows)
     write_tables(request.out, board, rows)
     figures = board_figures(board, rows)
-    write_report(request.out, summary_of(board), figures, partial(page, board), progress, formats)
+    write_report(request.out, board, figures, partial(page, board), progress, formats)
     return board
 
 
 def page(board: Board, pictures: Sequence[Picture]) -> str:
     tables = [
-        (each, about(each), [(law, cells(board.entry(each, law))) for law in board.laws]) for each in board.scenarios
+        (each, about(each), [(law, *cells(board.entry(each, law))) for law in board.laws]) for each in board.scenarios
     ]
     failed = sum(entry.failed for entry in board.entries)
-    return template("board.html.j2", "zsim_analysis.board").render(
-        board=board, heads=heads(), tables=tables, failed=failed, figures=sources(pictures)
-    )
+    values = {"board": board, "heads": ["law", *heads()], "tables": tables, "failed": failed}
+    return rendered("board.html.j2", pictures, "zsim_analysis.board", **values)
 
 
 def terminal_text(board: Board) -> Group:
@@ -89,7 +70,7 @@ def terminal_text(board: Board) -> Group:
     return Group(*tables)
 
 
-def board_figures(board: Board, rows: Sequence[Row]) -> Iterator[ReportFigure]:
+def board_figures(board: Board, rows: Sequence[Row]) -> Iterator[style.ReportFigure]:
     """Yield the figures of a board; ways and shapes over time are those of the first seed."""
     yield _measures(board)
     first = {(row["scenario"], row["law"]): row for row in rows if row["seed"] == 1 and row["failure"] is None}
@@ -98,11 +79,11 @@ def board_figures(board: Board, rows: Sequence[Row]) -> Iterator[ReportFigure]:
         yield _shapes(board, first)
 
 
-def _measures(board: Board) -> ReportFigure:
+def _measures(board: Board) -> style.ReportFigure:
     shown = [each for each in MEASURES if any(entry.means[each.name] is not None for entry in board.entries)]
     columns = 4
     lines = -(-len(shown) // columns)
-    figure = new_figure(PAGE_IN, lines * (MARGIN_IN + ROW_IN * len(board.laws)) * 0.75)
+    figure = style.new_figure(style.PAGE_IN, lines * (MARGIN_IN + ROW_IN * len(board.laws)) * 0.75)
     panels = figure.subplots(lines, columns, sharey=True, squeeze=False)
     for axes in panels.flat[len(shown) :]:
         axes.set_visible(False)
@@ -117,56 +98,55 @@ def _measures(board: Board) -> ReportFigure:
                 colour, y = COLOURS[place % len(COLOURS)], row + offset
                 axes.plot([entry.least[measure.name], entry.greatest[measure.name]], [y, y], color=colour, lw=1.0)
                 axes.plot(mean, y, MARKS[place % len(MARKS)], color=colour, ms=3.2, label=scenario.replace("_", " "))
-        dress(axes)
+        style.dress(axes)
         axes.margins(x=0.08)
         axes.set_xlim(0.0, max(axes.get_xlim()[1], 10.0**-measure.digits))
         unit = f" ({measure.unit})" if measure.unit else ""
-        axes.set_xlabel(f"{measure.title}{unit}", fontsize=PAPER_PT)
+        axes.set_xlabel(f"{measure.title}{unit}", fontsize=style.PAPER_PT)
         axes.set_yticks(range(len(board.laws)), [law.replace("_", " ") for law in board.laws])
         axes.set_ylim(len(board.laws) - 0.5, -0.5)
-    letter_panels(list(panels.flat[: len(shown)]))
-    legend_above(figure, panels[0, 0])
+    style.letter_panels(list(panels.flat[: len(shown)]))
+    style.legend_above(figure, panels[0, 0])
     spread = f"Means over {board.seeds} seeds; lines from the least to the greatest."
     caption = f"{spread} A law without a mark has no such measure."
-    return ReportFigure("measures.png", "What the laws achieve", caption, figure)
+    return style.ReportFigure("measures.png", "What the laws achieve", caption, figure)
 
 
-def _ways(board: Board, first: dict[tuple[str, str], Row]) -> ReportFigure:
+def _ways(board: Board, first: dict[tuple[str, str], Row]) -> style.ReportFigure:
     boxes = [_box(board, scenario, first) for scenario in board.scenarios]
-    wide = (PAGE_IN - 0.4) / len(board.laws)
+    wide = (style.PAGE_IN - 0.4) / len(board.laws)
     heights = [max(wide * (high[1] - low[1]) / (high[0] - low[0]), LEAST_IN) for low, high in boxes]
-    figure = new_figure(PAGE_IN, 0.5 + sum(heights) + 0.08 * len(heights))
+    figure = style.new_figure(style.PAGE_IN, 0.5 + sum(heights) + 0.08 * len(heights))
     shape = {"squeeze": False, "height_ratios": heights}
     panels = figure.subplots(len(board.scenarios), len(board.laws), **shape)
     for line, (scenario, (low, high)) in enumerate(zip(board.scenarios, boxes, strict=True)):
-        plan, obstacles = planned_figure(scenario), _obstacles(scenario)
+        plan, flown = planned_figure(scenario), resolved("consensus", scenario, 1)  # with the obstacles of all laws
         for axes, law in zip(panels[line], board.laws, strict=True):
             axes.set_aspect("equal")
             axes.set_xlim(low[0], high[0])
             axes.set_ylim(low[1], high[1])
             axes.set_xticks([])
             axes.set_yticks([])
-            axes.spines[:].set_color(GREY)
-            for patch in map(_patch, obstacles):
-                axes.add_patch(patch)
+            axes.spines[:].set_color(style.GREY)
+            draw_obstacles(axes, flown)
             if line == 0:
-                axes.set_title(law.replace("_", "\n"), fontsize=PAPER_PT - 2)
+                axes.set_title(law.replace("_", "\n"), fontsize=style.PAPER_PT - 2)
             if (row := first.get((scenario, law))) is None:
                 continue
             t_s, p = np.array(row["track_t_s"]), np.array(row["track_m"], float)
             centre = np.array([plan.reference.at(float(t)).p_W for t in t_s])
-            axes.plot(*centre.T, color=GREY, lw=0.8, ls=(0, (3, 2)))
+            axes.plot(*centre.T, color=style.GREY, lw=0.8, ls=(0, (3, 2)))
             for drone, colour in enumerate(drone_colours(p.shape[1])):
                 axes.plot(*p[:, drone].T, color=colour, lw=0.6)
                 known = np.flatnonzero(np.isfinite(p[:, drone, 0]))
                 if len(known):
                     axes.plot(*p[known[-1], drone], "o", color=colour, ms=2.2)
-        panels[line, 0].set_ylabel(scenario.replace("_", " "), fontsize=PAPER_PT)
+        panels[line, 0].set_ylabel(scenario.replace("_", " "), fontsize=style.PAPER_PT)
     caption = (
         "Seen from above, x to the right; each drone in its colour, a dot where it was last in the air; dashed, the "
         "way of the reference's centre. Panels of a row have one scale."
     )
-    return ReportFigure("ways.png", "The ways of the drones, first seed", caption, figure)
+    return style.ReportFigure("ways.png", "The ways of the drones, first seed", caption, figure)
 
 
 def _box(board: Board, scenario: str, first: dict[tuple[str, str], Row]) -> tuple[Any, Any]:
@@ -176,10 +156,10 @@ def _box(board: Board, scenario: str, first: dict[tuple[str, str], Row]) -> tupl
     return np.nanmin(places, axis=0) - 1.0, np.nanmax(places, axis=0) + 1.0
 
 
-def _shapes(board: Board, first: dict[tuple[str, str], Row]) -> ReportFigure:
+def _shapes(board: Board, first: dict[tuple[str, str], Row]) -> style.ReportFigure:
     columns = min(2, len(board.scenarios))
     lines = -(-len(board.scenarios) // columns)
-    figure = new_figure(PAGE_IN, 0.4 + 1.7 * lines)
+    figure = style.new_figure(style.PAGE_IN, 0.4 + 1.7 * lines)
     panels = figure.subplots(lines, columns, sharex=True, squeeze=False)
     for axes in panels.flat[len(board.scenarios) :]:
         axes.set_visible(False)
@@ -190,25 +170,15 @@ def _shapes(board: Board, first: dict[tuple[str, str], Row]) -> ReportFigure:
             if row and np.isfinite(errors).any():
                 name = law.replace("_", " ")
                 axes.plot(row["track_t_s"], errors, color=COLOURS[place % len(COLOURS)], lw=0.8, label=name)
-        dress(axes, "shape error (m)")
+        style.dress(axes, "shape error (m)")
         axes.set_yscale("log")
-        axes.set_title(scenario.replace("_", " "), fontsize=PAPER_PT, color=DARK)
+        axes.set_title(scenario.replace("_", " "), fontsize=style.PAPER_PT, color=style.DARK)
     for axes in panels[-1]:
-        axes.set_xlabel("simulated time (s)", fontsize=PAPER_PT)
-    legend_above(figure, panels[0, 0])
+        axes.set_xlabel("simulated time (s)", fontsize=style.PAPER_PT)
+    style.legend_above(figure, panels[0, 0])
     about_all = "; ".join(f"{each.replace('_', ' ')}: {about(each)}" for each in board.scenarios)
     caption = (
         "Root mean square distance of the drones from their places, after what the law leaves open; "
         f"laws without places are not shown. {about_all[0].upper()}{about_all[1:]}."
     )
-    return ReportFigure("shapes.png", "Shape error over time, first seed", caption, figure)
-
-
-def _obstacles(scenario: str) -> list[dict[str, Any]]:
-    return document("consensus", scenario, 1).get("environment", {}).get("obstacles", [])
-
-
-def _patch(each: dict[str, Any]) -> Rectangle:
-    """Return an obstacle of a shipped scenario: all are boxes along the axes."""
-    (x, y), (wide, deep) = each["position_m"][:2], each["size_m"][:2]
-    return Rectangle((x - wide / 2, y - deep / 2), wide, deep, color=GREY, alpha=0.6, lw=0)
+    return style.ReportFigure("shapes.png", "Shape error over time, first seed", caption, figure)

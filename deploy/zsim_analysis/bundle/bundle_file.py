@@ -21,6 +21,7 @@ from msgspec import Struct
 
 from zsim.errors import OTHER_OUT, RunError, file_fault
 from zsim.output_folder import temporary_folder
+from zsim_analysis.report import indented_json
 
 SUFFIX = ".zsim"
 MANIFEST, README, SCENARIO, LOCK = "bundle.json", "README.md", "scenario.yaml", "lock.txt"
@@ -72,7 +73,7 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return msgspec.structs.replace(self, seal=hashlib.sha256(blank.text()).hexdigest())
 
     def text(self) -> bytes:
-        return msgspec.json.format(msgspec.json.encode(self, order="sorted"), indent=2) + b"\n"
+        return indented_json(self, "sorted")
 
 
 class WrittenBundle(NamedTuple):

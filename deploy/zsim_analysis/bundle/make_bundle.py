@@ -42,8 +42,9 @@ from zsim_analysis.bundle.bundle_file import (
 )
 from zsim_analysis.reading import recorded_run
 from zsim_analysis.reading.recorded_run import GateDigests, OutputHashes, RecordedAgents, RecordedRun, content_of
+from zsim_analysis.report import indented_json
 from zsim_analysis.report.make_report import figures
-from zsim_analysis.report.summary import RunSummary, judge
+from zsim_analysis.report.summary import judge
 from zsim_world.run.coordinator import FLIGHT_REQUESTS
 
 PROJECT = "zsim"
@@ -387,7 +388,8 @@ def _add_figures(members: dict[str, Path | bytes], record: Path) -> None:
     for figure in figures(flight, formations, summary):
         members[f"{names.FIGURES}/{figure.name}"] = figure.png()
         members[f"{names.FIGURES}/{Path(figure.name).stem}.csv"] = _drawn(figure.drawing)
-    members[names.RESULTS] = _results(summary)
+    kept = {name: value for name, value in msgspec.to_builtins(summary).items() if name not in OF_THE_WALL_CLOCK}
+    members[names.RESULTS] = indented_json(kept, "sorted")
 
 
 def _drawn(drawing: Any) -> bytes:
@@ -402,11 +404,6 @@ def _drawn(drawing: Any) -> bytes:
             name = str(count) if label.startswith("_") else label
             writer.writerows([panel, name, f"{x:.9g}", f"{y:.9g}"] for x, y in zip(*curve.get_data(), strict=True))
     return file.getvalue().encode()
-
-
-def _results(summary: RunSummary) -> bytes:
-    kept = {name: value for name, value in msgspec.to_builtins(summary).items() if name not in OF_THE_WALL_CLOCK}
-    return msgspec.json.format(msgspec.json.encode(kept, order="sorted"), indent=2) + b"\n"
 
 
 README = """# {name}

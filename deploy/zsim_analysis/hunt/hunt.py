@@ -35,6 +35,7 @@ from zsim.schema import yaml_file
 from zsim_analysis.hunt.requirements import BROKEN, Margin, Requirement, figures_of, worst
 from zsim_analysis.hunt.shrink import Shrinker, causes_of, only
 from zsim_analysis.hunt.space import LAG, WIND, Case, HuntSpace, Strategy
+from zsim_analysis.report import indented_json
 from zsim_analysis.report.summary import RunSummary, summarise
 from zsim_analysis.sweep.design import METRICS, text_of
 from zsim_analysis.sweep.process_pool import ProcessPool, cores
@@ -472,7 +473,7 @@ def write(hunted: Hunted) -> None:
         "document": request.document,
     }  # fmt: skip
     try:
-        (request.out / PLAN).write_bytes(msgspec.json.format(msgspec.json.encode(plan), indent=2) + b"\n")
+        (request.out / PLAN).write_bytes(indented_json(plan))
         (request.out / TABLE).write_text(table(hunted), encoding="utf-8")
         if summary.violation:
             text = yaml_file.dump(hunted.space.changed(summary.violation.shrunk))

@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import combinations
 
-import msgspec
 import numpy as np
 from rich.console import Group
 from rich.text import Text
@@ -27,18 +26,8 @@ from zsim_analysis.hunt.hunt import (
 )
 from zsim_analysis.hunt.shrink import causes_of
 from zsim_analysis.hunt.space import KindSpace
-from zsim_analysis.report.figure_style import (
-    BLUE,
-    DARK,
-    GREY,
-    PAGE_IN,
-    PAPER_PT,
-    VERMILION,
-    ReportFigure,
-    dress,
-    new_figure,
-)
-from zsim_analysis.report.make_report import Picture, make_report, sources, template, write_report
+from zsim_analysis.report import figure_style as style
+from zsim_analysis.report.make_report import Picture, make_report, rendered, write_report
 
 QUARTERS = 4  # parts of a range whose number of trials is shown
 KINDS_DRAWN = 24  # greatest size of the matrix of pairs
@@ -64,44 +53,43 @@ def make_hunt_report(
             make_bundle(out / VIOLATION, out / BUNDLE, True, True, notes.append)
         except ZsimError as error:
             notes.append(f"no bundle: {error}")
-    content = msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n"
     searched = [each for each in hunted.flown if each.stage == SEARCH]
-    write_report(out, content, figures(summary, searched), partial(page, hunted, searched), progress, formats)
+    write_report(out, summary, figures(summary, searched), partial(page, hunted, searched), progress, formats)
     return notes
 
 
-def figures(summary: HuntSummary, searched: Sequence[HuntFlight]) -> Iterator[ReportFigure]:
+def figures(summary: HuntSummary, searched: Sequence[HuntFlight]) -> Iterator[style.ReportFigure]:
     yield _margins(summary, searched)
     kinds = sorted({kind for each in searched for kind in each.case.kinds})
     if 1 < len(kinds) <= KINDS_DRAWN:
         yield _pairs(kinds, searched)
 
 
-def _margins(summary: HuntSummary, searched: Sequence[HuntFlight]) -> ReportFigure:
-    figure = new_figure(PAGE_IN, 1.6 * len(summary.requirements) + 0.4)
+def _margins(summary: HuntSummary, searched: Sequence[HuntFlight]) -> style.ReportFigure:
+    figure = style.new_figure(style.PAGE_IN, 1.6 * len(summary.requirements) + 0.4)
     panels = figure.subplots(len(summary.requirements), 1, sharex=True, squeeze=False)[:, 0]
     for i, (axes, text) in enumerate(zip(panels, summary.requirements, strict=True)):
         known = [(each.number, each.margins[i].value, each.margins[i].holds) for each in searched]
         points = np.array([(number, value) for number, value, _ in known if value is not None], float).reshape(-1, 2)
         broken = np.array([not holds for _, value, holds in known if value is not None], bool)
-        axes.plot(*points[~broken].T, ".", color=BLUE, ms=2.5)
-        axes.plot(*points[broken].T, "x", color=VERMILION, ms=5)
+        axes.plot(*points[~broken].T, ".", color=style.BLUE, ms=2.5)
+        axes.plot(*points[broken].T, "x", color=style.VERMILION, ms=5)
         if len(points):
-            axes.plot(points[:, 0], np.minimum.accumulate(points[:, 1]), color=DARK, lw=0.8)
+            axes.plot(points[:, 0], np.minimum.accumulate(points[:, 1]), color=style.DARK, lw=0.8)
         for number in (number for number, value, _ in known if value is None):
-            axes.axvline(number, color=VERMILION, lw=0.6)
-        axes.axhline(0.0, color=GREY, lw=0.8)
-        dress(axes, "margin")
-        axes.set_title(text, fontsize=PAPER_PT, color=DARK, loc="left")
-    panels[-1].set_xlabel("flight", fontsize=PAPER_PT)
+            axes.axvline(number, color=style.VERMILION, lw=0.6)
+        axes.axhline(0.0, color=style.GREY, lw=0.8)
+        style.dress(axes, "margin")
+        axes.set_title(text, fontsize=style.PAPER_PT, color=style.DARK, loc="left")
+    panels[-1].set_xlabel("flight", fontsize=style.PAPER_PT)
     caption = (
         "Margin of each flight of the search to breaking a requirement, in the unit of its figures; crosses below 0 "
         "are violations. Line: the least margin so far. Vertical line: a figure is unknown."
     )
-    return ReportFigure("margins.png", "Margins over the flights", caption, figure)
+    return style.ReportFigure("margins.png", "Margins over the flights", caption, figure)
 
 
-def _pairs(kinds: Sequence[str], searched: Sequence[HuntFlight]) -> ReportFigure:
+def _pairs(kinds: Sequence[str], searched: Sequence[HuntFlight]) -> style.ReportFigure:
     least = np.full((len(kinds), len(kinds)), np.nan)
     counts = np.zeros_like(least)
     for each in searched:
@@ -110,24 +98,26 @@ def _pairs(kinds: Sequence[str], searched: Sequence[HuntFlight]) -> ReportFigure
             row, column = max(a, b), min(a, b)
             least[row, column] = np.nanmin([least[row, column], each.worst.share])
             counts[row, column] += 1
-    side = min(PAGE_IN, 1.6 + 0.33 * len(kinds))
-    figure = new_figure(side + 0.6, side)
+    side = min(style.PAGE_IN, 1.6 + 0.33 * len(kinds))
+    figure = style.new_figure(side + 0.6, side)
     axes = figure.subplots()
     image = axes.imshow(100 * least, cmap="viridis", vmin=-100, vmax=100)
-    axes.set_xticks(range(len(kinds)), [kind.replace("_", " ") for kind in kinds], rotation=90, fontsize=PAPER_PT - 1)
-    axes.set_yticks(range(len(kinds)), [kind.replace("_", " ") for kind in kinds], fontsize=PAPER_PT - 1)
+    axes.set_xticks(
+        range(len(kinds)), [kind.replace("_", " ") for kind in kinds], rotation=90, fontsize=style.PAPER_PT - 1
+    )
+    axes.set_yticks(range(len(kinds)), [kind.replace("_", " ") for kind in kinds], fontsize=style.PAPER_PT - 1)
     for row, column in zip(*np.nonzero(counts), strict=True):
         colour = "black" if least[row, column] > 0 else "white"
         text = f"{counts[row, column]:.0f}"
-        axes.text(column, row, text, ha="center", va="center", fontsize=PAPER_PT - 2, color=colour)
+        axes.text(column, row, text, ha="center", va="center", fontsize=style.PAPER_PT - 2, color=colour)
     bar = figure.colorbar(image, shrink=0.7)
-    bar.set_label("least margin (%)", fontsize=PAPER_PT)
-    bar.ax.tick_params(labelsize=PAPER_PT - 1)
+    bar.set_label("least margin (%)", fontsize=style.PAPER_PT)
+    bar.ax.tick_params(labelsize=style.PAPER_PT - 1)
     caption = (
         "Least margin of the flights with both kinds, as a share of that of the flight without faults, and their "
         "number; on the diagonal those of all flights with a kind. Empty: not tried."
     )
-    return ReportFigure("pairs.png", "Kinds of faults flown together", caption, figure)
+    return style.ReportFigure("pairs.png", "Kinds of faults flown together", caption, figure)
 
 
 # Page
@@ -136,7 +126,10 @@ def _pairs(kinds: Sequence[str], searched: Sequence[HuntFlight]) -> ReportFigure
 def page(hunted: Hunted, searched: Sequence[HuntFlight], pictures: Sequence[Picture]) -> str:
     summary, space = hunted.summary, hunted.space
     found = summary.violation
-    return template("hunt.html.j2", "zsim_analysis.hunt").render(
+    return rendered(
+        "hunt.html.j2",
+        pictures,
+        "zsim_analysis.hunt",
         summary=summary,
         facts=facts(hunted.request, summary),
         found=[cause_text(found.found, each) for each in causes_of(found.found)] if found else [],
@@ -145,7 +138,8 @@ def page(hunted: Hunted, searched: Sequence[HuntFlight], pictures: Sequence[Pict
         record=f"{VIOLATION}/report.html",
         number=number,
         kinds=[kind_row(space.kinds[name], searched) for name in space.kinds],
-        figures=sources(pictures),
+        causes=[(each.text, number(each.without), number(each.alone)) for each in found.causes] if found else [],
+        stages=[(each.name, each.flights, f"{each.wall_s:.1f}") for each in summary.stages],
     )
 
 

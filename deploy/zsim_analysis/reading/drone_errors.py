@@ -8,7 +8,7 @@ from msgspec import Struct
 
 from zsim.errors import ZsimError
 from zsim.math.frames import wrap_angle
-from zsim.vehicles.vehicle_catalogue import vehicle_of
+from zsim.vehicles.vehicle import vehicle_of
 from zsim_analysis.reading.formation import common_instants
 from zsim_analysis.reading.recorded_flight import Array, RecordedFlight
 

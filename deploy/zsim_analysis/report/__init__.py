@@ -8,4 +8,13 @@
 Imports zsim_analysis.reading, matplotlib and jinja2.
 """
 
+from typing import Any, Literal
+
+import msgspec
+
 FORMATS = ("pdf", "svg")  # of figures, beside PNG
+
+
+def indented_json(content: Any, order: Literal["sorted"] | None = None) -> bytes:
+    """Return the bytes of a file such as summary.json."""
+    return msgspec.json.format(msgspec.json.encode(content, order=order), indent=2) + b"\n"

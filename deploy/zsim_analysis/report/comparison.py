@@ -37,7 +37,7 @@ from zsim_analysis.report.flight_figures import (
     numbered,
     parameter_groups,
 )
-from zsim_analysis.report.make_report import Picture, facts, sources, template, write_page
+from zsim_analysis.report.make_report import Picture, facts, rendered, write_page
 from zsim_analysis.report.summary import STATISTICS, RunSummary, flies_paper_test, judge
 
 ABSENT = "–"
@@ -136,7 +136,9 @@ def runs_id(directories: Sequence[Path]) -> str:
 
 def comparison_page(runs: Sequence[ComparedRun], pictures: Sequence[Picture]) -> str:
     groups = [runs[start : start + RUNS_PER_TABLE] for start in range(0, len(runs), RUNS_PER_TABLE)]
-    return template("comparison.html.j2").render(
+    return rendered(
+        "comparison.html.j2",
+        pictures,
         runs=runs,
         runs_id=runs_id([run.directory for run in runs]),
         facts=fact_rows(runs),
@@ -146,7 +148,6 @@ def comparison_page(runs: Sequence[ComparedRun], pictures: Sequence[Picture]) ->
         tables={name: [(group, statistics_rows(group, name)) for group in groups] for name in clusters(runs)},
         scenario=scenario_rows(runs),
         without=[run.name for run in runs if run.flight.scenario is None],
-        figures=sources(pictures),
     )
 
 

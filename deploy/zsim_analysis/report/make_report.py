@@ -10,9 +10,9 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from zsim.errors import ReportError
@@ -28,7 +28,7 @@ from zsim_analysis.reading.drone_errors import (
 from zsim_analysis.reading.formation import Formation, goal_errors
 from zsim_analysis.reading.recorded_flight import RadioSummary, RecordedFlight
 from zsim_analysis.reading.shortfall import percent_text, seconds_text, span_text
-from zsim_analysis.report import FORMATS
+from zsim_analysis.report import FORMATS, indented_json
 from zsim_analysis.report.figure_style import DARK, TAKE_OVER, VERMILION, ReportFigure, mark_figure, time_marks
 from zsim_analysis.report.flight_figures import (
     PAIRS_MAX,
@@ -77,7 +77,7 @@ def make_report(
     """
     flight, formations, summary = judge(directory / RECORD, progress, answers=True)
     drawings = figures(flight, formations, summary)
-    write_report(directory, summary.json(), drawings, partial(page, summary), progress, formats)
+    write_report(directory, summary, drawings, partial(page, summary), progress, formats)
     return summary
 
 
@@ -206,7 +206,14 @@ def _of_cluster(
 
 
 def page(summary: RunSummary, pictures: Sequence[Picture]) -> str:
-    return template("page.html.j2").render(
+    events = [(f"{each.t_s:.2f}", each.kind, each.source, each.subject, each.text) for each in summary.events]
+    participants = [
+        (p["name"], p["host"], p["pid"], summary.versions.get(p["name"], ""), p["incarnations"], p["left"])
+        for p in summary.participants
+    ]
+    return rendered(
+        "page.html.j2",
+        pictures,
         summary=summary,
         facts=facts(summary),
         window=span_text(summary.window_s),
@@ -214,7 +221,8 @@ def page(summary: RunSummary, pictures: Sequence[Picture]) -> str:
         tables={name: error_table(cluster) for name, cluster in summary.clusters.items()},
         tracking=tracking_table(summary) if summary.tracking else None,
         paper_note=PAPER_NOTE if any(cluster.paper_std for cluster in summary.clusters.values()) else "",
-        figures=sources(pictures),
+        events=events,
+        participants=participants,
     )
 
 
@@ -282,19 +290,16 @@ def date_text(date: str | None) -> str:
     return f"{date[:16].replace('T', ' ')} UTC" if date else "not known"
 
 
-def template(name: str, package: str = "zsim_analysis.report") -> Template:
-    """Return a page's template; it may include templates of its own package and of this one."""
-    return Environment(
+def rendered(name: str, pictures: Iterable[Picture], package: str = "zsim_analysis.report", **values: Any) -> str:
+    """Return a page: a template of a package, which may use those of this one, with `figures` and other values."""
+    environment = Environment(
         loader=ChoiceLoader([PackageLoader(package, "."), PackageLoader("zsim_analysis.report", ".")]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
-    ).get_template(name)
-
-
-def sources(pictures: Iterable[Picture]) -> list[tuple[ReportFigure, str]]:
-    """Return each figure with its PNG file as a data URI."""
-    return [(figure, "data:image/png;base64," + base64.b64encode(png).decode()) for figure, png in pictures]
+    )
+    sources = [(figure, "data:image/png;base64," + base64.b64encode(png).decode()) for figure, png in pictures]
+    return environment.get_template(name).render(figures=sources, **values)
 
 
 # Files
@@ -302,7 +307,7 @@ def sources(pictures: Iterable[Picture]) -> list[tuple[ReportFigure, str]]:
 
 def write_report(
     directory: Path,
-    summary: bytes,
+    summary: object,
     figures: Iterable[ReportFigure],
     page: Callable[[Sequence[Picture]], str],
     progress: Callable[[str], None],
@@ -327,7 +332,7 @@ def write_report(
         pictures = _render(figures, new / "figures", progress, formats)
         for figure, png in pictures:
             (new / "figures" / figure.name).write_bytes(png)
-        (new / "summary.json").write_bytes(summary)
+        (new / "summary.json").write_bytes(indented_json(summary))
         (new / "report.html").write_text(page(pictures), encoding="utf-8")
     _remove_others(pictures, directory / "figures", formats)
 

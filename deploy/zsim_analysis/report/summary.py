@@ -133,9 +133,6 @@ class RunSummary(Struct, frozen=True):
     record: RecordFacts
     notes: list[str]
 
-    def json(self) -> bytes:
-        return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
-
 
 def judge(
     record: Path, progress: Callable[[str], None] = lambda _: None, answers: bool = False

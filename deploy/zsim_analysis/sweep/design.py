@@ -20,7 +20,7 @@ from msgspec import Struct
 
 from zsim import __version__
 from zsim.errors import DocumentError, ScenarioError
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
 from zsim.scenario import scenario_file
 from zsim.scenario.roles import check_alone, check_pace
 from zsim.scenario.scenario import Scenario

@@ -25,11 +25,12 @@ from msgspec import Struct
 from rich.console import Console
 from rich.live import Live
 
-from zsim.errors import ReportError, RunError, printable
-from zsim.output_folder import no_locks, refuse_others, take_lock
+from zsim.errors import OTHER_OUT, ReportError, RunError, file_fault, printable
+from zsim.output_folder import RECORD, held_folder, no_locks
 from zsim.runtime.progress import NotebookLine, cell
 from zsim.runtime.rate_limit import RateLimit
 from zsim.schema import plugin
+from zsim_analysis.report import indented_json
 from zsim_analysis.sweep.design import PLAN, SEED, Axis, Grid, SweepDesign, SweepPlan, difference, is_sweep
 from zsim_analysis.sweep.process_pool import ProcessPool, cores
 from zsim_analysis.sweep.sweep_run import FIXED, Row, Task
@@ -101,7 +102,10 @@ def _fly(folder: "SweepFolder", request: SweepRequest, missing: list[int], scree
 
         modules = {file.name: file.read_text(encoding="utf-8") for file in folder.path.glob(f"{plugin.MADE}*.py")}
         pool = DaskPool(request.dask, screen.say, modules)
-    with folder.journal() as journal, closing(pool.rows(_tasks(folder, missing, request.open_run))) as rows:
+    with (
+        folder.journal() as journal,
+        closing(pool.rows(_tasks(folder, missing, request.open_run))) as rows,
+    ):
         for row in rows:
             journal.append(row)
             screen.finished(row["failure"] is not None)
@@ -249,18 +253,10 @@ def locked(path: Path, plan: SweepPlan, force: bool = False) -> Iterator[SweepFo
     Raises:
         RunError: another sweep is running there, or it holds something else.
     """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        if not is_sweep(path):
-            if (path / "run.mcap").exists() or (path / TABLE).exists():
-                raise RunError(f"{path}: holds another run or sweep; give --out another folder")
-            refuse_others(path, (LOCK, NEW_PLAN), force, "sweep into")
-        lock = (path / LOCK).open("w")
-    except OSError as error:
-        raise RunError(f"{path}: cannot be made ({error.strerror}); give --out another folder") from error
-    with lock:
-        if not take_lock(lock):
-            raise RunError(f"{path}: another sweep is running there; give --out another folder")
+    with file_fault(path, "cannot be made", OTHER_OUT):
+        if not is_sweep(path) and ((path / RECORD).exists() or (path / TABLE).exists()):
+            raise RunError(f"{path}: holds another run or sweep; {OTHER_OUT}")
+    with held_folder(path, PLAN, (LOCK, NEW_PLAN), force, "sweep into", "another sweep is running"):
         if warning := no_locks(path):
             print(printable(warning), file=sys.stderr)
         _write_plan(path, plan)
@@ -270,7 +266,7 @@ def locked(path: Path, plan: SweepPlan, force: bool = False) -> Iterator[SweepFo
 def _write_plan(path: Path, plan: SweepPlan) -> None:
     """Write the plan, unless the folder holds another sweep; a sweep without a finished run may be replaced."""
     try:
-        content = msgspec.json.format(msgspec.json.encode(plan), indent=2) + b"\n"
+        content = indented_json(plan)
     except UnicodeEncodeError as error:
         character = error.object[error.start : error.end][:1]
         reason = f"cannot be written ({character!a} is not a character); give text in UTF-8"
@@ -281,11 +277,9 @@ def _write_plan(path: Path, plan: SweepPlan) -> None:
         if other and present.rows():
             raise RunError(f"{path}: holds another sweep ({other}); give --out another folder")
     new = path / NEW_PLAN
-    try:
+    with file_fault(path, "cannot be written", OTHER_OUT):
         new.write_bytes(content)
         new.replace(path / PLAN)
-    except OSError as error:
-        raise RunError(f"{path}: cannot be written ({error.strerror}); give --out another folder") from error
 
 
 class Journal:

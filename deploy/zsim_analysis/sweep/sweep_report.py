@@ -21,7 +21,7 @@ from rich.text import Text
 from zsim.errors import ReportError, printable
 from zsim.runtime.progress import cell
 from zsim_analysis.reading.shortfall import span_text
-from zsim_analysis.report.make_report import Picture, changed_text, date_text, sources, template, write_report
+from zsim_analysis.report.make_report import Picture, changed_text, date_text, rendered, write_report
 from zsim_analysis.report.summary import PAPER_COLUMN, PAPER_NOTE, STATISTICS
 from zsim_analysis.sweep.sweep import load
 from zsim_analysis.sweep.sweep_figures import figures
@@ -61,7 +61,7 @@ def make_sweep_report(
         raise ReportError(f"{directory}: no run of this sweep is finished yet; there is nothing to report")
     results = SweepResults(sweep.design, rows)
     summary = results.summary()
-    write_report(directory, summary.json(), figures(results), partial(page, summary), progress, formats)
+    write_report(directory, summary, figures(results), partial(page, summary), progress, formats)
     return summary
 
 
@@ -88,7 +88,10 @@ def page(summary: SweepSummary, pictures: Sequence[Picture]) -> str:
     own = {column: str(field_name(column)) for column in summary.metrics if column in summary.known}
     differing_points = [each for each in points if each.differences]
     columns = ["parameter", *([PAPER_COLUMN] if summary.paper_std else []), *STATISTICS, QUANTILES]
-    return template("sweep.html.j2", "zsim_analysis.sweep").render(
+    return rendered(
+        "sweep.html.j2",
+        pictures,
+        "zsim_analysis.sweep",
         summary=summary,
         facts=facts(summary),
         notes=notes(summary),
@@ -107,7 +110,6 @@ def page(summary: SweepSummary, pictures: Sequence[Picture]) -> str:
         details=columns,
         tables=[(heading_of(point), details(point, names, summary.paper_std)) for point in points[:DETAILED_MAX]],
         paper_note=PAPER_NOTE if summary.paper_std else "",
-        figures=sources(pictures),
     )
 
 

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
-import msgspec
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
@@ -183,9 +182,6 @@ class SweepSummary(Struct, frozen=True):
     unmeasured: dict[str, int]  # number of runs without those, by the reason
     points: list[GridPoint]
     window_notes: dict[str, int] = {}  # number of runs that ended well, by why their window is not the scenario's
-
-    def json(self) -> bytes:
-        return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
 
     @property
     def flown(self) -> list[GridPoint]:

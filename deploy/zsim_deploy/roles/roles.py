@@ -329,16 +329,14 @@ def serve_pictures(
         return chosen("detect: drone", drones, everybody) if drones else watched_drones("", scenario) or everybody
 
     def serve(link: Session, info: Info, participant: Participant, stopped: Stopped, say: Say) -> None:
+        from zsim_agents.cameras.camera_process import CameraProcess, DetectorProcess
+
         scenario = scenario_file.from_text(info.scenario)
         own = drones_of(scenario)
         if role == "camera":
-            from zsim_agents.cameras.camera_process import CameraProcess
-
             say(f"{participant.name}: draws for {', '.join(own)}")
             CameraProcess(link, info, participant, scenario, own).run(stopped)
         else:
-            from zsim_agents.cameras.detector_process import DetectorProcess
-
             say(f"{participant.name}: looks at the pictures of {', '.join(own)}")
             hats = scenario.environment.hats
             diameter = diameter_m or (Hats() if hats is UNSET else hats).diameter_m

@@ -19,7 +19,7 @@ from zsim.contract.messages import ClusterInfo, DroneInfo, Info, Origin
 from zsim.errors import printable
 from zsim.math import elementary as el
 from zsim.math import linear
-from zsim.math.distributions import normal_quantile
+from zsim.math.randomness import normal_quantile
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 

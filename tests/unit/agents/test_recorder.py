@@ -4,7 +4,7 @@ import errno
 import os
 from io import FileIO
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -21,7 +21,7 @@ from zsim.contract.framing import GateMessages, encode_batch, key_table
 from zsim.contract.messages import DroneInfo, Imu, Info, Origin
 from zsim.contract.run_messages import RUN_ENDED, Clock, ControlAnswer, Event, Faults
 from zsim.errors import RecordError
-from zsim.record import Completeness, RecordReader, RecordWriter, completeness, record_writer
+from zsim.record import Completeness, RecordReader, RecordWriter, completeness, mcap_layout
 from zsim.record.completeness import GateGap
 from zsim.record.mcap_layout import places
 from zsim_agents import recorder
@@ -34,16 +34,13 @@ INFO = Info(
 )  # fmt: skip
 TABLE = key_table(["d1"])
 IMU = keys.sensor("d1", "imu")
+JOIN = keys.process("recorder", "join")
 Pair = tuple[str, bytes]
-
-
-def recorder_of(link: Any, info: Info, path: Path, say: Any = lambda text: None) -> Recorder:
-    return Recorder(link, info, path, say=say)
 
 
 def record(link: Any, path: Path, info: Info = INFO, say: Any = lambda text: None) -> None:
     """Record a run that a link brings to its end."""
-    assert recorder_of(link, info, path, say).run() == RUN_ENDED
+    assert Recorder(link, info, path, say=say).run() == RUN_ENDED
 
 
 def on_record(path: Path, *wanted: str) -> list[Pair]:
@@ -81,18 +78,35 @@ def page(passed: list[Pair], more: int | None = None) -> ControlAnswer:
     return ControlAnswer(True, result=[list(each) for each in passed], more=more)
 
 
-def recorded(
-    path: Path, answers: list[ControlAnswer], *batches: list[Pair], last: dict[str, bytes] | None = None
-) -> list[Pair]:
-    """Record a run that answers replays, has last values, and sends batches; return what is in the record."""
+def linked(answers: list[ControlAnswer], *batches: list[Pair], last: dict[str, bytes] = LAST) -> FakeLink:
+    """Return a link to a world that answers replays, has last values, and has sent batches."""
     link, left = FakeLink(), iter(answers)
-    link.last = LAST if last is None else last
+    link.last = last
     link.on_request = lambda key, args: next(left, page([]))  # the world has no more of the gates before the last one
-    for passed in (*batches, [clock(99, "stopped")]):
+    for passed in batches:
         link.deliver(keys.BATCH, encode_batch(passed))
+    return link
+
+
+def recorded(
+    path: Path, answers: list[ControlAnswer], *batches: list[Pair], last: dict[str, bytes] = LAST
+) -> list[Pair]:
+    """Record a run of which all answers are asked for; return what is in the record."""
+    link = linked(answers, *batches, [clock(99, "stopped")], last=last)
     record(link, path)
-    assert next(left, None) is None
+    assert len(link.requests) >= len(answers)
     return on_record(path)
+
+
+def cut_at_first_join(link: FakeLink) -> None:
+    """Lose the link, and restore it, once the recorder has joined."""
+
+    def cut(key: str, payload: bytes) -> None:
+        if key == JOIN and len(link.published_on(key)) == 1:
+            link.cut(False)
+            link.cut(True)
+
+    link.on_publish = cut
 
 
 def stamps(found: list[Pair], key: str) -> list[int]:
@@ -180,11 +194,9 @@ def test_garbage_is_recorded_as_it_came(tmp_path: Path, key: str, payload: bytes
 
 def test_what_a_record_has_no_room_for_is_counted_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("zsim.record.record_writer.CHANNELS_MAX", 2)
-    link, lines = FakeLink(), []
-    link.on_request = lambda key, args: page([])
-    link.deliver(keys.BATCH, encode_batch([imu(0), clock(0), imu(1), clock(1, "stopped")]))
+    link, lines = linked([], [imu(0), clock(0), imu(1), clock(1, "stopped")], last={}), []
     link.deliver("view/drones", b"\x81\xa4t_ns\x01")
-    made = recorder_of(link, INFO, tmp_path / "run.mcap", lines.append)
+    made = Recorder(cast("Any", link), INFO, tmp_path / "run.mcap", say=lines.append)
     assert made.run() == RUN_ENDED
     assert made.health.refused == 3
     (line,) = lines
@@ -237,22 +249,21 @@ def test_what_its_last_chunk_lacks_is_asked_for(tmp_path: Path, cut: int):
 
 
 def test_news_of_a_join_of_its_own_process_that_it_did_not_publish_are_answered_by_a_newer_one(tmp_path: Path):
-    link = FakeLink()
+    link = linked([], last={})
 
     def entry(number: int, incarnation: int) -> Pair:
         news = {"incarnation": incarnation, "host": link.host, "pid": os.getpid(), "from_ns": 0}
         return pair(keys.EVENT, Event(0, number, "superseded", "recorder", "recorder", "", news))
 
     def admit(key: str, payload: bytes) -> None:
-        joins = link.published_on("process/recorder/join")
-        if key == "process/recorder/join" and len(joins) == 1:
+        joins = link.published_on(JOIN)
+        if key == JOIN and len(joins) == 1:
             admitted = [entry(0, joins[0].incarnation), entry(1, 7)]
             link.deliver(keys.BATCH, encode_batch([*admitted, clock(1), clock(2, "stopped")]))
 
     link.on_publish = admit
-    link.on_request = lambda key, args: page([])
     record(link, tmp_path / "run.mcap")
-    assert len({join.incarnation for join in link.published_on("process/recorder/join")} - {7}) == 2
+    assert len({join.incarnation for join in link.published_on(JOIN)} - {7}) == 2
 
 
 def test_the_record_of_another_run_is_left_alone(tmp_path: Path):
@@ -266,21 +277,17 @@ def test_the_record_of_another_run_is_left_alone(tmp_path: Path):
 
 def test_a_disk_that_is_full_while_it_joins_is_a_bye(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The world has its join then: without a bye it would wait for a recorder that is started again."""
-    link = FakeLink()
-    link.last = LAST
-    link.on_request = lambda key, args: page(gates(0))
-
-    write_all = record_writer.write_all
+    link, write_all = linked([page(gates(0))]), mcap_layout.write_all
 
     def write(file: FileIO, data: bytes) -> None:
         if file.tell():
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         write_all(file, data)
 
-    monkeypatch.setattr(record_writer, "write_all", write)
+    monkeypatch.setattr(mcap_layout, "write_all", write)
     with refused(RecordError, "run.mcap", os.strerror(errno.ENOSPC)) as full:
         record(link, tmp_path / "run.mcap")
-    (join,) = link.published_on("process/recorder/join")
+    (join,) = link.published_on(JOIN)
     (bye,) = link.published_on("process/recorder/bye")
     assert (bye.reason, bye.incarnation) == (str(full.value), join.incarnation)
 
@@ -292,13 +299,13 @@ def test_what_passed_while_its_link_was_lost_is_asked_for(tmp_path: Path):
 
     def answer(key: str, args: dict[str, Any]) -> ControlAnswer:
         answered = next(replays)
-        if len(joins := link.published_on("process/recorder/join")):
+        if joins := link.published_on(JOIN):
             link.deliver(keys.BATCH, encode_batch([*gates(3, 4), clock(5, "stopped")]))
             assert len(joins) == 1
         return answered
 
     def cut(key: str, payload: bytes) -> None:
-        if key == "process/recorder/join" and len(link.published_on(key)) == 1:
+        if key == JOIN and len(link.published_on(key)) == 1:
             link.deliver(keys.BATCH, encode_batch(gates(1)))
             link.cut(False)
             link.cut(True)
@@ -309,7 +316,7 @@ def test_what_passed_while_its_link_was_lost_is_asked_for(tmp_path: Path):
     found = on_record(path)
     assert stamps(found, IMU) == list(range(5))
     assert stamps(found, keys.CLOCK) == [*range(6)]
-    first, second = link.published_on("process/recorder/join")
+    first, second = link.published_on(JOIN)
     assert first.incarnation != second.incarnation
 
 
@@ -334,12 +341,9 @@ def test_a_clock_of_time_that_stood_still_is_missed_by_its_number(tmp_path: Path
 
 def test_gates_that_the_world_has_no_longer_are_missing_by_number(tmp_path: Path):
     """Printed in a line while the run goes on, and read off the record afterwards."""
-    path, link, lines = tmp_path / "run.mcap", FakeLink(), []
-    replays, link.last = iter([page(gates(0)), page(gates(8, 9))]), LAST
-    link.on_request = lambda key, args: next(replays)
-    for passed in (gates(1), gates(2), whole(9), whole(10), [clock(11, "stopped")]):
-        link.deliver(keys.BATCH, encode_batch(passed))
-    record(link, path, say=lines.append)
+    path, lines = tmp_path / "run.mcap", []
+    answers = [page(gates(0)), page(gates(8, 9))]
+    record(linked(answers, gates(1), gates(2), whole(9), whole(10), [clock(11, "stopped")]), path, say=lines.append)
     (line,) = lines
     assert has_terms(line, "recorder", "5", "0.06", "0.14")
     found = completed(path)
@@ -361,35 +365,27 @@ def test_the_end_of_a_run_that_passed_while_the_link_was_lost_is_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
 ):
     monkeypatch.setattr(recorder, "QUIET_S", 0.0)
-    path, link, info = tmp_path / "run.mcap", FakeLink(), replace(INFO, mode=mode)
-    replays = iter([page(gates(0)), page([*gates(0, 1, 2), clock(3, "stopped")])])
-    link.on_request = lambda key, args: next(replays)
-    link.last = dict([pair(keys.INFO, info)])
-
-    def cut(key: str, payload: bytes) -> None:
-        if key == "process/recorder/join" and len(link.published_on(key)) == 1:
-            link.cut(False)
-            link.cut(True)
-
-    link.on_publish = cut
+    path, info = tmp_path / "run.mcap", replace(INFO, mode=mode)
+    answers = [page(gates(0)), page([*gates(0, 1, 2), clock(3, "stopped")])]
+    link = linked(answers, last=dict([pair(keys.INFO, info)]))
+    cut_at_first_join(link)
     record(link, path, info)
     assert completed(path).complete
 
 
 def test_what_passed_before_a_link_was_back_is_asked_for_in_realtime_though_no_clock_is_missing(tmp_path: Path):
     """A world that was started again has published events, and the recorder comes back when only clocks follow."""
-    path, link, info = tmp_path / "run.mcap", FakeLink(), replace(INFO, mode="realtime")
+    path, info = tmp_path / "run.mcap", replace(INFO, mode="realtime")
     missed = [pair(keys.EVENT, Event(0, number, "superseded", "x.y", "x.y", "")) for number in (0, 1)]
-    replays = iter([page(gates(0)), page([*gates(0), *missed, *gates(1)])])
-    link.on_request = lambda key, args: next(replays)
-    link.last = dict([pair(keys.INFO, info)])
+    answers = [page(gates(0)), page([*gates(0), *missed, *gates(1)])]
+    link = linked(answers, last=dict([pair(keys.INFO, info)]))
 
     def cut(key: str, payload: bytes) -> None:
-        joins = link.published_on("process/recorder/join")
-        if key == "process/recorder/join" and len(joins) == 1:
+        joins = link.published_on(JOIN)
+        if key == JOIN and len(joins) == 1:
             link.cut(False)
             link.cut(True)
-        elif key == "process/recorder/join":
+        elif key == JOIN:
             data = {"incarnation": joins[-1].incarnation, "host": link.host, "pid": os.getpid(), "from_ns": 0}
             back = pair(keys.EVENT, Event(0, 2, "superseded", "recorder", "recorder", "", data))
             link.deliver(keys.BATCH, encode_batch([back]))
@@ -403,37 +399,31 @@ def test_what_passed_before_a_link_was_back_is_asked_for_in_realtime_though_no_c
 
 
 def test_another_run_is_not_asked_for_gates_that_are_missing(tmp_path: Path):
-    path, link = tmp_path / "run.mcap", FakeLink()
-    replays = iter([page(gates(0))])
-    link.on_request = lambda key, args: next(replays)
-    link.last = dict([pair(keys.INFO, replace(INFO, run_id="other"))])
-    link.deliver(keys.BATCH, encode_batch([*gates(1), *gates(4), clock(5, "stopped")]))
+    path, other = tmp_path / "run.mcap", dict([pair(keys.INFO, replace(INFO, run_id="other"))])
+    link = linked([page(gates(0))], [*gates(1), *gates(4), clock(5, "stopped")], last=other)
     record(link, path)
     assert completed(path).gates_missing == 2
+    assert len(link.requests) == 1
 
 
 def test_who_goes_on_with_a_record_counts_from_its_end(tmp_path: Path):
-    path, link, lines = tmp_path / "run.mcap", FakeLink(), []
+    path, lines = tmp_path / "run.mcap", []
     died(path, [pair(keys.INFO, INFO), *gates(0, 1, 2)])
-    link.on_request = lambda key, args: page(gates(5))
-    link.deliver(keys.BATCH, encode_batch([*gates(5, 6), clock(7, "stopped")]))
-    record(link, path, say=lines.append)
+    record(linked([page(gates(5))] * 2, [*gates(5, 6), clock(7, "stopped")], last={}), path, say=lines.append)
     assert [has_terms(line, "2", "0.06", "0.08") for line in lines] == [False, True]
     assert completed(path).gaps == (GateGap(2, 3 * GATE_NS, 4 * GATE_NS),)
 
 
 def test_who_goes_on_with_the_record_of_a_run_that_is_over_leaves(tmp_path: Path):
-    path, link = tmp_path / "run.mcap", FakeLink()
-    before = [pair(keys.INFO, INFO), *gates(0, 1, 2), clock(3, "stopped")]
+    path, before = tmp_path / "run.mcap", [pair(keys.INFO, INFO), *gates(0, 1, 2), clock(3, "stopped")]
     died(path, before)
-    link.on_request = lambda key, args: page(before)
-    record(link, path)
+    record(linked([page(before)], last={}), path)
     assert completed(path).complete
 
 
 def test_it_publishes_how_far_the_record_is_on_disk(tmp_path: Path):
-    path, link = tmp_path / "run.mcap", FakeLink()
-    on_disk: list[tuple[int, int]] = []
+    path, on_disk = tmp_path / "run.mcap", list[tuple[int, int]]()
+    link = linked([page(gates(*range(60)))], [*gates(*range(59, 130)), clock(130, "stopped")], last={})
 
     def look(key: str, payload: bytes) -> None:
         if key == "process/recorder/done":
@@ -442,22 +432,19 @@ def test_it_publishes_how_far_the_record_is_on_disk(tmp_path: Path):
             on_disk.append((messages.decode(key, payload).done_ns, last.t_ns if last else 0))
 
     link.on_publish = look
-    link.on_request = lambda key, args: page(gates(*range(60)))
-    link.deliver(keys.BATCH, encode_batch([*gates(*range(59, 130)), clock(130, "stopped")]))
     record(link, path)
     assert on_disk[0] == (59 * GATE_NS, 59 * GATE_NS)
     assert all(done_ns == last_ns for done_ns, last_ns in on_disk)
-    (join,) = link.published_on("process/recorder/join")
+    (join,) = link.published_on(JOIN)
     assert join.period_ns == 0 < join.slack_ns
 
 
 @pytest.mark.parametrize("garbage", [b"\x91\x92\xa1\xff\xc4\x00", b"\x91" * 5000 + b"\xc0", b"\xc1"])
 def test_a_batch_of_a_stranger_ends_nothing(tmp_path: Path, garbage: bytes):
-    link = FakeLink()
-    link.on_request = lambda key, args: page([])
+    link = linked([], last={})
     for payload in (garbage, encode_batch([clock(0, "stopped")])):
         link.deliver(keys.BATCH, payload)
-    made = recorder_of(link, INFO, tmp_path / "run.mcap")
+    made = Recorder(cast("Any", link), INFO, tmp_path / "run.mcap")
     assert made.run() == RUN_ENDED
     assert made.health.refused == 1
 
@@ -469,13 +456,9 @@ FRONT, FRONT_INFO = keys.camera("d1", "front"), keys.camera_info("d1", "front")
 
 def filmed(path: Path, pictures: list[Struct | bytes], last: dict[str, bytes]) -> list[Pair]:
     """Record a run in which pictures are published beside what passes the world; return what is on record."""
-    link = FakeLink()
-    link.last = LAST | last
-    link.on_request = lambda key, args: page([])
+    link = linked([], gates(0), [clock(99, "stopped")], last=LAST | last)
     for picture in pictures:
         link.deliver(FRONT, picture)
-    for passed in (gates(0), [clock(99, "stopped")]):
-        link.deliver(keys.BATCH, encode_batch(passed))
     record(link, path)
     return on_record(path)
 

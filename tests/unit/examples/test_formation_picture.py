@@ -7,7 +7,7 @@ from formation_picture import CAMERA, Instant, follower, picture, sides
 
 from zsim.math.frames import quaternion_from_heading, rotation_matrix
 from zsim.sensors.camera_model import camera_pose, lens_of
-from zsim_agents.cameras.rendering.scene import DroneStates, Scene, View, camera_motion, default_look
+from zsim_agents.cameras.scene import DroneStates, Scene, View, camera_motion, default_look
 
 
 def formation(count: int, radius_m: float, height_m: float, turn_rad: float = 0.0) -> DroneStates:

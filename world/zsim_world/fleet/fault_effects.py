@@ -8,18 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract.run_messages import Fault
+from zsim.contract.snapshot import Saved
 from zsim.math import elementary as el
-from zsim.math.distributions import normal_probability, normal_quantile
+from zsim.math.randomness import normal_probability, normal_quantile
 from zsim.scenario.faults import sensor_parts
 from zsim.sensors.scanner import SCANNERS
 from zsim.vehicles.vehicle import Vehicle
-from zsim_world.physics.air import WIND
+from zsim_world.physics.contacts import WIND
 from zsim_world.physics.fleet_arrays import STATE, Arrays
-from zsim_world.run_state import Saved
 from zsim_world.sensors import sensor_set as ss
 from zsim_world.sensors.scans import SCANNER, ScanSampler
 from zsim_world.sensors.sensor_set import CONFIG, FAULT, FleetSensors
-from zsim_world.vehicles.simd_firmware import ACTUATOR, sound_actuators
+from zsim_world.vehicles.firmware import ACTUATOR, sound_actuators
 
 
 class Impairment:

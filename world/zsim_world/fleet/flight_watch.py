@@ -15,8 +15,7 @@ from zsim.math import elementary as el
 from zsim.math.compiled import Field, columns, inlined
 from zsim.math.rotation import add, rotate
 from zsim.schema.quantities import G_M_S2
-from zsim_world.physics.fleet_arrays import STATE, VEHICLE, Arrays, Bodies, Watched
-from zsim_world.physics.rigid_body import four, vector
+from zsim_world.physics.fleet_arrays import STATE, VEHICLE, Arrays, Bodies, Watched, four, vector
 from zsim_world.physics.surfaces import FEET, PLANE, POINTS, contact_point, nearest, plane_depth
 from zsim_world.vehicles.firmware import EMERGENCY, FLYING, HOVERING, LANDING, MEMORY, SETTING, TAKING_OFF
 from zsim_world.vehicles.observer import STEP_S

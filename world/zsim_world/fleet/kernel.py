@@ -9,55 +9,41 @@ import math
 
 from numpy.typing import NDArray
 
-from zsim.math.compiled import inlined, kernel, noinline
+from zsim.math.compiled import inlined, kernel
 from zsim.math.held import Held
 from zsim.math.rotation import norm
 from zsim.scenario.surroundings import Sheet
 from zsim_world.fleet.flight_watch import watch
 from zsim_world.physics import rigid_body as body
-from zsim_world.physics.air import WIND, blow
-from zsim_world.physics.contacts import meet_drones
+from zsim_world.physics.contacts import WIND, blow, meet_drones
 from zsim_world.physics.fleet_arrays import (
     CLOCK,
     EXPOSED,
-    PLACE,
     SPAN,
     STATE,
     STREAMS,
-    VEHICLE,
     Arrays,
     Bodies,
     NoiseRows,
     PerRotor,
     Senses,
+    four,
+    put,
+    put_four,
+    vector,
 )
 from zsim_world.physics.rays import Scene
-from zsim_world.physics.rigid_body import drained, four, put, put_four, vector
+from zsim_world.physics.rigid_body import drained
 from zsim_world.physics.simd import accelerate, lead, line_up, move
-from zsim_world.physics.surface_contact import meet_surfaces
-from zsim_world.physics.surfaces import meet_obstacles
+from zsim_world.physics.surfaces import meet_obstacles, meet_surfaces
 from zsim_world.sensors import sensor_set as ss
-from zsim_world.sensors.downward import flow_over, sonar_over
-from zsim_world.sensors.equations import (
-    BodyTruth,
-    MountedSensor,
-    Site,
-    Values,
-    add_errors,
-    baro,
-    displace,
-    flow,
-    gps,
-    hold_reading,
-    imu,
-    mag,
-    pressure,
-    sonar,
+from zsim_world.sensors.sensor_set import (
+    NEVER,
+    SCHEDULE,
 )
-from zsim_world.sensors.sensor_set import CONFIG, NEVER, SCHEDULE
 from zsim_world.vehicles import firmware
+from zsim_world.vehicles.firmware import steer
 from zsim_world.vehicles.observer import DEVICE, STEP_S
-from zsim_world.vehicles.simd_firmware import steer
 
 POSITION_MAX_M, RATE_MAX_RAD_S = 1e6, 1e4  # beyond, the integration has diverged
 
@@ -93,75 +79,6 @@ def _meet(wind: NDArray, gust: NDArray, bodies: Bodies, sheet: Sheet) -> float:
     if bodies.plane.shape[1] > 0:
         meet_surfaces(bodies, sheet)
     return meet_drones(bodies)
-
-
-@inlined
-def _ideal(s: int, x: BodyTruth, mounted: MountedSensor, site: Site) -> Values:
-    """Return the errorless values of stock sensor number s."""
-    if s == ss.IMU:
-        return imu(x, mounted, site)
-    if s == ss.GPS:
-        return gps(x, mounted, site)
-    if s == ss.MAG:
-        return mag(x, mounted, site)
-    if s == ss.BARO:
-        return baro(x, mounted, site)
-    if s == ss.SONAR:
-        return sonar(x, mounted, site)
-    return flow(x, mounted, site)
-
-
-@inlined
-def _read(s: int, value: NDArray, config: NDArray, bias: NDArray, noise: NDArray, at: int, height: float) -> bool:
-    """Turn errorless values into a reading, in place; return False if it is lost."""
-    n = ss.CHANNELS[s]
-    add_errors(n, value, config, bias, noise, at)
-    if s == ss.SONAR:
-        value[0] = max(value[0], 0.0)
-        if value[0] < config[CONFIG.limit_min] or value[0] > config[CONFIG.limit_max]:
-            value[1] = 0.0
-    elif s == ss.BARO:
-        value[1] = value[0]
-        value[0] = pressure(height + value[1])
-    return noise[at + 2 * n] >= config[CONFIG.drop]
-
-
-@inlined
-def _sample(s: int, i: int, bodies: Bodies, noise: NoiseRows, senses: Senses, scene: Scene, value: NDArray) -> bool:
-    """Write a reading of sensor s of drone i into value (6,); return False if it is lost."""
-    config, accel = senses.config[i, s], bodies.accel[i]
-    p, v, q, rate = body.pose(bodies.state[i])
-    x = BodyTruth(p, v, q, rate, vector(accel, 0), vector(accel, 3))
-    mounted = MountedSensor(vector(config, CONFIG.p_BS), four(config, CONFIG.q_BS), config[CONFIG.limit_max])
-    site = Site(bodies.vehicle[i, VEHICLE.gravity], vector(senses.place, PLACE.field_W))
-    first, second = _ideal(s, x, mounted, site)
-    if scene.tree.part.shape[0] > 0 or bodies.near.above[i] != 0:
-        if s == ss.SONAR:
-            first = sonar_over(x, mounted, first, scene, bodies.state, bodies.vehicle, i)
-        elif s == ss.FLOW:
-            beam = senses.config[i, ss.SONAR]
-            ranging = MountedSensor(vector(beam, CONFIG.p_BS), four(beam, CONFIG.q_BS), beam[CONFIG.limit_max])
-            first = flow_over(x, mounted, ranging, first, scene, bodies.state, bodies.vehicle, i)
-    put(value, 0, first)
-    put(value, 3, second)
-    at = noise.at[s] + noise.cursor[i, s] * noise.width[i, s]
-    noise.cursor[i, s] += 1
-    height = senses.place[PLACE.height]
-    if config[CONFIG.faulty] != 0.0:
-        return _read_faulty(s, value, config, senses.bias[i, s], senses.fault[i, s], noise.table[i], at, height)
-    return _read(s, value, config, senses.bias[i, s], noise.table[i], at, height)
-
-
-@noinline
-def _read_faulty(
-    s: int, value: NDArray, config: NDArray, bias: NDArray, fault: NDArray, noise: NDArray, at: int, height: float
-) -> bool:
-    """Do as `_read`, with the offset of a fault added before and the hold of a stuck sensor applied after."""
-    displace(ss.CHANNELS[s], value, fault)
-    kept = _read(s, value, config, bias, noise, at, height)
-    if kept:
-        hold_reading(value, fault)
-    return kept
 
 
 @inlined
@@ -246,7 +163,7 @@ def _take(
 ) -> int:
     """Sample sensor s of drone i for the firmware and, if due, for the log; return the length of the log."""
     value = senses.value[logged]
-    kept = _sample(s, i, bodies, noise, senses, scene, value)
+    kept = ss.sample(s, i, bodies, noise, senses, scene, value)
     if kept:
         _register(device, s, value)
     if _due(senses.schedule[i, s], tick) and kept:

@@ -9,9 +9,9 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.contract import encoding, flight_messages, messages
-from zsim.contract.encoding import GAP, Layouts, Program, TextTable
-from zsim.contract.framing import GateMessages, key_table
+from zsim.contract import flight_messages, framing, messages
+from zsim.contract.framing import GAP, GateMessages, Layouts, Program, TextTable, key_table
+from zsim.contract.snapshot import IN_PLACE, Saved
 from zsim.errors import UserCodeError, reason_of
 from zsim.math.compiled import compiled, inlined, kernel
 from zsim.math.held import Held, hold
@@ -23,7 +23,6 @@ from zsim.vehicles.vehicle import ROTORS_MAX, ROTORS_MIN
 from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, Fleet
 from zsim_world.physics.fleet_arrays import STATE
 from zsim_world.physics.rigid_body import charge_percent
-from zsim_world.run_state import IN_PLACE, Saved
 from zsim_world.sensors import sampler, sensor_set
 from zsim_world.sensors.sampler import WHOSE, Sampled
 from zsim_world.vehicles import firmware
@@ -44,7 +43,7 @@ INTS, FLOATS = LAYOUTS.ints, LAYOUTS.floats
 OPS, FIRST, LITERALS = LAYOUTS.program  # compiled in
 COMMANDER = len(firmware.MODES)  # the first commander among the words: nobody
 
-write = inlined(encoding.write)
+write = inlined(framing.write)
 
 
 class PublicationBuffers(NamedTuple):
@@ -121,7 +120,7 @@ class GatePublication:
         sigmas_m = np.array(fleet.gps_sigma_m)
         self._fleetwide = PublishedState(fleet.touching, sigmas_m, commanders, self.counts, rotors, own_messages)
         self._known: dict[str | None, int] = {None: COMMANDER}
-        self._words = encoding.words((*firmware.MODES, None))
+        self._words = framing.words((*firmware.MODES, None))
         payloads = self._payloads()
         self._room_beside = 2 * len(payloads.data)  # bytes of messages that are encoded in Python
         self._make_room(16 * fleet.count)
@@ -157,7 +156,7 @@ class GatePublication:
         """Return the number of a word, adding it if it is new."""
         if commander not in self._known:
             self._known[commander] = COMMANDER + len(self._known)
-            self._words = encoding.words((*firmware.MODES, *self._known))
+            self._words = framing.words((*firmware.MODES, *self._known))
             self._make_room(self._written.columns.shape[1])
         return self._known[commander]
 

@@ -12,8 +12,8 @@ from zsim.math.compiled import kernel
 from zsim.math.held import Held, hold
 from zsim.math.rotation import norm, scaled, subtract
 from zsim.scenario.scenario import RECEPTION_MIN, Radio, Scenario, Topology
+from zsim_world.physics.fleet_arrays import vector
 from zsim_world.physics.rays import Scene, cast_parts
-from zsim_world.physics.rigid_body import vector
 
 Matrix = NDArray[np.bool_]
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from zsim.math import elementary as el
 from zsim.math.compiled import Field, columns, inlined
+from zsim.math.rotation import Quaternion, Vector
 from zsim.scenario.scenario import Drone, Environment
 from zsim.scenario.surroundings import Sheet
 from zsim.schema.quantities import COULOMB_PER_MAH, SEA_LEVEL_KG_M3
@@ -155,9 +156,9 @@ class Boards(NamedTuple):
     set_tick: NDArray  # int64 (N,), when the setpoint was sent
     memory: NDArray  # (N, firmware.MEMORY.size)
     belief: NDArray  # (N, observer.BELIEF.size + R)
-    actuator: NDArray  # (N, simd_firmware.ACTUATOR.size + 2 R), what faults make of the commands to the rotors
+    actuator: NDArray  # (N, firmware.ACTUATOR.size + 2 R), what faults make of the commands to the rotors
     device: NDArray  # (N, observer.DEVICE.size)
-    lanes: NDArray  # (blocks, columns of a block), see simd_firmware.py
+    lanes: NDArray  # (blocks, columns of a block), see firmware.py
 
 
 class NoiseRows(NamedTuple):
@@ -198,7 +199,7 @@ class Arrays(NamedTuple):
     boards: Boards
     noise: NoiseRows
     senses: Senses
-    wind: NDArray  # (air.WIND.size,)
+    wind: NDArray  # (contacts.WIND.size,)
     gust: NDArray  # (N, 3), m/s
     watched: Watched
     scene: Scene
@@ -228,6 +229,26 @@ class Aero(NamedTuple):
 
     parts: tuple[int, ...]
     numbers: Row  # (AERO.size,)
+
+
+@inlined
+def vector(row: Row, at: int) -> Vector:
+    return (row[at], row[at + 1], row[at + 2])
+
+
+@inlined
+def four(row: Row, at: int) -> Quaternion:
+    return (row[at], row[at + 1], row[at + 2], row[at + 3])
+
+
+@inlined
+def put(row: NDArray, at: int, a: Vector) -> None:
+    row[at], row[at + 1], row[at + 2] = a
+
+
+@inlined
+def put_four(row: NDArray, at: int, a: Quaternion) -> None:
+    row[at], row[at + 1], row[at + 2], row[at + 3] = a
 
 
 @inlined

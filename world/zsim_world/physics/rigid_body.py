@@ -21,35 +21,19 @@ from zsim_world.physics.fleet_arrays import (
     Aero,
     PerRotor,
     Row,
+    four,
     lift_share,
     mixed,
     of,
     place,
+    put,
+    put_four,
     put_of,
+    vector,
 )
 from zsim_world.physics.surfaces import Touch, contact, touched
 
 NOTHING = (0.0, 0.0, 0.0)  # N or N m
-
-
-@inlined
-def vector(row: Row, at: int) -> Vector:
-    return (row[at], row[at + 1], row[at + 2])
-
-
-@inlined
-def four(row: Row, at: int) -> Quaternion:
-    return (row[at], row[at + 1], row[at + 2], row[at + 3])
-
-
-@inlined
-def put(row: NDArray, at: int, a: Vector) -> None:
-    row[at], row[at + 1], row[at + 2] = a
-
-
-@inlined
-def put_four(row: NDArray, at: int, a: Quaternion) -> None:
-    row[at], row[at + 1], row[at + 2], row[at + 3] = a
 
 
 @inlined

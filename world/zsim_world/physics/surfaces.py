@@ -7,7 +7,13 @@ At obstacles a drone is a rigid set of balls: the ground contact points, with ra
 one in its middle, so that neither a post nor an edge fits between them. A ball is pushed along the surface normal by
 the same law. The distance to a convex solid acts as a potential, so springs and anchors never return more energy than
 was put in. A drone has slots for the solids within its reach, each with an anchor per ball; they are updated after
-every step and held within it. On surfaces each ball has a plane instead (surface_contact.py).
+every step and held within it.
+
+At surfaces (sheets of triangles) each ball has a plane instead, that of the nearest point, found after every step and
+then held. A sheet has no inside. A ball starts in front of it and its side is stored: it changes sides when its path
+from step to step crosses a triangle, and behind the sheet it is pushed back, however deep it is. Beside a rim a ball is
+always free. A closed mesh therefore acts from outside as a solid; like a box, it can be penetrated where a wall is
+thinner than the dent of a collision.
 """
 
 import math
@@ -21,7 +27,8 @@ from zsim.math.compiled import Field, columns, inlined, noinline
 from zsim.math.rotation import Quaternion, Vector, add, axpy, cross, dot, norm, rotate, rotate_back, scaled, subtract
 from zsim.scenario import surroundings
 from zsim.scenario.scenario import Environment
-from zsim_world.physics.fleet_arrays import STATE, VEHICLE, Bodies, Row
+from zsim.scenario.surroundings import FACE, Sheet, crosses, nearest_point, side_of
+from zsim_world.physics.fleet_arrays import STATE, VEHICLE, Bodies, Row, four, vector
 
 Pair = tuple[float, float]
 
@@ -153,11 +160,6 @@ def ball(row: Row, k: int) -> tuple[Vector, float]:
 
 
 @inlined
-def _vector(row: NDArray) -> Vector:
-    return (row[0], row[1], row[2])
-
-
-@inlined
 def _across(a: Vector, n: Vector) -> Vector:
     """Return the component of a vector perpendicular to the unit vector n."""
     return axpy(a, -dot(a, n), n)
@@ -184,19 +186,19 @@ def touched(
             depth, n = radius - distance, (nx, ny, nz)
             if depth > 0.0:
                 v = add(v_WB, rotate(q_WB, cross(w_WB_B, r_B)))
-                f_W = _pushed(row, k, depth, n, subtract(x, _vector(touch.anchor[s, k])), v)
+                f_W = _pushed(row, k, depth, n, subtract(x, vector(touch.anchor[s, k], 0)), v)
                 force = add(force, f_W)
                 moment = add(moment, cross(r_B, rotate_back(q_WB, f_W)))
     for k in range(touch.plane.shape[0]):
         plane = touch.plane[k]
         if plane[PLANE.side] != 0.0:
             r_B, radius = ball(row, k)
-            x, n = add(p_WB, rotate(q_WB, r_B)), _vector(plane[PLANE.normal_W : PLANE.normal_W + 3])
-            moved = subtract(x, _vector(plane[PLANE.centre_W : PLANE.centre_W + 3]))
+            x, n = add(p_WB, rotate(q_WB, r_B)), vector(plane, PLANE.normal_W)
+            moved = subtract(x, vector(plane, PLANE.centre_W))
             depth = radius - (plane[PLANE.distance] + dot(n, moved))
             if depth > 0.0:
                 v = add(v_WB, rotate(q_WB, cross(w_WB_B, r_B)))
-                gap = subtract(x, _vector(plane[PLANE.anchor_W : PLANE.anchor_W + 3]))
+                gap = subtract(x, vector(plane, PLANE.anchor_W))
                 f_W = _pushed(row, k, depth, n, gap, v)
                 force = add(force, f_W)
                 moment = add(moment, cross(r_B, rotate_back(q_WB, f_W)))
@@ -235,7 +237,7 @@ def meet_obstacles(bodies: Bodies) -> None:
     p, v = STATE.p_WB, STATE.v_WB
     for i in range(bodies.state.shape[0]):
         row, state = bodies.vehicle[i], bodies.state[i]
-        reach = reach_of(row, _vector(state[v : v + 3]))
+        reach = reach_of(row, vector(state, v))
         for m in range(bodies.obstacle.shape[0]):
             distance = nearest(bodies.obstacle[m], state[p], state[p + 1], state[p + 2])[0]
             hit = False
@@ -298,8 +300,7 @@ def _drag_anchors(row: NDArray, solid: NDArray, anchor: NDArray, state: NDArray,
     An anchor is at its ball's centre where there is no contact or `is_new`, and otherwise follows within the friction
     cone.
     """
-    p_WB, q = _vector(state[STATE.p_WB : STATE.p_WB + 3]), state[STATE.q_WB : STATE.q_WB + 4]
-    q_WB = (q[0], q[1], q[2], q[3])
+    p_WB, q_WB = vector(state, STATE.p_WB), four(state, STATE.q_WB)
     hit = False
     for k in range(BALLS):
         r_B, radius = ball(row, k)
@@ -316,8 +317,78 @@ def drag(row: Row, depth: float, x: Vector, n: Vector, anchor: NDArray, is_new: 
     keep, gap = 0.0, (0.0, 0.0, 0.0)
     if depth > 0.0:
         if not is_new:
-            gap = _across(subtract(x, _vector(anchor)), n)
+            gap = _across(subtract(x, vector(anchor, 0)), n)
         size, limit = norm(gap), row[VEHICLE.friction] * depth
         keep = 1.0 if size <= limit else limit / size
     for axis in range(3):
         anchor[axis] = x[axis] - keep * gap[axis]
+
+
+LOST_M = 1.0  # m, chosen: depth at which a drone is beyond the sheet
+TINY_M = 1e-9  # m; nearer to an edge or corner a ball keeps its normal
+ROOM_M = 1e-6  # m, above the rounding error of a distance
+
+
+@noinline
+def meet_surfaces(bodies: Bodies, sheet: Sheet) -> None:
+    """Find the planes of all drones' balls, move their anchors, and note which hulls touch which surface.
+
+    `braced[i]` becomes 1 where a surface is in reach; `bumping` and `bumped` as in `meet_obstacles`, behind obstacles.
+    """
+    first = bodies.obstacle.shape[0]
+    for i in range(bodies.state.shape[0]):
+        row, state, planes = bodies.vehicle[i], bodies.state[i], bodies.plane[i]
+        p_WB = vector(state, STATE.p_WB)
+        reach = reach_of(row, vector(state, STATE.v_WB))
+        for k in range(BALLS):
+            if planes[k, PLANE.side] < 0.0:
+                reach = max(reach, LOST_M)
+        away = nearest_point(sheet, p_WB, reach).distance
+        if away < reach:
+            brace(bodies, i)
+            q_WB = four(state, STATE.q_WB)
+            for k in range(BALLS):
+                _follow(row, sheet, planes[k], k, p_WB, q_WB, away)
+        else:
+            for k in range(BALLS):
+                planes[k, PLANE.side] = 0.0
+        for thing in range(first, bodies.bumping.shape[1]):
+            hit = False
+            for k in range(FEET, BALLS):
+                if planes[k, PLANE.surface] == thing - first and plane_depth(planes[k], ball(row, k)[1]) > 0.0:
+                    hit = True
+            note_bump(bodies, i, thing, hit)
+
+
+@inlined
+def _follow(row: Row, sheet: Sheet, plane: NDArray, k: int, p_WB: Vector, q_WB: Quaternion, away: float) -> None:
+    """Find the plane of ball k of a drone whose centre is `away` [m] from the nearest surface, and move its anchor.
+
+    A ball without a plane starts in front of the surface, unless it is slightly behind it as seen from the drone's
+    centre, as the feet of a drone that stands on the surface are.
+    """
+    r_B, radius = ball(row, k)
+    x = add(p_WB, rotate(q_WB, r_B))
+    found = nearest_point(sheet, x, away + norm(r_B) + ROOM_M)
+    is_new = plane[PLANE.side] == 0.0
+    side = 1.0 if is_new else plane[PLANE.side]
+    was = p_WB if is_new else vector(plane, PLANE.centre_W)
+    near = row[VEHICLE.foot_depth] if is_new else norm(subtract(x, was))  # else its way is too short
+    if found.distance <= near and crosses(sheet, was, x):
+        side = -side
+    triangle = sheet.triangle[found.triangle]
+    n = vector(plane, PLANE.normal_W)
+    if found.feature == FACE:
+        volume, normal = side_of(triangle, x)
+        n = scaled(normal, (side if volume >= 0.0 else -side) / norm(normal))
+    else:
+        if sheet.rim[found.triangle, found.feature] != 0:
+            side = 1.0
+        if found.distance > TINY_M:
+            n = scaled(subtract(x, found.point), side / found.distance)
+    plane[PLANE.side], plane[PLANE.distance] = side, side * found.distance
+    plane[PLANE.surface] = sheet.surface[found.triangle]
+    for axis in range(3):
+        plane[PLANE.normal_W + axis], plane[PLANE.centre_W + axis] = n[axis], x[axis]
+    anchor = plane[PLANE.anchor_W : PLANE.anchor_W + 3]
+    drag(row, plane_depth(plane, radius), x, n, anchor, is_new)

@@ -12,9 +12,9 @@ from msgspec import UNSET
 
 from zsim.contract import keys
 from zsim.contract.run_messages import Bye, Done, Join, Waiting
+from zsim.contract.snapshot import Saved
 from zsim.scenario.roles import WORLD
 from zsim_world.run.outbox import Refusal
-from zsim_world.run_state import Saved
 
 
 @dataclass

@@ -15,13 +15,12 @@ import msgspec
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Ardrone
 from zsim.contract.run_messages import PRIORITY_MAX, ControlRequest, Fault
+from zsim.contract.snapshot import Saved
 from zsim.runtime.links import NEVER, RADIO, WORLD, distance_between, drone_of, joins, place_of, total_delay_ns
-from zsim_world.fleet.external_drones import ExternalDrones
-from zsim_world.fleet.fleet import Fleet
+from zsim_world.fleet.fleet import ExternalDrones, Fleet
 from zsim_world.run.coordinator import Coordinator
 from zsim_world.run.outbox import Refusal, too_many
 from zsim_world.run.run_clock import Operation, number, refused_argument
-from zsim_world.run_state import Saved
 
 MISSION_STATES = ("active", "finished", "aborted")
 MISSION_ITEMS_MAX, MISSION_REASON_MAX = 1_000_000, 80  # chosen: far more than autopilots keep; a line

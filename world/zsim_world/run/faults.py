@@ -8,6 +8,7 @@ import msgspec
 
 from zsim.contract import keys
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Fault, Faults
+from zsim.contract.snapshot import PART, Saved
 from zsim.runtime.links import KINDS as LINK_KINDS
 from zsim.scenario import faults as fault_kinds
 from zsim.scenario.faults import PROCESS_KILL, Known, flaws
@@ -19,7 +20,6 @@ from zsim_world.fleet.fault_effects import Impairment
 from zsim_world.run.coordinator import Coordinator
 from zsim_world.run.outbox import Refusal
 from zsim_world.run.run_clock import Operation
-from zsim_world.run_state import PART, Saved
 
 NEVER_NS = 2**63 - 1  # a gate that is never reached
 SELECTORS = ("id", "target", "kind")

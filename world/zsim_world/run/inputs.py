@@ -18,7 +18,7 @@ from zsim.contract.framing import Pairs, pairs_of
 from zsim.contract.messages import REFUSALS
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Join
 from zsim.errors import DecodeError
-from zsim.runtime.health import HealthMeter
+from zsim.runtime.membership import HealthMeter
 from zsim.scenario import roles
 from zsim.schema.message import Count
 from zsim_world.run.coordinator import Coordinator

@@ -8,9 +8,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 from zsim.contract import keys, run_messages
+from zsim.contract.snapshot import PART, Saved
 from zsim.runtime.rate_limit import SUBJECTS_MAX, RateLimit
 from zsim.scenario.roles import WORLD
-from zsim_world.run_state import PART, Saved
 
 KeyedMessage = tuple[str, Any]  # key and message; or keys.GATE and GateMessages at a gate
 CHANGES_MAX = 1000  # of a source at once, as many as there may be faults; then one per gate

@@ -11,10 +11,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from zsim.contract.run_messages import GATES_MAX, RATE_MAX, ControlAnswer, ControlRequest
+from zsim.contract.snapshot import PART, Saved
 from zsim.scenario.scenario import TimeSteps
 from zsim_world.run.barrier import Participant
 from zsim_world.run.outbox import Refusal
-from zsim_world.run_state import PART, Saved
 
 Operation = Callable[[ControlRequest], Refusal | ControlAnswer | None]
 """Carries out a request; returns why it is refused, an answer with a result, or None when done."""

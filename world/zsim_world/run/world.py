@@ -13,7 +13,7 @@ from zsim.contract import keys, messages
 from zsim.contract.fingerprint import TruthHash, fingerprint
 from zsim.contract.flight_messages import DroneView, Status, ViewDrones
 from zsim.contract.keys import SIGHTINGS
-from zsim.contract.snapshot import State
+from zsim.contract.snapshot import PART, Saved, State, saved_state
 from zsim.errors import UserCodeError
 from zsim.runtime.agent import Output
 from zsim.scenario import scenario_file
@@ -21,15 +21,13 @@ from zsim.scenario.roles import WORLD, check_pace, expected_processes
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim.sensors.sensor_catalogue import declarations
-from zsim_world.fleet.external_drones import ExternalDrones
-from zsim_world.fleet.fleet import DivergedError, Fleet
+from zsim_world.fleet.fleet import DivergedError, ExternalDrones, Fleet
 from zsim_world.fleet.publication import GatePublication
 from zsim_world.fleet.radio import RadioChannel
 from zsim_world.physics.fleet_arrays import STATE
 from zsim_world.run.commands import CommandIntake
 from zsim_world.run.coordinator import Coordinator
 from zsim_world.run.faults import FaultInjector
-from zsim_world.run_state import PART, Saved, saved_state
 
 DURATION_OVER = "the scenario's duration is over"  # why a run of full length ended
 

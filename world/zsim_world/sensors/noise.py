@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from zsim.math import elementary as el
 from zsim.math.compiled import Field, columns, inlined, kernel
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.stock_sensors import BOARD_RATE_HZ
 from zsim_world.sensors.sensor_set import CHANNELS, CHANNELS_MAX, SENSORS, channels, noise_width, rate_of

@@ -4,29 +4,33 @@ Values in the contract's order of fields. imu: ax, ay, az [m/s^2], gx, gy, gz [r
 altitude [m], e, n, u [m], ve, vn, vu [m/s]; mag: x, y, z [uT]; baro: pressure [Pa], altitude [m]; sonar: range [m],
 valid 0 or 1; flow: forward, left, up [m/s], quality. A user's sensor: the numbers of its reading, computed in Python
 after the gate from the truth that the kernel logged.
+
+Sightings and scans are computed after the gate, too, from the poses of all drones at their sampling instants
+(`Exposures`, `poses_between`), and held back (`released`).
 """
 
-from typing import ClassVar, NamedTuple
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.contract.snapshot import IN_PLACE, PART, Saved
 from zsim.errors import UserCodeError, reason_of
 from zsim.math import frames
 from zsim.math.compiled import Field, columns, inlined, kernel
 from zsim.math.frames import rotation_matrix
 from zsim.math.held import Held, hold
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
+from zsim.math.rotation import attitude_between, position_between
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim.schema.checker import show
 from zsim.sensors.sensor import Sensor, SensorTruth, SensorType
-from zsim_world.physics.fleet_arrays import EXPOSED, STATE, Senses
-from zsim_world.run_state import IN_PLACE, PART, Saved
+from zsim_world.physics.fleet_arrays import EXPOSED, STATE, Senses, four, vector
 from zsim_world.sensors import sensor_set
-from zsim_world.sensors.equations import read
 from zsim_world.sensors.noise import place, words
-from zsim_world.sensors.sensor_set import CHANNELS_MAX, CONFIG, SENSORS, FleetSensors, noise_width
+from zsim_world.sensors.sensor_set import CHANNELS_MAX, CONFIG, SENSORS, FleetSensors, noise_width, read
 
 WHOSE = columns("WhoseColumns", (Field("sensor", "1"), Field("drone", "1"), Field("t", "ns"), Field("t_sample", "ns")))
 VALUE_COLUMNS = 9  # of a GPS fix, with its place on the Earth
@@ -250,3 +254,89 @@ class _UserSensor:
         if not np.isfinite(values).all():
             numbers = [float(value) for value in values[:count]]
             raise UserCodeError(f"{name} returns {numbers}; must be finite", where)
+
+
+Array = NDArray[np.float64]
+
+
+class Between(NamedTuple):
+    """The states of all drones at two gates, (N, STATE.size) each, for `poses_between`."""
+
+    former: Array
+    former_ns: int
+    now: Array
+    now_ns: int
+
+
+class Exposures:
+    """The instants n / rate of some sensors, gate by gate."""
+
+    SAVED: ClassVar[Saved] = {
+        "_counts": list[int],
+        "_due_ns": list[int],
+        "_next_ns": int,
+        "_former": np.ndarray,
+        "_former_ns": int,
+    }
+
+    def __init__(self, rates_hz: Sequence[float], gate_ns: int) -> None:
+        self._rates_hz, self._gate_ns = rates_hz, gate_ns
+        self._counts = [0] * len(rates_hz)
+        self._due_ns = [0] * len(rates_hz)  # the next sample of each
+        self._next_ns = 0  # the soonest of all
+        self._former = np.empty((0, STATE.size))  # states of the last gate before a sample
+        self._former_ns = 0
+
+    def until(self, state: Array, now_ns: int) -> tuple[list[tuple[int, int]], Between | None]:
+        """Return instants and indices of the sensors whose samples are due by a gate, sorted, and the states.
+
+        Args:
+            state: states of all drones at the gate, (N, STATE.size or more).
+        """
+        due, between = [], None
+        if self._next_ns <= now_ns:
+            now = state[:, : STATE.size].copy()
+            for place, rate_hz in enumerate(self._rates_hz):
+                while self._due_ns[place] <= now_ns:
+                    due.append((self._due_ns[place], place))
+                    self._counts[place] += 1
+                    self._due_ns[place] = round(self._counts[place] * 1e9 / rate_hz)
+            due.sort()
+            self._next_ns = min(self._due_ns)
+            former, former_ns = (self._former, self._former_ns) if len(self._former) else (now, now_ns)
+            between = Between(former, former_ns, now, now_ns)
+        if self._next_ns <= now_ns + self._gate_ns:  # a sample before the next gate needs this state
+            self._former, self._former_ns = state[:, : STATE.size].copy(), now_ns
+        return due, between
+
+
+def released(later: list[Any], now_ns: int) -> list[Any]:
+    """Remove from a list of delayed messages those that are due, by their t_ns, and return them."""
+    due = [each for each in later if each.t_ns <= now_ns]
+    if due:
+        later[:] = [each for each in later if each.t_ns > now_ns]
+    return due
+
+
+@kernel()
+def poses_between(former: NDArray, former_ns: int, now: NDArray, now_ns: int, t_ns: int) -> NDArray:
+    """Return the poses of all drones at an instant between two gates, (N, STATE.size).
+
+    Args:
+        former, now: states at the gates, (N, STATE.size or more), between which the other columns are interpolated.
+    """
+    if t_ns >= now_ns or now_ns <= former_ns:
+        return now.copy()
+    s, dt = (t_ns - former_ns) / (now_ns - former_ns), (now_ns - former_ns) * 1e-9
+    poses = former + s * (now - former)
+    for i in range(len(poses)):
+        a, b = former[i], now[i]
+        p = position_between(
+            s, dt, vector(a, STATE.p_WB), vector(a, STATE.v_WB), vector(b, STATE.p_WB), vector(b, STATE.v_WB)
+        )
+        q = attitude_between(s, four(a, STATE.q_WB), four(b, STATE.q_WB))
+        for k in range(3):
+            poses[i, STATE.p_WB + k] = p[k]
+        for k in range(4):
+            poses[i, STATE.q_WB + k] = q[k]
+    return poses

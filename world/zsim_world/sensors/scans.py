@@ -13,26 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract.messages import Depth, Lidar, Range
+from zsim.contract.snapshot import IN_PLACE, PART, Saved
 from zsim.math import elementary as el
 from zsim.math.compiled import Field, columns, inlined, kernel
-from zsim.math.distributions import normal_quantile
 from zsim.math.frames import quaternion_from_rpy, rotation_matrix
 from zsim.math.held import Held, hold
-from zsim.math.random_streams import stream
+from zsim.math.randomness import normal_quantile, stream
 from zsim.math.rotation import add, dot, matrix, product, subtract
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import camera_pose, lens_of, undistorted
 from zsim.sensors.scanner import SINGLE, DepthConfig, LidarConfig, RangeConfig, Scanner, along, scanners
 from zsim.sensors.sensor import Mount, Sample
-from zsim_world.physics.fleet_arrays import STATE
+from zsim_world.physics.fleet_arrays import STATE, four, vector
 from zsim_world.physics.rays import Scene, cast, cast_hull
-from zsim_world.physics.rigid_body import four, vector
-from zsim_world.run_state import IN_PLACE, PART, Saved
-from zsim_world.sensors.equations import rounded
-from zsim_world.sensors.exposures import Between, Exposures
-from zsim_world.sensors.hats_in_view import poses_between
 from zsim_world.sensors.noise import WORDS, fill, words
+from zsim_world.sensors.sampler import Between, Exposures, poses_between, released
+from zsim_world.sensors.sensor_set import rounded
 
 CONE_RAYS = 8  # about the axis of a beam with a cone, beside that along it
 SHARE_MIN = 0.2  # of the length of a ray that its depth is, at the edge of a picture of 150 deg: 0.26
@@ -159,11 +156,7 @@ class ScanSampler:
         samples, between = self._exposures.until(state, now_ns)
         for at_ns, place in samples:
             self._scan(at_ns, place, between)
-        if not self._later:
-            return []
-        due = [self._made(each) for each in self._later if each.t_ns <= now_ns]
-        self._later = [each for each in self._later if each.t_ns > now_ns]
-        return due
+        return [self._made(each) for each in released(self._later, now_ns)]
 
     def _scan(self, at_ns: int, place: int, between: Between | None) -> None:
         """Take a sample and hold it until it is due."""

@@ -1,4 +1,16 @@
-"""The sensors of a fleet as arrays: errors, mounts and schedules, a row per drone and sensor."""
+"""The stock sensors of a fleet: errors, mounts and schedules as arrays, measurement equations, errors and faults.
+
+The arrays have a row per drone and sensor. From `sample` on, all is compiled.
+
+A sensor is at p_BS in the body, rotated by R_BS (q_BS: sensor components to body components). An equation is a function
+of body, mount and site, and returns two vectors of errorless values; unused places are zero. `n` numbers of a reading
+have an error of their own.
+
+Sonar and optical flow may see an obstacle or a drone below. A flow camera measures the motion of its picture, from
+which the board computes a velocity with the distance measured by the sonar. A picture with two motions, of the ground
+and of a drone below, gives that of the larger part, as does the largest peak of a histogram of block motions (PX4/Flow,
+src/modules/flow/flow.c).
+"""
 
 import math
 from collections.abc import Sequence
@@ -9,13 +21,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.math import elementary as el
-from zsim.math.compiled import Field, columns
-from zsim.math.distributions import normal_quantile
+from zsim.math.compiled import Field, columns, inlined, kernel, noinline
 from zsim.math.frames import quaternion_from_rpy
+from zsim.math.randomness import normal_quantile
+from zsim.math.rotation import (
+    Quaternion,
+    Vector,
+    add,
+    axpy,
+    cross,
+    heading,
+    rotate,
+    rotate_back,
+    scaled,
+    subtract,
+    z_axis,
+)
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor import VALUES_MAX, ErrorModel, Sensor, SensorType, noise_sigma
 from zsim.sensors.sensor_catalogue import STOCK, Sensors
 from zsim.sensors.stock_sensors import BOARD_RATE_HZ, MagConfig, SonarConfig
+from zsim_world.physics.fleet_arrays import PLACE, STATE, VEHICLE, Bodies, NoiseRows, Senses, four, put, vector
+from zsim_world.physics.rays import Scene, cast_ground, cast_hull, cast_parts
+from zsim_world.physics.rigid_body import pose, velocity_at
 
 SENSORS = tuple(STOCK)  # the contract's order; a user's own count on from there
 IMU, GPS, MAG, BARO, SONAR, FLOW = range(len(SENSORS))
@@ -55,6 +83,17 @@ SCHEDULE = columns(  # sample n falls due at the first physics tick >= n * numer
 FIELD_MIN_UT = 1.0  # uT, of a horizontal field that still gives a heading: a fifteenth of that at 50 degrees north
 HEADING_SIGMA_MAX_RAD = 0.5  # rad, chosen: noisier, samples wrap around, and their mean is no heading
 DENOMINATOR_MAX = 1000  # of a rate in Hz: any is met within 0.05 %, and n * numerator stays below 2^63
+SEA_LEVEL_PA = 101_325.0  # Pa, ISO 2533
+LAPSE_1_M = 2.25577e-5  # 1/m, 0.0065 K/m over 288.15 K, ISO 2533
+PRESSURE_EXPONENT = 5.25588  # g M / (R L), ISO 2533
+SONAR_COSINE_MIN = 0.5  # an echo comes back up to 60 deg from the vertical; beyond, it is scattered away
+# Of the picture, tangents of half of its view ahead and aside: 320 x 240 pixels, 64 deg across (data sheet of the
+# AR.Drone 2.0); taken for every vehicle's
+HALF_VIEW = (0.375, 0.5)
+# Middles of the cells of a picture in 3 x 3, but the one in the middle; a hull that has more than half of all nine
+# has the one in the middle and four of these
+CELLS = ((-1.0, -1.0), (-1.0, 0.0), (-1.0, 1.0), (0.0, -1.0), (0.0, 1.0), (1.0, -1.0), (1.0, 0.0), (1.0, 1.0))
+CELLS_MIN = 4
 
 
 class FleetSensors(NamedTuple):
@@ -162,3 +201,333 @@ def has_compass(mag: MagConfig, field_ut: Sequence[float]) -> bool:
     """Return whether a magnetometer gives a heading in the magnetic field of the place [uT; W]."""
     horizontal_ut = el.length(field_ut[:2])
     return horizontal_ut >= FIELD_MIN_UT and heading_sigma(mag, horizontal_ut) <= HEADING_SIGMA_MAX_RAD
+
+
+Values = tuple[Vector, Vector]
+NONE = (0.0, 0.0, 0.0)
+
+
+class BodyTruth(NamedTuple):
+    """The true state of a drone."""
+
+    p_WB: Vector  # m
+    v_WB: Vector  # m/s
+    q_WB: Quaternion
+    w_WB_B: Vector  # rad/s
+    a_WB: Vector  # m/s^2, of the centre of mass in W
+    alpha_B: Vector  # rad/s^2
+
+
+class MountedSensor(NamedTuple):
+    """Pose of a sensor in the body, and the largest range of a range sensor."""
+
+    p_BS: Vector  # m
+    q_BS: Quaternion
+    range_max: float  # m
+
+
+class Site(NamedTuple):
+    """The place of the flight."""
+
+    gravity: float  # m/s^2
+    field_W: Vector  # uT, of the Earth
+
+
+@inlined
+def sample(s: int, i: int, bodies: Bodies, noise: NoiseRows, senses: Senses, scene: Scene, value: NDArray) -> bool:
+    """Write a reading of sensor s of drone i into value (6,); return False if it is lost."""
+    config, accel = senses.config[i, s], bodies.accel[i]
+    p, v, q, rate = pose(bodies.state[i])
+    x = BodyTruth(p, v, q, rate, vector(accel, 0), vector(accel, 3))
+    mounted = MountedSensor(vector(config, CONFIG.p_BS), four(config, CONFIG.q_BS), config[CONFIG.limit_max])
+    site = Site(bodies.vehicle[i, VEHICLE.gravity], vector(senses.place, PLACE.field_W))
+    first, second = _ideal(s, x, mounted, site)
+    if scene.tree.part.shape[0] > 0 or bodies.near.above[i] != 0:
+        if s == SONAR:
+            first = sonar_over(x, mounted, first, scene, bodies.state, bodies.vehicle, i)
+        elif s == FLOW:
+            beam = senses.config[i, SONAR]
+            ranging = MountedSensor(vector(beam, CONFIG.p_BS), four(beam, CONFIG.q_BS), beam[CONFIG.limit_max])
+            first = flow_over(x, mounted, ranging, first, scene, bodies.state, bodies.vehicle, i)
+    put(value, 0, first)
+    put(value, 3, second)
+    at = noise.at[s] + noise.cursor[i, s] * noise.width[i, s]
+    noise.cursor[i, s] += 1
+    height = senses.place[PLACE.height]
+    if config[CONFIG.faulty] != 0.0:
+        return _read_faulty(s, value, config, senses.bias[i, s], senses.fault[i, s], noise.table[i], at, height)
+    return _read(s, value, config, senses.bias[i, s], noise.table[i], at, height)
+
+
+@inlined
+def _ideal(s: int, x: BodyTruth, mounted: MountedSensor, site: Site) -> Values:
+    """Return the errorless values of stock sensor number s."""
+    if s == IMU:
+        return imu(x, mounted, site)
+    if s == GPS:
+        return gps(x, mounted, site)
+    if s == MAG:
+        return mag(x, mounted, site)
+    if s == BARO:
+        return baro(x, mounted, site)
+    if s == SONAR:
+        return sonar(x, mounted, site)
+    return flow(x, mounted, site)
+
+
+@inlined
+def _read(s: int, value: NDArray, config: NDArray, bias: NDArray, noise: NDArray, at: int, height: float) -> bool:
+    """Turn errorless values into a reading, in place; return False if it is lost."""
+    n = CHANNELS[s]
+    add_errors(n, value, config, bias, noise, at)
+    if s == SONAR:
+        value[0] = max(value[0], 0.0)
+        if value[0] < config[CONFIG.limit_min] or value[0] > config[CONFIG.limit_max]:
+            value[1] = 0.0
+    elif s == BARO:
+        value[1] = value[0]
+        value[0] = pressure(height + value[1])
+    return noise[at + 2 * n] >= config[CONFIG.drop]
+
+
+@noinline
+def _read_faulty(
+    s: int, value: NDArray, config: NDArray, bias: NDArray, fault: NDArray, noise: NDArray, at: int, height: float
+) -> bool:
+    """Do as `_read`, with the offset of a fault added before and the hold of a stuck sensor applied after."""
+    displace(CHANNELS[s], value, fault)
+    kept = _read(s, value, config, bias, noise, at, height)
+    if kept:
+        hold_reading(value, fault)
+    return kept
+
+
+@inlined
+def sensor_velocity(x: BodyTruth, s: MountedSensor) -> Vector:
+    """Return the velocity of the sensor in W: v_WB + R (w × p_BS)."""
+    return add(x.v_WB, rotate(x.q_WB, cross(x.w_WB_B, s.p_BS)))
+
+
+@inlined
+def sensor_height(x: BodyTruth, s: MountedSensor) -> float:
+    """Return the height of the sensor over the origin of W [m]."""
+    return x.p_WB[2] + rotate(x.q_WB, s.p_BS)[2]
+
+
+@inlined
+def imu(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
+    """Return specific force [m/s^2] and body rate [rad/s] at the sensor, both in S.
+
+    f_S = R_SB (R_BW (a_WB - g_W) + alpha × p_BS + w × (w × p_BS)),  w_S = R_SB w    (Titterton and Weston, ch. 3)
+    """
+    f = rotate_back(x.q_WB, (x.a_WB[0], x.a_WB[1], x.a_WB[2] + site.gravity))
+    f = add(f, add(cross(x.alpha_B, s.p_BS), cross(x.w_WB_B, cross(x.w_WB_B, s.p_BS))))
+    return rotate_back(s.q_BS, f), rotate_back(s.q_BS, x.w_WB_B)
+
+
+@inlined
+def gps(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
+    """Return position [m] and velocity [m/s] of the antenna in W."""
+    return add(x.p_WB, rotate(x.q_WB, s.p_BS)), sensor_velocity(x, s)
+
+
+@inlined
+def mag(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
+    """Return the Earth's field in S [uT]."""
+    return rotate_back(s.q_BS, rotate_back(x.q_WB, site.field_W)), NONE
+
+
+@inlined
+def baro(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
+    """Return the height of the sensor over the origin of W [m]."""
+    return (sensor_height(x, s), 0.0, 0.0), NONE
+
+
+@inlined
+def pressure(altitude_m: float) -> float:
+    """Return the static pressure [Pa] of the standard atmosphere at an altitude above sea level (ISO 2533).
+
+    The law holds to 11 km, the limit of scenarios; beyond it is extrapolated, to vacuum at 44 km.
+    """
+    return SEA_LEVEL_PA * el.power(max(1.0 - LAPSE_1_M * altitude_m, 0.0), PRESSURE_EXPONENT)
+
+
+@inlined
+def sonar(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
+    """Return the distance [m] to the ground along -z of the sensor, and 1 where there is an echo.
+
+    Without an echo (beyond range_max, or the beam too far from the vertical) the distance is range_max.
+    """
+    upright = rotate(x.q_WB, z_axis(s.q_BS))[2]  # cosine between beam and vertical
+    if upright < SONAR_COSINE_MIN:
+        return (s.range_max, 0.0, 0.0), NONE
+    distance = max(sensor_height(x, s), 0.0) / upright
+    return (min(distance, s.range_max), 1.0 if distance <= s.range_max else 0.0, 0.0), NONE
+
+
+@inlined
+def flow(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
+    """Return the sensor's velocity [m/s] in the heading frame, and the quality in [0, 1].
+
+    Heading frame: x forward and y left in the horizontal plane, z up. The quality is the cosine of the tilt: how much
+    of the picture is ground.
+    """
+    v = sensor_velocity(x, s)
+    psi = heading(x.q_WB)
+    cos, sin = el.cos(psi), el.sin(psi)
+    quality = max(z_axis(x.q_WB)[2], 0.0)
+    return (cos * v[0] + sin * v[1], cos * v[1] - sin * v[0], v[2]), (quality, 0.0, 0.0)
+
+
+@inlined
+def rounded(value: float, bias: float, white: float, quantum: float) -> float:
+    """Return value + bias + white, rounded to the quantum of the converter (0: not rounded)."""
+    x = value + bias + white
+    return x if quantum == 0.0 else quantum * math.floor(x / quantum + 0.5)
+
+
+@inlined
+def add_errors(n: int, value: NDArray, config: NDArray, bias: NDArray, noise: NDArray, at: int) -> None:
+    """Add the errors of n channels to a value, in place.
+
+    `noise` has standard normal numbers from `at` on (sensor_set.noise_width); `bias` is the bias of each channel, and
+    behind those of all its Gauss-Markov process.
+    """
+    if config[CONFIG.correlated] != 0.0:
+        for k in range(n):
+            state = CHANNELS_MAX + k
+            bias[state] = config[CONFIG.decay + k] * bias[state] + config[CONFIG.kick + k] * noise[at + 2 * n + 1 + k]
+            value[k] += bias[state]
+    for k in range(n):
+        bias[k] += config[CONFIG.walk + k] * noise[at + n + k]
+        white = config[CONFIG.white + k] * noise[at + k]
+        value[k] = rounded(value[k], bias[k], white, config[CONFIG.quantum + k])
+
+
+@inlined
+def displace(n: int, value: NDArray, fault: NDArray) -> None:
+    """Add the offset of a fault to the errorless values of a sensor, in place."""
+    for k in range(n):
+        value[k] += fault[FAULT.offset + k]
+
+
+@inlined
+def hold_reading(value: NDArray, fault: NDArray) -> None:
+    """Store the first reading (6,) of a stuck sensor, or replace a reading by the stored one, in place."""
+    if fault[FAULT.hold] == ARMED:
+        fault[FAULT.hold] = HOLDING
+        for k in range(CHANNELS_MAX):
+            fault[FAULT.held + k] = value[k]
+    elif fault[FAULT.hold] == HOLDING:
+        for k in range(CHANNELS_MAX):
+            value[k] = fault[FAULT.held + k]
+
+
+@kernel(makes_arrays=False)
+def read(n: int, value: NDArray, config: NDArray, bias: NDArray, fault: NDArray, noise: NDArray) -> bool:
+    """Turn the errorless values of a user's sensor into a reading, in place; return False if it is lost."""
+    displace(n, value, fault)
+    add_errors(n, value, config, bias, noise, 0)
+    kept = noise[2 * n] >= config[CONFIG.drop]
+    if kept:
+        hold_reading(value, fault)
+    return kept
+
+
+@inlined
+def _beam(x: BodyTruth, s: MountedSensor) -> tuple[Vector, Vector]:
+    """Return where a sensor is, and the unit vector along its -z, in W."""
+    return add(x.p_WB, rotate(x.q_WB, s.p_BS)), scaled(rotate(x.q_WB, z_axis(s.q_BS)), -1.0)
+
+
+@inlined
+def _hull(state: NDArray, vehicle: NDArray, i: int, o: Vector, d: Vector, far: float) -> tuple[float, int]:
+    """Return the distance [m] at which a ray meets the hull of a drone other than i, and whose; `far` and -1 if none.
+
+    Args:
+        state, vehicle: of all drones, as in Bodies.
+    """
+    nearest, whose = far, -1
+    for j in range(state.shape[0]):
+        if j != i:
+            p, q = vector(state[j], STATE.p_WB), four(state[j], STATE.q_WB)
+            met = cast_hull(p, q, vehicle[j, VEHICLE.hull_radius], o, d, nearest)
+            if met < nearest:
+                nearest, whose = met, j
+    return nearest, whose
+
+
+@noinline
+def sonar_over(
+    x: BodyTruth, s: MountedSensor, value: Vector, scene: Scene, state: NDArray, vehicle: NDArray, i: int
+) -> Vector:
+    """Return distance [m] and echo of a sonar from the first object in its beam, given those over the bare ground.
+
+    As over the ground, there is no echo if the beam is too far from the vertical.
+
+    Args:
+        state, vehicle: of all drones, as in Bodies; i: whose sonar it is.
+    """
+    o, d = _beam(x, s)
+    if -d[2] < SONAR_COSINE_MIN:
+        return value
+    distance, _ = _hull(state, vehicle, i, o, d, cast_parts(scene, o, d, value[0]))
+    return (distance, 1.0, 0.0) if distance < value[0] else value
+
+
+@noinline
+def flow_over(
+    x: BodyTruth,
+    s: MountedSensor,
+    ranging: MountedSensor,
+    value: Vector,
+    scene: Scene,
+    state: NDArray,
+    vehicle: NDArray,
+    i: int,
+) -> Vector:
+    """Return the velocity [m/s] that a flow sensor reports, given that over the bare ground.
+
+    It is the velocity relative to the surface in the picture, times the ratio of the distance measured by the sonar to
+    that of the surface: correct if both see the same surface. The surface is the one in the middle of the picture, a
+    drone's hull only if it covers most of the picture, with the velocity of the hull where the axis meets it.
+
+    Args:
+        ranging: the sonar; state, vehicle: of all drones, as in Bodies; i: whose sensor it is.
+    """
+    o, d = _beam(x, s)
+    b, down = _beam(x, ranging)
+    far = ranging.range_max
+    if -d[2] < SONAR_COSINE_MIN or -down[2] < SONAR_COSINE_MIN:
+        return value  # without a distance the board keeps the last one
+    seen = cast_parts(scene, o, d, far)
+    measured, _ = _hull(state, vehicle, i, b, down, cast_parts(scene, b, down, far))
+    covered, whose = _hull(state, vehicle, i, o, d, seen)
+    if whose >= 0 and not _covers(x, s, scene, state[whose], vehicle[whose, VEHICLE.hull_radius], o, far):
+        covered, whose = seen, -1
+    if covered >= far and measured >= far:
+        return value
+    seen, measured = cast_ground(o, d, covered), cast_ground(b, down, measured)
+    if seen >= far or measured >= far or seen <= 0.0:
+        return value
+    u, v = value[0], value[1]
+    if whose >= 0:
+        arm = subtract(axpy(o, seen, d), vector(state[whose], STATE.p_WB))
+        moving, psi = velocity_at(state[whose], arm), heading(x.q_WB)
+        cos, sin = el.cos(psi), el.sin(psi)
+        u, v = u - (cos * moving[0] + sin * moving[1]), v - (cos * moving[1] - sin * moving[0])
+    return (u * measured / seen, v * measured / seen, value[2])
+
+
+@inlined
+def _covers(x: BodyTruth, s: MountedSensor, scene: Scene, hull: NDArray, radius: float, o: Vector, far: float) -> bool:
+    """Tell whether the hull of a drone in the middle of the picture covers most of it."""
+    cells, share = 0, 2.0 / 3.0
+    for k in range(len(CELLS)):
+        ahead, aside = share * HALF_VIEW[0] * CELLS[k][0], share * HALF_VIEW[1] * CELLS[k][1]
+        per = 1.0 / math.sqrt(ahead * ahead + aside * aside + 1.0)
+        d = rotate(x.q_WB, rotate(s.q_BS, (ahead * per, aside * per, -per)))
+        free = cast_parts(scene, o, d, far)
+        if cast_hull(vector(hull, STATE.p_WB), four(hull, STATE.q_WB), radius, o, d, free) < free:
+            cells += 1
+    return cells >= CELLS_MIN

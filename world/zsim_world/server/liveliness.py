@@ -24,8 +24,8 @@ RETURN_NS = 5_000_000_000  # wall time in which a process rejoins a restarted wo
 START_NS = 60_000_000_000  # wall time in which a restarted process joins; a small computer needs 20 s
 NEW_TOKEN_NS = 1_500_000_000  # wall time within which a router knows a new token; up to 1 s measured
 TOKENS_S = 1.0  # timeout of a token query, which a router answers within milliseconds
-SILENT_S = 10  # seconds without health after which a process that only reads is dead, as its link is closed by then
 SILENT_NS = 1_800_000_000  # wall time without health, which comes once a second; so silence is reported within 2 s
+DEAD_NS = 10_000_000_000  # without health, after which a process that only reads is dead: its link is closed by then
 STALL_NS = 300_000_000  # wall time between two checks beyond which the world itself, or its machine, was stopped
 SHOWN = 5  # expressions shown of a process that subscribes to many
 _decode_health = msgspec.msgpack.Decoder(Health).decode
@@ -62,30 +62,13 @@ class LivelinessMonitor:
         self._lost: deque[str] = deque()  # names whose token seems lost, reported by other threads
         self._checks: dict[str, _Check] = {}
         self._health = HealthWatch(lambda name, since_ns: run.call("silence_changed", name, since_ns))
-        self._silent_s: dict[str, int] = {}  # by process that publishes its health
 
     def token_lost(self, name: str) -> None:
         """Note, from any thread, the loss of a token; the bye of its process may still follow."""
         self._lost.append(name)
 
     def health_received(self, name: str) -> None:
-        self._silent_s[name] = 0
         self._health.received(name, time.monotonic_ns())
-
-    def count_second(self) -> None:
-        """Count a second during which the world itself ran.
-
-        A process that only reads counts as dead after a long time without health: Zenoh does not always report that it
-        has closed the full link of a stopped process. A gating process blocks the clock instead, and `clock` names it.
-        """
-        for name in list(self._silent_s):
-            participant = self._barrier.participants.get(name)
-            if participant is None or not participant.alive or participant.gating:
-                del self._silent_s[name]
-                continue
-            self._silent_s[name] += 1
-            if self._silent_s[name] > SILENT_S:
-                self._report_death(name)
 
     def check_all(self) -> None:
         """Schedule a check of all former participants of a restarted world, after the time that a rejoin takes."""
@@ -106,14 +89,18 @@ class LivelinessMonitor:
         """Check the processes whose check is due.
 
         A process without a token is dead, unless its token may be too new to be known. Such a process is checked again,
-        and so is one that has a token.
+        and so is one that has a token. A process that only reads also counts as dead after a long time without health:
+        Zenoh does not always report that it has closed the full link of a stopped process. A gating process blocks the
+        clock instead, and `clock` names it.
         """
         self._take_lost()
         now_ns = time.monotonic_ns()
-        for name in self._health.look(now_ns):
+        for name, silent_ns in self._health.look(now_ns).items():
             participant = self._barrier.participants.get(name)
             if participant is None or not participant.alive:
                 self._health.forget(name)
+            elif silent_ns > DEAD_NS and not participant.gating:
+                self._report_death(name)
         for name in [name for name, check in self._checks.items() if check.due_ns <= now_ns]:
             self._take_in()
             participant = self._barrier.participants.get(name)
@@ -165,17 +152,20 @@ class HealthWatch:
         self._last_wall_ns.pop(name, None)
         self._silent.discard(name)
 
-    def look(self, wall_ns: int) -> list[str]:
-        """Report silent processes; return the processes whose health is expected. Must be called frequently."""
+    def look(self, wall_ns: int) -> dict[str, int]:
+        """Report silent processes; return, for each whose health is expected, how long it has been missing [ns].
+
+        Must be called frequently.
+        """
         stall_ns = wall_ns - self._look_wall_ns
         self._look_wall_ns = wall_ns
         if stall_ns > STALL_NS:  # messages that arrived meanwhile were not read
-            self._last_wall_ns = {name: last_ns + stall_ns for name, last_ns in self._last_wall_ns.items()}
+            self._last_wall_ns = {name: min(last + stall_ns, wall_ns) for name, last in self._last_wall_ns.items()}
         for name, last_ns in list(self._last_wall_ns.items()):
             if name not in self._silent and wall_ns - last_ns >= SILENT_NS:
                 self._silent.add(name)
                 self._handle_silence(name, last_ns)
-        return list(self._last_wall_ns)
+        return {name: wall_ns - last_ns for name, last_ns in self._last_wall_ns.items()}
 
 
 class SlowReaders:

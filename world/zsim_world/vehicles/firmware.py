@@ -1,4 +1,4 @@
-"""The firmware of one drone at 200 Hz: modes, velocity, attitude and rate loops, using only its own estimate.
+"""The firmware of the drones at 200 Hz: modes, velocity, attitude and rate loops, using only its own estimate.
 
 Loops from inside out, each about three times slower than the one it contains, with the AR.Drone's figures:
     rotors   overdriven so that their lag halves (15 ms)
@@ -8,6 +8,9 @@ Loops from inside out, each about three times slower than the one it contains, w
     hold     v_des = 0.8 (p_hold - p), height 1.5
 A velocity in the heading frame is tracked in the instantaneous frame: while the drone yaws at r, it lags by r v / 3
 laterally. The gains follow from the rotors' lag and the design of `zsim.vehicles.vehicle.Firmware`, for any vehicle.
+
+Observation and decision are computed per drone; the attitude update and the loops of attitude and rate, which have no
+branches, for blocks of eight drones at once (physics/simd.py).
 """
 
 import math
@@ -19,13 +22,41 @@ from numpy.typing import NDArray
 from zsim.contract.flight_messages import DroneState
 from zsim.math import elementary as el
 from zsim.math import rotation as rot
-from zsim.math.compiled import Field, columns, inlined
+from zsim.math.compiled import Field, columns, inlined, noinline
 from zsim.math.rotation import Quaternion, Vector, axpy
 from zsim.scenario.scenario import Drone
 from zsim.vehicles.vehicle import ROTORS_MAX, Firmware, Vehicle
-from zsim_world.physics.fleet_arrays import ROTOR, VEHICLE, PerRotor, Row, of, put_of
-from zsim_world.physics.rigid_body import four, mix, vector
-from zsim_world.vehicles.observer import BELIEF, FLOOR_MIN_M, STEP_S, STILL_STEPS_MIN, lift, standing_height
+from zsim_world.physics.fleet_arrays import (
+    CLOCK,
+    ROTOR,
+    SPAN,
+    VEHICLE,
+    Boards,
+    Bodies,
+    KernelTime,
+    PerRotor,
+    Row,
+    four,
+    of,
+    put,
+    put_four,
+    put_of,
+    vector,
+)
+from zsim_world.physics.rigid_body import charge_percent, mix
+from zsim_world.physics.simd import (
+    LANES,
+    LEVEL,
+    blocks,
+    lane_four,
+    lane_rotors,
+    lane_row,
+    lane_vector,
+    put_lane_four,
+    put_lane_vector,
+)
+from zsim_world.vehicles import observer
+from zsim_world.vehicles.observer import BELIEF, DEVICE, FLOOR_MIN_M, STEP_S, STILL_STEPS_MIN, lift, standing_height
 
 DRIVE = columns(  # what the loops of attitude and rate need of the firmware's settings, by which these begin
     "DriveColumns",
@@ -38,79 +69,6 @@ DRIVE = columns(  # what the loops of attitude and rate need of the firmware's s
         Field("body_rate", "rad/s"),  # largest, wanted of the tilt loop
     ),
 )
-Gains = tuple[float, float, float, float, float, float]
-
-
-def loop_gains(design: Firmware, rotor_lag_s: float) -> tuple[float, float, float]:
-    """Return the gains of rate, tilt and velocity loop [1/s] for a lag of the rotors."""
-    rate = design.rate_per_lag / max(design.lag_lead * rotor_lag_s, design.lag_min_s)
-    return rate, rate / design.loop_ratio, rate / el.square(design.loop_ratio)
-
-
-def lag_shares(design: Firmware, rotor_lag_s: float) -> tuple[float, float]:
-    """Return the fraction of a rotor's lag that remains after a step, and the overdrive that shortens it."""
-    decay = el.exp(-STEP_S / rotor_lag_s)
-    return decay, (1.0 - el.exp(-STEP_S / (design.lag_lead * rotor_lag_s))) / (1.0 - decay)
-
-
-@inlined
-def drive(
-    row: Row,
-    rotors: PerRotor,
-    gains: Gains,
-    own: Quaternion,
-    q_WB: Quaternion,
-    w_WB_B: Vector,
-    speeds: PerRotor,
-    z_des: Vector,
-    thrust_n: float,
-    yaw_rate: float,
-    commands: PerRotor,
-) -> None:
-    """Set rotor commands for a wanted direction of z_B (heading frame), thrust [N] and yaw rate [rad/s].
-
-    Branch-free, so that several drones are computed at once (simd_firmware.py).
-
-    Args:
-        row, rotors: parameters; gains: its settings in DRIVE.
-        own: the heading frame in W; q_WB, w_WB_B, speeds: estimated attitude, body rate and rotor speeds.
-        commands: [rad/s], to be set.
-    """
-    k_rate, k_tilt, overdrive, slope, yaw_share, body_rate_max = gains
-    q_HB = rot.level(own, q_WB)
-    z_B = rot.rotate_back(q_HB, limited_tilt(z_des, slope))
-    up_B = rot.rotate_back(q_HB, (0.0, 0.0, yaw_rate))
-    w, wx, wy = w_WB_B, -k_tilt * z_B[1], k_tilt * z_B[0]
-    size = math.sqrt(wx * wx + wy * wy)
-    s = 1.0 if size <= body_rate_max else body_rate_max / size
-    ix, iy, iz = vector(row, VEHICLE.inertia)
-    moment = (
-        ix * k_rate * (s * wx + up_B[0] - w[0]) + (iz - iy) * w[1] * w[2],
-        iy * k_rate * (s * wy + up_B[1] - w[1]) + (ix - iz) * w[2] * w[0],
-        iz * k_rate * yaw_share * (up_B[2] - w[2]) + (iy - ix) * w[0] * w[1],
-    )
-    mix(row, rotors, thrust_n, moment, commands)
-    for r in range(len(rotors.each)):  # under these commands the rotors reach what is wanted with a part of their lag
-        speed = of(speeds, 0, r)
-        put_of(commands, r, clipped(rotors, r, speed + overdrive * (of(commands, 0, r) - speed)))
-
-
-@inlined
-def clipped(rotors: PerRotor, r: int, speed: float) -> float:
-    """Return a speed [rad/s] of rotor r within its limits."""
-    return min(max(speed, of(rotors, ROTOR.low, r)), of(rotors, ROTOR.high, r))
-
-
-@inlined
-def limited_tilt(z: Vector, slope: float) -> Vector:
-    """Return the unit vector along z, with its tilt from the vertical limited to this tangent."""
-    across = math.sqrt(z[0] * z[0] + z[1] * z[1])
-    most = max(z[2], 1e-3) * slope
-    s = 1.0 if across <= most else most / across
-    z = (s * z[0], s * z[1], max(z[2], 1e-3))
-    return axpy((0.0, 0.0, 0.0), 1.0 / rot.norm(z), z)
-
-
 SETTING = columns(  # limits of what a commander may ask, and the design of vehicle.Firmware
     "SettingColumns",
     (
@@ -142,6 +100,57 @@ SETTING = columns(  # limits of what a commander may ask, and the design of vehi
         Field("low_battery", "%"),
     ),
 )
+LANDED, TAKING_OFF, HOVERING, FLYING, LANDING, EMERGENCY = range(6)
+MODES: tuple[DroneState, ...] = ("landed", "taking_off", "hovering", "flying", "landing", "emergency")
+NONE, VELOCITY, VELOCITY_WORLD, ARDRONE, HOVER, ATTITUDE, ROTORS = range(7)  # kinds of setpoint
+# Values of a setpoint by its kind:
+#   velocity: vx, vy, vz [m/s], yaw rate [rad/s]; ardrone: forward, left, up, yaw_left in [-1, 1];
+#   attitude: w, x, y, z, thrust [N], yaw rate [rad/s]; rotors: their speeds [rad/s]
+SETPOINT = columns("SetpointColumns", (Field("kind", "1"), Field("value", "see above", ROTORS_MAX)))
+MEMORY = columns(
+    "MemoryColumns",
+    (
+        Field("mode", "1"),
+        Field("steps", "1"),  # in this mode
+        Field("hold_xy", "m", 2),
+        Field("hold_z", "m"),
+        Field("holds_xy", "1"),
+        Field("holds_z", "1"),  # or RISING: the height held rises to that of the take-off, or HOLDING: it stays
+        Field("touch", "1"),  # steps for which the ground has borne the weight
+    ),
+)
+RISING, HOLDING = 1.0, 2.0
+BOARD_LANES = columns(
+    "BoardLanes",
+    (
+        Field("vehicle", "VEHICLE", VEHICLE.size),
+        Field("drive", "DRIVE", DRIVE.size),
+        Field("mount", "1", 4),  # q_BS of the gyro
+        Field("gyro", "rad/s", 3),  # the newest sample
+        Field("bias", "rad/s", 3),  # what is believed to be its bias
+        Field("q_WB", "1", 4),  # of the belief, as the next
+        Field("w_WB_B", "rad/s", 3),
+        Field("angle", "rad"),  # of the step's turn
+        Field("sine", "1"),  # of half of it
+        Field("cosine", "1"),
+        Field("north", "1"),  # where the nose points
+        Field("east", "1"),
+        Field("heading", "rad"),
+        Field("own", "1", 4),  # heading frame in W
+        Field("z_H", "1", 3),  # wanted: z_B in the heading frame
+        Field("thrust", "N"),
+        Field("yaw_rate", "rad/s"),
+        Field("driven", "1"),  # 0 if the firmware itself has set the command
+    ),
+)
+BOARD_ROTORS = columns(
+    "BoardRotors",
+    (Field("known", "ROTOR", ROTOR.size), Field("speed", "rad/s"), Field("command", "rad/s"), Field("drive", "rad/s")),
+)
+# and by how much the speed of each rotor is less than commanded (R); the one at which it is held (R)
+ACTUATOR = columns("ActuatorColumns", (Field("faulty", "1"),))
+FOLLOWS = -1.0  # rad/s, of a rotor that is not held
+Gains = tuple[float, float, float, float, float, float]
 
 
 def settings(vehicle: Vehicle, drone: Drone) -> NDArray[np.float64]:
@@ -167,28 +176,158 @@ def settings(vehicle: Vehicle, drone: Drone) -> NDArray[np.float64]:
     return row
 
 
-LANDED, TAKING_OFF, HOVERING, FLYING, LANDING, EMERGENCY = range(6)
-MODES: tuple[DroneState, ...] = ("landed", "taking_off", "hovering", "flying", "landing", "emergency")
+def loop_gains(design: Firmware, rotor_lag_s: float) -> tuple[float, float, float]:
+    """Return the gains of rate, tilt and velocity loop [1/s] for a lag of the rotors."""
+    rate = design.rate_per_lag / max(design.lag_lead * rotor_lag_s, design.lag_min_s)
+    return rate, rate / design.loop_ratio, rate / el.square(design.loop_ratio)
 
-NONE, VELOCITY, VELOCITY_WORLD, ARDRONE, HOVER, ATTITUDE, ROTORS = range(7)  # kinds of setpoint
-# Values of a setpoint by its kind:
-#   velocity: vx, vy, vz [m/s], yaw rate [rad/s]; ardrone: forward, left, up, yaw_left in [-1, 1];
-#   attitude: w, x, y, z, thrust [N], yaw rate [rad/s]; rotors: their speeds [rad/s]
-SETPOINT = columns("SetpointColumns", (Field("kind", "1"), Field("value", "see above", ROTORS_MAX)))
 
-MEMORY = columns(
-    "MemoryColumns",
-    (
-        Field("mode", "1"),
-        Field("steps", "1"),  # in this mode
-        Field("hold_xy", "m", 2),
-        Field("hold_z", "m"),
-        Field("holds_xy", "1"),
-        Field("holds_z", "1"),  # or RISING: the height held rises to that of the take-off, or HOLDING: it stays
-        Field("touch", "1"),  # steps for which the ground has borne the weight
-    ),
-)
-RISING, HOLDING = 1.0, 2.0
+def lag_shares(design: Firmware, rotor_lag_s: float) -> tuple[float, float]:
+    """Return the fraction of a rotor's lag that remains after a step, and the overdrive that shortens it."""
+    decay = el.exp(-STEP_S / rotor_lag_s)
+    return decay, (1.0 - el.exp(-STEP_S / (design.lag_lead * rotor_lag_s))) / (1.0 - decay)
+
+
+def sound_actuators(drones: int, rotors: int) -> NDArray[np.float64]:
+    """Return the rows of drones without rotor faults, (drones, ACTUATOR.size + 2 rotors)."""
+    rows = np.ones((drones, ACTUATOR.size + 2 * rotors))
+    rows[:, ACTUATOR.faulty], rows[:, ACTUATOR.size + rotors :] = 0.0, FOLLOWS
+    return rows
+
+
+def board_blocks(row: NDArray, rotors: NDArray, setting: NDArray, mounts: NDArray) -> NDArray[np.float64]:
+    """Return the blocks of N boards: parameters, those of their rotors, settings and mounts of the gyro (N, 4)."""
+    each = rotors.shape[1] // ROTOR.size
+    drive = setting[:, SETTING.drive : SETTING.drive + DRIVE.size]
+    known = BOARD_LANES.size + BOARD_ROTORS.known * each
+    constant = ((BOARD_LANES.vehicle, row), (BOARD_LANES.drive, drive), (BOARD_LANES.mount, mounts), (known, rotors))
+    level, unturned = np.tile(LEVEL, (len(row), 1)), np.ones((len(row), 1))
+    start = ((BOARD_LANES.q_WB, level), (BOARD_LANES.cosine, unturned))
+    return blocks(BOARD_LANES.size + BOARD_ROTORS.size * each, (*constant, *start))
+
+
+@inlined
+def steer(time: KernelTime, bodies: Bodies, boards: Boards) -> None:
+    count, each = bodies.state.shape[0], bodies.each
+    for first in range(0, count, LANES):
+        lanes, last, driven = boards.lanes[first // LANES], min(first + LANES, count), False
+        for i in range(first, last):
+            _line_up(boards, lanes, i, i - first)
+        _turn(lanes, last - first)
+        for i in range(first, last):
+            driven |= _decide(time, bodies, boards, lanes, i, i - first)
+        if driven:
+            _drive(lanes, each)
+        for i in range(first, last):
+            _command(bodies, boards, i, _rotors(lanes, BOARD_ROTORS.command, i - first, each))
+
+
+@inlined
+def _rotors(lanes: NDArray, group: int, k: int, each: tuple[int, ...]) -> PerRotor:
+    """Return a group of numbers per rotor of the drone in lane k, and those after it."""
+    return lane_rotors(lanes, BOARD_LANES.size + group * len(each), k, each)
+
+
+@inlined
+def _line_up(boards: Boards, lanes: NDArray, i: int, k: int) -> None:
+    """Copy the inputs of drone i's attitude update into lane k."""
+    belief = boards.belief[i]
+    put_lane_vector(lanes, BOARD_LANES.gyro, k, vector(boards.device[i], DEVICE.gyro))
+    put_lane_vector(lanes, BOARD_LANES.bias, k, vector(belief, BELIEF.gyro_bias))
+    put_lane_four(lanes, BOARD_LANES.q_WB, k, four(belief, BELIEF.q_WB))
+
+
+@inlined
+def _turn(lanes: NDArray, count: int) -> None:
+    """Rotate the attitudes by the gyro readings; `count` lanes have a drone."""
+    for k in range(LANES):
+        mount, gyro = lane_four(lanes, BOARD_LANES.mount, k), lane_vector(lanes, BOARD_LANES.gyro, k)
+        bias = lane_vector(lanes, BOARD_LANES.bias, k)
+        w = observer.body_rate(mount, gyro, bias)
+        put_lane_vector(lanes, BOARD_LANES.w_WB_B, k, w)
+        lanes[LANES * BOARD_LANES.angle + k] = rot.norm(observer.step_turn(w))
+    for k in range(count):
+        half = 0.5 * lanes[LANES * BOARD_LANES.angle + k]
+        lanes[LANES * BOARD_LANES.sine + k], lanes[LANES * BOARD_LANES.cosine + k] = el.sin(half), el.cos(half)
+    for k in range(LANES):
+        r, angle = observer.step_turn(lane_vector(lanes, BOARD_LANES.w_WB_B, k)), lanes[LANES * BOARD_LANES.angle + k]
+        turn = rot.turn_about(r, angle, lanes[LANES * BOARD_LANES.sine + k], lanes[LANES * BOARD_LANES.cosine + k])
+        q = rot.normalised(rot.multiply(lane_four(lanes, BOARD_LANES.q_WB, k), turn))
+        put_lane_four(lanes, BOARD_LANES.q_WB, k, q)
+        lanes[LANES * BOARD_LANES.north + k], lanes[LANES * BOARD_LANES.east + k] = rot.forwards(q)
+    for k in range(count):
+        heading = el.atan2(lanes[LANES * BOARD_LANES.north + k], lanes[LANES * BOARD_LANES.east + k])
+        lanes[LANES * BOARD_LANES.heading + k] = heading
+        put_lane_four(lanes, BOARD_LANES.own, k, rot.about_z(heading))
+
+
+@inlined
+def _decide(time: KernelTime, bodies: Bodies, boards: Boards, lanes: NDArray, i: int, k: int) -> bool:
+    """Run observer and decision of drone i for lane k; return whether the drive must compute its command."""
+    each, memory, belief, row = bodies.each, boards.memory[i], boards.belief[i], bodies.vehicle[i]
+    setting, heading = boards.setting[i], lanes[LANES * BOARD_LANES.heading + k]
+    own, turned = lane_four(lanes, BOARD_LANES.own, k), heading - belief[BELIEF.heading]
+    belief[BELIEF.heading] = heading
+    put_four(belief, BELIEF.q_WB, lane_four(lanes, BOARD_LANES.q_WB, k))
+    put(belief, BELIEF.w_WB_B, lane_vector(lanes, BOARD_LANES.w_WB_B, k))
+    on_ground = stands(memory, setting)
+    gain, device, board = boards.gain[i], boards.device[i], boards.calibration[i]
+    own = observer.observe(belief, own, turned, row, gain, device, board, on_ground, each)
+    silence = (time.clock[CLOCK.tick] - boards.set_tick[i]) * time.spans[SPAN.dt]
+    hover_s, land_s = time.spans[SPAN.hover], time.spans[SPAN.land]
+    charge = charge_percent(row, bodies.energy[i])
+    rotors, commands = PerRotor(bodies.rotors[i], 0, 1, each), _rotors(lanes, BOARD_ROTORS.command, k, each)
+    setpoint = boards.setpoint[i]
+    decision = decide(commands, memory, belief, own, row, rotors, setting, setpoint, silence, hover_s, land_s, charge)
+    put_lane_four(lanes, BOARD_LANES.own, k, own)
+    put_lane_four(lanes, BOARD_LANES.q_WB, k, four(belief, BELIEF.q_WB))
+    speeds = _rotors(lanes, BOARD_ROTORS.speed, k, each)
+    for r in range(len(each)):
+        put_of(speeds, r, belief[BELIEF.size + r])
+    put_lane_vector(lanes, BOARD_LANES.z_H, k, decision.z_H)
+    lanes[LANES * BOARD_LANES.thrust + k], lanes[LANES * BOARD_LANES.yaw_rate + k] = (
+        decision.thrust_n,
+        decision.yaw_rate,
+    )
+    lanes[LANES * BOARD_LANES.driven + k] = 1.0 if decision.driven else 0.0
+    return decision.driven
+
+
+@inlined
+def _drive(lanes: NDArray, each: tuple[int, ...]) -> None:
+    """Compute the commands of all drones of the block whose firmware has not set them itself."""
+    for k in range(LANES):
+        own, attitude = lane_four(lanes, BOARD_LANES.own, k), lane_four(lanes, BOARD_LANES.q_WB, k)
+        rate, z = lane_vector(lanes, BOARD_LANES.w_WB_B, k), lane_vector(lanes, BOARD_LANES.z_H, k)
+        gains = lane_vector(lanes, BOARD_LANES.drive, k) + lane_vector(lanes, BOARD_LANES.drive + 3, k)
+        thrust, yaw_rate = lanes[LANES * BOARD_LANES.thrust + k], lanes[LANES * BOARD_LANES.yaw_rate + k]
+        rotors, speeds = _rotors(lanes, BOARD_ROTORS.known, k, each), _rotors(lanes, BOARD_ROTORS.speed, k, each)
+        commands, wanted = _rotors(lanes, BOARD_ROTORS.command, k, each), _rotors(lanes, BOARD_ROTORS.drive, k, each)
+        row = lane_row(lanes, k)
+        drive(row, rotors, gains, own, attitude, rate, speeds, z, thrust, yaw_rate, wanted)
+        driven = lanes[LANES * BOARD_LANES.driven + k] > 0.0
+        for r in range(len(each)):
+            put_of(commands, r, of(wanted, 0, r) if driven else of(commands, 0, r))
+
+
+@inlined
+def _command(bodies: Bodies, boards: Boards, i: int, commands: PerRotor) -> None:
+    """Set the rotor commands of drone i, if its battery allows, and update its firmware's rotor model."""
+    charged, command = bodies.energy[i] > 0.0, bodies.command[i]
+    observer.model_rotors(boards.belief[i], boards.setting[i, SETTING.rotor_decay], commands)
+    for r in range(len(commands.each)):
+        command[r] = of(commands, 0, r) if charged else 0.0
+    if boards.actuator[i, ACTUATOR.faulty] != 0.0 and charged:
+        _weaken(bodies.command[i], boards.actuator[i])
+
+
+@noinline
+def _weaken(command: NDArray, actuator: NDArray) -> None:
+    """Apply rotor faults to a command [rad/s] (R,), in place."""
+    count = command.shape[0]
+    for r in range(count):
+        held = actuator[ACTUATOR.size + count + r]
+        command[r] = held if held >= 0.0 else actuator[ACTUATOR.size + r] * command[r]
 
 
 class Decision(NamedTuple):
@@ -463,3 +602,61 @@ def _descent(memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray, e
 @inlined
 def _clip(x: float, most: float) -> float:
     return min(max(x, -most), most)
+
+
+@inlined
+def drive(
+    row: Row,
+    rotors: PerRotor,
+    gains: Gains,
+    own: Quaternion,
+    q_WB: Quaternion,
+    w_WB_B: Vector,
+    speeds: PerRotor,
+    z_des: Vector,
+    thrust_n: float,
+    yaw_rate: float,
+    commands: PerRotor,
+) -> None:
+    """Set rotor commands for a wanted direction of z_B (heading frame), thrust [N] and yaw rate [rad/s].
+
+    Branch-free, so that several drones are computed at once (`_drive`).
+
+    Args:
+        row, rotors: parameters; gains: its settings in DRIVE.
+        own: the heading frame in W; q_WB, w_WB_B, speeds: estimated attitude, body rate and rotor speeds.
+        commands: [rad/s], to be set.
+    """
+    k_rate, k_tilt, overdrive, slope, yaw_share, body_rate_max = gains
+    q_HB = rot.level(own, q_WB)
+    z_B = rot.rotate_back(q_HB, limited_tilt(z_des, slope))
+    up_B = rot.rotate_back(q_HB, (0.0, 0.0, yaw_rate))
+    w, wx, wy = w_WB_B, -k_tilt * z_B[1], k_tilt * z_B[0]
+    size = math.sqrt(wx * wx + wy * wy)
+    s = 1.0 if size <= body_rate_max else body_rate_max / size
+    ix, iy, iz = vector(row, VEHICLE.inertia)
+    moment = (
+        ix * k_rate * (s * wx + up_B[0] - w[0]) + (iz - iy) * w[1] * w[2],
+        iy * k_rate * (s * wy + up_B[1] - w[1]) + (ix - iz) * w[2] * w[0],
+        iz * k_rate * yaw_share * (up_B[2] - w[2]) + (iy - ix) * w[0] * w[1],
+    )
+    mix(row, rotors, thrust_n, moment, commands)
+    for r in range(len(rotors.each)):  # under these commands the rotors reach what is wanted with a part of their lag
+        speed = of(speeds, 0, r)
+        put_of(commands, r, clipped(rotors, r, speed + overdrive * (of(commands, 0, r) - speed)))
+
+
+@inlined
+def clipped(rotors: PerRotor, r: int, speed: float) -> float:
+    """Return a speed [rad/s] of rotor r within its limits."""
+    return min(max(speed, of(rotors, ROTOR.low, r)), of(rotors, ROTOR.high, r))
+
+
+@inlined
+def limited_tilt(z: Vector, slope: float) -> Vector:
+    """Return the unit vector along z, with its tilt from the vertical limited to this tangent."""
+    across = math.sqrt(z[0] * z[0] + z[1] * z[1])
+    most = max(z[2], 1e-3) * slope
+    s = 1.0 if across <= most else most / across
+    z = (s * z[0], s * z[1], max(z[2], 1e-3))
+    return axpy((0.0, 0.0, 0.0), 1.0 / rot.norm(z), z)

@@ -29,8 +29,18 @@ from zsim.scenario.scenario import Drone, Environment
 from zsim.sensors.sensor import ErrorModel, Sensor, noise_sigma, scaled
 from zsim.sensors.stock_sensors import BOARD_RATE_HZ
 from zsim.vehicles.vehicle import Vehicle
-from zsim_world.physics.fleet_arrays import REFERENCE_DENSITY_KG_M3, VEHICLE, PerRotor, of, put_of
-from zsim_world.physics.rigid_body import four, free_thrust, lagged, put, put_four, vector
+from zsim_world.physics.fleet_arrays import (
+    REFERENCE_DENSITY_KG_M3,
+    VEHICLE,
+    PerRotor,
+    four,
+    of,
+    put,
+    put_four,
+    put_of,
+    vector,
+)
+from zsim_world.physics.rigid_body import free_thrust, lagged
 from zsim_world.sensors.sensor_set import FIELD_MIN_UT, heading_sigma
 
 STEP_S = 1.0 / BOARD_RATE_HZ  # s
@@ -91,18 +101,13 @@ SONAR_AGE_MAX = 100.0  # steps, 0.5 s without echo: heights come from the barome
 
 
 @inlined
-def _face(belief: NDArray, q: Quaternion) -> Quaternion:
-    """Set the estimated attitude; return its heading frame in W."""
-    put_four(belief, BELIEF.q_WB, q)
-    belief[BELIEF.heading] = rot.heading(q)
-    return rot.about_z(belief[BELIEF.heading])
-
-
-@inlined
 def _turn_by(belief: NDArray, own: Quaternion, r_H: Vector) -> Quaternion:
     """Rotate the estimated attitude by a small rotation vector [rad; heading frame]; return the new frame."""
     turn = rot.from_rotation_vector(rot.rotate(own, r_H))
-    return _face(belief, rot.normalised(rot.multiply(turn, four(belief, BELIEF.q_WB))))
+    q = rot.normalised(rot.multiply(turn, four(belief, BELIEF.q_WB)))
+    put_four(belief, BELIEF.q_WB, q)
+    belief[BELIEF.heading] = rot.heading(q)
+    return rot.about_z(belief[BELIEF.heading])
 
 
 @inlined
@@ -138,7 +143,7 @@ def observe(
 ) -> Quaternion:
     """Advance the estimate by one step of 5 ms and process the new samples of the devices.
 
-    Body rate, attitude and heading are at the end of the step already, as the gyro has them (simd_firmware.py).
+    Body rate, attitude and heading are at the end of the step already, as the gyro has them (firmware.py).
 
     Args:
         belief: (BELIEF.size + R,) in place.
@@ -243,15 +248,6 @@ def _correct(belief: NDArray, gain: NDArray, at: int, e: Vector) -> None:
 
 
 @inlined
-def _correct_tilt(belief: NDArray, gain: NDArray, own: Quaternion, e: Vector) -> Quaternion:
-    """Correct tilt and gyro bias by an innovation of the flow; the accelerometer does not correct them."""
-    tilt, rate = gain[GAIN.flow_tilt], gain[GAIN.flow_rate]
-    own = _turn_by(belief, own, (-tilt * e[1], tilt * e[0], 0.0))  # faster forward than believed: pitched farther so
-    _take_bias(belief, own, (-rate * e[1], rate * e[0], 0.0))
-    return own
-
-
-@inlined
 def _lift_by(belief: NDArray, gain: NDArray, at: int, e: float) -> None:
     """Correct height, climb, vertical disturbance and accelerometer bias by an innovation with the gains at `at`."""
     belief[BELIEF.height] += gain[at] * e
@@ -265,7 +261,9 @@ def _see_flow(belief: NDArray, gain: NDArray, own: Quaternion, flow_H: Vector) -
     """Correct velocity, disturbance, tilt, bias and climb rate by a flow velocity; return the new heading frame."""
     e = axpy(flow_H, -1.0, vector(belief, BELIEF.v_H))
     _correct(belief, gain, GAIN.flow_v, e)
-    own = _correct_tilt(belief, gain, own, e)
+    tilt, rate = gain[GAIN.flow_tilt], gain[GAIN.flow_rate]  # these the accelerometer does not correct
+    own = _turn_by(belief, own, (-tilt * e[1], tilt * e[0], 0.0))  # faster forward than believed: pitched farther so
+    _take_bias(belief, own, (-rate * e[1], rate * e[0], 0.0))
     _lift_by(belief, gain, GAIN.climb_z, e[2])
     return own
 

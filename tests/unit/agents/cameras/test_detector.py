@@ -12,8 +12,8 @@ from refused import has_terms
 from zsim.sensors.camera import Camera, FrontCamera, PictureError, frame_of
 from zsim.sensors.camera_model import camera_pose, lens_of
 from zsim_agents.cameras.detector import HatDetector, decoded
-from zsim_agents.cameras.rendering.foreground import AMBIENT, ball_images
-from zsim_agents.cameras.rendering.scene import View
+from zsim_agents.cameras.foreground import AMBIENT, ball_images
+from zsim_agents.cameras.scene import View
 
 ASSOCIATED_RAD = 0.03  # rad, within which a sighting is that of the hat
 

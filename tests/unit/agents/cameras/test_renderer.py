@@ -14,7 +14,7 @@ from zsim.scenario.surroundings import row_of
 from zsim.sensors.camera import FrontCamera, Hats
 from zsim.sensors.camera_model import lens_of
 from zsim.sensors.sensor import Mount
-from zsim_agents.cameras.rendering.renderer import Ground
+from zsim_agents.cameras.renderer import Ground
 
 CENTRE_PX = 0.5  # what the issue asks for
 AHEAD = bodies([(0, 0, 5), (4, 0.5, 4.6)])

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from zsim_agents.laws.bearing_only import bearing_only, bearing_rigidity_matrix
 from zsim_agents.laws.consensus import consensus
 from zsim_agents.laws.distance_based import distance_based, rigidity_matrix
-from zsim_agents.laws.pilot import repulsion
-from zsim_agents.laws.reference import FormationReference, polygon
+from zsim_agents.laws.pilot import FormationReference, polygon, repulsion
 from zsim_agents.laws.virtual_structure import virtual_structure
 
 Array = NDArray[np.float64]

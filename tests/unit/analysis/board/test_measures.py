@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from zsim_agents.laws.reference import polygon
+from zsim_agents.laws.pilot import polygon
 from zsim_analysis.board.measures import Flown, Wanted, lattice_errors, shape_errors
 
 C = polygon(5, 3.0)

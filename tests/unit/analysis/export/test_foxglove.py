@@ -390,7 +390,9 @@ def test_a_drone_s_mesh_reaches_to_the_rims_of_its_rotors() -> None:
     assert (area > 0).all()
 
 
-def test_without_rerun_s_library_there_is_no_blueprint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recorded_run.write(tmp_path / "run.mcap")
+def test_without_rerun_s_library_there_is_no_blueprint(
+    filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copy(filmed / "run.mcap", tmp_path)
     monkeypatch.setattr(viewers, "has_rerun", lambda: False)
     assert [path.name for path in export(tmp_path, Format.FOXGLOVE).paths] == ["foxglove.mcap", "foxglove-layout.json"]

@@ -13,7 +13,7 @@ from refused import has_terms
 from rich.console import Console
 
 from zsim.errors import RunError, ScenarioError
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
 from zsim.scenario.scenario import Scenario
 from zsim.schema import yaml_file
 from zsim_analysis.hunt import hunt as hunting
@@ -101,26 +101,29 @@ class FakePool:
         return {**known, "faults": faults, "margins": margins}
 
 
-@pytest.fixture
-def fly(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Hunted]:
+@pytest.fixture(scope="module")
+def fly(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Hunted]]:
     """Hunt for a separation of 1 m, with other arguments of HuntRequest if given."""
-    monkeypatch.setattr(hunting, "ProcessPool", FakePool)
-    monkeypatch.setattr(FakePool, "separation", staticmethod(separation_m))
-    monkeypatch.setattr(FakePool, "stops_after", None)
-    count = iter(range(100))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(hunting, "ProcessPool", FakePool)
 
-    def made(**more: Any) -> Hunted:
-        request: dict[str, Any] = {
-            "document": DOCUMENT, "source": "pair.yaml", "requirements": ("min_separation_m > 1",), "faults": KINDS,
-            "out": tmp_path / str(next(count)), "flights": 3000, "workers": 2, "console": Console(quiet=True),
-        }  # fmt: skip
-        return hunt(HuntRequest(**{**request, **more}))
+        def made(**more: Any) -> Hunted:
+            request: dict[str, Any] = {
+                "document": DOCUMENT, "source": "pair.yaml", "requirements": ("min_separation_m > 1",), "faults": KINDS,
+                "out": tmp_path_factory.mktemp("hunt"), "flights": 3000, "workers": 1, "console": Console(quiet=True),
+            }  # fmt: skip
+            return hunt(HuntRequest(**{**request, **more}))
 
-    return made
+        yield made
 
 
-def test_three_causes_are_found_and_nothing_else_is_left_of_the_flight(fly: Callable[..., Hunted]) -> None:
-    found = fly().summary.violation
+@pytest.fixture(scope="module")
+def whole(fly: Callable[..., Hunted]) -> Hunted:
+    return fly()
+
+
+def test_three_causes_are_found_and_nothing_else_is_left_of_the_flight(whole: Hunted) -> None:
+    found = whole.summary.violation
     assert found is not None
     faults = {fault["kind"]: fault for fault in found.shrunk.faults}
     assert set(faults) == DEFECT
@@ -135,18 +138,22 @@ def test_three_causes_are_found_and_nothing_else_is_left_of_the_flight(fly: Call
     assert found.margin < 0
 
 
-def test_the_same_seed_gives_the_same_flights_and_verdict_whoever_is_finished_first(fly: Callable[..., Hunted]) -> None:
-    one, other, third = fly(workers=1), fly(workers=7), fly(workers=7, seed=2)
-    assert one.summary.verdict == "violated"
-    assert [(each.stage, each.case) for each in one.flown] == [(each.stage, each.case) for each in other.flown]
-    assert one.summary.violation == other.summary.violation
-    assert one.flown[1].case != third.flown[1].case
-    longer = fly(flights=4000)  # begins with the same
-    assert [each.case for each in longer.flown[:20]] == [each.case for each in one.flown[:20]]
+def test_the_same_seed_gives_the_same_flights_and_verdict_whoever_is_finished_first(
+    fly: Callable[..., Hunted], whole: Hunted
+) -> None:
+    other = fly(workers=7)
+    assert whole.summary.verdict == "violated"
+    assert [(each.stage, each.case) for each in whole.flown] == [(each.stage, each.case) for each in other.flown]
+    assert whole.summary.violation == other.summary.violation
+    shorter, third = fly(flights=20), fly(flights=20, seed=2)
+    assert [each.case for each in shorter.flown] == [each.case for each in whole.flown[:20]]
+    assert whole.flown[1].case != third.flown[1].case
 
 
-def test_search_near_low_margins_needs_fewer_flights_than_drawing_alone(fly: Callable[..., Hunted]) -> None:
-    counts = [sum(each.stage == SEARCH for each in fly(seed=seed).flown) for seed in range(3)]
+def test_search_near_low_margins_needs_fewer_flights_than_drawing_alone(
+    fly: Callable[..., Hunted], whole: Hunted
+) -> None:
+    counts = [sum(each.stage == SEARCH for each in one.flown) for one in (whole, fly(seed=0), fly(seed=2))]
     space, drawn = HuntSpace(DOCUMENT, "pair.yaml", KINDS), 2000
     hits = 0
     for number in range(drawn):
@@ -187,12 +194,12 @@ def test_a_flight_without_faults_that_breaks_it_already_needs_none(
 
 @pytest.mark.parametrize(("stops_after", "verdict"), [(5, "interrupted"), (None, "violated")])
 def test_ctrl_c_leaves_what_was_found(
-    fly: Callable[..., Hunted], monkeypatch: pytest.MonkeyPatch, stops_after: int | None, verdict: str
+    fly: Callable[..., Hunted], whole: Hunted, monkeypatch: pytest.MonkeyPatch, stops_after: int | None, verdict: str
 ) -> None:
     if stops_after is None:
-        stops_after = sum(each.stage == SEARCH for each in fly().flown) + 10  # while it shrinks
+        stops_after = sum(each.stage == SEARCH for each in whole.flown) + 10  # while it shrinks
     monkeypatch.setattr(FakePool, "stops_after", stops_after)
-    hunted = fly(workers=1)
+    hunted = fly()
     assert (hunted.summary.verdict, hunted.summary.interrupted) == (verdict, True)
     assert len(rows_of(hunted)) == len(hunted.flown) <= stops_after
 

@@ -389,7 +389,7 @@ def test_a_report_is_not_written_through_a_link(tmp_path: Path, name: str) -> No
     link.symlink_to(elsewhere)
     with refused(ReportError, str(link), "link"):
         if name == "figures":
-            write_report(folder, b"{}", (), lambda _: "", lambda _: None)
+            write_report(folder, {}, (), lambda _: "", lambda _: None)
         else:
             write_page(folder / "report.html", (), lambda _: "", lambda _: None)
     assert [path.name for path in elsewhere.iterdir()] == ["drones.svg"]

@@ -15,7 +15,8 @@ from refused import has_terms, without_tags
 from sweep_rows import made, plan, printed, well
 
 from zsim.errors import ReportError
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
+from zsim_analysis.report import indented_json
 from zsim_analysis.sweep.design import SweepDesign, SweepPlan
 from zsim_analysis.sweep.sweep import locked, read_table
 from zsim_analysis.sweep.sweep_figures import BEYOND_AXIS, NEVER_AS_PLANNED, figures, slices
@@ -174,7 +175,7 @@ def test_the_report_says_which_cluster_and_how_many_were_engaged(tmp_path: Path)
         again = folder.compact()
     assert [row["clusters.errors.engaged_s"] for row in again] == [None, 6.0] * 4
     read = judged(of, read_table(tmp_path / "sweep.parquet"))
-    assert read.summary().json() == (tmp_path / "summary.json").read_bytes()
+    assert indented_json(read.summary()) == (tmp_path / "summary.json").read_bytes()
 
 
 @undrawn

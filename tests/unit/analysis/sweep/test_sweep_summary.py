@@ -7,7 +7,7 @@ import pytest
 import scipy.stats
 from sweep_rows import made, plan, well
 
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
 from zsim_analysis.sweep.design import SweepDesign
 from zsim_analysis.sweep.sweep_summary import (
     LEVEL,

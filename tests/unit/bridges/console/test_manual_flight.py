@@ -16,8 +16,8 @@ from zsim.contract.flight_messages import ViewCluster
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Piloted
 from zsim.vehicles.vehicle import Limits
+from zsim_agents.references.cruise import Course
 from zsim_agents.references.path import SHARE, PathLimits
-from zsim_agents.references.tracking import Course
 from zsim_bridges.console.manual_flight import (
     GONE_S,
     PERIOD_S,

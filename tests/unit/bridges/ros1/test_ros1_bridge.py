@@ -13,7 +13,7 @@ from synthetic_pictures import AHEAD, FRONT_P_BK, NO_JPEG, image, info, jpeg
 from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.framing import GateMessages, encode_batch, key_table
 from zsim.errors import RunError, SessionError
-from zsim.runtime.health import HealthMeter
+from zsim.runtime.membership import HealthMeter
 from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.transport.session import RawSample, ReceivedSample

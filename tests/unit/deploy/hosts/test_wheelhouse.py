@@ -100,6 +100,7 @@ def test_versions_are_those_of_here_and_others_only_where_there_are_none(index: 
         return others
 
     assert not download("gadget==1.0")
+    write_wheel(index, "gadget")  # from here on, nothing is built
     assert download("gadget==0.9")
     assert download("gadget==0.9", "gadget==1.0")
 
@@ -155,7 +156,9 @@ def test_a_project_that_cannot_be_built_is_a_line(checkout: Path, tmp_path: Path
 
 
 @pytest.fixture
-def no_gadget(index: Path, checkout: Path) -> None:
+def no_gadget(index: Path, checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let there be no gadget, of whatever version."""
+    monkeypatch.setattr(wheelhouse, "constraints", list)
     (index / "gadget-1.0.tar.gz").unlink()
     (index / "gadget-1.0-py3-none-any.whl").unlink()
 

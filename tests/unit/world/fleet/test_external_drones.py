@@ -12,8 +12,7 @@ from refused import has_terms
 from zsim.contract import keys
 from zsim.contract.flight_messages import POSE_AGE_MAX_NS, Ardrone, Attitude, Mode, RotorSpeeds, Status, Truth, Velocity
 from zsim.scenario.scenario_file import resolve
-from zsim_world.fleet.external_drones import ExternalDrones
-from zsim_world.fleet.fleet import Fleet
+from zsim_world.fleet.fleet import ExternalDrones, Fleet
 from zsim_world.fleet.publication import GatePublication
 
 GATE_NS = 20_000_000

@@ -12,8 +12,7 @@ from vehicle_rows import one_drone, per_rotor
 
 from zsim.scenario.scenario_file import resolve
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
-from zsim.vehicles.vehicle import Rotor, Vehicle
-from zsim.vehicles.vehicle_catalogue import STOCK, vehicle_of
+from zsim.vehicles.vehicle import MODELS, Rotor, Vehicle, vehicle_of
 from zsim_world.physics import rigid_body
 from zsim_world.physics.fleet_arrays import (
     CROSS_ROTORS,
@@ -154,13 +153,13 @@ def plus() -> Vehicle:
     ends: tuple[tuple[str, float, float, Literal[-1, 1]], ...] = (
         ("ahead", 1.0, 0.0, 1), ("right", 0.0, -1.0, -1), ("behind", -1.0, 0.0, 1), ("left", 0.0, 1.0, -1)
     )  # fmt: skip
-    vehicle = STOCK["ardrone2"]
+    vehicle = vehicle_of("ardrone2")
     arm_m = vehicle.arm_m
     rotors = tuple(Rotor(name=name, x_m=arm_m * x, y_m=arm_m * y, turn=turn) for name, x, y, turn in ends)
     return replace(vehicle, rotors=rotors)
 
 
-@pytest.mark.parametrize("model", STOCK)
+@pytest.mark.parametrize("model", MODELS)
 def test_the_constants_are_those_of_the_stock_vehicles(model: str):
     _, rotors = one_drone(model=model)
     assert len(rotors.each) == CROSS_ROTORS
@@ -171,7 +170,7 @@ def test_the_constants_are_those_of_the_stock_vehicles(model: str):
 
 
 def test_other_vehicles_have_places_of_their_own():
-    stock = list(STOCK.values())
+    stock = [*map(vehicle_of, MODELS)]
     assert rotor_slots(stock) == CROSS_ROTORS
     assert rotor_slots([*stock, plus()]) == CROSS_ROTORS + 1
     assert rotor_slots([*stock, vehicle_of("hexacopter")]) == 6

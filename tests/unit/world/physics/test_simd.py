@@ -10,8 +10,7 @@ from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.physics import rigid_body as body
 from zsim_world.physics import simd
-from zsim_world.physics.fleet_arrays import STATE, PerRotor
-from zsim_world.physics.rigid_body import four, put, vector
+from zsim_world.physics.fleet_arrays import STATE, PerRotor, four, put, vector
 from zsim_world.physics.surfaces import drag_anchors
 
 DT = 0.0025  # s

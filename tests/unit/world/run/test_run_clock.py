@@ -1,4 +1,4 @@
-"""Simulated time of a run: its states, and the requests that change it."""
+"""Simulated time of a run: its states, the requests that change it, and what a run measures of itself."""
 
 import math
 from typing import Any
@@ -9,7 +9,7 @@ from refused import has_terms
 from zsim.contract.run_messages import ControlRequest
 from zsim.scenario.scenario import TimeSteps
 from zsim_world.run.outbox import Refusal
-from zsim_world.run.run_clock import RunClock
+from zsim_world.run.run_clock import GATES_KEPT, CommandAges, RealTimeFactor, RunClock, RunStatistics
 
 GATE_NS = 20_000_000
 
@@ -77,3 +77,115 @@ def test_of_several_reasons_to_end_the_first_is_kept():
     made.stop("later")
     assert has_terms(made.ended, "tester.one", "lunch")
     assert made.is_halted
+
+
+MS = 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("gates", "commands", "summary"),
+    [
+        ([], [], None),
+        ([(0, 0)], [(7, 5)], None),
+        ([(0, 100), (GATE_NS, 120)], [(0, 103), (GATE_NS, 121)], (2.0, 2.98, 3.0)),
+        ([(0, 0)], [(0, age_ms) for age_ms in range(101)], (50.0, 99.0, 100.0)),
+        ([(gate, gate) for gate in range(GATES_KEPT + 1)], [(0, 10)], None),
+        ([(gate, gate) for gate in range(GATES_KEPT + 1)], [(1, 11)], (10.0, 10.0, 10.0)),
+        ([(0, 5), (0, 9), *((g, g) for g in range(1, 2 * GATES_KEPT))], [(GATES_KEPT, GATES_KEPT + 1)], (1.0,) * 3),
+    ],
+    ids=["none", "of no gate", "of two gates", "many", "of a forgotten gate", "of the oldest", "published twice"],
+)
+def test_the_age_of_a_command_is_counted_from_the_gate_that_it_answers(
+    gates: list[tuple[int, int]], commands: list[tuple[int, int]], summary: tuple[float, ...] | None
+):
+    ages = CommandAges()
+    for t_ns, wall_ms in gates:
+        ages.gate(t_ns, wall_ms * MS)
+    for t_ns, wall_ms in commands:
+        ages.command(t_ns, wall_ms * MS)
+    wanted = summary and dict(zip(("p50", "p99", "max"), summary, strict=True))
+    assert ages.summary_ms() == (pytest.approx(wanted) if wanted else None)
+
+
+def test_old_ages_are_forgotten(monkeypatch):
+    monkeypatch.setattr("zsim_world.run.run_clock.AGES_KEPT", 2)
+    ages = CommandAges()
+    ages.gate(0, 0)
+    for age_ms in (9, 8, 3, 2, 1):
+        ages.command(0, age_ms * MS)
+    assert ages.summary_ms() == pytest.approx({"p50": 1.5, "p99": 1.99, "max": 2.0})
+
+
+def test_the_rate_is_simulated_per_wall_time_over_the_last_second():
+    rate = RealTimeFactor()
+    assert (rate.now(), rate.wall_s) == (0.0, 0.0)
+    rate.gate(0, 7_000 * MS)
+    assert rate.now() == 0.0
+    for gate in range(1, 101):
+        rate.gate(gate * GATE_NS, 7_000 * MS + gate * 5 * MS)
+    assert (rate.now(), rate.wall_s) == pytest.approx((4.0, 0.5))
+    for gate in range(101, 301):
+        rate.gate(gate * GATE_NS, 7_500 * MS + (gate - 100) * 10 * MS)
+    assert rate.now() == pytest.approx(2.0, rel=0.02)
+    assert rate.wall_s == pytest.approx(2.5)
+
+
+@pytest.mark.parametrize(
+    ("wall_ms", "now"), [([0, 5_000, 10_000, 15_000], 0.004), ([5, 5], 0.0)], ids=["rare gates", "a standing clock"]
+)
+def test_any_wall_clock_gives_a_rate(wall_ms: list[int], now: float):
+    rate = RealTimeFactor()
+    for gate, wall in enumerate(wall_ms):
+        rate.gate(gate * GATE_NS, wall * MS)
+    assert rate.now() == pytest.approx(now)
+
+
+def test_time_that_jumps_does_not_pass():
+    """From 300 s on, five seconds at twice its pace; then back to 1 s, and five more."""
+    rate = RealTimeFactor()
+    for number in range(11):
+        if number == 6:
+            rate.jump()
+        t_s = 300 + number if number < 6 else number - 5
+        rate.gate(t_s * 1_000 * MS, number * 500 * MS)
+        assert rate.now() == pytest.approx(0.0 if number in (0, 6) else 2.0)
+    assert (rate.sim_ns / 1e9, rate.wall_s) == pytest.approx((9.0, 5.0))
+
+
+def test_simulated_time_passes_from_before_a_stand_to_the_gate_after_it():
+    rate = RealTimeFactor()
+    rate.gate(0, 0)
+    rate.gate(GATE_NS, 20 * MS)
+    rate.stand_still(5_000 * MS)
+    rate.gate(2 * GATE_NS, 5_010 * MS)
+    assert (rate.sim_ns, rate.wall_s, rate.now()) == (2 * GATE_NS, pytest.approx(0.03), pytest.approx(2.0))
+
+
+class Owing:
+    """A participant that owes its dones up to a gate."""
+
+    def __init__(self, name: str, owes_until_ns: int) -> None:
+        self.name, self.gating, self.deadline_misses = name, True, 0
+        self._owes_until_ns = owes_until_ns
+
+    def required_ns(self, need_ns: int) -> int | None:
+        return need_ns if need_ns >= 0 else None
+
+    def blocks(self, need_ns: int) -> bool:
+        return need_ns < self._owes_until_ns
+
+
+def test_the_result_counts_who_was_late_and_how_near_drones_came():
+    measured = RunStatistics()
+    both: list[Any] = [Owing("late", 2), Owing("quick", 0)]
+    for need_ns in (-1, 0, 1, 2):
+        measured.deadlines(both, need_ns)
+    measured.world_misses += 1
+    for t_ns, wall_ns in ((0, 0), (2_000_000_000, 500_000_000)):
+        measured.gate(t_ns, wall_ns)
+    result = measured.result(both)
+    assert (result["real_time_factor"], result["deadlines"], result["deadline_misses"]) == (4.0, 6, 3)
+    assert result["deadline_misses_by"] == {"late": 2, "quick": 0, "world": 1}
+    assert result["closest_m"] is None
+    measured.closest_m = 0.5
+    assert measured.result(both)["closest_m"] == 0.5

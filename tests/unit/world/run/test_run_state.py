@@ -8,10 +8,9 @@ from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Mode, Velocity
 from zsim.contract.framing import GateMessages
 from zsim.contract.run_messages import ControlRequest, Done, Join
-from zsim.contract.snapshot import pack, unpack
+from zsim.contract.snapshot import pack, restore, unpack
 from zsim.scenario import scenario_file
 from zsim_world.run.world import World
-from zsim_world.run_state import restore
 
 GATE_NS = 20_000_000
 GATES = 340

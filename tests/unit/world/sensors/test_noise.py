@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from zsim.math.compiled import kernel
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
 from zsim.scenario.scenario_file import resolve
 from zsim_world.sensors.noise import WORDS, NoiseTable, fill, words
 from zsim_world.sensors.sensor_set import CHANNELS, SENSORS

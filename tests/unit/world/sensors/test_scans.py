@@ -9,14 +9,13 @@ import pytest
 from zsim.contract import messages
 from zsim.contract.messages import Depth, Lidar, Range
 from zsim.contract.run_messages import Fault
-from zsim.contract.snapshot import pack, unpack
+from zsim.contract.snapshot import pack, restore, saved_state, unpack
 from zsim.math.frames import rotation_matrix
 from zsim.scenario.scenario_file import resolve
 from zsim.sensors.scanner import SCANNERS
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.fleet.publication import GatePublication
 from zsim_world.physics.fleet_arrays import VEHICLE
-from zsim_world.run_state import restore, saved_state
 
 WALL = {"name": "wall", "shape": "box", "position_m": [6, 0, 0], "size_m": [2, 40, 20]}  # its face is at x = 5
 EXACT = {"noise_m": 0, "noise_share": 0, "noise_1_m": 0, "bias_m": 0}

@@ -1,5 +1,6 @@
-"""Sightings: when pictures are taken, what errors they have, and that chance goes on where it was."""
+"""Sightings: which hats are in view, when pictures are taken, their errors, and that chance goes on where it was."""
 
+import math
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -9,10 +10,15 @@ import pytest
 from continued import continue_from
 from numpy.typing import NDArray
 
+from zsim.math.frames import quaternion_from_rpy
 from zsim.scenario import scenario_file
-from zsim.scenario.scenario import Scenario
+from zsim.scenario.scenario import Obstacle, Scenario
+from zsim.scenario.surroundings import COLUMNS, TRIANGLE, row_of
+from zsim.sensors.camera import FrontCamera
+from zsim.sensors.camera_model import camera_pose, lens_of
+from zsim_world.physics.fleet_arrays import STATE
 from zsim_world.physics.rays import scene
-from zsim_world.sensors.sightings import PictureSightings, SightingSampler
+from zsim_world.sensors.sightings import POINTS, VIEW, MountedCamera, PictureSightings, SightingSampler, hats_in_view
 
 GATE_NS = 20_000_000
 SCENARIO = """
@@ -120,3 +126,148 @@ def test_it_goes_on_from_a_snapshot():
     continue_from(first, second)
     after: list[Any] = sampled(second, range(101, 200))
     assert before + after == whole
+
+
+HAT_B, DIAMETER_M, HULL_M = (-0.03, 0.0, 0.11), 0.14, 0.26
+LENS_B = (0.162, 0.0, 0.012)  # of the front camera
+
+
+def pose(x: float, y: float, z: float, rpy_deg: tuple[float, float, float] = (0, 0, 0)) -> NDArray[np.float64]:
+    row = np.zeros(STATE.size)
+    row[:3], row[STATE.q_WB : STATE.q_WB + 4] = (x, y, z), quaternion_from_rpy(np.radians(rpy_deg))
+    return row
+
+
+def look(
+    poses: list[NDArray[np.float64]],
+    balls: list[tuple[float, float, float]] | None = None,
+    bare: list[bool] | None = None,
+    obstacles: list[Obstacle] | None = None,
+    triangles: list[list[tuple[float, float, float]]] | None = None,
+) -> NDArray[np.float64]:
+    """Return what the front camera of the first drone has in view."""
+    at, camera = camera_pose(FrontCamera()), FrontCamera()
+    x, y, z = at.p_BK.tolist()
+    w, i, j, k = at.q_BK
+    mounted = MountedCamera(lens_of(camera), (x, y, z), (w, i, j, k))
+    view = np.zeros((len(poses) + len(balls or []), VIEW.size))
+    rows = np.array([row_of(each) for each in obstacles or []]).reshape(-1, COLUMNS)
+    corners = np.array(triangles or []).reshape(-1, 3, 3)
+    sheet = np.concatenate([corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=1)
+    around = scene(rows, sheet.reshape(-1, TRIANGLE))
+    spheres, seen = np.array(balls or []).reshape(-1, 3), np.array(bare or [True] * len(poses))
+    hulls = np.full(len(poses), HULL_M)
+    hats_in_view(mounted, 0, np.array(poses), hulls, HAT_B, DIAMETER_M, spheres, seen, around, view)
+    return view
+
+
+def test_a_hat_ahead_is_seen_where_it_is():
+    view = look([pose(0, 0, 5), pose(4, 1, 5.5)])
+    to_B = np.array([4 + HAT_B[0] - LENS_B[0], 1.0, 0.5 + HAT_B[2] - LENS_B[2]])
+    away = float(np.linalg.norm(to_B))
+    assert view[:, VIEW.seen].tolist() == [0.0, 1.0]
+    to_K = view[1, VIEW.direction_K : VIEW.direction_K + 3]
+    assert to_K == pytest.approx(np.array([-to_B[1], -to_B[2], to_B[0]]) / away)
+    assert view[1, VIEW.range] == pytest.approx(away)
+    assert view[1, VIEW.angle] == pytest.approx(2 * math.asin(DIAMETER_M / 2 / away))
+
+
+@pytest.mark.parametrize(("yaw_deg", "seen"), [(0, 1), (40, 1), (42, 0), (-40, 1), (-42, 0), (180, 0)])
+def test_a_hat_is_seen_within_the_picture_s_width(yaw_deg: float, seen: int):
+    # 92 deg across the diagonal of 640 x 360 are 84.2 deg across the width, less than the hat itself; all level
+    view = look(
+        [
+            pose(
+                -LENS_B[0] * math.cos(math.radians(yaw_deg)),
+                -LENS_B[0] * math.sin(math.radians(yaw_deg)),
+                0,
+                (0, 0, yaw_deg),
+            ),
+            pose(4 - HAT_B[0], 0, LENS_B[2] - HAT_B[2]),
+        ]
+    )
+    assert view[1, VIEW.seen] == seen
+
+
+def test_a_covered_hat_is_not_seen_and_a_false_one_is():
+    view = look([pose(0, 0, 5), pose(4, 0, 5)], balls=[(3.0, 1.0, 5.0)], bare=[True, False])
+    assert view[:, VIEW.seen].tolist() == [0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize(("height_m", "seen"), [(0.03, 0), (0.1, 0), (0.5, 1), (-0.5, 1)])
+def test_a_hull_in_between_hides_it(height_m: float, seen: int):
+    """The middle one stands in the line of sight, which rises by 0.1 m over 4 m, or over or under it."""
+    view = look([pose(0, 0, 5), pose(4, 0, 5), pose(2, 0, 5 + height_m)], bare=[True, True, False])
+    assert view[1, VIEW.seen] == seen
+
+
+def test_its_own_hull_hides_a_hat_from_below():
+    view = look([pose(0, 0, 5, (0, -30, 0)), pose(0.8, 0, 6.5)])
+    assert view[1, VIEW.seen] == 0.0
+
+
+RIM_M = 1.15 * HULL_M, 0.14 * HULL_M  # radius and height of the rotors' rim
+
+
+@pytest.mark.parametrize("below_deg", [-10.0, 0.0, 4.0, 8.0, 12.0])
+def test_its_own_rotors_hide_a_hat_from_its_lower_edge_on(below_deg: float):
+    """A straight edge hides an arc of its edge, by the height of the rim's near edge over the hat's lower one."""
+    slope = math.tan(math.radians(below_deg))
+    view = look([pose(-LENS_B[0], 0, 5 - LENS_B[2]), pose(4.0 - HAT_B[0], 0, 5 + 4.0 * slope - HAT_B[2])])
+    hidden_m = RIM_M[1] + (RIM_M[0] + HAT_B[0]) * slope - (HAT_B[2] - DIAMETER_M / 2)
+    cut = min(max(hidden_m / DIAMETER_M, 0.0), 1.0) if below_deg > 0 else 0.0
+    arc = 1 - math.acos(1 - 2 * cut) / math.pi
+    beside = 2 / POINTS if cut else 0.0  # the points beside it are left out
+    row = view[1]
+    assert row[VIEW.share] == pytest.approx(arc - beside, abs=2 / POINTS)
+    assert (row[VIEW.centre] > 1.0, row[VIEW.radius] > 1.0) == (cut > 0, cut > 0)
+
+
+def test_an_edge_that_is_visible_to_a_half_tells_the_circle_as_least_squares_do():
+    """A wall hides the right half; of a circle through 15 points of 32 the errors are those of (A^T A)^-1."""
+    wall = Obstacle(name="wall", shape="box", position_m=(2, -1.0001, 0), size_m=(0.01, 2, 20))
+    view = look([pose(0, 0, 5), pose(4, 0, 5)], obstacles=[wall])[1]
+    count = round(view[VIEW.share] * POINTS)
+    turns = 2 * math.pi * (np.arange(count) - (count - 1) / 2) / POINTS
+    A = np.column_stack([np.cos(turns), np.sin(turns), np.ones(count)])
+    of_part = np.diag(np.linalg.inv(A.T @ A))
+    assert count in (13, 14, 15)
+    assert view[VIEW.centre] == pytest.approx(math.sqrt((of_part[0] + of_part[1]) / 2 / (2 / POINTS)), rel=1e-6)
+    assert view[VIEW.radius] == pytest.approx(math.sqrt(of_part[2] * POINTS), rel=1e-6)
+
+
+OBSTACLES = [
+    Obstacle(name="box", shape="box", position_m=(2, 0, 0), size_m=(0.2, 2, 10)),
+    Obstacle(name="pole", shape="cylinder", position_m=(2, 0, 0), radius_m=0.1, height_m=10),
+    Obstacle(name="ball", shape="sphere", position_m=(2, 0, 5.05), radius_m=0.3),
+]
+
+
+@pytest.mark.parametrize("obstacle", OBSTACLES, ids=lambda obstacle: obstacle.name)
+@pytest.mark.parametrize(("y", "seen"), [(0.0, 0), (6.0, 1)])
+def test_an_obstacle_in_between_hides_it(obstacle: Obstacle, y: float, seen: int):
+    """The second pair stands beside the obstacle."""
+    view = look([pose(0, y, 5), pose(4, y, 5)], obstacles=[obstacle])
+    assert view[1, VIEW.seen] == seen
+
+
+@pytest.mark.parametrize(("below_m", "share"), [(-0.06, 1.0), (0.0, 0.5), (0.06, 0.0)])
+def test_a_hill_in_between_hides_the_part_of_a_hat_that_is_below_its_crest(below_m: float, share: float):
+    """A crest in the middle between lens and hat, its height that of their line and so much above it, of a hat of 14 cm."""
+    line_m = 0.5 * (5 + LENS_B[2] + 5 + HAT_B[2])
+    x, z = 0.5 * (LENS_B[0] + 4 + HAT_B[0]), line_m + below_m
+    slopes = [[(x, -9.0, z), (x, 9.0, z), (x + side, 0.0, 0.0)] for side in (-1.0, 1.0)]
+    row = look([pose(0, 0, 5), pose(4, 0, 5)], triangles=slopes)[1]
+    beside = 2 / POINTS if share == 0.5 else 0.0  # the points beside what is hidden are left out
+    assert row[VIEW.share] == pytest.approx(share - beside, abs=1 / POINTS)
+    assert row[VIEW.seen] == (share > 0.0)
+
+
+def test_it_moves_over_the_picture_as_the_drones_move_and_turn():
+    watcher, other = pose(0, 0, 5), pose(4, 0, 5)
+    away = 4 + HAT_B[0] - LENS_B[0]
+    other[STATE.v_WB + 1] = 2.0
+    assert look([watcher, other])[1, VIEW.rate] == pytest.approx(2.0 / away, rel=0.01)
+    watcher[STATE.w_WB_B + 2] = 0.5
+    watcher[STATE.v_WB : STATE.v_WB + 3] = other[STATE.v_WB : STATE.v_WB + 3]
+    assert look([watcher, other])[1, VIEW.rate] == pytest.approx(0.5 * (1 + LENS_B[0] / away), rel=0.01)

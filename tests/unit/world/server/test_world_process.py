@@ -1,12 +1,13 @@
-"""The world as a process: what strangers send it, outputs that got lost, a state that is no longer finite."""
+"""The world as a process: what strangers send, lost outputs, a state that is no longer finite, and when gates are delayed."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import msgspec
 import pytest
 from fake_link import BAD_UTF8, NESTED, UNANSWERED, FakeLink
 from refused import has_terms, parts, refused
+from small_world import GATE_NS, small_world
 from synthetic_pictures import image, info, sightings
 
 from zsim.contract import keys, messages, run_messages
@@ -14,30 +15,22 @@ from zsim.contract.flight_messages import ClusterState, Estimate, Velocity
 from zsim.contract.framing import decode_batch
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Done, Event, Health, Join
 from zsim.errors import DecodeError
-from zsim.runtime.health import HealthMeter
-from zsim.scenario import roles, scenario_file
+from zsim.runtime.membership import HealthMeter
+from zsim.scenario import roles
 from zsim.schema.message import Message
 from zsim_world.fleet.fleet import DivergedError
 from zsim_world.run.world import DURATION_OVER, World
-from zsim_world.server.world_process import WorldProcess
+from zsim_world.server.world_process import DELAY_MAX_NS, GATES_SENT, LAG_GATES, Pipelining, TurnWatch, WorldProcess
 
-GATE_NS = 20_000_000
 GATES = 10
 ME = "tester.one"
 FRONT, FRONT_INFO, DETECTIONS = keys.camera("d1", "front"), keys.camera_info("d1", "front"), keys.detections("d1")
 ESTIMATE, STATE, VELOCITY = keys.estimate("d1"), keys.cluster_state("main"), keys.command("d1", "velocity")
-SCENARIO = f"""
-name: one
-seed: 3
-duration_s: {GATES * GATE_NS / 1e9}
-drones: [{{name: d1, position_m: [0, 0, 0]}}]
-processes: {{expect: []}}
-"""
 ZEROS = (0.0, 0.0, 0.0)
 
 
 def world(*expect: str) -> World:
-    made = World(scenario_file.from_text(SCENARIO), run_id="run1")
+    made = small_world(duration_s=GATES * GATE_NS / 1e9)
     for name in expect:
         made.barrier.expect(name)
     return made
@@ -306,8 +299,7 @@ def test_a_diverged_state_ends_the_run_for_everybody(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(("action", "waits"), [("restart", True), ("wait", True), ("end", False), ("drop", False)])
 def test_the_end_waits_for_a_recorder_that_died_where_it_comes_back(action: str, waits: bool):
     """It has the last gates to write; others have nothing to do any more."""
-    text = SCENARIO.replace("{expect: []}", f"{{expect: [], on_death: {{recorder: {action}}}}}")
-    made = World(scenario_file.from_text(text), run_id="run1")
+    made = small_world(processes={"on_death": {"recorder": action}})
     join = Join(0, 0, "run1", 1, "recorder", "here", 1, 0, slack_ns=GATE_NS)
     made.handle(keys.process("recorder", "join"), join, 0)
     made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 1, "tester", "here", 2, GATE_NS), 0)
@@ -329,3 +321,104 @@ def test_the_end_names_whom_it_waits_for():
     waited = [clock for clock in link.published_on(keys.CLOCK) if clock.state == "stopped" and clock.waiting_for]
     assert [each.name for each in waited[0].waiting_for] == ["recorder"]
     assert waited[0].waiting_for[0].since_wall_s == pytest.approx(1.0, abs=0.5)
+
+
+class Lagging:
+    """A world of one agent that is through with `done` gates; the delay is five gates."""
+
+    def __init__(self, delay: int = 5, mode: str = "lockstep", rate: float = 0.0) -> None:
+        self.gate_ns, self.ahead_ns = GATE_NS, delay * GATE_NS
+        self.mode, self.rate = mode, rate
+        self.clock = self
+        self.now, self.done = 0, 0
+
+    def blocking(self, ahead_ns: int = 0) -> list[str]:
+        needed = self.now - (self.ahead_ns - ahead_ns) // GATE_NS
+        return ["estimator.d1"] if self.done < needed else []
+
+    def may_advance(self) -> bool:
+        return not self.blocking()
+
+
+def pipelining_of(world: Lagging) -> Pipelining:
+    made: Any = Pipelining
+    return made(world)
+
+
+def advance(world: Lagging, pipelining: Pipelining, wall_ns: int = 0) -> int:
+    """Go on as the process does; return how many gates that were."""
+    gates = 0
+    while world.may_advance() and not pipelining.delays(wall_ns):
+        world.now += 1
+        gates += 1
+    pipelining.pause(wall_ns)
+    return gates
+
+
+def test_once_it_must_wait_it_goes_on_when_the_agent_has_nearly_caught_up() -> None:
+    world = Lagging()
+    pipelining = pipelining_of(world)
+    assert advance(world, pipelining) == 6  # the first five need nothing
+    gates = []
+    for _ in range(12):
+        world.done += 1
+        gates.append(advance(world, pipelining))
+    size = 5 - LAG_GATES + 1
+    assert gates[:8] == [0] * (size - 1) + [size] + [0] * (size - 1) + [size]
+    assert world.now - world.done <= 5 + 1
+
+
+def test_whoever_is_slow_gets_all_the_gates_that_it_may_have() -> None:
+    world = Lagging()
+    pipelining = pipelining_of(world)
+    advance(world, pipelining)
+    world.done += 1
+    assert advance(world, pipelining, wall_ns=DELAY_MAX_NS // 2) == 0
+    assert pipelining.blocking() == ["estimator.d1"]
+    assert advance(world, pipelining, wall_ns=2 * DELAY_MAX_NS) == 1
+
+
+@pytest.mark.parametrize(
+    "world", [Lagging(mode="realtime"), Lagging(rate=1.0), Lagging(delay=1), Lagging(delay=LAG_GATES)]
+)
+def test_a_paced_world_and_one_without_slack_hold_nothing_back(world: Lagging) -> None:
+    pipelining = pipelining_of(world)
+    advance(world, pipelining)
+    for _ in range(10):
+        world.done += 1
+        assert advance(world, pipelining) == 1
+        assert not pipelining.continues()
+
+
+def test_messages_are_sent_every_few_gates_and_when_the_next_may_not_come() -> None:
+    world = Lagging(delay=9)
+    pipelining = pipelining_of(world)
+    sent = []
+    while world.may_advance():
+        world.now += 1
+        sent.append(not pipelining.continues())
+    assert sent == [(gate + 1) % GATES_SENT == 0 or gate == len(sent) - 1 for gate in range(len(sent))]
+
+
+TICK_MS = 100
+
+
+def looks(watch: TurnWatch, at_ms: Iterable[int], turn_ms: int) -> list[tuple[int, float]]:
+    """Return when something was named, and for how long it had lasted."""
+    found = [(ms, watch.stuck_s(ms * 1_000_000, turn_ms * 1_000_000)) for ms in at_ms]
+    return [(ms, stuck_s) for ms, stuck_s in found if stuck_s is not None]
+
+
+def test_a_turn_that_does_not_end_is_named_every_two_seconds() -> None:
+    named = looks(TurnWatch(0), range(TICK_MS, 5_000, TICK_MS), turn_ms=100)
+    assert named == [(2_200, 2.1), (4_300, 4.2)]
+
+
+def test_no_turn_is_not_stuck() -> None:
+    assert looks(TurnWatch(0), range(TICK_MS, 5_000, TICK_MS), turn_ms=0) == []
+
+
+def test_a_process_that_stood_was_not_stuck() -> None:
+    watch = TurnWatch(0)
+    assert looks(watch, [100, 12_100, 12_200], turn_ms=50) == []
+    assert looks(watch, range(12_300, 14_300, TICK_MS), turn_ms=50) == [(14_200, 2.1)]

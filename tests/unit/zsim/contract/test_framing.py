@@ -1,12 +1,16 @@
-"""All that the world says at a gate in one buffer: written, sent, read, recorded as the messages one by one."""
+"""Messages in one payload and messages from rows of numbers: the same bytes as one by one, whatever comes."""
+
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from refused import refused
 
-from zsim.contract import keys, messages
-from zsim.contract.framing import GateMessages, key_table
+from zsim.contract import flight_messages, keys, messages
+from zsim.contract.framing import BOOL, FLOATS, INT, TEXT, GateMessages, Layouts, key_table, read, words, write
 from zsim.errors import DecodeError
 from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
@@ -124,3 +128,117 @@ def test_a_record_that_has_no_number_left_for_a_key_takes_the_others(
         writer.add_gate(flown[0], 5)
     assert writer.refused == len(flown[0]) - len(list(RecordReader(tmp_path / "run.mcap")))
     assert len({message.key for message in RecordReader(tmp_path / "run.mcap")}) == 2
+
+
+EDGES = (0, 127, 128, 255, 256, 65535, 65536, 2**32 - 1, 2**32, 2**63 - 1, -1, -32, -33, -128, -129, -32768, -32769)
+EDGES += (-(2**31), -(2**31) - 1, -(2**62) - 1, -(2**63))
+WHOLE = st.integers(-(2**63), 2**63 - 1) | st.sampled_from(EDGES)
+COUNT = WHOLE.map(lambda value: value if value >= 0 else -(value + 1))
+NUMBER = st.floats(allow_nan=False, allow_infinity=False)
+TEXTS = ["landed", "flying", "", "controller.main", "ö" * 15, None]
+
+
+def written(kinds: list[Any], rows: list[tuple[int, list[int], list[float]]]) -> list[bytes]:
+    """Return what is written of (kind, whole numbers, floats), having read again what can be."""
+    layouts, texts = Layouts(kinds), words(TEXTS)
+    found = []
+    for kind, whole, real in rows:
+        ints, floats = padded(whole, layouts.ints, np.int64), padded(real, layouts.floats, np.float64)
+        out = np.zeros(layouts.room(texts), dtype=np.uint8)
+        size = write(layouts.program, texts, kind, ints, floats.view(np.uint64), out, 0)
+        found.append(out[:size].tobytes())
+        check_reading(layouts, kind, found[-1], ints, floats)
+    return found
+
+
+def padded(values: Any, size: int, dtype: type) -> np.ndarray:
+    return np.array([*values, *[0] * size][:size], dtype=dtype)
+
+
+def check_reading(layouts: Layouts, kind: int, payload: bytes, ints: np.ndarray, floats: np.ndarray) -> None:
+    """Whatever was written is read again, but for texts and numbers below zero; what is cut off or longer is not."""
+    data, program = np.frombuffer(payload, dtype=np.uint8), layouts.program
+    again, bits = ints.copy(), np.zeros(len(floats), dtype=np.uint64)
+    for end in range(0, len(data), 41):
+        assert not read(program, kind, data, 0, end, again, bits)
+    assert not read(program, kind, np.append(data, np.uint8(0)), 0, len(data) + 1, again, bits)
+    again, bits = ints.copy(), floats.view(np.uint64).copy()
+    places, readable = program.ops[program.first[kind] : program.first[kind + 1]], True
+    for op, place, size in places.tolist():
+        readable = readable and op != TEXT and not (op == INT and ints[place] < 0)
+        if op in (INT, BOOL):
+            again[place] = 99
+        elif op == FLOATS:
+            bits[place : place + size] = 0
+    assert read(program, kind, data, 0, len(data), again, bits) == readable
+    if readable:
+        assert again.tolist() == ints.tolist()
+        assert bits.tolist() == floats.view(np.uint64).tolist()
+
+
+@pytest.mark.parametrize("whole", EDGES)
+def test_whole_numbers_at_the_edges_give_the_encoders_bytes(whole: int) -> None:
+    message: Any = messages.Imu(0, 0, whole, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    assert written([messages.Imu], [(0, [0, 0, whole], [])]) == [messages.encode(message)]
+
+
+@given(st.data())
+@settings(max_examples=10, deadline=None)
+def test_any_numbers_give_the_encoders_bytes(data: st.DataObject) -> None:
+    t_ns, seq, count, sample_ns = data.draw(COUNT), data.draw(COUNT), data.draw(COUNT), data.draw(WHOLE)
+    real: Any = tuple(data.draw(st.lists(NUMBER, min_size=20, max_size=20)))
+    flag, text, name = data.draw(st.booleans()), data.draw(st.integers(0, 1)), data.draw(st.integers(0, len(TEXTS) - 1))
+    state: Any = TEXTS[text]
+    cases: list[tuple[Any, list[int]]] = [
+        (messages.Imu(t_ns, seq, sample_ns, real[:3], real[3:6]), [t_ns, seq, sample_ns]),
+        (
+            messages.Gps(t_ns, seq, sample_ns, real[0], real[1], real[2], real[3:6], real[6:9], real[9], count, 9),
+            [t_ns, seq, sample_ns, count, 9],
+        ),
+        (messages.Sonar(t_ns, seq, sample_ns, real[0], flag), [t_ns, seq, sample_ns, flag]),
+        (
+            flight_messages.Status(t_ns, seq, state, real[0], flag, TEXTS[name], count),
+            [t_ns, seq, text, flag, name, count],
+        ),
+    ]
+    rows = [(k, whole, real) for k, (_, whole) in enumerate(cases)]
+    found = written([type(message) for message, _ in cases], rows)
+    assert found == [messages.encode(message) for message, _ in cases]
+
+
+@pytest.mark.parametrize("kind", [messages.Mag, messages.Baro, messages.Flow, flight_messages.Truth])
+def test_every_kind_that_a_world_says_has_a_layout(kind: type) -> None:
+    values = [0.5 * k for k in range(20)]
+    whole = [7, 300] if kind is flight_messages.Truth else [7, 300, -5]
+    laid_out = (kind, 4) if kind is flight_messages.Truth else kind
+    (payload,) = written([laid_out], [(0, whole, values)])
+    message: Any = messages.decode_as(kind, payload, "here")
+    assert (message.t_ns, message.seq) == (7, 300)
+    assert messages.encode(message) == payload
+
+
+def test_a_kind_with_a_list_of_any_length_has_none() -> None:
+    class Several(msgspec.Struct):
+        values: list[float]
+
+    with pytest.raises(TypeError, match="Several: values"):
+        Layouts([Several])
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), float("-inf")])
+def test_what_is_not_finite_is_not_read(bad: float) -> None:
+    layouts = Layouts([messages.Mag])
+    payload = messages.encode(messages.Mag(1, 2, 3, (0.0, bad, 1.0)))
+    ints, bits = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.uint64)
+    assert not read(layouts.program, 0, np.frombuffer(payload, dtype=np.uint8), 0, len(payload), ints, bits)
+
+
+def test_fields_in_another_order_or_of_another_type_are_not_read() -> None:
+    layouts = Layouts([messages.Mag])
+    ints, bits = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.uint64)
+    for message in ({"seq": 1, "t_ns": 2, "t_sample_ns": 3, "field_ut": [1.0, 2.0, 3.0]},
+                    {"t_ns": 1.0, "seq": 2, "t_sample_ns": 3, "field_ut": [1.0, 2.0, 3.0]},
+                    {"t_ns": 1, "seq": 2, "t_sample_ns": 3, "field_ut": [1, 2.0, 3.0]},
+                    {"t_ns": 2**64 - 1, "seq": 2, "t_sample_ns": 3, "field_ut": [1.0, 2.0, 3.0]}):  # fmt: skip
+        data = np.frombuffer(msgspec.msgpack.encode(message), dtype=np.uint8)
+        assert not read(layouts.program, 0, data, 0, len(data), ints, bits)

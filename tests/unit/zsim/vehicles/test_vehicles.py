@@ -10,29 +10,30 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from refused import has_terms
+from refused import faults_of, has_terms
 
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import VEHICLE_NUMBERS
-from zsim.vehicles import ardrone2, vehicle_catalogue
-from zsim.vehicles.vehicle import Rotor, Vehicle, allocation, cross_layout, lift_shares, mixing
+from zsim.vehicles import ardrone2, crazyflie2
+from zsim.vehicles.vehicle import MODELS, Rotor, Vehicle, allocation, cross_layout, lift_shares, mixing, vehicle_of
 
 
 def document(**drone: Any) -> dict[str, Any]:
     return {"name": "t", "duration_s": 1, "drones": [{"name": "a", "position_m": [0, 0, 0], **drone}]}
 
 
+STOCK = {"ardrone2": ardrone2, "crazyflie2": crazyflie2}
+
+
 def fault_of(**drone: Any) -> str:
-    with pytest.raises(ScenarioError) as raised:
-        scenario_file.resolve(document(**drone))
-    (line,) = raised.value.faults
+    (line,) = faults_of(document(**drone))
     return line
 
 
-@pytest.mark.parametrize("model", vehicle_catalogue.STOCK)
+@pytest.mark.parametrize("model", MODELS)
 def test_a_stock_vehicle_gives_a_drone_its_numbers(model: str):
-    vehicle = vehicle_catalogue.vehicle_of(model)
+    vehicle = vehicle_of(model)
     drone = scenario_file.resolve(document(model=model)).drones[0]
     assert {name: getattr(drone, name) for name in VEHICLE_NUMBERS} == {
         name: getattr(vehicle, name) for name in VEHICLE_NUMBERS
@@ -41,9 +42,9 @@ def test_a_stock_vehicle_gives_a_drone_its_numbers(model: str):
     assert drone.sensors.preset == vehicle.sensor_preset
 
 
-@pytest.mark.parametrize("model", vehicle_catalogue.STOCK)
+@pytest.mark.parametrize("model", MODELS)
 def test_every_number_of_a_stock_vehicle_has_its_source_or_reason(model: str):
-    text = Path(str(getattr(vehicle_catalogue, model).__file__)).read_text()
+    text = Path(str(STOCK[model].__file__)).read_text()
     numbers = [line for line in text.splitlines() if re.match(r"\s+\w+=\(?-?[\d.]", line)]
     assert len(numbers) > 30
     assert [line for line in numbers if "#" not in line] == []
@@ -72,7 +73,7 @@ def test_a_fault_names_a_rotor_that_the_vehicle_has():
         with pytest.raises(ScenarioError) as error:
             scenario_file.resolve(document(model=model) | {"faults": [fault | {"rotor": rotor}]})
         (line,) = error.value.faults
-        names = vehicle_catalogue.vehicle_of(model).rotor_names
+        names = vehicle_of(model).rotor_names
         for part in ("faults[0].rotor", repr(rotor), ", ".join((*names, "all"))):
             assert part in line
 
@@ -99,7 +100,7 @@ def test_a_module_without_a_sound_vehicle_is_refused(monkeypatch: pytest.MonkeyP
     line = fault_of(model="my_plane")
     assert has_terms(line, "drones[0].model", "'my_plane'")
     assert found in line
-    vehicle_catalogue.vehicle_of.cache_clear()
+    vehicle_of.cache_clear()
 
 
 def with_rotors(*rotors: Rotor) -> Vehicle:
@@ -129,8 +130,7 @@ def test_rotors_that_cannot_hold_it_level_are_refused(rotors: tuple[Rotor, ...],
 
 
 def test_mixing_inverts_the_allocation_and_adds_no_thrust():
-    own = [vehicle_catalogue.vehicle_of(name) for name in ("hexacopter", "iris")]
-    for vehicle in (*vehicle_catalogue.STOCK.values(), *own):
+    for vehicle in map(vehicle_of, (*MODELS, "hexacopter", "iris")):
         np.testing.assert_allclose(allocation(vehicle) @ mixing(vehicle), np.eye(3), atol=1e-9)
         np.testing.assert_allclose(mixing(vehicle).sum(axis=0), 0.0, atol=1e-9)
 

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from zsim.runtime.health import STEPS_KEPT, HealthMeter, resident_bytes
+from zsim.runtime.membership import STEPS_KEPT, HealthMeter, resident_bytes
 
 
 class WallClock:

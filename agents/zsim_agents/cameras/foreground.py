@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.scenario.surroundings import BOX, CENTRE, COSINE, HALF, SHAPE, SINE, SPHERE, corners_of
-from zsim_agents.cameras.rendering.scene import (
+from zsim_agents.cameras.scene import (
     ARM_M,
     BLUR_MAX_PX,
     SHIFT,

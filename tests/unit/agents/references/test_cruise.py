@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from zsim.scenario.scenario import Piloted
-from zsim_agents.references.cruise import Cruise
+from zsim_agents.references.cruise import LOST_M, Axes, Course, Cruise, velocity_towards
 from zsim_agents.references.path import SHARE, PathLimits
-from zsim_agents.references.tracking import LOST_M, Axes, Course, velocity_towards
 
 LIMITS = PathLimits(5.0, 1.0, 1.0, 2.5)
 LAW = Piloted(lead_s=0.0)

@@ -19,6 +19,7 @@ from zsim.sensors.camera import Hats
 from zsim.sensors.camera_model import CameraPose, Lens, camera_matrix, undistorted
 from zsim.vehicles.vehicle import cross_layout
 
+cv2.setNumThreads(1)  # other cores belong to the world and the agents; one thread gives the same bits everywhere
 Array = NDArray[np.float64]
 Kernel = NDArray[np.float32]
 ARM_M = 0.1785  # m, of the AR.Drone, for records whose drones name no rotors

@@ -18,20 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.math.frames import rotation_matrix
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
 from zsim.scenario.surroundings import nearest
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import Lens, camera_pose, lens_of
-from zsim_agents.cameras.rendering.foreground import SEEN_M, DroneImager, SurfaceImager, draw_obstacle
-from zsim_agents.cameras.rendering.scene import (
-    SHIFT,
-    CameraMotion,
-    DroneStates,
-    Scene,
-    View,
-    camera_motion,
-    motion_blur_kernels,
-)
+from zsim_agents.cameras.foreground import SEEN_M, DroneImager, SurfaceImager, draw_obstacle, fixed
+from zsim_agents.cameras.scene import SHIFT, CameraMotion, DroneStates, Scene, View, camera_motion, motion_blur_kernels
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -291,7 +283,7 @@ class Backdrop:
                 cv2.convertScaleAbs(upwards + np.float32(a) * self._columns, dst=self.grey[slice(*rows)])
             ground = half_plane(self._size, down, 0.0)
             if len(ground) >= 3:
-                cv2.fillConvexPoly(self.grey, _fixed(ground), self._ground.mean, cv2.LINE_AA, SHIFT)
+                cv2.fillConvexPoly(self.grey, fixed(np.array(ground)), self._ground.mean, cv2.LINE_AA, SHIFT)
             first = len(self._ground.levels) - 1
         # homography from pixels to (x, y, 1) on the ground [m], in the nearest of the repeated tiles
         x, y = (p - self._ground.tile_m * round(p / self._ground.tile_m) for p in motion.p_WK[:2].tolist())
@@ -327,12 +319,8 @@ class Backdrop:
         if is_all:
             return
         mask.fill(0)
-        cv2.fillConvexPoly(mask, _fixed([(u, v - v0) for u, v in part]), 255, cv2.LINE_8, SHIFT)
+        cv2.fillConvexPoly(mask, fixed(np.array(part) - (0, v0)), 255, cv2.LINE_8, SHIFT)
         cv2.copyTo(drawn, mask, out)
-
-
-def _fixed(points: Points) -> NDArray[np.int32]:
-    return np.rint(np.array(points) * (1 << SHIFT)).astype(np.int32)
 
 
 def _rows(part: Points, size: tuple[int, int]) -> tuple[int, int] | None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from zsim.math.random_streams import stream
+from zsim.math.randomness import stream
 
 NAMES = [f"drone{n}/{sensor}" for n in (1, 2, 3) for sensor in ("imu", "gps", "mag", "wind")]
 
