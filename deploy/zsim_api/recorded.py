@@ -606,7 +606,8 @@ def _own_table(reader: RecordReader, key: str) -> Table:
 def _own_columns(name: str, values: Sequence[Any]) -> Table:
     known = [value for value in values if value is not None]
     width = len(known[0]) if known and isinstance(known[0], list) else 0
-    if width and all(_is_vector(value, width) for value in known):
+    vectors = (isinstance(each, list) and len(each) == width and _kind(each) in ("whole", "number") for each in known)
+    if width and all(vectors):
         rows = np.array([value or [np.nan] * width for value in values], np.float64)
         return dict(zip(component_names(name, width), rows.T, strict=True))
     kind = _kind(known)
@@ -615,10 +616,6 @@ def _own_columns(name: str, values: Sequence[Any]) -> Table:
     elif kind == "flag" and len(known) < len(values):
         return {name: np.array(values, object)}
     return {name: as_array(kind, list(values))}
-
-
-def _is_vector(value: Any, width: int) -> bool:
-    return isinstance(value, list) and len(value) == width and _kind(value) in ("whole", "number")
 
 
 def _kind(values: Sequence[Any]) -> Kind:

@@ -108,7 +108,8 @@ def sweep(
     except ScenarioError as error:
         raise ScenarioError([_in_python(fault) for fault in error.faults]) from None
     folder = Path(out) if out is not None else temporary_folder("sweep-")
-    modules = made_modules(_names(plan), [scratch_folder()])
+    named = re.findall(rf"{plugin.MADE}\w+", msgspec.json.encode(plan).decode())  # anywhere in the plan
+    modules = made_modules(named, [scratch_folder()])
     try:
         rows = flown(plan, folder, workers, client, console=console, modules=tuple(modules))
     except KeyboardInterrupt:
@@ -194,11 +195,6 @@ def _labels(values: Any, scenario: Scenario) -> dict[str, str]:
     made = {place: value.__name__ for place, value in enumerate(given) if hasattr(value, "__name__")}
     labels = distinct(texts, made)
     return {texts[place]: labels[place] for place in made}
-
-
-def _names(plan: SweepPlan) -> list[str]:
-    """Return the names of modules, made for what a notebook or a script defines, anywhere in a plan."""
-    return re.findall(rf"{plugin.MADE}\w+", msgspec.json.encode(plan).decode())
 
 
 def _in_python(line: str) -> str:

@@ -5,7 +5,7 @@ The inputs are synthetic: drones that stand, take off when they are asked to, an
 
 import random
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from msgspec import Struct
 from msgspec.structs import replace
+from plain_messages import run_info
 from refused import refused
 
 from zsim.contract import flight_messages, keys, messages, run_messages
@@ -26,6 +27,7 @@ from zsim.runtime.agent import Agent, Output
 from zsim.runtime.inbox import Inbox
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
+from zsim.sensors.sensor_catalogue import STOCK
 from zsim_agents.estimation.estimator import Estimator
 from zsim_agents.formation.controller import Controller
 from zsim_agents.hosting import hosted
@@ -73,25 +75,14 @@ def info() -> Info:
     """Return what a world would say of itself, its text included."""
     it = scenario()
     text = scenario_file.to_text(it)
-    return Info(
-        t_ns=0,
-        seq=0,
-        contract=1,
-        run_id="run1",
+    return run_info(
+        [drone.name for drone in it.drones],
+        [messages.ClusterInfo(cluster.name, tuple(cluster.drones)) for cluster in it.clusters],
         federation=it.federation,
-        mode="lockstep",
-        rate=0.0,
-        gate_ns=GATE_NS,
         physics_dt_ns=2_500_000,
-        command_delay_ns=GATE_NS,
-        seed=1,
         origin=messages.Origin(-34.603, -58.368, 25.0),
-        drones=tuple(messages.DroneInfo(drone.name, drone.model) for drone in it.drones),
-        clusters=tuple(messages.ClusterInfo(cluster.name, tuple(cluster.drones)) for cluster in it.clusters),
         scenario=text,
         scenario_sha256=scenario_file.sha256(text),
-        version="0.1.0",
-        fingerprint="f00d",
     )
 
 
@@ -138,9 +129,14 @@ class Flight:
         sent = [self._imu(drone, at) for at in range(t_ns - GATE_NS + IMU_NS, t_ns + 1, IMU_NS) if at >= 0]
         z = self._height_m(t_ns)
         if gate % 2 == 0:
-            sent += [self._mag(drone, t_ns), self._baro(drone, t_ns, z), self._sonar(drone, t_ns, z)]
+            mag = tuple(np.add((17.8, 2.8, 14.0), self._noise(0.3)).tolist())
+            sent += [
+                self._sample(drone, "mag", t_ns, mag),
+                self._sample(drone, "baro", t_ns, 101_000.0, z + self._noise(0.1)[0]),
+                self._sample(drone, "sonar", t_ns, z, z > 0.03),
+            ]
         if gate % 3 == 0:
-            sent.append(self._flow(drone, t_ns))
+            sent.append(self._sample(drone, "flow", t_ns, self._noise(0.1), 1.0))
         if gate % 10 == 0:
             sent.append(self._gps(drone, t_ns, (start_m[0], start_m[1], z)))
         return sent
@@ -149,34 +145,16 @@ class Flight:
         return HEIGHT_M * min(1.0, max(0.0, (t_ns * 1e-9 - LIFTOFF_S) / (AIRBORNE_S - LIFTOFF_S)))
 
     def _imu(self, drone: str, t_ns: int) -> tuple[str, Any]:
-        key = keys.sensor(drone, "imu")
         x, y, z = self._noise(0.1)
-        return key, messages.Imu(t_ns, self._next(key), t_ns, (x, y, z + GRAVITY_M_S2), self._noise(0.001))
-
-    def _mag(self, drone: str, t_ns: int) -> tuple[str, Any]:
-        key = keys.sensor(drone, "mag")
-        x, y, z = self._noise(0.3)
-        return key, messages.Mag(t_ns, self._next(key), t_ns, (17.8 + x, 2.8 + y, 14.0 + z))
-
-    def _baro(self, drone: str, t_ns: int, z_m: float) -> tuple[str, Any]:
-        key = keys.sensor(drone, "baro")
-        return key, messages.Baro(t_ns, self._next(key), t_ns, 101_000.0, z_m + self._noise(0.1)[0])
-
-    def _sonar(self, drone: str, t_ns: int, z_m: float) -> tuple[str, Any]:
-        key = keys.sensor(drone, "sonar")
-        return key, messages.Sonar(t_ns, self._next(key), t_ns, z_m, z_m > 0.03)
-
-    def _flow(self, drone: str, t_ns: int) -> tuple[str, Any]:
-        key = keys.sensor(drone, "flow")
-        return key, messages.Flow(t_ns, self._next(key), t_ns, self._noise(0.1), 1.0)
+        return self._sample(drone, "imu", t_ns, (x, y, z + GRAVITY_M_S2), self._noise(0.001))
 
     def _gps(self, drone: str, t_ns: int, p_m: tuple[float, float, float]) -> tuple[str, Any]:
-        key = keys.sensor(drone, "gps")
-        x, y, z = self._noise(0.5)
-        found = (p_m[0] + x, p_m[1] + y, p_m[2] + z)
-        velocity = self._noise(0.1)
-        seq = self._next(key)
-        return key, messages.Gps(t_ns, seq, t_ns, -34.603, -58.368, 25.0 + found[2], found, velocity, 0.5, 3, 9)
+        x, y, z = np.add(p_m, self._noise(0.5)).tolist()
+        return self._sample(drone, "gps", t_ns, -34.603, -58.368, 25.0 + z, (x, y, z), self._noise(0.1), 0.5, 3, 9)
+
+    def _sample(self, drone: str, kind: str, t_ns: int, *measured: Any) -> tuple[str, Any]:
+        key = keys.sensor(drone, kind)
+        return key, STOCK[kind].message(t_ns, self._next(key), t_ns, *measured)
 
     def _status(self, drone: str, gate: int, count: int) -> tuple[str, Any]:
         t_s = gate * GATE_NS * 1e-9
@@ -192,17 +170,9 @@ class Flight:
         turn = (float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2)))
         covariance = tuple((0.01 * np.eye(6)).ravel().tolist())
         seq = self._next(key)
+        velocity, zeros = self._noise(0.02), (0.0, 0.0, 0.0)
         return key, flight_messages.Estimate(
-            t_ns,
-            seq,
-            position,
-            self._noise(0.02),
-            turn,
-            yaw,
-            covariance,
-            0.02,
-            (0.0, 0.0, 0.0),
-            {"gps": (1, 0)},
+            t_ns, seq, position, velocity, turn, yaw, covariance, 0.02, zeros, {"gps": (1, 0)}
         )
 
 
@@ -217,28 +187,36 @@ def inputs(agent: Agent) -> list[KeyedMessages]:
     return [[(key, m) for key, m in gate if any(keys.matches(e, key) for e in agent.reads)] for gate in flight()]
 
 
-def run(agent: Agent, gates: list[KeyedMessages], inbox: Inbox | None = None) -> list[tuple[int, list[Output]]]:
-    """Drive an agent as the runners do; return its outputs by gate."""
+Stepped = tuple[int, list[Output]]  # a gate, and what the agent said in it
+
+
+def stepped(
+    agent: Agent, gates: list[KeyedMessages], inbox: Inbox | None = None, before: Callable[[], None] = lambda: None
+) -> Iterator[Stepped]:
+    """Drive an agent as the runners do; `before` is called before each gate."""
     inbox = inbox or Inbox(agent.gate_keys, agent.counted)
-    outputs = []
     for sent in gates:
+        before()
         for key, message in sent:
             assert inbox.put(key, message)
         while (t_ns := inbox.next_gate_ns()) is not None and inbox.missing(t_ns) is None:
             for key, message in inbox.take(t_ns):
                 agent.receive(key, message)
             if t_ns % agent.period_ns == 0:
-                outputs.append((t_ns, list(agent.step(t_ns))))
-    return outputs
+                yield t_ns, list(agent.step(t_ns))
+
+
+def run(agent: Agent, gates: list[KeyedMessages], inbox: Inbox | None = None) -> list[Stepped]:
+    return list(stepped(agent, gates, inbox))
 
 
 @cache
-def flown(name: str) -> list[tuple[int, list[Output]]]:
+def flown(name: str) -> list[Stepped]:
     agent = make(name)
     return run(agent, inputs(agent))
 
 
-def wire(outputs: list[tuple[int, list[Output]]]) -> list[tuple[int, str, bytes]]:
+def wire(outputs: list[Stepped]) -> list[tuple[int, str, bytes]]:
     return [(t_ns, key, messages.encode(message)) for t_ns, gate in outputs for key, message in gate]
 
 
@@ -246,36 +224,24 @@ def wire(outputs: list[tuple[int, list[Output]]]) -> list[tuple[int, str, bytes]
 
 
 @every_agent
-def test_its_name_is_role_and_thing(name: str):
+def test_its_name_is_role_and_thing_and_its_period_whole_gates(name: str):
     agent = make(name)
     role, dot, thing = agent.name.partition(".")
     assert (dot, agent.role) == (".", role)
     assert keys.name(agent.name) == name
     assert thing in {drone.name for drone in scenario().drones} | {cluster.name for cluster in scenario().clusters}
+    assert agent.period_ns > 0
+    assert agent.period_ns % GATE_NS == 0
 
 
 @every_agent
-def test_its_period_is_a_multiple_of_the_gate(name: str):
-    period_ns = make(name).period_ns
-    assert period_ns > 0
-    assert period_ns % GATE_NS == 0
-
-
-@every_agent
-def test_it_reads_what_closes_its_gates(name: str):
+def test_it_reads_what_closes_its_gates_and_is_counted_for_it(name: str):
     agent = make(name)
     assert agent.gate_keys
-    for key in agent.gate_keys:
+    assert {keys.status(drone) for drone in agent.counted} <= set(agent.gate_keys)
+    counted = [keys.sensor(drone, kind) for drone in agent.counted for kind in keys.SENSORS]
+    for key in (*agent.gate_keys, *counted):
         assert any(keys.matches(expression, key) for expression in agent.reads)
-
-
-@every_agent
-def test_it_reads_all_that_is_counted_for_it(name: str):
-    agent = make(name)
-    for drone in agent.counted:
-        assert keys.status(drone) in agent.gate_keys
-        for kind in keys.SENSORS:
-            assert any(keys.matches(expression, keys.sensor(drone, kind)) for expression in agent.reads)
 
 
 @every_agent
@@ -335,42 +301,20 @@ def test_the_flight_makes_the_controller_say_all_that_it_can():
 
 
 @every_agent
-def test_its_outputs_bear_the_time_of_the_gate(name: str):
-    for t_ns, gate in flown(name):
-        assert {message.t_ns for _, message in gate} == {t_ns}  # type: ignore[attr-defined]
-
-
-@every_agent
-def test_its_numbers_have_no_gaps(name: str):
+def test_its_outputs_have_time_number_type_and_source(name: str):
+    """Stamped with the gate, numbered by key without gaps, the same after the wire."""
     numbers: defaultdict[str, list[int]] = defaultdict(list)
-    for _, gate in flown(name):
+    for t_ns, gate in flown(name):
         for key, message in gate:
-            numbers[key].append(message.seq)  # type: ignore[attr-defined]
+            said: Any = message
+            assert (said.t_ns, type(said), getattr(said, "source", name)) == (t_ns, messages.type_of(key), name)
+            assert messages.decode(key, messages.encode(message)) == message
+            numbers[key].append(said.seq)
     for found in numbers.values():
         assert found == list(range(len(found)))
 
 
-@every_agent
-def test_its_outputs_are_what_their_keys_say_and_survive_the_wire(name: str):
-    for _, gate in flown(name):
-        for key, message in gate:
-            assert type(message) is messages.type_of(key)
-            assert messages.decode(key, messages.encode(message)) == message
-
-
-@every_agent
-def test_its_outputs_name_it_as_their_source(name: str):
-    for _, gate in flown(name):
-        assert {getattr(message, "source", name) for _, message in gate} == {name}
-
-
 # The same bits
-
-
-@every_agent
-def test_the_same_inputs_give_the_same_bits(name: str):
-    agent = make(name)
-    assert wire(run(agent, inputs(agent))) == wire(flown(name))
 
 
 @every_agent
@@ -445,17 +389,8 @@ def _again(key: str, message: Struct) -> Any:
 def test_two_agents_of_one_process_do_not_touch_each_other(name: str):
     first, second = make(name), make(name)
     gates = inputs(first)
-    both: list[list[tuple[int, list[Output]]]] = [[], []]
-    inboxes = [Inbox(agent.gate_keys, agent.counted) for agent in (first, second)]
-    for sent in gates:
-        for agent, inbox, outputs in zip((first, second), inboxes, both, strict=True):
-            for key, message in sent:
-                inbox.put(key, message)
-            t_ns = sent[-1][1].t_ns
-            for key, message in inbox.take(t_ns):
-                agent.receive(key, message)
-            outputs.append((t_ns, list(agent.step(t_ns))))
-    assert wire(both[0]) == wire(both[1])
+    by_turns = list(zip(stepped(first, gates), stepped(second, gates), strict=True))
+    assert wire([one for one, _ in by_turns]) == wire([other for _, other in by_turns])
 
 
 # Restart
@@ -524,23 +459,18 @@ def test_a_request_that_makes_no_sense_is_refused_in_a_line(name: str, request_:
 @every_agent
 def test_a_refused_request_changes_no_bit(name: str):
     agent = make(name)
-    gates = inputs(agent)
-    outputs = []
-    inbox = Inbox(agent.gate_keys, agent.counted)
-    for sent in gates:
+
+    def ask() -> None:
         for key in agent.control_keys():
             agent.control(key, ControlRequest("target", {"values": {"no_such_variable": 1.0}}))
-        for key, message in sent:
-            inbox.put(key, message)
-        t_ns = sent[-1][1].t_ns
-        for key, message in inbox.take(t_ns):
-            agent.receive(key, message)
-        estimates_sent = agent.step(t_ns)
-        asked = [output.message for output in estimates_sent if isinstance(output.message, run_messages.ClusterRequest)]
+
+    outputs = []
+    for t_ns, said in stepped(agent, inputs(agent), before=ask):
+        asked = [output.message for output in said if isinstance(output.message, run_messages.ClusterRequest)]
         assert [(a.t_ns, a.op, a.ok, a.controller) for a in asked] == [
             (t_ns, "target", False, name) for _ in agent.control_keys()
         ]
-        outputs.append((t_ns, [output for output in estimates_sent if output.message not in asked]))
+        outputs.append((t_ns, [output for output in said if output.message not in asked]))
     assert wire(outputs) == wire(flown(name))
 
 

@@ -170,7 +170,7 @@ class FakeLink:
     def get(self, expression: str, timeout_s: float = 2.0) -> list[ReceivedSample]:
         return [ReceivedSample(key, payload) for key, payload in self.last.items() if keys.matches(expression, key)]
 
-    def get_surely(self, expression: str, timeout_s: float = 2.0) -> list[ReceivedSample] | None:
+    def get_surely(self, expression: str) -> list[ReceivedSample] | None:
         return self.get(expression)
 
     def far_ends(self) -> dict[str, FarEnd]:

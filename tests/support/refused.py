@@ -8,8 +8,11 @@ meaning in the same order: `has_terms(line, "drones[2].mass_kg", "-1.4", "0", "1
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
+
+from zsim.errors import ScenarioError
 
 LINE_PUNCTUATION = ",;:.!?`"
 
@@ -33,6 +36,20 @@ def has_terms(text: str | None, *terms: str) -> bool:
 def without_tags(html: str) -> str:
     """Return the text of a page, its tags replaced by spaces."""
     return re.sub(r"<[^<>]*>", " ", html)
+
+
+def faults_of(document: dict[str, Any]) -> list[str]:
+    """Return the lines with which a document is refused as a scenario."""
+    from zsim.scenario import scenario_file  # here: with its compiled code it takes a second to load
+
+    with pytest.raises(ScenarioError) as raised:
+        scenario_file.resolve(document)
+    return [line.removeprefix("scenario: ") for line in raised.value.faults]
+
+
+def faulty_fields(document: dict[str, Any], section: str = "") -> list[str]:
+    """Return the fields that these lines are about, below a section."""
+    return [line.removeprefix(section).split(" ")[0] for line in faults_of(document)]
 
 
 @contextmanager

@@ -18,6 +18,7 @@ Quaternion = tuple[Number, Number, Number, Number]
 Rotors = Annotated[tuple[Number, ...], Meta(min_length=4, max_length=8)]
 Covariance = Annotated[tuple[Number, ...], Meta(min_length=36, max_length=36)]
 DroneState = Literal["landed", "taking_off", "hovering", "flying", "landing", "emergency"]
+AIRBORNE: frozenset[DroneState] = frozenset({"hovering", "flying"})  # states of a drone that takes setpoints
 Connection = Literal["waiting", "connected", "armed", "lost"]
 Phase = Literal["idle", "taking_off", "assembling", "engaged", "landing", "held"]
 ReferencePhase = Literal["waiting", "approaching", "path", "holding", "over"]
@@ -368,7 +369,7 @@ _RULES: dict[str, tuple[str, frozenset[DroneState]]] = {
     "emergency": ("", _ALL),
     "reset": ("a reset needs an emergency", frozenset({"emergency"})),
 }
-_SETPOINT = ("a setpoint needs it hovering or flying", frozenset[DroneState]({"hovering", "flying"}))
+_SETPOINT = ("a setpoint needs it hovering or flying", AIRBORNE)
 
 
 def state_refusal(name: str, state: str, asked: str) -> str | None:

@@ -135,6 +135,10 @@ def _names(entries: _Entries) -> list[str]:
     return [item.name for _, item in entries if item.name is not None]
 
 
+def _placed(drones: _Entries) -> _Entries:
+    return [(index, drone) for index, drone in drones if drone.position_m is not None]
+
+
 def _under(section: str, faults: Iterable[Fault]) -> Iterator[Fault]:
     yield from ((f"{section}.{path}", text) for path, text in faults)
 
@@ -169,7 +173,7 @@ def _clearance_m(drone: Any, vehicles: Mapping[str, Vehicle]) -> float:
 
 
 def _start_faults(drones: _Entries, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
-    placed = [(index, drone) for index, drone in drones if drone.position_m is not None]
+    placed = _placed(drones)
     positions = np.array([drone.position_m for _, drone in placed], dtype=float).reshape(-1, 3)
     clearance = np.array([_clearance_m(drone, vehicles) for _, drone in placed])
     for place, (index, _) in enumerate(placed):
@@ -194,8 +198,7 @@ def _obstacle_faults(obstacles: _Entries, drones: _Entries, vehicles: Mapping[st
     """Yield the faults of obstacles: names, sizes, and drones that start inside or too close, other than on top."""
     yield from _name_faults("environment.obstacles", obstacles)
     names = _names(drones)
-    placed = [(index, drone) for index, drone in drones if drone.position_m is not None]
-    starts = [(index, drone.position_m, _clearance_m(drone, vehicles)) for index, drone in placed]
+    starts = [(index, drone.position_m, _clearance_m(drone, vehicles)) for index, drone in _placed(drones)]
     for index, obstacle in obstacles:
         path = f"environment.obstacles[{index}]"
         if obstacle.name in names:
@@ -234,7 +237,7 @@ def _surface_faults(
         if surface.name in names or surface.name in obstacles:
             other = "a drone" if surface.name in names else "an obstacle"
             yield f"environment.surfaces[{index}].name", f"is {surface.name!r}, as {other}; must be another"
-    placed = [(index, drone) for index, drone in drones if drone.position_m is not None]
+    placed = _placed(drones)
     for _, surface in surfaces:
         is_read = isinstance(surface.triangles, str) and _known(surface.position_m, surface.yaw_deg, surface.scale)
         if not placed or not is_read:
@@ -260,9 +263,7 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
     gravity = scenario.environment and scenario.environment.gravity_m_s2
     vehicle = vehicles.get(drone.model) if drone.model else None
     if vehicle and _known(drone.thrust_n_s2, high):
-        scale = math.sqrt(
-            math.sqrt(drone.thrust_n_s2 / vehicle.thrust_n_s2)
-        )  # of a rotor; larger may be a wrong unit of that
+        scale = math.sqrt(math.sqrt(drone.thrust_n_s2 / vehicle.thrust_n_s2))  # larger may be a wrong unit of that
         radius_m = vehicle.rotor_radius_m * min(1.0, scale)
         if radius_m * high > TIP_MAX_M_S:
             tip = f"so that the tip of a rotor of {radius_m:.3g} m moves at {radius_m * high:.0f} m/s"
@@ -466,19 +467,20 @@ def _in_line(places: list[Any]) -> bool:
 
 
 def _plan_faults(cluster: Any) -> Iterator[Fault]:
-    for (_, before), (index, after) in pairwise(_entries((cluster.plan and cluster.plan.assemblies) or [])):
-        if _known(before.at_s, after.at_s) and after.at_s <= before.at_s:
-            yield f"plan.assemblies[{index}].at_s", f"is {after.at_s:g}; must be > {before.at_s:g}, the one before"
+    yield from _order_faults("plan.assemblies", (cluster.plan and cluster.plan.assemblies) or [])
     trajectory = cluster.plan and cluster.plan.trajectory
     if not trajectory:
         return
     expressions, waypoints = trajectory.expressions, trajectory.waypoints
     if _known(expressions, waypoints) and bool(expressions) == bool(waypoints):
         yield "plan.trajectory", "has both or neither of expressions and waypoints; must have one of them"
-    for (_, before), (index, after) in pairwise(_entries(waypoints)):
+    yield from _order_faults("plan.trajectory.waypoints", waypoints)
+
+
+def _order_faults(path: str, points: list[Any] | None) -> Iterator[Fault]:
+    for (_, before), (index, after) in pairwise(_entries(points)):
         if _known(before.at_s, after.at_s) and after.at_s <= before.at_s:
-            path = f"plan.trajectory.waypoints[{index}].at_s"
-            yield path, f"is {after.at_s:g}; must be > {before.at_s:g}, the one before"
+            yield f"{path}[{index}].at_s", f"is {after.at_s:g}; must be > {before.at_s:g}, the one before"
 
 
 def _reference_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
@@ -533,12 +535,10 @@ def _path_faults(reference: Any) -> Iterator[Fault]:
         if getattr(reference, name) and "expressions" not in given:
             yield name, "is given; must be left out without expressions"
     for name in ("waypoints", "minimum_snap"):
-        points = _entries(getattr(reference, name))
-        if name == "minimum_snap" and len(points) == 1:
+        points = getattr(reference, name)
+        if name == "minimum_snap" and len(_entries(points)) == 1:
             yield name, "has 1 entry; must have 2 or more"
-        for (_, before), (index, after) in pairwise(points):
-            if _known(before.at_s, after.at_s) and after.at_s <= before.at_s:
-                yield f"{name}[{index}].at_s", f"is {after.at_s:g}; must be > {before.at_s:g}, the one before"
+        yield from _order_faults(name, points)
     yield from _landing_faults(reference, reference.start_s or reference.takeoff_s)
 
 

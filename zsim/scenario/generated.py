@@ -25,7 +25,7 @@ from zsim.math.randomness import stream
 from zsim.scenario.scenario import OBSTACLES_MAX, Cloud, Corridor, Forest, Position, Scenario
 from zsim.scenario.surroundings import TRIANGLE, TRIANGLES_MAX, packed, unpacked
 from zsim.schema import plugin
-from zsim.schema.checker import Fault, faults, show, sound
+from zsim.schema.checker import Fault, faults, faults_in, show, sound
 
 TRIES_MAX = 500  # places for a trunk, after which the forest is taken for full; chosen
 BYTES_MAX = 100_000_000  # of a file
@@ -55,31 +55,34 @@ def with_generated(document: dict[str, Any]) -> tuple[dict[str, Any], list[Fault
         where = f"environment.{name}"
         found = [*faults(environment[name], kind, where)]
         wrong += found
-        if not found:
-            settings: Any = msgspec.convert(environment[name], kind)
+        if found:
+            continue
+        settings: Any = msgspec.convert(environment[name], kind)
+        try:
             if name == "cloud":
-                entries, fault = _boxes(settings, where)
-            else:
-                seed = parts.seed if settings.seed is msgspec.UNSET else settings.seed
-                rng = stream(0 if seed is None else seed, name)
-                entries, fault = (_forest if name == "forest" else _corridor)(settings, rng, starts, where)
-            wrong += [fault] if fault else []
-            obstacles += entries
+                obstacles += _boxes(settings, where)
+                continue
+            seed = parts.seed if settings.seed is msgspec.UNSET else settings.seed
+            rng = stream(0 if seed is None else seed, name)
+            obstacles += _forest(settings, rng, starts, where) if name == "forest" else _corridor(settings, rng)
+        except DocumentError as error:
+            wrong += faults_in(error)
     rest = {name: value for name, value in environment.items() if name not in _KINDS}
     return {**document, "environment": {**rest, "obstacles": obstacles} if obstacles else rest}, wrong
 
 
-def _forest(
-    own: Forest, rng: np.random.Generator, starts: Sequence[Position], where: str
-) -> tuple[list[Entry], Fault | None]:
-    """Return trunks at random places, each clear of the previous ones and of the drones' start positions."""
+def _forest(own: Forest, rng: np.random.Generator, starts: Sequence[Position], where: str) -> list[Entry]:
+    """Return trunks at random places, each clear of the previous ones and of the drones' start positions.
+
+    DocumentError if the areas or spans are not rising, or so many trunks do not fit.
+    """
     for name in ("radius_m", "height_m"):
         low, high = getattr(own, name)
         if low > high:
-            return [], (f"{where}.{name}", f"is {[low, high]}; must be [least, greatest]")
+            raise DocumentError([f"{where}.{name} is {[low, high]}; must be [least, greatest]"])
     west, south, east, north = own.area_m
     if west >= east or south >= north:
-        return [], (f"{where}.area_m", f"is {list(own.area_m)}; must be [west, south, east, north], rising")
+        raise DocumentError([f"{where}.area_m is {list(own.area_m)}; must be [west, south, east, north], rising"])
     places = np.empty((own.trees, 3))  # x, y, radius
     clear = np.array([(x, y) for x, y, _ in starts]).reshape(-1, 2)
     entries: list[Entry] = []
@@ -97,16 +100,14 @@ def _forest(
                 break
         else:
             most = f"{count} trunks of {list(own.radius_m)} m with gap_m {own.gap_m:g} and clear_m {own.clear_m:g} fit"
-            return entries, (f"{where}.trees", f"is {own.trees}; must be less: {most}")
+            raise DocumentError([f"{where}.trees is {own.trees}; must be less: {most}"])
         places[count] = x, y, radius
         trunk = {"shape": "cylinder", "position_m": [x, y, 0.0], "radius_m": radius, "height_m": height}
         entries.append({"name": f"tree{count + 1}", **trunk})
-    return entries, None
+    return entries
 
 
-def _corridor(
-    own: Corridor, rng: np.random.Generator, starts: Sequence[Position], where: str
-) -> tuple[list[Entry], Fault | None]:
+def _corridor(own: Corridor, rng: np.random.Generator) -> list[Entry]:
     """Return the walls on both sides of a line with a random turn after each segment, joined at the bends."""
     turns = [0.0, *np.radians(rng.uniform(-own.turn_deg, own.turn_deg, own.segments - 1)).tolist()]
     headings = (math.radians(own.heading_deg) + np.cumsum(turns)).tolist()
@@ -130,15 +131,15 @@ def _corridor(
                 "yaw_deg": round(math.degrees(el.atan2(by - ay, bx - ax)), 3),
             }
             entries.append(wall)
-    return entries, None
+    return entries
 
 
-def _boxes(own: Cloud, where: str) -> tuple[list[Entry], Fault | None]:
-    """Return boxes for the occupied cells of a point cloud, merged along z, then along x."""
-    try:
-        points = points_of(plugin.beside(own.file), f"{where}.file")
-    except DocumentError as error:
-        return [], _fault(error)
+def _boxes(own: Cloud, where: str) -> list[Entry]:
+    """Return boxes for the occupied cells of a point cloud, merged along z, then along x.
+
+    DocumentError if the file cannot be read, or makes too many boxes.
+    """
+    points = points_of(plugin.beside(own.file), f"{where}.file")
     cells, counts = np.unique(np.floor(points / own.cell_m).astype(np.int64), axis=0, return_counts=True)
     runs: dict[tuple[int, int], list[list[int]]] = {}  # first and last z of each, by x and y
     for x, y, z in cells[counts >= own.points_min].tolist():
@@ -157,10 +158,8 @@ def _boxes(own: Cloud, where: str) -> tuple[list[Entry], Fault | None]:
                 row.append([x, x])
     found = sorted((x, y, z) for (y, *z), row in rows.items() for x in row)
     if len(found) > OBSTACLES_MAX:
-        return [], (
-            f"{where}.cell_m",
-            f"is {own.cell_m:g}, which makes {len(found)} boxes; must make <= {OBSTACLES_MAX}",
-        )
+        made = f"which makes {len(found)} boxes; must make <= {OBSTACLES_MAX}"
+        raise DocumentError([f"{where}.cell_m is {own.cell_m:g}, {made}"])
     entries: list[Entry] = []
     for (first, last), y, (low, high) in found:
         middle = [0.5 * (first + last + 1), y + 0.5, float(low)]
@@ -168,7 +167,7 @@ def _boxes(own: Cloud, where: str) -> tuple[list[Entry], Fault | None]:
         place = [round(p + own.cell_m * m, 3) for p, m in zip(own.position_m, middle, strict=True)]
         size = [round(own.cell_m * side, 3) for side in sides]
         entries.append({"name": f"cloud{len(entries) + 1}", "shape": "box", "position_m": place, "size_m": size})
-    return entries, None
+    return entries
 
 
 def _read_surfaces(given: list[Any]) -> tuple[list[Any], list[Fault]]:
@@ -192,18 +191,13 @@ def _read_surfaces(given: list[Any]) -> tuple[list[Any], list[Fault]]:
             elif isinstance(text, str):
                 triangles = unpacked(text)
         except DocumentError as error:
-            wrong.append(_fault(error))
+            wrong += faults_in(error)
         except ValueError as error:
             wrong.append((f"{where}.triangles", str(error)))
         count += 0 if triangles is None else len(triangles)
     if count > TRIANGLES_MAX:
         wrong.append(("environment.surfaces", f"have {count} triangles; must have at most {TRIANGLES_MAX}"))
     return surfaces, wrong
-
-
-def _fault(error: DocumentError) -> Fault:
-    path, _, text = error.faults[0].partition(" ")
-    return path, text
 
 
 def triangles_of(path: Path, where: str, cell_m: float | None) -> Array:

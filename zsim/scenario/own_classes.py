@@ -14,7 +14,7 @@ from zsim.contract.messages import AgentMessage, about, message_info
 from zsim.errors import DocumentError, NotTrustedError
 from zsim.scenario.scenario import LAWS, OwnAgent
 from zsim.schema import parameters, plugin
-from zsim.schema.checker import Fault, faults, listed
+from zsim.schema.checker import Fault, faults, faults_in, listed
 from zsim.sensors.sensor_catalogue import sensor_names
 
 OF_THE_RUN = ("info", "scenario", "drone", "cluster")  # arguments of an agent's constructor that are no parameters
@@ -49,7 +49,7 @@ def with_agents(section: Any, imports: bool) -> tuple[Any, list[Fault]]:
         except NotTrustedError:
             continue
         except DocumentError as error:
-            wrong += [(path, text) for path, _, text in (line.partition(" ") for line in error.faults)]
+            wrong += faults_in(error)
     return filled, wrong
 
 
@@ -93,7 +93,7 @@ def with_parameters(document: dict[str, Any]) -> list[Fault]:
             else:
                 parameters.bound(kind, given, f"{where}.{field}")
         except DocumentError as error:
-            wrong += [(path, text) for path, _, text in (line.partition(" ") for line in error.faults)]
+            wrong += faults_in(error)
     return wrong
 
 

@@ -20,7 +20,7 @@ from zsim.scenario.consistency import cross_faults
 from zsim.scenario.generated import with_generated
 from zsim.scenario.scenario import DRONES_MAX, VEHICLE_NUMBERS, Document, Scenario, SharedVehicle, Topology
 from zsim.schema import plugin, yaml_file
-from zsim.schema.checker import Fault, faults, first_lines, show, sound, suggestion
+from zsim.schema.checker import Fault, faults, faults_in, first_lines, show, sound, suggestion
 from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, Sensors, flattened, in_channel_units, separate
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.vehicle import DEFAULT_MODEL, MODELS, Aerodynamics, Vehicle, vehicle_of
@@ -211,7 +211,7 @@ def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
     try:
         pieces = pieces_of(plugin.beside(name), f"{where}.file")
     except DocumentError as error:
-        unsound += [(path, text) for path, _, text in (line.partition(" ") for line in error.faults)]
+        unsound += faults_in(error)
         return reference
     return {**{key: value for key, value in reference.items() if key != "file"}, "pieces": pieces}
 

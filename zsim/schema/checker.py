@@ -16,6 +16,8 @@ from typing import Any, cast
 import msgspec
 from msgspec import inspect as types
 
+from zsim.errors import DocumentError
+
 SHOWN_MAX = 60  # characters of what was found that fit into a line
 FAULTS_MAX = 100  # lines; further faults are counted
 COUNTED_MAX = 10_000  # of further faults: a document of 1 MB can have many more, each of which takes time
@@ -27,6 +29,11 @@ Fault = tuple[str, str]  # (path, "is …; must be …"); the path of the docume
 def faults(value: Any, description: Any, path: str = "") -> Iterator[Fault]:
     """Yield the path and the fault of every place where `value` does not fit the type `description`."""
     yield from _check(value, _type_info(description), path)
+
+
+def faults_in(error: DocumentError) -> list[Fault]:
+    """Return the faults whose path and text are the lines of an error."""
+    return [(path, text) for path, _, text in (line.partition(" ") for line in error.faults)]
 
 
 def first_fault(value: Any, description: Any) -> Fault | None:

@@ -22,7 +22,7 @@ from msgspec import UNSET, Struct, UnsetType
 
 from zsim.errors import DocumentError, NotTrustedError
 from zsim.schema import plugin
-from zsim.schema.checker import Fault, faults, field_path, show, suggestion
+from zsim.schema.checker import Fault, faults, faults_in, field_path, show, suggestion
 from zsim.schema.quantities import G_M_S2, NonNegative
 from zsim.sensors import stock_sensors
 from zsim.sensors.camera import CAMERAS, BottomCamera, Camera, FrontCamera, SightingModel
@@ -229,9 +229,7 @@ def _section_faults(name: str, section: dict[str, Any], imports: bool) -> Iterat
     except NotTrustedError:
         return
     except DocumentError as error:
-        for line in error.faults:
-            path, _, text = line.partition(" ")
-            yield path, text
+        yield from faults_in(error)
         return
     yield from faults(_settings_of(section), kind.settings, name)
 

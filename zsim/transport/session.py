@@ -405,9 +405,9 @@ class Session:
         replies = self.query(expression, timeout_s=timeout_s)
         return [ReceivedSample(reply.key, reply.payload) for reply in replies if reply.kind != "ERROR"]
 
-    def get_surely(self, expression: str, timeout_s: float = 2.0) -> list[ReceivedSample] | None:
+    def get_surely(self, expression: str) -> list[ReceivedSample] | None:
         """Return the last values of the keys of an expression; None if a process did not reply in time."""
-        replies = self.query(expression, timeout_s=timeout_s)
+        replies = self.query(expression)
         if any(reply.kind == "ERROR" for reply in replies):  # Zenoh's own "Timeout" among them
             return None
         return [ReceivedSample(reply.key, reply.payload) for reply in replies]

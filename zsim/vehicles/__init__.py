@@ -1,5 +1,5 @@
-"""Vehicles as data: the class of their parameters, one file per stock vehicle, and the catalogue that finds them.
+"""Vehicles as data: `vehicle` has their parameters and finds one by the name of its model; a file per stock vehicle.
 
-A file here states numbers with unit and source, and nothing else; the equations that use them are in zsim_world.
+That file states numbers with unit and source, and nothing else; the equations that use them are in zsim_world.
 Imports schema.
 """

@@ -41,9 +41,8 @@ class Controller(Agent):
         spec = scenario.cluster(cluster)
         self.name = f"controller.{cluster}"
         self.period_ns = info.gate_ns
-        self.drones = tuple(spec.drones)
-        estimates = tuple(keys.estimate(drone) for drone in spec.drones)
-        states = tuple(keys.status(drone) for drone in spec.drones)
+        self._name(spec.drones)
+        estimates, states = (tuple(map(key, spec.drones)) for key in (keys.estimate, keys.status))
         self._engagement = engagement_of(scenario, spec)
         self._grants = self._engagement.law.grants
         self.gate_keys = states + estimates
@@ -51,8 +50,6 @@ class Controller(Agent):
         self._state_key, self._view_key = keys.cluster_state(cluster), keys.cluster_view(cluster)
         self._control_key, self._request_key = keys.cluster_control(cluster), keys.cluster_request(cluster)
         self.writes, self.repeats = (self._state_key,), (self._request_key,)
-        self._place = {key(drone): i for i, drone in enumerate(spec.drones) for key in (keys.status, keys.estimate)}
-        self._velocity_keys = [keys.command(drone, "velocity") for drone in spec.drones]
         self._estimates = [_UNKNOWN] * len(spec.drones)
         table = np.empty((12, len(spec.drones)))  # the numbers of a GateInput, valid until the next gate
         self._p_W, self._v_W, self._sigma_m = table[:9].reshape(3, len(spec.drones), 3)
@@ -122,10 +119,13 @@ class Controller(Agent):
         self._estimates = [self._estimates[k] for k in places]
         self._states = [self._states[k] for k in places]
         self._status_ns = [self._status_ns[k] for k in places]
+        self._name(drones)
+        self._grants.seat(drones)
+
+    def _name(self, drones: Sequence[str]) -> None:
         self.drones = tuple(drones)
         self._velocity_keys = [keys.command(drone, "velocity") for drone in drones]
         self._place = {key(drone): i for i, drone in enumerate(drones) for key in (keys.status, keys.estimate)}
-        self._grants.seat(drones)
 
     def _gate(self, t_ns: int) -> GateInput:
         positions, velocities, variances, yaws, yaw_sigmas, ages_s = [], [], [], [], [], []

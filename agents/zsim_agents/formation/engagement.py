@@ -324,8 +324,7 @@ class Engagement:
         if fault := self._unflyable(gate):
             return self._output(gate, fault, command=self._upright(gate, 0.0, self.gains.limits))
         assembly.advance(gate.p_W, self._dt_s)
-        v_W, guarded, alarmed = guard(gate.p_W, gate.v_W, assembly.velocities(gate.p_W), self.gains.limits)
-        command = FormationCommand(v_W, np.zeros(self.space.n), 1.0, guarded, alarmed)
+        command = self._guarded(gate, assembly.velocities(gate.p_W), self.gains.limits)
         reason = self._way_left(gate) or self.check.engagement_fault(gate) or READY_TO_ENGAGE
         return self._output(gate, reason, command=command)
 
@@ -381,9 +380,13 @@ class Engagement:
         if self._places is None:
             command = self._upright(gate, 0.0, self._held_limits)
         else:
-            v_W, guarded, alarmed = guard(gate.p_W, gate.v_W, self._places.velocities(gate.p_W), self._held_limits)
-            command = FormationCommand(v_W, np.zeros(self.space.n), 1.0, guarded, alarmed)
+            command = self._guarded(gate, self._places.velocities(gate.p_W), self._held_limits)
         return self._output(gate, self._fault, command=command)
+
+    def _guarded(self, gate: GateInput, v_W: Array, limits: RobotLimits) -> FormationCommand:
+        """Return the command of velocities (n, 3) [m/s, W] without turning."""
+        v_W, guarded, alarmed = guard(gate.p_W, gate.v_W, v_W, limits)
+        return FormationCommand(v_W, np.zeros(self.space.n), 1.0, guarded, alarmed)
 
     def _upright(self, gate: GateInput, climb_m_s: Array | float, limits: RobotLimits) -> FormationCommand:
         """Return guarded climb rates (n,) without turning; zero if the estimates are not flyable."""

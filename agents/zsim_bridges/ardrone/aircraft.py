@@ -10,7 +10,7 @@ from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple
 
 from zsim.contract import flight_messages, messages
-from zsim.contract.flight_messages import Status
+from zsim.contract.flight_messages import AIRBORNE, Status
 from zsim.math import elementary as el
 from zsim.math import frames as rotations
 from zsim.scenario.scenario import Drone
@@ -28,7 +28,7 @@ from zsim_bridges.ardrone.navdata import (
     Send,
     StateBit,
 )
-from zsim_bridges.vehicle_links.drone_link import CommandSender, ModeName, OnboardState
+from zsim_bridges.vehicle_links.drone_link import REPEAT_NS, CommandSender, ModeName, OnboardState
 
 WATCHDOG_NS = 50_000_000  # ns without an AT command until the watchdog's bit (Developer Guide 6.6, COMWDG)
 LAND_AFTER_NS = 2_000_000_000  # ns of hovering without a pilot's program before it lands, chosen
@@ -50,9 +50,7 @@ NEXT_CHANNEL = 4
 AGAIN_NS = 500_000_000  # ns, chosen: a mode that is not entered is asked for again, as the pilot's REF is repeated
 ASKED_MAX = 3  # times that a mode is asked for before it is given up, chosen
 PER_GATE = 3  # setpoints that are sent at once within a gate, chosen: the world takes one at each
-AIRBORNE = ("hovering", "flying")
 IN_THE_AIR = ("taking_off", *AIRBORNE)
-REPEAT_NS = 100_000_000  # ns; a commander that is silent for 0.5 s counts as dead, scenario `silence.hover_s`
 NO_ALTITUDE_LIMIT_MM = 100_000  # altitude_max that means none (ARDroneLib)
 CLIMB_1_S = 1.5  # 1/s, as the firmware nears its own greatest height
 CALIBRATION_YAW_RAD_S = 1.0  # rad/s, chosen: a turn takes 6 s, as on the aircraft

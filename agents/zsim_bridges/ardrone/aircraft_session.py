@@ -11,7 +11,7 @@ from typing import Any
 
 from zsim.contract.flight_messages import DroneState
 from zsim.contract.messages import Info
-from zsim.math.frames import heading, quaternion_from_rpy
+from zsim.math.frames import heading, quaternion_from_rpy, turned_about_up
 from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Scenario
 from zsim.schema.quantities import G_M_S2
@@ -337,8 +337,8 @@ class NavdataReadings(AircraftReadings):
             mx = m[0] * math.cos(pitch) + mz * math.sin(pitch)
             self._align(yaw, self._north_rad - math.atan2(my, mx), dt_s)
         yaw += self._yaw_offset_rad or 0.0
-        vx, vy, vz = own = _flipped((demo.vx_mm_s / 1e3, demo.vy_mm_s / 1e3, demo.vz_mm_s / 1e3))
-        velocity = vx * math.cos(yaw) - vy * math.sin(yaw), vx * math.sin(yaw) + vy * math.cos(yaw), vz
+        own = _flipped((demo.vx_mm_s / 1e3, demo.vy_mm_s / 1e3, demo.vz_mm_s / 1e3))
+        velocity = turned_about_up(own, yaw)
         if 0.0 < dt_s < GAP_S_MAX:
             self._x, self._y = self._x + dt_s * velocity[0], self._y + dt_s * velocity[1]
         w, x, y, z = quaternion_from_rpy((roll, pitch, yaw)).tolist()

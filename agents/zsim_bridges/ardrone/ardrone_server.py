@@ -27,7 +27,7 @@ from zsim_bridges.ardrone import at_commands, navdata, video
 from zsim_bridges.ardrone.aircraft import Aircraft, Outlets
 from zsim_bridges.ardrone.video import VideoEncoder, VideoFrame, pave_header
 from zsim_bridges.vehicle_links import drone_link
-from zsim_bridges.vehicle_links.server import PictureIntake, Say, TrafficIntake, VehicleServer
+from zsim_bridges.vehicle_links.server import PictureServer, Say
 
 AUTHENTICATION_PORT = 5552  # UDP, where programs look for drones (ARDroneLib, config.h)
 QUESTION, ANSWER = b"PARROT AUTH", b"PARROT AUTH OK"  # ARDroneLib, ardrone_auth.c
@@ -65,7 +65,7 @@ class ArdroneOptions(NamedTuple):
     rate: float | None
 
 
-class ArdroneServer(VehicleServer):
+class ArdroneServer(PictureServer):
     """One run's drones as AR.Drones.
 
     Raises:
@@ -86,25 +86,14 @@ class ArdroneServer(VehicleServer):
 
     async def open(self, stack: contextlib.AsyncExitStack) -> None:
         drone_link.warm_up()
-        self._pictures = PictureIntake(self.link, asyncio.get_running_loop(), self._stream)
+        await super().open(stack)
         for name, drone in self._drones.items():
             stack.push_async_callback(drone.close)
             for line in await drone.open():
                 self.say(line)
             self.say(f"{name} is an AR.Drone 2.0 at {drone.address}")
-        stack.callback(self._pictures.follow, ())
-
-    async def on_arrivals(self, intake: TrafficIntake) -> None:
-        for arrived in intake.arrivals():
-            for key, payload in arrived:
-                self.forward(key, payload)
-                if keys.is_status(key):  # a gate of a fleet takes long: what pilots send meanwhile comes first
-                    await asyncio.sleep(0)
-            await asyncio.sleep(0)
-        self._pictures.follow(self.wanted_pictures())
 
     def wanted_pictures(self) -> Iterator[str]:
-        """Yield the keys of the cameras for whose pictures somebody is connected."""
         for name, drone in self._drones.items():
             if drone.video.is_watched:
                 if self._has_encoder:
@@ -127,7 +116,7 @@ class ArdroneServer(VehicleServer):
             except (ValueError, ArithmeticError) as error:  # finite, but beyond what a field of navdata can hold
                 self.refuse(f"{key}: {error}")
 
-    def _stream(self, key: str, payload: bytes) -> None:
+    def on_picture(self, key: str, payload: bytes) -> None:
         image = self.decoded(key, payload)
         drone = self._drones.get(keys.thing(key))
         if image is not None and drone is not None and keys.leaf(key) == drone.aircraft.camera:

@@ -15,7 +15,6 @@ import struct
 from collections import namedtuple
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from enum import IntEnum, IntFlag
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,8 +43,8 @@ GYRO_LSB_PER_DEG_S = 16.4  # of the raw gyro (measured on an aircraft)
 MAG_UT_PER_LSB = 0.3  # uT (AK8975 datasheet)
 MG_PER_UT = 10.0  # milligauss
 PWM_MAX = 255  # of a motor at its greatest speed; below, in proportion, chosen: the curve is not published
-VOLTAGE_MV = ((0.0, 9000.0), (10.0, 10_500.0), (50.0, 11_686.0), (100.0, 12_500.0))
-"""Battery [mV] by charge [%]: vbat_min of the SDK, two chosen, and 50 % as an aircraft showed it."""
+VOLTAGE_MV = (0.0, 10.0, 50.0, 100.0), (9000.0, 10_500.0, 11_686.0, 12_500.0)
+"""Charges [%] and voltages [mV] of the battery: vbat_min of the SDK, two chosen, and 50 % as an aircraft showed it."""
 SECONDS_MASK = 0x7FF  # 11 bits
 FIX_3D = 3  # of a GPS receiver, as in NMEA
 _INT16 = 32_767
@@ -435,7 +434,9 @@ class NavdataContent:
             put["phys_measures"](0.0, 0, 1e3 * fx, -1e3 * fy, -1e3 * fz, p, -q, -r, 0, 0, 0)
             accs = [round(min(max(ACCEL_ZERO_LSB + ACCEL_LSB_PER_G * f, 0), 2 * _INT16)) for f in (fx, -fy, fz)]
             gyros = [_int16(GYRO_LSB_PER_DEG_S * rate) for rate in (p, -q, -r)]
-            put["raw_measures"](*accs, *gyros, 0, 0, round(voltage_mv(charge)), *(0,) * 10, self._echo_mm(), 0)
+            put["raw_measures"](
+                *accs, *gyros, 0, 0, round(np.interp(charge, *VOLTAGE_MV)), *(0,) * 10, self._echo_mm(), 0
+            )
 
     def _echo_mm(self) -> int:
         return round(1e3 * self._sonar.range_m) if self._sonar and self._sonar.valid else 0
@@ -498,13 +499,6 @@ def angles_deg(q_WB: Quaternion) -> Vector:
     pitch = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
     yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return -math.degrees(pitch), math.degrees(roll), -math.degrees(yaw)
-
-
-def voltage_mv(charge_percent: float) -> float:
-    for (low, low_mv), (high, high_mv) in pairwise(VOLTAGE_MV):
-        if charge_percent <= high:
-            return low_mv + (high_mv - low_mv) * max(0.0, charge_percent - low) / (high - low)
-    return VOLTAGE_MV[-1][1]
 
 
 def _int16(value: float) -> int:

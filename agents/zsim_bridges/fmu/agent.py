@@ -7,6 +7,7 @@ published with the stamp t, as the answer of any agent to that gate.
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -105,14 +106,14 @@ class FmuAgent(Agent):
         self.name = of.name or f"fmu.{of.drone or 'main'}"
         self._say = of.say or _print
         self.period_ns = _period_ns(model, of.period_s, info)
-        formations = _Formations(scenario)
-        mapping = mapping_of(model, of.map, info, of.drone, lambda cluster: formations[cluster].names)
+        formation = cache(partial(Formation, scenario))
+        mapping = mapping_of(model, of.map, info, of.drone, lambda cluster: formation(cluster).names)
         if not mapping.outputs:
             known = ", ".join(each.name for each in model.variables.values() if each.causality == "output") or "none"
             raise RunError(f"{of.path}: none of its outputs is mapped; must map one of {known}")
         self._inputs = mapping.inputs
         self._formations = {
-            key: formations[keys.thing(key)]
+            key: formation(keys.thing(key))
             for key in (link.place.key for link in (*mapping.inputs, *mapping.outputs))
             if keys.parts(key)[2] in FORMATION
         }
@@ -130,7 +131,7 @@ class FmuAgent(Agent):
         if not model.restores:
             self._say(f"{self.name}: {of.path.name} cannot give its state: started again, it begins afresh")
         self._unit = FmuInstance(model, self.name, lambda line: self._say(f"{self.name}: {line}"), of.log)
-        self._unit.set_parameters([_parameter(model, name, value) for name, value in of.param.items()])
+        self._unit.write([_parameter(model, name, value) for name, value in of.param.items()])
 
     def _declare_keys(self, info: Info) -> None:
         reads = {link.place.key for link in self._inputs} - self._formations.keys()
@@ -166,7 +167,9 @@ class FmuAgent(Agent):
         self._unit.step(t_s, self.period_ns / 1e9)
         given = self._unit.read(self._given)
         for variable, values in zip(self._given, given, strict=True):
-            self._check_finite(variable, values)
+            for value in values:
+                if isinstance(value, float) and not math.isfinite(value):
+                    raise UserCodeError(f"{self._model.path}: output {variable.name} is {value}; must be finite")
         outputs = self._takeoffs(t_ns)
         begin = 0
         for writer in self._writers:
@@ -187,11 +190,6 @@ class FmuAgent(Agent):
             if read is not None:
                 values.append((link.variable, link.converted(read)))
         return values
-
-    def _check_finite(self, variable: Variable, values: Sequence[Any]) -> None:
-        for value in values:
-            if isinstance(value, float) and not math.isfinite(value):
-                raise UserCodeError(f"{self._model.path}: output {variable.name} is {value}; must be finite")
 
     def _takeoffs(self, t_ns: int) -> list[Output]:
         if self._takeoff_ns is None or t_ns < self._takeoff_ns:
@@ -316,18 +314,6 @@ class _FormationWriter:
             for index, value in zip(link.place.indices or (), own, strict=True):
                 c_dot[index] = float(value)
         return agent.motion(t_ns, self._formation, c_dot)
-
-
-class _Formations(dict[str, Formation]):
-    """Formations by cluster, made when they are first asked for."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        super().__init__()
-        self._scenario = scenario
-
-    def __missing__(self, cluster: str) -> Formation:
-        self[cluster] = made = Formation(self._scenario, cluster)
-        return made
 
 
 def _writers(

@@ -82,7 +82,6 @@ class Variable(NamedTuple):
 
     name: str
     causality: str
-    variability: str
     type: str  # as FMI names it
     kind: Kind
     call: str  # in the names of FMPy's functions
@@ -136,7 +135,6 @@ class FmuModel:
             self.variables[each.name] = Variable(
                 name=each.name,
                 causality=each.causality or "local",
-                variability=each.variability or "",
                 type=each.type,
                 kind=kind,
                 call=call,
@@ -208,10 +206,6 @@ class FmuInstance:
         self._end = weakref.finalize(self, _freed, self._unit, model.version)
         self._end.atexit = False  # a library that embeds an interpreter cannot be left while that ends
 
-    def set_parameters(self, values: Inputs) -> None:
-        """Set values before the start."""
-        self._calling(self._write, values)
-
     def start(self, t_s: float, inputs: Inputs) -> None:
         """Initialise it at a simulated time [s] with the inputs of that time."""
         if self.model.version == 2:
@@ -223,6 +217,7 @@ class FmuInstance:
         self._calling(self._unit.exitInitializationMode)
 
     def write(self, inputs: Inputs) -> None:
+        """Set inputs, and parameters before the start."""
         self._calling(self._write, inputs)
 
     def step(self, t_s: float, step_s: float) -> None:
@@ -242,10 +237,6 @@ class FmuInstance:
     def restore(self, state: bytes) -> None:
         """Take over a state, started or not."""
         self._calling(self._restore, state)
-
-    def close(self) -> None:
-        """Free it; no other method may be called afterwards."""
-        self._end()
 
     def _write(self, inputs: Inputs) -> None:
         grouped: dict[str, tuple[list[int], list[Any]]] = {}

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from zsim.contract.flight_messages import DroneState
 from zsim.contract.messages import Info
 from zsim.math import elementary as el
-from zsim.math.frames import geodetic_to_enu, heading
+from zsim.math.frames import geodetic_to_enu, heading, turned_about_up
 from zsim.math.rotation import LEVEL, Vector
 from zsim.scenario.scenario import Scenario
 from zsim.schema.quantities import G_M_S2
@@ -271,8 +271,8 @@ class AutopilotSession(VehicleSession):
             self._ground_m = None
         return self._ground_m is None
 
-    def figures(self, now_ns: int) -> LinkFigures:
-        figures = super().figures(now_ns)
+    def figures(self) -> LinkFigures:
+        figures = super().figures()
         return figures._replace(refused=figures.refused + sum(self._parser.refused.values()))
 
 
@@ -492,14 +492,12 @@ class TelemetryReadings(AircraftReadings):
     def _on_position(self, m: Any, now_ns: int) -> None:
         x, y, z = ned((m.x, m.y, m.z))
         ox, oy, oz = self._local_origin_m
-        vx, vy, vz = velocity = ned((m.vx, m.vy, m.vz))
+        velocity = ned((m.vx, m.vy, m.vz))
         taken_ns = self._since_boot(m, now_ns)
         self.pose = AircraftPose(taken_ns, (x + ox, y + oy, z + oz), velocity, self._q_WB, self._w_WB_B)
         if taken_ns - max(self._measured_flow_ns + FLOW_LOST_NS, self._flow_ns + FLOW_NS) >= 0:
             self._flow_ns = taken_ns
-            yaw = float(heading(self._q_WB))
-            forward, left = vx * el.cos(yaw) + vy * el.sin(yaw), vy * el.cos(yaw) - vx * el.sin(yaw)
-            self.read("flow", taken_ns, (forward, left, vz), 1.0)
+            self.read("flow", taken_ns, turned_about_up(velocity, -float(heading(self._q_WB))), 1.0)
 
     def _read_field(self, taken_ns: int, unit_ut: float, m: Any) -> None:
         self.read("mag", taken_ns, frd((unit_ut * m.xmag, unit_ut * m.ymag, unit_ut * m.zmag)))

@@ -128,11 +128,11 @@ class MavlinkServer(VehicleServer):
 
     async def open(self, stack: contextlib.AsyncExitStack) -> None:
         sys.setswitchinterval(SWITCH_S)
-        loop, options, last = asyncio.get_running_loop(), self.options, len(self._served) - 1
+        options, last = self.options, len(self._served) - 1
         for served in self._served.values():
             for port in served.ports:
-                stack.callback(port.close, loop)
-                port.open(loop, time.monotonic)
+                stack.callback(port.close)
+                port.open()
         stack.callback(self._requests.shutdown, wait=False, cancel_futures=True)
         for what, (host, port), local, step in (
             ("ground station", options.gcs, options.gcs_local, 0),
@@ -141,7 +141,7 @@ class MavlinkServer(VehicleServer):
             to = f"{port} to {port + step}" if step else f"{port}"
             own = f"{local} to {local + last}" if last else f"{local}"
             self.say(f"{what}: UDP {host}:{to}, from {options.listen}:{own}")
-        stack.callback(loop.create_task(self._tick_always()).cancel)
+        stack.callback(asyncio.create_task(self._tick_always()).cancel)
 
     async def on_arrivals(self, intake: TrafficIntake) -> None:
         """Process what has arrived; of each message of a drone, only the newest."""
@@ -254,17 +254,16 @@ class VehiclePort:
         self.peers = Peers(peer)
         self.parser = Parser(signing)
 
-    def open(self, loop: asyncio.AbstractEventLoop, wall_s: Callable[[], float]) -> None:
-        self._wall_s = wall_s
-        loop.add_reader(self._socket.fileno(), self._read)
+    def open(self) -> None:
+        asyncio.get_running_loop().add_reader(self._socket.fileno(), self._read)
 
-    def close(self, loop: asyncio.AbstractEventLoop) -> None:
-        loop.remove_reader(self._socket.fileno())
+    def close(self) -> None:
+        asyncio.get_running_loop().remove_reader(self._socket.fileno())
         self._socket.close()
 
     def send(self, datagrams: Sequence[bytes]) -> None:
         """Send to all peers; datagrams that do not fit into the buffer are lost, as on a radio link."""
-        for address in self.peers.addresses(self._wall_s()) if datagrams else ():
+        for address in self.peers.addresses(time.monotonic()) if datagrams else ():
             for datagram in datagrams:
                 with contextlib.suppress(OSError):  # nobody there, no route, no room
                     self._socket.sendto(datagram, address)
@@ -277,7 +276,7 @@ class VehiclePort:
                 return
             except OSError:
                 continue  # a datagram sent before could not be delivered
-            if self.peers.accepts(address, self._wall_s()):
+            if self.peers.accepts(address, time.monotonic()):
                 for received in self.parser.feed(data):
                     self._on_received(received)
 

@@ -420,10 +420,7 @@ def from_local(message: dialect.SetPositionTargetLocalNed, state: VehicleState) 
     if frame not in FROM_HERE:
         return f"frame {frame} of a local setpoint is not flown"
     along_heading = frame in ALONG_HEADING
-    x, y, z = dialect.frd(place) if along_heading else ned(place)
-    if along_heading:
-        c, s = el.cos(state.yaw_rad), el.sin(state.yaw_rad)
-        x, y = c * x - s * y, s * x + c * y
+    x, y, z = turned_about_up(dialect.frd(place), state.yaw_rad) if along_heading else ned(place)
     own_x, own_y, own_z = state.position_m
     return _target(message, (own_x + x, own_y + y, own_z + z), along_heading, state)
 

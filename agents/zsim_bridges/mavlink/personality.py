@@ -11,6 +11,7 @@ from enum import Enum
 from typing import Literal, NamedTuple
 
 from zsim.scenario.scenario import Drone
+from zsim_agents.references.cruise import Cruise
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import Autopilot, ParamType
 
@@ -190,12 +191,6 @@ _INTEGERS = {
 }
 
 
-class SpeedLimits(NamedTuple):
-    horizontal_m_s: float
-    up_m_s: float
-    down_m_s: float
-
-
 class Parameters:
     """The parameters of one vehicle: `parameters["speed_m_s"]` is a setting, whatever the autopilot calls it."""
 
@@ -211,8 +206,8 @@ class Parameters:
         return spec.unit * self.values[spec.name]
 
     @property
-    def speeds(self) -> SpeedLimits:
-        return SpeedLimits(self["speed_m_s"], self["up_m_s"], self["down_m_s"])
+    def speeds(self) -> Cruise:
+        return Cruise(self["speed_m_s"], self["up_m_s"], self["down_m_s"])
 
     @property
     def fence_action(self) -> FenceAction:

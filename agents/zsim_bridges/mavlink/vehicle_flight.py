@@ -14,7 +14,7 @@ from zsim_bridges.mavlink.dialect import Severity
 from zsim_bridges.mavlink.mission import Mission
 from zsim_bridges.mavlink.personality import HOLDING, FlightMode, Parameters, Personality
 from zsim_bridges.mavlink.vehicle_state import NOWHERE, Target, TiltTarget, VehicleState
-from zsim_bridges.vehicle_links.drone_link import CommandSender, ModeName
+from zsim_bridges.vehicle_links.drone_link import REPEAT_NS, CommandSender, ModeName
 
 OVER_ON_GROUND = (FlightMode.TAKEOFF, FlightMode.LAND, FlightMode.RETURN, FlightMode.MISSION)
 Report = Callable[[Severity, str], None]
@@ -22,7 +22,6 @@ ANSWER_NS = 1_000_000_000  # ns within which the drone should begin a take-off o
 ARRIVED_M = 0.3  # m of the height at which a climb is over
 STEP_NS = 40_000_000  # ns; the law is evaluated 25 times a second
 BURST = 500  # commands at once: half of what the world records of a source that is not in the lockstep
-REPEAT_NS = 100_000_000  # ns; the firmware treats a commander that is silent for 0.5 s as dead
 
 
 class Flight:
@@ -437,7 +436,7 @@ class FlightControl:
         """Return the velocity [m/s], in the axes of the target, and the yaw rate [rad/s] that lead to it."""
         speeds, (t_s, here, moving) = self._parameters.speeds, self._motion()
         level = min(target.speed_m_s or math.inf, speeds.horizontal_m_s)
-        asked = target, Cruise(level, speeds.up_m_s, speeds.down_m_s)
+        asked = target, speeds._replace(horizontal_m_s=level)
         if asked != self._asked:
             goal, rate = (*target.position_m, target.yaw_rad), (*target.velocity_m_s, target.yaw_rate_rad_s)
             self._course.send(goal, t_s, here, moving, rate, asked[1])

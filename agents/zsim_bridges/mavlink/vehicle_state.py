@@ -14,12 +14,12 @@ from zsim.math.rotation import LEVEL, Quaternion, Vector
 from zsim.scenario.scenario import Drone
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import SensorBit
+from zsim_bridges.vehicle_links.drone_link import has_attitude
 
 ESTIMATE_AGE_MAX_NS = 500_000_000  # ns; an older estimate is not used
 SAMPLES_MISSED = 5  # periods of a sensor without a sample: it has failed
-UNIT_SLACK = 0.01  # of a quaternion's length; an estimator of positions alone may publish zeros
 LOW_BATTERY_PERCENT = 20.0  # chosen: above BAT_CRIT_THR and the like, so that the pilot is warned before they act
-AIRBORNE = ("taking_off", "hovering", "flying", "landing")
+OFF_THE_GROUND = ("taking_off", "hovering", "flying", "landing")
 SENSORS = {
     "imu": SensorBit.GYRO | SensorBit.ACCEL,
     "mag": SensorBit.MAG,
@@ -80,7 +80,7 @@ class VehicleState:
                     self.position_m, self.velocity_m_s = message.position_m, message.velocity_m_s
                     self.q_WB = message.orientation_wxyz
             case flight_messages.Estimate():
-                if abs(math.hypot(*message.orientation_wxyz) - 1.0) <= UNIT_SLACK:
+                if has_attitude(message):
                     self._estimate_ns, self.is_estimated = message.t_ns, True
                     self.position_m, self.velocity_m_s = message.position_m, message.velocity_m_s
                     self.q_WB = message.orientation_wxyz
@@ -99,12 +99,12 @@ class VehicleState:
 
     @property
     def is_airborne(self) -> bool:
-        return self.status is not None and self.status.state in AIRBORNE
+        return self.status is not None and self.status.state in OFF_THE_GROUND
 
     @property
     def is_steerable(self) -> bool:
         """Whether the firmware accepts setpoints."""
-        return self.status is not None and self.status.state in ("hovering", "flying")
+        return self.status is not None and self.status.state in flight_messages.AIRBORNE
 
     @property
     def state(self) -> str:

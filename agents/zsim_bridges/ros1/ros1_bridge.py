@@ -16,7 +16,7 @@ import numpy as np
 from rosbags.typesys.stores import ros1_noetic as ros1
 
 from zsim.contract import flight_messages, keys, messages
-from zsim.contract.flight_messages import CameraImage, CameraInfo
+from zsim.contract.flight_messages import AIRBORNE, CameraImage, CameraInfo
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
 from zsim.errors import RunError
@@ -31,8 +31,8 @@ from zsim.transport.session import Session
 from zsim_bridges import ros_messages as ros
 from zsim_bridges.ros1.node import PublishedTopic, Ros1Node, message_class
 from zsim_bridges.vehicle_links import drone_link
-from zsim_bridges.vehicle_links.drone_link import CommandSender, ModeName, OnboardState
-from zsim_bridges.vehicle_links.server import PictureIntake, Say, TrafficIntake, VehicleServer
+from zsim_bridges.vehicle_links.drone_link import REPEAT_NS, CommandSender, ModeName, OnboardState
+from zsim_bridges.vehicle_links.server import PictureServer, Say
 
 WORLD = "world"
 MAG_LSB_PER_UT = 1 / 0.3  # AK8975 datasheet, 0.3 uT per LSB: the AR.Drone 2.0's
@@ -48,8 +48,6 @@ DRIVER_QUEUE = 200  # messages, of the driver's publishers
 CAMERA_QUEUE = 10  # pictures, of the driver's image publishers
 QUEUE = 100  # messages
 NEARLY_ZERO = 1e-6  # of a component of cmd_vel, _EPS of the driver
-REPEAT_NS = 100_000_000  # ns; a commander that is silent for 0.5 s counts as dead, scenario `silence.hover_s`
-AIRBORNE = ("hovering", "flying")
 COMMANDABLE = ("taking_off", *AIRBORNE)
 Part = tuple[str, Vector, Quaternion]  # frame of a part, and its pose in the body
 Navdata = message_class("ardrone_autonomy/Navdata")
@@ -87,7 +85,7 @@ def serve(
         raise NodeShutdownError(f"{observer.name}: {node.shutdown_reason}")
 
 
-class Ros1Bridge(VehicleServer):
+class Ros1Bridge(PictureServer):
     """One run in one ROS graph.
 
     Raises:
@@ -111,23 +109,16 @@ class Ros1Bridge(VehicleServer):
     async def open(self, stack: contextlib.AsyncExitStack) -> None:
         for sample in self.link.get(keys.camera_info("*", "*")):
             self.forward(sample.key, sample.payload)
-        self._pictures = PictureIntake(self.link, asyncio.get_running_loop(), self.forward)
-        stack.callback(self._pictures.follow, ())
+        await super().open(stack)
         await stack.enter_async_context(self._node.running())
 
-    async def on_arrivals(self, intake: TrafficIntake) -> None:
-        for arrived in intake.arrivals():
-            for key, payload in arrived:
-                self.forward(key, payload)
-            await asyncio.sleep(0)  # other tasks run
-        self._pictures.follow(self.wanted_pictures())
-
     def wanted_pictures(self) -> list[str]:
-        """Return the keys of the cameras that some node subscribes to."""
         return [keys.camera(name, camera) for name, drone in self._drones.items() for camera in drone.cameras.wanted()]
 
+    def on_picture(self, key: str, payload: bytes) -> None:
+        self.forward(key, payload)
+
     def forward(self, key: str, payload: bytes) -> None:
-        """Convert and publish a message that has passed through the world."""
         kind, thing, leaf = keys.parts(key)
         if key == keys.CLOCK:
             clock = self.observer.update_clock(payload)

@@ -319,10 +319,7 @@ float32 tm
 """
 
 MESSAGES = {"zsim_msgs/msg/ClusterState": CLUSTER_STATE, "zsim_msgs/msg/Navdata": NAVDATA}
-SERVICES = {  # requests and responses
-    "std_srvs/srv/Trigger": ("", "bool success\nstring message\n"),
-    "std_srvs/srv/SetBool": ("bool data\n", "bool success\nstring message\n"),
-}
+SERVICES = {"std_srvs/srv/Trigger": ("", "bool success\nstring message\n")}  # requests and responses
 SERVICE_EVENT_INFO = """\
 uint8 event_type
 builtin_interfaces/Time stamp
@@ -421,11 +418,6 @@ def type_hash(name: str) -> str:
     members = {"request_message": request, "response_message": response, "event_message": event}
     store.fielddefs[name] = [], [(member, reference(kind)) for member, kind in members.items()]
     return store.hash_rihs01(name)
-
-
-def definition(name: str) -> str:
-    """Return the text of a message type, without those that it is made of."""
-    return _store.gendefhash(_stored(name), {}, 2)[0]
 
 
 @cache

@@ -26,7 +26,7 @@ from zsim_bridges import ros_messages as ros
 from zsim_bridges.ros2 import rmw_zenoh, topics
 from zsim_bridges.ros2.rmw_zenoh import Publisher, Ros2Node, RosContext, ros_names
 from zsim_bridges.ros2.topics import DRIVER, DroneCameras, RosNames, Topic
-from zsim_bridges.vehicle_links.drone_link import CommandSender
+from zsim_bridges.vehicle_links.drone_link import CommandSender, ModeName
 
 NODE = "zsim"
 POLL_S = 0.1  # how often a stop is checked for
@@ -166,8 +166,8 @@ class Ros2Bridge:
             node.service(f"/{name}/{DRIVER}/togglecam", TRIGGER, cameras.toggle)
             callbacks: dict[str, tuple[str, Callable[..., None]]] = {
                 "cmd_vel": ("geometry_msgs/msg/Twist", commands.send_velocity),
-                "takeoff": (EMPTY, commands.take_off),
-                "land": (EMPTY, commands.land),
+                "takeoff": (EMPTY, partial(commands.send_mode, "takeoff")),
+                "land": (EMPTY, partial(commands.send_mode, "land")),
                 "reset": (EMPTY, commands.toggle_emergency),
             }
             for leaf, (kind, act) in callbacks.items():
@@ -229,13 +229,9 @@ class RosCommands:
         with self._lock:
             self._senders[drone].velocity(self._observer.now_ns, v, float(turn), "heading")
 
-    def take_off(self, drone: str, _: Any) -> None:
+    def send_mode(self, mode: ModeName, drone: str, _: Any = None) -> None:
         with self._lock:
-            self._senders[drone].mode(self._observer.now_ns, "takeoff")
-
-    def land(self, drone: str, _: Any) -> None:
-        with self._lock:
-            self._senders[drone].mode(self._observer.now_ns, "land")
+            self._senders[drone].mode(self._observer.now_ns, mode)
 
     def toggle_emergency(self, drone: str, _: Any) -> None:
         """Stop the rotors at once, or reset a drone whose rotors were stopped: the aircraft's emergency button.
@@ -251,8 +247,7 @@ class RosCommands:
             state = messages.decode(key, sample.payload).state
         except DecodeError as error:
             raise ValueError(str(error)) from error
-        with self._lock:
-            self._senders[drone].mode(self._observer.now_ns, "reset" if state == "emergency" else "emergency")
+        self.send_mode("reset" if state == "emergency" else "emergency", drone)
 
     def request(self, key: str, op: str, args: dict[str, Any], _: Any) -> Any:
         """Send a control request for a service whose own request is empty; return the response."""

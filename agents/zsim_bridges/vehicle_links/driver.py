@@ -225,7 +225,7 @@ class DriverProcess:
     def _hint(self) -> None:
         """Print possible causes if an aircraft does not appear."""
         if self._session.state.received_ns is None:
-            channel, refused = self._session.channels[0], self._session.figures(self._clock.now_ns()).refused
+            channel, refused = self._session.channels[0], self._session.figures().refused
             silence = self._sockets[0].fault.lower() or "nothing comes"
             what = f"{refused} messages of other senders arrived" if refused else silence
             advice = "check its address, that it is switched on, and over MAVLink its system id and key"
@@ -252,7 +252,7 @@ class DriverProcess:
         if now != self._reported:
             self._say(f"link {state}, {phase}{f' ({reason})' if reason else ''}")
         self._reported, self._reported_s = now, time.monotonic()
-        figures = self._session.figures(now_ns)
+        figures = self._session.figures()
         received_ns, channel = self._session.state.received_ns, self._session.channels[0]
         message = flight_messages.LinkState(
             t_ns=self._observer.now_ns,

@@ -15,7 +15,7 @@ from zsim.sensors.sensor import Mount
 from zsim_agents.estimation.strapdown import madgwick_step
 
 BETA_RAD_S = 0.02  # of Madgwick's filter: levels within seconds, and is little disturbed by manoeuvres
-UNIT_SLACK = 0.01  # of a quaternion's length; an estimator of positions alone may publish zeros
+REPEAT_NS = 100_000_000  # ns; a commander that is silent for 0.5 s counts as dead, scenario `silence.hover_s`
 STEP_S_MAX = 0.1  # longer gaps in the IMU's samples are not integrated over
 POSITIONS_KEPT = 32  # gates whose integrated position is remembered; an estimate is a few gates late at most
 ModeName = Literal["takeoff", "land", "emergency", "reset"]
@@ -124,11 +124,12 @@ class OnboardState:
                 before, self.flow = self.flow, message
                 if before is not None:
                     dt = (message.t_sample_ns - before.t_sample_ns) * 1e-9
-                    yaw, (vx, vy, _) = float(rotations.heading(self.attitude)), message.velocity_m_s
-                    self._x_m += dt * (vx * math.cos(yaw) - vy * math.sin(yaw))
-                    self._y_m += dt * (vx * math.sin(yaw) + vy * math.cos(yaw))
+                    yaw = float(rotations.heading(self.attitude))
+                    vx, vy, _ = rotations.turned_about_up(message.velocity_m_s, yaw)
+                    self._x_m += dt * vx
+                    self._y_m += dt * vy
             case flight_messages.Estimate():
-                if abs(math.hypot(*message.orientation_wxyz) - 1.0) < UNIT_SLACK:
+                if has_attitude(message):
                     self.estimate = message
                     self.attitude = message.orientation_wxyz
                 position = next((position for t_ns, position in self._positions if t_ns == message.t_ns), None)
@@ -143,6 +144,11 @@ class OnboardState:
     @property
     def position_m(self) -> Vector:
         return self._x_m, self._y_m, self.altitude_m
+
+
+def has_attitude(estimate: flight_messages.Estimate) -> bool:
+    """Return whether an estimate has an attitude; an estimator of positions alone may publish zeros."""
+    return abs(math.hypot(*estimate.orientation_wxyz) - 1.0) <= flight_messages.UNIT_SLACK
 
 
 def warm_up() -> None:

@@ -192,6 +192,35 @@ class VehicleServer(ABC):
             self.say(text)
 
 
+class PictureServer(VehicleServer):
+    """A server that forwards each message in its order, and also the pictures of the cameras that somebody watches."""
+
+    async def open(self, stack: contextlib.AsyncExitStack) -> None:
+        self._pictures = PictureIntake(self.link, asyncio.get_running_loop(), self.on_picture)
+        stack.callback(self._pictures.follow, ())
+
+    async def on_arrivals(self, intake: TrafficIntake) -> None:
+        for arrived in intake.arrivals():
+            for key, payload in arrived:
+                self.forward(key, payload)
+                if keys.is_status(key):  # a gate of a fleet takes long: what clients send meanwhile comes first
+                    await asyncio.sleep(0)
+            await asyncio.sleep(0)
+        self._pictures.follow(self.wanted_pictures())
+
+    @abstractmethod
+    def wanted_pictures(self) -> Iterable[str]:
+        """Return the keys of the cameras that somebody watches."""
+
+    @abstractmethod
+    def forward(self, key: str, payload: bytes) -> None:
+        """Hand on a message that has passed through the world."""
+
+    @abstractmethod
+    def on_picture(self, key: str, payload: bytes) -> None:
+        """Hand on a picture."""
+
+
 def set_pace(link: Session, info: Info, name: str, rate: float | None) -> None:
     """Request a pace from the world, if one is given; refuse a run without one, since programs use the wall clock.
 

@@ -24,7 +24,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, Literal, NamedTuple
 
 from zsim.contract import flight_messages
-from zsim.contract.flight_messages import DroneState
+from zsim.contract.flight_messages import AIRBORNE, DroneState
 from zsim.math import elementary as el
 from zsim.math.frames import geodetic_to_enu, heading, turned_about_up
 from zsim.math.rotation import LEVEL, Quaternion, Vector
@@ -37,7 +37,6 @@ SCALE_M = 44_330.77  # m, T0 / lapse rate = 288.15 K / 6.5 K/km (ISO 2533)
 EXPONENT = 0.190263  # R lapse / g (ISO 2533)
 PRESSURES = 250  # chosen: 10 s at 25 Hz average 0.1 m of noise to less than 1 cm
 STILL: Vector = (0.0, 0.0, 0.0)
-AIRBORNE: tuple[DroneState, ...] = ("hovering", "flying")
 STANDING: tuple[DroneState, ...] = ("landed", "emergency")  # states in which no rotor turns
 LOSS_WINDOW = 1000  # numbers that count for the loss, a few seconds of telemetry
 Action = Literal["none", "take_off", "hold", "fly", "land", "kill", "reset"]
@@ -362,7 +361,7 @@ class VehicleSession(ABC):
     def advance(self, now_ns: int, demand: Demand) -> Iterable[tuple[int, bytes]]:
         """Return the datagrams that are due, with the channel of each; called at least every 20 ms."""
 
-    def figures(self, now_ns: int) -> LinkFigures:
+    def figures(self) -> LinkFigures:
         clock = self.readings.clock
         return LinkFigures(self._loss.percent, clock.round_trip_ms, clock.ahead_ms, self._refused)
 
@@ -509,11 +508,7 @@ class ClockOffset:
     def taken_ns(self, stamp_ns: int, arrival_ns: int) -> int:
         """Record a stamped message that arrives now; return when it was created, by this clock."""
         self.add(stamp_ns, arrival_ns)
-        return min(arrival_ns, self.to_local(stamp_ns))
-
-    def to_local(self, stamp_ns: int) -> int:
-        """Return this clock's time at a time of the other."""
-        return stamp_ns + self.offset_ns
+        return min(arrival_ns, stamp_ns + self.offset_ns)
 
     def to_remote(self, local_ns: int) -> int:
         """Return the other clock's time at a time of this one."""

@@ -79,9 +79,11 @@ def measures(flight: RecordedFlight, figure: Figure | None = None) -> dict[str, 
         "cpu_per_s": flight.cpu_s / length_s if flight.cpu_s else None,
     }
     if flown.wanted is not None:
-        found["centre_error_m"] = _rms(_mean(flown.p) - _centre_of_flying(flown))
-        if flown.wanted.places is not None:
-            found["place_error_m"] = _rms(flown.p - flown.wanted.places)
+        centre, places, _ = flown.wanted
+        if places is not None:  # the centre of the drones in the air; without places, that of all
+            centre = _mean(np.where(np.isnan(flown.p), np.nan, places))
+            found["place_error_m"] = _rms(flown.p - places)
+        found["centre_error_m"] = _rms(_mean(flown.p) - centre)
     return found
 
 
@@ -113,7 +115,8 @@ def shape_errors(flown: Flown) -> Array:
     wanted = flown.wanted
     if wanted is None or wanted.places is None:
         return np.full(len(flown.t_s), np.nan)
-    p, c = (_complex(each) for each in (flown.p, np.where(np.isnan(flown.p), np.nan, wanted.places)))
+    planes = (flown.p, np.where(np.isnan(flown.p), np.nan, wanted.places))
+    p, c = (each[..., 0] + 1j * each[..., 1] for each in planes)  # places in the plane as complex numbers
     with np.errstate(invalid="ignore", divide="ignore"):
         if "translation" in wanted.invariances:
             p, c = p - _mean(p)[:, None], c - _mean(c)[:, None]
@@ -169,13 +172,6 @@ def _shape_error(scenario: Scenario | None, flown: Flown) -> float | None:
     return _root_mean_square(shape_errors(flown))
 
 
-def _centre_of_flying(flown: Flown) -> Array:
-    """Return where the centre of the drones in the air was to be (T, 2): without places, that of all."""
-    assert flown.wanted is not None
-    places = flown.wanted.places
-    return flown.wanted.centre if places is None else _mean(np.where(np.isnan(flown.p), np.nan, places))
-
-
 def _effort(flight: RecordedFlight) -> float | None:
     efforts = []
     for track in flight.tracks:
@@ -197,10 +193,6 @@ def _messages(flight: RecordedFlight) -> int:
 def _within(track: Track, window_s: tuple[float, float]) -> Track:
     chosen = (track.t_ns >= window_s[0] * 1e9) & (track.t_ns <= window_s[1] * 1e9)
     return replace(track, t_ns=track.t_ns[chosen], truth=track.truth[chosen])
-
-
-def _complex(p: Array) -> Any:
-    return p[..., 0] + 1j * p[..., 1]
 
 
 def _mean(values: Any) -> Any:

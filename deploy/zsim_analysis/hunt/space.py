@@ -457,7 +457,9 @@ class Strategy:
                 kinds = tuple(str(each) for each in rng.choice(names, self.space.most, replace=False)) if names else ()
             if kinds is not None:
                 self._planned.add(tuple(sorted(kinds)))
-                return self._anew(kinds, rng)
+                faults = tuple(self.space.kinds[kind].draw(rng) for kind in kinds)
+                values = {path: self.space.draw_value(path, rng) for path in self.space.fields}
+                return Case(self.space.draw_seed(rng), values, faults)
         case = self._near(rng)
         self._planned.add(case.kinds)
         return case
@@ -468,11 +470,6 @@ class Strategy:
         known = self.elites.get(case.kinds)
         if case.faults and (known is None or (margin.share < known.margin.share)):
             self.elites[case.kinds] = Elite(margin, case)
-
-    def _anew(self, kinds: Sequence[str], rng: Generator) -> Case:
-        faults = tuple(self.space.kinds[kind].draw(rng) for kind in kinds)
-        values = {path: self.space.draw_value(path, rng) for path in self.space.fields}
-        return Case(self.space.draw_seed(rng), values, faults)
 
     def _near(self, rng: Generator) -> Case:
         """Return a neighbour of one of the best flights, preferring the better ones."""

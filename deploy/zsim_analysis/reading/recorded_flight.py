@@ -491,9 +491,11 @@ class FlightReader:
         for drone, rows in self._references.items():
             t_ns, place, texts = rows.by_time()
             references[drone] = DroneReferences(t_ns, place, [phase for (phase,) in texts])
+        scenario = scenario_of(info)
+        radio = scenario.radio_of_agents if scenario else None
         return RecordedFlight(
             info=info,
-            scenario=scenario_of(info),
+            scenario=scenario,
             tracks=tracks,
             clusters=clusters,
             events=sorted(self._events, key=lambda event: (event.t_ns, event.seq)),
@@ -506,16 +508,9 @@ class FlightReader:
             estimates=estimates,
             commands=self._flown_commands(),
             others=dict(self._others),
-            radio=self._radio_history(info, len(tracks)),
+            radio=RadioHistory(self._radio, len(tracks), radio.loss if radio else 0.0) if self._radio else None,
             references=references,
         )
-
-    def _radio_history(self, info: Info | None, drones: int) -> RadioHistory | None:
-        if not self._radio:
-            return None
-        scenario = scenario_of(info)
-        radio = scenario.radio_of_agents if scenario else None
-        return RadioHistory(self._radio, drones, radio.loss if radio else 0.0)
 
     def _flown_commands(self) -> dict[str, VelocityCommands]:
         """Return the commands of each drone that were obeyed, by time.

@@ -21,7 +21,7 @@ from zsim.contract.framing import GateMessages, encode_batch, key_table
 from zsim.contract.messages import DroneInfo, Imu, Info, Origin
 from zsim.contract.run_messages import RUN_ENDED, Clock, ControlAnswer, Event, Faults
 from zsim.errors import RecordError
-from zsim.record import Completeness, RecordReader, RecordWriter, completeness, record_writer
+from zsim.record import Completeness, RecordReader, RecordWriter, completeness, mcap_layout
 from zsim.record.completeness import GateGap
 from zsim.record.mcap_layout import places
 from zsim_agents import recorder
@@ -277,14 +277,14 @@ def test_the_record_of_another_run_is_left_alone(tmp_path: Path):
 
 def test_a_disk_that_is_full_while_it_joins_is_a_bye(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The world has its join then: without a bye it would wait for a recorder that is started again."""
-    link, write_all = linked([page(gates(0))]), record_writer.write_all
+    link, write_all = linked([page(gates(0))]), mcap_layout.write_all
 
     def write(file: FileIO, data: bytes) -> None:
         if file.tell():
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         write_all(file, data)
 
-    monkeypatch.setattr(record_writer, "write_all", write)
+    monkeypatch.setattr(mcap_layout, "write_all", write)
     with refused(RecordError, "run.mcap", os.strerror(errno.ENOSPC)) as full:
         record(link, tmp_path / "run.mcap")
     (join,) = link.published_on(JOIN)

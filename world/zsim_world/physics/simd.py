@@ -263,14 +263,19 @@ def _touch(bodies: Bodies, i: int) -> Touch:
     return Touch(bodies.obstacle, bodies.solid[i], bodies.held[i], bodies.plane[i], vector(bodies.twist[i], 0))
 
 
-@noinline
-def _step_braced(bodies: Bodies, i: int, dt: float) -> None:
-    """Step a drone with all its contacts."""
+@inlined
+def _step_alone(bodies: Bodies, i: int, touch: Touch | None, dt: float) -> None:
+    """Step a drone near the ground or in contact with anything."""
     row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
     air, push = vector(bodies.air[i], 0), vector(bodies.push[i], 0)
     rotors = PerRotor(bodies.rotors[i], 0, 1, bodies.each)
     aero = Aero(bodies.aero_parts, bodies.aero[i])
-    body.step(row, rotors, anchor, state, bodies.command[i], air, push, dt, _touch(bodies, i), aero)
+    body.step(row, rotors, anchor, state, bodies.command[i], air, push, dt, touch, aero)
+
+
+@noinline
+def _step_braced(bodies: Bodies, i: int, dt: float) -> None:
+    _step_alone(bodies, i, _touch(bodies, i), dt)
 
 
 @inlined
@@ -288,10 +293,7 @@ def _take_over(bodies: Bodies, lanes: NDArray, i: int, k: int, dt: float) -> Non
         if bodies.braced[i] != 0:
             _step_braced(bodies, i, dt)
         else:
-            rotors = PerRotor(bodies.rotors[i], 0, 1, bodies.each)
-            air, push = vector(bodies.air[i], 0), vector(bodies.push[i], 0)
-            aero = Aero(bodies.aero_parts, bodies.aero[i])
-            body.step(row, rotors, anchor, state, bodies.command[i], air, push, dt, None, aero)
+            _step_alone(bodies, i, None, dt)
         _put_state(lanes, k, state, bodies.each)
     if _in_reach(bodies, i):
         drag_anchors(row, anchor, vector(state, STATE.p_WB), four(state, STATE.q_WB))

@@ -101,18 +101,13 @@ SONAR_AGE_MAX = 100.0  # steps, 0.5 s without echo: heights come from the barome
 
 
 @inlined
-def _face(belief: NDArray, q: Quaternion) -> Quaternion:
-    """Set the estimated attitude; return its heading frame in W."""
-    put_four(belief, BELIEF.q_WB, q)
-    belief[BELIEF.heading] = rot.heading(q)
-    return rot.about_z(belief[BELIEF.heading])
-
-
-@inlined
 def _turn_by(belief: NDArray, own: Quaternion, r_H: Vector) -> Quaternion:
     """Rotate the estimated attitude by a small rotation vector [rad; heading frame]; return the new frame."""
     turn = rot.from_rotation_vector(rot.rotate(own, r_H))
-    return _face(belief, rot.normalised(rot.multiply(turn, four(belief, BELIEF.q_WB))))
+    q = rot.normalised(rot.multiply(turn, four(belief, BELIEF.q_WB)))
+    put_four(belief, BELIEF.q_WB, q)
+    belief[BELIEF.heading] = rot.heading(q)
+    return rot.about_z(belief[BELIEF.heading])
 
 
 @inlined
@@ -253,15 +248,6 @@ def _correct(belief: NDArray, gain: NDArray, at: int, e: Vector) -> None:
 
 
 @inlined
-def _correct_tilt(belief: NDArray, gain: NDArray, own: Quaternion, e: Vector) -> Quaternion:
-    """Correct tilt and gyro bias by an innovation of the flow; the accelerometer does not correct them."""
-    tilt, rate = gain[GAIN.flow_tilt], gain[GAIN.flow_rate]
-    own = _turn_by(belief, own, (-tilt * e[1], tilt * e[0], 0.0))  # faster forward than believed: pitched farther so
-    _take_bias(belief, own, (-rate * e[1], rate * e[0], 0.0))
-    return own
-
-
-@inlined
 def _lift_by(belief: NDArray, gain: NDArray, at: int, e: float) -> None:
     """Correct height, climb, vertical disturbance and accelerometer bias by an innovation with the gains at `at`."""
     belief[BELIEF.height] += gain[at] * e
@@ -275,7 +261,9 @@ def _see_flow(belief: NDArray, gain: NDArray, own: Quaternion, flow_H: Vector) -
     """Correct velocity, disturbance, tilt, bias and climb rate by a flow velocity; return the new heading frame."""
     e = axpy(flow_H, -1.0, vector(belief, BELIEF.v_H))
     _correct(belief, gain, GAIN.flow_v, e)
-    own = _correct_tilt(belief, gain, own, e)
+    tilt, rate = gain[GAIN.flow_tilt], gain[GAIN.flow_rate]  # these the accelerometer does not correct
+    own = _turn_by(belief, own, (-tilt * e[1], tilt * e[0], 0.0))  # faster forward than believed: pitched farther so
+    _take_bias(belief, own, (-rate * e[1], rate * e[0], 0.0))
     _lift_by(belief, gain, GAIN.climb_z, e[2])
     return own
 

@@ -93,7 +93,7 @@ def test_a_folder_goes_on_with_its_own_plan_and_refuses_any_other(tmp_path: Path
             pass
     (tmp_path / "run").mkdir()
     (tmp_path / "run/run.mcap").touch()
-    with pytest.raises(RunError, match=r"run: .*--out"), locked(tmp_path / "run", of):
+    with pytest.raises(RunError, match=r"run: .*--out"), locked(tmp_path / "run", of, force=True):
         pass
     (out / "plan.json").write_text("{}")
     with pytest.raises(RunError, match=r"plan\.json: "):

@@ -21,7 +21,7 @@ from synthetic_record import flight as flight_of
 from zsim.contract.fingerprint import fingerprint
 from zsim.contract.framing import GateMessages
 from zsim.errors import RecordError, ScenarioError
-from zsim.record import record_writer
+from zsim.record import mcap_layout, record_writer
 from zsim.scenario import scenario_file
 from zsim.schema import plugin
 from zsim_analysis import in_process
@@ -158,7 +158,7 @@ def test_a_full_disk_is_the_sweep_s_end_and_no_fault_of_the_run(
 ) -> None:
     """What was written of the record keeps the name under which the error speaks of it."""
 
-    calls, write = itertools.count(), record_writer.write_all
+    calls, write = itertools.count(), mcap_layout.write_all
 
     def full_after_two(file: Any, data: bytes) -> None:
         if next(calls) >= 2:
@@ -166,7 +166,7 @@ def test_a_full_disk_is_the_sweep_s_end_and_no_fault_of_the_run(
         write(file, data)
 
     monkeypatch.setattr(record_writer, "CHUNK_BYTES", 1000)
-    monkeypatch.setattr(record_writer, "write_all", full_after_two)
+    monkeypatch.setattr(mcap_layout, "write_all", full_after_two)
     part = tmp_path / "000007.part"
     with refused(RecordError, "000007.part/run.mcap", os.strerror(errno.ENOSPC)):
         fly(task(record=tmp_path / "000007"))

@@ -225,7 +225,5 @@ def test_nothing_that_anybody_sends_raises():
         datagram = bytearray(good)
         for _ in range(chance.randrange(1, 30)):
             datagram[chance.randrange(len(datagram))] = chance.randrange(256)
-        commands, refusals = at.parse(bytes(datagram[: chance.randrange(len(datagram) + 1)]))
-        for command in commands:
+        for command in at.parse(bytes(datagram[: chance.randrange(len(datagram) + 1)])).commands:
             assert all(math.isfinite(value) for value in command if isinstance(value, float))
-        assert commands or refusals or len(datagram) >= 0

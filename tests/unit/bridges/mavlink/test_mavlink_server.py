@@ -2,7 +2,6 @@
 
 import asyncio
 import socket
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -65,7 +64,7 @@ def program() -> Iterator[socket.socket]:
 
 def served_vehicle(program: socket.socket, received: list[Received]) -> ServedVehicle:
     port = VehiclePort(("127.0.0.1", 0), program.getsockname(), None, received.append)
-    port.open(asyncio.get_running_loop(), time.monotonic)
+    port.open()
     vehicle: Any = None
     return ServedVehicle(vehicle, [port], Link(1, 1))
 
@@ -84,7 +83,7 @@ async def test_messages_go_together_in_datagrams_and_those_out_of_range_are_coun
     served = served_vehicle(program, [])
     served.send([*many[:25], dialect.Heartbeat(type=300), *many[25:]])
     assert served.refused()["unsent"] == 1
-    served.ports[0].close(asyncio.get_running_loop())
+    served.ports[0].close()
     parser, read = Parser(), []
     while len(read) < len(many):
         data = program.recv(65_536)
@@ -104,7 +103,7 @@ async def test_what_a_program_sends_is_read_and_what_is_damaged_is_counted(progr
         await asyncio.sleep(0)
     assert received == [Received(dialect.Heartbeat(type=6), 255, 190, 0, False)]
     assert served.refused()["bad_crc"] == 1
-    served.ports[0].close(asyncio.get_running_loop())
+    served.ports[0].close()
 
 
 def server_of(link: Any, first_system_id: int = 1, run_id: str = "r") -> MavlinkServer:

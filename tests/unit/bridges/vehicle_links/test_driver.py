@@ -71,7 +71,7 @@ class Session(VehicleSession):
     def advance(self, now_ns: int, demand: Demand) -> Iterator[tuple[int, bytes]]:
         yield 0, demand.action.encode()
 
-    def figures(self, now_ns: int) -> LinkFigures:
+    def figures(self) -> LinkFigures:
         return LinkFigures(loss_percent=1.0)
 
 

@@ -8,6 +8,7 @@ from continued import continue_from
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refused import has_terms, refused
+from small_world import GATE_NS, events_of, small_world
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Ardrone, Mode, Status, Truth, Velocity
@@ -21,7 +22,6 @@ from zsim_world.run.world import World
 
 D1, D2 = 0, 1
 OPERATOR = 10  # priority that docs/protocol.md gives to operators
-GATE_NS = 20_000_000
 
 
 def velocity(source: str, seq: int = 0, t_ns: int = 0, x: float = 1.0) -> Velocity:
@@ -227,27 +227,16 @@ def test_modes_are_open_to_all_while_nobody_or_a_program_flies(queue: CommandQue
 # In a world
 
 AGE_MAX_MS = 400
-SCENARIO = f"""
-name: one
-duration_s: 10
-time: {{max_command_age_ms: {AGE_MAX_MS}}}
-drones: [{{name: d1, position_m: [0, 0, 0]}}]
-processes: {{expect: []}}
-"""
-
-
-def events(world: World, kind: str) -> list[Event]:
-    return [each for _, each in world.take_outbox() if isinstance(each, Event) and each.kind == kind]
 
 
 def refusals(mode: str, age_ms: int, kind: str = "velocity") -> list[dict[str, Any]]:
     """Return the refusals of a command of gate 0 that comes so much later."""
-    world = World(scenario_file.from_text(SCENARIO), mode, run_id="run1")
+    world = small_world(mode, duration_s=10, time={"max_command_age_ms": AGE_MAX_MS})
     for _ in range(1 + age_ms * 1_000_000 // GATE_NS):
         world.advance(0)
     command = Mode(0, 0, "me.x", "land") if kind == "mode" else Velocity(0, 0, "me.x", (0.0, 0.0, 0.0), 0.0)
     world.handle(keys.command("d1", kind), command, 0)
-    return [event.data for event in events(world, "refused")]
+    return [event.data for event in events_of(world, "refused")]
 
 
 @pytest.mark.parametrize("kind", ["velocity", "mode"])
@@ -259,7 +248,7 @@ def test_an_old_command_is_refused_in_realtime_alone(kind: str):
 
 @pytest.mark.parametrize(("priority", "ok"), [(0, True), (PRIORITY_MAX, True), (-1, False), (PRIORITY_MAX + 1, False)])
 def test_a_drone_is_acquired_with_any_priority_of_the_protocol(priority: int, ok: bool):
-    world = World(scenario_file.from_text(SCENARIO), "realtime", run_id="run1")
+    world = small_world("realtime")
     answer = world.control(ControlRequest("acquire", {"drone": "d1", "priority": priority}, "me.x"))
     assert answer.ok == ok
 
@@ -269,10 +258,10 @@ MISSION = {"drone": "d1", "state": "aborted", "items": 5, "done": 3, "reason": "
 
 def reported(**changed: Any) -> tuple[str, list[Event]]:
     """Report a mission; return the refusal and the events of missions."""
-    world = World(scenario_file.from_text(SCENARIO), "realtime", run_id="run1")
+    world = small_world("realtime")
     world.advance(0)
     answer = world.control(ControlRequest("mission", MISSION | changed, "mavlink.main"))
-    return answer.error, events(world, "mission")
+    return answer.error, events_of(world, "mission")
 
 
 def test_a_mission_that_is_reported_is_an_event_of_its_drone():

@@ -3,29 +3,23 @@
 from typing import Any
 
 import pytest
+import yaml
 from continued import continue_from
 from msgspec import UNSET
 from refused import has_terms
+from small_world import GATE_NS, events_of, small_world
 
 from zsim.contract import keys
-from zsim.contract.run_messages import Bye, ControlRequest, Done, Event, Join
+from zsim.contract.run_messages import Bye, ControlRequest, Done, Join
 from zsim.errors import RunFailedError, ScenarioError
 from zsim.runtime.membership import HealthMeter
-from zsim.scenario import scenario_file
 from zsim_world.run import inputs
 from zsim_world.run.coordinator import DataFlow
 from zsim_world.run.inputs import Called, Run
 from zsim_world.run.world import World
 
-GATE_NS = 20_000_000
 ME, OWN = "estimator.d1", "fence.main"
 RETURN_NS = 2_000_000_000
-SCENARIO = """
-name: one
-duration_s: 1
-drones: [{name: d1, position_m: [0, 0, 0]}]
-processes: {expect: [], PROCESSES}
-"""
 
 
 def join(made: World, name: str, incarnation: int = 1, period_ns: int = GATE_NS, **more: Any) -> None:
@@ -39,7 +33,7 @@ def say_bye(made: World, name: str = ME, reason: str = "enough", **of: Any) -> N
 
 def world(processes: str = "on_death: {}", mode: str = "lockstep") -> World:
     """Return a world that ME has taken part in since wall time 0, and whose time stands for ME."""
-    made = World(scenario_file.from_text(SCENARIO.replace("PROCESSES", processes)), mode, run_id="run1")
+    made = small_world(mode, processes=yaml.safe_load(f"{{{processes}}}"))
     join(made, ME)
     while made.may_advance():
         made.advance(0)
@@ -47,13 +41,9 @@ def world(processes: str = "on_death: {}", mode: str = "lockstep") -> World:
     return made
 
 
-def news(made: World) -> list[Event]:
-    return [message for _, message in made.take_outbox() if isinstance(message, Event)]
-
-
 def events(made: World) -> list[tuple[str, str]]:
     """Return kinds and subjects of the events since the last look."""
-    return [(event.kind, event.subject) for event in news(made)]
+    return [(event.kind, event.subject) for event in events_of(made)]
 
 
 def test_one_that_died_is_overdue_after_its_time_and_not_before() -> None:
@@ -106,7 +96,7 @@ def test_one_that_is_stopped_is_overdue_too_and_on_death_says_what_it_means(on_d
 
 def test_nobody_overdue_is_waited_for() -> None:
     with pytest.raises(ScenarioError, match=r"processes\.on_overdue\.estimator"):
-        scenario_file.from_text(SCENARIO.replace("PROCESSES", "return_s: 1, on_overdue: {estimator: wait}"))
+        small_world(processes={"return_s": 1, "on_overdue": {"estimator": "wait"}})
 
 
 @pytest.mark.parametrize(
@@ -129,7 +119,7 @@ def test_a_loss_a_join_and_a_request_are_the_same_from_the_journal(method: str, 
     (entry,) = inputs.decode(inputs.encode([Called(method, args)]))
     made, again = world("return_s: 2"), world("return_s: 2")
     assert getattr(made, method)(*args) == Run(again, HealthMeter("world")).enter(entry)
-    assert news(made) == news(again)
+    assert events_of(made) == events_of(again)
     assert made.barrier.participants == again.barrier.participants
 
 
@@ -138,8 +128,7 @@ def test_a_loss_a_join_and_a_request_are_the_same_from_the_journal(method: str, 
 
 def waiting(processes: str, is_launched: bool = True) -> World:
     """Return a world that waits for OWN, and for the estimator that its launcher starts."""
-    text = SCENARIO.replace("expect: [], PROCESSES", f"expect: [{OWN}, {ME}], {processes}")
-    made = World(scenario_file.from_text(text), run_id="run1", wall_ns=lambda: 0)
+    made = small_world(processes={"expect": [OWN, ME], **yaml.safe_load(f"{{{processes}}}")})
     made.is_launched = is_launched
     return made
 
@@ -223,7 +212,7 @@ def test_a_bye_of_another_incarnation_or_run_is_refused(
 ) -> None:
     made = world()
     say_bye(made, failed=failed, **of)
-    (event,) = news(made)
+    (event,) = events_of(made)
     assert event.kind == "refused"
     assert has_terms(event.text, f"process/{ME}/bye", *wrong)
     assert made.barrier.participants[ME].alive
@@ -264,7 +253,7 @@ def test_who_says_done_after_such_a_bye_has_not_said_it() -> None:
     made = world()
     say_bye(made)
     made.handle(keys.process(ME, "done"), Done(0, 0, "run1", 1, 0, 0), 6)
-    (event,) = news(made)
+    (event,) = events_of(made)
     assert event.kind == "refused"
     assert has_terms(event.text, f"process/{ME}/bye", "incarnation", "missing", "1")
     made.died(ME, 7)
@@ -288,7 +277,7 @@ def test_who_leaves_early_is_named_and_fails_the_run_unless_that_is_allowed(
         join(made, "host.b", 9, period_ns=0, serves=serves)
     made.take_outbox()
     say_bye(made, run_id="run1", incarnation=1)
-    (event,) = news(made)
+    (event,) = events_of(made)
     assert event.data == {"reason": "enough", "run_id": "run1", "incarnation": 1, **({"fails": True} if fails else {})}
     assert [has_terms(line, ME, "0.02 s", "enough") for line in made.left_early] == [True] * fails
     assert made.ended is None
@@ -308,18 +297,12 @@ def test_who_is_not_needed_may_leave_and_a_recorder_ends_the_run(name: str) -> N
 
 # Who is held up by whom
 
-PAIR = scenario_file.from_text("""
-name: pair
-duration_s: 1
-drones: [{name: d1, position_m: [0, 0, 0]}, {name: d2, position_m: [5, 0, 0]}]
-clusters: [{name: main, drones: [d1, d2]}]
-processes: {expect: []}
-""")
+PAIR: dict[str, Any] = {"drones": 2, "clusters": [{"name": "main", "drones": ["d1", "d2"]}]}
 ESTIMATORS, CONTROLLER = ("estimator.d1", "estimator.d2"), "controller.main"
 
 
 def test_estimators_feed_the_controller_and_nobody_else_anybody():
-    flow = DataFlow(PAIR)
+    flow = DataFlow(small_world(**PAIR).scenario)
     names = (*ESTIMATORS, CONTROLLER, "planner.main", "tester.one")
     pairs = {(writer, reader) for writer in names for reader in names if flow.feeds(writer, reader)}
     assert pairs == {(e, reader) for e in ESTIMATORS for reader in (CONTROLLER, "planner.main")}
@@ -333,7 +316,7 @@ def test_estimators_feed_the_controller_and_nobody_else_anybody():
     ],
 )
 def test_who_lacks_an_estimate_is_a_victim(done: list[str], held_by: dict[str, tuple[str, ...]]):
-    made = World(PAIR, run_id="run1")
+    made = small_world(**PAIR)
     for name in (*ESTIMATORS, CONTROLLER):
         join(made, name)
     while made.may_advance():

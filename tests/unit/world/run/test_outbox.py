@@ -7,27 +7,20 @@ from continued import continue_from
 from msgspec import UNSET
 from msgspec.structs import replace
 from refused import has_terms
+from small_world import GATE_NS, small_world
 
 from zsim.contract import keys
 from zsim.contract.flight_messages import Mode, Velocity
 from zsim.contract.run_messages import Bye, ControlAnswer, ControlRequest, Done, Event, Join
-from zsim.scenario import scenario_file
 from zsim_world.run.outbox import CHANGES_MAX, EVENTS_MAX, REASONS_MAX, REFUSED_MAX, STRANGERS_MAX, UNJOINED, RefusalLog
 from zsim_world.run.world import World
 
 FLOOD = 5000  # requests, several times what is published
-GATE_NS = 20_000_000
-SCENARIO = """
-name: one
-duration_s: 1000
-drones: [{name: d1, position_m: [0, 0, 0]}]
-processes: {expect: []}
-"""
 
 
 @pytest.fixture
 def world() -> World:
-    world = World(scenario_file.from_text(SCENARIO), run_id="run1")
+    world = small_world(duration_s=1000)
     world.advance(0)
     return world
 

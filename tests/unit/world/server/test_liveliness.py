@@ -8,16 +8,15 @@ from typing import Any
 
 import pytest
 from fake_link import FakeLink
+from small_world import GATE_NS, small_world
 
 from zsim.contract import keys, messages
 from zsim.contract.run_messages import ControlRequest, Done, Event, Health, Join
 from zsim.runtime.membership import HealthMeter
-from zsim.scenario import scenario_file
 from zsim.scenario.roles import WORLD
 from zsim.transport.link_watch import ClosedLink, SessionTokens
 from zsim_world.run.inputs import Run
 from zsim_world.run.outbox import STRANGERS_MAX
-from zsim_world.run.world import World
 from zsim_world.server.liveliness import (
     DEAD_NS,
     DONE_NS,
@@ -33,19 +32,6 @@ from zsim_world.server.liveliness import (
     SlowReaders,
 )
 
-GATE_NS = 20_000_000
-SCENARIO = """
-name: one
-duration_s: 1
-drones: [{name: d1, position_m: [0, 0, 0]}]
-processes: {expect: [], on_death: {recorder: end}}
-"""
-AWAITING = """
-name: one
-duration_s: 1
-drones: [{name: d1, position_m: [0, 0, 0]}]
-processes: {expect: [estimator.d1]}
-"""
 ME = "estimator.d1"
 VISITOR = "tester.one"
 KINDS = {"join", "restart", "superseded", "no_show", "death", "drop"}
@@ -59,7 +45,7 @@ class Case:
     def __init__(self, name: str, period_ns: int = 0) -> None:
         self.name, self.period_ns = name, period_ns
         self.take_in: Callable[[], None] = lambda: None
-        self.world = World(scenario_file.from_text(SCENARIO), run_id="run1")
+        self.world = small_world(processes={"on_death": {"recorder": "end"}})
         run, link = Run(self.world, HealthMeter(WORLD)), FakeLink()
         self.liveliness = LivelinessMonitor(link, run, lambda: self.take_in())  # type: ignore[arg-type]
         self.wall_ns = 10 * S
@@ -187,7 +173,6 @@ def test_what_the_world_did_not_read_while_it_was_held_up_is_nobody_s_silence():
     assert case.reports == []
 
 
-ONE = "{name: one, duration_s: 1, drones: [{name: d1, position_m: [0, 0, 0]}]}"
 CONSOLE = ClosedLink("192.0.2.7:4000", "", ("console.1",), 400_000, 1)
 STRANGER = ClosedLink("127.0.0.1:4000", "pid 7 (python reader.py)", (), 70_000, 2)
 
@@ -197,7 +182,7 @@ def readers() -> SlowReaders:
     """Those of a run in which console.1 has published its health."""
     link = FakeLink()
     health = Health(0, 0, "console", "desk", 9, {}, 0, 0, 0, 0, reads=("view/**", "world/event"))
-    run = Run(World(scenario_file.from_text(ONE), run_id="run1"), HealthMeter(WORLD))
+    run = Run(small_world(), HealthMeter(WORLD))
     run.history.add(keys.process("console.1", "health"), messages.encode(health), 0)
     return SlowReaders(link, SessionTokens(link), run)  # type: ignore[arg-type]
 
@@ -235,7 +220,7 @@ class Door:
 
     def __init__(self, trusts: bool = False, mode: str = "lockstep") -> None:
         self.link = FakeLink()
-        self.world = World(scenario_file.from_text(AWAITING), mode, run_id="run1")
+        self.world = small_world(mode, processes={"expect": [ME]})
         tokens = SessionTokens(self.link)  # type: ignore[arg-type]
         tokens.watch()
         run = Run(self.world, HealthMeter(WORLD))

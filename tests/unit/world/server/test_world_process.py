@@ -7,6 +7,7 @@ import msgspec
 import pytest
 from fake_link import BAD_UTF8, NESTED, UNANSWERED, FakeLink
 from refused import has_terms, parts, refused
+from small_world import GATE_NS, small_world
 from synthetic_pictures import image, info, sightings
 
 from zsim.contract import keys, messages, run_messages
@@ -15,29 +16,21 @@ from zsim.contract.framing import decode_batch
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Done, Event, Health, Join
 from zsim.errors import DecodeError
 from zsim.runtime.membership import HealthMeter
-from zsim.scenario import roles, scenario_file
+from zsim.scenario import roles
 from zsim.schema.message import Message
 from zsim_world.fleet.fleet import DivergedError
 from zsim_world.run.world import DURATION_OVER, World
 from zsim_world.server.world_process import DELAY_MAX_NS, GATES_SENT, LAG_GATES, Pipelining, TurnWatch, WorldProcess
 
-GATE_NS = 20_000_000
 GATES = 10
 ME = "tester.one"
 FRONT, FRONT_INFO, DETECTIONS = keys.camera("d1", "front"), keys.camera_info("d1", "front"), keys.detections("d1")
 ESTIMATE, STATE, VELOCITY = keys.estimate("d1"), keys.cluster_state("main"), keys.command("d1", "velocity")
-SCENARIO = f"""
-name: one
-seed: 3
-duration_s: {GATES * GATE_NS / 1e9}
-drones: [{{name: d1, position_m: [0, 0, 0]}}]
-processes: {{expect: []}}
-"""
 ZEROS = (0.0, 0.0, 0.0)
 
 
 def world(*expect: str) -> World:
-    made = World(scenario_file.from_text(SCENARIO), run_id="run1")
+    made = small_world(duration_s=GATES * GATE_NS / 1e9)
     for name in expect:
         made.barrier.expect(name)
     return made
@@ -306,8 +299,7 @@ def test_a_diverged_state_ends_the_run_for_everybody(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(("action", "waits"), [("restart", True), ("wait", True), ("end", False), ("drop", False)])
 def test_the_end_waits_for_a_recorder_that_died_where_it_comes_back(action: str, waits: bool):
     """It has the last gates to write; others have nothing to do any more."""
-    text = SCENARIO.replace("{expect: []}", f"{{expect: [], on_death: {{recorder: {action}}}}}")
-    made = World(scenario_file.from_text(text), run_id="run1")
+    made = small_world(processes={"on_death": {"recorder": action}})
     join = Join(0, 0, "run1", 1, "recorder", "here", 1, 0, slack_ns=GATE_NS)
     made.handle(keys.process("recorder", "join"), join, 0)
     made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 1, "tester", "here", 2, GATE_NS), 0)

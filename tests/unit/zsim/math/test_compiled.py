@@ -27,7 +27,7 @@ def test_the_sources_of_a_kernel_are_all_that_its_module_imports():
     """Where a function is compiled, what it calls and the constants that it names are too, wherever they come from."""
     assert {"kalman_update", "strapdown", "compiled"} <= names("zsim_agents.estimation.estimator_bank")
     pytest.importorskip("numba")
-    flown = {"kernel", "firmware", "rigid_body", "simd", "rotation", "vehicle", "obstacle", "sensor_set", "compiled"}
+    flown = {"kernel", "firmware", "simd", "rotation", "vehicle", "surroundings", "sensor_set", "compiled"}
     assert flown <= names("zsim_world.fleet.kernel")
     assert "kernel" not in names("zsim_world.sensors.noise")
 

@@ -11,21 +11,18 @@ from mcap.opcode import Opcode
 from mcap.stream_reader import StreamReader
 from msgspec.msgpack import decode, encode
 from msgspec.structs import replace
+from plain_messages import GATE_NS, imu, run_info
 from refused import has_terms
 
 from zsim.contract import keys
-from zsim.contract.messages import DroneInfo, Imu, Info, Origin
+from zsim.contract.messages import DroneInfo, Info
 from zsim.contract.run_messages import Clock
 from zsim.record import Completeness, RecordReader, RecordWriter, completeness
 from zsim.record.completeness import UNREAD, GateGap, sequence_numbers
 from zsim.record.mcap_layout import places
 from zsim.record.record_reader import MessageSpans
 
-GATE_NS = 20_000_000
-INFO = Info(
-    0, 0, 1, "r", "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, Origin(0.0, 0.0, 0.0), (DroneInfo("d1", "any"),), (),
-    "", "", "", "",
-)  # fmt: skip
+INFO = run_info(["d1"])
 IMU = keys.sensor("d1", "imu")
 
 
@@ -53,7 +50,7 @@ def judged(
         for clock in on_clock:
             writer.add_message(keys.CLOCK, clock, 1)
         for seq in imus:
-            writer.add_message(IMU, Imu(0, seq, 0, (0.0, 0.0, 9.8), (0.0, 0.0, 0.0)), 1)
+            writer.add_message(IMU, imu(0, seq), 1)
     with RecordReader(path) as reader:
         return completeness(reader)
 

@@ -163,110 +163,103 @@ def test_repair_makes_a_cut_record_one_that_other_tools_seek_in(tmp_path):
             assert sum(1 for _ in StreamReader(file, validate_crcs=True).records) > len(before)
 
 
+class Damaged:
+    """A record of so many messages, whose bytes may be changed before it is read."""
+
+    def __init__(self, folder: Path, messages: int = 200) -> None:
+        self.path, self.recorded = folder / "run.mcap", flight(messages)
+        self.sizes = write(self.path, self.recorded)
+        self.data = bytearray(self.path.read_bytes())
+        self.chunks = [place for place in places(bytes(self.data)) if place.opcode == Opcode.CHUNK]
+        self.third = self.sizes[2 * CHUNK_MESSAGES - 1]  # where the third chunk begins
+
+    def read(self) -> tuple[list[Recorded], tuple[str, ...], bool]:
+        """Return the messages in the order of the file, the damage, and whether it was closed."""
+        self.path.write_bytes(self.data)
+        with RecordReader(self.path) as reader:
+            return list(reader.messages(by_time=False)), reader.damaged, reader.complete
+
+
 def test_a_damaged_chunk_is_passed_over_and_counted(tmp_path):
-    path = tmp_path / "run.mcap"
-    sizes = write(path, recorded := flight(200))
-    data = bytearray(path.read_bytes())
-    data[sizes[CHUNK_MESSAGES - 1] - 3000] ^= 0xFF  # inside the first chunk's compressed content
-    path.write_bytes(data)
-    first = next(place for place in places(bytes(data)) if place.opcode == Opcode.CHUNK)
-    with RecordReader(path) as reader:
-        assert list(reader.messages(by_time=False)) == recorded[CHUNK_MESSAGES:]
-        (damage,) = reader.damaged
-        assert has_terms(damage, "byte", str(first.start))
-        assert has_terms(record_notes(reader)[0], "damaged", str(first.start))
+    record = Damaged(tmp_path)
+    record.data[record.sizes[CHUNK_MESSAGES - 1] - 3000] ^= 0xFF  # inside the first chunk's compressed content
+    found, (damage,), _ = record.read()
+    assert found == record.recorded[CHUNK_MESSAGES:]
+    assert has_terms(damage, "byte", str(record.chunks[0].start))
+    with RecordReader(record.path) as reader:
+        assert list(reader)
+        assert has_terms(record_notes(reader)[0], "damaged", str(record.chunks[0].start))
 
 
 def test_a_chunk_whose_check_sum_was_changed_is_named(tmp_path):
     """Its content is whole, and so nothing but the sum tells."""
-    path = tmp_path / "run.mcap"
-    write(path, recorded := flight(200))
-    data = bytearray(path.read_bytes())
-    second = [place for place in places(bytes(data)) if place.opcode == Opcode.CHUNK][1]
+    record = Damaged(tmp_path)
+    second, recorded = record.chunks[1], record.recorded
     crc = second.body + CHUNK_HEAD.size - 8
-    assert int.from_bytes(data[crc : crc + 4], "little") == chunk_head(bytes(data), second).crc
+    assert int.from_bytes(record.data[crc : crc + 4], "little") == chunk_head(bytes(record.data), second).crc
     for changed in (b"\x01\x02\x03\x04", b"\0\0\0\0"):  # MCAP has 0 for no sum; a record of ours always has one
-        data[crc : crc + 4] = changed
-        path.write_bytes(data)
-        with RecordReader(path) as reader:
-            found = list(reader.messages(by_time=False))
-            assert found == recorded[:CHUNK_MESSAGES] + recorded[2 * CHUNK_MESSAGES :]
-            (damage,) = reader.damaged
-            assert has_terms(damage, "byte", str(second.start))
+        record.data[crc : crc + 4] = changed
+        found, (damage,), _ = record.read()
+        assert found == recorded[:CHUNK_MESSAGES] + recorded[2 * CHUNK_MESSAGES :]
+        assert has_terms(damage, "byte", str(second.start))
 
 
 def test_a_damaged_chunk_before_a_cut_is_counted_before_anything_is_read(tmp_path):
-    path = tmp_path / "run.mcap"
-    write(path, recorded := flight(2 * CHUNK_MESSAGES))
-    data = bytearray(path.read_bytes()[:-1])
-    last = [place for place in places(bytes(data)) if place.opcode == Opcode.CHUNK][-1]
-    data[last.end - 20] ^= 4
-    path.write_bytes(data)
-    with RecordReader(path) as reader:
-        assert len(reader.damaged) == 1
-        assert list(reader.messages(by_time=False)) == recorded[:CHUNK_MESSAGES]
-        assert len(reader.damaged) == 1
+    record = Damaged(tmp_path, 2 * CHUNK_MESSAGES)
+    del record.data[-1:]
+    record.data[record.chunks[-1].end - 20] ^= 4
+    found, damage, _ = record.read()
+    assert (found, len(damage)) == (record.recorded[:CHUNK_MESSAGES], 1)
+    with RecordReader(record.path) as reader:
+        assert reader.damaged == damage
 
 
 def test_a_length_that_cannot_be_right_hides_what_follows_and_is_counted(tmp_path):
-    path = tmp_path / "run.mcap"
-    sizes = write(path, recorded := flight(200))
-    data = bytearray(path.read_bytes())
-    chunk = sizes[2 * CHUNK_MESSAGES - 1]  # the third chunk begins here
-    assert data[chunk] == Opcode.CHUNK
+    record = Damaged(tmp_path)
+    assert record.data[record.third] == Opcode.CHUNK
     for length in (0, 3, 2**63):
-        data[chunk + 1 : chunk + 9] = length.to_bytes(8, "little")
-        path.write_bytes(data)
-        with RecordReader(path) as reader:
-            assert reader.complete
-            assert list(reader.messages(by_time=False)) == recorded[: 2 * CHUNK_MESSAGES]
-            assert len(reader.damaged) == 1
+        record.data[record.third + 1 : record.third + 9] = length.to_bytes(8, "little")
+        found, damage, complete = record.read()
+        assert (found, len(damage), complete) == (record.recorded[: 2 * CHUNK_MESSAGES], 1, True)
 
 
 @pytest.mark.parametrize("bit", [4, 14, 20, 62])
 def test_a_length_that_leads_behind_a_cut_is_not_told_as_the_cut(tmp_path, bit):
-    path = tmp_path / "run.mcap"
-    sizes = write(path, recorded := flight(600))
-    data = bytearray(path.read_bytes()[:-1000])
-    chunk = sizes[2 * CHUNK_MESSAGES - 1]  # the third chunk begins here
-    for place in (chunk, next(place.start for place in places(bytes(data)) if place.start > chunk)):
-        changed = bytearray(data)
-        changed[place + 1 + bit // 8] ^= 1 << bit % 8
-        path.write_bytes(changed)
-        with RecordReader(path) as reader:
-            found = list(reader.messages(by_time=False))
-            assert found == recorded[: len(found)]
-            assert (reader.complete, len(found) <= 3 * CHUNK_MESSAGES, len(reader.damaged) >= 1) == (False, True, True)
+    record = Damaged(tmp_path, 600)
+    del record.data[-1000:]
+    after = next(place.start for place in places(bytes(record.data)) if place.start > record.third)
+    for place in (record.third, after):
+        record.data[place + 1 + bit // 8] ^= 1 << bit % 8
+        found, damage, complete = record.read()
+        assert found == record.recorded[: len(found)]
+        assert (complete, len(found) <= 3 * CHUNK_MESSAGES, len(damage) >= 1) == (False, True, True)
+        record.data[place + 1 + bit // 8] ^= 1 << bit % 8
 
 
 def test_a_chunk_whose_head_is_damaged_is_passed_over_and_left_out_of_the_summary(tmp_path):
-    path = tmp_path / "run.mcap"
-    sizes = write(path, recorded := flight(200))
-    data = bytearray(path.read_bytes())
-    name = sizes[2 * CHUNK_MESSAGES - 1] + HEAD.size + CHUNK_HEAD.size - 4  # length of the third chunk's compression
-    assert data[name : name + 8] == b"\x04\x00\x00\x00zstd"
-    data[name : name + 4] = b"\x00\xff\xff\x00"
-    path.write_bytes(data[:-1])  # cut, so that there is something to repair
-    sound = recorded[: 2 * CHUNK_MESSAGES] + recorded[3 * CHUNK_MESSAGES :]
-    assert repair(path)
-    with RecordReader(path) as reader:
-        assert list(reader.messages(by_time=False)) == sound
-        assert len(reader.damaged) == 1
-    with open(path, "rb") as file:
+    record = Damaged(tmp_path)
+    name = record.third + HEAD.size + CHUNK_HEAD.size - 4  # length of the chunk's compression
+    assert record.data[name : name + 8] == b"\x04\x00\x00\x00zstd"
+    record.data[name : name + 4] = b"\x00\xff\xff\x00"
+    record.path.write_bytes(record.data[:-1])  # cut, so that there is something to repair
+    assert repair(record.path)
+    record.data = bytearray(record.path.read_bytes())
+    found, damage, _ = record.read()
+    sound = record.recorded[: 2 * CHUNK_MESSAGES] + record.recorded[3 * CHUNK_MESSAGES :]
+    assert (found, len(damage)) == (sound, 1)
+    with open(record.path, "rb") as file:
         assert sum(1 for _ in make_reader(file).iter_messages()) == len(sound)
 
 
 @pytest.mark.parametrize("opcode", [Opcode.SCHEMA, Opcode.CHANNEL])
 def test_a_damaged_schema_or_channel_is_one_line(tmp_path, opcode):
-    path = tmp_path / "run.mcap"
-    write(path, flight(100))
-    data = bytearray(path.read_bytes())
-    place = next(place for place in places(bytes(data)) if place.opcode == opcode)
+    record = Damaged(tmp_path, 100)
+    place = next(place for place in places(bytes(record.data)) if place.opcode == opcode)
     at = place.body + (2 if opcode == Opcode.SCHEMA else 4)  # the length of its name
-    data[at : at + 4] = b"\xff\xff\xff\x7f"
-    path.write_bytes(data[:-1])  # cut, so that there is something to repair
+    record.data[at : at + 4] = b"\xff\xff\xff\x7f"
+    record.path.write_bytes(record.data[:-1])  # cut, so that there is something to repair
     with refused(RecordError, str(opcode.name).lower(), f"byte {place.start}", "damaged"):
-        repair(path)
+        repair(record.path)
 
 
 @given(st.integers(0, 2**32))

@@ -4,17 +4,15 @@ from collections.abc import Sequence
 from typing import Any
 
 import pytest
+from plain_messages import GATE_NS, estimate, run_info, status
 from refused import refused
 
 from zsim.contract import keys
-from zsim.contract.flight_messages import Estimate, Status
-from zsim.contract.messages import Info, Origin
 from zsim.contract.run_messages import Bye, ControlAnswer, ControlRequest
 from zsim.contract.snapshot import pack, unpack
 from zsim.errors import RunError
 from zsim.runtime.agent import Agent, AgentGroup, Output
 
-GATE_NS = 20_000_000
 HOLD_NS = 2 * GATE_NS  # with a command delay of a gate
 CLUSTER = keys.cluster_control("main")
 
@@ -71,15 +69,6 @@ class Asked(Member):
         return ControlAnswer(ok=True, result=request.op)
 
 
-def status(t_ns: int, seq: int = 0) -> Status:
-    return Status(t_ns, seq, "flying", 50.0, False, None, 1)
-
-
-def estimate(t_ns: int, seq: int) -> Estimate:
-    zeros = (0.0, 0.0, 0.0)
-    return Estimate(t_ns, seq, zeros, zeros, (1.0, *zeros), 0.0, (0.0,) * 36, 0.1, zeros, {})
-
-
 def team() -> tuple[Member, Member, AgentGroup]:
     first = Member("estimator.d1", [keys.status("d1")], keys.estimate("d1"))
     first.serves = ("estimator.d2",)
@@ -122,7 +111,7 @@ def test_what_closes_the_gate_of_one_is_held_for_another_who_only_reads_it(resum
         return overhearing, AgentGroup([overhearing, waiting], HOLD_NS)
 
     overhearing, group = made()
-    info = Info(0, 0, 1, "r", "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, Origin(0, 0, 0), (), (), "", "", "", "")
+    info = run_info()
     for gate in range(4):
         group.receive(keys.status("d1"), status(gate * GATE_NS, gate))
         group.receive(keys.estimate("d2"), estimate(gate * GATE_NS, gate))

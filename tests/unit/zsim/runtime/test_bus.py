@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec import Struct
+from plain_messages import GATE_NS, estimate, imu, status
 from refused import refused
 
 from zsim.contract import keys
@@ -18,7 +19,6 @@ from zsim.errors import RunError, UserCodeError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.bus import Bus
 
-GATE_NS = 20_000_000
 DRONES = ("d1", "d2")
 KeyedMessages = list[tuple[str, Any]]
 
@@ -72,10 +72,8 @@ class Hub:
     def advance(self, wall_ns: int) -> None:
         t_ns = self._gate * GATE_NS
         for drone in DRONES:
-            sample = Imu(t_ns, self._gate, t_ns, (0.0, 0.0, 9.8), (0.0, 0.0, 0.0))
-            self._outbox.append(Output(keys.sensor(drone, "imu"), sample))
-            status = Status(t_ns, self._gate, "flying", 50.0, False, None, 2)
-            self._outbox.append(Output(keys.status(drone), status))
+            self._outbox.append(Output(keys.sensor(drone, "imu"), imu(t_ns, self._gate)))
+            self._outbox.append(Output(keys.status(drone), status(t_ns, self._gate, 2)))
         self._gate += 1
         if self._gate == self._gates:
             self.ended = "over"
@@ -112,10 +110,7 @@ class FakeEstimator(Notes):
 
     def step(self, t_ns: int) -> list[Output]:
         self.notes.append(("step", t_ns))
-        zeros = (0.0, 0.0, 0.0)
-        seq = self.next_seq(self._key)
-        estimate = Estimate(t_ns, seq, zeros, zeros, (1.0, *zeros), 0.0, (0.0,) * 36, 0.1, zeros, {})
-        return [Output(self._key, estimate)]
+        return [Output(self._key, estimate(t_ns, self.next_seq(self._key)))]
 
 
 class FakeController(Notes):

@@ -10,32 +10,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plain_messages import GATE_NS, estimate, imu, status
 
 from zsim.contract import keys, messages
-from zsim.contract.flight_messages import Estimate, Sightings, Status
+from zsim.contract.flight_messages import Sightings
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.messages import Baro, Imu, encode
+from zsim.contract.messages import Baro, encode
 from zsim.runtime.inbox import ALWAYS_NS, GAP_MAX, NEVER_NS, GateRouter, Inbox, RoutingTable
 
-GATE_NS = 20_000_000
 STEP_NS = 5_000_000
 STATUS = keys.status("d1")
 IMU = keys.sensor("d1", "imu")
 
 Sent = tuple[str, Any]
-
-
-def imu(t_ns: int, seq: int) -> Imu:
-    return Imu(t_ns, seq, t_ns, (0.0, 0.0, 9.8), (0.0, 0.0, 0.0))
-
-
-def status(t_ns: int, seq: int, count: int) -> Status:
-    return Status(t_ns, seq, "flying", 80.0, False, None, count)
-
-
-def estimate(t_ns: int, seq: int) -> Estimate:
-    zeros = (0.0, 0.0, 0.0)
-    return Estimate(t_ns, seq, zeros, zeros, (1.0, *zeros), 0.0, (0.0,) * 36, 0.1, zeros, {})
 
 
 def gate_of(drone: str, gate: int) -> list[Sent]:
@@ -429,7 +416,7 @@ def gate_messages(*pairs: tuple[str, bytes]) -> GateMessages:
 
 
 def status_pair(drone: str) -> tuple[str, bytes]:
-    return keys.status(drone), encode(Status(GATE_NS, 1, "flying", 90.0, False, None, 2))
+    return keys.status(drone), encode(status(GATE_NS, 1, 2))
 
 
 def baro_pair(drone: str, t_ns: int = GATE_NS) -> tuple[str, bytes]:
@@ -458,7 +445,7 @@ def test_keys_outside_of_the_table_are_not_followed(place: int) -> None:
 
 
 def test_messages_of_a_gate_come_among_the_others_in_canonical_order() -> None:
-    other = (keys.estimate("d1"), Status(GATE_NS, 1, "flying", 90.0, False, None, 1))
+    other = (keys.estimate("d1"), status(GATE_NS, 1))
     router = GateRouter(RoutingTable([["**"]]))
     inputs = [(keys.GATE, gate_messages(status_pair("d2"), baro_pair("d1"), baro_pair("d3", GATE_NS - 1))), other]
     names = [keys.sensor("d3", "baro"), keys.estimate("d1"), keys.sensor("d1", "baro"), keys.status("d2")]

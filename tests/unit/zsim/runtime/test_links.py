@@ -4,14 +4,16 @@ import math
 from collections import Counter
 from typing import Any
 
+import plain_messages
 import pytest
 from msgspec.structs import replace
+from plain_messages import GATE_NS, ZEROS, run_info
 from refused import has_terms
 
 from zsim.contract import keys
-from zsim.contract.flight_messages import Estimate, Mode, Status
+from zsim.contract.flight_messages import Mode, Status
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.messages import AgentMessage, ClusterInfo, DroneInfo, Imu, Info, Origin, encode, register_messages
+from zsim.contract.messages import AgentMessage, ClusterInfo, Imu, Info, encode, register_messages
 from zsim.contract.run_messages import ControlRequest, Fault, Faults, RadioLinks
 from zsim.contract.snapshot import pack, unpack
 from zsim.runtime.agent import Agent, Output
@@ -22,28 +24,20 @@ from zsim.scenario.scenario import Radio
 from zsim_agents.formation.controller import REQUESTS_MAX, Controller
 from zsim_world.run.world import World
 
-GATE_NS = 20_000_000
 ME, OTHER = "controller.main", "estimator.d1"
 ESTIMATE, STATUS = keys.estimate("d1"), keys.status("d1")
-ZEROS = (0.0, 0.0, 0.0)
-RUN = Info(
-    0, 0, 1, "r", "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, Origin(*ZEROS),
-    (DroneInfo("d1", "ardrone2"), DroneInfo("d2", "ardrone2")),
-    (ClusterInfo("main", ("d1", "d2")),), "", "", "", "",
-)  # fmt: skip
+RUN = run_info(["d1", "d2"], [ClusterInfo("main", ("d1", "d2"))])
 Given = tuple[str, Any]
 
 
 def estimate(
     gate: int, position_m: tuple[float, float, float] = ZEROS, source: str = OTHER, drone: str = "d1"
 ) -> Given:
-    return keys.estimate(drone), Estimate(
-        gate * GATE_NS, gate, position_m, ZEROS, (1.0, 0.0, 0.0, 0.0), 0.0, (0.0,) * 36, 0.1, ZEROS, {}, source
-    )
+    return keys.estimate(drone), plain_messages.estimate(gate * GATE_NS, gate, position_m, source)
 
 
 def status(gate: int) -> Given:
-    return STATUS, Status(gate * GATE_NS, gate, "flying", 90.0, False, None, 1)
+    return STATUS, plain_messages.status(gate * GATE_NS, gate)
 
 
 def links(*faults: Fault, names: tuple[str, ...] = (ME,), seed: int = 1) -> Links:

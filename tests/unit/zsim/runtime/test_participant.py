@@ -6,9 +6,10 @@ from typing import Any
 import pytest
 from fake_link import FakeLink
 from msgspec.structs import replace
+from plain_messages import GATE_NS, run_info
 
 from zsim.contract import keys, messages
-from zsim.contract.messages import Info, Origin, ProcessEntry
+from zsim.contract.messages import ProcessEntry
 from zsim.contract.run_messages import Clock, ControlAnswer, Event, Snapshot
 from zsim.contract.snapshot import VERSION, pack
 from zsim.runtime import participant
@@ -16,10 +17,7 @@ from zsim.runtime.agent import Agent, Output
 from zsim.runtime.participant import RETRY_S, AgentParticipant, Participant
 from zsim.transport.session import ReceivedSample
 
-GATE_NS = 20_000_000
-INFO = Info(
-    0, 0, 1, "r", "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, Origin(0.0, 0.0, 0.0), (), (), "", "", "", ""
-)
+INFO = run_info()
 
 
 class Quiet(Agent):

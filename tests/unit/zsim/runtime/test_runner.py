@@ -5,15 +5,17 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import plain_messages
 import pytest
 from fake_link import UNANSWERED, FakeLink
 from msgspec.structs import replace
+from plain_messages import GATE_NS, run_info
 from refused import has_terms, refused
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Estimate, Status
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.messages import DroneInfo, Info, Mag, Origin, encode
+from zsim.contract.messages import Info, Mag, encode
 from zsim.contract.run_messages import (
     RUN_ENDED,
     Clock,
@@ -31,8 +33,7 @@ from zsim.runtime import participant
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.runner import Runner
 
-GATE_NS = 20_000_000
-DRONES = tuple(DroneInfo(name, "ardrone") for name in ("d1", "d2", "d3"))
+DRONES = "d1", "d2", "d3"
 END = 6  # last gate of the runs here
 ME = "judge.main"
 REPLAY = keys.replay(ME)
@@ -55,17 +56,15 @@ class Judge(Agent):
 
 
 def info(run_id: str = "run1") -> Info:
-    origin = Origin(0.0, 0.0, 0.0)
-    return Info(0, 0, 1, run_id, "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, origin, DRONES, (), "", "", "", "")
+    return run_info(DRONES, run_id=run_id)
 
 
 def status(gate: int) -> Status:
-    return Status(gate * GATE_NS, gate, "flying", 50.0, False, None, 1)
+    return plain_messages.status(gate * GATE_NS, gate)
 
 
 def estimate(gate: int, source: str = "my.d1") -> Estimate:
-    zeros, t_ns = (0.0, 0.0, 0.0), gate * GATE_NS
-    return Estimate(t_ns, gate, zeros, zeros, (1.0, *zeros), 0.0, (0.0,) * 36, 0.1, zeros, {}, source)
+    return plain_messages.estimate(gate * GATE_NS, gate, source=source)
 
 
 def event(kind: str, subject: str, **data: Any) -> Event:
@@ -191,7 +190,7 @@ class Swarm(Judge):
 
 def bundle_of(t_ns: int, seq: int, entries: list[tuple[str, Any]]) -> GateMessages:
     """Return messages on drones d1 to d3 as the world bundles them."""
-    table = key_table([drone.name for drone in DRONES])
+    table = key_table(DRONES)
     return GateMessages.of(t_ns, seq, table, [(key, messages.encode(message)) for key, message in entries])
 
 

@@ -1,15 +1,21 @@
 """Forests, corridors, meshes, height maps and clouds: what becomes of them, and what is refused."""
 
+import struct
 from itertools import combinations, pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from refused import faulty_fields, has_terms
 
-from zsim.errors import ScenarioError
+from zsim.errors import DocumentError
 from zsim.scenario import scenario_file
+from zsim.scenario.generated import triangles_of
 from zsim.scenario.scenario_file import resolve
-from zsim.scenario.surroundings import nearest, row_of
+from zsim.scenario.surroundings import COLUMNS, nearest, packed, placed, row_of
+from zsim.schema import plugin
+from zsim_world.physics.rays import cast, scene
 
 FOREST = {"trees": 60, "area_m": [-15, -15, 15, 15], "gap_m": 1.0, "clear_m": 3.0}
 CORRIDOR = {"segments": 8, "turn_deg": 60, "start_m": [-2, 0]}
@@ -23,12 +29,6 @@ def document(seed: int = 1, **environment: Any) -> dict[str, Any]:
 
 def obstacles(**given: Any) -> Any:
     return resolve(document(**given)).environment.obstacles
-
-
-def faults_of(**environment: Any) -> list[str]:
-    with pytest.raises(ScenarioError) as refused:
-        resolve(document(**environment))
-    return [line.removeprefix("scenario: environment.").split(" ")[0] for line in refused.value.faults]
 
 
 def test_trunks_are_clear_of_each_other_and_of_the_starts():
@@ -76,32 +76,163 @@ def test_a_corridor_is_as_wide_as_told_and_closed_at_its_bends():
 @pytest.mark.parametrize(
     ("section", "change", "field"),
     [
-        ("forest", {"trees": 0}, "trees"),
-        ("forest", {"trees": 1001}, "trees"),
         ("forest", {"trees": 900}, "trees"),  # do not fit
         ("forest", {"area_m": [5, 0, -5, 1]}, "area_m"),
         ("forest", {"radius_m": [0.3, 0.2]}, "radius_m"),
-        ("forest", {"height_m": [0, 2]}, "height_m[0]"),
-        ("forest", {"gap_m": -1}, "gap_m"),
-        ("forest", {"clear_m": "much"}, "clear_m"),
-        ("forest", {"seed": -1}, "seed"),
         ("forest", {"colour": 1}, "colour"),
-        ("corridor", {"segments": 0}, "segments"),
-        ("corridor", {"turn_deg": 91}, "turn_deg"),
-        ("corridor", {"width_m": 0}, "width_m"),
-        ("corridor", {"wall_m": -1}, "wall_m"),
-        ("corridor", {"length_m": 0}, "length_m"),
-        ("corridor", {"height_m": 0}, "height_m"),
-        ("corridor", {"start_m": [0]}, "start_m"),
-        ("corridor", {"heading_deg": "east"}, "heading_deg"),
         ("corridor", {"seed": 0.5}, "seed"),
     ],
 )
 def test_what_is_refused(section: str, change: dict[str, Any], field: str):
     base = {"forest": FOREST, "corridor": CORRIDOR}[section]
-    assert faults_of(**{section: base | change}) == [f"{section}.{field}"]
+    assert faulty_fields(document(**{section: base | change}), "environment.") == [f"{section}.{field}"]
 
 
 def test_together_they_are_no_more_than_a_world_takes():
     big = {"forest": FOREST | {"trees": 999, "area_m": [-300, -300, 300, 300]}, "corridor": CORRIDOR}
-    assert faults_of(**big) == ["obstacles"]
+    assert faulty_fields(document(**big), "environment.") == ["obstacles"]
+
+
+CORNERS = np.array([[[0, -1, 0], [0, 1, 0], [0, 0, 2]], [[2, -1, 0], [2, 1, 0], [2, 0, 2]]], dtype="<f4")  # x = 0 and 2
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Write the same two triangles in every format; height maps and clouds of other shapes."""
+    monkeypatch.setenv(plugin.FOLDERS, "")
+    plugin.search(tmp_path)
+    facets = b"".join(struct.pack("<12fH", 0, 0, 0, *each.ravel(), 0) for each in CORNERS)
+    (tmp_path / "binary.stl").write_bytes(bytes(80) + struct.pack("<I", len(CORNERS)) + facets)
+    loops = "".join(
+        "facet normal 0 0 0\nouter loop\n"
+        + "".join("vertex {} {} {}\n".format(*p) for p in each)
+        + "endloop\nendfacet\n"
+        for each in CORNERS.tolist()
+    )
+    (tmp_path / "text.stl").write_text(f"solid t\n{loops}endsolid t\n")
+    points = CORNERS.reshape(-1, 3).tolist()
+    vertices = "".join("v {} {} {}\n".format(*p) for p in points)
+    (tmp_path / "mesh.obj").write_text(f"{vertices}f 1 2 3\nf 4 5 6\n")
+    (tmp_path / "hill.csv").write_text("0,0,0\n0,3,0\n0,0,0\n")
+    np.save(tmp_path / "hill.npy", [[0, 0, 0], [0, 3, 0], [0, 0, 0]])
+    np.save(tmp_path / "complex.npy", np.full((3, 3), 1j))
+    np.savez(tmp_path / "archive.npz", np.zeros((3, 3)))
+    (tmp_path / "archive.npz").rename(tmp_path / "archive.npy")
+    (tmp_path / "bad.csv").write_text("0,much\n")
+    (tmp_path / "nan.csv").write_text("0,0\n0,nan\n")
+    (tmp_path / "torn.stl").write_bytes(bytes(80) + struct.pack("<I", 9) + facets)
+    (tmp_path / "points.csv").write_text("0.1,0.1,0.1\n0.4,0.2,0.7\n1.7,0.1,0.2\n9,9,nan\n")
+    head = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 3\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
+    (tmp_path / "points.pcd").write_text(f"{head}POINTS 3\nDATA ascii\n0.1 0.1 0.1\n0.4 0.2 0.7\n1.7 0.1 0.2\n")
+    properties = "element vertex 3\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    (tmp_path / "points.ply").write_text(f"ply\nformat ascii 1.0\n{properties}0.1 0.1 0.1\n0.4 0.2 0.7\n1.7 0.1 0.2\n")
+    return tmp_path
+
+
+def with_files(**environment: Any) -> dict[str, Any]:
+    drones = [{"name": "d1", "position_m": [-9, 0, 0]}]
+    return {"name": "t", "duration_s": 1, "environment": environment, "drones": drones}
+
+
+def resolved(**environment: Any) -> Any:
+    return resolve(with_files(**environment))
+
+
+def seen(made: Any, o: Any, d: Any) -> float:
+    triangles = np.concatenate([placed(each) for each in made.environment.surfaces])
+    return cast(scene(np.empty((0, COLUMNS)), triangles), o, d, 50.0)
+
+
+@pytest.mark.parametrize("file", ["binary.stl", "text.stl", "mesh.obj"])
+def test_a_mesh_is_seen_where_it_is_placed(file: str):
+    pytest.importorskip("trimesh")
+    made = resolved(surfaces=[{"name": "m", "file": file, "position_m": [5, 3, 0], "yaw_deg": 90, "scale": 2}])
+    assert seen(made, (5.0, -4.0, 1.0), (0.0, 1.0, 0.0)) == pytest.approx(7.0, abs=1e-6)  # turned: y = 3
+    assert seen(made, (5.0, 4.0, 1.0), (0.0, 1.0, 0.0)) == pytest.approx(3.0, abs=1e-6)  # and y = 3 + 2 * 2
+    assert seen(made, (5.0, -4.0, 4.1), (0.0, 1.0, 0.0)) == 50.0  # above its top
+
+
+@pytest.mark.parametrize("file", ["hill.csv", "hill.npy"])
+def test_a_height_map_is_flat_between_its_heights(file: str):
+    made = resolved(surfaces=[{"name": "hill", "file": file, "cell_m": 4}])
+    for x, y, height in ((0.0, 0.0, 3.0), (2.0, 0.0, 1.5), (0.0, -1.0, 2.25), (3.9, 3.9, 0.075)):
+        assert seen(made, (x, y, 9.0), (0.0, 0.0, -1.0)) == pytest.approx(9.0 - height, abs=1e-5)
+
+
+def test_the_resolved_text_needs_no_file(folder: Path):
+    made = resolved(surfaces=[{"name": "hill", "file": "hill.csv", "cell_m": 4}])
+    text = scenario_file.to_text(made)
+    (folder / "hill.csv").unlink()
+    assert scenario_file.from_text(text) == made
+
+
+@pytest.mark.parametrize("file", ["points.csv", "points.pcd", "points.ply"])
+def test_a_cloud_becomes_boxes_of_its_occupied_cells(file: str):
+    """Cells of 0.5 m: two above each other make one box, the third is apart."""
+    if not file.endswith("csv"):
+        pytest.importorskip("trimesh")
+        pytest.importorskip("pypcd4")
+    first, second = resolved(cloud={"file": file, "cell_m": 0.5, "position_m": [2, 0, 0]}).environment.obstacles
+    assert (first.position_m, first.size_m) == ((2.25, 0.25, 0.0), (0.5, 0.5, 1.0))
+    assert (second.position_m, second.size_m) == ((3.75, 0.25, 0.0), (0.5, 0.5, 0.5))
+
+
+@pytest.mark.parametrize(
+    ("environment", "field"),
+    [
+        ({"surfaces": [{"name": "m"}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "file": "nowhere.csv", "cell_m": 1}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "file": "hill.txt"}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "file": "hill.csv"}]}, "surfaces[0].file"),  # without cell_m
+        ({"surfaces": [{"name": "m", "file": "bad.csv", "cell_m": 1}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "file": "nan.csv", "cell_m": 1}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "file": "torn.stl"}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "file": 5}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "file": "complex.npy", "cell_m": 1}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "file": "archive.npy", "cell_m": 1}]}, "surfaces[0].file"),
+        ({"surfaces": [{"name": "m", "triangles": "no"}]}, "surfaces[0].triangles"),
+        ({"surfaces": [{"name": "m", "triangles": packed(np.ones((4, 9)))[:-8]}]}, "surfaces[0].triangles"),
+        ({"surfaces": [{"name": "m", "triangles": packed(np.full((1, 9), np.nan))}]}, "surfaces[0].triangles"),
+        ({"surfaces": [{"name": "m", "triangles": packed(np.ones((400_000, 9)))}]}, "surfaces[0].triangles"),
+        ({"surfaces": [{"name": "m", "file": "hill.csv", "cell_m": 1}] * 2}, "surfaces[1].name"),
+        ({"cloud": {"file": "nowhere.csv", "cell_m": 1}}, "cloud.file"),
+        ({"cloud": {"file": "hill.npy", "cell_m": 1}}, "cloud.file"),
+    ],
+)
+def test_files_and_texts_that_cannot_be_are_refused(environment: dict[str, Any], field: str):
+    found = faulty_fields(with_files(**environment), "environment.")
+    assert field in found
+    assert {each.partition(".")[0] for each in found} == {field.partition(".")[0]}
+
+
+def test_more_triangles_than_a_scenario_can_carry_are_refused(folder: Path):
+    np.save(folder / "large.npy", np.zeros((200, 200)))
+    surfaces = [{"name": "m", "file": "large.npy", "cell_m": 1}]
+    assert faulty_fields(with_files(surfaces=surfaces)) == ["environment.surfaces"]
+
+
+def test_a_bad_binary_stl_is_refused_with_its_size_or_triangle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One is cut short, the second triangle of another has a NaN."""
+    triangle = np.array([0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0], "<f4")
+    bad = triangle.copy()
+    bad[4] = np.nan
+    head = bytes(80) + (2).to_bytes(4, "little")
+    monkeypatch.chdir(tmp_path)
+    path = Path("rock.stl")
+    for content, finding in (
+        (triangle.tobytes(), "132"),
+        (triangle.tobytes() + b"\0\0" + bad.tobytes() + b"\0\0", "2"),
+    ):
+        path.write_bytes(head + content)
+        with pytest.raises(DocumentError) as raised:
+            triangles_of(path, "environment.surfaces[0].file", None)
+        assert has_terms(raised.value.faults[0], "environment.surfaces[0].file", "'rock.stl'", finding)
+
+
+def test_a_height_that_is_not_finite_is_named_by_row_and_column(tmp_path: Path) -> None:
+    heights = np.zeros((4, 5))
+    heights[2, 3] = np.nan
+    np.save(tmp_path / "hill.npy", heights)
+    with pytest.raises(DocumentError) as raised:
+        triangles_of(tmp_path / "hill.npy", "environment.surfaces[0].file", 1.0)
+    assert has_terms(raised.value.faults[0], "environment.surfaces[0].file", "row 3", "column 4")

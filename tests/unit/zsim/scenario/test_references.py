@@ -85,18 +85,8 @@ def test_a_scenario_without_any_is_as_it_was() -> None:
         ({"waypoints": [ONE[1], ONE[0]], "start_s": 5}, ("reference.waypoints[1].at_s", "0", "4")),
         ({"minimum_snap": [ONE[0], ONE[0]], "start_s": 5}, ("reference.minimum_snap[1].at_s", "0", "0")),
         ({"minimum_snap": ONE[:1], "start_s": 5}, ("reference.minimum_snap", "1", "2")),
-        ({"waypoints": [{"at_s": 0, "position_m": [0, 0]}], "start_s": 5}, ("reference.waypoints[0].position_m", "3")),
         ({"waypoints": ONE, "start_s": 5, "duration_s": 3}, ("reference.duration_s", "expressions")),
         ({"waypoints": ONE, "start_s": 5, "constants": {"f": 1}}, ("reference.constants", "expressions")),
-        ({"circle": {"radius_m": 0, "period_s": 9}, "start_s": 5}, ("reference.circle.radius_m", "0", "0")),
-        ({"circle": {"radius_m": 1, "period_s": 9, "laps": 0.1}, "start_s": 5}, ("reference.circle.laps", "0.1", "0.25")),
-        ({"figure_eight": {"length_m": 4, "period_s": 9}, "start_s": 5}, ("reference.figure_eight.width_m", "missing")),
-        ({"pieces": [{"duration_s": 0}], "start_s": 5}, ("reference.pieces[0].duration_s", "0", "0")),
-        ({"pieces": [{"duration_s": 1, "x": [0.0] * 9}], "start_s": 5}, ("reference.pieces[0].x", "9", "8")),
-        ({"fit": 1}, ("reference.fit", "1", "true")),
-        ({"gain_1_s": 3}, ("reference.gain_1_s", "3", "2")),
-        ({"lead_s": -1}, ("reference.lead_s", "-1", "0")),
-        ({"time_scale": 0}, ("reference.time_scale", "0", "0.01")),
         ({"file": "absent.csv", "start_s": 5}, ("reference.file", "absent.csv…")),
         ({"file": "no_header.csv", "start_s": 5}, ("reference.file", "duration", "33")),
         ({"file": "short.csv", "start_s": 5}, ("reference.file", "3", "3", "33")),
@@ -147,14 +137,11 @@ def test_a_drone_has_one_who_flies_it() -> None:
         ({"drones": ["d1", "d9"]}, ("exchanges[0].drones[1]", "'d9'", "d1", "d2")),
         ({"drones": ["d1"]}, ("exchanges[0].stages[0].places_m", "2", "1")),
         ({"drones": ["d1", "d1"]}, ("exchanges[0].drones[1]", "'d1'", "exchanges[0]")),
-        ({"stages": []}, ("exchanges[0].stages", "0", "1 to 100")),
         ({"takeoff_s": 9}, ("exchanges[0].stages[0].start_s", "8", "9")),
         ({"land_s": 10}, ("exchanges[0].land_s", "10", "16")),
         ({"stages": [*EXCHANGE["stages"], *EXCHANGE["stages"]]}, ("exchanges[0].stages[1].start_s", "8", "16")),
-        ({"stages": [{**EXCHANGE["stages"][0], "over_s": 0}]}, ("exchanges[0].stages[0].over_s", "0", "0")),
     ],
 )
 def test_an_exchange_that_cannot_be_is_refused(changed: dict[str, Any], terms: tuple[str, ...]) -> None:
-    with pytest.raises(ScenarioError) as raised:
+    with refused(ScenarioError, *terms):
         resolve(exchanges=[{**EXCHANGE, **changed}])
-    assert has_terms(str(raised.value), *terms), raised.value

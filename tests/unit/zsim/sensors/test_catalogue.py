@@ -269,12 +269,3 @@ def test_what_is_wrong_is_a_line(sensors: dict[str, Any], terms: tuple[str, ...]
     with pytest.raises(ScenarioError) as refused:
         resolved(**sensors)
     assert any(all(term in line for term in terms) for line in refused.value.faults), refused.value.faults
-
-
-@pytest.mark.parametrize(("field", "bad"), [("sigma_max_m", 0), ("heading_sigma_max_deg", 200)])
-def test_limits_of_certainty_are_checked(field: str, bad: float):
-    drones = [{"name": name, "position_m": [3 * k, 0, 0]} for k, name in enumerate("ab")]
-    cluster = {"name": "main", "drones": ["a", "b"], "gains": {field: bad}}
-    with pytest.raises(ScenarioError) as refused:
-        resolve({"name": "t", "duration_s": 1, "drones": drones, "clusters": [cluster]})
-    assert [line for line in refused.value.faults if f"gains.{field} is {bad}" in line]

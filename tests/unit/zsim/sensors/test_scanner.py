@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refused import faulty_fields
 
 from zsim.contract import messages
 from zsim.contract.messages import Depth, Lidar, Range
-from zsim.errors import DecodeError, ScenarioError
-from zsim.scenario.scenario_file import resolve
+from zsim.errors import DecodeError
 
 FOUR = np.array([1.5, 0.0, 2.0, 3.0], dtype="<f4").tobytes()
 LIDAR: dict[str, Any] = {
@@ -24,45 +24,24 @@ LIDAR: dict[str, Any] = {
 LIDAR.update({"elevation_rad": (0.0, 0.1), "azimuth_rad": (0.0, math.pi / 2)})
 
 
-def paths(**sensors: Any) -> list[str]:
-    drones = [{"name": "d1", "position_m": [0, 0, 0], "sensors": sensors}]
-    with pytest.raises(ScenarioError) as refused:
-        resolve({"name": "t", "duration_s": 1, "drones": drones})
-    return [line.removeprefix("scenario: drones[0].sensors.").split(" ")[0] for line in refused.value.faults]
-
-
 @pytest.mark.parametrize(
     ("section", "settings", "field"),
     [
         ("range", {"beams": {}}, "beams"),
         ("range", {"beams": {"Front": {}}}, "beams.Front"),
-        ("range", {"beams": {"front": {"rpy_deg": [0, 90]}}}, "beams.front.rpy_deg"),
-        ("range", {"cone_deg": 61}, "cone_deg"),
-        ("range", {"rate_hz": 0}, "rate_hz"),
-        ("range", {"min_m": 0}, "min_m"),
         ("range", {"min_m": 5}, "min_m"),  # beyond max_m
-        ("range", {"max_m": -1}, "max_m"),
-        ("range", {"miss": 1.1}, "miss"),
-        ("lidar", {"channels": 0}, "channels"),
-        ("lidar", {"columns": 5000}, "columns"),
         ("lidar", {"channels": 100, "columns": 1001}, "columns"),  # too many rays
-        ("lidar", {"elevation_deg": [-91, 0]}, "elevation_deg[0]"),
         ("lidar", {"azimuth_deg": [-200, 200]}, "azimuth_deg"),  # more than a turn
         ("lidar", {"azimuth_deg": [10, 10]}, "azimuth_deg"),
-        ("lidar", {"noise_m": -0.1}, "noise_m"),
-        ("lidar", {"noise_share": "much"}, "noise_share"),
-        ("lidar", {"bias_m": -1}, "bias_m"),
-        ("lidar", {"quantum_m": -1}, "quantum_m"),
-        ("lidar", {"dropout": 2}, "dropout"),
         ("lidar", {"module": "lidar"}, "module"),
         ("depth", {}, "cameras[0]"),  # the drone has no front camera
-        ("depth", {"cameras": ["left"]}, "cameras[0]"),
-        ("depth", {"cameras": ["bottom"], "rows": 0}, "rows"),
-        ("depth", {"cameras": ["bottom"], "noise_1_m": -1}, "noise_1_m"),
     ],
 )
 def test_what_is_refused(section: str, settings: dict[str, Any], field: str):
-    assert paths(bottom_camera={}, **{section: settings}) == [f"{section}.{field}"]
+    drone = {"name": "d1", "position_m": [0, 0, 0], "sensors": {"bottom_camera": {}, section: settings}}
+    assert faulty_fields({"name": "t", "duration_s": 1, "drones": [drone]}, "drones[0].sensors.") == [
+        f"{section}.{field}"
+    ]
 
 
 def test_a_lidar_is_read_as_an_array_whose_zeros_are_infinite():

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from refused import has_terms
+from refused import faults_of, has_terms
 
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
@@ -27,9 +27,7 @@ STOCK = {"ardrone2": ardrone2, "crazyflie2": crazyflie2}
 
 
 def fault_of(**drone: Any) -> str:
-    with pytest.raises(ScenarioError) as raised:
-        scenario_file.resolve(document(**drone))
-    (line,) = raised.value.faults
+    (line,) = faults_of(document(**drone))
     return line
 
 
