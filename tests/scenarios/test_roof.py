@@ -1,5 +1,6 @@
-"""A pair that lands on the roof of a box 8 m away, rests there and takes off again; and one over whose edge it tips."""
+"""Pairs that land on the roof of a box and on a hill of a height map, and rest there; and one that tips over an edge."""
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -9,10 +10,14 @@ import pytest
 from operated_flight import OperatedFlight
 
 import zsim
+from zsim.errors import ScenarioError
+from zsim.scenario import scenario_file
 from zsim.scenario.scenario_file import resolve
+from zsim.schema import plugin
 from zsim.vehicles.ardrone2 import VEHICLE
 
 ROOF_M, LAND_S = 1.0, 60.0
+TOP_M, SLOPE, LANDED_S = 1.0, 0.12, 80
 STAND_M = VEHICLE.airframe.foot_depth_m - VEHICLE.airframe.foot_sag_m
 
 
@@ -92,3 +97,78 @@ def test_a_drone_that_starts_on_a_roof_knows_its_height(tmp_path: Path) -> None:
     error_m = run.estimate("d1").position_m_z - run.truth("d1").position_m_z
     assert error_m.abs().max() < 0.1
     assert run.truth("d1").position_m_z.iloc[-1] == pytest.approx(4.0, abs=0.1)
+
+
+def height_m(x_m: float) -> float:
+    """Return the height of the hill: 1 m up to x = 9 m, then falling by 12 cm a metre."""
+    return float(np.clip(TOP_M - SLOPE * (x_m - 9.0), 0.0, TOP_M))
+
+
+@pytest.fixture
+def hill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Return the document of the flight to a height map from x = 4 to 14 m, in cells of 1 m."""
+    rows = [",".join(f"{height_m(x):g}" for x in range(4, 15))] * 9
+    (tmp_path / "hill.csv").write_text("\n".join(rows))
+    monkeypatch.setenv(plugin.FOLDERS, "")
+    plugin.search(tmp_path)
+    surface = {"name": "hill", "file": "hill.csv", "cell_m": 1, "position_m": [9, 0, 0]}
+    plan = {"takeoff_s": 3, "target": {"x_c": 9, "y_c": 0, "z_c": 4, "p": 4}, "land_s": 50}
+    drones = [{"name": f"drone{k + 1}", "position_m": [x, 0, 0]} for k, x in enumerate((2, -2))]
+    return {
+        "name": "hill",
+        "duration_s": LANDED_S,
+        "environment": {"surfaces": [surface]},
+        "drones": drones,
+        "clusters": [{"name": "main", "drones": ["drone1", "drone2"], "plan": plan}],
+    }
+
+
+@pytest.mark.soak
+def test_a_pair_lands_on_a_hill_and_rests_there(hill: dict[str, Any], tmp_path: Path, forked: None) -> None:
+    """Expected: both stand on it to millimetres at its slope, and nothing is told but the landing; likewise as processes,
+    of which the world is killed while they come down."""
+    path = tmp_path / "hill.yaml"  # beside the height map
+    path.write_text(json.dumps(hill))
+    run = zsim.run(path, out=tmp_path / "alone", progress=False)
+    truths = [run.truth(drone) for drone in run.drones]
+    for truth in truths:
+        end = truth.iloc[-1]
+        x_m, slope = end.position_m_x, SLOPE if end.position_m_x > 9.2 else 0.0
+        assert end.position_m_z == pytest.approx(height_m(x_m) + STAND_M * np.hypot(1.0, slope), abs=2e-3)
+        assert np.linalg.norm(end[["velocity_m_s_x", "velocity_m_s_y", "velocity_m_s_z"]].astype(float)) < 1e-3
+        tilt = 2.0 * np.arcsin(np.hypot(end.orientation_x, end.orientation_y))
+        assert tilt == pytest.approx(np.arctan(slope), abs=0.02)
+    assert max(truth.position_m_x.iloc[-1] for truth in truths) > 9.5
+    assert run.events[run.events.kind == "collision"].empty
+    assert all(0.03 < away_m < 0.07 for away_m in run.summary.obstacle_distance_m.values())
+    with zsim.Federation(path, out=tmp_path / "many") as flight:
+        flight.wait_until(60.0)
+        flight.kill("world")
+        assert flight.run().truth_sha256 == run.truth_sha256
+
+
+@pytest.mark.parametrize(
+    ("place", "is_sound"),
+    [((5.0, 0.0, 1.0), True), ((11.0, 0.0, 0.76), True), ((5.0, 0.0, 0.9), False), ((14.2, 0.0, 0.4), False)],
+    ids=["on the top", "on the slope", "below the top", "beside its rim"],
+)
+def test_a_drone_may_start_upon_a_surface_and_not_in_it(hill: dict[str, Any], place: Any, is_sound: bool) -> None:
+    document = {**hill, "clusters": []}
+    document["drones"] = [{"name": "drone1", "position_m": [*place]}]
+    if is_sound:
+        scenario_file.resolve(document)
+        return
+    with pytest.raises(ScenarioError) as refused:
+        scenario_file.resolve(document)
+    assert [fault.split(" ")[1] for fault in refused.value.faults] == ["drones[0].position_m"]
+
+
+def test_a_surface_has_a_name_of_its_own(hill: dict[str, Any]) -> None:
+    for name in ("drone1", "post"):
+        document = {**hill}
+        post = {"name": "post", "shape": "sphere", "position_m": [0, 30, 9], "radius_m": 1}
+        surface = {**document["environment"]["surfaces"][0], "name": name}
+        document["environment"] = {"obstacles": [post], "surfaces": [surface]}
+        with pytest.raises(ScenarioError) as refused:
+            scenario_file.resolve(document)
+        assert [fault.split(" ")[1] for fault in refused.value.faults] == ["environment.surfaces[0].name"]

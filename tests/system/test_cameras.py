@@ -1,19 +1,24 @@
-"""A run with cameras and detectors: what they see agrees with the truth, and no failure of theirs changes it."""
+"""Cameras and detectors of a run: what they see agrees with the truth, and neither they nor what fails changes it."""
 
+import signal
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from federation import Federation, Record
+from refused import has_terms
 from wire import Client
 
 from zsim.contract.flight_messages import CameraInfo
+from zsim.errors import ScenarioError
 from zsim.math.frames import rotation_matrix
 from zsim.math.rotation import pose_between
+from zsim.scenario import scenario_file
 from zsim.sensors.camera import FrontCamera, Hats
 from zsim.sensors.camera_model import camera_pose
 from zsim_agents.cameras.detector import decoded
+from zsim_analysis.in_process import InProcessFlight
 
 PAIR = """
 name: pair
@@ -35,6 +40,9 @@ SIGMAS = 5.0
 SEEN_DEAD = ("death", "superseded")  # the second where it is back before its death is noticed
 FOREVER = ("--duration", "600", "--rate", "1")
 LEAST = 12  # sightings that are compared with the truth
+GATING = ("--set", "processes.gating=[camera]")
+GATED_S, RATE_HZ = 6, 10
+NAMED = ("silent", "death")  # the second where its link, which takes nothing, is closed before
 GARBAGE = (b"", b"\xff\xd8\xff\xd9", bytes(range(256)))
 
 
@@ -137,3 +145,116 @@ def pose(truths: list[dict[str, Any]], t_s: float) -> tuple[np.ndarray, np.ndarr
 def test_pictures_of_a_stranger_are_refused_and_counted(flown: Flown) -> None:
     assert flown.record.all(HEALTH)[-1]["refused"] >= 1
     assert {event["subject"] for event in flown.record.events(*SEEN_DEAD)} == {"camera.main"}
+
+
+@pytest.mark.slow
+def test_no_picture_is_left_out(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> None:
+    with Federation(tmp_path_factory.mktemp("gating")) as federation:
+        federation.run(PAIR, "--cameras", "--duration", str(GATED_S), *GATING).ends(with_code=0)
+        record = federation.record()
+        sha256 = record.sha256()
+        stamps = [message["t_sample_ns"] for message in record.all(PICTURES)]
+    of_all = [round(n * 1e9 / RATE_HZ) for n in range(GATED_S * RATE_HZ + 1)]
+    assert stamps in (of_all, of_all[:-1])  # the last one comes when the run is over
+    assert sha256 == sha256_alone(tmp_path_factory.mktemp("without"), GATED_S)
+
+
+@pytest.mark.slow
+@pytest.mark.soak
+def test_a_camera_that_is_killed_holds_time_until_it_is_back(
+    tmp_path_factory: pytest.TempPathFactory, compiled: None
+) -> None:
+    """It is started by the launcher, which knows that the scenario needs it."""
+    with Federation(tmp_path_factory.mktemp("killed")) as federation:
+        run = federation.run(PAIR, "--duration", "30", "--rate", "4", *GATING)
+        client = federation.client()
+        pictures, events = client.subscribe(PICTURES), client.subscribe("world/event")
+        pictures.until(lambda m: m["t_ns"] > 2_000_000_000)
+        federation.kill("camera")
+        died_ns = events.until(lambda m: m["kind"] in SEEN_DEAD and m["subject"] == "camera.main").message["t_ns"]
+        pictures.until(lambda m: m["t_ns"] > died_ns + 2_000_000_000)
+        assert client.request("world/control", "stop")["ok"]
+        run.ends(with_code=0)
+
+
+def test_one_process_has_no_cameras_to_wait_for(tmp_path_factory: pytest.TempPathFactory) -> None:
+    place = tmp_path_factory.mktemp("one") / "pair.yaml"
+    place.write_text(PAIR)
+    with pytest.raises(ScenarioError, match=r"processes\.gating"):
+        InProcessFlight(scenario_file.load(place, ["processes.gating=[camera]"]))
+
+
+amiss = pytest.mark.soak  # cameras are nice: on a loaded machine they stand still of themselves
+
+
+@pytest.fixture(scope="module")
+def disturbed(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Any:
+    """A flight with a second detector of drone1, whose camera is stopped for a while and goes on."""
+    with Federation(tmp_path_factory.mktemp("amiss")) as federation:
+        run = federation.run(PAIR, "--cameras", "--detect", *FOREVER)
+        client = federation.client()
+        pictures, seen, events = (client.subscribe(key) for key in (PICTURES, SEEN, "world/event"))
+        seen.until(lambda m: m["source"] == "detector.main")
+        federation.role("detect", "drone1", "--name", "detector.second")
+        seen.until(lambda m: m["source"] == "detector.second")
+        events.until(lambda m: m["kind"] == "doubled")
+        federation.kill("camera", signal.SIGSTOP)
+        named = events.until(lambda m: m["kind"] in NAMED and m["subject"] == "camera.main")
+        federation.kill("camera", signal.SIGCONT)
+        pictures.until(lambda m: m["t_sample_ns"] > named.message["t_ns"])
+        assert client.request("world/control", "stop")["ok"]
+        run.ends(with_code=0)
+        record = federation.record()
+        yield Flown(record, sha256_alone(tmp_path_factory.mktemp("alone"), record.end()["last_ns"] / 1e9))
+
+
+@amiss
+def test_no_bit_of_the_truth_changes(disturbed: Flown) -> None:
+    assert disturbed.record.sha256() == disturbed.without
+
+
+@amiss
+def test_two_detectors_of_a_drone_are_named(disturbed: Flown) -> None:
+    doubled = disturbed.record.events("doubled")
+    assert doubled
+    for each in doubled:
+        assert {each["subject"], each["data"]["other"]} == {"detector.second", "detector.main"}
+        assert has_terms(each["text"], "detector.drone1")
+
+
+@amiss
+def test_each_of_two_detectors_says_whose_sightings_it_publishes(disturbed: Flown) -> None:
+    of_both = {name: {} for name in ("detector.main", "detector.second")}
+    for message in disturbed.record.all(SEEN):
+        of_both[message["source"]][message["t_sample_ns"]] = message["seen"]
+    both = of_both["detector.main"].keys() & of_both["detector.second"].keys()
+    assert both
+    assert all(of_both["detector.main"][t_ns] == of_both["detector.second"][t_ns] for t_ns in both)
+
+
+@amiss
+def test_a_camera_that_stands_still_is_named_and_leaves_out_what_is_too_old(disturbed: Flown) -> None:
+    assert "camera.main" in {event["subject"] for event in disturbed.record.events(*NAMED)}
+    assert disturbed.record.events("drop", "overdue") == []
+    late = [m["t_ns"] - m["t_sample_ns"] for m in disturbed.record.all(PICTURES)]
+    assert max(late) <= 300_000_000
+
+
+ONE_SEES = PAIR.replace(", front_camera: {rate_hz: 10}", "").replace(
+    "{name: drone1,", "{name: drone1, sensors: {front_camera: {}},"
+)
+
+# name: (command, what its last line must show)
+UNKNOWN = {
+    "a camera of nobody": (("camera", "ghost"), ("'ghost'", "drone1")),
+    "a camera of one without": (("camera", "drone2"), ("'drone2'", "drone1")),
+    "a detector of nobody": (("detect", "ghost"), ("'ghost'", "drone1", "drone2")),
+}
+
+
+def test_a_camera_that_is_none_is_a_line(federation: Federation) -> None:
+    federation.world(ONE_SEES, *FOREVER, "--expect", "nobody.yet")
+    for name, (command, terms) in UNKNOWN.items():
+        role = federation.role(*command)
+        role.ends(with_code=2)
+        assert has_terms(role.text(), *terms), name

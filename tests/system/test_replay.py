@@ -1,4 +1,4 @@
-"""A record played back onto the keys: the same bytes, for whoever would listen to a flight."""
+"""A record played back onto the keys: the same bytes, for whoever would listen to a flight; pictures, too."""
 
 import re
 import shutil
@@ -11,7 +11,8 @@ from typing import Any
 import msgpack
 import pytest
 import zenoh
-from federation import PAIR, PAIR_ROLES, Federation, Role
+from federation import ONE, PAIR, PAIR_ROLES, Federation, Role
+from picture_pump import calibration, pumping
 from refused import parts
 from wire import PATIENCE_S, Client
 
@@ -313,3 +314,52 @@ def test_a_record_that_was_cut(federation: Federation, flown: Path) -> None:
         refused.ends(with_code=2)
         refused.line(text)
     shutil.rmtree(cut)
+
+
+FRONT, FRONT_INFO = "drone/drone1/camera/front", "drone/drone1/camera/front/info"
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Path:
+    """The folder of a run of 4 s beside which a camera of somebody's own publishes."""
+    with Federation(tmp_path_factory.mktemp("filmed")) as federation:
+        world = federation.world(ONE.replace("duration_s: 10", "duration_s: 4"), "--rate", "1", "--expect", "recorder")
+        recorder = federation.role("record", "--out", str(federation.out))
+        camera = federation.client()
+        camera.subscribe("clock").until(lambda m: m["state"] == "running")
+        camera.put(FRONT_INFO, **calibration())
+        with pumping(camera, FRONT):
+            world.ends(with_code=0)
+            recorder.ends(with_code=0)
+        assert federation.record().complete
+        return federation.out
+
+
+def test_they_are_on_record_and_the_run_is_flown_again_without_them(filmed: Path, federation: Federation) -> None:
+    pictures = recorded(filmed, FRONT)[FRONT]
+    assert len(pictures) > 20
+    assert len(set(pictures)) == len(pictures)  # none is there twice
+    assert len(recorded(filmed, FRONT_INFO)[FRONT_INFO]) == 1
+    again = federation.start("rerun", str(filmed))
+    again.ends(with_code=0)
+    again.line("truth_sha256 is the same")
+
+
+def test_a_replay_plays_them_byte_by_byte_and_answers_how_the_camera_sees(filmed: Path, federation: Federation) -> None:
+    pictures = recorded(filmed, FRONT)[FRONT]
+    role = replay(federation, filmed, "--rate", "2", "--paused")
+    client = federation.client()
+    ear, clock = Ear(client, FRONT), client.subscribe("clock")
+    clock.until(lambda m: m["state"] == "paused")
+    resume(client)
+    clock.until(lambda m: m["t_ns"] >= 3_000_000_000)
+    (info,) = client.get("drone/*/camera/*/info").values()
+    assert {name: info[name] for name in ("K", "D", "orientation_wxyz")} == {
+        name: calibration()[name] for name in ("K", "D", "orientation_wxyz")
+    }
+    assert FRONT not in client.get("drone/*/sensor/status")
+    clock.until(lambda m: m["state"] == "stopped")
+    role.ends(with_code=0)
+    played = ear.received[FRONT]
+    assert len(played) > 1  # a machine with much to do skips some
+    assert [payload for payload in pictures if payload in set(played)] == played

@@ -51,6 +51,7 @@ from zsim_bridges.console.orders import OrderRequest
 from zsim_bridges.web import is_loopback_authority
 from zsim_bridges.web.web_server import (
     ANY_PORT,
+    Handler,
     ServedSite,
     check_token,
     open_on_thread,
@@ -214,8 +215,8 @@ class HttpProxy:
         shared = {"/state": self._state, "/head": self._head, "/cameras": self._cameras, "/actions": self._actions}
         shared |= {f"/{name}": partial(self._file, path) for name, path in self._backend.files.paths.items()}
         for path, handler in shared.items():
-            app.add_routes([web.get(path, handler), web.get(f"{VIEW_PATH}{path}", handler)])
-        app.add_routes([web.post("/command", self._command)])
+            app.add_routes([web.get(each, self._permitted(handler)) for each in (path, f"{VIEW_PATH}{path}")])
+        app.add_routes([web.post("/command", self._permitted(self._command))])  # viewers have no such path
         host, port, or_any = self._address
         try:
             site = await start_site(app, host, (port, ANY_PORT) if or_any else (port,), shutdown_s=CLOSE_S)
@@ -232,8 +233,14 @@ class HttpProxy:
         await self._client.close()
         await site.cleanup()
 
-    def _role_of(self, request: web.Request) -> str | None:
-        return self._tokens.role_of(_page_request(request))
+    def _permitted(self, serve: Callable[[web.Request, str], Awaitable[web.StreamResponse]]) -> Handler:
+        """Return a handler that lets `serve` answer a request in its role, and refuses others."""
+
+        async def respond(request: web.Request) -> web.StreamResponse:
+            role = self._tokens.role_of(_page_request(request))
+            return _missing_token() if role is None else await serve(request, role)
+
+        return respond
 
     async def _page(self, request: web.Request) -> web.StreamResponse:
         page_request = _page_request(request)
@@ -253,32 +260,24 @@ class HttpProxy:
         headers = {**HEADERS, "Content-Encoding": "gzip"}
         return web.Response(body=self._pages[role], content_type="text/html", charset="utf-8", headers=headers)
 
-    async def _state(self, request: web.Request) -> web.Response:
-        return _missing_token() if self._role_of(request) is None else _json_response(self._backend.state())
+    async def _state(self, _: web.Request, role: str) -> web.Response:
+        return _json_response(self._backend.state())
 
-    async def _head(self, request: web.Request) -> web.Response:
-        role = self._role_of(request)
-        if role is None:
-            return _missing_token()
+    async def _head(self, request: web.Request, role: str) -> web.Response:
         key = request.headers.get(CLIENT_HEADER, "")
         if key:
             self._backend.looked(key, role, request.remote or "")
         files = self._backend.files.shown(request.headers.get(PAGE_HEADER, ""), COPIED_HEADER in request.headers)
         return _json_response({**self._backend.head(), **files})
 
-    async def _file(self, path: Path, request: web.Request) -> web.StreamResponse:
+    async def _file(self, path: Path, _: web.Request, role: str) -> web.StreamResponse:
         """Serve a file of the run: a page to display, or a file to download."""
-        if self._role_of(request) is None:
-            return _missing_token()
         if self._backend.files.size_bytes(path) is None:
             return web.Response(status=404, text=f"{path} is not there yet\n", headers=HEADERS)
         kept = {} if path.suffix == ".html" else {"Content-Disposition": f'attachment; filename="{path.name}"'}
         return web.FileResponse(path, headers={**HEADERS, **kept})
 
-    async def _command(self, request: web.Request) -> web.Response:
-        """Process an order of an operator; viewers have no such path."""
-        if self._role_of(request) != OPERATOR:
-            return _missing_token()
+    async def _command(self, request: web.Request, role: str) -> web.Response:
         try:
             order = _ORDERS.decode(await request.read())
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
@@ -287,16 +286,10 @@ class HttpProxy:
         refusal = progress["reason"] if progress["state"] == "refused" else ""
         return _json_response({"refusal": refusal, "order": progress}, 409 if refusal else 200)
 
-    async def _cameras(self, request: web.Request) -> web.StreamResponse:
-        role = self._role_of(request)
-        if role is None:
-            return _missing_token()
+    async def _cameras(self, request: web.Request, role: str) -> web.StreamResponse:
         return await self._stream(f"cameras of {role}", lambda: self._backend.serve_cameras(request))
 
-    async def _actions(self, request: web.Request) -> web.StreamResponse:
-        role = self._role_of(request)
-        if role is None:
-            return _missing_token()
+    async def _actions(self, request: web.Request, role: str) -> web.StreamResponse:
         return await self._stream(f"actions of {role}", lambda: self._backend.serve_actions(request, role))
 
     async def _stream(self, what: str, serve: Callable[[], Awaitable[web.StreamResponse]]) -> web.StreamResponse:

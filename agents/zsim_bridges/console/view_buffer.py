@@ -155,26 +155,25 @@ class ViewBuffer:
         for drone in self.drones.drones if self.drones else ():
             _, x, y, _ = drone.orientation_wxyz
             failsafe, link = self.failsafes.get(drone.name), self.link_of(drone.name)
-            condition = DroneCondition(
+            received = estimates.get(drone.name)
+            fresh = received if received is not None and received.fresh else None
+            found[drone.name] = DroneCondition(
                 drone.name,
                 drone.state,
                 drone.battery_percent,
+                lag_ms=self.lag_ms(received) if received else None,
+                sigma_m=fresh.sigma_m if fresh else None,
+                yaw_sigma_deg=fresh.yaw_sigma_deg if fresh else None,
+                estimate_lost=received is not None and fresh is None,
                 tilt_deg=math.degrees(math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (x * x + y * y))))),
-                commander=drone.commander,
                 failsafe=failsafe.text if failsafe else "",
+                commander=drone.commander,
                 is_external=drone.name in self.external,
+                link_age_s=link.age_s if link else None,
+                link_state=link.state.state if link else None,
+                link_age_ms=link.state.age_ms if link else None,
+                link_loss_percent=link.state.loss_percent if link else None,
             )
-            received = estimates.get(drone.name)
-            if received is not None:
-                condition = condition._replace(lag_ms=self.lag_ms(received), estimate_lost=not received.fresh)
-            if received is not None and received.fresh:
-                condition = condition._replace(sigma_m=received.sigma_m, yaw_sigma_deg=received.yaw_sigma_deg)
-            if link is not None:
-                state, age_ms, loss = link.state.state, link.state.age_ms, link.state.loss_percent
-                condition = condition._replace(
-                    link_state=state, link_age_ms=age_ms, link_loss_percent=loss, link_age_s=link.age_s
-                )
-            found[drone.name] = condition
         return found
 
     def link_of(self, drone: str) -> ReceivedLink | None:

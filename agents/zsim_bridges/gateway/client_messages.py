@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import Annotated, Any
+from typing import Annotated, Any, Union
 
 import msgspec
 from msgspec import Meta, Struct
@@ -351,18 +351,12 @@ class LeaveRequest(StreamRequest, tag="leave"):
     reason: str = ""
 
 
-_decode = msgspec.json.Decoder(
-    HelloRequest
-    | LatestRequest
-    | SubscribeRequest
-    | UnsubscribeRequest
-    | PutRequest
-    | AskRequest
-    | JoinRequest
-    | DoneRequest
-    | LeaveRequest
-).decode
-OPS = ("hello", "latest", "subscribe", "unsubscribe", "put", "ask", "join", "done", "leave")
+_REQUESTS = (
+    HelloRequest, LatestRequest, SubscribeRequest, UnsubscribeRequest, PutRequest, AskRequest, JoinRequest, DoneRequest,
+    LeaveRequest,
+)  # fmt: skip
+_OPS = ", ".join(str(kind.__struct_config__.tag) for kind in _REQUESTS)
+_decode = msgspec.json.Decoder(Union[_REQUESTS]).decode  # noqa: UP007 -- of a tuple
 
 
 def decode_request(line: bytes) -> StreamRequest:
@@ -370,4 +364,4 @@ def decode_request(line: bytes) -> StreamRequest:
     try:
         return _decode(line)
     except REFUSALS as error:
-        raise DecodeError(f"request: {error}; must be a JSON object with op of {', '.join(OPS)}") from error
+        raise DecodeError(f"request: {error}; must be a JSON object with op of {_OPS}") from error

@@ -32,7 +32,7 @@ from zsim_bridges.gateway.client_messages import (
     value_line,
 )
 from zsim_bridges.gateway.client_streams import LINE_MAX, OUTBOX_BYTES_MAX, Outbox, PictureFeeds, serve_lines
-from zsim_bridges.gateway.http_server import AccessCheck, CameraTree, JsonTree, RestTree, application
+from zsim_bridges.gateway.http_server import AccessCheck, KeyTrees, application
 from zsim_bridges.gateway.run_access import LockstepSession, RunAccess, SharedSubscriptions
 from zsim_bridges.web.web_server import (
     ServedSite,
@@ -271,10 +271,9 @@ class Gateway:
 
     async def _open(self) -> tuple[ServedSite, asyncio.Server]:
         host, http_port, lines_port = self._ports
-        rest = RestTree(self.run, self._full_key_subscriptions)
-        tree = JsonTree(self.run, self.subscriptions, self.name)
-        cameras = CameraTree(self.run, self._pictures, self._client_limit)
-        app = application(self._access_check, rest, tree, cameras, self._new_client)
+        subscribed = self._full_key_subscriptions, self.subscriptions
+        trees = KeyTrees(self.run, *subscribed, self._pictures, self._client_limit, self.name)
+        app = application(self._access_check, trees, self._new_client)
         serve = partial(serve_lines, self._new_client, not self._needs_token)
         try:
             site = await start_site(app, host, (http_port,), shutdown_s=1.0)

@@ -1,16 +1,16 @@
 """The gateway's HTTP server: access, and the keys as trees.
 
-RestTree: the tree of the Zenoh REST plugin: full keys, payloads as they are. GET and POST query, PUT and PATCH publish,
+Full keys, the tree of the Zenoh REST plugin, with payloads as they are. GET and POST query, PUT and PATCH publish,
 DELETE deletes; `Accept: text/event-stream` subscribes; `?_raw` returns the first payload alone. Source: zenoh,
 plugins/zenoh-plugin-rest.
 
-JsonTree: /json/KEY without the federation's name, JSON by the schema of each message.
+/json/KEY without the federation's name, JSON by the schema of each message.
 GET    /json/drone/drone1/sensor/imu      the last value; of an expression, a list of {key, value}
 GET    … with Accept: text/event-stream   every value from now on
 PUT    /json/drone/drone1/cmd/velocity    {"velocity_m_s": [1, 0, 0]}; t_ns, seq and source are filled in
 POST   /json/world/control                {"op": "pause", "args": {}}
 
-CameraTree: /camera/DRONE/CAMERA, a stream of pictures; /camera/DRONE/CAMERA.jpg, the newest one.
+/camera/DRONE/CAMERA, a stream of pictures; /camera/DRONE/CAMERA.jpg, the newest one.
 """
 
 import base64
@@ -112,9 +112,7 @@ STATUS: tuple[tuple[type[ZsimError], int], ...] = (
 )
 
 
-def application(
-    access_check: "AccessCheck", rest: "RestTree", tree: "JsonTree", cameras: "CameraTree", new_client: ClientFactory
-) -> web.Application:
+def application(access_check: "AccessCheck", trees: "KeyTrees", new_client: ClientFactory) -> web.Application:
     """Return the web application of a gateway; `new_client` makes the client of a WebSocket."""
 
     async def index(request: web.Request) -> web.Response:
@@ -138,18 +136,18 @@ def application(
     app.router.add_get("/", index)
     app.router.add_get(DESCRIPTION, describe)
     app.router.add_get(STREAM, lambda request: serve_websocket(request, new_client))
-    app.router.add_get(json_path, tree.get, allow_head=False)
-    app.router.add_put(json_path, tree.put)
-    app.router.add_post(json_path, tree.post)
+    app.router.add_get(json_path, trees.get_json, allow_head=False)
+    app.router.add_put(json_path, trees.put_json)
+    app.router.add_post(json_path, trees.post_json)
     app.router.add_route("*", json_path, not_allowed("GET", "POST", "PUT"))
-    app.router.add_get(CAMERA, cameras.get, allow_head=False)
+    app.router.add_get(CAMERA, trees.get_pictures, allow_head=False)
     for path in (STREAM, DESCRIPTION, CAMERA):
         app.router.add_route("*", path, not_allowed("GET"))
-    app.router.add_get(full_path, rest.get, allow_head=False)
-    app.router.add_post(full_path, rest.get)
-    app.router.add_put(full_path, rest.put)
-    app.router.add_patch(full_path, rest.put)
-    app.router.add_delete(full_path, rest.delete)
+    app.router.add_get(full_path, trees.get_full, allow_head=False)
+    app.router.add_post(full_path, trees.get_full)
+    app.router.add_put(full_path, trees.put_full)
+    app.router.add_patch(full_path, trees.put_full)
+    app.router.add_delete(full_path, trees.delete_full)
     return app
 
 
@@ -226,21 +224,25 @@ def _is_from_this_machine(request: web.Request) -> bool:
 
 
 @dataclass(frozen=True)
-class RestTree:
-    """Handlers of the tree of full keys."""
+class KeyTrees:
+    """Handlers of the trees of full keys, of JSON, and of the pictures of cameras."""
 
     run: Callable[[], RunAccess]  # the current one
-    subscriptions: SharedSubscriptions  # subscriptions to full keys
+    full_subscriptions: SharedSubscriptions  # subscriptions to full keys
+    subscriptions: SharedSubscriptions  # subscriptions to keys without the federation's name
+    feeds: PictureFeeds
+    limit: ClientLimit  # in which streams of pictures count
+    source: str  # of control requests that name none
 
-    async def get(self, request: web.Request) -> web.StreamResponse:
-        """Answer a GET or a POST."""
+    async def get_full(self, request: web.Request) -> web.StreamResponse:
+        """Answer a GET or a POST of a full key."""
         expression, accepted = _key_of(request, "/"), _first_accepted(request)
         if any(part.startswith("@") for part in expression.split("/")):  # wildcards do not match these
             raise ForbiddenError(
                 f"{expression[:80]}: Zenoh's own keys are not shown; must be keys without @, as zsim/**"
             )
         if accepted == EVENT_STREAM:
-            return await stream_events(request, self.subscriptions, expression, _sample_event)
+            return await stream_events(request, self.full_subscriptions, expression, _sample_event)
         samples = await self._query(request, expression)
         if RAW in request.query:
             if not samples:
@@ -263,25 +265,16 @@ class RestTree:
         stored_keys = {sample.key for sample in stored}
         return [*stored, *(answer for answer in answers if answer.kind == "ERROR" or answer.key not in stored_keys)]
 
-    async def put(self, request: web.Request) -> web.Response:
+    async def put_full(self, request: web.Request) -> web.Response:
         key, body = _key_of(request, "/"), await request.read()
         self.run().put_full_key(key, body, _encoding_of(request))
         return web.Response()
 
-    async def delete(self, request: web.Request) -> web.Response:
+    async def delete_full(self, request: web.Request) -> web.Response:
         self.run().delete_full_key(_key_of(request, "/"))
         return web.Response()
 
-
-@dataclass(frozen=True)
-class JsonTree:
-    """Handlers of the tree of JSON."""
-
-    run: Callable[[], RunAccess]
-    subscriptions: SharedSubscriptions  # subscriptions to keys without the federation's name
-    source: str  # of control requests that name none
-
-    async def get(self, request: web.Request) -> web.StreamResponse:
+    async def get_json(self, request: web.Request) -> web.StreamResponse:
         """Answer with the last values, or with every value from now on."""
         expression = _checked_key(request)
         if _first_accepted(request) == EVENT_STREAM:
@@ -292,7 +285,7 @@ class JsonTree:
             return _as_json(entries)
         return _as_json(entries[0]["value"]) if entries else error_response(404, f"{expression[:80]}: {NO_VALUE}")
 
-    async def put(self, request: web.Request) -> web.Response:
+    async def put_json(self, request: web.Request) -> web.Response:
         key, body = _checked_key(request), await request.read()
         try:
             value = msgspec.json.decode(body)
@@ -302,7 +295,7 @@ class JsonTree:
         run.put(key, value, run.defaults)
         return _as_json({})
 
-    async def post(self, request: web.Request) -> web.Response:
+    async def post_json(self, request: web.Request) -> web.Response:
         """Send a control request to the process that answers on a key."""
         key = _checked_key(request)
         try:
@@ -312,16 +305,7 @@ class JsonTree:
         answer = await self.run().request(key, control.op, control.args, control.source or self.source)
         return _as_json({"ok": answer.ok, "error": answer.error, "result": json_value(answer.result)})
 
-
-@dataclass(frozen=True)
-class CameraTree:
-    """Handlers of the pictures of cameras."""
-
-    run: Callable[[], RunAccess]
-    feeds: PictureFeeds
-    limit: ClientLimit  # in which streams count
-
-    async def get(self, request: web.Request) -> web.StreamResponse:
+    async def get_pictures(self, request: web.Request) -> web.StreamResponse:
         """Answer with all pictures from now on, or with only the newest one if the path ends with `.jpg`."""
         camera = request.match_info["camera"]
         key = self.run().camera_key(request.match_info["drone"], camera.removesuffix(ONE_PICTURE))

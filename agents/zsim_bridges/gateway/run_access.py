@@ -511,7 +511,7 @@ class LockstepSession(Agent):
         connection_lost: whether its client disconnected without leaving, so that its process counts as dead.
 
     Raises:
-        DecodeError: name, period or a gate key is invalid.
+        DecodeError: the period or a gate key is invalid.
         UnknownError: a gate key names a drone or cluster that the run does not have.
         SessionError: an entry of `reads` is not a key expression.
     """
@@ -530,8 +530,6 @@ class LockstepSession(Agent):
             check_expression(key)
         self.name = name
         self.period_ns = round(request.period_s * 1e9)
-        if not keys.PROCESS_NAME.fullmatch(name) or "." not in name.strip("."):
-            raise DecodeError(f"join: name is {name[:60]!r}; must be a role, a dot and a name of a-z 0-9 _ . -")
         if self.period_ns <= 0 or self.period_ns % info.gate_ns:
             must = f"must be a multiple of {info.gate_ns / 1e9:g}"
             raise DecodeError(f"join: period_s is {self.period_ns / 1e9:g}; {must}")

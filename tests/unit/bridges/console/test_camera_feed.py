@@ -1,4 +1,4 @@
-"""The pictures of a run: subscribed to while a page asks, checked, matched with what was seen, and sent to pages. Where sightings fall on a picture, and what is written beside them. What is let through to a browser as a picture."""
+"""The cameras of a run for pages: what is subscribed to while a page asks, which pictures pass, and the marks on them."""
 
 import io
 import json
@@ -138,22 +138,15 @@ def test_what_a_page_looks_at_is_subscribed_to_and_no_more(run: Run):
     assert list(run.link.subscribed) == [keys.camera_info("*", "*")]
 
 
-def test_what_no_page_watches_costs_nothing(watched: Run):
+def test_a_page_that_has_gone_or_sleeps_costs_nothing(watched: Run):
     watched.feed.ask("another", [FRONT])
     watched.feed.release(PAGE)
-    watched.feed.update()
-    assert watched.link.pictures() == {"drone/drone1/camera/front"}
-
+    for later_s, keys_left in ((ASKED_S - 0.1, {"drone/drone1/camera/front"}), (0.1, set())):
+        watched.wall_s += later_s
+        watched.feed.update()
+        assert watched.link.pictures() == keys_left
+    watched.watch(FRONT)
     watched.feed.close()
-    assert watched.link.pictures() == set()
-
-
-def test_a_page_that_sleeps_costs_nothing(watched: Run):
-    watched.wall_s += ASKED_S - 0.1
-    watched.feed.update()
-    assert len(watched.link.pictures()) == 2
-    watched.wall_s += 0.1
-    watched.feed.update()
     assert watched.link.pictures() == set()
 
 
@@ -297,22 +290,16 @@ def test_a_page_is_told_of_cameras_and_sent_what_it_asks_for(watched: Run):
     assert data == JPEG["bottom"] + JPEG["front"]
 
 
-def test_only_what_has_changed_is_sent(watched: Run):
+def test_only_what_has_changed_is_sent_and_a_later_detection_without_its_picture(watched: Run):
     made = PageBatches()
     watched.say_picture()
     watched.say_picture("bottom")
     batch(made, watched.feed, FRONT, BOTTOM)
     assert made.next(watched.feed, (FRONT, BOTTOM)) is None
-    watched.say_picture()
+    watched.say_picture(t_ns=0)
     header, data = batch(made, watched.feed, FRONT, BOTTOM)
     assert [each["camera"] for each in header["pictures"]] == [FRONT]
     assert data == JPEG["front"]
-
-
-def test_a_detection_that_comes_after_its_picture_is_sent_without_it(watched: Run):
-    made = PageBatches()
-    watched.say_picture(t_ns=0)
-    batch(made, watched.feed, FRONT)
     detected(watched, 0)
     header, data = batch(made, watched.feed, FRONT)
     assert [(each["size"], len(each["marks"])) for each in header["pictures"]] == [(0, 1)]
@@ -449,23 +436,6 @@ def test_the_size_of_a_jpeg_is_read(options: dict[str, Any]):
     assert frame_of(whole)[1:] == frame_of(filled)[1:] == (641, 363)
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"",
-        b"\xff\xd8",
-        b"\xff\xd8\xff\xd9",
-        b"no picture",
-        encoded(kind="PNG"),
-        encoded()[:-40],
-        encoded()[:30] + b"\xff\xd9",
-    ],
-)
-def test_what_is_no_jpeg_is_refused(data: bytes):
-    with pytest.raises(PictureError):
-        check_picture(data, 40, 30)
-
-
 @given(st.binary(max_size=200))
 def test_any_bytes_have_a_size_or_are_refused(middle: bytes):
     with suppress(PictureError):
@@ -480,16 +450,22 @@ def test_a_byte_that_is_wrong_does_no_harm(at: int, byte: int):
         check_picture(bytes(data), 40, 30)
 
 
+NO_JPEG = (
+    b"", b"\xff\xd8", b"\xff\xd8\xff\xd9", b"no picture", encoded(kind="PNG"), encoded()[:-40],
+    encoded()[:30] + b"\xff\xd9",
+)  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("data", "width", "height", "terms"),
     [
+        *((data, 40, 30, ()) for data in NO_JPEG),
         (encoded(), 30, 40, ("40 × 30", "30 × 40")),
         (encoded(4000, 4000), 4000, 4000, ("4000 × 4000", "2304000")),  # it would fill a browser's memory
         (encoded()[:-2] + bytes(PICTURE_BYTES_MAX) + encoded()[-2:], 40, 30, (str(PICTURE_BYTES_MAX),)),
     ],
-    ids=["another size", "too many pixels", "too many bytes"],
 )
-def test_a_picture_of_another_size_or_too_large_is_refused(
+def test_what_is_no_jpeg_or_of_another_size_or_too_large_is_refused(
     data: bytes, width: int, height: int, terms: tuple[str, ...]
 ):
     check_picture(encoded(), 40, 30)

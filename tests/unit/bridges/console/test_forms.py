@@ -570,6 +570,9 @@ def test_the_least_side_that_a_slider_offers_is_no_refusal_of_rounding(bench: Be
 def test_of_many_variables_the_others_are_moved_one_at_a_time():
     bench = Bench("grid30")
     bench.formation()
+    shown = primary_variables(bench.space.names)
+    assert shown[:6] == ["x_c", "y_c", "z_c", "roll", "pitch", "yaw"]
+    assert len(shown) < 16
     hidden = next(name for name in bench.space.names if f"{name} [m]" not in bench.gui.at and name.startswith("w"))
     value = next(control for label, control in bench.gui.at.items() if label.startswith("value ["))
     bench.gui.at["variable"].put(next(name for name in bench.space.names if name.startswith("phi")))
@@ -583,14 +586,18 @@ def test_of_many_variables_the_others_are_moved_one_at_a_time():
 
 def test_trajectories_are_flown_as_they_are_typed(bench: Bench):
     bench.formation()
-    bench.gui.at["expressions [m, deg]"].value = "x_c = R*cos(0.1*t)\nyaw = 6*t\nR = 5"
+    bench.gui.at["expressions [m, deg]"].value = "# a circle\nx_c = R*cos(0.1*t)\n\nyaw = 6*t\nR = 5"
     bench.gui.press("Fly the expressions")
-    bench.gui.at[WAYPOINTS].value = "20: x_c = 5"
+    bench.gui.at[WAYPOINTS].value = "0: x_c = 1, p=4\n20.5: x_c=5"
     bench.gui.press("Fly the waypoints")
     name = bench.cluster.name
     assert bench.client.asked == [
         (name, "trajectory", {"expressions": {"x_c": "R*cos(0.1*t)", "yaw_deg": "6*t"}, "constants": {"R": 5.0}}),
-        (name, "trajectory", {"waypoints": [{"at_s": 20.0, "values": {"x_c": 5.0}}]}),
+        (
+            name,
+            "trajectory",
+            {"waypoints": [{"at_s": 0.0, "values": {"x_c": 1.0, "p": 4.0}}, {"at_s": 20.5, "values": {"x_c": 5.0}}]},
+        ),
     ]
 
 
@@ -626,27 +633,17 @@ def test_switches_change_the_scene(bench: Bench):
         assert shown[-1] == (what, False)
 
 
-def test_every_variable_has_a_range_in_its_unit():
-    scenario = scenario_file.load(SCENARIOS / "step.yaml")
-    cluster = scenario.clusters[0]
-    space = scenario_space(scenario, cluster)
-    found = {each.name: each for each in slider_ranges(space, cluster, scenario)}
-    assert list(found) == list(space.names)
-    assert found["p"].low == cluster.gains.separation_min_m
+def test_every_variable_has_a_range_in_its_unit(bench: Bench):
+    found = {each.name: each for each in slider_ranges(bench.space, bench.cluster, bench.scenario)}
+    assert list(found) == list(bench.space.names)
+    assert found["p"].low == bench.cluster.gains.separation_min_m
     assert found["yaw"].unit == "deg"
     assert found["yaw"].to_si(90.0) == pytest.approx(math.pi / 2)
     assert found["yaw"].to_display(math.pi / 2 + math.tau) == 90.0
     assert found["z_c"].low > 0
-    assert found["beta"].low > 0
-    assert found["beta"].high < 180
-    goal = {name: float(value) for name, value in cluster.plan.target.items()}
+    assert 0 < found["beta"].low < found["beta"].high < 180
+    goal = {name: float(value) for name, value in bench.cluster.plan.target.items()}
     assert all(found[n].refusal(found[n].to_display(v)) is None for n, v in goal.items())
-
-
-def test_what_is_out_of_range_is_refused_with_what_is_allowed():
-    scenario = scenario_file.load(SCENARIOS / "step.yaml")
-    space = scenario_space(scenario, scenario.clusters[0])
-    found = {each.name: each for each in slider_ranges(space, scenario.clusters[0], scenario)}
     assert has_terms(found["p"].refusal(0.5) or "", "p", "0.5")
     assert found["p"].refusal(math.nan) is not None
     assert found["p"].to_display(1.0) == 1.0  # as it is: only what is asked for must be within
@@ -664,24 +661,8 @@ def test_every_range_has_room_whatever_the_scenario_allows(altitude_m: float, se
         assert found.low <= found.start <= found.high
 
 
-def test_of_many_variables_those_of_the_whole_are_shown():
-    scenario = scenario_file.load(SCENARIOS / "grid30.yaml")
-    space = scenario_space(scenario, scenario.clusters[0])
-    assert primary_variables(space.names)[:6] == ["x_c", "y_c", "z_c", "roll", "pitch", "yaw"]
-    assert len(primary_variables(space.names)) < 16
-
-
-def test_expressions_are_read_with_their_constants():
-    text = "# a circle\nx_c = R*cos(0.1*t)\n\ny_c = R*sin(0.1*t)\nR = 5"
-    assert parse_expressions(text, ("x_c", "y_c")) == {
-        "expressions": {"x_c": "R*cos(0.1*t)", "y_c": "R*sin(0.1*t)"},
-        "constants": {"R": 5.0},
-    }
-
-
-def test_expressions_of_angles_are_in_degrees_as_the_sliders_are():
-    scenario = scenario_file.load(SCENARIOS / "step.yaml")
-    space = scenario_space(scenario, scenario.clusters[0])
+def test_expressions_of_angles_are_in_degrees_as_the_sliders_are(bench: Bench):
+    space = bench.space
     text = "yaw = 90 + 6*t\nroll_deg = A\nx_c = 1\nA = 5"
     read = parse_expressions(text, space.names, ("roll", "pitch", "yaw"))
     c, c_dot = ExpressionTrajectory(space, read["expressions"], np.zeros(space.size), read["constants"]).value(5.0)
@@ -690,27 +671,25 @@ def test_expressions_of_angles_are_in_degrees_as_the_sliders_are():
     assert c_dot[space.index("yaw")] == pytest.approx(math.radians(6.0))
 
 
-def test_waypoints_are_read():
-    assert parse_waypoints("0: x_c = 1, p=4\n20.5: x_c=2", {}) == {
-        "waypoints": [{"at_s": 0.0, "values": {"x_c": 1.0, "p": 4.0}}, {"at_s": 20.5, "values": {"x_c": 2.0}}]
-    }
-
-
 @pytest.mark.parametrize(
-    ("text", "terms"),
+    ("read", "texts"),
     [
-        ("x_c", ("line 1", "'x_c'")),
-        ("x_c = 5\nyc = 6", ("yc", "x_c")),
-        ("x_c = 1\nradius = wide", ("line 2", "radius", "'wide'")),
-        ("", ("trajectory",)),
+        (
+            lambda text: parse_expressions(text, ("x_c",)),
+            {
+                "x_c": ("line 1", "'x_c'"),
+                "x_c = 5\nyc = 6": ("yc", "x_c"),
+                "x_c = 1\nradius = wide": ("line 2", "radius", "'wide'"),
+                "": ("trajectory",),
+            },
+        ),
+        (
+            lambda text: parse_waypoints(text, {}),
+            dict.fromkeys(("x_c = 1", "0 x_c=1", "0: 5", "a: x_c = 1"), ("line 1",)) | {"": ("waypoints",)},
+        ),
     ],
 )
-def test_an_invalid_expression_is_refused_by_line_and_value(text: str, terms: tuple[str, ...]):
-    with refused(InputError, *terms):
-        parse_expressions(text, ("x_c",))
-
-
-@pytest.mark.parametrize("text", ["x_c = 1", "0 x_c=1", "0: 5", "a: x_c = 1", ""])
-def test_a_waypoint_that_is_none_is_refused_in_words(text: str):
-    with pytest.raises(InputError):
-        parse_waypoints(text, {})
+def test_a_text_that_is_no_trajectory_is_refused_by_line_and_value(read: Any, texts: dict[str, tuple[str, ...]]):
+    for text, terms in texts.items():
+        with refused(InputError, *terms):
+            read(text)

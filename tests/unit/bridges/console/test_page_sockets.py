@@ -46,12 +46,27 @@ def test_every_page_moves_its_own_camera(role: str, actions: Actions):
     assert actions.looked == [(7, True, False, "top")]
 
 
-@pytest.mark.parametrize(
-    "change", [{"do": "stop"}, {"direction": "below"}, {"page": "x" * 65}, {"follows": 1}, {"more": 0}]
-)
-def test_what_is_no_action_closes_the_socket(change: dict[str, Any], actions: Actions):
-    assert not actions.act(OPERATOR, **LOOK | change)
-    assert actions.looked == []
+PLAY, STEER = {"do": "play", "op": "seek", "value": 1.0}, {"do": "steer", "held": True}
+NO_ACTIONS = [
+    *(
+        LOOK | change
+        for change in ({"do": "stop"}, {"direction": "below"}, {"page": "x" * 65}, {"follows": 1}, {"more": 0})
+    ),
+    *(PLAY | change for change in ({"op": "acquire"}, {"value": -1.0}, {"value": 1e10}, {"value": "1"})),
+    *(
+        STEER | change
+        for change in ({"forward": 1.1}, {"held": 1}, {"speed_m_s": -1.0}, {"speed_m_s": 1e3}, {"drone": "drone2"})
+    ),
+]
+
+
+@pytest.mark.parametrize("action", NO_ACTIONS)
+def test_what_is_no_action_closes_the_socket(action: dict[str, Any], actions: Actions):
+    assert not actions.act(OPERATOR, **action)
+    assert (actions.looked, actions.played) == ([], [])
+    flying, sockets = flying_sockets()
+    assert sockets.act(json.dumps(action), OPERATOR) is None
+    assert flying.done == []
 
 
 def test_an_operator_plays_a_record_and_a_viewer_does_not(actions: Actions):
@@ -62,11 +77,6 @@ def test_an_operator_plays_a_record_and_a_viewer_does_not(actions: Actions):
     assert actions.played == [("seek", 5.0)]
 
 
-@pytest.mark.parametrize("change", [{"op": "acquire"}, {"value": -1.0}, {"value": 1e10}, {"value": "1"}])
-def test_what_no_timeline_says_closes_the_socket(change: dict[str, Any]):
-    assert not Actions().act(OPERATOR, **{"do": "play", "op": "seek", "value": 1.0} | change)
-
-
 class FakeFlying:
     """What pages may do with single drones, noted."""
 
@@ -74,13 +84,8 @@ class FakeFlying:
         self.chosen: list[tuple[Any, str]] = []
         self.refused: int | None = -1  # page that another one keeps from flying
         self.done: list[tuple[Any, ...]] = []
-        self.control: Any = SimpleNamespace(
-            take=partial(self._note, "take"),
-            steer=partial(self._note, "steer"),
-            go=partial(self._note, "go"),
-            leave=partial(self._note, "leave"),
-            lose=partial(self._note, "lose"),
-        )
+        does = ("take", "steer", "go", "leave", "lose")
+        self.control: Any = SimpleNamespace(**{what: partial(self._note, what) for what in does})
         self.pages: Any = SimpleNamespace(
             choose=lambda *chosen: self.chosen.append(chosen),
             use=lambda client_id, drone: "main is held" if client_id == self.refused else "",
@@ -146,15 +151,6 @@ def test_every_page_sees_the_plan_and_chooses_a_drone_of_its_own(role: str):
     assert looked == {"plan": {"page": 7, "whole": True}}
     assert sockets.act(json.dumps({"do": "choose", "page": "key", "drone": "drone3"}), role) == {}
     assert flying.chosen == [(7, "drone3")]
-
-
-@pytest.mark.parametrize(
-    "change", [{"forward": 1.1}, {"held": 1}, {"speed_m_s": -1.0}, {"speed_m_s": 1e3}, {"drone": "drone2"}]
-)
-def test_a_stick_beyond_its_stops_closes_the_socket(change: dict[str, Any]):
-    flying, sockets = flying_sockets()
-    assert sockets.act(json.dumps({"do": "steer", "held": True} | change), OPERATOR) is None
-    assert flying.done == []
 
 
 INFO = synthetic_camera.info_of("front")

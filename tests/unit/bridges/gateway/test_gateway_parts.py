@@ -3,6 +3,7 @@
 import asyncio
 import json
 import sys
+from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -13,16 +14,17 @@ from aiohttp import web
 from aiohttp.test_utils import make_mocked_request
 from hypothesis import given
 from hypothesis import strategies as st
-from refused import refused
+from refused import has_terms, refused
+from synthetic_pictures import NO_JPEG, image, jpeg
 
-from zsim.contract import messages
+from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Status, Velocity
 from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.messages import ClusterInfo, DroneInfo, Imu, Info, Origin
 from zsim.errors import DecodeError, NoWorldError
 from zsim.runtime.rate_limit import RateLimit
 from zsim.transport.session import RawSample
-from zsim_bridges.gateway import run_access
+from zsim_bridges.gateway import client_streams, run_access
 from zsim_bridges.gateway.client_messages import (
     ClientLimit,
     JoinRequest,
@@ -38,7 +40,7 @@ from zsim_bridges.gateway.client_messages import (
     payload_to_json,
     value_line,
 )
-from zsim_bridges.gateway.client_streams import Outbox
+from zsim_bridges.gateway.client_streams import BOUNDARY, Outbox, PictureFeed, PictureFeeds, picture_part
 from zsim_bridges.gateway.gateway_server import Client
 from zsim_bridges.gateway.http_server import AccessCheck, described_sample, description, methods_of, value_event
 from zsim_bridges.gateway.run_access import EchoFilter, LastValues, LockstepSession, gate_keys_of
@@ -297,6 +299,15 @@ def test_a_client_that_floods_is_slowed_down_and_told():
     assert "1.000 s" in entries[-1]["error"]
 
 
+def test_a_client_has_the_name_of_a_process_other_than_the_gateway():
+    for name, own in {"myctrl": "client.myctrl", "matlab.main": "matlab.main"}.items():
+        assert FakeGateway().answers(b'{"op": "hello", "name": "%b"}' % name.encode())[0]["name"] == own
+    for op in (b'"hello"', b'"join", "period_s": 0.02'):
+        for name in ("A.b", ".", "gateway.main"):
+            (answer,) = FakeGateway().answers(b'{"op": %b, "name": "%b"}' % (op, name.encode()))
+            assert has_terms(answer["error"], "name", f"'{name}'"), answer
+
+
 def test_a_fault_of_ours_is_an_answer_and_a_line_for_a_person():
     gateway = FakeGateway()
     (answer,) = gateway.answers(b'{"op": "subscribe", "key": "a"}')  # this gateway has no feed
@@ -394,8 +405,6 @@ def test_in_realtime_a_late_gate_goes_with_a_newer_one():
 @pytest.mark.parametrize(
     ("given", "terms"),
     [
-        ({"name": "nodot"}, ("name", "'nodot'")),
-        ({"name": "A.b"}, ("name", "'A.b'")),
         ({"period_s": 0.020000001}, ("period_s", "0.02…")),
         ({"period_s": 0.0}, ("period_s", "0…")),
         ({"gates": ["drone/*/truth"]}, ("gates…",)),
@@ -464,3 +473,119 @@ def test_the_description_has_every_message_and_where_clients_speak():
     assert sent["required"] == ["velocity_m_s", "yaw_rate_rad_s"]  # not what is filled in
     velocity = sent["properties"]["velocity_m_s"]
     assert (velocity["minItems"], velocity["maxItems"], velocity["items"]["maximum"]) == (3, 3, sys.float_info.max)
+
+
+FRONT = keys.camera("d1", "front")
+MS = 1_000_000
+
+
+def sample(number: int, data: bytes | None = None) -> RawSample:
+    return RawSample("PUT", FRONT, messages.encode(image(number * 20 * MS, number, data)), "", None)
+
+
+class Publisher:
+    """Counts subscriptions, and publishes to those that are there."""
+
+    def __init__(self) -> None:
+        self.subscribers: list[Callable[[RawSample], None]] = []
+        self.made = 0
+
+    def subscribe(self, key: str, subscriber: Callable[[RawSample], None]) -> Callable[[], None]:
+        assert key == FRONT
+        self.made += 1
+        self.subscribers.append(subscriber)
+        return lambda: self.subscribers.remove(subscriber)
+
+    def publish(self, published: RawSample) -> None:
+        for subscriber in self.subscribers:
+            subscriber(published)
+
+
+def test_who_comes_late_gets_the_newest_and_nothing_twice() -> None:
+    async def look() -> list[int | None]:
+        feed = PictureFeed(FRONT, lambda reason: None)
+        for number in range(5):
+            feed.take(sample(number))
+        late = await feed.after(-1, 1.0)
+        assert late is not None
+        again = await feed.after(late.number, 0.0)
+        feed.take(sample(9))
+        next_one = await feed.after(late.number, 1.0)
+        return [picture and picture.image.seq for picture in (late, again, next_one)]
+
+    assert asyncio.run(look()) == [4, None, 9]
+
+
+def test_who_waits_gets_the_next_picture() -> None:
+    async def look() -> int:
+        feed = PictureFeed(FRONT, lambda reason: None)
+        waiting = asyncio.create_task(feed.after(-1, 60.0))
+        await asyncio.sleep(0)
+        feed.take(sample(7))
+        picture = await waiting
+        assert picture is not None
+        return picture.image.seq
+
+    assert asyncio.run(look()) == 7
+
+
+@pytest.mark.parametrize("payload", [b"\xc1", messages.encode(image(0, 0, NO_JPEG)), b""])
+def test_what_is_no_picture_is_refused_and_not_shown(payload: bytes) -> None:
+    refused: list[str] = []
+
+    async def look() -> PictureFeed:
+        feed = PictureFeed(FRONT, refused.append)
+        feed.take(sample(3))
+        feed.take(RawSample("PUT", FRONT, payload, "", None))
+        return feed
+
+    newest = asyncio.run(look()).newest
+    assert newest is not None
+    assert newest.image.seq == 3
+    assert len(refused) == 1
+    assert refused[0].startswith(FRONT)
+
+
+def test_a_hundred_who_look_cost_one_subscription_and_it_ends_after_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client_streams, "LINGER_S", 0.0)
+    publisher = Publisher()
+
+    async def look() -> list[int]:
+        feeds = PictureFeeds(publisher.subscribe, lambda reason: None)
+        counts = []
+
+        async def watch() -> None:
+            with feeds.watched(FRONT) as feed:
+                assert await feed.after(-1, 60.0)
+
+        watchers = [asyncio.create_task(watch()) for _ in range(100)]
+        await asyncio.sleep(0)
+        counts.append(publisher.made)
+        publisher.publish(sample(0))
+        await asyncio.gather(*watchers)
+        closed = asyncio.Event()
+        asyncio.get_running_loop().call_later(0.0, closed.set)  # after what the watchers had called later
+        await closed.wait()
+        return [*counts, len(publisher.subscribers)]
+
+    assert asyncio.run(look()) == [1, 0]
+
+
+def test_pictures_of_another_run_are_forgotten() -> None:
+    async def look() -> bool:
+        publisher = Publisher()
+        feeds = PictureFeeds(publisher.subscribe, lambda reason: None)
+        with feeds.watched(FRONT) as feed:
+            publisher.publish(sample(0))
+            assert feed.newest
+            feeds.forget()
+            return feed.newest is None
+
+    assert asyncio.run(look())
+
+
+def test_a_part_ends_with_the_boundary() -> None:
+    head, _, rest = picture_part(image(20 * MS)).partition(b"\r\n\r\n")
+    assert rest == jpeg() + f"\r\n--{BOUNDARY}\r\n".encode()
+    assert b"Content-Length: %d" % len(jpeg()) in head
+    assert b"X-Timestamp: 0.016000" in head

@@ -21,7 +21,6 @@ from zsim_bridges.console.run_condition import (
     formation_refusals,
     preflight_checks,
 )
-from zsim_bridges.console.run_monitor import FAULTS_KEPT, FaultWatch
 
 DEAD, LOW = Alarm("red", "estimator.drone1", "dead"), Alarm("amber", "drone1", "battery", "17 %")
 MEMBERS = ("drone1", "drone2", "drone3")
@@ -245,63 +244,3 @@ def test_why_nobody_takes_off_is_true(phase: str, states: tuple[str, ...], terms
     refusal = fleet_refusals(found)["takeoff"]
     assert has_terms(refusal, *terms)
     assert "nobody" not in refusal
-
-
-# What faults did
-
-
-class Watched:
-    """Two drones of a formation, and a fault."""
-
-    def __init__(self, fault: Fault) -> None:
-        self.watch, self.fault = FaultWatch(), fault
-        self.drones = {name: FIT._replace(name=name, state="flying") for name in MEMBERS[:2]}
-
-    def see(self, acts: bool = True, phase: str = "engaged", lost: tuple[str, ...] = (), wind: float = 0.5) -> str:
-        active = [self.fault] if acts else []
-        self.watch.update([self.fault], active, self.drones, {"main": phase}, lost, wind)
-        (line,) = self.watch.lines(is_over=not acts)
-        return line
-
-    def change(self, drone: str, **change: Any) -> None:
-        self.drones[drone] = self.drones[drone]._replace(**change)
-
-
-def test_a_fault_of_a_drone_tells_what_it_did_to_it_and_to_nobody_else():
-    of = Watched(Fault(3, "gps_dropout", "drone1", {"probability": 0.4}, 12_000_000_000, 42_000_000_000))
-    assert has_terms(of.see(), "#3 gps_dropout of drone1 probability=0.4", "12.0 s to 42.0 s", "no effect seen")
-    of.change("drone2", sigma_m=9.0, state="emergency")
-    assert has_terms(of.see(), "no effect seen")
-    of.change("drone1", sigma_m=1.4, state="landing")
-    assert has_terms(of.see(phase="held"), "σ 0.20 → 1.40 m", "drone1 flying → landing", "main engaged → held")
-    of.change("drone1", sigma_m=0.3)
-    assert has_terms(of.see(acts=False), "σ 0.20 → 1.40 m")  # the worst
-    of.change("drone1", sigma_m=5.0)
-    assert has_terms(of.see(acts=False), "σ 0.20 → 1.40 m")  # the fault is over
-
-
-def test_a_gust_tells_its_wind_and_a_link_its_lag():
-    gust = Watched(Fault(1, "gust", "world", {"velocity_m_s": [4.0, 0.0, 0.0]}, 0))
-    gust.see()
-    assert has_terms(gust.see(wind=4.4), "velocity_m_s=[4.0, 0.0, 0.0]", "wind 0.5 → 4.4 m/s")
-    link = Watched(Fault(1, "link_delay", "world/estimator.drone2", {"delay_ms": 300.0, "one_way": False}, 0))
-    link.see()
-    link.change("drone2", lag_ms=310.0)
-    assert has_terms(link.see(), "world/estimator.drone2", "delay_ms=300.0", "lag 10 → 310 ms")
-
-
-def test_a_kill_tells_the_death_and_the_return_of_its_process():
-    of = Watched(Fault(1, "process_kill", "estimator.drone1", {}, 0, 20_000_000))
-    of.see(acts=False)
-    assert has_terms(of.see(acts=False, lost=("estimator.drone1",)), "estimator.drone1 alive → dead")
-    assert has_terms(of.see(acts=False), "estimator.drone1 alive → dead → alive")
-
-
-def test_many_faults_that_are_over_are_not_kept():
-    watch = FaultWatch()
-    for number in range(3 * FAULTS_KEPT):
-        fault = Fault(number, "gps_stuck", "drone1", {}, 0)
-        watch.update([], [fault], {"drone1": FIT}, {}, (), 0.0)
-    watch.update([], [], {"drone1": FIT}, {}, (), 0.0)
-    assert len(watch.lines(is_over=True)) == FAULTS_KEPT
-    assert watch.lines() == []
