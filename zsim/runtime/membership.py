@@ -1,6 +1,6 @@
-"""What a process says of itself: join, done and bye, for Zenoh and the in-memory bus, and its health once per second.
+"""The messages of a process about itself: join, done and bye, on Zenoh and on the in-memory bus, and its health.
 
-And garbage collection without delaying gates.
+Also schedules garbage collection so that it does not delay gates.
 """
 
 import gc

@@ -193,7 +193,7 @@ class VehicleServer(ABC):
 
 
 class PictureServer(VehicleServer):
-    """A server that forwards each message in its order, and also the pictures of the cameras that somebody watches."""
+    """A server that forwards all messages in order, and the pictures of the cameras that clients watch."""
 
     async def open(self, stack: contextlib.AsyncExitStack) -> None:
         self._pictures = PictureIntake(self.link, asyncio.get_running_loop(), self.on_picture)
@@ -210,15 +210,15 @@ class PictureServer(VehicleServer):
 
     @abstractmethod
     def wanted_pictures(self) -> Iterable[str]:
-        """Return the keys of the cameras that somebody watches."""
+        """Return the keys of the cameras that clients watch."""
 
     @abstractmethod
     def forward(self, key: str, payload: bytes) -> None:
-        """Hand on a message that has passed through the world."""
+        """Forward a message that has passed through the world."""
 
     @abstractmethod
     def on_picture(self, key: str, payload: bytes) -> None:
-        """Hand on a picture."""
+        """Forward a picture."""
 
 
 def set_pace(link: Session, info: Info, name: str, rate: float | None) -> None:
