@@ -330,7 +330,7 @@ def test_show_advises_a_command_that_mends(lab: Path) -> None:
     now = datetime.now(UTC)
     signer = certificates.authority(lab / "certs", now)
     assert run("show", lab / "hosts.yaml").stderr == ""
-    for days, state in ((-0.5, "expired on "), (1.0, "ends soon")):
+    for days, state in ((-0.5, "expired on "), (1.0, "expires soon")):
         issue(lab / "certs", signer, CertificateRequest("h1", "world", ("127.0.0.1",)), now, days)
         shown = run("show", lab / "hosts.yaml")
         (row,) = [line for line in shown.stdout.splitlines() if state in line]
