@@ -126,7 +126,7 @@ def nearest(row: Sequence[float], x: float, y: float, z: float) -> tuple[float, 
 
 
 def least_distances(obstacles: Iterable[Any], p_W: ArrayLike) -> NDArray[np.float64]:
-    """Return the distance [m] of each point (T, 3) to the nearest obstacle, as `nearest` does; inf if there are none."""
+    """Return the distance [m] of each point (T, 3) to the nearest obstacle, as `nearest` does; inf if none."""
     points, rows = np.asarray(p_W, dtype=float).reshape(-1, 3), np.array([*map(row_of, obstacles)]).reshape(-1, COLUMNS)
     least, step = np.full(len(points), np.inf), max(1, PAIRS_MAX // max(len(rows), 1))
     for first in range(0, len(points) if len(rows) else 0, step):
