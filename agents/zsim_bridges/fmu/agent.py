@@ -122,7 +122,7 @@ class FmuAgent(Agent):
         self._commanded = sorted({drone for writer in self._writers for drone in writer.commanded})
         self._takeoff_ns = None if of.takeoff_s is None else round(of.takeoff_s * 1e9)
         self._latest: dict[str, Any] = {}
-        self._states: dict[str, Any] = {}  # of the firmware, by drone
+        self._states: dict[str, Any] = {}  # states of firmwares, by drone
         self._raised: set[str] = set()  # modes whose outputs were true at the last step
         self._has_started = False
         self._declare_keys(info)

@@ -59,7 +59,7 @@ class Place(NamedTuple):
     text: str  # as the user wrote it
     key: str
     field: str
-    indices: tuple[int, ...] | None  # of its elements; None for a field with a single value
+    indices: tuple[int, ...] | None  # indices of its elements; None for a field with a single value
     kind: Kind
 
     @property

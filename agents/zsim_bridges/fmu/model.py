@@ -339,7 +339,7 @@ def _described(path: Path) -> Any:
         raise RunError(f"{path}: its modelDescription.xml is invalid: {first}") from error
     except RunError:
         raise
-    except Exception as error:  # of lxml, and bare ones of FMPy
+    except Exception as error:  # lxml and FMPy raise various exceptions
         raise RunError(f"{path}: cannot be read as an FMU: {reason_of(error)}; {ALLOWED}") from error
     if str(description.fmiVersion).partition(".")[0] not in ("2", "3"):
         raise RunError(f"{path}: is for FMI {description.fmiVersion}; {ALLOWED}")

@@ -234,7 +234,7 @@ class Gateway:
 
     def _observe_link(self, run: RunAccess) -> None:
         def on_link(up: bool) -> None:
-            with suppress(RuntimeError):  # in a thread of Zenoh's; the gateway has ended
+            with suppress(RuntimeError):  # called in a Zenoh thread; the gateway has ended
                 self.loop.call_soon_threadsafe(self._notify_link, run, up)
 
         run.link.on_link(on_link)

@@ -50,7 +50,7 @@ OWN_BYTES_MAX = 64_000_000  # total size of the values on clients' own keys
 KEYS_MAX = 200_000  # number of keys with a last value; 1000 drones have about 12 000
 WAITING_MAX = 50_000  # default limit of an expression's messages that wait for the loop
 DELIVER_MAX = 500  # messages delivered before other tasks of the loop run
-EXPRESSIONS_MAX = 2_000  # of all clients together; each is a subscription that the world's session checks
+EXPRESSIONS_MAX = 2_000  # number for all clients together; the world's session checks each subscription
 
 Subscriber = Callable[[RawSample], None]
 ANSWER_TIMEOUT_S = 10.0  # wall time after which a client that answers nothing in realtime leaves the lockstep
