@@ -1,4 +1,4 @@
-"""The air and the other drones around a drone: wind, gusts, downwash, and contact between hulls, treated as spheres.
+"""Effects of air and other drones on a drone: wind, gusts, downwash, and contact between hulls, treated as spheres.
 
 Gusts have the Dryden longitudinal form and are correlated between drones.
 """
@@ -21,7 +21,7 @@ WIND = columns(
         Field("gust", "m/s"),  # standard deviation per axis
         Field("length", "m"),
         Field("speed_min", "m/s"),
-        Field("correlation", "1"),  # between drones
+        Field("correlation", "1"),  # correlation between drones
     ),
 )
 JET_SPREAD = 0.107  # growth of a round jet's 1/e width (Fischer et al., Mixing in Inland and Coastal Waters, 1979)
@@ -50,7 +50,7 @@ def blow(wind: Row, v_WB: Vector, gust: NDArray, common: Vector, own: Vector, dt
     Args:
         wind: the wind's parameters (WIND.size,); load them once for many drones, so that roots are computed once.
         v_WB: the drone's velocity [m/s].
-        common: standard normal numbers that all drones share; own: of this drone.
+        common, own: standard normal numbers shared by all drones, and of this drone.
     """
     square = 0.0
     for k in range(3):
@@ -65,7 +65,7 @@ def blow(wind: Row, v_WB: Vector, gust: NDArray, common: Vector, own: Vector, dt
 
 @inlined
 def jet_reach(start_m: float, below_m: float) -> float:
-    """Return the radius [m] of a jet, of this width at its start, so far below it."""
+    """Return the radius [m] of a jet at a distance below its start, given its width there."""
     return JET_WIDTHS * (start_m + JET_SPREAD * below_m)
 
 
@@ -77,8 +77,8 @@ def downwash(thrust_n: float, density: float, start_m: float, below_m: float, as
     w = 2 v_h (b0 / b) exp(-(r / b)^2), b = b0 + 0.107 z, A = pi b0^2, b0 = sqrt(n) R for n rotors of radius R.
 
     Args:
-        thrust_n: of the drone above; density: of the air [kg/m^3]; start_m: b0 of the drone above.
-        below_m, aside_m: where, from the drone above, both >= 0.
+        thrust_n, start_m: thrust and b0 of the drone above; density: of the air [kg/m^3].
+        below_m, aside_m: position relative to the drone above, both >= 0.
     """
     width = start_m + JET_SPREAD * below_m
     if aside_m > JET_WIDTHS * width or thrust_n <= 0.0:
@@ -89,10 +89,10 @@ def downwash(thrust_n: float, density: float, start_m: float, below_m: float, as
     return core * el.exp(-ratio * ratio)
 
 
-DISTANCE_MIN_M = 1e-9  # m, so that two drones in one place have a direction
-CLOSE = 1.0 + 1e-9  # of the square of a distance: more than rounding can make of it
+DISTANCE_MIN_M = 1e-9  # m, lower bound that gives two drones at one position a direction
+CLOSE = 1.0 + 1e-9  # factor of a squared distance that exceeds any rounding error
 STRAY_M = 0.25  # m, motion of a drone after which near pairs are found again: 0.4 s at 0.6 m/s
-APPROACH_M = 0.501  # m, by which a pair's distance may have changed by then: twice as much, and room for rounding
+APPROACH_M = 0.501  # m, largest change of a pair's distance by then: twice STRAY_M, and a margin for rounding
 
 
 @inlined
@@ -130,13 +130,13 @@ def _touch(bodies: Bodies, i: int, j: int, d: Vector, distance: float) -> None:
     share = distance / (one[VEHICLE.hull_radius] + other[VEHICLE.hull_radius])
     arms = scaled(n, share * one[VEHICLE.hull_radius]), scaled(n, -share * other[VEHICLE.hull_radius])
     v = subtract(velocity_at(bodies.state[j], arms[1]), velocity_at(bodies.state[i], arms[0]))
-    # the softer of the two, so that a light drone stays within what its step can follow
+    # the softer of the two, so that the step stays short enough for a light drone
     stiffness = min(one[VEHICLE.hull_stiffness], other[VEHICLE.hull_stiffness])
     damping = min(one[VEHICLE.hull_damping], other[VEHICLE.hull_damping])
     depth = one[VEHICLE.hull_radius] + other[VEHICLE.hull_radius] - distance
     normal = hull_force(stiffness, damping, depth, -dot(v, n))
     slip = axpy(v, -dot(v, n), n)
-    # slip is damped at the rate of the approach: a push across a hull turns it, and finds less inertia than one along d
+    # slip is damped at the rate of the approach: a tangential force also turns the hull and meets less inertia
     straight = 1.0 / one[VEHICLE.mass] + 1.0 / other[VEHICLE.mass]
     turning = dot(arms[0], arms[0]) / _least_inertia(one) + dot(arms[1], arms[1]) / _least_inertia(other)
     viscous, limit = (
@@ -169,7 +169,7 @@ def _meet(bodies: Bodies, i: int, j: int) -> float:
     aside2 = dx * dx + dy * dy
     square = aside2 + dz * dz
     distance, hulls = math.inf, vehicle[i, VEHICLE.hull_radius] + vehicle[j, VEHICLE.hull_radius]
-    if square < CLOSE * hulls * hulls:  # the root takes long, and most pairs are farther
+    if square < CLOSE * hulls * hulls:  # most pairs are farther apart, and the root is costly
         distance = max(math.sqrt(square), DISTANCE_MIN_M)
     contact = distance < hulls
     if contact:
@@ -201,7 +201,7 @@ def _may_see(radius: float, eye: NDArray, aside: float, dz: float, distance: flo
     """Return whether a hull dz higher may come into the view down of a drone until one strays: within a cone, a range.
 
     Args:
-        eye: the row of `NearPairs.eye` of the drone that looks.
+        eye: row of the looking drone in `NearPairs.eye`.
     """
     room, cosine = radius + eye[0] + APPROACH_M, eye[2]
     return cosine * aside + math.sqrt(1.0 - cosine * cosine) * dz < room and distance < eye[1] + room
@@ -209,7 +209,7 @@ def _may_see(radius: float, eye: NDArray, aside: float, dz: float, distance: flo
 
 @inlined
 def _find_near(vehicle: NDArray, state: NDArray, touching: NDArray, near: NearPairs) -> None:
-    """Note all pairs that can touch, blow on each other or be the closest until a drone strays, and who is above."""
+    """Note all pairs that can touch, be in downwash or be the closest until a drone strays, and who is above."""
     count, least = 0, math.inf
     for i in range(state.shape[0]):
         near.above[i] = 0
@@ -239,7 +239,7 @@ def _find_near(vehicle: NDArray, state: NDArray, touching: NDArray, near: NearPa
 
 @inlined
 def meet_drones(bodies: Bodies) -> float:
-    """Add downwash to `air`, the forces between hulls to `push`, and return the least distance [m].
+    """Add downwash to `air`, the forces between hulls to `push`, and return the smallest distance [m].
 
     Only near pairs are examined, in the order of all pairs, which gives the same bits as all pairs. They are updated
     when a drone has moved by STRAY_M. `touching[i, j]` is 1 where i < j are in contact now; `touched` is set to 1 where

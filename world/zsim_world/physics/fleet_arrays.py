@@ -24,7 +24,7 @@ from zsim.schema.quantities import COULOMB_PER_MAH, SEA_LEVEL_KG_M3
 from zsim.vehicles.vehicle import Aerodynamics, Vehicle, allocation, lift_shares, mixing
 from zsim_world.physics.rays import Scene
 
-REFERENCE_DENSITY_KG_M3 = SEA_LEVEL_KG_M3  # thrust, torque and drag of a vehicle hold there
+REFERENCE_DENSITY_KG_M3 = SEA_LEVEL_KG_M3  # air density at which a vehicle's thrust, torque and drag are given
 
 VEHICLE = columns(
     "VehicleColumns",
@@ -32,7 +32,7 @@ VEHICLE = columns(
         Field("mass", "kg"),
         Field("inertia", "kg m^2", 3),
         Field("rotor_unit", "m"),  # unit of the rotors' positions: arm / sqrt(2)
-        Field("thrust", "N s^2"),  # at the field's air density, as torque and drag
+        Field("thrust", "N s^2"),  # at the field's air density; likewise torque and drag
         Field("torque", "N m s^2"),
         Field("rotor_lag", "s"),
         Field("rotor_min", "rad/s"),
@@ -42,10 +42,10 @@ VEHICLE = columns(
         Field("air_density", "kg/m^3"),
         Field("rotor_radius", "m"),
         Field("rotor_inertia", "kg m^2"),
-        Field("rotor_share", "1"),  # 1 / number of its rotors
+        Field("rotor_share", "1"),  # 1 / number of rotors
         Field("jet_start", "m"),  # width of the jet where it leaves the rotors
         Field("contact_reach", "m"),  # farther than any contact point from the centre of mass
-        Field("stand_height", "m"),  # of the centre of mass of a standing drone
+        Field("stand_height", "m"),  # height of the centre of mass of a standing drone
         Field("foot_stiffness", "N/m"),  # per contact point
         Field("foot_damping", "N s/m"),
         Field("foot_xy", "m"),
@@ -54,26 +54,26 @@ VEHICLE = columns(
         Field("rim_height", "m"),
         Field("friction", "1"),
         Field("hull_radius", "m"),
-        Field("hull_stiffness", "N/m"),  # between two hulls, of this drone's mass
+        Field("hull_stiffness", "N/m"),  # between two hulls of this drone's mass
         Field("hull_damping", "N s/m"),
-        Field("capacity", "J"),  # of a full battery
-        Field("efficiency", "1"),  # electric to shaft power
+        Field("capacity", "J"),  # energy of a full battery
+        Field("efficiency", "1"),  # from electric to shaft power
         Field("electronics", "W"),
     ),
 )
-ROTOR = columns(  # groups of what is known of each rotor
+ROTOR = columns(  # parameters of the rotors: one group per parameter, one number per rotor
     "RotorGroups",
     (
         Field("x", "rotor_unit"),
         Field("y", "rotor_unit"),
-        Field("turn", "1"),  # sign of its drag torque on the body about z; 0 where there is no rotor
-        Field("low", "rad/s"),  # limits of its speed
+        Field("turn", "1"),  # sign of the drag torque on the body about z; 0: no such rotor
+        Field("low", "rad/s"),  # speed limits
         Field("high", "rad/s"),
-        Field("roll", "1"),  # thrust per moment over rotor_unit
+        Field("roll", "1"),  # thrust per (moment / rotor_unit)
         Field("pitch", "1"),
-        Field("yaw", "1"),  # thrust per moment over torque per thrust
-        Field("yaw_inverse", "1"),  # 0 where yaw is
-        Field("lift", "1"),  # thrust over the mean of all, so that it gives no moment; 1 of balanced rotors
+        Field("yaw", "1"),  # thrust per (moment / (torque per thrust))
+        Field("yaw_inverse", "1"),  # 1 / yaw; 0 if yaw is 0
+        Field("lift", "1"),  # thrust / mean thrust of all rotors at zero moment; 1 for balanced rotors
     ),
 )
 AERO = columns(  # zsim.vehicles.vehicle.Aerodynamics, at the field's air density
@@ -86,20 +86,24 @@ AERO = columns(  # zsim.vehicles.vehicle.Aerodynamics, at the field's air densit
         Field("rotor_lift", "N s^2/m^2"),
     ),
 )
-STATE = columns(  # and R speeds [rad/s]
+STATE = columns(  # followed by R rotor speeds [rad/s]
     "StateColumns", (Field("p_WB", "m", 3), Field("v_WB", "m/s", 3), Field("q_WB", "1", 4), Field("w_WB_B", "rad/s", 3))
 )
-CLOCK = columns("ClockColumns", (Field("tick", "1"), Field("ticks_per_step", "1")))  # present one; of the board's step
-SPAN = columns("SpanColumns", (Field("dt", "s"), Field("hover", "s"), Field("land", "s")))  # tick; patience in silence
-PLACE = columns("PlaceColumns", (Field("field_W", "uT", 3), Field("height", "m")))  # height of W above the sea
-EXPOSED = columns(  # what a user's sensor is exposed to; accel as in Bodies
+CLOCK = columns(
+    "ClockColumns", (Field("tick", "1"), Field("ticks_per_step", "1"))
+)  # present tick; ticks per step of the board
+SPAN = columns(
+    "SpanColumns", (Field("dt", "s"), Field("hover", "s"), Field("land", "s"))
+)  # tick; silence until hovering, then landing
+PLACE = columns("PlaceColumns", (Field("field_W", "uT", 3), Field("height", "m")))  # height of W above sea level
+EXPOSED = columns(  # truth that a user's sensor measures; accel as in Bodies
     "ExposedColumns", (Field("state", "STATE", 13), Field("accel", "m/s^2, rad/s^2", 6), Field("air", "m/s", 3))
 )
 STREAMS = columns("StreamColumns", (Field("sensors", "1", 6), Field("wind", "1")))
 
-Row = NDArray[np.float64] | tuple[float, ...]  # of one drone: a view, or loaded
+Row = NDArray[np.float64] | tuple[float, ...]  # row of one drone: an array view, or its values loaded into a tuple
 CROSS_ROTORS = 4
-# Of a cross of four (zsim.vehicles.vehicle.cross_layout), as in ROTOR
+# Groups of ROTOR for a cross of four rotors (zsim.vehicles.vehicle.cross_layout)
 _X, _Y, _TURN = (1.0, 1.0, -1.0, -1.0), (1.0, -1.0, -1.0, 1.0), (1.0, -1.0, 1.0, -1.0)
 _ROLL, _PITCH, _YAW = (0.25, -0.25, -0.25, 0.25), (-0.25, -0.25, 0.25, 0.25), (0.25, -0.25, 0.25, -0.25)
 
@@ -113,10 +117,10 @@ class NearPairs(NamedTuple):
     """Pairs of drones that can affect each other, and the positions at which they were found (contacts.py)."""
 
     pair: NDArray  # int32 (N (N - 1) / 2, 2), i < j, ascending
-    number: NDArray  # int64 (1,), how many pairs
+    number: NDArray  # int64 (1,), number of pairs
     origin: NDArray  # (N, 3), m
-    above: NDArray  # int8 (N,), 1 where sonar or flow of a drone may see another
-    eye: NDArray  # (N, 3), how it looks down: from how far off its centre [m], how far [m], cosine of most of the tilt
+    above: NDArray  # int8 (N,), 1 if a drone's sonar or flow sensor may see another drone
+    eye: NDArray  # (N, 3), view down: offset from the drone's centre [m], range [m], cosine of the largest tilt
 
 
 class Bodies(NamedTuple):
@@ -124,28 +128,28 @@ class Bodies(NamedTuple):
     vehicle: NDArray  # (N, VEHICLE.size)
     rotors: NDArray  # (N, ROTOR.size * R)
     state: NDArray  # (N, STATE.size + R)
-    accel: NDArray  # (N, 6), acceleration in W and angular acceleration in B
-    anchor: NDArray  # (N, 8, 2), m
+    accel: NDArray  # (N, 6), acceleration in W [m/s^2] and angular acceleration in B [rad/s^2]
+    anchor: NDArray  # (N, 8, 2), m, anchors of the contact points on the ground
     command: NDArray  # (N, R), rad/s
     energy: NDArray  # (N,), J
     air: NDArray  # (N, 3), m/s
     push: NDArray  # (N, 3), N
-    touching: NDArray  # int8 (N, N)
+    touching: NDArray  # int8 (N, N), hulls in contact now
     touched: NDArray  # int8 (N, N), contacts that began in this gate
     near: NearPairs
     obstacle: NDArray  # (M, obstacle.COLUMNS)
-    bumping: NDArray  # int8 (N, M + surfaces), who touches which obstacle or surface with more than its feet
+    bumping: NDArray  # int8 (N, M + surfaces), 1 if more than a drone's feet touches an obstacle or surface
     bumped: NDArray  # int8 (N, M + surfaces), contacts that began in this gate
-    solid: NDArray  # int32 (N, K), the obstacles in reach of each, see physics/surfaces.py
-    held: NDArray  # (N, K, BALLS, 3), m, anchors on them
-    plane: NDArray  # (N, BALLS, PLANE.size), where each is nearest to a surface, see physics/surfaces.py; none: no rows
-    braced: NDArray  # int8 (N,), 1 where obstacle or surface is in reach or a hull touches another
-    twist: NDArray  # (N, 3), N m in W, of other drones' hulls; of those that are braced
+    solid: NDArray  # int32 (N, K), obstacles within reach, see physics/surfaces.py
+    held: NDArray  # (N, K, BALLS, 3), m, anchors on these obstacles
+    plane: NDArray  # (N, BALLS, PLANE.size), nearest planes of surfaces, see physics/surfaces.py; no rows without any
+    braced: NDArray  # int8 (N,), 1 if an obstacle or surface is within reach or a hull touches another
+    twist: NDArray  # (N, 3), N m in W, moment of other drones' hulls; valid where braced
     lanes: NDArray  # (blocks, columns of a block), see physics/simd.py
-    aero_parts: tuple[int, ...]  # one number; two where any drone has aerodynamics, which are left out else
+    aero_parts: tuple[int, ...]  # length 2 if any drone has aerodynamics, else 1: compiled code then omits them
     aero: NDArray  # (N, AERO.size)
-    external: NDArray  # int64 (E,), the drones that are not integrated
-    pose: NDArray  # (E, STATE.size + R), where they are: moved on with their velocities in every tick
+    external: NDArray  # int64 (E,), indices of the drones that are not integrated
+    pose: NDArray  # (E, STATE.size + R), their states, extrapolated with their velocities in every tick
 
 
 class Boards(NamedTuple):
@@ -153,36 +157,36 @@ class Boards(NamedTuple):
     gain: NDArray  # (N, observer.GAIN.size)
     calibration: NDArray  # (N, observer.CALIBRATION.size)
     setpoint: NDArray  # (N, firmware.SETPOINT.size)
-    set_tick: NDArray  # int64 (N,), when the setpoint was sent
+    set_tick: NDArray  # int64 (N,), tick at which the setpoint was sent
     memory: NDArray  # (N, firmware.MEMORY.size)
     belief: NDArray  # (N, observer.BELIEF.size + R)
-    actuator: NDArray  # (N, firmware.ACTUATOR.size + 2 R), what faults make of the commands to the rotors
+    actuator: NDArray  # (N, firmware.ACTUATOR.size + 2 R), effects of faults on rotor commands
     device: NDArray  # (N, observer.DEVICE.size)
     lanes: NDArray  # (blocks, columns of a block), see firmware.py
 
 
 class NoiseRows(NamedTuple):
-    """Standard normal numbers, a row per drone; the last row holds the wind that all share."""
+    """Standard normal numbers, a row per drone; the last row holds those of the wind common to all."""
 
     table: NDArray  # (N + 1, all streams)
     at: NDArray  # int64 (STREAMS.size,), where each stream begins in a row
-    width: NDArray  # int64 (N + 1, STREAMS.size), numbers of a sample
-    cursor: NDArray  # int64 (N + 1, STREAMS.size), how much of each stream is used
+    width: NDArray  # int64 (N + 1, STREAMS.size), numbers per sample
+    cursor: NDArray  # int64 (N + 1, STREAMS.size), used numbers of each stream
 
 
 class Senses(NamedTuple):
-    """N sets of S sensors, the six stock ones first, and the log of what they sampled in a gate."""
+    """N sets of S sensors, the six stock ones first, and the log of their samples in a gate."""
 
     place: NDArray  # (PLACE.size,)
     config: NDArray  # (N, S, sensor_set.CONFIG.size)
     fault: NDArray  # (N, S, sensor_set.FAULT.size)
     schedule: NDArray  # int64 (N, S, sensor_set.SCHEDULE.size)
-    soonest: NDArray  # int64 (N,), tick at which one of the sensors but the IMU falls due
-    bias: NDArray  # (N, 6, 12): of each channel its bias, behind all of them their Gauss-Markov processes
+    soonest: NDArray  # int64 (N,), next tick at which a sensor other than the IMU is due
+    bias: NDArray  # (N, 6, 12): biases of all channels, then their Gauss-Markov processes
     whose: NDArray  # int64 (samples, 3): sensor, drone, tick
     value: NDArray  # (samples, 6)
-    exposed_count: NDArray  # int64 (1,), samples of users' sensors that are to be made of this gate
-    exposed_whose: NDArray  # int64 (user samples, 3), as whose
+    exposed_count: NDArray  # int64 (1,), number of exposures of users' sensors in this gate
+    exposed_whose: NDArray  # int64 (user samples, 3): sensor, drone, tick
     exposed: NDArray  # (user samples, EXPOSED.size)
 
 
@@ -190,7 +194,7 @@ class Watched(NamedTuple):
     """The data for detecting incidents of N drones, see fleet/flight_watch.py."""
 
     seen: NDArray  # (N, flight_watch.SEEN.size)
-    found: NDArray  # int64 (N,), bits of the incidents of each in the last gate
+    found: NDArray  # int64 (N,), bits of each drone's incidents in the last gate
 
 
 class Arrays(NamedTuple):
@@ -207,7 +211,7 @@ class Arrays(NamedTuple):
 
 
 def state_arrays(group: tuple[object, ...]) -> Iterator[NDArray]:
-    """Yield the arrays that make up the state of a fleet: not near pairs (found anew), scene and sheet."""
+    """Yield the arrays that make up the state of a fleet, without near pairs (found anew), scene and sheet."""
     for member in group:
         if isinstance(member, np.ndarray):
             yield member
@@ -253,7 +257,7 @@ def put_four(row: NDArray, at: int, a: Quaternion) -> None:
 
 @inlined
 def of(rotors: PerRotor, group: int, r: int) -> float:
-    """Return the number of rotor r in a group of groups."""
+    """Return the number of rotor r in a group."""
     return rotors.numbers[rotors.first + rotors.step * (group * len(rotors.each) + r)]
 
 

@@ -31,8 +31,8 @@ from zsim.scenario.surroundings import (
     tree_over,
 )
 
-HUGE = 1e300  # in place of 1 / 0: a product with it is never 0 times infinity
-HULL_FLATNESS = 0.25  # height over width of a hull, the AR.Drone's rounded: 0.13 m of 0.52 m
+HUGE = 1e300  # replaces 1 / 0, so that no product is 0 times infinity
+HULL_FLATNESS = 0.25  # height over width of a hull, rounded from the AR.Drone's: 0.13 m / 0.52 m
 
 Array = NDArray[np.float64]
 
@@ -42,11 +42,11 @@ class Scene(NamedTuple):
 
     solid: NDArray  # (M, COLUMNS), rows of zsim.scenario.surroundings
     triangle: NDArray  # (T, TRIANGLE), m, in W
-    tree: Tree  # its parts are obstacles by their number, triangles by M plus theirs
+    tree: Tree  # its parts: obstacle m is part m, triangle t is part M + t
 
 
 def scene(solid: Array, triangle: Array) -> Scene:
-    """Return the scene of some obstacles, (M, COLUMNS), and triangles, (T, TRIANGLE)."""
+    """Return the scene of obstacles, (M, COLUMNS), and triangles, (T, TRIANGLE)."""
     solid, triangle = solid.reshape(-1, COLUMNS), triangle.reshape(-1, TRIANGLE)
     corners = corners_of(triangle)
     boxes = [_bounds_of(row) for row in solid.tolist()]
@@ -157,7 +157,7 @@ def cast_hull(p_WB: Vector, q_WB: Quaternion, radius: float, o: Vector, d: Vecto
     away = subtract(o, p_WB)
     along, square = dot(away, d), dot(away, away) - radius * radius
     if square > 0.0 and (along > 0.0 or along * along < square):
-        return far  # it passes the ball about the hull
+        return far  # it misses the sphere around the hull
     at, to = rotate_back(q_WB, away), rotate_back(q_WB, d)
     up = 1.0 / HULL_FLATNESS
     at, to = (at[0], at[1], up * at[2]), (to[0], to[1], up * to[2])
@@ -182,7 +182,7 @@ def _box(bounds: NDArray, o: Vector, per: Vector, far: float) -> float:
 def cast_parts(scene: Scene, o: Vector, d: Vector, far: float) -> float:
     """Return the distance [m] at which a ray meets obstacle or triangle; arguments as of `cast`."""
     best, count, tree = far, scene.solid.shape[0], scene.tree
-    waiting, entered = tree.waiting, tree.away  # boxes, and where the ray enters them [m]
+    waiting, entered = tree.waiting, tree.away  # boxes to visit, and the distances at which the ray enters them [m]
     if tree.bounds.shape[0] == 0:
         return best
     per = (inverse(d[0]), inverse(d[1]), inverse(d[2]))
@@ -217,6 +217,6 @@ def cast(scene: Scene, o: Vector, d: Vector, far: float) -> float:
     """Return the distance [m] at which a ray meets ground, obstacle or triangle; `far` if not before.
 
     Args:
-        o, d: where it begins [m], and the unit vector along it, in W.
+        o, d: origin [m] and unit direction of the ray, in W.
     """
     return cast_parts(scene, o, d, cast_ground(o, d, far))

@@ -1,6 +1,6 @@
 """One drone as a rigid body under rotors, drag, ground and contact forces; one step of fourth-order Runge-Kutta.
 
-After it the rotors: lag, thrust, torque, power; the mixer that finds speeds for a thrust and a torque; the battery.
+Then the rotors (lag, thrust, torque, power), the mixer, which finds speeds for a thrust and a torque, and the battery.
 Rotor r is at (x, y) rotor_unit in B; seen from above it turns clockwise where its `turn` is 1. `PerRotor` holds groups
 of numbers per rotor, in the order of fleet_arrays.ROTOR.
 """
@@ -33,7 +33,7 @@ from zsim_world.physics.fleet_arrays import (
 )
 from zsim_world.physics.surfaces import Touch, contact, touched
 
-NOTHING = (0.0, 0.0, 0.0)  # N or N m
+NOTHING = (0.0, 0.0, 0.0)  # zero force [N] or moment [N m]
 
 
 @inlined
@@ -246,8 +246,8 @@ def stepped(
     )
 
 
-LOW_SQUARE_MIN = 1e-12  # (rad/s)^2, of rotors that may stand still
-GROUND_CLEARANCE_MIN = 0.5  # radii, the formula below is not meant for less
+LOW_SQUARE_MIN = 1e-12  # (rad/s)^2, lower bound of a squared speed limit, which may be zero
+GROUND_CLEARANCE_MIN = 0.5  # rotor radii, smallest height for which the formula is used
 
 
 @inlined
@@ -287,8 +287,8 @@ def wrench(
         row, rotors: the drone's parameters.
         q_WB, height_m: attitude, and height of the centre of mass over the ground.
         w_WB_B: body rate [rad/s].
-        speeds, commands: of the rotors [rad/s] at the start of the step; decay: what is left of their lag since, or
-            None at the start.
+        speeds, commands: of the rotors [rad/s] at the start of the step; decay: remaining fraction of their
+            lag since then, or None at the start.
     """
     unit, radius, inertia = row[VEHICLE.rotor_unit], row[VEHICLE.rotor_radius], row[VEHICLE.rotor_inertia]
     ex, ey = rotate(q_WB, (unit, 0.0, 0.0))[2], rotate(q_WB, (0.0, unit, 0.0))[2]
@@ -369,7 +369,7 @@ def mix(row: Row, rotors: PerRotor, thrust_n: float, moment: Vector, speeds: Per
         by_roll, by_pitch, _, _ = mixed(rotors, r)
         reach = max(reach, abs(by_roll * roll + by_pitch * pitch))
         least, most_lift = min(least, lift_share(rotors, r)), max(most_lift, lift_share(rotors, r))
-    # a mean with (low + reach) / least <= mean <= (high - reach) / most_lift, and the tilt that leaves one
+    # find a mean with (low + reach) / least <= mean <= (high - reach) / most_lift; reduce the tilt until one exists
     room = (high * least - low * most_lift) * (2.0 / (least + most_lift))
     scale = room / (2.0 * reach) if 2.0 * reach > room else 1.0
     roll, pitch, reach = roll * scale, pitch * scale, reach * scale

@@ -21,7 +21,7 @@ from zsim_world.physics import rigid_body as body
 from zsim_world.physics.fleet_arrays import AERO, ROTOR, STATE, VEHICLE, Aero, Bodies, PerRotor, Row, four, put, vector
 from zsim_world.physics.surfaces import Touch, drag_anchors
 
-LANES = 8  # doubles in a register of 512 bit, or in two of 256
+LANES = 8  # number of doubles in one 512-bit register, or in two 256-bit registers
 LEVEL = (1.0, 0.0, 0.0, 0.0)  # attitude of a lane without a drone
 
 # Every block begins with the parameters of its drones. This one ends with groups of numbers per rotor.
@@ -29,11 +29,11 @@ BODY_LANES = columns(
     "BodyLanes",
     (
         Field("vehicle", "VEHICLE", VEHICLE.size),
-        Field("decay", "1"),  # of a rotor's lag in half a tick
+        Field("decay", "1"),  # remaining fraction of a rotor's lag after half a tick
         Field("state", "STATE", STATE.size),
         Field("air", "m/s", 3),
         Field("push", "N", 3),
-        Field("accel", "m/s^2, rad/s^2", 6),  # in W; angular, in B
+        Field("accel", "m/s^2, rad/s^2", 6),  # acceleration in W, angular acceleration in B
         Field("aero", "AERO", AERO.size),
         Field("clear", "1"),  # 1 if the ground was out of reach in the whole step, so that its result holds
     ),
@@ -44,12 +44,12 @@ BODY_ROTORS = columns(
 
 
 def blocks(count: int, parts: Iterable[tuple[int, NDArray[np.float64]]]) -> NDArray[np.float64]:
-    """Return the blocks of N drones, (blocks, LANES * count), with some columns; all else is 0.
+    """Return the blocks of N drones, (blocks, LANES * count), with some columns filled; the rest is 0.
 
     Args:
-        count: of a block's columns.
-        parts: first column, and numbers (N, any) from there on. Lanes without a drone, which are computed too, get
-            those of the last drone and an initial attitude, to avoid division by 0 in Python.
+        count: number of columns of a block.
+        parts: pairs of a first column and the numbers (N, any) from there on. Lanes without a drone, which are
+            computed too, get those of the last drone and an initial attitude, to avoid division by 0 in Python.
     """
     listed = list(parts)
     drones = len(listed[0][1])
@@ -62,7 +62,7 @@ def blocks(count: int, parts: Iterable[tuple[int, NDArray[np.float64]]]) -> NDAr
 
 
 def body_blocks(row: NDArray, rotors: NDArray, decay: NDArray, aero: NDArray) -> NDArray[np.float64]:
-    """Return the blocks of N bodies: parameters, rotors, the lag of these in half a tick (N, 1), aerodynamics."""
+    """Return the blocks of N bodies: parameters, rotors, their decay in half a tick (N, 1), aerodynamics."""
     each = rotors.shape[1] // ROTOR.size
     known = BODY_LANES.size + BODY_ROTORS.known * each
     level = (BODY_LANES.state + STATE.q_WB, np.tile(LEVEL, (len(row), 1)))

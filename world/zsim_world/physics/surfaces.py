@@ -4,12 +4,12 @@ Friction is a spring to an anchor on the surface; where it would exceed the fric
 The anchor is fixed within a step and moved after it, so that a step is a smooth function of the state.
 
 At obstacles a drone is a rigid set of balls: the ground contact points, with radius zero, then balls along its hull and
-one in its middle, so that neither a post nor an edge fits between them. A ball is pushed along the surface normal by
+one at its centre, so that neither a post nor an edge fits between them. A ball is pushed along the surface normal by
 the same law. The distance to a convex solid acts as a potential, so springs and anchors never return more energy than
 was put in. A drone has slots for the solids within its reach, each with an anchor per ball; they are updated after
 every step and held within it.
 
-At surfaces (sheets of triangles) each ball has a plane instead, that of the nearest point, found after every step and
+At surfaces (sheets of triangles) each ball instead has a plane at the nearest point, found after every step and
 then held. A sheet has no inside. A ball starts in front of it and its side is stored: it changes sides when its path
 from step to step crosses a triangle, and behind the sheet it is pushed back, however deep it is. Beside a rim a ball is
 always free. A closed mesh therefore acts from outside as a solid; like a box, it can be penetrated where a wall is
@@ -33,7 +33,7 @@ from zsim_world.physics.fleet_arrays import STATE, VEHICLE, Bodies, Row, four, v
 Pair = tuple[float, float]
 
 
-POINTS = 8  # under which there may be ground: four feet, four corners of the hull's rim
+POINTS = 8  # ground contact points: four feet, four corners of the hull's rim
 
 
 @inlined
@@ -46,7 +46,7 @@ def contact_point(row: Row, k: int) -> Vector:
 
 def contact_points(row: NDArray) -> np.ndarray:
     """Return all contact points in B [m], (POINTS, 3)."""
-    of_row = getattr(contact_point, "py_func", contact_point)  # as Python: it is rarely called
+    of_row = getattr(contact_point, "py_func", contact_point)  # not compiled, since it is rarely called
     return np.array([[float(x) for x in of_row(row, k)] for k in range(POINTS)])
 
 
@@ -106,28 +106,31 @@ def drag_anchors(row: NDArray, anchor: NDArray, p_WB: Vector, q_WB: Quaternion) 
             anchor[k, 0], anchor[k, 1] = x - gx * keep, y - gy * keep
 
 
-HULL_BALLS = 16  # along the hull, chosen: 2 cm are between two of the AR.Drone's, and a thinner post meets the last
+HULL_BALLS = 16  # balls along the hull; chosen: 2 cm apart on the AR.Drone; a thinner post meets the ball at the centre
 BALLS = POINTS + HULL_BALLS + 1
-BALL_SHARE = 0.35  # of the height from feet to rim, chosen: a landing tilted by 9 deg does not touch with the hull
-BELOW_RIM_SHARE = 0.05  # of that height, chosen: lying on its back the rim bears it, which is more than a foot's sag
-FEET = 4  # the first of the contact points
-SLOTS_MAX = 8  # solids in reach of one drone at a time, chosen: as many boxes as meet in a corner
-LOOK_S = 0.01  # s, two of the longest steps: what a drone reaches within it is in its reach
+BALL_SHARE = 0.35  # in heights from feet to rim; chosen: in a landing tilted by 9 deg no hull ball touches
+BELOW_RIM_SHARE = 0.05  # in the same height; chosen: upside down, the rim bears the drone; more than a foot's sag
+FEET = 4  # number of feet, which come first among the contact points
+SLOTS_MAX = 8  # solids within reach of one drone at a time; chosen: as many boxes as meet in a corner
+LOOK_S = 0.01  # s, two of the longest steps; whatever a drone can touch within this time is within reach
 _ANGLES = [2.0 * math.pi * (k + 0.5) / HULL_BALLS for k in range(HULL_BALLS)]
-_COSINES = (*(el.cos(angle) for angle in _ANGLES), 0.0)  # of the hull balls, in units of the hull's middle line
+_COSINES = (
+    *(el.cos(angle) for angle in _ANGLES),
+    0.0,
+)  # directions of the hull balls, in units of the radius of the hull's centre line
 _SINES = (*(el.sin(angle) for angle in _ANGLES), 0.0)
 
 nearest: Any = inlined(surroundings.nearest)
 
 
-PLANE = columns(  # of a ball: where it is nearest to a surface
+PLANE = columns(  # plane of a ball, at the nearest point of a surface
     "PlaneColumns",
     (
-        Field("side", "1"),  # 1 in front of it, -1 behind, where it is driven back; 0: none is in reach
-        Field("normal_W", "1", 3),  # from it, towards where the ball is free
-        Field("distance", "m"),  # of the ball's centre, below 0 behind it
+        Field("side", "1"),  # 1: in front; -1: behind, where the ball is pushed back; 0: no surface within reach
+        Field("normal_W", "1", 3),  # points to the side where the ball is free
+        Field("distance", "m"),  # signed distance of the ball's centre, below 0 behind the plane
         Field("surface", "1"),
-        Field("centre_W", "m", 3),  # of the ball, when this was found
+        Field("centre_W", "m", 3),  # the ball's centre when the plane was found
         Field("anchor_W", "m", 3),
     ),
 )
@@ -137,10 +140,10 @@ class Touch(NamedTuple):
     """The contacts of one drone beside the ground."""
 
     obstacle: NDArray  # (M, obstacle.COLUMNS)
-    solid: NDArray  # int32 (K,), those in its reach by their places in `obstacle`; -1: none
-    anchor: NDArray  # (K, BALLS, 3), m, in W
+    solid: NDArray  # int32 (K,), indices in `obstacle` of those within reach; -1: empty slot
+    anchor: NDArray  # (K, BALLS, 3), anchors of the balls [m; W]
     plane: NDArray  # (BALLS, PLANE.size); (0, PLANE.size) where there are no surfaces
-    twist_W: Vector  # N m, of other drones' hulls
+    twist_W: Vector  # moment of other drones' hulls [N m]
 
 
 def obstacle_rows(environment: Environment) -> NDArray[np.float64]:
@@ -149,7 +152,7 @@ def obstacle_rows(environment: Environment) -> NDArray[np.float64]:
 
 @inlined
 def ball(row: Row, k: int) -> tuple[Vector, float]:
-    """Return centre in B and radius [m] of ball k: four feet, four corners of the rim, the hull, its middle."""
+    """Return centre in B and radius [m] of ball k: four feet, four corners of the rim, the hull, its centre."""
     if k < POINTS:
         return contact_point(row, k), 0.0
     height = abs(row[VEHICLE.rim_height] + row[VEHICLE.foot_depth])
@@ -172,7 +175,7 @@ def touched(
     """Return the force in W [N] and moment in B [N m] of obstacles, and the moment of other hulls, on one drone.
 
     Args:
-        row: the drone's parameters; touch: what it touches.
+        row: the drone's parameters; touch: its contacts.
         p_WB, v_WB, q_WB, w_WB_B: state of the drone [m, m/s, -, rad/s].
     """
     force, moment = (0.0, 0.0, 0.0), rotate_back(q_WB, touch.twist_W)
@@ -231,7 +234,7 @@ def plane_depth(plane: NDArray, radius: float) -> float:
 def meet_obstacles(bodies: Bodies) -> None:
     """Find the obstacles within reach of every drone, move its anchors, and note contacts of hulls.
 
-    `braced[i]` is 1 if there are any; `bumping[i, m]` is 1 where more than the feet is in contact now; `bumped` is set
+    `braced[i]` is 1 if there are any; `bumping[i, m]` is 1 if more than the feet is in contact now; `bumped` is set
     to 1 where such contact begins.
     """
     p, v = STATE.p_WB, STATE.v_WB
@@ -280,7 +283,7 @@ def brace(bodies: Bodies, i: int) -> None:
 
 @inlined
 def _slot(bodies: Bodies, i: int, m: int, distance: float) -> int:
-    """Return the slot for obstacle m of drone i: its own, or that of the farthest; -1 if all hold nearer ones."""
+    """Return the slot for obstacle m of drone i: its own, or that of the farthest one; -1 if all hold nearer ones."""
     solid, p = bodies.solid[i], STATE.p_WB
     x, y, z = bodies.state[i, p], bodies.state[i, p + 1], bodies.state[i, p + 2]
     chosen, farthest = -1, distance
@@ -325,15 +328,16 @@ def drag(row: Row, depth: float, x: Vector, n: Vector, anchor: NDArray, is_new: 
 
 
 LOST_M = 1.0  # m, chosen: depth at which a drone is beyond the sheet
-TINY_M = 1e-9  # m; nearer to an edge or corner a ball keeps its normal
-ROOM_M = 1e-6  # m, above the rounding error of a distance
+TINY_M = 1e-9  # m; within this distance of an edge or corner a ball keeps its normal
+ROOM_M = 1e-6  # m, margin above the rounding error of a distance
 
 
 @noinline
 def meet_surfaces(bodies: Bodies, sheet: Sheet) -> None:
-    """Find the planes of all drones' balls, move their anchors, and note which hulls touch which surface.
+    """Find the planes of all drones' balls, move their anchors, and note which hulls touch which surfaces.
 
-    `braced[i]` becomes 1 where a surface is in reach; `bumping` and `bumped` as in `meet_obstacles`, behind obstacles.
+    `braced[i]` becomes 1 where a surface is in reach; `bumping` and `bumped` as in `meet_obstacles`, in the
+    columns after those of obstacles.
     """
     first = bodies.obstacle.shape[0]
     for i in range(bodies.state.shape[0]):

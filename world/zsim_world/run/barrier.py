@@ -53,7 +53,7 @@ class Participant:
 
     @property
     def is_missed(self) -> bool:
-        """Tell whether it is dead, silent or away."""
+        """Return whether it is dead, silent or away."""
         return not self.alive or self.away or self.silent_wall_ns is not None
 
     @property
@@ -65,7 +65,7 @@ class Participant:
         return self.gating or self.join.slack_ns > 0
 
     def is_process_of(self, join: Join) -> bool:
-        """Tell whether another join comes from the same process with the same kind of participation."""
+        """Return whether another join comes from the same process with the same kind of participation."""
         fields = ("host", "pid", "role", "period_ns", "slack_ns", "serves")
         return all(getattr(self.join, name) == getattr(join, name) for name in fields)
 
@@ -75,7 +75,7 @@ class Participant:
 
     @property
     def incomplete(self) -> bool:
-        """Tell whether outputs or a done of it were lost or are still on their way."""
+        """Return whether outputs or a done of it were lost or are still on their way."""
         return self.missing > 0 or self.lost_done
 
     def required_ns(self, need_ns: int) -> int | None:
@@ -90,7 +90,7 @@ class Participant:
         return required if required >= self.from_ns else None
 
     def blocks(self, need_ns: int) -> bool:
-        """Tell whether its done for `need_ns`, or an output counted by a done, has not arrived."""
+        """Return whether its done for `need_ns`, or an output counted by a done, has not arrived."""
         required = self.required_ns(need_ns)
         return required is not None and (self.done_ns < required or self.incomplete)
 
@@ -165,7 +165,7 @@ class Barrier:
         return None
 
     def would_replace(self, name: str, message: Join) -> bool:
-        """Tell whether a join would replace another process."""
+        """Return whether a join would replace another process."""
         if self.join_refusal(name, message):
             return False
         former = self.participants.get(name)
@@ -250,7 +250,7 @@ class Barrier:
         return None
 
     def has_farewell(self, name: str) -> bool:
-        """Tell whether a participant leaves as soon as its token is lost."""
+        """Return whether a participant leaves as soon as its token is lost."""
         participant = self.participants.get(name)
         return participant is not None and participant.farewell is not None
 
@@ -289,7 +289,7 @@ class Barrier:
     # Who is there, and who is waited for
 
     def is_gating(self, name: str) -> bool:
-        """Tell whether a process gates, even one that is marked dead: its outputs may arrive before it rejoins."""
+        """Return whether a process gates, even one that is marked dead: its outputs may arrive before it rejoins."""
         participant = self.participants.get(name)
         return participant is not None and participant.gating
 

@@ -114,7 +114,7 @@ class CommandIntake:
         return NEVER if late_ns is None else -(-late_ns // self._clock.gate_ns) * self._clock.gate_ns
 
     def _is_lost_by_radio(self, drone: str, command: QueuedCommand, gate_ns: int) -> bool:
-        """Tell whether the radio loses a command that would take effect before a gate."""
+        """Return whether the radio loses a command that would take effect before a gate."""
         acting = self._faults_at(gate_ns)
         if not acting:
             return False

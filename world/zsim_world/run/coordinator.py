@@ -305,7 +305,7 @@ class Coordinator(ABC):
         return roles.on_death(self.scenario.processes.on_death, participant.name, participant.join.role)
 
     def _may_return(self, participant: Participant) -> bool:
-        """Tell whether the run waits for the return of a process that died."""
+        """Return whether the run waits for the return of a process that died."""
         return self._on_death(participant) in ("restart", "wait")
 
     def _drop(self, name: str, is_news: bool = True) -> None:
@@ -461,7 +461,7 @@ class Coordinator(ABC):
     # Time
 
     def may_advance(self) -> bool:
-        """Tell whether the next gate may come, pacing apart."""
+        """Return whether the next gate may come, pacing apart."""
         clock = self.clock
         if clock.is_halted or self.barrier.away():
             return False
@@ -480,7 +480,7 @@ class Coordinator(ABC):
         return self.blocking() if waits else []
 
     def must_wait_for(self, participant: Participant) -> bool:
-        """Tell whether the scenario needs a participant, whose first step may then take any time."""
+        """Return whether the scenario needs a participant, whose first step may then take any time."""
         if participant.served_names <= self.unpaced:
             return True
         return not participant.successor and not participant.served_names.isdisjoint(self._expected)
@@ -544,7 +544,7 @@ class DataFlow:
         self._known: dict[tuple[str, str], bool] = {}
 
     def feeds(self, writer: str, reader: str) -> bool:
-        """Tell whether the reader reads outputs of the writer, but not the writer outputs of the reader."""
+        """Return whether the reader reads outputs of the writer, but not the writer outputs of the reader."""
         return self._writes_for(writer, reader) and not self._writes_for(reader, writer)
 
     def _writes_for(self, writer: str, reader: str) -> bool:

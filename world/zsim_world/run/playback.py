@@ -185,7 +185,7 @@ class Playback(Coordinator):
         return _Live({name for names in served for name in names}, by_name)
 
     def _is_replaced(self, recorded: Recorded, live: _Live) -> bool:
-        """Tell whether a participant publishes a message in place of one on record."""
+        """Return whether a participant publishes a message in place of one on record."""
         role = OF_CAMERAS.get(messages.type_of(recorded.key))
         if role is None:
             return bool(live.names) and _author(recorded) in live.names
@@ -449,7 +449,7 @@ class RecordedGates:
 
 
 def _is_gate(payload: bytes) -> bool:
-    """Tell whether a clock message belongs to a gate; those published before the start do not."""
+    """Return whether a clock message belongs to a gate; those published before the start do not."""
     try:
         return _decode_clock(payload).state != "waiting"
     except REFUSALS:
@@ -457,7 +457,7 @@ def _is_gate(payload: bytes) -> bool:
 
 
 def _is_played(key: str) -> bool:
-    """Tell whether the messages of a key may be played.
+    """Return whether the messages of a key may be played.
 
     A replay publishes its own info, clock and views, and omits messages about the recorded processes.
     """

@@ -66,7 +66,7 @@ class RunClock:
 
     @property
     def is_halted(self) -> bool:
-        """Tell whether time stands still regardless of dones: the run has ended or is paused."""
+        """Return whether time stands still regardless of dones: the run has ended or is paused."""
         return self.ended is not None or (self.state == "paused" and self.steps_allowed == 0)
 
     def start(self, t_ns: int, paused: bool = False) -> None:

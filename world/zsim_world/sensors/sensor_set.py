@@ -3,8 +3,8 @@
 The arrays have a row per drone and sensor. From `sample` on, all is compiled.
 
 A sensor is at p_BS in the body, rotated by R_BS (q_BS: sensor components to body components). An equation is a function
-of body, mount and site, and returns two vectors of errorless values; unused places are zero. `n` numbers of a reading
-have an error of their own.
+of body, mount and site, and returns two vectors of errorless values; unused elements are zero. `n` numbers of a reading
+have separate errors.
 
 Sonar and optical flow may see an obstacle or a drone below. A flow camera measures the motion of its picture, from
 which the board computes a velocity with the distance measured by the sonar. A picture with two motions, of the ground
@@ -45,53 +45,53 @@ from zsim_world.physics.fleet_arrays import PLACE, STATE, VEHICLE, Bodies, Noise
 from zsim_world.physics.rays import Scene, cast_ground, cast_hull, cast_parts
 from zsim_world.physics.rigid_body import pose, velocity_at
 
-SENSORS = tuple(STOCK)  # the contract's order; a user's own count on from there
+SENSORS = tuple(STOCK)  # in the contract's order; users' sensors are numbered after these
 IMU, GPS, MAG, BARO, SONAR, FLOW = range(len(SENSORS))
-CHANNELS = tuple(kind.width for kind in STOCK.values())  # numbers with an error of their own
+CHANNELS = tuple(kind.width for kind in STOCK.values())  # numbers with separate errors
 CHANNELS_MAX = VALUES_MAX
-NEVER = 2**63 - 1  # a tick that does not come
+NEVER = 2**63 - 1  # a tick that is never reached
 
-CONFIG = columns(  # of each drone and sensor
+CONFIG = columns(  # settings of each drone and sensor
     "SensorColumns",
     (
         Field("white", "channel's", CHANNELS_MAX),  # standard deviation per sample
         Field("walk", "channel's", CHANNELS_MAX),  # standard deviation of the bias's step per sample
         Field("quantum", "channel's", CHANNELS_MAX),
-        Field("correlated", "1"),  # 0: no channel has an error that is a Gauss-Markov process
-        Field("decay", "1", CHANNELS_MAX),  # of that error from sample to sample
-        Field("kick", "channel's", CHANNELS_MAX),  # standard deviation of what it gains per sample
+        Field("correlated", "1"),  # 0: no channel has a Gauss-Markov error
+        Field("decay", "1", CHANNELS_MAX),  # factor of that error from sample to sample
+        Field("kick", "channel's", CHANNELS_MAX),  # standard deviation of its increment per sample
         Field("p_BS", "m", 3),
         Field("q_BS", "1", 4),
         Field("drop", "1"),  # a sample is lost when its standard normal number is below this
-        Field("limit_min", "m"),  # of the sonar
+        Field("limit_min", "m"),  # range limits of the sonar
         Field("limit_max", "m"),
-        Field("faulty", "1"),  # 0: the fault row below has no say
+        Field("faulty", "1"),  # 0: the row of FAULT has no effect
     ),
 )
-FAULT = columns(  # of each drone and sensor
+FAULT = columns(  # effects of faults on each drone and sensor
     "SensorFaultColumns",
     (
         Field("offset", "channel's", CHANNELS_MAX),  # added to the errorless values
-        Field("hold", "1"),  # FREE; ARMED: the next sample is kept; HOLDING: it is given again and again
+        Field("hold", "1"),  # FREE; ARMED: the next sample is kept; HOLDING: it is repeated
         Field("held", "channel's", CHANNELS_MAX),
     ),
 )
 FREE, ARMED, HOLDING = 0.0, 1.0, 2.0
-SCHEDULE = columns(  # sample n falls due at the first physics tick >= n * numerator / denominator
+SCHEDULE = columns(  # sample n is due at the first physics tick >= n * numerator / denominator
     "ScheduleColumns", (Field("numerator", "1"), Field("denominator", "1"), Field("count", "1"), Field("due", "tick"))
 )
-FIELD_MIN_UT = 1.0  # uT, of a horizontal field that still gives a heading: a fifteenth of that at 50 degrees north
-HEADING_SIGMA_MAX_RAD = 0.5  # rad, chosen: noisier, samples wrap around, and their mean is no heading
-DENOMINATOR_MAX = 1000  # of a rate in Hz: any is met within 0.05 %, and n * numerator stays below 2^63
+FIELD_MIN_UT = 1.0  # uT, weakest horizontal field that gives a heading: a fifteenth of that at 50 deg N
+HEADING_SIGMA_MAX_RAD = 0.5  # rad, chosen: noisier samples wrap around, so their mean is not a heading
+DENOMINATOR_MAX = 1000  # of a rate [Hz]: matches any rate within 0.05 %; n * numerator stays below 2^63
 SEA_LEVEL_PA = 101_325.0  # Pa, ISO 2533
 LAPSE_1_M = 2.25577e-5  # 1/m, 0.0065 K/m over 288.15 K, ISO 2533
 PRESSURE_EXPONENT = 5.25588  # g M / (R L), ISO 2533
-SONAR_COSINE_MIN = 0.5  # an echo comes back up to 60 deg from the vertical; beyond, it is scattered away
-# Of the picture, tangents of half of its view ahead and aside: 320 x 240 pixels, 64 deg across (data sheet of the
-# AR.Drone 2.0); taken for every vehicle's
+SONAR_COSINE_MIN = 0.5  # echoes return up to 60 deg from the vertical; beyond, they are scattered away
+# Tangents of half the picture's field of view, ahead and aside: 320 x 240 pixels, 64 deg across (data sheet of the
+# AR.Drone 2.0); assumed for every vehicle
 HALF_VIEW = (0.375, 0.5)
-# Middles of the cells of a picture in 3 x 3, but the one in the middle; a hull that has more than half of all nine
-# has the one in the middle and four of these
+# Centres of the cells of a picture divided into 3 x 3, without the central one; a hull covers more than half of the
+# picture if it covers the central cell and four of these
 CELLS = ((-1.0, -1.0), (-1.0, 0.0), (-1.0, 1.0), (0.0, -1.0), (0.0, 1.0), (1.0, -1.0), (1.0, 0.0), (1.0, 1.0))
 CELLS_MIN = 4
 
@@ -101,7 +101,7 @@ class FleetSensors(NamedTuple):
 
     names: tuple[str, ...]
     types: tuple[SensorType, ...]
-    settings: list[list[Sensor | None]]  # of each drone, in the order of the names; None: it has no such sensor
+    settings: list[list[Sensor | None]]  # of each drone, in the order of the names; None: no such sensor
 
 
 def fleet_sensors(scenario: Scenario) -> FleetSensors:
@@ -141,7 +141,9 @@ def config(sensors: FleetSensors) -> NDArray[np.float64]:
                 row[CONFIG.white + k] = model.white_sigma(settings.rate_hz)
                 row[CONFIG.walk + k] = model.bias_walk / math.sqrt(rate)
                 row[CONFIG.quantum + k] = model.quantum
-                if sigma := model.correlated_sigma:  # exact: Brown and Hwang, "Random signals", section 5.3
+                if (
+                    sigma := model.correlated_sigma
+                ):  # exact discretisation: Brown and Hwang, "Random signals", section 5.3
                     decay = el.exp(-1.0 / (rate * model.correlation_time_s))
                     row[CONFIG.correlated], row[CONFIG.decay + k] = 1.0, decay
                     row[CONFIG.kick + k] = sigma * math.sqrt(1.0 - decay * decay)
@@ -198,7 +200,7 @@ def heading_sigma(mag: MagConfig, horizontal_ut: float) -> float:
 
 
 def has_compass(mag: MagConfig, field_ut: Sequence[float]) -> bool:
-    """Return whether a magnetometer gives a heading in the magnetic field of the place [uT; W]."""
+    """Return whether a magnetometer gives a heading in the magnetic field of the site [uT; W]."""
     horizontal_ut = el.length(field_ut[:2])
     return horizontal_ut >= FIELD_MIN_UT and heading_sigma(mag, horizontal_ut) <= HEADING_SIGMA_MAX_RAD
 
@@ -214,7 +216,7 @@ class BodyTruth(NamedTuple):
     v_WB: Vector  # m/s
     q_WB: Quaternion
     w_WB_B: Vector  # rad/s
-    a_WB: Vector  # m/s^2, of the centre of mass in W
+    a_WB: Vector  # m/s^2, acceleration of the centre of mass
     alpha_B: Vector  # rad/s^2
 
 
@@ -227,10 +229,10 @@ class MountedSensor(NamedTuple):
 
 
 class Site(NamedTuple):
-    """The place of the flight."""
+    """The site of the flight."""
 
     gravity: float  # m/s^2
-    field_W: Vector  # uT, of the Earth
+    field_W: Vector  # uT, the Earth's magnetic field
 
 
 @inlined
@@ -390,8 +392,8 @@ def rounded(value: float, bias: float, white: float, quantum: float) -> float:
 def add_errors(n: int, value: NDArray, config: NDArray, bias: NDArray, noise: NDArray, at: int) -> None:
     """Add the errors of n channels to a value, in place.
 
-    `noise` has standard normal numbers from `at` on (sensor_set.noise_width); `bias` is the bias of each channel, and
-    behind those of all its Gauss-Markov process.
+    `noise` has standard normal numbers from `at` on (sensor_set.noise_width); `bias` has the biases of all channels,
+    then their Gauss-Markov processes.
     """
     if config[CONFIG.correlated] != 0.0:
         for k in range(n):
@@ -489,7 +491,7 @@ def flow_over(
     """Return the velocity [m/s] that a flow sensor reports, given that over the bare ground.
 
     It is the velocity relative to the surface in the picture, times the ratio of the distance measured by the sonar to
-    that of the surface: correct if both see the same surface. The surface is the one in the middle of the picture, a
+    that of the surface: correct if both see the same surface. The surface is the one at the centre of the picture, a
     drone's hull only if it covers most of the picture, with the velocity of the hull where the axis meets it.
 
     Args:
@@ -521,7 +523,7 @@ def flow_over(
 
 @inlined
 def _covers(x: BodyTruth, s: MountedSensor, scene: Scene, hull: NDArray, radius: float, o: Vector, far: float) -> bool:
-    """Tell whether the hull of a drone in the middle of the picture covers most of it."""
+    """Return whether the hull at the centre of the picture covers most of it."""
     cells, share = 0, 2.0 / 3.0
     for k in range(len(CELLS)):
         ahead, aside = share * HALF_VIEW[0] * CELLS[k][0], share * HALF_VIEW[1] * CELLS[k][1]

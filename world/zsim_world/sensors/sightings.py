@@ -292,7 +292,7 @@ def mounted(row: NDArray) -> MountedCamera:
 
 @inlined
 def _hull_hides(eye: Vector, ray: Vector, far: float, p_WB: Vector, q_WB: Quaternion, radius: float) -> bool:
-    """Tell whether a hull is on a ray (unit vector, W) nearer than `far` [m]: an ellipsoid, scaled to a ball."""
+    """Return whether a hull is on a ray (unit vector, W) nearer than `far` [m]: an ellipsoid, scaled to a ball."""
     o, d = rotate_back(q_WB, subtract(eye, p_WB)), rotate_back(q_WB, ray)
     stretch = 1.0 / HULL_FLATNESS
     o, d = (o[0], o[1], stretch * o[2]), (d[0], d[1], stretch * d[2])
@@ -306,7 +306,7 @@ def _hull_hides(eye: Vector, ray: Vector, far: float, p_WB: Vector, q_WB: Quater
 
 @inlined
 def _rim_hides(eye: Vector, ray: Vector, p_WB: Vector, q_WB: Quaternion, radius: float) -> bool:
-    """Tell whether a ray to a drone's own hat passes upwards through the disc of its rotors."""
+    """Return whether a ray to a drone's own hat passes upwards through the disc of its rotors."""
     o, d = rotate_back(q_WB, subtract(eye, p_WB)), rotate_back(q_WB, ray)
     rise = RIM_HIGH * radius - o[2]
     if rise <= 0.0 or d[2] <= 0.0:
@@ -317,14 +317,14 @@ def _rim_hides(eye: Vector, ray: Vector, p_WB: Vector, q_WB: Quaternion, radius:
 
 @inlined
 def _drone_hides(eye: Vector, ray: Vector, away: float, i: int, m: int, pose: NDArray, radius: float) -> bool:
-    """Tell whether drone i is on a ray to a ball, the hat of drone m or of no drone."""
+    """Return whether drone i is on a ray to a ball, the hat of drone m or of no drone."""
     p, q = vector(pose, STATE.p_WB), four(pose, STATE.q_WB)
     return _rim_hides(eye, ray, p, q, radius) if i == m else _hull_hides(eye, ray, away, p, q, radius)
 
 
 @inlined
 def _passes(eye: Vector, ray: Vector, away: float, p: Vector, radius: float) -> bool:
-    """Tell whether a sphere is beside or behind all rays to a ball."""
+    """Return whether a sphere is beside or behind all rays to a ball."""
     to = subtract(p, eye)
     along = min(max(dot(to, ray), 0.0), away)
     off = axpy(to, -along, ray)
@@ -339,7 +339,7 @@ def _scale(lens: Lens, cosine: float) -> float:
 
 @inlined
 def _in_picture(lens: Lens, to_K: Vector, angle: float) -> bool:
-    """Tell whether a ball of an apparent diameter [rad] is entirely within the picture."""
+    """Return whether a ball of an apparent diameter [rad] is entirely within the picture."""
     cosine = to_K[2] / norm(to_K)
     if cosine < AHEAD_MIN:
         return False

@@ -288,11 +288,11 @@ class Admission:
         self._count_standing(min(passed_ns, 2 * LOOK_NS), wall_ns)
 
     def _needs_no_proof(self, name: str, join: Join) -> bool:
-        """Tell whether a join needs no proof: it replaces no process, and time does not wait for it."""
+        """Return whether a join needs no proof: it replaces no process, and time does not wait for it."""
         return not (self._barrier.would_replace(name, join) or self._is_stranger(name, join))
 
     def _is_stranger(self, name: str, join: Join) -> bool:
-        """Tell whether time would wait for an unexpected newcomer without a token."""
+        """Return whether time would wait for an unexpected newcomer without a token."""
         stands = (join.period_ns > 0 or join.slack_ns > 0) and not self._barrier.join_refusal(name, join)
         if not stands or name in self._barrier.participants:
             return False
@@ -322,7 +322,7 @@ class Admission:
             self._run.call("falsely_joined", name, join, reason)
 
     def _may_replace(self, name: str, withheld: _Withheld, wall_ns: int) -> bool:
-        """Tell whether a process is proved to be behind a join that replaces another, or the other is gone."""
+        """Return whether a process is proved to be behind a join that replaces another, or the other is gone."""
         if self._is_stranger(name, withheld.join):
             return False
         if self._trusts or withheld.has_done or self._tokens.sessions(name) - self._sessions.get(name, Sessions()):

@@ -100,7 +100,7 @@ class RunJournal:
             self._guarded(lambda: _write(self._truth, data))
 
     def is_due(self, now_ns: int, wall_ns: int) -> bool:
-        """Tell whether a checkpoint is due by simulated and monotonic wall time."""
+        """Return whether a checkpoint is due by simulated and monotonic wall time."""
         due = now_ns >= self._due_ns and wall_ns >= self._due_wall_ns and self._is_kept
         return due and (self._written is None or self._written.done())
 

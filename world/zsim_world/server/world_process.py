@@ -616,11 +616,11 @@ class Pipelining:
 
     @property
     def _enabled(self) -> bool:
-        """Tell whether agents may lag and gates are not paced."""
+        """Return whether agents may lag and gates are not paced."""
         return self._ahead_ns > 0 and self._clock.mode == "lockstep" and self._clock.rate <= 0
 
     def delays(self, wall_ns: int) -> bool:
-        """Tell whether to delay the next gate although it may come."""
+        """Return whether to delay the next gate although it may come."""
         if self._continues or not self._enabled:
             return False
         late = wall_ns - self._delayed_wall_ns > DELAY_MAX_NS
@@ -628,7 +628,7 @@ class Pipelining:
         return not self._continues
 
     def continues(self) -> bool:
-        """Tell, after a gate, whether the next one follows immediately, so that both can be sent together."""
+        """Return, after a gate, whether the next one follows immediately, so that both can be sent together."""
         self._gates = (self._gates + 1) % GATES_SENT
         return self._gates > 0 and self._continues and self._enabled and self._world.may_advance()
 
