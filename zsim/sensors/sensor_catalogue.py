@@ -6,8 +6,9 @@ fields of `zsim.sensors.sensor.ErrorModel`, in the channel's unit:
     imu: {accel_m_s2: {density_ug_sqrt_hz: 175}, gyro_deg_s: {bias_instability_deg_h: 2, correlation_s: 300}}
     imu: {accelerometer_noise_density: 0.0017, gyroscope_random_walk: 2.0e-5, update_rate: 200}
 
-White noise of density N is what an Allan deviation of slope -1/2 shows at 1 s, in the units of an angle or velocity
-random walk 60 N; a random walk K of the bias has slope +1/2 and K at 3 s (IEEE Std 952-1997, annex C). Kalibr's
+The density N of white noise is the Allan deviation at 1 s on the line of slope -1/2, or 60 N in the units of an angle
+or velocity random walk; a random walk K of the bias is that at 3 s on the line of slope +1/2 (IEEE Std 952-1997, annex
+C). Kalibr's
 `noise_density` and `random_walk` are these two in SI units (ethz-asl/kalibr, wiki, "IMU Noise Model").
 """
 
@@ -150,8 +151,8 @@ def separate(
 ) -> tuple[dict[str, Any], dict[str, dict[str, Any]], list[Fault]]:
     """Return a `sensors:` section without users' sensors, the users' sensors with all settings, and their faults.
 
-    A resolved sensor is returned unchanged, so that readers of `world/info` import nothing. Without `imports` any other
-    is a fault; one that must not be imported (`plugin.names_only`) is left out.
+    A resolved sensor is returned unchanged, so that readers of `world/info` import nothing. Without `imports`, any
+    other is a fault; one that must not be imported (`plugin.names_only`) is omitted.
     """
     rest = {name: value for name, value in section.items() if name in FIELDS}
     own: dict[str, dict[str, Any]] = {}
