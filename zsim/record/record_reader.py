@@ -291,7 +291,7 @@ def record_notes(reader: RecordReader) -> list[str]:
     """Return warnings about a truncated or damaged record, one line each."""
     notes = []
     if not reader.complete:
-        notes.append("the record is truncated: its writer did not close it; everything up to its end was read")
+        notes.append("the record was cut off: its writer did not close it; everything before the cut was read")
     if reader.damaged:
         notes.append(f"the record is damaged; skipped: {shown(reader.damaged)}")
     return notes
