@@ -17,7 +17,7 @@ from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.fingerprint import fingerprint
 from zsim.contract.flight_messages import Sightings
 from zsim.contract.framing import GateMessages
-from zsim.contract.run_messages import ControlRequest
+from zsim.contract.run_messages import ADMISSIONS, ControlRequest
 from zsim.errors import RecordError, RunError, RunFailedError
 from zsim.record import Recorded, RecordReader
 from zsim.runtime.agent import Agent, AgentGroup, Output
@@ -38,7 +38,6 @@ from zsim_world.run.world import World
 
 Say = Callable[[str], None]
 COUNTED = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_velocity_rad_s")  # of truth_sha256
-JOINED = ("join", "restart", "superseded")  # events of admitted joins
 
 
 class RerunResult(NamedTuple):
@@ -419,7 +418,7 @@ class RerunBus(Bus):
 
     def _feed_event(self, event: run_messages.Event) -> None:
         """Repeat what reached the world other than as a message: deaths, requests, and joins that were withheld."""
-        if event.kind in JOINED and event.source not in self._rerun:
+        if event.kind in ADMISSIONS and event.source not in self._rerun:
             joined = _joined(event)
             if (join := self._withheld.pop(joined, None)) is not None:
                 self._world.handle(keys.process(joined[0], "join"), join, 0)
@@ -447,4 +446,4 @@ def _admitted(inputs: Sequence[Recorded]) -> set[_Joined]:
     Their joins are repeated in place. A join that was withheld for longer has its event in a later gate.
     """
     events = (recorded_run.decode_or_none(recorded) for recorded in inputs if recorded.key == keys.EVENT)
-    return {_joined(event) for event in events if event is not None and event.kind in JOINED}
+    return {_joined(event) for event in events if event is not None and event.kind in ADMISSIONS}

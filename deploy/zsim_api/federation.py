@@ -394,11 +394,7 @@ class Federation(Assertions):
     def _standing(self, clock: Clock | None, waiting: Sequence[Waiting]) -> str:
         if clock is None:
             return "no clock of a world was received"
-        lines = []
-        for each in holding_up(clock.state, waiting) or waiting:
-            on = f" on {each.host}" if each.host else ""
-            held = f", held by {', '.join(each.held_by)}" if each.held_by else ""
-            lines.append(f"  {each.name}{on} since {each.since_wall_s:.1f} s{held}")
+        lines = [f"  {each}" for each in holding_up(clock.state, waiting) or waiting]
         if not self._watch.left and self._watch.wanted is None:
             lines.append(f"  {PROCESS}, this test, which is not waiting for anything at the moment")
         lines.insert(0, f"t = {clock.t_ns / 1e9:.2f} s, {clock.state}; waiting_for:{'' if lines else ' none'}")

@@ -15,7 +15,7 @@ from msgspec import UNSET
 from zsim.contract import keys, messages, run_messages
 from zsim.contract.flight_messages import EstimateView, LinkState, ViewCluster, ViewDrones, ViewEstimates
 from zsim.contract.messages import Info
-from zsim.contract.run_messages import Event, Fault, Health
+from zsim.contract.run_messages import INCIDENTS, Event, Fault, Health
 from zsim.errors import DecodeError
 from zsim.runtime.participant import Participant
 from zsim.transport.session import RawSample, Session
@@ -27,7 +27,6 @@ EVENTS_KEPT = 200  # the newest, each by itself
 ROWS_KEPT, OWN_ROWS_KEPT = 200, 100  # of distinct events; of the console's own requests
 OWN_KINDS = frozenset({"accepted", "done", "control", "refused"})  # kinds of events that answer an operator's request
 ALL, OWN = "all", "own actions"
-INCIDENTS = frozenset({"emergency", "flip", "impact", "touchdown", "battery"})  # of drones
 KINDS: dict[str, frozenset[str]] = {
     ALL: frozenset(),
     OWN: frozenset(),

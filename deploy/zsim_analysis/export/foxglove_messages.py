@@ -19,7 +19,7 @@ from foxglove import messages as fox
 
 from zsim.contract.flight_messages import CameraImage, CameraInfo, ClusterState, Estimate, Status, Truth
 from zsim.contract.messages import Gps
-from zsim.contract.run_messages import Event
+from zsim.contract.run_messages import INCIDENTS, Event
 from zsim.math.frames import heading, principal_axes, quaternion_from_rpy
 from zsim.presentation import colours_of, rgb
 from zsim_analysis.export.columns import Values
@@ -42,8 +42,7 @@ DRONE_NUMBERS = (
     "battery_percent",
 )
 WARNINGS = ("refused", "fingerprint", "outputs_missing", "fault", "landing")  # kinds of events; others: information
-FALLS = ("collision", "emergency", "flip", "impact", "touchdown", "battery")
-FAILURES = (*FALLS, "death", "failure", "overdue", "diverged")
+FAILURES = ("collision", *INCIDENTS, "death", "failure", "overdue", "diverged")
 _POINT = np.dtype([("position", "<f4", 3), ("colour", "u1", 4)])
 
 FramePose = tuple[str, Any, Any]  # a frame's name, its position and its orientation in the parent frame

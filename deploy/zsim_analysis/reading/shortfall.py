@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from zsim.contract.run_messages import Event
+from zsim.contract.run_messages import INCIDENTS, Event
 from zsim.errors import NotTrustedError
 from zsim.record import Completeness
 from zsim.record.completeness import SECOND_NS
@@ -37,7 +37,6 @@ STRAYED_M, STRAYED_S = 5.0, 3  # chosen: twice the least distance of drones, for
 SETTLED_S = 10.0  # chosen: time from the engagement until drones must be in their places
 SAME = 1e-3  # m or rad; tolerance of the reference against the plan's, which is computed by the same formulas
 CONTROLLER, CONSOLE = ("controller.", f"{PILOT}."), "console"  # name prefixes of planned controllers, and operators
-INCIDENTS = ("emergency", "flip", "impact", "touchdown", "battery", "landing")  # events of drones
 CRASHES = ("emergency", "flip", "impact", "touchdown")  # incidents by which a drone comes down
 ONE_HIT_NS = 500_000_000  # chosen: a touchdown within this time of an impact belongs to it
 REFUSED_NS = 5_000_000_000  # chosen: a command refused within this time before a landing explains it
@@ -170,7 +169,7 @@ def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
     """Yield a line for each drone with incidents: the first of each kind, by time."""
     by_drone: dict[str, list[Event]] = {}
     for event in flight.events:
-        if event.kind in INCIDENTS:
+        if event.kind in (*INCIDENTS, "landing"):
             by_drone.setdefault(event.subject, []).append(event)
     for drone, events in by_drone.items():
         first = {event.kind: event for event in reversed(events)}

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from msgspec import Struct
 
+from zsim.contract.run_messages import ADMISSIONS
 from zsim.scenario.faults import PROCESS_KILL
 from zsim.scenario.roles import PILOT
 from zsim_agents.formation.spaces.cluster_space import unit
@@ -224,7 +225,6 @@ SHORT, HAIRLINE_PT = 0.005, 0.8  # bands shorter than this share of the axis are
 WINDOW = "window of the statistics"
 WINDOW_GREY = "#e7ebf0"  # lighter than the grid lines
 ASSEMBLY = {"taking_off": "assembly", "assembling": "assembly"}
-RETURNS = ("restart", "superseded", "join")  # events of a process that takes part again
 
 
 class Band(Struct, frozen=True):
@@ -280,7 +280,7 @@ def _faults(flight: RecordedFlight) -> Iterator[Band]:
             end_ns = ends.get(event.data.get("id"))
             if end_ns is None and event.data.get("kind") == PROCESS_KILL:  # until the process takes part again
                 later = (each for each in flight.events[place + 1 :] if each.subject == event.subject)
-                if back := next((each for each in later if each.kind in RETURNS), None):
+                if back := next((each for each in later if each.kind in ADMISSIONS), None):
                     done_ns = back.data.get("done_ns", back.t_ns)  # the last gate of its predecessor
                     is_known = isinstance(done_ns, int)
                     end_ns = max(event.t_ns, min(back.t_ns, done_ns)) if is_known else back.t_ns
