@@ -185,7 +185,7 @@ def check_free(target: Path, force: bool, record: Path) -> None:
             others = {path.name for path in target.iterdir()} - {MANIFEST, *tables}
             other = f"it contains {min(others)}" if others else ""
         except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
-            other = f"it has no {MANIFEST} of an export"
+            other = f"it has no {MANIFEST}"
         if other:
             what = f"is a folder but not an export ({other})"
             raise ReportError(f"{target}: {what}; give --out another path")
