@@ -204,7 +204,7 @@ def _manifest(path: Path, archive: zipfile.ZipFile) -> Manifest:
         raise RunError(f"{path}: was changed: the content of {MANIFEST} does not match its seal")
     held = {entry.filename for entry in entries} - {MANIFEST}
     if others := sorted(held ^ set(manifest.files)):
-        fault = f"is not in {MANIFEST}" if others[0] in held else f"is in {MANIFEST}, but missing"
+        fault = f"is not in {MANIFEST}" if others[0] in held else f"is missing, but listed in {MANIFEST}"
         raise RunError(f"{path}: was changed: {others[0]} {fault}")
     for name in (README, SCENARIO, LOCK):
         if name not in held:

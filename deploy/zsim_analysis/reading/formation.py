@@ -71,7 +71,7 @@ class Formation:
         return (self.t_s >= window_s[0]) & (self.t_s <= window_s[1])
 
     def judged(self, window_s: tuple[float, float]) -> NDArray[np.bool_]:
-        """Return a mask (K,) of a window's samples for statistics: those engaged; earlier, the estimate is the desired."""
+        """Return a mask (K,) of a window's engaged samples; in others, the desired value may be just the estimate."""
         return self.within(window_s) & self.engaged
 
     def engaged_share(self, window_s: tuple[float, float]) -> float | None:
