@@ -281,7 +281,7 @@ def _rank(alarm: Alarm, is_over: bool = False) -> tuple[bool, bool, str, str]:
 
 TILT_MAX_DEG = 30.0  # tilt of a drone before take-off; chosen: above any slope, far below a drone on its side
 LINK_SILENT_S = 3.0  # wall; drivers publish the state of a link once a second
-LIMITS = EngagementLimits()  # within which a formation's controller lets its drones take off
+LIMITS = EngagementLimits()  # limits within which a formation's controller lets its drones take off
 AT_END = "the record is at its end; go back on the timeline"
 WAITING_SHOWN = 4  # number of awaited processes that are named
 STANDS_S = 2.0  # wall; a running world that waits for longer is shown as waiting
@@ -382,8 +382,8 @@ class RunCondition(NamedTuple):
     """The condition on which the controls of a page depend."""
 
     clock: str | None = None  # state of the run's clock; None before the first answer
-    silent_s: float = 0.0  # how long the world has not answered [wall]; 0 while it answers
-    ended: str = ""  # why the run is over; empty while it goes on
+    silent_s: float = 0.0  # how long the world has not answered [s; wall]; 0 while it answers
+    ended: str = ""  # why the run is over; empty while it continues
     replayed: bool = False  # whether it is a replay, in which nothing can be flown
     at_end: bool = False  # whether the replay is at the end of its record
     drones: Mapping[str, str] = {}  # state by name of the drones seen so far

@@ -111,8 +111,8 @@ class ViewBuffer:
         self.losses = Losses()
         self.failsafes: dict[str, Event] = {}  # last automatic landing or stop of each drone, until its next mode
         self.begun: deque[Fault] = deque(maxlen=FAULTS_KEPT)  # the most recently begun faults
-        self.end = ""  # why the run ended, by its last event; empty while it goes on
-        self.on_own_event: Callable[[Event], None] = lambda _: None  # called with events that our commands cause
+        self.end = ""  # why the run ended, by its last event; empty while it continues
+        self.on_own_event: Callable[[Event], None] = lambda _: None  # called with events that the console causes
 
     def open(self) -> None:
         """Subscribe, and read the values published last."""
