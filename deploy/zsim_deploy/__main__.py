@@ -1,4 +1,4 @@
-"""The `zsim` command: Ctrl-C ends it with one line, even while it is loading modules."""
+"""The `zsim` command; Ctrl-C ends it with one line, even while it is loading modules."""
 
 import gc
 import os
@@ -6,13 +6,13 @@ import signal
 
 from zsim_deploy import INTERRUPTED
 
-GARBAGE_OBJECTS = 10_000  # threshold of the garbage collector; with Python's 700 it takes a tenth of the start
+GARBAGE_OBJECTS = 10_000  # threshold of the garbage collector; Python's 700 would cost a tenth of the start-up time
 
 
 def main() -> None:
-    """Load the command line, and run it."""
+    """Load and run the command line."""
     gc.set_threshold(GARBAGE_OBJECTS)
-    takes_interrupts = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # unless a shell ignores it
+    takes_interrupts = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # a shell may have made it ignored
     if takes_interrupts:
         signal.signal(signal.SIGINT, _leave)
     from zsim_deploy.roles.closed_output import renew_streams

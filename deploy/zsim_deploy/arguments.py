@@ -1,4 +1,4 @@
-"""Shared parts of the commands: common options, the values that they are combined into, and terminal output."""
+"""Shared parts of the commands: common options, the types that combine their values, and terminal output."""
 
 import inspect
 import math
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 CONNECT_VARIABLE = "ZSIM_CONNECT"  # environment variable: default of --connect
-RUN_ID = "{run}"  # placeholder in the folder of a record: a restarted recorder finds the record that it began
-CONSOLE_PORT = 8080  # of its page
+RUN_ID = "{run}"  # placeholder for the run's id in the folder of a record, by which a restarted recorder finds it again
+CONSOLE_PORT = 8080  # TCP port of the console's page
 PORT_MAX = 65535
-REALTIME = "--realtime"  # of the world, and of routers, whose lease it shortens
-CHANGED = "--changed"  # of the world: overrides already contained in the resolved scenario of a launcher
+REALTIME = "--realtime"  # option of the world, and of routers, whose lease it shortens
+CHANGED = "--changed"  # option of the world: overrides that the launcher's resolved scenario already contains
 LOOK_S = 5.0  # wall time for which an interactive command waits for a world
 
-# Panels of the help
+# Panels in the help of `zsim`
 RUN, HOSTS = "Run", "On several machines"
 ROLES = "Roles, started by hand, on any machine, in any order"
-WATCH, TRANSLATE, POKE = "Watch and steer", "Bridges and gateways", "Inspect and send"
+WATCH, TRANSLATE, POKE = "Watch and control", "Bridges and gateways", "Inspect and send"
 
-# Modules that a command needs, by the extra that brings them
+# Modules that a command needs, by the extra that installs them
 CAMERA_NEEDS = {"cameras": ("cv2",)}
 CONSOLE_NEEDS = {"console": ("aiohttp", "viser")}
 FLIGHT_NEEDS = {"record": ("mcap", "zstandard"), "world": ("numba",), "agents": ("scipy",)}
@@ -57,7 +57,7 @@ def failed(cause: str) -> Exit:
 
 @contextmanager
 def working(text: str) -> Iterator[Callable[[str], None]]:
-    """Show on a terminal what is being done for the duration of the block; yield a function that changes the text."""
+    """Show a status text on a terminal for the duration of the block; yield a function that changes it."""
     from rich.console import Console
 
     from zsim.runtime.progress import cell
@@ -67,7 +67,7 @@ def working(text: str) -> Iterator[Callable[[str], None]]:
 
 
 def require(command: str, needs: Mapping[str, Sequence[str]]) -> None:
-    """Raise RunError if modules that a command needs are missing; `needs`: modules by the extra that brings them."""
+    """Raise RunError if modules that a command needs are missing; `needs`: modules by the extra that installs them."""
     missing = {module: extra for extra, modules in needs.items() for module in modules if find_spec(module) is None}
     if missing:
         lacking = f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} not installed"
@@ -88,8 +88,8 @@ positive = _check(lambda value: 0 < value < math.inf, "a finite number > 0")
 not_negative = _check(lambda value: 0 <= value < math.inf, "a finite number >= 0")
 
 
-def between(least: float, greatest: float) -> Callable[[float | None], float | None]:
-    return _check(lambda value: least <= value <= greatest, f">= {least:g} and <= {greatest:g}")
+def between(minimum: float, maximum: float) -> Callable[[float | None], float | None]:
+    return _check(lambda value: minimum <= value <= maximum, f">= {minimum:g} and <= {maximum:g}")
 
 
 def check_range(from_: float | None, to: float | None) -> None:
@@ -98,7 +98,7 @@ def check_range(from_: float | None, to: float | None) -> None:
 
 
 def endpoint_origin(text: str, arguments: Sequence[str], environment: Mapping[str, str]) -> str:
-    """Add to an error about an endpoint that it comes from the environment, if so."""
+    """Return the text of an error; if it names the endpoint of CONNECT_VARIABLE, say so."""
     value = environment.get(CONNECT_VARIABLE)
     is_given = any(each.partition("=")[0] == "--connect" for each in arguments)
     return f"{text} ({value} is from {CONNECT_VARIABLE})" if value and value in text and not is_given else text
@@ -121,36 +121,36 @@ ScenarioPath = Annotated[Path, Argument(help="Scenario file (YAML).", show_defau
 Set = Annotated[list[str] | None, Option("--set", help="Override a field: a.b.c=value. Repeatable.")]
 Seed = Annotated[int | None, Option(help="Seed instead of the scenario's.")]
 Duration = Annotated[float | None, Option(help="Simulated seconds instead of the scenario's.")]
-Realtime = Annotated[bool, Option(REALTIME, help="Pace by the wall clock without waiting for any process.")]
-Rate = Annotated[float | None, Option(help="Simulated per wall second (realtime 1, lockstep unpaced).")]
-Connect = Annotated[str, Option("--connect", envvar=CONNECT_VARIABLE, help="Where the world (or a router) listens.")]
-Federation = Annotated[str, Option(envvar="ZSIM_FEDERATION", help="Name of the federation: the prefix of its keys.")]
-Wait = Annotated[float | None, Option(callback=not_negative, help="Seconds to wait for a world; forever if not given.")]
-Launched = Annotated[str | None, Option("--launched", hidden=True)]  # by `zsim run`, for the run of this id
+Realtime = Annotated[bool, Option(REALTIME, help="Pace by the wall clock, without waiting for any process.")]
+Rate = Annotated[
+    float | None, Option(help="Simulated seconds per wall second (default: realtime 1, lockstep unpaced).")
+]
+Connect = Annotated[str, Option("--connect", envvar=CONNECT_VARIABLE, help="Endpoint of the world or a router.")]
+Federation = Annotated[str, Option(envvar="ZSIM_FEDERATION", help="Name of the federation, the prefix of its keys.")]
+Wait = Annotated[float | None, Option(callback=not_negative, help="Seconds to wait for a world (default: no limit).")]
+Launched = Annotated[str | None, Option("--launched", hidden=True)]  # id of the run whose launcher started the process
 Tls = Annotated[Path | None, Option("--tls", help="Folder of this process's certificate (zsim certs init).")]
-Access = Annotated[Path | None, Option("--access", help="Zenoh's access control (zsim certs init).")]
-Host = Annotated[str | None, Option("--host", help="Name of this host, as others see it.")]
-Insecure = Annotated[bool, Option("--insecure", help="Without TLS, on a private network.")]
+Access = Annotated[Path | None, Option("--access", help="File with Zenoh's access control (zsim certs init).")]
+Host = Annotated[str | None, Option("--host", help="Name of this host, as shown to others.")]
+Insecure = Annotated[bool, Option("--insecure", help="Run without TLS, on a private network.")]
 Keys = Annotated[
     list[str] | None, Option(help="Only these keys, e.g. 'drone/*/truth'. Repeatable.", show_default=False)
 ]
-Trust = Annotated[bool, Option("--trust", help="Import the modules that the scenario names. This runs their code.")]
-From = Annotated[float | None, Option("--from", callback=not_negative, help="Simulated seconds of the first message.")]
-To = Annotated[float | None, Option("--to", callback=not_negative, help="Simulated seconds of the last message.")]
-Force = Annotated[
-    bool, Option("--force", help="Replace an earlier run in the folder; other files there stay as they are.")
-]
-Report = Annotated[bool, Option(help="Make the report at the end.")]
-Workers = Annotated[int | None, Option(min=1, max=1024, help="Processes (default: one per core).")]
+Trust = Annotated[bool, Option("--trust", help="Import the modules that the scenario names, which runs their code.")]
+From = Annotated[float | None, Option("--from", callback=not_negative, help="Start of the range, simulated seconds.")]
+To = Annotated[float | None, Option("--to", callback=not_negative, help="End of the range, simulated seconds.")]
+Force = Annotated[bool, Option("--force", help="Replace an earlier run in the folder; other files there are kept.")]
+Report = Annotated[bool, Option(help="Make the report at the end of the run.")]
+Workers = Annotated[int | None, Option(min=1, max=1024, help="Number of processes (default: one per core).")]
 Formats = Annotated[
-    str | None, Option("--format", help="pdf, svg or pdf,svg: further formats of the figures.", show_default=False)
+    str | None, Option("--format", help="Additional formats of the figures: pdf, svg or pdf,svg.", show_default=False)
 ]
-Listen = Annotated[list[str] | None, Option(help=f"Endpoint, repeatable (default {DEFAULT_ENDPOINT}).")]
+Listen = Annotated[list[str] | None, Option(help=f"Endpoint to listen on (default {DEFAULT_ENDPOINT}). Repeatable.")]
 Recorded = Annotated[Path, Argument(metavar="DIR", help="Folder of a run, or its run.mcap.", show_default=False)]
 
 
 def figure_formats(text: str | None) -> tuple[str, ...]:
-    """Return the values of --format of reports."""
+    """Return the formats in a value of --format; BadParameter for an unknown one."""
     formats = tuple(text.split(",")) if text else ()
     if not set(formats) <= set(FORMATS):
         raise BadParameter(f"--format is {text!r}; must be {' or '.join(FORMATS)}, or both separated by a comma")
@@ -158,7 +158,7 @@ def figure_formats(text: str | None) -> tuple[str, ...]:
 
 
 def process_option(default: str) -> Any:
-    """Return the option for the name of a process; `default` is its name without a certificate."""
+    """Return the option for the name of a process; `default`: the name that it has without a certificate."""
     return Option(help=f"Process name (default {default}, or the certificate's).")
 
 
@@ -185,9 +185,9 @@ def load_scenario(
     elsewhere: bool = False,
     modules: Iterable[Path] = (),
 ) -> Any:
-    """Load a scenario with the overrides of the command line; `elsewhere`: it flies on other hosts.
+    """Load a scenario with the overrides of the command line.
 
-    `modules`: further folders with modules that it names.
+    `elsewhere`: it is flown on other hosts; `modules`: further folders with modules that it names.
     """
     from zsim.scenario import scenario_file
     from zsim_agents.hosting import check_classes
@@ -198,7 +198,7 @@ def load_scenario(
 
 
 def changed_fields(overrides: Sequence[str] | None, seed: int | None, duration: float | None) -> list[str]:
-    """Return the changes that a command line makes to a scenario, as texts of `--set`."""
+    """Return the changes that a command line makes to a scenario, as values of `--set`."""
     own = {"seed": seed, "duration_s": duration}
     return [*(overrides or ()), *(f"{name}={value}" for name, value in own.items() if value is not None)]
 
@@ -212,7 +212,7 @@ def pace_options(mode: str, rate: float) -> list[str]:
 
 
 class FlightOptions(NamedTuple):
-    """A scenario to fly, and its pace; seed, duration and overrides (texts `a.b.c=value`) change the scenario."""
+    """A scenario to fly, its pace, and changes to it: seed, duration [s], and overrides (`a.b.c=value`)."""
 
     path: Path
     seed: int | None
@@ -222,7 +222,7 @@ class FlightOptions(NamedTuple):
     overrides: list[str] | None
 
     def scenario(self, elsewhere: bool = False) -> Any:
-        """Load the scenario and, unless it flies on other hosts (`elsewhere`), the classes that it names."""
+        """Load the scenario and, unless it is flown on other hosts (`elsewhere`), the classes that it names."""
         from zsim.scenario.roles import check_pace
 
         scenario = load_scenario(self.path, self.overrides, self.seed, self.duration, elsewhere)
@@ -233,7 +233,7 @@ class FlightOptions(NamedTuple):
         return changed_fields(self.overrides, self.seed, self.duration)
 
     def mode_and_rate(self) -> tuple[str, float]:
-        """Return the mode of a run, and its pace in simulated per wall seconds; 0 is as fast as possible."""
+        """Return the mode of a run and its pace in simulated seconds per wall second; 0: as fast as possible."""
         if self.rate is not None and not 0 < self.rate <= RATE_MAX:
             raise BadParameter(f"--rate is {self.rate:g}; must be > 0 and <= {RATE_MAX:g}")
         return ("realtime", self.rate or 1.0) if self.realtime else ("lockstep", self.rate or 0.0)
@@ -247,10 +247,10 @@ class WorldAccess(NamedTuple):
 
     endpoint: str  # on which the world or a router listens
     federation: str
-    wait_s: float | None  # for a world; None waits indefinitely
+    wait_s: float | None  # how long to wait for a world; None: indefinitely
     tls: Path | None  # folder of the process's certificate
     insecure: bool
-    host: str | None  # its name, as others see it
+    host: str | None  # name of this host, as shown to others
     launched: str | None = None  # id of the run, if a launcher started the process
 
     @property
@@ -259,16 +259,17 @@ class WorldAccess(NamedTuple):
 
 
 def option_group(argument: str, make: Callable[..., Any], options: Mapping[str, tuple[Any, Any]]) -> Callable[..., Any]:
-    """Return a decorator that replaces one argument of a command by options (annotation and default by name).
+    """Return a decorator that replaces one argument of a command by options.
 
-    `make` builds that argument from their values, in the order of the options.
+    `make` builds that argument from the values of the options, in their order; `options`: annotation and default of
+    each, by name.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @wraps(command)
         def with_options(**values: Any) -> None:
-            made = make(*(values.pop(option, default) for option, (_, default) in options.items()))
-            command(**values, **{argument: made})
+            combined = make(*(values.pop(option, default) for option, (_, default) in options.items()))
+            command(**values, **{argument: combined})
 
         parameters = [
             inspect.Parameter(option, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
@@ -306,18 +307,18 @@ flight_options = option_group(
     },
 )
 observer_options = option_group("reach", WorldAccess, _OBSERVER)
-"""For interactive commands, with an argument `reach`."""
+"""Decorator for interactive commands, with an argument `reach`."""
 participant_options = option_group("reach", WorldAccess, _PARTICIPANT)
-"""For commands that run a process of a federation, with an argument `reach`: it waits for a world."""
+"""Decorator for commands that run a process of a federation, with an argument `reach`; it waits for a world."""
 several_options = option_group(
     "reach",
     lambda connect, federation, wait, *more: WorldAccess(connect, federation, wait, None, *more),
     {name: each for name, each in _PARTICIPANT.items() if name != "tls"},
 )
-"""The same for a process that hosts several, which cannot have a certificate: that is for a single name."""
+"""The same for a process that hosts several agents; it cannot have a certificate, which is for a single name."""
 listener_options = option_group(
     "who",
     identity,
     {"host": (Host, None), "tls": (Tls, None), "insecure": (Insecure, False), "access": (Access, None)},
 )
-"""For commands that run a process to which others connect, with an argument `who`."""
+"""Decorator for commands that run a process to which others connect, with an argument `who`."""

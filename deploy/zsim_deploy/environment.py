@@ -1,8 +1,8 @@
-"""`zsim rerun --install`: an environment with the packages of a bundle, in which it is flown again.
+"""`zsim rerun --install`: a Python environment with the packages of a bundle, in which it is flown again.
 
 CACHE/environments/KEY    one for each Python, lock and version of zsim; KEY is a hash of these
 
-zsim itself is that of this machine; a bundle does not contain it.
+zsim itself is the version on this machine; a bundle does not contain it.
 """
 
 import hashlib
@@ -24,23 +24,23 @@ from zsim_analysis.bundle.bundle_rerun import check_content
 from zsim_deploy import SAFE_PATH
 from zsim_deploy.hosts.wheelhouse import PROJECT, checkout, default_cache, requirement
 
-KEY_DIGITS = 16
-READY = "ready"  # marks a complete environment
+KEY_DIGITS = 16  # 64 bits of a SHA-256
+READY = "ready"  # file that marks a complete environment
 LEFT_OUT = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
 
 
 def rerun_in_environment(
     bundle: Path, python: Path | None, commands_only: bool, trust: bool, note: Callable[[str], None]
 ) -> int:
-    """Fly a bundle again in its environment, which is made if missing; return the exit code of the flight.
+    """Fly a bundle again in its environment, which is created if missing; return the exit code of the flight.
 
     Args:
-        python: of the environment; None for this one.
-        trust: whether the bundle's own code may be run, and the packages that it needs be installed.
-        note: takes a line about each step.
+        python: interpreter of the environment; None: this one.
+        trust: whether the bundle's own code may be run, and the packages that it needs installed.
+        note: takes a line on each step.
 
     Raises:
-        RunError: the bundle is refused, or the environment cannot be made.
+        RunError: the bundle is refused, or the environment cannot be created.
     """
     with opened(bundle) as (manifest, folder):
         check_content(bundle, manifest, folder)
@@ -55,7 +55,7 @@ def rerun_in_environment(
 
 
 def _environment(python: str, lock: Sequence[str], needs: Sequence[str], note: Callable[[str], None]) -> Path:
-    """Return the folder of an environment with the packages of a lock."""
+    """Return the folder of an environment with the packages of a lock, created if missing."""
     version = _output([python, "-c", "import sys; print(sys.version)"], f"{python}: is not a Python")
     name, origin = str(checkout() or ""), ""
     if not name:
@@ -64,15 +64,15 @@ def _environment(python: str, lock: Sequence[str], needs: Sequence[str], note: C
     wanted = [f"{name}[{','.join(EXTRAS)}]{origin}", *needs]
     key = hashlib.sha256(json.dumps([python, version, __version__, wanted, list(lock)]).encode()).hexdigest()
     folder = default_cache() / "environments" / key[:KEY_DIGITS]
-    with file_fault(folder, "cannot be made", "set XDG_CACHE_HOME to a folder that can be written"):
+    with file_fault(folder, "cannot be created", "set XDG_CACHE_HOME to a folder that can be written"):
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / "lock").open("a") as held:
             if not take_lock(held):
-                raise RunError(f"{folder}: another command is making this environment; wait for it to end")
+                raise RunError(f"{folder}: another command is creating this environment; wait for it to end")
             if not (folder / READY).exists():
-                note(f"making an environment with {len(lock)} packages in {folder}")
+                note(f"creating an environment with {len(lock)} packages in {folder}")
                 shutil.rmtree(folder / "venv", ignore_errors=True)
-                _output([python, "-m", "venv", str(folder / "venv")], f"{folder}: no environment can be made")
+                _output([python, "-m", "venv", str(folder / "venv")], f"{folder}: no environment can be created")
                 (folder / names.LOCK).write_text("".join(f"{line}\n" for line in lock), "utf-8")
                 pip = [str(_python_of(folder)), "-m", "pip", "install", "--disable-pip-version-check", "--no-input"]
                 what = "the packages of the bundle cannot be installed with this Python"
@@ -86,7 +86,7 @@ def _python_of(environment: Path) -> Path:
 
 
 def _clean() -> dict[str, str]:
-    """Return the environment variables without those that make a Python import modules of another one."""
+    """Return the environment variables without those that make a Python import the modules of another one."""
     return {name: value for name, value in os.environ.items() if name not in LEFT_OUT}
 
 

@@ -281,7 +281,11 @@ def test_by_command_on_a_running_federation(federation: Federation) -> None:
     assert has_terms(printed[0], "1: gps_bias", "drone1", "cleared")
     assert "2: link_jitter" in printed[1]
     assert has_terms(printed[2], "3: gust", "world", "11.00 s", "12.00 s")
-    assert [line.split()[:2] for line in printed[3].splitlines()] == [["1", "acts"], ["2", "acts"], ["3", "planned"]]
+    assert [line.split()[:2] for line in printed[3].splitlines()] == [
+        ["1", "active"],
+        ["2", "active"],
+        ["3", "planned"],
+    ]
     assert "cleared 1" in printed[4]
     record = federation.record()
     begun = {event["data"]["id"]: event["data"] for event in record.events("fault")}

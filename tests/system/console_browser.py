@@ -167,4 +167,4 @@ def console(federation: Federation, *options: str) -> tuple[Role, dict[str, str]
     """Start a console; return it with its links."""
     role = federation.role("console", "--port", str(free_port()), *options)
     steer = role.line("steer at").text.rpartition(" ")[2]
-    return role, {"steer": steer, "look": role.line("look, without").text.rpartition(" ")[2]}
+    return role, {"steer": steer, "look": role.line("watch only").text.rpartition(" ")[2]}

@@ -129,7 +129,7 @@ def test_thirty_drones_are_sorted_filtered_and_commanded_together(
     run.link.asked.clear()
     number.fill("9")
     number.press("Enter")
-    fly = page.page.get_by_role("button", name="Fly what is previewed", exact=True)
+    fly = page.page.get_by_role("button", name="Fly the preview", exact=True)
     fly.wait_for()
     page.page.wait_for_function("() => Number(document.getElementById('zsim-map').dataset.previews) === 30")
     targets = lambda: [args for op, args in list(run.link.asked) if op == "target"]  # noqa: E731

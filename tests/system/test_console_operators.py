@@ -113,7 +113,7 @@ def test_of_two_operators_one_is_in_control_until_it_is_granted_released_or_lost
     # a page that is gone releases; who has asked has it
     button(first, "Ask for main").click()
     second.page.close()
-    see(first, re.compile("operator 2 is gone"))
+    see(first, re.compile("operator 2 has left"))
     see(first, "alone here")
     type_into(first, X_C, "8")
     wait_until(first, lambda: len(requests(run, "target")) == 3)
@@ -141,7 +141,7 @@ def test_alarms_stay_until_they_are_acknowledged_and_failsafes_say_their_cause(
         name: {"commander": "console.run" if name == "drone2" else "controller.main"}
         for name in ("drone1", "drone2", "drone3")
     }
-    head.get_by_text("main: not flown whole").wait_for()
+    head.get_by_text("main: partly flown by others").wait_for()
     head.get_by_text("engaged – drone2 is flown by console.run").wait_for()
 
     # a process that died, and is back

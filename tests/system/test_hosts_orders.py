@@ -83,7 +83,7 @@ def test_a_closed_terminal_ends_the_run_as_ctrl_c_does(lab: Lab) -> None:
         in_flight(run)
         follower = deployment.zsim("logs", "estimator.drone2", "--follow")
         follower.line("estimator.drone2: in run")
-        others = {"is up already .* --set federation=NAME": (), "h1: port 7447 is in use there": ("other",)}
+        others = {"is already up .* --set federation=NAME": (), "h1: port 7447 is in use there": ("other",)}
         for pattern, federation in others.items():
             options = [f"--set=federation={name}" for name in federation]
             other = deployment.zsim(

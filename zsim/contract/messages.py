@@ -1,16 +1,16 @@
-"""The contract's messages by key, version 1, and those of users' agents: types, encoding and decoding.
+"""The messages of the contract, version 1, and of users' agents by key: types, encoding and decoding.
 
-Every message is a msgpack map with exactly these field names, SI units and radians, the unit in the name.
-All messages are encoded by `encode` and decoded by `decode`, which checks types, shapes and finite numbers.
+Every message is a msgpack map with exactly these field names, in SI units and radians, with the unit in the name.
+`encode` encodes all messages; `decode` decodes them and checks types, shapes and finiteness.
 
 Users' agents exchange classes with a key, declared in `world/info` for readers without the class:
 
 class State(zsim.AgentMessage, frozen=True):
-    key = "swarm/{drone}/state"  # each drone's agent publishes on the key of its own drone
+    key = "swarm/{drone}/state"  # each drone's agent publishes on its own drone's key
     position_m: tuple[float, float, float]
     is_leader: bool = False
 
-State.of()  # "swarm/*/state", to read those of all
+State.of()  # "swarm/*/state", the key expression of all
 """
 
 import math
@@ -42,15 +42,15 @@ from zsim.sensors.stock_sensors import Sonar as Sonar
 _KEY = re.compile(r"([a-z][a-z0-9_]{0,31})/\{(drone|cluster|run)\}/([a-z][a-z0-9_]{0,31})")
 KEY_ALLOWED = "swarm/{drone}/state: a word, {drone}, {cluster} or {run}, and a word, of a-z 0-9 _"
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
-CONTRACT_WORDS = frozenset({"drone", "cluster", "process", "world", "view", "clock"})  # with which its keys begin
+CONTRACT_WORDS = frozenset({"drone", "cluster", "process", "world", "view", "clock"})  # that begin its keys
 
 
 class AgentMessage(Struct, frozen=True, kw_only=True, gc=False):
     """Base of the messages of users' agents: `zsim.AgentMessage`.
 
-    A subclass has `key`, in which `{drone}`, `{cluster}` or `{run}` stands for the name of what the agent is of, and
-    fields: numbers, tuples and lists of numbers, whole numbers, true and false, text. zsim fills in t_ns, the gate at
-    which it is published, seq, which counts the messages of a key from 0, and source, the process that publishes it.
+    A subclass has `key`, in which `{drone}`, `{cluster}` or `{run}` stands for the name of the agent's drone, cluster
+    or run, and fields: numbers, tuples and lists of numbers, integers, booleans, text. zsim fills in t_ns, the gate of
+    its publication; seq, which counts the messages of a key from 0; and source, the agent that publishes it.
     """
 
     key: ClassVar[str] = ""
@@ -61,7 +61,7 @@ class AgentMessage(Struct, frozen=True, kw_only=True, gc=False):
 
     @classmethod
     def of(cls, thing: str = "*") -> str:
-        """Return the key of the messages of one drone's or cluster's agent; by default the expression of all keys.
+        """Return the key on which the agent of a drone or cluster publishes; by default the expression for all agents.
 
         Raises:
             ValueError: the class's key is invalid.
@@ -84,7 +84,7 @@ class AgentMessage(Struct, frozen=True, kw_only=True, gc=False):
 
 
 class MessageInfo(Struct, frozen=True, omit_defaults=True):
-    """A message of users' agents: `key` has `*` in place of a name; `fields` by name, beside t_ns, seq and source.
+    """A message of users' agents: `key` has `*` in place of a name; `fields` by name, besides t_ns, seq and source.
 
     `role` is the first part of the names of the processes that publish it.
     """
@@ -95,13 +95,13 @@ class MessageInfo(Struct, frozen=True, omit_defaults=True):
     role: str = ""
 
     def declares(self, kind: object) -> bool:
-        """Tell whether a class is one of these messages."""
+        """Whether a class matches this declaration."""
         if not (isinstance(kind, type) and issubclass(kind, AgentMessage)):
             return False
         return kind.__name__ == self.message and field_types(kind, AgentMessage) == self.fields
 
     def is_sound(self) -> bool:
-        """Tell whether a class can be made of it."""
+        """Whether a class can be created from it."""
         head, star, leaf = (*self.key.split("/"), "", "")[:3]
         key_is_sound = star == "*" and self.key.count("/") == 2 and head not in CONTRACT_WORDS
         return key_is_sound and all(map(_NAME.fullmatch, (head, leaf, self.message.lower(), *self.fields)))
@@ -120,12 +120,12 @@ def message_info(kind: type[AgentMessage]) -> MessageInfo:
         raise ValueError(f"{kind.__name__}.key is {kind.key!r:.60}; {reserved}")
     info = MessageInfo(f"{parts[1]}/*/{parts[3]}", kind.__name__, field_types(kind, AgentMessage))
     if not info.is_sound():
-        raise ValueError(f"{kind.__name__}, or a field of it, is no name; must be letters, a-z 0-9 _, at most 32")
+        raise ValueError(f"{kind.__name__}, or one of its fields, is not a valid name; must be at most 32 of a-z 0-9 _")
     return info
 
 
 def type_of_info(info: MessageInfo) -> type[AgentMessage]:
-    """Return a class made from a declaration, for processes without the user's class."""
+    """Return a class created from a declaration, for processes without the user's class."""
     return declared_type(info.message, info.fields, AgentMessage, (("key", info.key),))
 
 
@@ -137,7 +137,7 @@ def about(kind: type[AgentMessage]) -> str:
 
 PAYLOAD_MAX = 16_000_000  # bytes; a scenario of 1000 drones in world/info is below this
 REFUSALS = (ValueError, TypeError, RecursionError, OverflowError, MemoryError, msgspec.MsgspecError)
-"""Whatever a decoder raises for a payload that somebody else wrote: wrong types, bad UTF-8, maps without end."""
+"""Errors that a decoder raises for a foreign payload: wrong types, invalid UTF-8, endless maps."""
 
 
 class Origin(Struct, frozen=True):
@@ -149,7 +149,7 @@ class Origin(Struct, frozen=True):
 
 
 class RotorInfo(Struct, frozen=True):
-    """A rotor: its place in B and its radius [m]; `turn` is 1 if it turns clockwise seen from above, else -1."""
+    """A rotor: its position in B and radius [m]; `turn` is 1 if it turns clockwise seen from above, otherwise -1."""
 
     name: str
     x_m: Number
@@ -161,8 +161,8 @@ class RotorInfo(Struct, frozen=True):
 class DroneInfo(Struct, frozen=True):
     """A drone of the run, the model of its aircraft, and its rotors in the order of `rotor_rad_s`.
 
-    Records of older versions name no rotors. `body` is left out of a simulated drone; an external one is published by
-    its driver, and the world integrates nothing of it.
+    Records of older versions name no rotors. `body` is omitted for a simulated drone; an external drone is published by
+    its driver, and the world does not simulate it.
     """
 
     name: str
@@ -179,7 +179,7 @@ class ClusterInfo(Struct, frozen=True):
 
 
 class SensorInfo(Struct, frozen=True):
-    """A sensor of a user's own: what `drone/{d}/sensor/{name}` carries after `t_ns`, `seq` and `t_sample_ns`.
+    """A user's sensor: the content of `drone/{d}/sensor/{name}` after `t_ns`, `seq` and `t_sample_ns`.
 
     `message` is the name of the message; `fields` has the type of each by name.
     """
@@ -191,15 +191,15 @@ class SensorInfo(Struct, frozen=True):
 
 @keys.on("world/info", writers="world", readers="each", last="world")
 class Info(Message, frozen=True):
-    """What a process needs to take part: the resolved scenario and how its time runs, `world/info`.
+    """What a process needs to take part: the resolved scenario and the settings of its time, on `world/info`.
 
-    `rate` is simulated per wall seconds, 0 for as fast as possible; `scenario` is YAML text. `replay_of` is the
-    run_id of the run that is played back; empty for a flight. `user_sensors` is left out where all sensors are the
-    contract's, `user_messages` where agents exchange none, `sightings` where the world computes none, `scanners`
-    where no drone has one of range, lidar, depth. `module_folders` are those in which the world has looked for modules
-    that the scenario names, for readers of the record; left out where it names none. `changed` has the texts
-    `a.b.c=value` by which the command line changed the scenario's file; left out where that is not known. Making or
-    decoding an Info registers the messages of its sensors and agents.
+    `rate` is simulated over wall time, 0 for as fast as possible; `scenario` is YAML text. `replay_of` is the run_id of
+    the run that is played back; empty for a flight. Omitted are `user_sensors` if all sensors are the contract's,
+    `user_messages` if agents exchange none, `sightings` if the world computes none, and `scanners` if no drone has
+    range, lidar or depth. `module_folders` are the folders that the world searched for modules that the scenario names,
+    for readers of the record; omitted if it names none. `changed` holds the texts `a.b.c=value` with which the command
+    line changed the scenario's file; omitted if unknown. Creating or decoding an Info registers the messages of its
+    sensors and agents.
     """
 
     contract: Count
@@ -249,17 +249,17 @@ class Info(Message, frozen=True):
 
 for _name, _message in {**{name: kind.message for name, kind in STOCK.items()}, **SCANNERS}.items():
     keys.on(f"drone/*/sensor/{_name}", writers="world")(_message)
-keys.on("drone/*/sensor/*", writers="driver", readers="estimator")(Sample)  # those of the users' sensors too
+keys.on("drone/*/sensor/*", writers="driver", readers="estimator")(Sample)  # also for users' sensors
 TOPICS = keys.TOPICS
-"""The contract's keys, `*` in place of a name, with what travels on them; whole once this module is imported."""
+"""The contract's keys, with `*` in place of a name, and their messages; complete once this module is imported."""
 
 RELAYED = (
     *(flight_messages.Estimate, flight_messages.ClusterState, flight_messages.Reference),
     *(run_messages.ClusterRequest, AgentMessage),
 )
-"""Messages, or their bases, that agents publish for each other; the world counts them, as it does commands."""
-KEYS_KEPT = 65_536  # keys whose type is remembered; 1000 drones have 15 000, garbage keys push each other out
-_OWN: dict[str, type[Struct]] = {}  # messages of users by shape of the key, as the newest Info has them
+"""Messages, or their bases, that agents publish for each other; the world counts them like commands."""
+KEYS_KEPT = 65_536  # keys with cached types; 1000 drones have 15 000, garbage keys displace each other
+_OWN: dict[str, type[Struct]] = {}  # users' messages by shape of the key, from the newest Info
 
 
 def _plain(value: Any) -> Any:
@@ -270,11 +270,11 @@ def _plain(value: Any) -> Any:
 
 
 encode: Callable[[Struct], bytes] = msgspec.msgpack.Encoder(enc_hook=_plain).encode
-"""Return the payload of a message; numbers and arrays of numpy's are taken."""
+"""Return the payload of a message; numpy's numbers and arrays are converted."""
 
 
 def shape_of(key: str) -> str:
-    """Return a key with `*` in place of the name in it, as in TOPICS."""
+    """Return a key with `*` in place of its name, as in TOPICS."""
     if key in TOPICS:
         return key
     kind, whose, what = keys.parts(key)
@@ -283,15 +283,15 @@ def shape_of(key: str) -> str:
 
 @lru_cache(maxsize=KEYS_KEPT)
 def type_of(key: str) -> type[Struct] | None:
-    """Return the message type of a key in the contract, None for an unknown key."""
+    """Return the message type of a key; None for an unknown key."""
     shape = shape_of(key)
     return TOPICS[shape].message if shape in TOPICS else _OWN.get(shape)
 
 
 def register_sensors(sensors: Iterable[SensorInfo]) -> None:
-    """Register the messages of the users' sensors of a run, by the name of the sensor.
+    """Register the messages of users' sensors in a run.
 
-    A sensor with an invalid name, message name or field name is omitted: its messages remain unknown.
+    A sensor with an invalid name, message name or field name is skipped: its messages remain unknown.
     """
     for each in sensors:
         if all(map(_NAME.fullmatch, (each.name, each.message.lower(), *each.fields))):
@@ -299,9 +299,9 @@ def register_sensors(sensors: Iterable[SensorInfo]) -> None:
 
 
 def register_messages(kinds: Iterable[type[AgentMessage]]) -> None:
-    """Register users' message classes, used here in place of the declarations in `world/info`.
+    """Register users' message classes, used in this process instead of the declarations in `world/info`.
 
-    TypeError, ValueError as of `message_info`.
+    TypeError and ValueError as for `message_info`.
     """
     for kind in kinds:
         _register(message_info(kind).key, kind)
@@ -319,11 +319,11 @@ def types_by_shape() -> dict[str, type[Struct]]:
 
 
 COMMANDS = {topic.message: shape for shape, topic in TOPICS.items() if topic.message and keys.is_command(shape)}
-"""Shapes of the keys of commands, by their messages."""
+"""Shapes of command keys, by message type."""
 
 
 def command_key(drone: str, command: Struct) -> str:
-    """Return the key of a command to a drone, by the command's type; RunError if it is not a command."""
+    """Return the key of a command to a drone; RunError if it is not a command."""
     shape = COMMANDS.get(type(command))
     if shape is None:
         kinds = ", ".join(each.__name__ for each in COMMANDS)
@@ -333,23 +333,23 @@ def command_key(drone: str, command: Struct) -> str:
 
 @lru_cache(maxsize=KEYS_KEPT)
 def is_output(key: str) -> bool:
-    """Tell whether the world counts the messages of a key for the done of the process that publishes them."""
+    """Whether the world counts a key's messages against the done of the process that publishes them."""
     topic = TOPICS.get(shape_of(key))
     return is_relayed(type_of(key)) if topic is None else topic.message is not None and topic.is_output
 
 
 def is_relayed(kind: type[Struct] | None) -> bool:
-    """Tell whether agents publish messages of a type for other agents."""
+    """Whether agents publish messages of a type for other agents."""
     return kind is not None and issubclass(kind, RELAYED)
 
 
 def output_type(key: str) -> type[Struct]:
-    """Return the message type that an agent may return on a key from a step; DecodeError if there is none."""
+    """Return the message type that an agent's step may return for a key; DecodeError if there is none."""
     kind = type_of(key)
     if kind is None:
         raise DecodeError(f"{key:.80}: is not a key of the contract; see docs/protocol.md")
     if not is_output(key):
-        todo = "return it from `views`" if key.startswith("view/") else "only who this is about writes there"
+        todo = "return it from `views`" if key.startswith("view/") else "only the process that owns it writes there"
         what = "is not a key of an agent's outputs (commands, estimates, states, messages)"
         raise DecodeError(f"{key:.80}: {what}; {todo}")
     return kind
@@ -366,7 +366,7 @@ def encoding(key: str) -> str:
 
 
 def decode(key: str, payload: bytes) -> Any:
-    """Return the message on `key`, checked for type, shape and finiteness; DecodeError names the fault."""
+    """Return the message on `key`, checked for types, shapes and finiteness; DecodeError names the fault."""
     kind, read = _reader_of(key)
     if kind is None:
         raise DecodeError(f"{key:.80}: is not a key of the contract; see docs/protocol.md")
@@ -385,7 +385,7 @@ def decode_as(kind: type[Struct], payload: bytes, where: str) -> Any:
 
 
 def fault_at(key: str, error: Exception) -> str:
-    """Return the text of a refusal without its leading key."""
+    """Return the text of a decoding error without its leading key."""
     text, where = str(error), key if len(key) <= 80 or str(error).startswith(key) else _shown(key)
     return text.removeprefix(f"{where}: ")
 
@@ -405,7 +405,7 @@ def _reader_of(key: str) -> tuple[type[Struct] | None, _Reader]:
 
 @cache
 def _reader(kind: type[Struct]) -> _Reader:
-    """Return the decoder of a `kind`: msgspec's own if its types express every check."""
+    """Return the decoder of a `kind`: msgspec's own if the types express every check."""
     decode_bare = msgspec.msgpack.Decoder(kind).decode
     fault_of = getattr(kind, "fault", None)
     if fault_of is None:
@@ -426,7 +426,7 @@ def _too_long(payload: bytes) -> NoReturn:
 
 
 def _refusal(kind: type[Struct], payload: bytes, where: str, error: Exception) -> DecodeError:
-    """Return a refusal that names key, field, finding and what is allowed."""
+    """Return a DecodeError that names the key, field, value found and values allowed."""
     where = _shown(where)
     if not isinstance(error, msgspec.MsgspecError):
         return DecodeError(f"{where}: {str(error) or type(error).__name__}")
@@ -454,9 +454,9 @@ class ProcessEntry(Struct, frozen=True):
     incarnation: int
     host: str
     pid: int
-    from_ns: Count  # first gate that it is waited for
-    done_ns: Whole = -1  # newest gate that it, or its former incarnation, is through with; -1 for none
-    former_pid: int | None = None  # of the incarnation whose place it takes
+    from_ns: Count  # first gate that waits for it
+    done_ns: Whole = -1  # newest gate that it, or its former incarnation, has done; -1 for none
+    former_pid: int | None = None  # of the incarnation that it replaces
 
 
 class WorldEvent(NamedTuple):

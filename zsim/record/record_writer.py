@@ -1,7 +1,7 @@
 """Writes a record during a run, closes it, and repairs one whose writer died.
 
-The end of a record (data end, summary and footer) is derived from the file, by the same code for closing and repair,
-so the writer needs no index in memory.
+Closing and repair use the same code to derive the end of a record (data end, summary and footer) from the file, so the
+writer needs no index in memory.
 """
 
 import struct
@@ -29,12 +29,12 @@ from zsim.record import mcap_layout as layout
 from zsim.record.mcap_layout import HEAD, INDEX_ENTRY, INDEX_HEAD, MESSAGE, MESSAGE_HEAD
 from zsim.record.record_reader import RecordReader
 
-CHUNK_BYTES = 1024 * 1024  # not yet on disk at most, besides the last message
-CHUNK_AGE_NS = 250_000_000  # wall time; with a tick every 0.1 s nothing waits longer than 0.5 s
-CHANNELS_MAX = 65_535  # MCAP counts channels in 16 bits
+CHUNK_BYTES = 1024 * 1024  # maximum not yet on disk, besides the last message
+CHUNK_AGE_NS = 250_000_000  # wall time; with a tick every 0.1 s no message waits longer than 0.5 s
+CHANNELS_MAX = 65_535  # MCAP numbers channels in 16 bits
 _TIME_MAX = 2**64 - 1
 _MEDIA = {"": "msgpack", "application/msgpack": "msgpack", "application/json": "json", "text/json": "json"}  # in MCAP
-_FOOTER_CRC = struct.Struct("<BQQQ")  # the part of the footer that its check sum covers
+_FOOTER_CRC = struct.Struct("<BQQQ")  # part of the footer covered by its checksum
 _FOOTER_LENGTH = 20
 _encode = messages.encode
 
@@ -43,25 +43,25 @@ class RecordWriter:
     """Appends messages to a record; for use by one thread.
 
     The file is readable at any time, even if this process dies: a chunk and its indexes are one write. Memory holds
-    only the open chunk and the names of the keys. If the disk is full or gone, every method raises RecordError; the
-    file is closed at its last whole chunk.
+    only the open chunk and the names of the keys. If the disk is full or lost, every method raises RecordError; the
+    file is closed after its last complete chunk.
     """
 
     def __init__(self, path: str | Path, goes_on: bool = False) -> None:
-        """Create the file, or continue one whose writer died, after its last whole chunk; no file is overwritten.
+        """Create the file or, if `goes_on`, continue it after its last complete chunk; no file is overwritten.
 
         RecordError if the file exists, cannot be continued, or cannot be written.
         """
         self.path = Path(path)
-        self.has_former = False  # whether the file had messages of a former writer
+        self.has_former = False  # whether the file had messages of an earlier writer
         self.refused = 0  # messages on keys beyond the 65 535 that a record can hold
-        self._channels: dict[str, int] = {}  # by key, counted from 1
+        self._channels: dict[str, int] = {}  # by key, numbered from 1
         self._gate_channels = PerPattern(self._channels_of)
         self._schemas: dict[str, int] = {}
-        self._ahead: list[bytes] = []  # schemas and channels that the open chunk is the first to use
+        self._ahead: list[bytes] = []  # new schemas and channels of the open chunk, written before it
         self._open = OpenChunk(CHUNK_BYTES + CHUNK_BYTES // 4)
-        self._seen = (0, 0)  # where the file ended at a tick, and when that tick was
-        self._end = 0  # of the last whole chunk
+        self._seen = (0, 0)  # end of the file at an earlier tick, and wall time of that tick
+        self._end = 0  # of the last complete chunk
         self._error = ""
         self._file = _opened(self.path, "r+" if goes_on else "x+")
         if not goes_on:
@@ -77,7 +77,7 @@ class RecordWriter:
             raise
 
     def _take_up(self) -> None:
-        """Read the channels and schemas of the file as far as it is whole."""
+        """Read the channels and schemas of the complete part of the file."""
         _cut_off(self._file, self.path)
         counts: Counter[int] = Counter()
         self._end = self._file.seek(0, 2)
@@ -101,7 +101,7 @@ class RecordWriter:
         Args:
             key: without the federation's prefix.
             payload: as on the wire.
-            encoding: Zenoh's, e.g. `application/msgpack;Truth`; the first one of a key applies to all its messages.
+            encoding: Zenoh's, e.g. `application/msgpack;Truth`; a key's first encoding applies to all its messages.
             t_ns: simulated time.
             wall_ns: wall clock of the recorder.
         """
@@ -123,7 +123,7 @@ class RecordWriter:
             self._end_chunk()
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
-        """Add the messages of a gate, whose columns have been checked."""
+        """Add the messages of a gate; its columns must have been checked."""
         channels = self._gate_channels.of(gate)
         if channels:
             self._open.add_gate(channels, gate, wall_ns)
@@ -137,15 +137,15 @@ class RecordWriter:
             self._end_chunk()
 
     def _channels_of(self, gate: GateMessages) -> bytes:
-        """Return the channel of each message, int64; empty if channels are exhausted."""
+        """Return the channel of each message as int64; empty if channels are exhausted."""
         names = [gate.table[place] for place in gate.which.tolist()]
         channels = [self._channels.get(key) or self._register(key, messages.encoding(key)) for key in names]
         return np.array(channels, dtype=np.int64).tobytes() if all(channels) else b""
 
     def tick(self, wall_ns: int) -> None:
-        """Write the open chunk to disk when it is old; call it every 0.1 s, even if no message arrives.
+        """Write the open chunk to disk once it is old; must be called every 0.1 s, even if no message arrives.
 
-        `wall_ns` is of a monotonic clock; only its own earlier values are compared with it.
+        `wall_ns` is of a monotonic clock; it is compared only with its own earlier values.
         """
         end, since_ns = self._seen
         if not self._open.size or end != self._end:
@@ -211,7 +211,7 @@ class RecordWriter:
         self._end += len(data)
 
     def _give_up(self, error: OSError) -> NoReturn:
-        """Close the file at its last whole chunk, with as much of a summary as fits on the disk."""
+        """Close the file after its last complete chunk, with as much of a summary as fits on the disk."""
         for ending in (_finish, _finish_bare, None) if self._end else (None,):
             try:
                 self._file.truncate(self._end)
@@ -223,7 +223,7 @@ class RecordWriter:
                 continue
         self._file.close()
         self._error = (
-            f"{self.path}: cannot be written any further ({error.strerror}); "
+            f"{self.path}: cannot be written further ({error.strerror}); "
             f"the record is readable up to byte {self._end}, make room and run again"
         )
         raise RecordError(self._error) from error
@@ -234,17 +234,17 @@ def _opened(path: Path, mode: str) -> FileIO:
     try:
         file = FileIO(path, mode)
     except FileExistsError as error:
-        raise RecordError(f"{path}: exists; a record is never overwritten, name another place") from error
+        raise RecordError(f"{path}: exists; a record is never overwritten, give another path") from error
     except OSError as error:
         raise RecordError(f"{path}: cannot be written ({error.strerror})") from error
     if not take_lock(file):
         file.close()
-        raise RecordError(f"{path}: another process writes it; end that one, or name another place")
+        raise RecordError(f"{path}: another process writes it; end that process, or give another path")
     return file
 
 
 def is_being_written(path: Path) -> bool:
-    """Tell whether a process is writing the record at a path; there may be none."""
+    """Whether a process is writing the record at a path; false if there is no record."""
     if not path.exists():
         return False
     with path.open("rb") as file:
@@ -252,22 +252,22 @@ def is_being_written(path: Path) -> bool:
 
 
 def _time(value: int) -> int:
-    """Return a time representable in MCAP."""
+    """Return a time [ns] limited to MCAP's range."""
     return value if type(value) is int and 0 <= value <= _TIME_MAX else min(max(int(value), 0), _TIME_MAX)
 
 
-_SEQUENCE_MASK = 2**32 - 1  # MCAP counts messages of a channel in 32 bits
+_SEQUENCE_MASK = 2**32 - 1  # MCAP numbers a channel's messages in 32 bits
 
 
 class OpenChunk:
     """The messages not yet on disk: payloads in a buffer and heads as columns, written together.
 
-    Channels are counted from 1. The memory is reused for each chunk: allocating new pages would take longer than
+    Channels are numbered from 1. The memory is reused for each chunk: allocating new pages would take longer than
     everything else here.
 
     Args:
         room: usual size of a chunk with its last message [bytes].
-        counted: messages that each channel had in earlier chunks.
+        counted: number of messages of each channel in earlier chunks.
 
     Attributes:
         size: bytes of its records.
@@ -303,7 +303,7 @@ class OpenChunk:
     def add_gate(self, channels: bytes, gate: GateMessages, wall_ns: int) -> None:
         """Add the messages of a gate, whose buffer has room for a head before each message.
 
-        `channels`: number of each message's, int64.
+        `channels`: channel number of each message, int64.
         """
         if not self.size:
             self.since_ns = wall_ns
@@ -329,19 +329,19 @@ class OpenChunk:
 
 
 class Content:
-    """The records of a chunk; columns of M messages."""
+    """The records of a chunk, as columns of M messages."""
 
     def __init__(self, data: memoryview, channels: NDArray, ends: NDArray, log: NDArray, published: NDArray) -> None:
         self.data = data
         self.first_ns, self.last_ns = int(log.min()), int(log.max())
         self._channels, self._ends, self._log, self._published = channels, ends, log, published
         self._starts = np.concatenate(([0], ends[:-1]))
-        self._order = np.argsort(channels, kind="stable")  # channel by channel, each in the order of arrival
+        self._order = np.argsort(channels, kind="stable")  # by channel, in the order of arrival
 
     def write_heads(self, counted: NDArray) -> NDArray:
         """Write the head of each message; return the number of messages of each channel so far.
 
-        `counted`: messages that channels have had before.
+        `counted`: number of earlier messages of each channel.
         """
         heads = np.empty(len(self._ends), dtype=MESSAGE_HEAD)
         heads["opcode"], heads["channel"] = int(Opcode.MESSAGE), self._channels
@@ -375,10 +375,10 @@ def cut_at_last(path: Path, key: str, is_it: Callable[[bytes], bool]) -> bool:
     """Truncate a record before the last message of a key, to resume its run; return whether there was one.
 
     Args:
-        is_it: tells by the payload whether it is the wanted one.
+        is_it: whether a payload is that of the message sought.
 
     Raises:
-        RecordError: no record, it cannot be written, or another process writes it.
+        RecordError: the file is not a record, cannot be written, or is being written by another process.
     """
     with RecordReader(path) as reader:
         cut = reader.last_chunk(key, is_it)
@@ -399,8 +399,8 @@ def cut_at_last(path: Path, key: str, is_it: Callable[[bytes], bool]) -> bool:
 def repair(path: str | Path) -> bool:
     """Finish a record whose writer died, in place; return whether it was unfinished.
 
-    The record is kept up to its last whole chunk. No process may be writing it. An interruption does no harm: the file
-    is then an unfinished record as before.
+    The record is kept up to its last complete chunk. No process may be writing it. An interruption does no harm: the
+    file then remains an unfinished record.
 
     Raises:
         RecordError: the file is not a record, or cannot be written.
@@ -420,7 +420,7 @@ def repair(path: str | Path) -> bool:
 
 
 def _cut_off(file: FileIO, path: Path) -> None:
-    """Truncate a record after its last whole chunk, or else its header, so that it can be continued from there.
+    """Truncate a record after its last complete chunk, or else its header, so that it can be continued from there.
 
     RecordError if the file is not a record; OSError if it cannot be written.
     """
@@ -434,7 +434,7 @@ def _cut_off(file: FileIO, path: Path) -> None:
                     break
                 if last is None or place.opcode == Opcode.CHUNK:
                     last = place
-            if last is not None:  # the cut may have taken the indexes of its chunk
+            if last is not None:  # the indexes of its chunk may be cut off
                 content = layout.content_of(source, last) if last.opcode == Opcode.CHUNK else None
                 found = layout.indexes_of(content or b"").items()
                 end = last.end
@@ -445,7 +445,7 @@ def _cut_off(file: FileIO, path: Path) -> None:
 
 
 def _finish(file: FileIO) -> None:
-    """Write summary and footer at the end of a file opened for unbuffered reading and writing; OSError without room."""
+    """Write summary and footer at the end of a file opened for unbuffered reading and writing; OSError if full."""
     with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
         summary = _summary(source)
         data_end = layout.packed(DataEnd(layout.crc_until(source, len(source))))
@@ -462,7 +462,7 @@ def _finish(file: FileIO) -> None:
 
 
 def _summary(source: layout.Source) -> dict[Opcode, bytes]:
-    """Return the records of the summary of a data section, by kind, in the order of the file."""
+    """Return the records of a data section's summary by kind, in the order of the file."""
     schemas, channels, chunks = RecordBuilder(), RecordBuilder(), RecordBuilder()
     numbers: Counter[Opcode] = Counter()
     messages: Counter[int] = Counter()
@@ -476,7 +476,7 @@ def _summary(source: layout.Source) -> dict[Opcode, bytes]:
         else:
             head = layout.chunk_head(source, place)
             if head.content > place.end:
-                continue  # readers of the summary would be sent to what they cannot read
+                continue  # the summary would refer readers to an unreadable chunk
             for index in group.indexes:
                 messages[index.channel] += index.messages
             first_ns, last_ns = min(first_ns, head.first_ns), max(last_ns, head.last_ns)
@@ -512,6 +512,6 @@ def _summary(source: layout.Source) -> dict[Opcode, bytes]:
 
 
 def _finish_bare(file: FileIO) -> None:
-    """Write the shortest end that MCAP allows, 50 bytes without a summary; OSError without room."""
+    """Write the shortest end that MCAP allows, 50 bytes without a summary; OSError if the disk is full."""
     file.seek(0, 2)
     layout.write_all(file, layout.packed(DataEnd(0)) + layout.packed(Footer(0, 0, 0)) + layout.MAGIC)

@@ -1,10 +1,10 @@
-"""An agent, alone or in a group: a plain object with inputs and outputs, without Zenoh and wall clock.
+"""An agent, alone or in a group: a plain object with inputs and outputs, independent of Zenoh and wall time.
 
     runner ──receive(key, message)──▶ agent          every input of a gate, in canonical order
     runner ──step(t_ns)────────────▶ agent ──▶ [(key, message), …]
 
 `zsim.runtime.runner` runs it as a process on Zenoh, `zsim.runtime.bus` on an in-memory bus. Both pass the same inputs
-in the same order, so that the outputs are the same to the bit.
+in the same order, so that the outputs are identical to the bit.
 """
 
 import math
@@ -33,7 +33,7 @@ from zsim.scenario.scenario import Radio
 from zsim.schema import plugin
 from zsim.schema.checker import show
 
-_FILLED = ("name", "period_ns", "reads", "gate_keys")  # by `Agent.bind`, where a class leaves them out
+_FILLED = ("name", "period_ns", "reads", "gate_keys")  # set by `Agent.bind` where a class does not define them
 
 
 class Output(NamedTuple):
@@ -50,25 +50,25 @@ class Agent(ABC):
     period_ns: int  # how often it publishes done; a multiple of the gate
     reads: tuple[str, ...]  # key expressions it subscribes to
     gate_keys: tuple[str, ...]  # keys of which one message stamped t closes the gate t, e.g. the drone's sensor/status
-    # drones of which it reads all sensors, so that what their status counts is waited for
+    # drones all of whose sensors it reads: it waits for every message that their status counts
     counted: tuple[str, ...] = ()
-    # keys whose messages belong to no gate: a late one is handed over with the next gate
+    # keys whose messages belong to no gate: a late one is delivered with the next gate
     uncounted: tuple[str, ...] = ()
     writes: tuple[str, ...] = ()  # keys that it publishes at every gate and that others of its process may read
-    serves: tuple[str, ...] = ()  # names of processes whose work it does beside its own
+    serves: tuple[str, ...] = ()  # names of the processes that it replaces, besides its own
     # whether it takes the world's messages of a gate as columns and one buffer, in `receive_gate`
     takes_gates: bool = False
-    repeats: tuple[str, ...] = ()  # keys of its outputs that carry the requests that it took, for `repeat`
-    messages: tuple[type[AgentMessage], ...] = ()  # classes of messages of a user's that it publishes
-    thing = ""  # name of the drone or cluster that it is of: the second part of its own name
-    _flies = ""  # the only drone that it may command, where it is of one
+    repeats: tuple[str, ...] = ()  # keys of its outputs that record the requests it accepted, for `repeat`
+    messages: tuple[type[AgentMessage], ...] = ()  # user's message classes that it publishes
+    thing = ""  # name of its drone or cluster: the second part of its own name
+    _flies = ""  # the only drone that it may command; empty: any
     _links: Links | None = None
     _transmitter: Transmitter | None = None
-    _answered_ns = 0  # the gate whose inputs it took last
+    _answered_ns = 0  # the last gate whose inputs it received
 
     def __init__(self) -> None:
         self._seq: defaultdict[str, int] = defaultdict(int)
-        self._process = ""  # of the group that it is a member of, under whose name it publishes
+        self._process = ""  # name of the group that it belongs to, under which it publishes
 
     def bind(self, info: Info, name: str = "", radio: Radio | None = None) -> None:
         """Fill in the defaults of a user's class before its agent joins the run of `world/info`.
@@ -125,7 +125,7 @@ class Agent(ABC):
 
     @property
     def overhears(self) -> bool:
-        """Tell whether it may read outputs of other agents that close none of its gates."""
+        """Whether it may read outputs of other agents that close none of its gates."""
         return any(not keys.is_sensor(key) and key not in self.gate_keys for key in self.reads)
 
     def update_faults(self, info: Info, faults: Faults) -> None:
@@ -136,9 +136,9 @@ class Agent(ABC):
             self._links.update(faults)
 
     def answer(self, t_ns: int, inputs: Sequence[Input]) -> Sequence[Output] | None:
-        """Process the inputs of a gate; return its outputs, None at a gate at which it does not step.
+        """Process the inputs of a gate; return its outputs, or None at a gate at which it does not step.
 
-        Outputs of a user's class are converted as over Zenoh: types of the contract, finite, Python's own.
+        Outputs of a user's class are converted as they would be over Zenoh, to finite values of the contract's types.
 
         Raises:
             UserCodeError: a user's class raised, or returned an invalid value.
@@ -163,7 +163,7 @@ class Agent(ABC):
 
     @staticmethod
     def held_by(frame: FrameType | None) -> str:
-        """Return which agent has not answered, and its current line, given a frame of the waiting thread; or ""."""
+        """Return which agent has not returned, and its current line, given a frame of its thread; "" if none."""
         line = plugin.innermost_line(frame)
         while frame and frame.f_code is not Agent.answer.__code__:
             frame = frame.f_back
@@ -173,7 +173,7 @@ class Agent(ABC):
         return f"; {agent.name} has not returned at {agent._answered_ns / 1e9:.2f} s{line}"
 
     def failure(self, error: BaseException, t_ns: int) -> UserCodeError | None:
-        """Return an error raised by a user's code with the agent's name and the gate; None for other errors."""
+        """Return an error raised by a user's code, with the agent's name and the gate; None for other errors."""
         return plugin.user_code_error(error, f"{self.name} at {t_ns / 1e9:.2f} s")
 
     @cached_property
@@ -183,22 +183,22 @@ class Agent(ABC):
     def _checked(self, t_ns: int, output: Any) -> Output:
         """Return an output of a user's class as it would be received, with its source.
 
-        A message of the class's own types may be returned without key, stamp and number.
+        A message of the class's own types may lack its key, stamp and number.
         """
         try:
             if isinstance(output, AgentMessage):
                 output = self.message(t_ns, output)
             if not (isinstance(output, tuple) and len(output) == 2 and isinstance(output[0], str)):
                 allowed = "must be of self.command, self.message or zsim.Output"
-                raise DecodeError(f"{show(output)}: is no output; {allowed}")
+                raise DecodeError(f"{show(output)}: is not an output; {allowed}")
             key, message = output
             if isinstance(message, AgentMessage) and type(message) not in self.messages:
-                raise DecodeError(f"{key}: {type(message).__name__} is no message of its class; must be in `messages`")
+                raise DecodeError(f"{key}: {type(message).__name__} is undeclared; must be in its class's `messages`")
             kind = messages.output_type(key)
             if isinstance(message, AgentMessage) and key != message.of(self.thing):
-                raise DecodeError(f"{key}: is another's; must be {message.of(self.thing)}")
+                raise DecodeError(f"{key}: belongs to another agent; must be {message.of(self.thing)}")
             if keys.is_command(key) and keys.thing(key) != self._flies and self._flies:
-                raise DecodeError(f"{key}: commands another's drone; {self.name} may command {self._flies} only")
+                raise DecodeError(f"{key}: commands another agent's drone; {self.name} may command {self._flies} only")
             if isinstance(message, AgentMessage) and message.seq < 0:
                 message = self.message(t_ns, message).message
             if type(message) is not kind:
@@ -215,7 +215,7 @@ class Agent(ABC):
             raise UserCodeError(f"{plugin.full_name(type(self))}.step returns {error}") from error
 
     def deliver(self, t_ns: int, inputs: Sequence[Input]) -> None:
-        """Receive the inputs of a gate in canonical order, after the effect of its links."""
+        """Receive the inputs of a gate in canonical order, after applying its link faults and radio."""
         if self._links is not None and self._links.act_at(t_ns):
             inputs = self._links.delivered(t_ns, self._router.one_by_one(inputs))
         elif not self.takes_gates and not self._process:
@@ -246,17 +246,16 @@ class Agent(ABC):
     def views(self, t_ns: int) -> Sequence[Output]:
         """Return the messages on `view/**` for displays at the gate t_ns, the last one stepped.
 
-        Called only after some gates, at display rate, and never in the same process as the world: nothing may depend
-        on it.
+        Called at display rate, only after some gates, and never in the world's process: nothing may depend on it.
         """
         return ()
 
     def rehearse(self) -> None:
-        """Load and compile the code of the first step; called before joining, so that no gate waits for it."""
+        """Load and compile the code of the first step before joining, so that no gate waits for it."""
         return
 
     def control_keys(self) -> tuple[str, ...]:
-        """Return the keys at which it answers requests, by `control`."""
+        """Return the keys at which `control` answers requests."""
         return ()
 
     def control(self, key: str, request: ControlRequest) -> ControlAnswer:
@@ -264,27 +263,27 @@ class Agent(ABC):
         return ControlAnswer(ok=False, error=f"{key}: {self.name} answers no requests")
 
     def warm_start_keys(self) -> tuple[str, ...]:
-        """Return the keys whose last value a new incarnation takes over, by `warm_start`."""
+        """Return the keys whose last values a new incarnation takes over through `warm_start`."""
         return ()
 
-    def warm_start(self, key: str, message: Any) -> None:  # noqa: B027 - taking over nothing is a choice
+    def warm_start(self, key: str, message: Any) -> None:  # noqa: B027 - optional
         """Take over the last value that the predecessor published."""
 
     def snapshot(self) -> State | None:
-        """Return the state after the gate stepped last as plain values; None if that is not supported.
+        """Return the state after the last gate stepped, as plain values; None if not supported.
 
-        A new agent that takes it over by `restore` continues with the same outputs to the bit.
+        A new agent given this state by `restore` continues with outputs identical to the bit.
         """
         return None
 
-    def restore(self, state: State) -> None:  # noqa: B027 - an agent without a snapshot is never asked to
-        """Take over the state that a predecessor returned by `snapshot`; after an error the agent starts anew."""
+    def restore(self, state: State) -> None:  # noqa: B027 - never called without a snapshot
+        """Take over the state that a predecessor returned from `snapshot`; after an error the agent starts anew."""
 
     def repeat(self, key: str, message: Any) -> None:  # noqa: B027 - most agents answer no requests
-        """Repeat, before the gate of the message, a request that the predecessor published on a key of `repeats`."""
+        """Repeat a request that the predecessor published on a key of `repeats`; called before the message's gate."""
 
     def checkpoint(self) -> State | None:
-        """Return the snapshot with the common state of all agents: sequence numbers and messages held by links."""
+        """Return the snapshot with the state common to all agents: sequence numbers and messages held by links."""
         own = self.snapshot()
         if self._is_own:
             try:
@@ -301,7 +300,7 @@ class Agent(ABC):
         }
 
     def resume(self, info: Info, checkpoint: State) -> None:
-        """Take over a checkpoint; that of another version of this agent may raise any error."""
+        """Take over a checkpoint; one from another version of this agent may raise any error."""
         self.restore(checkpoint["own"])
         self._seq = defaultdict(int, checkpoint["seq"])
         if checkpoint["links"] is not None:
@@ -311,28 +310,28 @@ class Agent(ABC):
             self._transmitter.restore(checkpoint["transmitter"])
 
     def command(self, t_ns: int, drone: str, command: Struct) -> Output:
-        """Return a command to a drone as an output of the gate t_ns; stamp, number and source are filled in.
+        """Return a command to a drone as an output of the gate t_ns, with stamp, number and source.
 
         Args:
-            command: made by `zsim.velocity` and so on.
+            command: from `zsim.velocity` or a similar function.
         """
         key = messages.command_key(drone, command)
         stamp = {"t_ns": t_ns, "seq": self.next_seq(key), "source": self.source}
         return Output(key, replace(command, **stamp))
 
     def message(self, t_ns: int, message: AgentMessage) -> Output:
-        """Return a message to agents, which read it a gate later, as an output; stamp, number, source are filled in."""
-        key = message.of(self.thing)  # its source is the agent, whatever process it shares: its reader may go by it
+        """Return a message to agents, which read it a gate later, as an output with stamp, number and source."""
+        key = message.of(self.thing)  # the source is the agent even in a group, since readers may depend on it
         return Output(key, replace(message, t_ns=t_ns, seq=self.next_seq(key), source=self.name))
 
     def next_seq(self, key: str) -> int:
-        """Return the next sequence number of one of its keys, from 0."""
+        """Return the next sequence number for one of its keys, starting at 0."""
         count = self._seq[key]
         self._seq[key] = count + 1
         return count
 
     def resume_seq(self, key: str, last: int) -> None:
-        """Continue numbering after `last`, so that new messages are distinguishable after a restart."""
+        """Continue numbering after `last`, so that messages after a restart are distinguishable."""
         self._seq[key] = last + 1
 
 
@@ -347,11 +346,11 @@ class AgentGroup(Agent):
 
         AgentGroup([estimators, controller], output_hold_ns(info))     sensors in, estimates and commands out
 
-    A process costs more than its agents; three estimators and a controller in one process are about twice as fast.
+    A process costs more than its agents: three estimators and a controller run about twice as fast in one process.
 
     A member receives each message at the gate at which a separate process would: outputs of other members that close
-    its gate (in their `writes` and its `gate_keys`) immediately, all others through the transport, `hold_ns` after
-    their stamp. The group has the name of its last member, which is also the source of all its messages.
+    its gate (in their `writes` and its `gate_keys`) immediately; all others through the transport, `hold_ns` after
+    their stamp. The group takes the name of its last member, which is also the source of all its messages.
 
     Args:
         members: in any order; each steps at the gates of its own period.
@@ -380,14 +379,14 @@ class AgentGroup(Agent):
         self.uncounted = _joined(member.uncounted for member in members)
         self.repeats = _joined(member.repeats for member in members)
         self._waiting: list[list[Input]] = [[] for _ in members]
-        self._held: list[tuple[int, int, Input]] = []  # until when [ns], and for which member
+        self._held: list[tuple[int, int, Input]] = []  # until when [ns], index of the member, input
         self._routes = RoutingTable([member.reads for member in self._members])
-        self._places: dict[str, list[tuple[int, int]]] = {}  # by key, which members receive it, how long after [ns]
+        self._places: dict[str, list[tuple[int, int]]] = {}  # by key: (receiving member, hold time [ns])
         self._relays = {key: [i for i, closing in enumerate(self._closing) if key in closing] for key in inner}
-        self._whole = [place for place, member in enumerate(self._members) if member.takes_gates]
+        self._gate_takers = [place for place, member in enumerate(self._members) if member.takes_gates]
         readers = [() if member.takes_gates else member.reads for member in self._members]
         self._gates = GateRouter(RoutingTable(readers))
-        self.takes_gates = True  # and takes them apart for its members that do not
+        self.takes_gates = True  # and splits them for members that do not
         for member in members:
             member._process = self.name
 
@@ -400,8 +399,8 @@ class AgentGroup(Agent):
         if places is None:
             places = self._places[key] = []
             for place in self._routes.readers(key):
-                closing = self._closing[place]  # what closes the gate of one member may be read by another only
-                if key not in self._inner & closing:  # else it has been relayed
+                closing = self._closing[place]  # what closes one member's gate may be a plain input of another
+                if key not in self._inner & closing:  # otherwise it has been relayed
                     held = is_held(key, closing, self._members[place].uncounted)
                     places.append((place, self._hold_ns if held else 0))
         for place, hold_ns in places:
@@ -411,7 +410,7 @@ class AgentGroup(Agent):
                 self._waiting[place].append((key, message))
 
     def receive_gate(self, gate: GateMessages) -> None:
-        for place in self._whole:
+        for place in self._gate_takers:
             self._waiting[place].append((keys.GATE, gate))
         for readers, key, message in self._gates.split(gate):
             for place in readers:
@@ -487,7 +486,7 @@ def _joined(parts: Any) -> tuple[str, ...]:
 def _in_order(members: Sequence[Agent]) -> tuple[Agent, ...]:
     """Return the members, each after those whose outputs close its gate; RunError if there is no such order."""
     if not members:
-        raise RunError("a group has no members; must have one at least")
+        raise RunError("a group has no members; must have at least one")
     writers = {key: place for place, member in enumerate(members) for key in member.writes}
     waits_for = {i: [writers[key] for key in m.gate_keys if writers.get(key, i) != i] for i, m in enumerate(members)}
     try:

@@ -5,8 +5,8 @@
     participant.tick()                  health once a second, and a new join after a lost link
     participant.leave("closed")         bye
 
-Of several processes of one name the last one admitted by the world takes part. `AgentParticipant`, for a process that
-runs an agent, also takes over the state of its predecessor and fetches missed messages.
+Of several processes with the same name, the last one admitted by the world takes part. `AgentParticipant`, for a
+process that runs an agent, also takes over the state of its predecessor and fetches missed messages.
 """
 
 import os
@@ -30,12 +30,12 @@ from zsim.transport.session import ReceivedSample, Session
 from zsim.transport.traffic import replay
 
 ANOTHER_RUN = "the world has begun another run"
-REPLAY_S = 2.0  # wall time; a hub answers a replay within milliseconds, over a lost link it never does
-REJOINS_MAX = 6  # unanswered rejoins before one counts as received; a router forwards nothing at first
-RETRY_S = 0.5  # wall time between two attempts at what the world has not answered
-ASKED_MAX = 10  # replays that may lack a lost message: the world also answers from what is still on its way to it
-RESUME_NS = 4_000_000_000  # simulated age up to which a snapshot can be used: the world keeps 5 s of history
-GATES_KEPT = 2  # gates of which the outputs are kept to answer a get (contract); more where the world runs ahead
+REPLAY_S = 2.0  # wall time; a hub answers a replay within milliseconds, over a lost link never
+REJOINS_MAX = 6  # unanswered rejoins until one is assumed received; a new router forwards nothing at first
+RETRY_S = 0.5  # wall time between attempts at an unanswered request to the world
+ASKED_MAX = 10  # replays for a lost message: a message still on its way to the world is missing from the first
+RESUME_NS = 4_000_000_000  # maximum simulated age of a usable snapshot: the world keeps 5 s of history
+GATES_KEPT = 2  # gates whose outputs are kept to answer a get (contract); more if the world runs ahead
 
 
 class Participant:
@@ -43,8 +43,8 @@ class Participant:
 
     Attributes:
         admitted: whether the world has admitted its newest incarnation.
-        successor: host and pid of the process that has taken over the name; empty while it has the name.
-        end_reason: why it has nothing left to do in this run; empty while the run goes on.
+        successor: host and pid of the process that has taken over its name; empty while it has the name.
+        end_reason: why its part in this run is over; empty while the run continues.
     """
 
     def __init__(
@@ -52,22 +52,22 @@ class Participant:
         link: Session,
         info: messages.Info,
         name: str,  # process name, role.thing
-        serves: tuple[str, ...] = (),  # names of processes whose work it does
-        # how far the world may be ahead of what it has reported as done; 0 for a process that never gates
+        serves: tuple[str, ...] = (),  # names of the processes that it replaces
+        # how far the world may be ahead of its last done; 0 for a process that the world does not wait for
         slack_ns: int = 0,
         *,
         period_ns: int = 0,  # how often an agent reports done; 0 for other processes
-        # whether its results depend on its arithmetic; otherwise its join states no fingerprint
+        # whether its results depend on floating-point arithmetic; otherwise its join states no fingerprint
         calculates: bool = True,
         next_seq: Callable[[str], int] | None = None,
     ) -> None:
         self.name = name
-        # whether the world waits for it; it then announces itself once it has subscribed to all that it needs
+        # whether the world waits for it; it then announces itself only after subscribing to all its inputs
         self.gates = slack_ns > 0
         self.now_ns = 0  # simulated time of the newest clock received
-        self.done_ns = -1  # newest gate that it is done with, -1 before the first
+        self.done_ns = -1  # newest gate done, -1 before the first
         self.health = HealthMeter(name.split(".", 1)[0], host=link.host, reads=link.reads)  # counters that it publishes
-        self.must_rejoin = False  # whether the world may have taken it for dead, or another process for it
+        self.must_rejoin = False  # whether the world may consider it dead, or have mistaken another process for it
         self.successor = self.end_reason = ""
         self.next_seq = next_seq or self._count  # returns the number of its next message of a kind, from 0
         self._link, self._info = link, info
@@ -75,7 +75,7 @@ class Participant:
         own = (name, link.host, info.run_id, self.next_seq)
         self._membership = Membership(*own, others, period_ns, slack_ns, calculates)
         self._seq: defaultdict[str, int] = defaultdict(int)
-        self._incarnations: list[int] = []  # the newest last
+        self._incarnations: list[int] = []  # oldest first
         self._renew_incarnation()
         self._was_link_lost = self._has_left = False
 
@@ -112,7 +112,7 @@ class Participant:
         self.publish("join", self._membership.join(self.now_ns))
 
     def done(self, t_ns: int) -> None:
-        """Publish that everything up to a gate is done, if the world waits for this process."""
+        """Publish that all gates up to t_ns are done, if the world waits for this process."""
         if self.gates:
             self.done_ns = max(self.done_ns, t_ns)
             self.publish("done", self._membership.done(t_ns, 0))
@@ -128,12 +128,12 @@ class Participant:
         if self.must_rejoin:
             self.must_rejoin = False
             self.join(again=True)
-            if self.done_ns >= 0:  # the last done may have been lost, or was of the former incarnation
+            if self.done_ns >= 0:  # the last done may be lost, or belong to the former incarnation
                 self.done(self.done_ns)
         self.publish_health()
 
     def publish_health(self) -> None:
-        """Publish health if the last is a wall second old."""
+        """Publish health if the last one is at least one wall second old."""
         if self.health.due():
             self.publish("health", self.health.message(self.now_ns, self.next_seq("health")))
 
@@ -143,7 +143,7 @@ class Participant:
     # Inputs
 
     def update_clock(self, payload: bytes) -> run_messages.Clock | None:
-        """Follow the run by a message on `clock`; return it, None if it cannot be decoded."""
+        """Update the state of the run from a message on `clock`; return it, None if it cannot be decoded."""
         try:
             clock: run_messages.Clock = messages.decode(keys.CLOCK, payload)
         except DecodeError:
@@ -162,7 +162,7 @@ class Participant:
             self.take_entry(entry)
 
     def entry_in(self, payload: bytes) -> ProcessEntry | None:
-        """Return the admission of a process of this name reported by an event, None if there is none."""
+        """Return the admission of a process of this name that an event reports; None if it reports none."""
         try:
             event = messages.read_event(payload)
         except DecodeError:
@@ -181,7 +181,7 @@ class Participant:
         elif not self.admitted or entry.incarnation in self._incarnations:
             return
         elif (entry.host, entry.pid) == (self._link.host, os.getpid()):
-            self.must_rejoin = True  # somebody else has joined under the identity of this process
+            self.must_rejoin = True  # another program has joined under the identity of this process
         else:
             self.successor = f"{entry.host} (pid {entry.pid})"
             self.end_reason = f"another process of this name joined from {self.successor}"
@@ -193,18 +193,18 @@ class Participant:
 class AgentParticipant(Participant):
     """The process of an agent in one run.
 
-    Unanswered requests to the world are repeated (`settle`).
+    `settle` repeats unanswered requests to the world.
     """
 
     def __init__(
         self,
         link: Session,
         info: messages.Info,
-        agent: Agent,  # whose name and sequence numbers it uses
-        take_in: Callable[[ReceivedSample], None],  # takes the messages that a replay brings
+        agent: Agent,  # provides the name and sequence numbers
+        take_in: Callable[[ReceivedSample], None],  # receives the messages of a replay
         say: Callable[[str], None],
         wall_s: Callable[[], float] = time.monotonic,
-        stopped: Callable[[], bool] = lambda: False,  # tells whether the process is to end
+        stopped: Callable[[], bool] = lambda: False,  # whether the process is to end
     ) -> None:
         super().__init__(link, info, agent.name, agent.serves, period_ns=agent.period_ns, next_seq=agent.next_seq)
         self._agent = agent
@@ -217,22 +217,22 @@ class AgentParticipant(Participant):
         self._kept: deque[tuple[int, Sequence[Output]]] = deque(maxlen=GATES_KEPT + ahead)
         self._unsent: Pairs = []
         self._resumed = False
-        self._unproved = 0  # rejoins left to publish until the world is seen to go on with this process …
-        self._proof_ns = 0  # … by coming to a gate beyond this one
+        self._unproved = 0  # rejoins left to publish, unless the world proves to continue with this process …
+        self._proof_ns = 0  # … by passing this gate
         self._missed_since_ns: int | None = None
         self._asked_ns, self._asked = -1, 0
         self._retry_s = 0.0
-        # gate up to which the predecessor has published all outputs; they are not published again
+        # gate up to which the predecessor published all outputs, which are not published again
         self.published_ns = -1
-        self.awaited = False  # whether the world has still to admit this process
-        self.failure: RunError | None = None  # why it cannot take part any longer; None while it can
+        self.awaited = False  # whether the world has yet to admit this process
+        self.failure: RunError | None = None  # why it can no longer take part; None while it can
 
     # Taking over from a predecessor
 
     def resume(self) -> int | None:
         """Restore the agent from the newest snapshot of its predecessor; return its time, None if unusable.
 
-        The world's history must reach back to it: the messages since are fetched and stepped through again.
+        The world's history must reach back to the snapshot: later messages are fetched and processed again.
         """
         for sample in self._last_values(keys.process(self.name, "snapshot")):
             fresh = self._agent.checkpoint()
@@ -244,25 +244,25 @@ class AgentParticipant(Participant):
                     found = f"it is of version {snapshot.version}, and {age_ns / 1e9:.2f} s old"
                     raise DecodeError(f"{found}; must be of version {VERSION}, and 0 to {RESUME_NS / 1e9:g} s old")
                 self._agent.resume(self._info, unpack(snapshot.state))
-            except Exception as error:  # it may come from any program, and a user's class reads it
-                self._say(f"{self.name}: its former snapshot is of no use: {error or type(error).__name__}")
+            except Exception as error:  # any program may have written it, and a user's class reads it
+                self._say(f"{self.name}: its last snapshot is unusable: {error or type(error).__name__}")
                 if fresh is not None:
-                    self._agent.resume(self._info, fresh)  # not half of the former state
+                    self._agent.resume(self._info, fresh)  # the former state may be half restored
                 continue
-            self._say(f"{self.name}: goes on from its snapshot of t = {snapshot.t_ns / 1e9:.2f} s")
+            self._say(f"{self.name}: continues from its snapshot of t = {snapshot.t_ns / 1e9:.2f} s")
             self.done_ns = self.now_ns = snapshot.t_ns
             self._resumed = True
             return self.done_ns
         return None
 
     def warm_start(self) -> int | None:
-        """Pass the agent the last values of its predecessor; return their time, None without any."""
+        """Pass the last values of its predecessor to the agent; return their time, None if there are none."""
         for key in self._agent.warm_start_keys():
             for sample in self._last_values(key):
                 try:
                     message = messages.decode(key, sample.payload)
                 except DecodeError as error:
-                    self._say(f"{self.name}: cold start, the last value is of no use: {error}")
+                    self._say(f"{self.name}: cold start, the last value is unusable: {error}")
                     continue
                 self._agent.warm_start(key, message)
                 self._agent.resume_seq(key, message.seq)
@@ -273,13 +273,13 @@ class AgentParticipant(Participant):
         return self.done_ns
 
     def _last_values(self, key: str) -> list[ReceivedSample]:
-        """Return the world's last values of a key, waiting for a world that answers.
+        """Return the world's last values of a key, waiting until a world answers.
 
-        A dead world is restarted, and an agent that did not wait for it would lose its former state.
+        A dead world is restarted; an agent that did not wait for it would lose its former state.
         """
         while not self._stopped():
             found = self._link.get_surely(key)
-            if not found and self._link.get_surely(keys.INFO):  # there is a world, which may have come just now
+            if not found and self._link.get_surely(keys.INFO):  # a world is there, possibly only since now
                 found = self._link.get_surely(key)
                 if found is not None:
                     return found
@@ -289,7 +289,7 @@ class AgentParticipant(Participant):
         return []
 
     def check_reach(self, t_ns: int, snapshot_ns: int) -> None:
-        """Raise if the first gate replayed by the world is not the one after a snapshot."""
+        """Set `failure` if the first gate that the world replays is not the one after a snapshot."""
         if t_ns > snapshot_ns + self._info.gate_ns:
             self._fail_behind(f"the gates after its snapshot of t = {snapshot_ns / 1e9:.2f} s are")
 
@@ -305,7 +305,7 @@ class AgentParticipant(Participant):
         self._retry_s = self._wall_s() + RETRY_S
 
     def publish_gate(self, t_ns: int, outputs: Sequence[Output]) -> None:
-        """Encode the outputs of a gate and the done that counts them, for `send`."""
+        """Queue the outputs of a gate and the done that counts them for `send`."""
         self._kept.append((t_ns, outputs))
         self.now_ns = self.done_ns = max(self.done_ns, t_ns)
         done = self._membership.done(t_ns, _counted(outputs))
@@ -315,9 +315,9 @@ class AgentParticipant(Participant):
         self._unsent.append((self._done_key, messages.encode(done)))
 
     def publish_snapshot(self, t_ns: int) -> None:
-        """Encode the state of the agent after a gate, for `send`, if it offers one.
+        """Queue a snapshot of the agent after a gate for `send`, if it offers one.
 
-        UserCodeError: a user's class returned a state that is not of plain values.
+        UserCodeError if a user's class returned a state other than plain values.
         """
         state = self._agent.checkpoint()
         if state is None:
@@ -326,7 +326,7 @@ class AgentParticipant(Participant):
         self._unsent.append((keys.process(self.name, "snapshot"), messages.encode(snapshot)))
 
     def send(self) -> None:
-        """Publish everything encoded since the last call at once, which wakes readers less often."""
+        """Publish everything queued since the last call at once, which wakes readers less often."""
         if self._unsent:
             unsent, self._unsent = self._unsent, []
             self._link.put_all(unsent)
@@ -356,26 +356,26 @@ class AgentParticipant(Participant):
             advice = "this one ends. Give each process its own name."
             self.failure = SupersededError(f"{self.name}: {self.end_reason}; {advice}")
         elif self.must_rejoin and not is_rejoining:
-            self._say(f"{self.name}: somebody else has joined as this process; it joins again")
+            self._say(f"{self.name}: another program has joined as this process; joining again")
             self.come_back()
 
     # Catching up and coming back
 
     @property
     def owes(self) -> bool:
-        """Tell whether a request to the world is unanswered."""
+        """Whether a request to the world is unanswered."""
         return self.must_rejoin or self._unproved > 0 or self.is_fetching
 
     @property
     def is_fetching(self) -> bool:
-        """Tell whether messages since a snapshot remain to be fetched."""
+        """Whether messages since a snapshot remain to be fetched."""
         return self.awaited or self._missed_since_ns is not None
 
     def ask_again(self, t_ns: int, missing: str) -> None:
         """Fetch the missing messages of a gate, for example after a cut link."""
         if t_ns != self._asked_ns:
             self._asked_ns, self._asked, self._retry_s = t_ns, 0, 0.0
-            self._say(f"{self.name}: {missing} of t = {t_ns / 1e9:.2f} s did not come; asking for it again")
+            self._say(f"{self.name}: {missing} of t = {t_ns / 1e9:.2f} s did not arrive; requesting it again")
         if self._asked >= ASKED_MAX:
             self._fail_behind(f"{missing} of t = {t_ns / 1e9:.2f} s is")
             return
@@ -395,12 +395,12 @@ class AgentParticipant(Participant):
         self.settle()
 
     def settle(self) -> None:
-        """Repeat unanswered requests to the world, unless made a moment ago."""
+        """Repeat unanswered requests to the world, at most every RETRY_S."""
         if not self.owes or self._wall_s() < self._retry_s:
             return
         if self.must_rejoin:
             info = read_info(self._link)
-            if info is not None:  # a world answers; it must still be that of the same run
+            if info is not None:  # a world answers, perhaps that of another run
                 self.must_rejoin = False
                 if info.run_id == self._info.run_id:
                     self._unproved = REJOINS_MAX
@@ -421,7 +421,7 @@ class AgentParticipant(Participant):
         self._retry_s = self._wall_s() + RETRY_S
 
     def _publish_again(self) -> None:
-        """Join, and repeat the outputs and dones that may have been lost."""
+        """Join, and repeat the outputs and dones that may be lost."""
         self.join()
         for t_ns, outputs in self._kept:
             for key, message in outputs:

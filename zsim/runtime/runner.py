@@ -1,6 +1,6 @@
 """Runs an agent as a process on Zenoh: joins the run, feeds the agent gate by gate, publishes done, leaves.
 
-Lockstep and realtime share one loop: lockstep waits for an incomplete gate, realtime gives it up when the next one
+Lockstep and realtime share one loop: lockstep waits for an incomplete gate; realtime stops waiting when the next one
 arrives.
 """
 
@@ -27,9 +27,9 @@ from zsim.scenario.faults import PROCESS_KILL
 from zsim.schema import plugin
 from zsim.transport.session import Query, RawSample, ReceivedSample, Session, Subscription
 
-TICK_S = 0.1  # how often a stop, and what the world has not answered, is looked for while nothing arrives
-DRAIN_S = 1.0  # how long the last gates are waited for once the run has ended
-VIEW_PERIOD_S = 1 / 20  # contract: at most 30 Hz wall; a console draws 20 pictures a second
+TICK_S = 0.1  # interval of checks for a stop and for unanswered requests while nothing arrives
+DRAIN_S = 1.0  # how long to wait for the last gates once the run has ended
+VIEW_PERIOD_S = 1 / 20  # wall time; the contract allows 30 Hz, a console draws 20 frames per second
 
 
 class Runner:
@@ -40,11 +40,11 @@ class Runner:
         link: Session,
         info: messages.Info,
         agent: Agent,
-        stopped: Callable[[], bool] = lambda: False,  # asked every TICK_S; True ends the process with a bye
+        stopped: Callable[[], bool] = lambda: False,  # called every TICK_S; True ends the process with a bye
         say: Callable[[str], None] = lambda text: None,
-        # asked at the end; True leaves without a bye, as a process that dies, so that the world waits for a successor
+        # called at the end; True leaves without a bye, as if it died, so that the world waits for a successor
         deserted: Callable[[], bool] = lambda: False,
-        snapshot_ns: int = 0,  # simulated time between two snapshots of the agent; 0 for none
+        snapshot_ns: int = 0,  # simulated time between snapshots of the agent; 0: none
     ) -> None:
         self._link = link
         self._info = info
@@ -63,14 +63,14 @@ class Runner:
         self._resumed_ns: int | None = None
         self._list_seq = -1
         self._kills: dict[int, run_messages.Fault] = {}  # by id
-        self._lives_after_ns: int | None = None  # faults up to this gate were to kill a predecessor
+        self._lives_after_ns: int | None = None  # kills up to this gate concerned a predecessor
         self._lacks = False
         self._view_wall_s = 0.0
         self._end_ns: int | None = None
         self._end_wall_s = 0.0
         self._leave: str | None = None
         self._over = threading.Event()
-        self.killed = False  # whether a fault has ended it, without a bye; its process is to die as well
+        self.killed = False  # whether a fault ended it, without a bye; its process must then die too
 
     def run(self) -> str:
         """Take part until the run ends; return the reason for leaving.
@@ -134,13 +134,13 @@ class Runner:
                 self._leave = self._leave or "session closed"
 
     def _ready_gate(self) -> int | None:
-        """Return the gate to step now, None if the agent must wait."""
+        """Return the gate to step now; None if the agent must wait."""
         inbox, member = self._inbox, self._member
         t_ns = inbox.next_gate_ns()
         self._lacks = False
         if t_ns is None or member.awaited:
             return None
-        if self._resumed_ns is not None:  # the gate after the snapshot must be there: the world replays it
+        if self._resumed_ns is not None:  # the world must have replayed the gate after the snapshot
             if member.is_fetching:
                 return None
             if not inbox.may_skip:
@@ -155,12 +155,12 @@ class Runner:
             lost = inbox.lost(t_ns)
             if lost is None or self.health.link_lost:
                 return None
-            member.ask_again(t_ns, lost)  # it will not come any more by itself
+            member.ask_again(t_ns, lost)  # it will not arrive without a request
             self._lacks = inbox.missing(t_ns) is not None
             return None if self._lacks else t_ns
         if inbox.latest_gate_ns() == t_ns:
             return None
-        self.health.dropped += 1  # the next gate is there: this one is stepped with what has come
+        self.health.dropped += 1  # the next gate has arrived: step this one with the messages received
         return t_ns
 
     def _step(self, t_ns: int) -> None:
@@ -184,7 +184,7 @@ class Runner:
                 self._link.put(key, message)
         if self._lives_after_ns is None:
             self._lives_after_ns = t_ns - self._agent.period_ns
-        for fault in self._kills.values():  # it ends in one of the gates that it has lived; their outputs still go out
+        for fault in self._kills.values():  # only kills within its own gates count; their outputs are still sent
             lives_after_ns = max(self._lives_after_ns, self._member.published_ns)
             if lives_after_ns < fault.from_ns + self._info.gate_ns <= t_ns:
                 self._leave, self.killed = f"killed by fault {fault.id}", True
@@ -195,8 +195,8 @@ class Runner:
     def _update_kills(self, faults: run_messages.Faults) -> None:
         """Update the faults that kill this process from a published list.
 
-        A kill that has begun remains although newer lists omit it, since a late process has yet to reach it; a kill
-        that has not begun and is not on the list was cleared.
+        A kill that has begun remains even if newer lists omit it, since a late process has yet to reach it; a kill that
+        has not begun and is not on the list was cleared.
         """
         if faults.seq > self._list_seq:
             self._list_seq = faults.seq
@@ -266,7 +266,7 @@ class RunnerInputs:
         self._health = health
         self._say = say
         self._is_realtime, self._gate_ns = info.mode == "realtime", info.gate_ns
-        self._blocking: Subscription | None = None  # where `wait` waits
+        self._blocking: Subscription | None = None  # subscription on which `wait` is waiting
         self._external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
         of_drivers = [key for key in agent.gate_keys if keys.parts(key)[1] in self._external]
         self.inbox = Inbox(
@@ -278,19 +278,19 @@ class RunnerInputs:
         self._subscriptions: dict[str, Subscription] = {}
         self._expressions = RoutingTable([[expression] for expression in agent.reads])
         self._table = run_key_table(info)
-        # on which the sensors of a gate come as GateMessages; those of external drones come singly, from drivers
+        # key of the gate's sensor messages as GateMessages; drivers publish those of external drones singly
         of_world = [drone for drone in agent.counted if drone not in self._external]
         self._gate_key = ""
         if of_world and len(agent.counted) > 1:
             self._gate_key = keys.GATE
         elif of_world and agent.takes_gates:
             self._gate_key = keys.gate(of_world[0])
-        self.rare: deque[WorldEvent | Query | bool] = deque()  # to be served in turn; a bool: whether the link is up
+        self.rare: deque[WorldEvent | Query | bool] = deque()  # served in order; a bool says whether the link is up
         self._fault_lists: deque[run_messages.Faults] = deque()
         self._repeated: dict[int, dict[tuple[str, int], Any]] = {}  # by gate, then by key and number
 
     def subscribe(self) -> None:
-        """Subscribe to the agent's keys, declare its request keys and its liveliness token."""
+        """Subscribe to the agent's keys; declare its request keys and liveliness token."""
         closing = [self._agent.reads[place] for place in self._expressions.readers_of_any(self._agent.gate_keys)]
         for expression in dict.fromkeys([*closing, *self._agent.reads]):
             of_world = keys.is_sensor(expression) and keys.thing(expression) not in self._external
@@ -321,13 +321,13 @@ class RunnerInputs:
             subscription.wake()
 
     def take_in_all(self) -> None:
-        """Take in messages, gate-closing ones first, so that messages received before them are found too."""
+        """Receive messages, gate-closing keys first, so that messages that arrived before them are not missed."""
         for subscription in self._subscriptions.values():
             for sample in subscription.drain():
                 self._open(sample)
 
     def _open(self, sample: ReceivedSample) -> None:
-        """Take in a message, or the messages of a gate."""
+        """Put a message, or the messages of a gate, into the inbox."""
         if sample.key != self._gate_key:
             self.take_in(sample)
             return
@@ -372,13 +372,13 @@ class RunnerInputs:
         return sorted((faults for faults in lists if faults.t_ns < t_ns), key=lambda faults: faults.seq)
 
     def repeated(self, t_ns: int) -> Iterator[tuple[str, Any]]:
-        """Remove and yield the requests that the predecessor took before a gate."""
+        """Remove and yield the requests that the predecessor accepted before a gate."""
         if self._repeated:
             for (key, _), request in sorted(self._repeated.pop(t_ns, {}).items(), key=itemgetter(0)):
                 yield key, request
 
     def ignore_estimates(self, process: str) -> None:
-        """Stop waiting for the estimates of a process: those that it published last, or those of its name."""
+        """Stop waiting for the estimates that a process published last, or for those that its name implies."""
         for key, stock in self._stock.items():
             if process == (self._estimated_by.get(key) or stock):
                 self.inbox.expect(key, NEVER_NS)
@@ -395,7 +395,7 @@ class RunnerInputs:
         try:
             read = messages.read_event(sample.payload)
         except DecodeError:
-            self._health.refused += 1  # of somebody else; the world's own events can be read
+            self._health.refused += 1  # from another program; the world's own events are valid
             return
         if read is not None:
             self._on_rare(read)

@@ -38,32 +38,34 @@ from zsim.sensors.stock_sensors import BOARD_RATE_HZ
 from zsim.vehicles.vehicle import Vehicle, lift_shares
 
 FIRMWARE_STEP_US = round(1e6 / BOARD_RATE_HZ)  # us, the firmware's own step
-TEMPLATE_ROBOTS_MIN = 3  # fewer are in one line
-TEMPLATE_WIDTH_MIN_M = 0.1  # m, chosen: anything is; where a formation may fly, the controller asks for more
-WORLD_DEATHS = ("restart", "end")  # of `on_death`: nobody else keeps the run
-LIFT_SHARE_MAX = 0.9  # of what the rotors lift; the rest is left for control
-TOP_COSINE, TOP_DEPTH_M = 0.999, 0.001  # of a roof's normal to the vertical; how deep a drone on it may be
-UPON_COSINE = 0.5  # of the same of a surface, which is no wall up to 60 deg; chosen
-THRUST_SHARE_MIN = 0.005  # of the rotors' lift, in a hover, chosen: racers that lift fifteen times themselves have .07
-TILT_FREE_DEG = 30.0  # deg, allowed to whatever is light enough to fly
-# Chosen, a decade or more beyond what flies: 60 to 400 W/kg from racers' hover to large rotors; 3 min to 2 h
+TEMPLATE_ROBOTS_MIN = 3  # robots; fewer are always collinear
+TEMPLATE_WIDTH_MIN_M = 0.1  # m, chosen: any real formation is wider; the controller requires more in flight
+WORLD_DEATHS = ("restart", "end")  # `on_death` of the world; no other process can continue the run
+LIFT_SHARE_MAX = 0.9  # maximum weight over the rotors' maximum lift; the rest is left for control
+TOP_COSINE, TOP_DEPTH_M = 0.999, 0.001  # minimum cosine of a roof's slope; maximum penetration by a drone on it
+UPON_COSINE = 0.5  # minimum cosine of the slope on which a drone may stand; chosen: steeper than 60 deg is a wall
+THRUST_SHARE_MIN = (
+    0.005  # minimum hover thrust over maximum lift; chosen: 0.07 in racers that lift 15 times their weight
+)
+TILT_FREE_DEG = 30.0  # deg, allowed to any drone that is light enough to fly
+# Chosen, a decade or more beyond real drones, which take 60 (large rotors) to 400 W/kg (racers) for 3 min to 2 h
 HOVER_W_KG = (3.0, 10_000.0)  # W/kg of electric power for the rotors
 HOVER_S = (10.0, 86_400.0)  # s on a full battery
 TIP_MAX_M_S = 340.3  # m/s, speed of sound at 15 deg C, ISO 2533; propellers lose their thrust near it
-# m/s, chosen: no multirotor falls so slowly. Falls of those of 20 g to 1 kg are tested at 7 to 24 m/s (Svaty et al.,
-# PLoS ONE 20 (2025) e0320073); by its drag an AR.Drone falls at 17 m/s, a Crazyflie at 43 m/s.
+# m/s, chosen: no multirotor falls so slowly. Those of 20 g to 1 kg fall at 7 to 24 m/s in tests (Svaty et al.,
+# PLoS ONE 20 (2025) e0320073); with the drag modelled here an AR.Drone falls at 17 m/s, a Crazyflie at 43 m/s.
 AIR_M_S = 2.0
-# of mass times arm_m squared, chosen: that of the AR.Drone about z is 0.35, of a ring of rotors 1
+# maximum inertia over mass_kg arm_m^2; chosen: the AR.Drone's about z is 0.35, that of a ring of rotors 1
 INERTIA_MAX_MR2 = 10.0
-LEAST_K1 = -4 / 27  # over the squared tangent of half the diagonal: where r + k1 r^3 turns back
-RESERVED_ROLES = (OPERATOR, "agent", "python", "test")  # of processes that zsim names, beside its roles
-SIGHTED_MAX = 12  # drones of a cluster: each of its estimators has the states of all; the cost grows by the square
+LEAST_K1 = -4 / 27  # minimum k1 times the squared tangent of half the diagonal; below it r + k1 r^3 turns back
+RESERVED_ROLES = (OPERATOR, "agent", "python", "test")  # used in names of zsim's own processes, in addition to ROLES
+SIGHTED_MAX = 12  # drones of a cluster: each of its estimators holds the states of all; the cost grows with the square
 
 
 def cross_faults(
     scenario: Any,
-    vehicles: Mapping[str, Vehicle],  # by model; what depends on a vehicle that is not among them is left out
-    unread: Collection[str] = (),  # names of sensors that it lacks, since their modules could not be read
+    vehicles: Mapping[str, Vehicle],  # by model; checks that need a missing vehicle are skipped
+    unread: Collection[str] = (),  # names of sensors missing from it because their modules could not be read
 ) -> Iterator[Fault]:
     """Yield every fault between fields of a scenario, or of its parts returned by `checker.sound`."""
     drones, clusters = _entries(scenario.drones), _entries(scenario.clusters)
@@ -124,7 +126,7 @@ def unflown_plans(scenario: Scenario) -> list[str]:
     return lines
 
 
-_Entries = list[tuple[int, Any]]  # sound entries of a list, with their places in it
+_Entries = list[tuple[int, Any]]  # sound entries of a list, with their indices
 
 
 def _entries(items: list[Any] | None) -> _Entries:
@@ -244,7 +246,7 @@ def _surface_faults(
             continue
         try:
             sheet = hold(sheet_of(SimpleNamespace(surfaces=[surface])))
-        except ValueError:  # its triangles are no such text, which is a fault of its own
+        except ValueError:  # invalid triangles are reported as a fault of their own
             continue
         least = np.array([_clearance_m(drone, vehicles) for _, drone in placed])
         places = np.array([drone.position_m for _, drone in placed])
@@ -263,7 +265,7 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
     gravity = scenario.environment and scenario.environment.gravity_m_s2
     vehicle = vehicles.get(drone.model) if drone.model else None
     if vehicle and _known(drone.thrust_n_s2, high):
-        scale = math.sqrt(math.sqrt(drone.thrust_n_s2 / vehicle.thrust_n_s2))  # larger may be a wrong unit of that
+        scale = math.sqrt(math.sqrt(drone.thrust_n_s2 / vehicle.thrust_n_s2))  # larger may come from a wrong unit
         radius_m = vehicle.rotor_radius_m * min(1.0, scale)
         if radius_m * high > TIP_MAX_M_S:
             tip = f"so that the tip of a rotor of {radius_m:.3g} m moves at {radius_m * high:.0f} m/s"
@@ -292,12 +294,12 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
 
 
 def _drag_faults(drone: Any, rotors: int) -> Iterator[Fault]:
-    """Yield drag coefficients in a wrong unit, by which slow air would push as hard as the weight.
+    """Yield drag coefficients in a wrong unit, with which slow air would push as hard as the weight.
 
-    One that is too small cannot be distinguished from an omitted one.
+    A coefficient that is too small cannot be distinguished from an omitted one.
     """
     weight, v = drone.mass_kg * G_M_S2, AIR_M_S
-    of_rotors = rotors * math.sqrt(weight / (rotors * drone.thrust_n_s2))  # rad/s, the speeds of all in a hover
+    of_rotors = rotors * math.sqrt(weight / (rotors * drone.thrust_n_s2))  # rad/s, sum of the rotor speeds in a hover
     speeds = {
         "drag_n_s_m": (v, "N s/m"),
         "aerodynamics.linear_drag_n_s_m": (v, "N s/m"),
@@ -344,7 +346,7 @@ def _hover_faults(drone: Any, vehicle: Vehicle, environment: Any) -> Iterator[Fa
     density = environment.air_density_kg_m3
     if not _known(torque, density):
         return
-    thin = density / SEA_LEVEL_KG_M3  # by which the coefficients are less
+    thin = density / SEA_LEVEL_KG_M3  # factor by which thin air reduces the coefficients
     speeds = np.sqrt(weight * shares / (count * thrust * thin))
     if low is not None and speeds.min() <= low < high:
         yield "rotor_min_rad_s", f"is {low:g}; must be < {speeds.min():.1f}, the speed of a rotor in a hover"
@@ -353,7 +355,7 @@ def _hover_faults(drone: Any, vehicle: Vehicle, environment: Any) -> Iterator[Fa
     least, greatest = (each * drone.mass_kg for each in HOVER_W_KG)
     if not least <= power <= greatest:
         takes = f"so that a hover takes {power:.3g} W"
-        units = "check its unit, N m s^2: of a torque per thrust in m, this times thrust_n_s2"
+        units = "check its unit, N m s^2: multiply a torque per thrust in m by thrust_n_s2"
         yield "torque_nm_s2", f"is {torque:g}, {takes}; sane: {least:.3g} to {greatest:.3g} W for its mass; {units}"
     elif drone.battery_mah is not None:
         power += battery.electronics_w
@@ -392,7 +394,7 @@ def _own_sensor_faults(drones: _Entries) -> Iterator[Fault]:
             if message in taken:
                 yield path, f"is {show(message)}, which is a message of the contract; must be another"
             elif fields_of.setdefault(message, section[DECLARED]["fields"]) != section[DECLARED]["fields"]:
-                yield path, f"is {show(message)}, which another sensor has with other fields; must be a name of its own"
+                yield path, f"is {show(message)}, which another sensor declares with other fields; must be unique"
             other, module = first.setdefault(name, (index, section[MODULE]))
             if module != section[MODULE]:
                 difference = f"is {show(section[MODULE])}, and {show(module)} in drones[{other}]"
@@ -452,7 +454,7 @@ def _template_faults(spec: Any, starts: list[Any], robots: int) -> Iterator[Faul
     elif template and len(template) != robots:
         yield "template_m", f"has {len(template)} places; must have {robots}, one for each robot"
     elif space != "template":
-        return  # a class of the user's own judges its template itself
+        return  # a user's class checks its own template
     elif template and _known(*template) and _in_line(template):
         yield "template_m", f"is in one line, within {TEMPLATE_WIDTH_MIN_M:g} m; must span a plane or space"
     elif not template and len(starts) == robots and _known(*starts) and _in_line(starts):
@@ -514,7 +516,7 @@ def _reference_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> It
                 count = len(exchange.drones)
                 yield f"{at}.places_m", f"has {len(stage.places_m)} places; must have {count}, one for each drone"
             if _known(stage.start_s, before_s) and stage.start_s < before_s:
-                yield f"{at}.start_s", f"is {stage.start_s:g}; must be >= {before_s:g}, the end of what is before it"
+                yield f"{at}.start_s", f"is {stage.start_s:g}; must be >= {before_s:g}, the end of the stage before"
             if _known(stage.start_s, stage.over_s):
                 before_s = stage.start_s + stage.over_s
         yield from _under(path, _landing_faults(exchange, before_s))
@@ -528,7 +530,7 @@ def _path_faults(reference: Any) -> Iterator[Fault]:
     if given and reference.start_s is None:
         yield "start_s", f"is missing; must say when {given[0]} begins"
     if not given and reference.start_s is not None:
-        yield "start_s", f"is {reference.start_s:g}, and nothing begins; must be left out, or one of {', '.join(PATHS)}"
+        yield "start_s", f"is {reference.start_s:g} without a path; must be left out, or with one of {', '.join(PATHS)}"
     if _known(reference.start_s, reference.takeoff_s) and reference.start_s < reference.takeoff_s:
         yield "start_s", f"is {reference.start_s:g}; must be >= takeoff_s ({reference.takeoff_s:g})"
     for name in ("constants", "duration_s"):
@@ -544,7 +546,7 @@ def _path_faults(reference: Any) -> Iterator[Fault]:
 
 def _landing_faults(piloted: Any, from_s: float | None) -> Iterator[Fault]:
     if _known(piloted.land_s, from_s) and piloted.land_s <= from_s:
-        yield "land_s", f"is {piloted.land_s:g}; must be > {from_s:g}, when it is still to fly"
+        yield "land_s", f"is {piloted.land_s:g}; must be > {from_s:g}, until which it flies"
 
 
 def _piloted(scenario: Any, drones: _Entries) -> _Entries:

@@ -1,7 +1,7 @@
-"""The faults that can be injected into a run: their kinds, the checks of a description, and the typed form.
+"""The faults that can be injected into a run: their kinds, checks of descriptions, and the form typed in a terminal.
 
-A fault is given as a map: `kind`, `target`, `at_s`, `for_s`, and the parameters of its kind; scenarios, requests and
-commands are checked by the same tables. In a terminal and in the console it is typed:
+A fault is described by a map: `kind`, `target`, `at_s`, `for_s`, and the parameters of its kind. The same tables check
+scenarios, requests and commands. In a terminal or the console, a fault is typed:
 `drone2 gps_dropout probability=0.5 --for 10s`.
 """
 
@@ -26,12 +26,12 @@ Shape = Literal["number", "vector", "choice", "word", "flag", "places"]
 
 ROTORS = ("front_left", "front_right", "rear_right", "rear_left")  # in the order of truth's rotor_rad_s
 PROCESS_KILL = "process_kill"
-VECTOR_SIZE = 3  # numbers of a bias that is given as a list
-ORIGIN = (0.0, 0.0, 0.0)  # m in W: where a process is that no `place` names
-FOR_EVER_S = 1e6  # s, as the longest scenario
-UNGATED = ("world", "recorder", "console", "gateway", "router")  # roles that no gate waits for: they ignore faults
-ALIKE = 0.85  # of difflib, chosen: from here on, words as long as "controller" differ by a slip of the hand
-COMMON = ("kind", "target", "at_s", "for_s")  # what every fault may have; the rest are parameters
+VECTOR_SIZE = 3  # numbers in a bias given as a list
+ORIGIN = (0.0, 0.0, 0.0)  # m in W, position of a process that no `place` gives
+FOR_EVER_S = 1e6  # s, length of the longest scenario
+UNGATED = ("world", "recorder", "console", "gateway", "router")  # roles outside the lockstep, which ignore faults
+ALIKE = 0.85  # minimum ratio of difflib, chosen: at this ratio, words as long as "controller" differ by a typing error
+COMMON = ("kind", "target", "at_s", "for_s")  # fields of every fault; all others are parameters
 
 
 class FaultParameter(NamedTuple):
@@ -39,28 +39,27 @@ class FaultParameter(NamedTuple):
 
     name: str
     shape: Shape
-    description: str  # what it is, for tables
-    unit: str = ""  # of the number or vector; empty for one without
-    least: float = -1e9  # limits, each of a vector's entries
+    description: str  # for tables
+    unit: str = ""  # of the number or vector; empty if dimensionless
+    least: float = -1e9  # limits, also of each entry of a vector
     most: float = 1e9
     above: bool = False  # whether `least` itself is not allowed
-    choices: tuple[str, ...] = ()  # of a word
-    default: Any = None  # its value where it is left out
-    required: bool = True  # whether it must not be left out
-    mildest: float = 0.0  # number at which the fault has no effect
+    choices: tuple[str, ...] = ()  # allowed words
+    default: Any = None  # value if omitted
+    required: bool = True  # whether it must be given
+    mildest: float = 0.0  # value at which the fault has no effect
 
 
 class FaultKind(NamedTuple):
     """One kind of fault."""
 
-    # its target: a drone; the world; a link "a/b" of two processes; the drones of a cluster, or of the world, on the
-    # radio; a process
+    # a drone; the world; a link "a/b" between two processes; the radio of a cluster's or all drones; a process
     strikes: Target
-    description: str  # what it does, for tables
+    description: str  # of its effect, for tables
     parameters: tuple[FaultParameter, ...] = ()
-    # "ends" needs `for_s`, "once" takes none, "any" takes it or lasts until it is cleared
+    # "ends" requires `for_s`, "once" forbids it; "any" allows it, and without it lasts until cleared
     lasts: Literal["any", "ends", "once"] = "any"
-    sensor: str = ""  # which it strikes, that a drone need not have
+    sensor: str = ""  # affected sensor, which not every drone has
 
 
 def _number(
@@ -71,7 +70,7 @@ def _number(
 
 _PROBABILITY = FaultParameter("probability", "number", "of each sample", "", 0.0, 1.0, default=1.0, required=False)
 _FACTOR = _number("factor", "by which the standard deviation grows", "", 1.0, 1e6, above=True, mildest=1.0)
-ROTOR = FaultParameter("rotor", "choice", "which", choices=(*ROTORS, "all"))  # of a vehicle: its own names, and all
+ROTOR = FaultParameter("rotor", "choice", "which", choices=(*ROTORS, "all"))  # a vehicle may name its own rotors
 _ONE_WAY = FaultParameter("one_way", "flag", "from the first to the second only", default=False, required=False)
 
 _RADIO = (
@@ -86,15 +85,15 @@ _RADIO = (
 class SensorPart(NamedTuple):
     """Values of a sensor that a fault affects together."""
 
-    sensor: str  # its name
-    label: str  # what the part is called
-    channel: Channel  # that of its first numbers, which a bias is added to
-    first: int  # place of its numbers among those of the sensor
+    sensor: str
+    label: str  # of the part
+    channel: Channel  # of its first numbers, to which a bias is added
+    first: int  # index of its first number among those of the sensor
     width: int
 
 
 def sensor_parts(sensors: Mapping[str, SensorType | Declaration]) -> dict[str, SensorPart]:
-    """Return the parts of sensors by the first word of their fault kinds: accel and gyro of an IMU, else the sensor."""
+    """Return the parts of sensors by the prefix of their fault kinds: accel and gyro of an IMU, else the sensor."""
     parts: dict[str, SensorPart] = {}
     for name, sensor in sensors.items():
         first = 0
@@ -190,7 +189,7 @@ def expected(p: FaultParameter) -> str:
 
 
 def unstated(kind: FaultKind, parameters: Mapping[str, Any]) -> list[FaultParameter]:
-    """Return the magnitudes of a kind that a fault omits, including those with a default."""
+    """Return the magnitudes that a fault of this kind omits, including those with a default."""
     return [
         p
         for p in kind.parameters
@@ -201,16 +200,16 @@ def unstated(kind: FaultKind, parameters: Mapping[str, Any]) -> list[FaultParame
 
 
 def planned(
-    description: Mapping[str, Any],  # without flaws
+    description: Mapping[str, Any],  # must be free of flaws
     number: int,  # its id
     source: str,
-    now_ns: int,  # when it begins where `at_s` is left out
+    now_ns: int,  # start of a fault without `at_s`
     gate_ns: int,
     kinds: Mapping[str, FaultKind] = KINDS,
 ) -> Fault:
-    """Return the fault given by a sound description, in whole gates and with every parameter.
+    """Return the fault given by a valid description, rounded to whole gates and with every parameter.
 
-    It acts in the gates after `from_ns` up to `until_ns`: on the motion between these instants, and on the messages of
+    It acts in the gates after `from_ns` up to `until_ns`: on the motion between these times, and on the messages of
     those gates.
     """
     kind, at_s, for_s = kinds[description["kind"]], description.get("at_s"), description.get("for_s")
@@ -223,7 +222,7 @@ def planned(
 
 
 def _plain(value: Any, p: FaultParameter) -> Any:
-    """Return a value as on the wire: numbers as floats, so that equal faults have equal texts."""
+    """Return a value as sent: numbers as floats, so that equal faults have equal texts."""
     if value is None:
         return p.default
     if p.shape == "number":
@@ -236,7 +235,7 @@ def _plain(value: Any, p: FaultParameter) -> Any:
 
 
 def acts(fault: Fault, gate_ns: int) -> bool:
-    """Tell whether a fault acts in the gate that ends at `gate_ns`."""
+    """Whether a fault acts in the gate that ends at `gate_ns`."""
     return fault.from_ns < gate_ns and (fault.until_ns is None or gate_ns <= fault.until_ns)
 
 
@@ -244,17 +243,17 @@ def acts(fault: Fault, gate_ns: int) -> bool:
 
 
 class Known(NamedTuple):
-    """Names that a target may have, and the kinds of faults of the run."""
+    """Valid names of targets, and the kinds of faults of the run."""
 
     drones: tuple[str, ...]
     clusters: tuple[str, ...]
-    processes: tuple[str, ...] = ()  # those that take part, besides estimators and controllers
+    processes: tuple[str, ...] = ()  # besides estimators and controllers
     kinds: Mapping[str, FaultKind] = KINDS
-    # of each drone; none of one whose vehicle is a module that is not read here
+    # by drone; empty if its vehicle's module is not imported here
     rotors: Mapping[str, tuple[str, ...]] = {}
-    external: tuple[str, ...] = ()  # drones whose bodies and sensors nobody simulates
-    sensors: Mapping[str, Collection[str]] = {}  # names of those of each drone, where they are known
-    unread: Collection[str] = ()  # sensors whose modules are not imported, or faulty: what can fail of them is unknown
+    external: tuple[str, ...] = ()  # drones whose bodies and sensors are not simulated
+    sensors: Mapping[str, Collection[str]] = {}  # names by drone, where known
+    unread: Collection[str] = ()  # sensors whose modules are faulty or not imported: their fault kinds are unknown
 
     def things(self) -> dict[str, tuple[str, ...]]:
         roles = {name: role.about for name, role in AGENTS.items() if name != PILOT}  # not every drone has a pilot
@@ -269,7 +268,7 @@ class Known(NamedTuple):
 
 
 def flaws(fault: Any, known: Known) -> Iterator[Flaw]:
-    """Yield path and text of every flaw of a fault in a scenario or request."""
+    """Yield the path and text of every flaw in a fault's description."""
     if not isinstance(fault, Mapping):
         yield "", f"is {show(fault)}; must be a map with kind and target"
         return
@@ -290,7 +289,7 @@ def flaws(fault: Any, known: Known) -> Iterator[Flaw]:
     target = fault.get("target")
     rotors = known.rotors.get(target) if isinstance(target, str) else None
     for p in kind.parameters:
-        if p is ROTOR and rotors is not None:  # of the target's vehicle, or of any name where that is not known
+        if p is ROTOR and rotors is not None:  # rotors of the target's vehicle; any name if unknown
             p = p._replace(choices=(*rotors, "all")) if rotors else p._replace(shape="word")
         faults += _parameter_flaws(fault, p, known)
     for path, text in faults:
@@ -342,7 +341,7 @@ def _link_flaws(actual: str, target: Any, one_way: bool, known: Known) -> Iterat
 
 
 def _allowed_instead(name: str, known: Known) -> str | None:
-    """Return what a process's name must be, None if it is acceptable: a user's process may have most names."""
+    """Return what a process's name must be; None if it is acceptable: a user's process may have almost any name."""
     if not keys.PROCESS_NAME.fullmatch(name):
         return "1 to 48 of a-z 0-9 _ . -"
     if name in known.processes:
@@ -351,9 +350,9 @@ def _allowed_instead(name: str, known: Known) -> str | None:
     things = known.things()
     if role in things and thing not in things[role]:
         return f"{role}.NAME of {listed(things[role])}"
-    for ours, there in {**things, "world": ("",)}.items():
-        if thing in there and ours not in role and SequenceMatcher(None, role, ours).ratio() >= ALIKE:
-            return f"{ours}{dot}{thing}, or a name less like it"
+    for ours, named in {**things, "world": ("",)}.items():
+        if thing in named and ours not in role and SequenceMatcher(None, role, ours).ratio() >= ALIKE:
+            return f"{ours}{dot}{thing}, or a less similar name"
     return None
 
 
@@ -364,7 +363,7 @@ def _time_flaws(fault: Mapping[str, Any], kind: FaultKind) -> Iterator[Flaw]:
     if kind.lasts == "once" and for_s is not None:
         yield "for_s", f"is {show(for_s)}; must be left out"
     elif kind.lasts == "ends" and for_s is None:
-        yield "for_s", "is missing; must be its length in s"
+        yield "for_s", "is missing; must be its duration in s"
     elif for_s is not None and not _within(for_s, 0.0, FOR_EVER_S, above=True):
         yield "for_s", f"is {show(for_s)}; must be > 0 and <= {FOR_EVER_S:g} s"
 
@@ -400,7 +399,7 @@ def _is_vector(value: Any, least: float, most: float) -> bool:
 
 
 def _within(value: Any, least: float, most: float, above: bool = False) -> bool:
-    """Tell whether a value is a number between limits; integers may be of any size, NaN is not within."""
+    """Whether a value is a number within limits; integers may be arbitrarily large, NaN is never within."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
     return number and least <= value <= most and not (above and value == least)
 
@@ -413,7 +412,7 @@ _OPTIONS = {"--for": "for_s", "--at": "at_s"}
 
 
 def typed_duration_s(text: str) -> float:
-    """Return the duration in a text such as 10s, 500ms or 2min; ValueError if it is not a duration."""
+    """Return the duration [s] given by a text such as 10s, 500ms or 2min; ValueError if it is not a duration."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(ms|s|min|)", text.strip())
     if not match:
         raise ValueError(f"is {text[:40]!r}; must be a duration such as 10s, 500ms or 2min")
@@ -421,17 +420,17 @@ def typed_duration_s(text: str) -> float:
 
 
 def typed_parameters(words: Sequence[str]) -> dict[str, Any]:
-    """Return the parameters given by words NAME=VALUE; values are YAML.
+    """Return the parameters given by words NAME=VALUE, with values in YAML.
 
-    ValueError if one is no such word, is given twice, or is given by an argument or option instead.
+    ValueError if a word has another form, repeats a name, or names an argument or option.
     """
     values: dict[str, Any] = {}
     for text in words:
         name, equals, value = text.partition("=")
         if not equals or not re.fullmatch("[a-z][a-z0-9_]*", name):
-            raise ValueError(f"{text[:40]!r} is no parameter; must be NAME=VALUE, see `zsim fault kinds`")
+            raise ValueError(f"{text[:40]!r} is not a parameter; must be NAME=VALUE, see `zsim fault kinds`")
         if name in OPTION_OF:
-            raise ValueError(f"{name} is no parameter of a kind; give it by {OPTION_OF[name]}")
+            raise ValueError(f"{name} is not a parameter; give it by {OPTION_OF[name]}")
         if name in values:
             raise ValueError(f"{name} is given twice; must be given once")
         try:
@@ -444,7 +443,7 @@ def typed_parameters(words: Sequence[str]) -> dict[str, Any]:
 def typed_rest(text: str) -> dict[str, Any]:
     """Return the parameters and times typed after TARGET KIND in `zsim fault add`.
 
-    Lists and maps need no quotes here, since no shell reads them.
+    Lists and maps need no quotes here, since no shell parses them.
 
     Raises:
         ValueError: it is not NAME=VALUE NAME=VALUE … --for DURATION --at DURATION.
@@ -481,5 +480,5 @@ def _words(text: str) -> list[str]:
 
 
 def allowed_kinds(found: Any, known: Collection[str]) -> str:
-    """Return the text on allowed kinds for an unknown kind of fault."""
+    """Return the error text that names the allowed kinds, for an unknown kind of fault."""
     return f"{suggestion(found, known)}must be one of the {len(known)} that `zsim fault kinds SCENARIO` lists"

@@ -1,6 +1,6 @@
 """The scenario: typed, immutable, every quantity with its unit in its name.
 
-A file is read by `scenario_file.load`; the limits written here are the ones that its faults quote.
+`scenario_file.load` reads a file; its error messages quote the limits given here.
 """
 
 from typing import Annotated, Any, Literal, get_type_hints
@@ -19,26 +19,26 @@ from zsim.sensors.sensor_catalogue import Sensors
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.vehicle import MODELS, Aerodynamics, Arm, Limits, Mass, RotorLag, TakeoffHeight, Vehicle
 
-TEMPLATE_FROM = 5  # robots; below it the variables of the triad are fewer to name, and as well conditioned
+TEMPLATE_FROM = 5  # robots; with fewer, a triad has fewer variables and is as well conditioned
 DRONES_MAX = 1000  # one world integrates them all
-OBSTACLES_MAX = 1000  # every drone is compared with each, in every step
+OBSTACLES_MAX = 1000  # every drone is compared with every obstacle in every step
 SURFACES_MAX = 100
-FAULTS_MAX = 1000  # injected ones, planned and active; each is looked at wherever one begins or ends
-CLUSTERS_MAX = DRONES_MAX // 2  # each has two drones at least, which no other has
-PROCESSES_MAX = 4 * DRONES_MAX  # an estimator a drone, a controller a cluster, and twice as many of a user's own
-WAYPOINTS_MAX = 10_000  # an hour of them at 3 a second
-CONSTANTS_MAX = 100  # of a user, for the expressions of a trajectory
-ROBOTS_MAX = 64  # drones of a cluster; beyond it a dense Jacobian of 4n x 4n no longer fits a control gate of 20 ms
-POINTS_MAX = 1000  # of a path of one drone
-PIECES_MAX = 5000  # polynomials of one path
-STAGES_MAX = 100  # of drones that change places, or become another formation
-METRICS_MAX = 20  # functions
-ROLES_MAX = 20  # of users' agents; each is a process for every drone
-PROGRAMS_MAX = 100  # of users, beside agents
-WORDS_MAX = 1000  # of a command line
-LAW_SENSORS_MAX = 100  # that a law reads
+FAULTS_MAX = 1000  # injected faults, planned and active; all are examined whenever one begins or ends
+CLUSTERS_MAX = DRONES_MAX // 2  # each has at least two drones, which belong to no other
+PROCESSES_MAX = 4 * DRONES_MAX  # an estimator per drone, a controller per cluster, and twice as many of the user's
+WAYPOINTS_MAX = 10_000  # an hour of waypoints at 3 a second
+CONSTANTS_MAX = 100  # a user's constants in the expressions of a trajectory
+ROBOTS_MAX = 64  # drones of a cluster; above this, a dense Jacobian of 4n x 4n no longer fits a control gate of 20 ms
+POINTS_MAX = 1000  # points in the path of one drone
+PIECES_MAX = 5000  # polynomials in one path
+STAGES_MAX = 100  # stages of an exchange, and assemblies of a cluster's plan
+METRICS_MAX = 20  # a user's metric functions
+ROLES_MAX = 20  # roles of users' agents; each may be a process for every drone
+PROGRAMS_MAX = 100  # users' programs, in addition to agents
+WORDS_MAX = 1000  # words of a command line
+LAW_SENSORS_MAX = 100  # sensors that a law reads
 MESSAGES_MAX = 20  # classes of messages that a class of agents publishes
-VARIABLES_MAX = 4 * ROBOTS_MAX  # of a formation: four a robot
+VARIABLES_MAX = 4 * ROBOTS_MAX  # variables of a formation: four per robot
 SEA_HEIGHT_MAX_M = 11_000  # m above the sea: end of the layer whose pressure the barometer follows (ISO 2533)
 
 EXTERNAL = "external"  # body of a drone that a driver publishes
@@ -46,7 +46,7 @@ EXTERNAL = "external"  # body of a drone that a driver publishes
 OnDeath = Literal["wait", "restart", "drop", "end"]
 OnOverdue = Literal["drop", "end"]
 Name = Annotated[str, Meta(pattern=r"^[a-z0-9_.-]{1,32}\Z")]
-Coordinate = Annotated[float, Meta(ge=-100_000, le=100_000)]  # m; beyond it a tangent plane is no map
+Coordinate = Annotated[float, Meta(ge=-100_000, le=100_000)]  # m; a tangent plane is no map of a larger area
 Position = tuple[Coordinate, Coordinate, Coordinate]
 
 
@@ -55,17 +55,17 @@ class Spec(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 Value = Annotated[Real | str, Meta(description="a finite number or an expression")]
-"""Of a variable: in metres or radians, in degrees where the name of an angle ends in `_deg`."""
+"""Value of a variable: in metres or radians; in degrees where the name of an angle ends in `_deg`."""
 
 
 class Piloted(Spec, frozen=True, kw_only=True):
-    """How drones that fly by themselves follow where they are to be."""
+    """How a drone without a cluster follows its reference."""
 
     takeoff_s: NonNegative = 0.0
     land_s: NonNegative | None = None
     fit: bool = False
-    """Whether what is too fast for the drone is flown more slowly; else it is refused."""
-    gain_1_s: Annotated[float, Meta(gt=0, le=2)] = 0.6  # of the position; chosen, as that of formations
+    """Whether a path too fast for the drone is slowed down; otherwise it is refused."""
+    gain_1_s: Annotated[float, Meta(gt=0, le=2)] = 0.6  # position gain; chosen: as for formations
     lead_s: Annotated[float, Meta(ge=0, le=2)] = 0.4  # the AR.Drone's: 0.33 s of its velocity loop, 0.11 s of its tilt
 
 
@@ -73,7 +73,7 @@ class PathPoint(Spec, frozen=True, kw_only=True):
     at_s: NonNegative
     position_m: Position
     yaw_deg: Real | None = None
-    """None: as before, and at the first point as the drone starts."""
+    """None: unchanged; at the first point, the yaw at which the drone starts."""
 
 
 Points = Annotated[list[PathPoint], Meta(max_length=POINTS_MAX)]
@@ -81,7 +81,7 @@ Terms = Annotated[list[Real], Meta(max_length=8)]  # coefficients of t^0, t^1, .
 
 
 class Piece(Spec, frozen=True, kw_only=True):
-    """Polynomials of the time from its beginning [m, rad]."""
+    """Polynomials in the time since the piece began [m, rad]."""
 
     duration_s: Annotated[float, Meta(gt=0, le=3600)]
     x: Terms = []
@@ -94,7 +94,7 @@ Laps = Annotated[float, Meta(ge=0.25, le=1000)]
 
 
 class Circle(Spec, frozen=True, kw_only=True):
-    """From (radius, 0) counter-clockwise; a helix where it climbs."""
+    """A circle flown counter-clockwise from (radius, 0); with a climb, a helix."""
 
     radius_m: Positive
     period_s: Positive
@@ -103,7 +103,7 @@ class Circle(Spec, frozen=True, kw_only=True):
 
 
 class FigureEight(Spec, frozen=True, kw_only=True):
-    """Along x, from its crossing."""
+    """A figure of eight along x that begins at its crossing."""
 
     length_m: Positive
     width_m: Positive
@@ -112,7 +112,7 @@ class FigureEight(Spec, frozen=True, kw_only=True):
 
 
 class DroneReference(Piloted, frozen=True, kw_only=True):
-    """The reference of a drone; without a path, it takes off and waits for requests."""
+    """The reference of a drone; without a path, the drone takes off and waits for requests."""
 
     start_s: NonNegative | None = None
     waypoints: Points = []
@@ -122,7 +122,7 @@ class DroneReference(Piloted, frozen=True, kw_only=True):
     duration_s: Positive | None = None
     pieces: Annotated[list[Piece], Meta(max_length=PIECES_MAX)] = []
     file: str | UnsetType = UNSET
-    """Of pieces, which replace it when the scenario is read."""
+    """File with pieces, which replace this field when the scenario is read."""
     circle: Circle | UnsetType = UNSET
     figure_eight: FigureEight | UnsetType = UNSET
     origin_m: Vector3 = (0.0, 0.0, 0.0)
@@ -137,7 +137,7 @@ PATHS = ("waypoints", "minimum_snap", "expressions", "pieces", "circle", "figure
 
 
 class Stage(Spec, frozen=True, kw_only=True):
-    """Places to which drones fly at once, each to one of them."""
+    """Positions to which drones fly simultaneously, one drone to each."""
 
     start_s: NonNegative
     over_s: Positive
@@ -145,7 +145,7 @@ class Stage(Spec, frozen=True, kw_only=True):
 
 
 class Exchange(Piloted, frozen=True, kw_only=True):
-    """Drones of which any may fly to any place: each stage is assigned for the least sum of squared ways."""
+    """Interchangeable drones: each stage assigns them to positions with the minimum sum of squared distances."""
 
     drones: Annotated[list[Name], Meta(min_length=1, max_length=DRONES_MAX)]
     stages: Annotated[list[Stage], Meta(min_length=1, max_length=STAGES_MAX)]
@@ -155,9 +155,9 @@ class Drone(Spec, frozen=True, kw_only=True):
     """One aircraft. Unset fields default to its model (zsim/vehicles); the defaults here are the AR.Drone's."""
 
     name: Name
-    model: str = "ardrone2"  # a stock vehicle, or `package.module` of the user's that defines VEHICLE
+    model: str = "ardrone2"  # a stock vehicle, or the user's `package.module` that defines VEHICLE
     body: Literal["simulated", "external"] | UnsetType = UNSET
-    """Unset: simulated, and left out of the resolved text. An external one is published by its driver."""
+    """Unset: simulated, and left out of the resolved text. A driver publishes the messages of an external body."""
     position_m: Position
     yaw_deg: Real = 0.0
     mass_kg: Mass = ARDRONE2.mass_kg
@@ -173,7 +173,7 @@ class Drone(Spec, frozen=True, kw_only=True):
     battery_percent: Annotated[float, Meta(ge=0, le=100)] = 100.0
     takeoff_height_m: TakeoffHeight = ARDRONE2.takeoff_height_m
     limits: Limits = ARDRONE2.limits
-    aerodynamics: Aerodynamics | UnsetType = UNSET  # unset: none but `drag_n_s_m`, and left out of the resolved text
+    aerodynamics: Aerodynamics | UnsetType = UNSET  # unset: only `drag_n_s_m`; left out of the resolved text
     reference: DroneReference | UnsetType = UNSET
     """Unset: none, and left out of the resolved text."""
     sensors: Sensors
@@ -186,18 +186,18 @@ class Drone(Spec, frozen=True, kw_only=True):
 class Wind(Spec, frozen=True, kw_only=True):
     """Steady wind and Dryden gusts, `gust_m_s` being the standard deviation per axis.
 
-    The form is that of MIL-HDBK-1797; its lengths, for aeroplanes high above the ground, are not used.
+    The form is that of MIL-HDBK-1797; its length scales, for aeroplanes high above the ground, are not used.
     """
 
     steady_m_s: Vector3 = (0.0, 0.0, 0.0)
     gust_m_s: NonNegative = 0.0
-    gust_length_m: Positive = 10.0  # chosen: eddies about as large as the flight is high
+    gust_length_m: Positive = 10.0  # chosen: eddies about as large as the flight height
     gust_speed_min_m_s: Positive = 2.0  # chosen: with 10 m, gusts on a hovering drone last 5 s
     gust_correlation: Fraction = 0.5  # chosen: drones some metres apart share half of the variance
 
 
 class Obstacle(Spec, frozen=True, kw_only=True):
-    """A solid that drones run into: a box and a cylinder stand upright, a sphere is where it is."""
+    """A solid obstacle; boxes and cylinders stand upright."""
 
     name: Name
     shape: Literal["box", "cylinder", "sphere"]
@@ -213,29 +213,29 @@ Seed = Annotated[int, Meta(ge=0, le=2**62)]
 
 
 class Forest(Spec, frozen=True, kw_only=True):
-    """Trunks at random places, which become obstacles; see zsim.scenario.generated."""
+    """Trunks at random positions, which become obstacles; see zsim.scenario.generated."""
 
     trees: Annotated[int, Meta(ge=1, le=OBSTACLES_MAX)]
     area_m: tuple[Coordinate, Coordinate, Coordinate, Coordinate]
-    """West, south, east, north: where their middles are."""
+    """West, south, east and north limits of the trunks' centres."""
     radius_m: Span = (0.1, 0.25)  # chosen: trunks of 20 to 50 cm
     height_m: Span = (6.0, 10.0)  # chosen
-    gap_m: NonNegative = 1.5  # between any two, chosen: three hulls of an AR.Drone
-    clear_m: NonNegative = 2.0  # about the place where a drone starts, chosen
+    gap_m: NonNegative = 1.5  # between any two trunks; chosen: three hulls of an AR.Drone
+    clear_m: NonNegative = 2.0  # around each drone's start position; chosen
     seed: Seed | UnsetType = UNSET  # unset: the scenario's
 
 
 class Corridor(Spec, frozen=True, kw_only=True):
-    """Walls on both sides of a way that bends at random, which become obstacles; see zsim.scenario.generated."""
+    """Walls on both sides of a randomly bending path, which become obstacles; see zsim.scenario.generated."""
 
     segments: Annotated[int, Meta(ge=1, le=100)]
-    length_m: Positive = 6.0  # of a segment, chosen
-    turn_deg: Annotated[float, Meta(ge=0, le=90)] = 40.0  # the most, to either side, from segment to segment; chosen
+    length_m: Positive = 6.0  # length of a segment, chosen
+    turn_deg: Annotated[float, Meta(ge=0, le=90)] = 40.0  # maximum turn to either side between segments; chosen
     width_m: Positive = 3.0  # between the walls, chosen
     wall_m: Positive = 0.2  # thickness, chosen
     height_m: Positive = 3.0  # chosen
     start_m: tuple[Coordinate, Coordinate] = (0.0, 0.0)
-    heading_deg: Real = 0.0  # of the first segment, from east to north
+    heading_deg: Real = 0.0  # direction of the first segment, from east towards north
     seed: Seed | UnsetType = UNSET  # unset: the scenario's
 
 
@@ -243,74 +243,74 @@ class Cloud(Spec, frozen=True, kw_only=True):
     """A cloud of points from a file, whose occupied cells become boxes; see zsim.scenario.generated."""
 
     file: Annotated[str, Meta(min_length=1, max_length=1000)]
-    """.pcd, .ply or .csv, beside the scenario or in this folder."""
+    """.pcd, .ply or .csv file, in the scenario's folder or the current one."""
     cell_m: Positive
-    points_min: Annotated[int, Meta(ge=1, le=1_000_000)] = 1  # in a cell that is occupied
+    points_min: Annotated[int, Meta(ge=1, le=1_000_000)] = 1  # minimum number of points in an occupied cell
     position_m: Position = (0.0, 0.0, 0.0)
 
 
 class Surface(Spec, frozen=True, kw_only=True):
-    """A sheet of triangles from a file, which is an obstacle; see zsim.scenario.generated."""
+    """A triangle mesh from a file, which is an obstacle; see zsim.scenario.generated."""
 
     name: Name
     file: Annotated[str, Meta(min_length=1, max_length=1000)] | UnsetType = UNSET
-    """.stl, .obj or .ply, or a height map .csv or .npy; beside the scenario or in this folder."""
-    cell_m: Positive | None = None  # of a height map: between two of its heights
+    """.stl, .obj or .ply file, or a height map in .csv or .npy; in the scenario's folder or the current one."""
+    cell_m: Positive | None = None  # grid spacing of a height map
     position_m: Position = (0.0, 0.0, 0.0)
     yaw_deg: Real = 0.0
-    scale: Positive = 1.0  # metres, of a unit of the file
+    scale: Positive = 1.0  # metres per unit of the file
     triangles: str | UnsetType = UNSET
-    """In place of `file`, filled in."""
+    """Replaces `file` when the scenario is resolved."""
 
 
 class Environment(Spec, frozen=True, kw_only=True):
-    """The field of the flight: default Buenos Aires, where the paper comes from."""
+    """The flight field; by default in Buenos Aires, where the paper was written."""
 
     latitude_deg: Annotated[float, Meta(ge=-90, le=90)] = -34.603
     longitude_deg: Annotated[float, Meta(ge=-180, le=180)] = -58.368
     height_m: Annotated[float, Meta(ge=-100_000, le=SEA_HEIGHT_MAX_M)] = 25.0
     gravity_m_s2: Positive = G_M_S2
-    magnetic_field_ut: Vector3 = (-2.8, 17.8, 14.0)  # ENU, within 0.4 uT of IGRF-14 there on 1 January 2013
+    magnetic_field_ut: Vector3 = (-2.8, 17.8, 14.0)  # ENU, within 0.4 uT of IGRF-14 in Buenos Aires on 1 January 2013
     air_density_kg_m3: Positive = SEA_LEVEL_KG_M3
     wind: Wind = Wind()
     obstacles: Annotated[list[Obstacle], Meta(max_length=OBSTACLES_MAX)] = []
-    forest: Forest | UnsetType = UNSET  # this and `corridor` become obstacles, and are left out of the resolved text
-    corridor: Corridor | UnsetType = UNSET
+    forest: Forest | UnsetType = UNSET  # becomes obstacles, and is left out of the resolved text
+    corridor: Corridor | UnsetType = UNSET  # likewise
     cloud: Cloud | UnsetType = UNSET  # likewise
     surfaces: Annotated[list[Surface], Meta(max_length=SURFACES_MAX)] | UnsetType = UNSET
     hats: Hats | UnsetType = UNSET  # unset: the defaults, and left out of the resolved text
-    light: Annotated[float, Meta(ge=0.02, le=1)] | UnsetType = UNSET  # of a clear day, for the cameras; unset: 1
+    light: Annotated[float, Meta(ge=0.02, le=1)] | UnsetType = UNSET  # share of a clear day's, for cameras; unset: 1
 
 
 class Silence(Spec, frozen=True, kw_only=True):
     """What the firmware does when the commander falls silent, in simulated time."""
 
-    hover_s: Positive = 0.5  # chosen: 25 gates, long against any delay of a link, short against a collision
-    land_s: Positive = 2.0  # after that; the AR.Drone's com_watchdog
+    hover_s: Positive = 0.5  # chosen: 25 gates, longer than any delay of a link, shorter than the time to a collision
+    land_s: Positive = 2.0  # from then on; the AR.Drone's com_watchdog
 
 
 HeadingSigma = Annotated[float, Meta(gt=0, le=180)]
 
 
 class Gains(Spec, frozen=True, kw_only=True):
-    """Of the cluster controller; see zsim_agents.formation.control_law.
+    """Gains of the cluster controller; see zsim_agents.formation.control_law.
 
-    All chosen. The loop is unstable from a proportional gain of about 2 1/s on, and answers well from 0.5 to 0.8.
+    All chosen. The loop becomes unstable at a proportional gain of about 2 1/s, and responds well from 0.5 to 0.8.
     """
 
     proportional_1_s: Annotated[float, Meta(gt=0, le=2)] = 0.6
-    integral_1_s2: Annotated[float, Meta(ge=0, le=0.5)] = 0.05  # takes a steady wind's offset away within half a minute
-    horizontal_speed_m_s: Positive = 1.5  # a third of what the firmware allows: the rest is for the wind
+    integral_1_s2: Annotated[float, Meta(ge=0, le=0.5)] = 0.05  # removes a steady wind's offset within half a minute
+    horizontal_speed_m_s: Positive = 1.5  # a third of what the firmware allows; the rest is for wind
     vertical_speed_m_s: Positive = 0.8  # of the 1 m/s that the firmware allows
-    yaw_rate_deg_s: Positive = 60.0  # of 200 deg/s; a turning drone lags across its way
-    separation_min_m: NonNegative = 2.0  # about four hulls; estimates err by 0.2 m along a side
+    yaw_rate_deg_s: Positive = 60.0  # of 200 deg/s; a turning drone drifts sideways off its path
+    separation_min_m: NonNegative = 2.0  # about four hulls; estimated separations err by 0.2 m
     separation_alarm_m: NonNegative = 1.5  # about three hulls
     sigma_max_m: Positive | UnsetType = UNSET
-    """Of each drone's position, per axis, for take-off and engagement; unset: 1 m. In flight twice as much."""
-    heading_sigma_max_deg: HeadingSigma | UnsetType = UNSET  # likewise of its heading; unset: 15 deg
+    """Maximum sigma of each drone's position per axis at take-off and engagement; unset: 1 m. Twice that in flight."""
+    heading_sigma_max_deg: HeadingSigma | UnsetType = UNSET  # likewise for the heading; unset: 15 deg
 
 
-Values = Annotated[dict[str, Value], Meta(max_length=VARIABLES_MAX)]  # values by the names of a formation's variables
+Values = Annotated[dict[str, Value], Meta(max_length=VARIABLES_MAX)]  # values by variable of a formation
 
 
 class Waypoint(Spec, frozen=True, kw_only=True):
@@ -328,18 +328,18 @@ class Trajectory(Spec, frozen=True, kw_only=True):
 
 
 class AssemblyPoint(Spec, frozen=True, kw_only=True):
-    """A formation to whose places its drones fly, each to one that is assigned to it."""
+    """A formation that the drones of a cluster assemble; each is assigned one of its positions."""
 
     at_s: NonNegative = 0.0
     values: Values = {}
 
 
 class ClusterPlan(Spec, frozen=True, kw_only=True):
-    """What the controller does without being asked."""
+    """What the controller does without requests."""
 
     takeoff_s: NonNegative | None = None
     assemblies: Annotated[list[AssemblyPoint], Meta(min_length=1, max_length=STAGES_MAX)] | UnsetType = UNSET
-    """Unset: the drones form the cluster as they stand at the start; left out of the resolved text."""
+    """Unset: the drones keep the places in which they start; left out of the resolved text."""
     target: Values = {}
     target_over_s: Positive | None = None
     trajectory: Trajectory | None = None
@@ -350,7 +350,7 @@ SpaceName = Annotated[
     str,
     Meta(pattern=rf"^(triad|template)\Z|{CLASS_NAME}", description="one of triad, template, or package.module:Class"),
 ]
-"""How the variables of a formation follow from its robots; a robot is a drone, or a group of them."""
+"""The space that defines a formation's variables; a robot is a drone or a group of drones."""
 Template = Annotated[list[Vector3], Meta(max_length=ROBOTS_MAX)]
 SensorName = Annotated[str, Meta(pattern=rf"^{SENSOR_NAME}\Z", description="name of a sensor")]
 LawName = Annotated[
@@ -359,7 +359,7 @@ LawName = Annotated[
 
 
 class ClusterGroup(Spec, frozen=True, kw_only=True):
-    """Drones of a cluster that form one of its robots: the next `size` ones in its order."""
+    """Drones of a cluster that form one of its robots: the next `size` of them in the cluster's order."""
 
     name: Name
     size: Annotated[int, Meta(ge=2)]
@@ -372,24 +372,24 @@ class Cluster(Spec, frozen=True, kw_only=True):
     name: Name
     drones: Annotated[list[Name], Meta(min_length=2, max_length=ROBOTS_MAX)]
     groups: Annotated[list[ClusterGroup], Meta(max_length=ROBOTS_MAX // 2)] = []
-    """Empty: every drone is a robot of the cluster by itself."""
+    """Empty: every drone is a robot of the cluster."""
     space: SpaceName | None = None  # None: see `space_name`
     template_m: Template = []
-    """Places of the robots, x ahead and y left of the formation; empty: as they stand at the start."""
+    """Robot positions, x ahead and y to the left of the formation; empty: their start positions."""
     law: LawName | UnsetType = UNSET
-    """Unset: proportional. Left out of the resolved text then, which names the scenario by its hash."""
+    """Unset: proportional, and left out of the resolved text, whose hash identifies the scenario."""
     space_parameters: Given | UnsetType = UNSET
     law_parameters: Given | UnsetType = UNSET
-    """Of a user's class; unset: none, or its defaults."""
+    """Parameters of a user's class; unset: none, or its defaults."""
     law_sensors: Annotated[list[SensorName], Meta(max_length=LAW_SENSORS_MAX)] | UnsetType = UNSET
-    """Of its drones, which a user's law may read beside their estimates; unset: none."""
+    """Sensors of its drones that a user's law may read in addition to their estimates; unset: none."""
     law_map: bool | UnsetType = UNSET
-    """Whether it is given the obstacles and surfaces of the scenario; unset: it is not."""
+    """Whether the law receives the obstacles and surfaces of the scenario; unset: false."""
     gains: Gains = Gains()
     plan: ClusterPlan = ClusterPlan()
 
 
-ESTIMATORS = ("ekf", "paper")  # of this product; the first flies unless a scenario chooses
+ESTIMATORS = ("ekf", "paper")  # built in; the first is the default
 AlgorithmName = Annotated[
     str,
     Meta(
@@ -400,7 +400,7 @@ AlgorithmName = Annotated[
 
 
 class Estimation(Spec, frozen=True, kw_only=True):
-    """Settings of the estimators; noise figures come from the drone's own sensors."""
+    """Settings of the estimators; noise parameters come from each drone's sensors."""
 
     algorithm: AlgorithmName | UnsetType = UNSET  # unset: left out of the resolved text
     madgwick_beta: Annotated[float, Meta(ge=0, le=1)] | None = None
@@ -409,30 +409,30 @@ class Estimation(Spec, frozen=True, kw_only=True):
     magnetometer: bool = True
     flow: bool = True
     use_sightings: bool | UnsetType = UNSET
-    """Whether drones of a cluster are located by what they see of each other; unset: not."""
+    """Whether drones of a cluster are also located by their sightings of each other; unset: false."""
 
     parameters: Given | UnsetType = UNSET
-    """Of a user's class; unset: none, or its defaults."""
+    """Parameters of a user's class; unset: none, or its defaults."""
 
     def chosen(self) -> str:
         return self.algorithm if isinstance(self.algorithm, str) else ESTIMATORS[0]
 
 
 class Processes(Spec, frozen=True, kw_only=True):
-    """Who takes part. `expect: null` means an estimator per drone and a controller per cluster."""
+    """The processes of a run. `expect: null` means an estimator per drone and a controller per cluster."""
 
     expect: Annotated[list[Name], Meta(max_length=PROCESSES_MAX)] | None = None
     on_death: Annotated[dict[str, OnDeath], Meta(max_length=PROCESSES_MAX)] = {}
     start_timeout_s: Positive | UnsetType = UNSET
-    """Wall time after which one that is expected and has not joined is overdue; unset: see docs/scenario.md."""
-    return_s: Positive | None = None  # wall; how long one that is to come back may stay away
-    on_overdue: Annotated[dict[str, OnOverdue], Meta(max_length=PROCESSES_MAX)] | UnsetType = UNSET  # then; unset: end
-    snapshot_s: Annotated[float, Meta(ge=0, le=3)] = 1.0  # simulated; 0: none. The world keeps 5 s for who goes on
+    """Wall time after which an expected process that has not joined is overdue; unset: see docs/scenario.md."""
+    return_s: Positive | None = None  # wall time within which a process that may restart must rejoin
+    on_overdue: Annotated[dict[str, OnOverdue], Meta(max_length=PROCESSES_MAX)] | UnsetType = UNSET  # unset: end
+    snapshot_s: Annotated[float, Meta(ge=0, le=3)] = 1.0  # simulated; 0: none. The world keeps 5 s of messages
     gating: Annotated[list[Literal["camera"]], Meta(max_length=1)] | UnsetType = UNSET
-    """Roles for which the run waits beside the agents; unset: none."""
+    """Roles other than agents' for which the run waits; unset: none."""
 
     def gates(self, role: str) -> bool:
-        """Tell whether the run waits for the processes of a role that is no agent's."""
+        """Whether the run waits for the processes of a role other than agents'."""
         return self.gating is not UNSET and role in self.gating
 
 
@@ -440,18 +440,18 @@ class TimeSteps(Spec, frozen=True, kw_only=True):
     """Steps of simulated time; all chosen."""
 
     gate_ms: Annotated[float, Meta(gt=0, le=1000)] = 20.0  # 50 Hz, against the formation loop's 1.7 s
-    physics_dt_ms: Annotated[float, Meta(gt=0, le=20)] = 2.5  # a twelfth of the rotors' lag, the fastest motion
-    command_delay_gates: Annotated[int, Meta(ge=1, le=50)] = 1  # the least with which world and agents work at once
-    max_command_age_ms: Positive = 500.0  # as silence.hover_s: an older command counts as silence
+    physics_dt_ms: Annotated[float, Meta(gt=0, le=20)] = 2.5  # a twelfth of the rotors' lag, the fastest dynamics
+    command_delay_gates: Annotated[int, Meta(ge=1, le=50)] = 1  # the minimum that lets world and agents run in parallel
+    max_command_age_ms: Positive = 500.0  # equals silence.hover_s: an older command counts as silence
 
 
 class OwnProgram(Spec, frozen=True, kw_only=True):
-    """A program in any language that is started with the run; its name is that of the process as which it joins."""
+    """A program in any language that is started with the run; it joins as a process under its own name."""
 
     command: Annotated[list[str], Meta(min_length=1, max_length=WORDS_MAX)]
     """`{endpoint}`, `{federation}`, `{folder}` (of the run) and `{name}` are replaced."""
     joins: bool = True  # the run waits for it, at its start and at every gate
-    start_timeout_s: Positive | UnsetType = UNSET  # unset: as of all processes
+    start_timeout_s: Positive | UnsetType = UNSET  # unset: that of all processes
 
 
 LAWS = {
@@ -463,7 +463,7 @@ LAWS = {
     "olfati_saber": "zsim_agents.laws.olfati_saber:OlfatiSaber",
     "vasarhelyi": "zsim_agents.laws.vasarhelyi:Vasarhelyi",
 }
-"""Formation laws by the names that a scenario may give them: classes of agents, each of which flies a drone."""
+"""Formation laws by their names in a scenario: classes of agents, one agent per drone."""
 AgentClass = Annotated[
     str,
     Meta(
@@ -472,23 +472,23 @@ AgentClass = Annotated[
     ),
 ]
 
-LinkTime = Annotated[float, Meta(ge=0, le=60_000)]  # ms, as of the faults of links
+LinkTime = Annotated[float, Meta(ge=0, le=60_000)]  # ms, limits as for link faults
 
 
 class OwnAgent(Spec, frozen=True, kw_only=True):
-    """Agents whose processes are named after what each is of: `pilot.drone1`, `watch.main`.
+    """Agents whose processes are named after their drone, cluster or run: `pilot.drone1`, `watch.main`.
 
-    Of a user's class, or of a formation law by its name, which stands for its class once the scenario is resolved.
+    `class` names a user's class, or a formation law, which is replaced with its class when the scenario is resolved.
     """
 
     named: AgentClass = field(name="class")
     per: Literal["drone", "cluster", "run"] = "drone"
     parameters: Given = {}
-    """Of the class, see docs/extending.md."""
+    """Parameters of the class; see docs/extending.md."""
     map: bool | UnsetType = UNSET
-    """Whether it is given the obstacles and surfaces of the scenario; unset: it is."""
+    """Whether each agent receives the obstacles and surfaces of the scenario; unset: true."""
     declared: Annotated[list[MessageInfo], Meta(max_length=MESSAGES_MAX)] | UnsetType = UNSET
-    """The messages that the class publishes; filled in, as all its parameters are."""
+    """The messages that the class publishes; filled in when the scenario is resolved, as are all its parameters."""
 
 
 Graph = Annotated[
@@ -498,22 +498,22 @@ Graph = Annotated[
 
 
 class Topology(Spec, frozen=True, kw_only=True):
-    """Whose messages the agents of a drone may hear. `topology: ring` and `topology: {a: [b, c]}` give the graph alone.
+    """Whose messages the agents of a drone may hear. `topology: ring` and `topology: {a: [b, c]}` give only the graph.
 
-    A drone hears those that the graph allows, that are within `within_m` and that the radio reaches; of these the
-    `nearest` only. Rings and paths are in the order of the scenario's drones.
+    A drone hears the drones that the graph allows, that are within `within_m` and that the radio reaches; of these
+    only the `nearest`. Rings and paths follow the order of the scenario's drones.
     """
 
     graph: Graph = "complete"
     within_m: Positive | None = None
     nearest: Annotated[int, Meta(ge=1)] | None = None
-    symmetric: bool = False  # whether who is heard by another hears it as well
+    symmetric: bool = False  # whether a drone also hears every drone that hears it
 
 
 class Radio(Spec, frozen=True, kw_only=True):
-    """What carries the messages of drones' agents to those of other drones, and to a ground station.
+    """The radio that carries messages between the agents of different drones, and to a ground station.
 
-    At the distance d between true places, a message is received with the probability
+    At the true distance d, a message is received with the probability
     (1 - loss) / (1 + exp((d - range_m) / spread_m)), the form of the faults of kind `radio`. Drones that receive less
     than RECEPTION_MIN of each other are no neighbours.
     """
@@ -521,17 +521,17 @@ class Radio(Spec, frozen=True, kw_only=True):
     range_m: Positive | None = None  # None: any distance
     spread_m: NonNegative = 0.0  # 0: everything is received up to range_m, and nothing beyond
     loss: Fraction = 0.0
-    line_of_sight: bool = False  # whether obstacles and surfaces are in the way of it
-    delay_ms: LinkTime = 0.0  # a message comes at the first gate after it, at the next one at least
-    jitter_ms: LinkTime = 0.0  # most of a further delay, evenly spread from 0
+    line_of_sight: bool = False  # whether obstacles and surfaces block it
+    delay_ms: LinkTime = 0.0  # a message arrives at the first gate after this delay, at the earliest at the next gate
+    jitter_ms: LinkTime = 0.0  # maximum of an additional delay, uniform from 0
     bandwidth_kbit_s: Positive | None = None  # of each agent's transmitter; None: any
-    header_bytes: Annotated[int, Meta(ge=0, le=1000)] = 16  # sent with each message; chosen, as of IEEE 802.15.4
-    queue_max: Annotated[int, Meta(ge=1, le=1000)] = 10  # messages that wait to be sent; beyond it the oldest is lost
+    header_bytes: Annotated[int, Meta(ge=0, le=1000)] = 16  # per message; chosen: as in IEEE 802.15.4
+    queue_max: Annotated[int, Meta(ge=1, le=1000)] = 10  # messages waiting to be sent; when full, the oldest is lost
     station_m: Position | None = None
-    """Antenna of the agents of clusters and of the run; None: these are wired to all."""
+    """Position of the antenna of the clusters' and the run's agents; None: they are wired to all."""
 
 
-RECEPTION_MIN = 1e-3  # chosen: rarer than that, two drones are no neighbours
+RECEPTION_MIN = 1e-3  # probability, chosen: two drones that receive less of each other are not neighbours
 
 RoleName = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,14}\Z", description="a letter and up to 14 of a-z 0-9 _")]
 
@@ -544,11 +544,11 @@ Functions = Annotated[
 
 
 class Figures(Spec, frozen=True, kw_only=True):
-    """What is reported of a run; window of the statistics in simulated seconds, None: the last two thirds."""
+    """The report on a run. `window_s` of the statistics is in simulated time; None: the last two thirds."""
 
     window_s: tuple[Real, Real] | None = None
     metrics: Functions | UnsetType = UNSET
-    """A user's functions, for further figures of each run of a sweep; unset: left out of the resolved text."""
+    """A user's functions that compute further metrics of each run of a sweep; unset: left out of the resolved text."""
 
     @property
     def metric_names(self) -> list[str]:
@@ -557,7 +557,7 @@ class Figures(Spec, frozen=True, kw_only=True):
 
 
 class Scenario(Spec, frozen=True, kw_only=True):
-    """A whole run."""
+    """A complete run."""
 
     name: Name
     federation: Name = "zsim"
@@ -577,7 +577,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
     """Programs of users, by the name of the process; unset: none, and left out of the resolved text."""
     topology: Topology | UnsetType = UNSET
     radio: Radio | UnsetType = UNSET
-    """Between agents of drones. Unset: all hear all; left out of the resolved text."""
+    """Unset: all hear all; left out of the resolved text."""
     processes: Processes = Processes()
     faults: Annotated[list[dict[str, Any]], Meta(max_length=FAULTS_MAX)] = []
     """Faults to inject, each a map; `zsim.scenario.faults.flaws` checks them."""
@@ -590,7 +590,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
         return {cluster.name: cluster for cluster in self.clusters}[name]
 
     def piloted(self) -> dict[str, DroneReference | Exchange]:
-        """Return the drones that have a reference of their own, or change places, with what they fly."""
+        """Return the references and exchanges that drones outside clusters fly, by drone in the scenario's order."""
         exchanges = [] if self.exchanges is UNSET else self.exchanges
         found: dict[str, DroneReference | Exchange] = {name: each for each in exchanges for name in each.drones}
         found |= {drone.name: drone.reference for drone in self.drones if drone.reference is not UNSET}
@@ -606,19 +606,19 @@ class Scenario(Spec, frozen=True, kw_only=True):
 
     @property
     def radio_of_agents(self) -> Radio | None:
-        """Return the radio over which users' agents exchange messages; None where all of them hear all."""
+        """The radio over which users' agents exchange messages; None where all hear all."""
         has_fault = bool(self.own_agents) and any(fault.get("kind") == "radio" for fault in self.faults)
         if self.radio is UNSET and self.topology is UNSET and not has_fault:
             return None
         return Radio() if self.radio is UNSET else self.radio
 
     def own_messages(self) -> list[MessageInfo]:
-        """Return the messages that users' agents declare, in the order of their keys."""
+        """Return the messages that users' agents declare, sorted by key."""
         declared = [replace(each, role=role) for role, own in self.own_agents.items() for each in own.declared or ()]
         return sorted(declared, key=lambda each: each.key)
 
     def own_code(self) -> list[str]:
-        """Return the classes, functions, sensors and vehicles of users that it names, whose modules a rerun needs."""
+        """Return the users' classes, functions, sensors and vehicles that it names; a rerun needs their modules."""
         spaces = [part.space for cluster in self.clusters for part in (cluster, *cluster.groups)]
         names = [*spaces, *(cluster.law for cluster in self.clusters), self.estimation.chosen()]
         names += self.report.metric_names
@@ -644,7 +644,7 @@ _OWN = (
     "yaw_deg",
     "reference",
     "sensors",
-)  # fields of a drone that are not of its vehicle
+)  # fields of a drone that its vehicle does not define
 _SHARED = {name: kind for name, kind in get_type_hints(Drone, include_extras=True).items() if name not in _OWN}
 SharedVehicle: Any = defstruct(
     "SharedVehicle",
@@ -653,18 +653,18 @@ SharedVehicle: Any = defstruct(
     frozen=True,
     kw_only=True,
 )
-"""The `vehicle:` section: fields of a drone that all drones take where they say nothing else."""
+"""The `vehicle:` section: fields shared by all drones that do not set them."""
 VEHICLE_NUMBERS = tuple(name for name in _SHARED if name in Vehicle.__struct_fields__ and name not in _SECTIONS)
 """Fields of a drone that its model gives, besides the sections `limits` and `aerodynamics`."""
 
 
 class Document(Scenario, frozen=True, kw_only=True):
-    """The content of a scenario file: a scenario, and what all its drones share."""
+    """The content of a scenario file: a scenario, and the fields shared by all its drones."""
 
     sensors: Sensors | None = None
     vehicle: SharedVehicle | None = None  # type: ignore[valid-type]
 
 
 def space_name(space: str | None, robots: int, template: bool) -> str:
-    """Return the space of so many robots: the scenario's, else a template where one is given or from five robots on."""
+    """Return the scenario's space; by default a template if one is given or there are five or more robots."""
     return space or ("template" if template or robots >= TEMPLATE_FROM else "triad")

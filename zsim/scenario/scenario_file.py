@@ -27,15 +27,15 @@ from zsim.vehicles.vehicle import DEFAULT_MODEL, MODELS, Aerodynamics, Vehicle, 
 
 EXAMPLE = "scenarios/step.yaml"  # named in errors
 SYNTAX = "a.b.c=value, e.g. drones.drone2.mass_kg=0.5 or environment.wind.gust_m_s=0.5"
-PATH_MAX = 1000  # characters; the longest of a scenario has a tenth of that
+PATH_MAX = 1000  # characters; ten times the longest path in a scenario
 NOTHING: Mapping[str, Any] = {}
-_STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # one step of a path: a word, or anything between brackets
+_STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # one step of a path: a word, or anything in brackets
 _FIRST = re.compile(r"[^.\[\]]+")
 _PATH = re.compile(r"([^.\[\]]+|\[[^\[\]]+\])(\.[^.\[\]]+|\[[^\[\]]+\])*")
 AXES = ("x", "y", "z", "yaw")
 TERMS = 8
 HEADER = ("duration", *(f"{axis}^{power}" for axis in AXES for power in range(TERMS)))
-BYTES_MAX = 2_000_000  # of a file: five thousand pieces
+BYTES_MAX = 2_000_000  # size of a file with five thousand pieces
 
 
 def load(
@@ -45,7 +45,7 @@ def load(
     imports: bool = True,
     **values: Any,
 ) -> Scenario:
-    """Return the resolved scenario of a YAML file; its classes may be in modules beside it.
+    """Return the resolved scenario of a YAML file; its classes may be in modules in the same folder.
 
     Args:
         overrides: texts `a.b.c=value` as given to `--set`, applied in order.
@@ -54,7 +54,7 @@ def load(
         values: top-level fields that replace the file's (`seed=3`); None is ignored.
 
     Raises:
-        ScenarioError: with every fault found, a line each.
+        ScenarioError: the scenario has faults; a line for each.
     """
     path = Path(path)
     plugin.search(path.parent, *modules)
@@ -88,17 +88,17 @@ def sha256(text: str) -> str:
 
 
 def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: bool = True) -> Scenario:
-    """Return the scenario of a raw document; `lines` are faults found before.
+    """Return the scenario of a raw document; `lines` are faults found earlier.
 
-    Later ones take precedence. For a drone: the numbers of its model, the document's `vehicle:`, its own fields; for
-    its sensors: the preset, the document's `sensors:`, its own. Faulty parts of the shared sections are not handed on
-    to the drones, so that their faults are reported once.
+    For a drone, its own fields take precedence over the document's `vehicle:`, and this over the numbers of its model;
+    for its sensors, its own over the document's `sensors:`, and these over the preset. Faulty parts of the shared
+    sections are not passed to the drones, so that their faults are reported once.
     """
-    misread: list[Fault] = []  # error models in units that cannot be read
-    unknown: list[Fault] = []  # models that are no vehicles
-    unsound: list[Fault] = []  # sensors of users
-    unread: set[str] = set()  # names of these that are faulty, or must not be imported
-    vehicles = {name: vehicle_of(name) for name in MODELS}  # by model, as far as drones need one
+    misread: list[Fault] = []  # error models with unreadable units
+    unknown: list[Fault] = []  # models that are not vehicles
+    unsound: list[Fault] = []  # users' sensors, classes, files and generated obstacles
+    unread: set[str] = set()  # names of users' sensors that are faulty, or must not be imported
+    vehicles = {name: vehicle_of(name) for name in MODELS}  # by model
 
     given = _in_channel_units(document.get("sensors"), "sensors", misread)
     shared_sensors = given or {}
@@ -123,7 +123,7 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
         own = _separated(_with_preset(own, vehicle.sensor_preset), f"{where}.sensors", unsound, unread, imports)
         numbers = {name: getattr(vehicle, name) for name in VEHICLE_NUMBERS}
         numbers["limits"] = msgspec.to_builtins(vehicle.limits)
-        if vehicle.aerodynamics != Aerodynamics():  # else they are left out of the resolved text
+        if vehicle.aerodynamics != Aerodynamics():  # otherwise left out of the resolved text
             numbers["aerodynamics"] = msgspec.to_builtins(vehicle.aerodynamics)
         if "reference" in drone:
             drone = {**drone, "reference": _with_pieces(drone["reference"], f"{where}.reference", unsound)}
@@ -201,7 +201,7 @@ def _separated(section: Any, where: str, unsound: list[Fault], unread: set[str],
 
 
 def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
-    """Return a drone's reference with the pieces of its file, which is beside the scenario or in this folder."""
+    """Return a drone's reference with the pieces of its file, which is in the scenario's folder or the current one."""
     name = reference.get("file") if isinstance(reference, dict) else None
     if not isinstance(name, str):
         return reference
@@ -217,7 +217,7 @@ def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
 
 
 def _is_graph(topology: Any) -> bool:
-    """Tell whether a `topology:` section is only a graph, by name or as lists of the drones that each one hears."""
+    """Whether a `topology:` section is only a graph, given by name or as lists of the drones that each drone hears."""
     if isinstance(topology, dict):
         named = any(isinstance(heard, list) for heard in topology.values())
         return named and not topology.keys() & set(Topology.__struct_fields__)
@@ -235,10 +235,10 @@ def _with_deaths(processes: Any, own: Any, action: str) -> Any:
 def _vehicle_of(
     drone: dict[str, Any], where: str, vehicles: dict[str, Vehicle], unknown: list[Fault], imports: bool
 ) -> Vehicle:
-    """Return the vehicle of a drone's model, the AR.Drone for an unknown model.
+    """Return the vehicle of a drone's model; the AR.Drone if it is unknown or must not be imported.
 
     A drone with all its numbers, as in a resolved scenario, needs no user's module: readers of `world/info` import
-    nothing. A vehicle that must not be imported is left out.
+    nothing.
     """
     model = drone.get("model", DEFAULT_MODEL)
     if not isinstance(model, str):
@@ -257,7 +257,7 @@ def _vehicle_of(
 
 
 def _whose(document: dict[str, Any], path: str) -> str:
-    """Return " (drone 'drone3')" for a path inside a drone's entry, the like for a cluster's."""
+    """Return " (drone 'drone3')" for a path inside a drone's entry, and likewise for a cluster's."""
     match = re.match(r"(drone|cluster)s\[(\d+)\]", path)
     entries = document.get(f"{match[1]}s") if match else None
     if not match or not isinstance(entries, Sequence):
@@ -267,23 +267,23 @@ def _whose(document: dict[str, Any], path: str) -> str:
     return f" ({match[1]} {name!r})" if isinstance(name, str) and len(name) <= 40 else ""
 
 
-# Overrides: `a.b.c=value`, entries of lists by place or by name
+# Overrides: `a.b.c=value`, entries of lists by index or name
 
 
 def apply_override(document: dict[str, Any], text: str, parse: Callable[[str], Any]) -> str | None:
-    """Apply one override to a raw document; return the fault, without a change, if there is one.
+    """Apply one override to a raw document; if it is faulty, return the fault and change nothing.
 
     Args:
         document: changed in place.
         text: as given, e.g. "drones[2].yaw_deg=90".
-        parse: converts the text of a value; the text of its ValueError is the fault.
+        parse: converts the text of a value; its ValueError gives the fault.
     """
     path, equals, value_text = text.partition("=")
     fault: object = None
     if len(path) > PATH_MAX:
         fault = f"is a path of {len(path)} characters; must have at most {PATH_MAX}"
     elif not equals or not _PATH.fullmatch(path):
-        fault = f"is no assignment; must be {SYNTAX}"
+        fault = f"is not an assignment; must be {SYNTAX}"
     else:
         try:
             _assign(document, steps_of(path, document), parse(value_text))
@@ -304,12 +304,12 @@ def steps_of(path: str, document: Mapping[str, Any] = NOTHING) -> list[str]:
 def whole_path(path: str, document: Mapping[str, Any] = NOTHING) -> str:
     """Return the full path of a field in a raw document.
 
-    The name of a section may be left out where only one section has such a field: wind.gust_m_s stands for
-    environment.wind.gust_m_s. Of a list of sections it may be left out where the list has one entry:
+    The name of a section may be omitted if only one section has such a field: wind.gust_m_s stands for
+    environment.wind.gust_m_s. The name of a list and its entry may be omitted if the list has one entry:
     gains.proportional_1_s stands for clusters.main.gains.proportional_1_s.
 
     Raises:
-        ValueError: the field belongs to a list of sections of which the document has several.
+        ValueError: the field belongs to a list of sections with several entries.
     """
     first = _FIRST.match(path)
     sections = {field.name: field.type for field in _fields(Document)}
@@ -330,13 +330,13 @@ def whole_path(path: str, document: Mapping[str, Any] = NOTHING) -> str:
     name = entry.get("name") if isinstance(entry, dict) else None
     whole = f"{section}.{name}" if isinstance(name, str) and _FIRST.fullmatch(name) else f"{section}[0]"
     if len(entries) > 1:
-        raise ValueError(f"is a field of each of {len(entries)} {section}; give the whole path, e.g. {whole}.{path}")
+        raise ValueError(f"is a field of each of {len(entries)} {section}; give the full path, e.g. {whole}.{path}")
     return f"{whole}.{path}"
 
 
 @cache
 def _fields(kind: Any) -> Sequence[Any]:
-    """Return the fields of a section, possibly an optional one; none for any other type."""
+    """Return the fields of a section or optional section; none for any other type."""
     sections = [each for each in (kind, *get_args(kind)) if isinstance(each, type) and issubclass(each, Struct)]
     return structs.fields(sections[0]) if sections else ()
 
@@ -367,17 +367,17 @@ def _assign(document: dict[str, Any], steps: list[str], value: Any) -> None:
 
 
 def pieces_of(path: Path, where: str) -> list[dict[str, Any]]:
-    """Return the polynomial pieces of a file in the form of a scenario: `duration_s`, and lists `x`, `y`, `z`, `yaw`.
+    """Return the polynomial pieces in a file as in a scenario: `duration_s`, and lists `x`, `y`, `z`, `yaw`.
 
-    The file is as uav_trajectories and Crazyswarm write and read it: a header line, then a line for each piece of 33
-    numbers: its duration [s], and the coefficients of t^0 to t^7 in x, y, z [m] and yaw [rad], t being the time from
-    the beginning of the piece. https://github.com/whoenig/uav_trajectories
+    The format is that of uav_trajectories and Crazyswarm: a header line, then a line of 33 numbers for each piece: its
+    duration [s], and the coefficients of t^0 to t^7 in x, y, z [m] and yaw [rad], with the time t since the piece
+    began. https://github.com/whoenig/uav_trajectories
 
     Args:
         where: path of the field that names the file.
 
     Raises:
-        DocumentError: the file cannot be read, or a line for each invalid piece.
+        DocumentError: the file cannot be read, or has invalid pieces; a line for each.
     """
     try:
         if path.stat().st_size > BYTES_MAX:
@@ -412,7 +412,7 @@ def pieces_of(path: Path, where: str) -> list[dict[str, Any]]:
 
 
 def _without_end(row: list[str]) -> list[str]:
-    """Return a row without empty cells at its end: files of Crazyswarm have a trailing comma."""
+    """Return a row without empty cells at its end: Crazyswarm's files have a trailing comma."""
     while row and not row[-1]:
         row.pop()
     return row

@@ -1,11 +1,11 @@
-"""The obstacles and surfaces around the drones: distances, directions, nearest points and crossings. Pure.
+"""The obstacles and surfaces around the drones: distances, directions, nearest points and crossings.
 
-An obstacle is a solid and a row of numbers: its shape, centre in W, cosine and sine of its yaw, and half of its size
-along its own axes (of a cylinder: radius, nothing, half of the height; of a sphere: radius). Distances from it are
-below 0 inside.
+An obstacle is a solid, given by a row of numbers: shape, centre in W, cosine and sine of yaw, and half of its size
+along its own axes (of a cylinder: radius, unused, half of the height; of a sphere: radius). Distances are negative
+inside it.
 
-A surface is a sheet of triangles without thickness: distances from it are unsigned. An edge of a single triangle is on
-its rim. All is exact, in a fixed order of plain operations, and compiled if numba is installed.
+A surface is a mesh of triangles without thickness, with unsigned distances. Its rim consists of the edges of only one
+triangle. All results are exact, computed in a fixed order of plain operations, and compiled if numba is installed.
 """
 
 import base64
@@ -23,37 +23,37 @@ from zsim.math.compiled import inlined, kernel, noinline
 from zsim.math.held import Held, hold
 from zsim.math.rotation import Vector, add, axpy, cross, dot, scaled, subtract
 
-# of an obstacle's row: its shape, centre in W, cosine and sine of its yaw, half of its size, see `row_of`
+# columns of an obstacle's row: shape, centre in W, cosine and sine of yaw, half of the size; see `row_of`
 BOX, CYLINDER, SPHERE = range(3)
 SHAPES = ("box", "cylinder", "sphere")
 SHAPE, CENTRE, COSINE, SINE, HALF = 0, 1, 4, 5, 6
 COLUMNS = 9
-TINY = 1e-12  # m, so that a point on an axis has a direction
-PAIRS_MAX = 1_000_000  # of points and obstacles that are compared at once
-WIDE = 1e9  # m, half of the side that a cylinder does not have
+TINY = 1e-12  # m, minimum length of a divisor, for points on an axis
+PAIRS_MAX = 1_000_000  # pairs of points and obstacles compared at once
+WIDE = 1e9  # m, half of a side that never limits a cylinder
 
-TRIANGLES_MAX = 40_000  # of all surfaces: with them a resolved scenario stays below the 4 MB of a file
-SINGLE = np.dtype("<f4")  # of the text that it holds
+TRIANGLES_MAX = 40_000  # of all surfaces: keeps a resolved scenario below a file's limit of 4 MB
+SINGLE = np.dtype("<f4")  # number format of packed triangles
 TRIANGLE = 9  # numbers of a triangle: a corner and the two edges from it [m; W]
-LEAF = 4  # parts of a leaf at most, chosen: a box costs about as much as a cylinder
-DEPTH = 64  # boxes that may wait while the tree is walked; each step down halves the parts
-MARGIN_M = 1e-6  # m, by which boxes are larger than what is in them, against rounding
-AREA_MIN_M2 = 1e-12  # m^2, twice the area; a smaller triangle has no direction and is left out
-WELD_M = 1e-6  # m, chosen: so near to each other two corners are one; a resolved scenario has single precision
-EDGE = 1e-9  # by which a triangle is wider for what crosses it, of its sides, so that nothing slips between two
-FIRST_EDGE, FIRST_CORNER, FACE = 0, 3, 6  # features of a triangle: edges ab, bc, ca; corners a, b, c; what is within
+LEAF = 4  # maximum number of parts in a leaf; chosen: a box costs about as much as a triangle
+DEPTH = 64  # maximum number of pending boxes while the tree is walked; each level halves the parts
+MARGIN_M = 1e-6  # m, margin of boxes around their contents, against rounding
+AREA_MIN_M2 = 1e-12  # m^2, minimum of twice the area; a smaller triangle has no defined normal and is left out
+WELD_M = 1e-6  # m, grid on which corners are merged; chosen: a resolved scenario has single precision
+EDGE = 1e-9  # relative widening of a triangle for crossings, so that no path slips between two
+FIRST_EDGE, FIRST_CORNER, FACE = 0, 3, 6  # features of a triangle: edges ab, bc, ca; corners a, b, c; interior
 
 Array = NDArray[np.float64]
 
 
 class Tree(NamedTuple):
-    """Boxes over P parts; the first is on top."""
+    """A tree of K bounding boxes over P parts; the first is the root."""
 
-    bounds: NDArray  # (K, 6), least and greatest x, y, z [m]
-    link: NDArray  # int32 (K, 2): the second child (the first follows) and 0; of a leaf its first part and their count
+    bounds: NDArray  # (K, 6), minimum and maximum x, y, z [m]
+    link: NDArray  # int32 (K, 2): second child (the first follows its parent) and 0; for a leaf, first part and count
     part: NDArray  # int32 (P,)
-    waiting: NDArray  # int32 (DEPTH,), boxes that wait while it is walked
-    away: NDArray  # (DEPTH,), what is known of them
+    waiting: NDArray  # int32 (DEPTH,), pending boxes while it is walked
+    away: NDArray  # (DEPTH,), their squared distances [m^2]
 
 
 class Sheet(NamedTuple):
@@ -61,7 +61,7 @@ class Sheet(NamedTuple):
 
     triangle: NDArray  # (T, TRIANGLE)
     rim: NDArray  # int8 (T, 6), 1 where an edge or corner is on the rim
-    surface: NDArray  # int32 (T,), whose it is
+    surface: NDArray  # int32 (T,), index of the surface
     tree: Tree
 
 
@@ -78,7 +78,7 @@ class Surroundings:
         self.is_empty = not self._obstacles and self._sheet is None
 
     def distances_m(self, p_W: ArrayLike) -> Array:
-        """Return the distance [m] of each point (P, 3) to the nearest one, below 0 in an obstacle; inf without any."""
+        """Return the distance [m] of each point (P, 3) to the nearest one; negative in an obstacle, inf if none."""
         least = least_distances(self._obstacles, p_W)
         if self._sheet is not None:
             least = np.minimum(least, nearest_points(self._sheet, p_W, np.maximum(least, 0.0))[0])
@@ -86,7 +86,7 @@ class Surroundings:
 
 
 def row_of(obstacle: Any) -> list[float]:
-    """Return the row of an obstacle of a scenario, whose position is that of its base, or the centre of a sphere."""
+    """Return the row of a scenario's obstacle, whose position is that of its base or of a sphere's centre."""
     x, y, z = obstacle.position_m
     if obstacle.shape == "box":
         half = [0.5 * side for side in obstacle.size_m]
@@ -99,7 +99,7 @@ def row_of(obstacle: Any) -> list[float]:
 
 
 def nearest(row: Sequence[float], x: float, y: float, z: float) -> tuple[float, float, float, float]:
-    """Return the distance of a point from the surface [m], below 0 inside, and the outward unit vector in W."""
+    """Return the distance of a point from an obstacle [m], negative inside, and the outward unit vector in W."""
     dx, dy, qz = x - row[CENTRE], y - row[CENTRE + 1], z - row[CENTRE + 2]
     c, s = row[COSINE], row[SINE]
     qx, qy = c * dx + s * dy, c * dy - s * dx
@@ -115,7 +115,7 @@ def nearest(row: Sequence[float], x: float, y: float, z: float) -> tuple[float, 
         if most > 0.0:
             ox, oy, oz = max(ox, 0.0), max(oy, 0.0), max(oz, 0.0)
             distance = math.sqrt(ox * ox + oy * oy + oz * oz)
-        else:  # inside: out by the nearest face
+        else:  # inside: towards the nearest face
             distance = most
             ox, oy, oz = 1.0 if ox == most else 0.0, 1.0 if oy == most else 0.0, 1.0 if oz == most else 0.0
         length = max(math.sqrt(ox * ox + oy * oy + oz * oz), TINY)
@@ -126,10 +126,7 @@ def nearest(row: Sequence[float], x: float, y: float, z: float) -> tuple[float, 
 
 
 def least_distances(obstacles: Iterable[Any], p_W: ArrayLike) -> NDArray[np.float64]:
-    """Return the distance [m] of each point (T, 3) from the nearest of some obstacles of a scenario, as `nearest` does.
-
-    inf where there are none.
-    """
+    """Return the distance [m] of each point (T, 3) to the nearest obstacle, as `nearest` does; inf if none."""
     points, rows = np.asarray(p_W, dtype=float).reshape(-1, 3), np.array([*map(row_of, obstacles)]).reshape(-1, COLUMNS)
     least, step = np.full(len(points), np.inf), max(1, PAIRS_MAX // max(len(rows), 1))
     for first in range(0, len(points) if len(rows) else 0, step):
@@ -147,7 +144,7 @@ def least_distances(obstacles: Iterable[Any], p_W: ArrayLike) -> NDArray[np.floa
 
 
 def sheet_of(environment: Any) -> Sheet:
-    """Return the triangles of the surfaces of a scenario's environment."""
+    """Return the triangles of all surfaces of a scenario's environment, with their tree."""
     each = [placed(surface) for surface in environment.surfaces or ()]
     triangle = np.concatenate([np.empty((0, TRIANGLE)), *each])
     whose = np.repeat(np.arange(len(each), dtype=np.int32), [len(part) for part in each])
@@ -162,7 +159,7 @@ def sheet_of(environment: Any) -> Sheet:
 
 
 def placed(surface: Any) -> Array:
-    """Return the triangles of a surface of a scenario in W, (T, 9): a corner, and the two edges from it [m]."""
+    """Return the triangles of a scenario's surface in W, (T, 9): a corner and the two edges from it [m]."""
     s, c = el.sin_cos(math.radians(surface.yaw_deg))
     x, y, z = np.moveaxis(surface.scale * unpacked(surface.triangles).reshape(-1, 3, 3), 2, 0)
     corners = np.stack([c * x - s * y, s * x + c * y, z], axis=2) + np.array(surface.position_m)
@@ -171,12 +168,12 @@ def placed(surface: Any) -> Array:
 
 
 def packed(triangles: Array) -> str:
-    """Return triangles as text: float32, compressed, in base 64."""
+    """Return triangles as text: float32, zlib, base64."""
     return base64.b64encode(zlib.compress(triangles.astype(SINGLE).tobytes(), 9)).decode()
 
 
 def unpacked(text: str) -> Array:
-    """Return the triangles of a text made by `packed`, (T, 9).
+    """Return the triangles (T, 9) in a text from `packed`.
 
     Raises:
         ValueError: the text is invalid.
@@ -186,11 +183,11 @@ def unpacked(text: str) -> Array:
     try:
         data = reader.decompress(base64.b64decode(text, validate=True), TRIANGLES_MAX * each + 1)
     except (binascii.Error, zlib.error) as error:
-        raise ValueError(f"is no triangles ({error})") from error
-    if len(data) > TRIANGLES_MAX * each:  # a short text may be of any number of bytes
+        raise ValueError(f"holds no triangles ({error})") from error
+    if len(data) > TRIANGLES_MAX * each:  # a short text may expand to any size
         raise ValueError(f"has more than {TRIANGLES_MAX} triangles; must have at most {TRIANGLES_MAX}")
     if not reader.eof:
-        raise ValueError("is no triangles (cut short)")
+        raise ValueError("holds no triangles (truncated)")
     if not data or len(data) % each:
         raise ValueError(f"has {len(data)} bytes; must have {each} for each triangle")
     triangles = np.frombuffer(data, SINGLE).astype(float).reshape(-1, TRIANGLE)
@@ -208,7 +205,7 @@ def corners_of(triangle: Array) -> Array:
 def outline_of(surface: Any) -> list[list[float]]:
     """Return the convex outline of a surface from above, counter-clockwise, as [x, y] [m; W].
 
-    By a monotone chain (A. M. Andrew, Information Processing Letters 9, 1979).
+    Monotone chain algorithm (A. M. Andrew, Information Processing Letters 9, 1979).
     """
     points = np.unique(np.round(corners_of(placed(surface))[..., :2].reshape(-1, 2), 2), axis=0).tolist()
 
@@ -227,7 +224,7 @@ def outline_of(surface: Any) -> list[list[float]]:
 
 
 def _rim(corners: Array) -> NDArray[np.int8]:
-    """Return which edges and corners of triangles are on the rim, (T, 6)."""
+    """Return 1 for each edge and corner of triangles on the rim, (T, 6)."""
     count = len(corners)
     if not count:
         return np.zeros((0, 6), dtype=np.int8)
@@ -242,7 +239,7 @@ def _rim(corners: Array) -> NDArray[np.int8]:
 
 
 def tree_over(low: Array, high: Array) -> Tree:
-    """Return the tree over P boxes, given their minimum and maximum corners (P, 3), halved along the longest side."""
+    """Return the tree over P boxes, halved along the longest side, given minimum and maximum corners (P, 3) [m]."""
     low, high = low - MARGIN_M, high + MARGIN_M
     part, middle = np.arange(len(low), dtype=np.int32), 0.5 * (low + high)
     bounds: list[Array] = []
@@ -267,18 +264,18 @@ def tree_over(low: Array, high: Array) -> Tree:
 
 
 class Nearest(NamedTuple):
-    """The nearest point of some triangles."""
+    """The point of a sheet nearest to a given point."""
 
     distance: float  # m
-    triangle: int  # -1: none is so near
-    feature: int  # of it
+    triangle: int  # index; -1: none within reach
+    feature: int  # of the triangle
     point: Vector
 
 
 def nearest_points(sheet: Held, p_W: ArrayLike, far_m: ArrayLike) -> tuple[Array, Array]:
-    """Return distances (P,) [m] and positions (P, 3) of the nearest points of a sheet, by `hold`, to points (P, 3).
+    """Return distances (P,) and positions (P, 3) [m] of the points of a held sheet nearest to points (P, 3).
 
-    They are `far_m` and the point itself if nothing is closer.
+    If no point is closer than `far_m`, they are `far_m` and the given point.
     """
     points = np.ascontiguousarray(p_W, dtype=float).reshape(-1, 3)
     least, found = np.array(np.broadcast_to(far_m, len(points)), dtype=float), np.empty_like(points)
@@ -288,7 +285,7 @@ def nearest_points(sheet: Held, p_W: ArrayLike, far_m: ArrayLike) -> tuple[Array
 
 @kernel()
 def _find_nearest(held: Held, points: NDArray, least: NDArray, found: NDArray) -> None:
-    """Set the nearest point (P, 3) to each point (P, 3), and the distance (P,), where this is less than it was."""
+    """Update the nearest point (P, 3) of each point (P, 3) and its distance (P,) if this decreases."""
     for k in range(points.shape[0]):
         nearest = nearest_point(held.content, (points[k, 0], points[k, 1], points[k, 2]), least[k])
         least[k] = nearest.distance
@@ -298,7 +295,7 @@ def _find_nearest(held: Held, points: NDArray, least: NDArray, found: NDArray) -
 
 @noinline
 def nearest_point(sheet: Sheet, x: Vector, far: float) -> Nearest:
-    """Return the nearest point closer than `far` [m]; of equally near points the first found."""
+    """Return the nearest point closer than `far` [m]; of equally near points, the first found."""
     tree = sheet.tree
     best, which, feature, point = far * far, -1, FACE, x
     if tree.bounds.shape[0] > 0 and _square(tree.bounds[0], x) < best:
@@ -333,9 +330,9 @@ def nearest_point(sheet: Sheet, x: Vector, far: float) -> Nearest:
 
 @inlined
 def nearest_on(row: NDArray, x: Vector) -> tuple[Vector, int]:
-    """Return the point of a triangle that is nearest to x, and the feature that it is on.
+    """Return the point of a triangle nearest to x, and its feature.
 
-    By the regions of Voronoi (C. Ericson, "Real-Time Collision Detection", 2005, section 5.1.5).
+    From the triangle's Voronoi regions (C. Ericson, "Real-Time Collision Detection", 2005, section 5.1.5).
     """
     a, ab, ac = (row[0], row[1], row[2]), (row[3], row[4], row[5]), (row[6], row[7], row[8])
     ax = subtract(x, a)
@@ -366,7 +363,7 @@ def nearest_on(row: NDArray, x: Vector) -> tuple[Vector, int]:
 
 @inlined
 def _square(bounds: NDArray, x: Vector) -> float:
-    """Return the square of a point's distance from a box [m^2]."""
+    """Return the squared distance of a point from a box [m^2]."""
     square = 0.0
     for k in range(3):
         over = max(bounds[k] - x[k], x[k] - bounds[k + 3], 0.0)
@@ -376,7 +373,7 @@ def _square(bounds: NDArray, x: Vector) -> float:
 
 @noinline
 def crosses(sheet: Sheet, start: Vector, end: Vector) -> bool:
-    """Tell whether the path from one point to another crosses a triangle; a point in its plane is in front of it."""
+    """Whether the segment between two points crosses a triangle; a point in its plane counts as in front of it."""
     tree = sheet.tree
     if tree.bounds.shape[0] == 0:
         return False
@@ -384,11 +381,11 @@ def crosses(sheet: Sheet, start: Vector, end: Vector) -> bool:
     while depth > 0:
         depth -= 1
         node = tree.waiting[depth]
-        apart = False
+        separated = False
         for k in range(3):
             low, high = min(start[k], end[k]), max(start[k], end[k])
-            apart |= high < tree.bounds[node, k] or low > tree.bounds[node, k + 3]
-        if apart:
+            separated |= high < tree.bounds[node, k] or low > tree.bounds[node, k + 3]
+        if separated:
             continue
         first, parts = tree.link[node, 0], tree.link[node, 1]
         if parts == 0:
@@ -415,6 +412,6 @@ def _crosses_one(row: NDArray, start: Vector, end: Vector) -> bool:
 
 @inlined
 def side_of(row: NDArray, x: Vector) -> tuple[float, Vector]:
-    """Return the volume that x spans with a triangle, above 0 in front of it, and its normal; neither of unit size."""
+    """Return the signed volume that x spans with a triangle, positive in front, and the normal; both unnormalized."""
     normal = cross((row[3], row[4], row[5]), (row[6], row[7], row[8]))
     return dot(normal, subtract(x, (row[0], row[1], row[2]))), normal

@@ -34,19 +34,19 @@ class ReceivedSample(NamedTuple):
 class FarEnd(NamedTuple):
     """A session at the other end of a link."""
 
-    session: str  # Zenoh's name of it
-    is_router: bool  # whether others may be behind it
+    session: str  # its Zenoh identifier
+    is_router: bool  # whether other sessions may be reached through it
 
 
 class RawSample(NamedTuple):
     """A publication, or a reply to a query, with all of Zenoh's metadata."""
 
-    kind: str  # "PUT" or "DELETE"; "ERROR" for a reply that refuses, which has no key
+    kind: str  # "PUT" or "DELETE"; "ERROR" for a refusal, which has no key
     key: str  # without the prefix of the session that received it
     payload: bytes  # as sent
-    encoding: str  # Zenoh's text of it, e.g. "application/msgpack;Imu"
-    timestamp: str | None  # of Zenoh, as text; None where nobody stamped it
-    attachment: bytes = b""  # what was sent beside the payload; empty where nothing was
+    encoding: str  # as Zenoh's text, e.g. "application/msgpack;Imu"
+    timestamp: str | None  # Zenoh's timestamp as text; None if no session added one
+    attachment: bytes = b""  # sent with the payload; empty if absent
 
 
 def _raw_sample(sample: zenoh.Sample, prefix: str) -> RawSample:
@@ -91,7 +91,7 @@ class Subscription:
         raw: the session.
         prefix: prefix of its keys.
         expression: keys to receive.
-        without: prefixes of keys to exclude; if given, pictures and this session's own messages are excluded too.
+        without: prefixes of keys to exclude; if given, also excludes pictures and this session's own messages.
     """
 
     def __init__(self, raw: zenoh.Session, prefix: str, expression: str, without: tuple[str, ...] = ()) -> None:
@@ -128,7 +128,7 @@ class Subscription:
         try:
             self._raw.put(self._wake_key, b"", allowed_destination=zenoh.Locality.SESSION_LOCAL)
         except zenoh.ZError:
-            return  # closed: nobody waits any longer
+            return  # closed: no `receive` is waiting
 
     def undeclare(self) -> None:
         """Stop receiving; a waiting `receive` raises SessionError."""
@@ -152,13 +152,13 @@ class Query:
     def __init__(self, raw: zenoh.Query, prefix: str) -> None:
         self._raw: zenoh.Query | None = raw
         self._prefix = prefix
-        # the keys that are queried, without the prefix of the session
+        # queried keys, without the session's prefix
         self.expression = str(raw.key_expr).removeprefix(prefix)
         self.payload = raw.payload.to_bytes() if raw.payload is not None else b""
         self.attachment = raw.attachment.to_bytes() if raw.attachment is not None else b""
 
     def request(self) -> ControlRequest:
-        """Return its request; DecodeError if it has none."""
+        """Decode its request; DecodeError if it has none."""
         return messages.decode_as(ControlRequest, self.payload, self.expression)
 
     def reply(self, key: str, payload: bytes) -> None:
@@ -200,19 +200,19 @@ class Session:
 
     def __init__(self, raw: zenoh.Session, federation: str, identity: Identity) -> None:
         self._raw = raw
-        self.federation = federation  # prefix of all keys
-        self.host = identity.host  # the name of this process's host, as its messages give it
+        self.federation = federation  # first part of all keys
+        self.host = identity.host  # name of this process's host in its messages
         # the name in its certificate; empty without one
         self.process = tls.own_name(identity) if identity.tls is not None else ""
         self.guarded = identity.access is not None  # whether access control is enforced here
-        # what access control at the other end permits this process; None where it has none, or is not asked
+        # what access control at the other end permits this process; None if there is none, or it is unknown
         self.permissions: Permissions | None = None
-        self.reads: list[str] = []  # the expressions that it has subscribed to so far
+        self.reads: list[str] = []  # expressions subscribed to so far
         self._prefix = f"{federation}/" if federation else ""
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._cached_publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
         self._matching: dict[str, bool] = {}
-        self._declared: dict[int, Callable[[], Any]] = {}  # by id of what is declared, what undeclares it
+        self._declared: dict[int, Callable[[], Any]] = {}  # by id of a declaration, the function that undeclares it
         self._realtime = False
 
     def use(self, mode: Mode) -> None:
@@ -220,7 +220,7 @@ class Session:
         self._realtime = mode == "realtime"
 
     def unprefixed(self) -> "Session":
-        """Return the same session with whole keys, prefix included, for bridges to other federations."""
+        """Return the same session with full keys, prefix included, for bridges between federations."""
         session = Session(self._raw, "", Identity(host=self.host))
         self._declared[id(session)] = session.undeclare_all
         return session
@@ -231,7 +231,7 @@ class Session:
     def undeclare_all(self) -> None:
         """Undeclare everything: declarations left when a Zenoh session closes leak files and memory."""
         for undeclare in list(self._declared.values()):
-            with suppress(zenoh.ZError):  # undeclared already, or its session is gone
+            with suppress(zenoh.ZError):  # already undeclared, or its session is closed
                 undeclare()
 
     def _keep(self, declared: Any) -> Any:
@@ -279,7 +279,7 @@ class Session:
         return publisher
 
     def has_subscribers(self, key: str) -> bool:
-        """Tell whether one of our keys has subscribers; cached, since Zenoh is too slow to be asked at each gate."""
+        """Whether one of our keys has subscribers; cached, since querying Zenoh at each gate is too slow."""
         if key in self._matching:
             return self._matching[key]
         publisher = self._publishers.get(key) or self._declare(key)
@@ -289,15 +289,15 @@ class Session:
 
         self._matching[key] = False
         self._keep(publisher.declare_matching_listener(zenoh.handlers.Callback(note, indirect=False)))
-        status: Any = publisher.matching_status  # the stub says bool; it is an object that has one
-        if status.matching:  # and never False: the listener's thread may have noted a subscriber meanwhile
+        status: Any = publisher.matching_status  # declared bool in the stub, but an object that has one
+        if status.matching:  # never set to False here: the listener's thread may have noted a subscriber meanwhile
             self._matching[key] = True
         return self._matching[key]
 
     def put_sample(self, key: str, payload: bytes, encoding: str) -> None:
-        """Publish a payload of any encoding on any of many keys, without declaring a publisher.
+        """Publish a payload of any encoding without declaring a publisher, for publishing on many keys.
 
-        SessionError if it is no key.
+        SessionError if `key` is not a key.
         """
         picture = keys.is_picture(key)
         with _key_errors(key):
@@ -306,7 +306,7 @@ class Session:
     def declare_publisher(self, key: str, encoding: str) -> Callable[[bytes, bytes], None]:
         """Return a function that publishes (payload, attachment) on one key; a full link drops it.
 
-        SessionError if it is no key, or our certificate does not permit us to publish there.
+        SessionError if `key` is not a key, or our certificate does not permit us to publish there.
         """
         self._check("publish", key)
         with _key_errors(key):
@@ -319,7 +319,7 @@ class Session:
     def put_cached(self, key: str, payload: bytes, encoding: str = "", attachment: bytes = b"") -> None:
         """Publish a payload, and keep it for later subscribers that query it, as Zenoh's advanced subscribers do.
 
-        Samples are numbered, since no session here stamps them.
+        Samples are numbered, since sessions here add no timestamps.
 
         Raises:
             SessionError: it is not a key.
@@ -387,7 +387,7 @@ class Session:
     def query(
         self, expression: str, parameters: str = "", payload: bytes = b"", encoding: str = "", timeout_s: float = 2.0
     ) -> list[RawSample]:
-        """Return all replies to a query, including refusals; SessionError if it is not a key expression."""
+        """Return all replies to a query, refusals included; SessionError if it is not a key expression."""
         body: dict[str, Any] = {"payload": payload, "encoding": zenoh.Encoding(encoding)} if payload else {}
         with _key_errors(expression):
             selector = zenoh.Selector(self._prefix + expression, parameters)
@@ -401,12 +401,12 @@ class Session:
         return found
 
     def get(self, expression: str, timeout_s: float = 2.0) -> list[ReceivedSample]:
-        """Return the last values of the keys of an expression."""
+        """Return the last values of the keys that match an expression."""
         replies = self.query(expression, timeout_s=timeout_s)
         return [ReceivedSample(reply.key, reply.payload) for reply in replies if reply.kind != "ERROR"]
 
     def get_surely(self, expression: str) -> list[ReceivedSample] | None:
-        """Return the last values of the keys of an expression; None if a process did not reply in time."""
+        """Return the last values of the keys that match an expression; None if a process did not reply in time."""
         replies = self.query(expression)
         if any(reply.kind == "ERROR" for reply in replies):  # Zenoh's own "Timeout" among them
             return None
@@ -415,14 +415,14 @@ class Session:
     def request(
         self, key: str, op: str, source: str, args: dict[str, Any] | None = None, timeout_s: float = 5.0
     ) -> ControlAnswer:
-        """Send a request to `key` and return its answer; `Unanswered` if none comes, or we may not ask there.
+        """Send a request to `key` and return its answer; `Unanswered` if none comes, or access control forbids it.
 
-        SessionError if it is no key, or the arguments cannot be encoded.
+        SessionError if `key` is not a key, or the arguments cannot be encoded.
         """
         try:
             payload = messages.encode(ControlRequest(op=op, args=args or {}, source=source))
         except (OverflowError, UnicodeEncodeError) as error:
-            allowed = "must hold whole numbers of 64 bits, and text in UTF-8"
+            allowed = "must be 64-bit integers and UTF-8 text"
             raise SessionError(f"{key}: {op} cannot be sent ({error}); {allowed}") from error
         if fault := self._refusal("ask", key):
             return Unanswered(ok=False, error=fault)
@@ -435,7 +435,7 @@ class Session:
         return Unanswered(ok=False, error=f"{key}: {what}; is it running?")
 
     def declare_queryable(self, expression: str, callback: Callable[[Query], None], complete: bool = False) -> None:
-        """Call back, in a thread of Zenoh's, for every query; `complete` if no other process need be asked about it."""
+        """Call back for every query, in a Zenoh thread; `complete` if no other process needs to be queried."""
         queryable = self._raw.declare_queryable(
             self._prefix + expression, lambda query: callback(Query(query, self._prefix)), complete=complete
         )
@@ -444,7 +444,7 @@ class Session:
     # Liveliness and links
 
     def declare_process(self, name: str) -> None:
-        """Declare the liveliness token of a process, and that this session belongs to it."""
+        """Declare the liveliness token of a process, and a token that assigns this session to it."""
         self.declare_token(keys.session_token(name, self.zid()))
         self.declare_token(keys.token(name))
 
@@ -453,7 +453,7 @@ class Session:
         self._keep(self._raw.liveliness().declare_token(self._prefix + key))
 
     def on_token(self, expression: str, callback: Callable[[str, bool], None]) -> None:
-        """Call back with (key, alive) whenever a token appears or disappears, and for those that exist already."""
+        """Call back with (key, alive) whenever a token appears or disappears, and for each existing one."""
 
         def forward(sample: zenoh.Sample) -> None:
             alive = sample.kind == zenoh.SampleKind.PUT
@@ -501,7 +501,7 @@ def open_session(
     try:
         raw = zenoh.open(config)
     except BaseException as error:
-        # a panic of Rust, whose class no module exports: no thread, no memory
+        # a Rust panic, whose class no module exports: out of threads or memory
         if not isinstance(error, zenoh.ZError) and type(error).__name__ != "PanicException":
             raise
         raise SessionError(explain(_first_sentence(error))) from error
@@ -510,14 +510,14 @@ def open_session(
         yield session
     finally:
         session.undeclare_all()
-        with suppress(zenoh.ZError):  # a process at a far end is stopped, and does not take what is left for it
+        with suppress(zenoh.ZError):  # a stopped process at the far end does not take its remaining messages
             raw.close()
 
 
 def _flow(view: bool, drop: bool) -> dict[str, Any]:
     """Return the treatment of a key's messages on a full link.
 
-    Views have a separate queue: in a shared one, a view forwarded by the hub would wait behind a blocked put.
+    Views have their own queue: in a shared one, a view forwarded by the hub would wait behind a blocked put.
     """
     return {
         "congestion_control": zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK,

@@ -1,7 +1,7 @@
-"""The cameras of a run for pages: their names, the newest picture of each one watched, and the marks drawn on it.
+"""The cameras of a run for pages: their names, the newest picture of each watched one, and the marks drawn on it.
 
 Pictures may come from any program, so each is checked before a browser decodes it. Frames: B of the drone; K of the
-camera, x right, y down, z ahead. Pixels count from the picture's upper left corner, whole numbers at pixel centres.
+camera: x right, y down, z ahead. Pixel (0, 0) is the centre of the picture's upper left pixel.
 """
 
 import math
@@ -22,23 +22,23 @@ from zsim.sensors.camera import CAMERAS, PictureError, frame_of
 from zsim.sensors.camera_model import Lens, pixel, undistorted
 from zsim.transport.session import RawSample, Session
 
-ASKED_S = 15.0  # wall; a page silent for longer counts as asleep: a slow one takes seconds for a picture
-MESSAGE_BYTES = 1_000  # of a picture's message, besides its data, at most; chosen
-SIGHTINGS_KEPT = 8  # of one camera from one key: half a second of 15 Hz
-MARKS_MAX = 40  # on a picture; more would hide it
-RADIUS_MIN_PX = 5.0  # of a circle; a smaller one goes unnoticed
-SIGMAS = 2.0  # of the direction, drawn around a hat
-FOLD_MAX = 1e-3  # focal lengths between a ray and the undistorted ray of its pixel; beyond it the polynomial folds over
-NORM_MIN = 1e-6  # of a quaternion or a direction
-AGE_MAX_NS = 300_000_000  # simulated, between a picture and sightings drawn on it; chosen: 3 pictures of 10 Hz
-PICTURE_BYTES_MAX = 1_000_000  # of a picture that is shown; ten a second fill 80 Mbit/s
-PIXELS_MAX = 1920 * 1200  # chosen: the largest camera of a scenario; a browser needs 4 bytes for each
-ENDS = b"\xff\xd9"  # of an image; ITU-T T.81, table B.1
-SHOWN = frozenset({0xC0, 0xC1, 0xC2})  # frames that browsers show: baseline, extended, progressive
+ASKED_S = 15.0  # wall; a page silent for longer counts as asleep: a slow page takes seconds for a picture
+MESSAGE_BYTES = 1_000  # largest size of a picture's message without its data; chosen
+SIGHTINGS_KEPT = 8  # number of sightings per camera and key: half a second at 15 Hz
+MARKS_MAX = 40  # number of marks on a picture; more would hide it
+RADIUS_MIN_PX = 5.0  # radius of a circle; a smaller one goes unnoticed
+SIGMAS = 2.0  # uncertainty of the direction that is drawn around a hat, in standard deviations
+FOLD_MAX = 1e-3  # focal lengths; largest distance between a ray and the undistorted ray of its pixel
+NORM_MIN = 1e-6  # norm of a quaternion or a direction
+AGE_MAX_NS = 300_000_000  # simulated; between a picture and the sightings drawn on it; chosen: 3 pictures at 10 Hz
+PICTURE_BYTES_MAX = 1_000_000  # size of a picture that is shown; ten a second fill 80 Mbit/s
+PIXELS_MAX = 1920 * 1200  # chosen: the largest camera of a scenario; a browser needs 4 bytes per pixel
+ENDS = b"\xff\xd9"  # last bytes of a JPEG; ITU-T T.81, table B.1
+SHOWN = frozenset({0xC0, 0xC1, 0xC2})  # markers of frames that browsers show: baseline, extended, progressive
 
 
 class CameraPicture(NamedTuple):
-    """A checked picture; another picture of the run has another number."""
+    """A checked picture; its number is unique in the run."""
 
     number: int
     image: CameraImage
@@ -47,7 +47,7 @@ class CameraPicture(NamedTuple):
 class Mark(Struct, frozen=True):
     """A circle on a picture [px], with a text beside it."""
 
-    u: float  # of its centre
+    u: float  # u, v: its centre
     v: float
     radius: float
     text: str
@@ -57,13 +57,13 @@ class _Watched:
     """The state of a camera while a page watches it."""
 
     def __init__(self) -> None:
-        self.payload: bytes | None = None  # newer than the picture; not decoded yet
+        self.payload: bytes | None = None  # a newer picture that is not decoded yet
         self.picture: CameraPicture | None = None
-        self.sightings: dict[str, deque[Sightings]] = {}  # by key
+        self.sightings: dict[str, deque[Sightings]] = {}  # newest ones by key
 
 
 class CameraFeed:
-    """The cameras of one run, each named `DRONE/CAMERA`; only those that a page watches are subscribed to.
+    """The cameras of one run, each named `DRONE/CAMERA`; only watched ones are subscribed to.
 
     Cameras of drones that are not in the run are ignored; `hat_m` is the diameter of a hat [m].
     """
@@ -83,35 +83,35 @@ class CameraFeed:
         self._wall_s = wall_s
         self._lock = threading.Lock()
         self._infos: dict[str, CameraInfo] = {}
-        self._asked: dict[object, tuple[tuple[str, ...], float]] = {}  # cameras, and until when [s; wall], by page
+        self._requests: dict[object, tuple[tuple[str, ...], float]] = {}  # cameras, and until when [s; wall], by page
         self._watched: dict[str, _Watched] = {}
         self._undeclare: dict[str, Callable[[], None]] = {}  # by key
         self._number = 0
         self.refused: Counter[str] = Counter()  # number of refused pictures by camera
-        self.reasons: dict[str, str] = {}  # why the last of them was refused
+        self.reasons: dict[str, str] = {}  # why the last picture of a camera was refused
 
     def open(self) -> None:
-        """Discover the existing cameras, and those that appear later."""
+        """Discover the cameras that exist or appear later."""
         expression = keys.camera_info("*", "*")
         self._link.declare_subscriber(expression, self._on_info)
         try:
             samples = self._link.get(expression)
         except ZsimError:
-            return  # an older certificate does not permit the query; later cameras are still discovered
+            return  # an older certificate does not permit the query; cameras that appear later are still discovered
         for sample in samples:
             self._on_info(sample, kept=True)
 
     def close(self) -> None:
         with self._lock:
-            self._asked.clear()
+            self._requests.clear()
         self.update()
 
     def update(self) -> None:
         """Subscribe to the cameras that pages recently requested, and no others; call it several times a second."""
         with self._lock:
             now_s = self._wall_s()
-            self._asked = {page: asked for page, asked in self._asked.items() if asked[1] > now_s}
-            wanted = {camera for cameras, _ in self._asked.values() for camera in cameras if camera in self._infos}
+            self._requests = {page: each for page, each in self._requests.items() if each[1] > now_s}
+            wanted = {camera for cameras, _ in self._requests.values() for camera in cameras if camera in self._infos}
             self._watched = {camera: self._watched.get(camera) or _Watched() for camera in wanted}
         wanted_keys = {keys.camera(*camera.split("/")) for camera in wanted}
         wanted_keys |= {key for camera in wanted for key in _sighting_keys(camera)}
@@ -130,11 +130,11 @@ class CameraFeed:
     def ask(self, page: object, cameras: Iterable[str]) -> None:
         """Request pictures of these cameras, and no others, for a page; to be repeated within ASKED_S."""
         with self._lock:
-            self._asked[page] = tuple(cameras), self._wall_s() + ASKED_S
+            self._requests[page] = tuple(cameras), self._wall_s() + ASKED_S
 
     def release(self, page: object) -> None:
         with self._lock:
-            self._asked.pop(page, None)
+            self._requests.pop(page, None)
 
     def picture(self, camera: str) -> CameraPicture | None:
         """Return the newest picture of a watched camera, None before the first."""
@@ -148,7 +148,7 @@ class CameraFeed:
             return watched.picture
 
     def marks(self, camera: str) -> tuple[Mark, ...]:
-        """Return the marks for the newest picture: of a detector's findings, else of the world's sightings."""
+        """Return the marks on the newest picture: from a detector's sightings, or otherwise from the world's."""
         with self._lock:
             watched, info = self._watched.get(camera), self._infos.get(camera)
             if watched is None or watched.picture is None or info is None:
@@ -183,7 +183,7 @@ class CameraFeed:
     def _on_info(self, sample: Any, kept: bool = False) -> None:
         camera = _camera_of(sample.key)
         if camera not in self._order or (kept and camera in self._infos):
-            return  # one that arrived meanwhile is newer than a kept one
+            return  # one that has arrived in the meantime is newer than a kept one
         try:
             info = messages.decode(sample.key, sample.payload)
         except DecodeError:
@@ -221,7 +221,7 @@ class CameraFeed:
                 watched.sightings.setdefault(sample.key, deque(maxlen=SIGHTINGS_KEPT)).append(seen)
 
     def _checked(self, camera: str, payload: bytes) -> CameraPicture | None:
-        """Return a valid picture; count an invalid one."""
+        """Return a valid picture; count an invalid one as refused."""
         try:
             image: CameraImage = messages.decode(keys.camera(*camera.split("/")), payload)
             check_picture(image.data, image.width, image.height)
@@ -272,7 +272,7 @@ def check_picture(data: bytes, width: int, height: int) -> None:
 
 
 def is_usable(info: CameraInfo) -> bool:
-    """Return whether a camera's description, which any program may have sent, is valid for computation."""
+    """Return whether a camera's description, which any program may have sent, permits computation."""
     fx, fy = info.K[0], info.K[4]
     return fx > 0 and fy > 0 and math.sqrt(sum(q * q for q in info.orientation_wxyz)) > NORM_MIN
 
@@ -282,7 +282,7 @@ def field_of_view(info: CameraInfo) -> float:
 
 
 def sightings_of(picture_ns: int, candidates: Iterable[Sightings]) -> Sightings | None:
-    """Return the sightings nearest to a picture's exposure; None where all are too far from it in time."""
+    """Return the sightings nearest to a picture's exposure; None if all are too far from it in time."""
     nearest = min(candidates, key=lambda each: abs(each.t_sample_ns - picture_ns), default=None)
     if nearest is None or abs(nearest.t_sample_ns - picture_ns) > AGE_MAX_NS:
         return None
@@ -292,24 +292,24 @@ def sightings_of(picture_ns: int, candidates: Iterable[Sightings]) -> Sightings 
 def marks_of(info: CameraInfo, seen: Iterable[Seen], hat_m: float) -> tuple[Mark, ...]:
     """Return the marks of sightings in B that fall on the picture of a usable camera.
 
-    A mark is a circle around a hat, of diameter `hat_m` [m], and 2 sigma of its direction.
+    A mark is a circle around a hat of diameter `hat_m` [m], enlarged by SIGMAS of its direction's uncertainty.
     """
     fx, _, cx, _, fy, cy, *_ = info.K
     lens = Lens(fx, fy, cx, cy, *info.D, info.width, info.height)
     q_BK = rotation.normalised(info.orientation_wxyz)
     marks = []
     for each in seen:
-        place = _place(lens, rotation.rotate_back(q_BK, each.direction_B))
-        if place is None or each.range_m <= 0:
+        centre = _pixel_of(lens, rotation.rotate_back(q_BK, each.direction_B))
+        if centre is None or each.range_m <= 0:
             continue
         half_angle = hat_m / 2.0 / each.range_m + SIGMAS * abs(each.sigma_direction_rad)
         radius = min(max(lens.fx * half_angle, RADIUS_MIN_PX), float(lens.height))
-        marks.append(Mark(round(place[0], 1), round(place[1], 1), round(radius, 1), range_text(each)))
+        marks.append(Mark(round(centre[0], 1), round(centre[1], 1), round(radius, 1), range_text(each)))
     return tuple(marks)
 
 
-def _place(lens: Lens, ray_K: rotation.Vector) -> tuple[float, float] | None:
-    """Return the pixel of a ray, None where it is outside the picture.
+def _pixel_of(lens: Lens, ray_K: rotation.Vector) -> tuple[float, float] | None:
+    """Return the pixel of a ray, None if it is outside the picture.
 
     A distortion polynomial folds over far outside the field of view: a ray from there would be drawn at the pixel of
     another ray.

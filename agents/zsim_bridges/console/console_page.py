@@ -35,14 +35,14 @@ from zsim_bridges.console.scene import ChosenRing, draw_ground
 from zsim_bridges.console.view_buffer import ALL, KINDS, EventRow, chosen_rows
 
 PANEL_PX = 350
-ROWS_SHOWN = 60  # events
+ROWS_SHOWN = 60  # number of events
 SWITCHES = {
-    "ghosts": "Ghosts: where the formation is to be",
+    "ghosts": "Ghosts: the desired formation",
     "estimates": "Estimates: 2σ ellipsoids (hold 74 % in 3-D)",
     "trails": "Trails",
 }
-MANY = 12  # drones; more do not fit on a page, so the worst come first by default
-FILTER_MAX = 80  # characters
+MANY = 12  # number of drones; more do not fit on a page, so the worst come first by default
+FILTER_MAX = 80  # characters of the filter's text
 SEVERITIES = ("red", "amber", None)
 SORTINGS: dict[str, Callable[[DroneRow], tuple[float, ...]]] = {
     "as in the scenario": lambda _: (),
@@ -67,8 +67,8 @@ DRONE_MODES = {
     "return": "Return",
     "emergency": "Emergency",
     "reset": "Reset",
-}  # and the return to the start, which is not a mode
-IN_CONTROL = ("takeoff", "return", "reset")  # these need control; any page may land or stop a drone
+}  # the return to the start is not a mode of the firmware
+IN_CONTROL = ("takeoff", "return", "reset")  # modes that need control; any page may land or stop a drone
 DRONE_ICONS = {"takeoff": viser.Icon.PLANE_DEPARTURE, "return": viser.Icon.HOME, "reset": viser.Icon.REFRESH}
 
 
@@ -78,16 +78,16 @@ class ConsolePage:
     Its folders are for each page's own controls.
 
     Args:
-        gui: of viser; the controls of another run are removed.
+        gui: viser's controls; those of another run are removed.
         report: called with the outcome of requests that are refused here.
         show: shows or hides one of `SWITCHES` in the scene.
         choose_trail: sets the length of trails [s].
-        request_return: lets a formation return to its start, and land.
-        show_preview: shows the path that a formation would fly; None: nothing.
+        request_return: returns a formation to its start, and lands it.
+        show_preview: shows the path that a formation would fly; None: removes it.
 
     Attributes:
         flights: history of single drones, for plots.
-        chosen: name of the formation that is shown; empty if there is none.
+        chosen: name of the shown formation; empty if there is none.
         parts: the part that a page must control to use a control, by the control's id.
     """
 
@@ -152,7 +152,7 @@ class ConsolePage:
         panel.set_width(PANEL_PX)
 
     def _formation_tabs(self, gui: viser.GuiApi, tabs: Any) -> None:
-        """Give every formation a folder in two tabs; only that of the chosen one is visible."""
+        """Add a folder for every formation to two tabs; only that of the chosen one is visible."""
         fly, plots = tabs.add_tab("Fly"), tabs.add_tab("Plots")
         for cluster in self._run.scenario.clusters:
             name, space = cluster.name, self._run.spaces[cluster.name]
@@ -204,10 +204,10 @@ class PageForms:
     """Adds the per-page controls to each page of a run, and keeps them.
 
     Args:
-        shared: the controls of all pages, with folders for those of each.
-        names, radii_m: of the drones.
+        shared: the controls of all pages, with folders for those of each page.
+        names, radii_m: names and radii of the drones.
         part_of: returns the part that a page must control to let a drone take off.
-        request_return: lets drones return to their starts.
+        request_return: returns drones to their starts, and lands them.
     """
 
     def __init__(
@@ -243,7 +243,7 @@ class PageForms:
             form.drone.choose(drone)
 
     def toggle(self, client_id: int | None, drone: str) -> None:
-        """Select a drone on one page for one command with others, or unselect it."""
+        """Select a drone on one page for a command to several drones, or deselect it."""
         if form := self._forms.get(client_id):
             form.fleet.toggle(drone)
 
@@ -266,7 +266,7 @@ class PageForms:
         sensors_of: Callable[[str], str],
         events: Sequence[EventRow],
     ) -> None:
-        """Show on each page the drones, sorted and filtered, the figures of the chosen one, and the chosen events.
+        """Show on each page the sorted and filtered drones, the figures of the chosen one, and the filtered events.
 
         `sensors_of` returns the sensors of a drone as HTML.
         """
@@ -340,7 +340,7 @@ class DroneForm:
 
     Args:
         may: returns why this page may not let a drone take off or reset it; with `use` true, it takes control first.
-        request_return: lets drones return to their starts, and land.
+        request_return: returns drones to their starts, and lands them.
     """
 
     def __init__(
@@ -375,7 +375,7 @@ class DroneForm:
 
     @property
     def targets(self) -> list[str]:
-        """Names of the drones that the buttons act on: the selected ones, or else the chosen one."""
+        """Names of the drones to which the buttons apply: the selected ones, or else the chosen one."""
         return self._selected or [self.chosen]
 
     @property
@@ -390,7 +390,7 @@ class DroneForm:
         self._choice.value = drone
 
     def select(self, drones: Sequence[str]) -> None:
-        """Let the buttons act on these drones; without any, on the chosen one."""
+        """Apply the buttons to these drones; if there are none, to the chosen one."""
         self._selected = list(drones)
         self._rename()
 
@@ -411,7 +411,7 @@ class DroneForm:
     def _request(self, mode: str) -> None:
         """Request an operation that needs control from all drones that would not refuse it."""
         able = [drone for drone in self.targets if not drone_refusals(self._run, drone)[mode]]
-        drones = able or self.targets  # the condition may have changed; otherwise the refusal is shown
+        drones = able or self.targets  # if all would refuse, the request shows why, or the condition has changed
         drones = [drone for drone in drones if not self._may(drone, True)]
         if not drones:
             return

@@ -1,6 +1,6 @@
 """The console: shows one run after another on a viser server that only its own HTTP server can reach.
 
-A `RunPage` shows one run, its views as pictures, tables and plots, and sends the operators' requests.
+A `RunPage` shows the views of one run as pictures, tables and plots, and sends the operators' requests.
 """
 
 import math
@@ -49,26 +49,26 @@ from zsim_bridges.console.run_monitor import KEPT_S, RecordPlayer, RunMonitor, T
 from zsim_bridges.console.scene import RunScene
 from zsim_bridges.console.view_buffer import ViewBuffer
 
-REASON_S = 0.1  # wall; between two checks for a reason to end
+REASON_S = 0.1  # wall; between two checks whether there is a reason to end
 OFFER_S = 20.0  # wall; how long pages may take to copy the files of a run: 100 MB over 40 Mbit/s Wi-Fi
-TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster
-STAMPS_PER_AGE = 5.0  # greatest age of a stamp, as a fraction of a command's maximum age; it grows older in transit
-TOLD_S = 2.0  # wall; a dragged slider is refused many times
+TABLE_S = 0.5  # wall; period of tables, plots and trails: people read no faster
+STAMPS_PER_AGE = 5.0  # a command's maximum age over that of a new stamp, which grows older in transit
+REFUSAL_S = 2.0  # wall; between two notifications of a page: a dragged slider is refused many times
 NOTICE_S = 8.0  # wall; how long a notification stays in the corner
-EVENTS_MAX = 20  # in `state`
-SILENT = "silent"  # in place of the clock's state, when the world does not answer
+EVENTS_MAX = 20  # number of events in `state`
+SILENT = "silent"  # replaces the clock's state while the world does not answer
 FEW_DRONES = 20  # drones; from this number on the picture rate is halved
 RATE_HZ, RATE_LOW_HZ = 20.0, 10.0
-FAST_RATE = 4.0  # × real time; from then on the picture rate is halved, too: the run needs the processors
+FAST_RATE = 4.0  # × real time; from this rate on the picture rate is halved, too: the run needs the processors
 
 
 class Console:
     """One console.
 
     Args:
-        token: of operators; None if only this machine can connect.
-        rate_hz: pictures a second; None: by the number of drones.
-        world: description of where a run is searched for.
+        token: the operators' token; None if only this machine can connect.
+        rate_hz: pictures a second; None: by the number of drones and the rate of the run.
+        world: description of where the console looks for a run.
         folder: where the shown run is recorded, if known.
 
     Raises:
@@ -125,7 +125,7 @@ class Console:
             with self._proxy.open():
                 urls = self._proxy.urls()
                 self._say(f"{self._name}: steer at {urls[OPERATOR]}")
-                self._say(f"{self._name}: look, without steering, at {urls[VIEWER]}")
+                self._say(f"{self._name}: watch only at {urls[VIEWER]}")
                 yield
         finally:
             self._viser.close()
@@ -151,7 +151,7 @@ class Console:
 
         Args:
             end_reason: returns the reason, None while there is none.
-            deserted: returns whether to stop waiting for the pages.
+            deserted: returns whether to stop waiting for the pages' copies.
         """
         while not (reason := end_reason()):
             time.sleep(REASON_S)
@@ -175,7 +175,7 @@ class RunPage:
     """The page of one run.
 
     Args:
-        server: of viser; what another run left on it is removed.
+        server: viser's server; the controls and nodes of another run are removed from it.
         rate_hz: pictures a second; None: by the number of drones and the rate of the run.
         world: description of where the run is.
 
@@ -205,7 +205,7 @@ class RunPage:
         self._rate_hz = rate_hz
         self._names, self._members = run.names, run.members
         self._table_s = self._monitor_s = 0.0
-        self._told_s: dict[int, float] = {}  # when a page was last told that it is not in control [s; wall]
+        self._notified_s: dict[int, float] = {}  # when a page was last notified of a refusal [s; wall]
 
         variables = {name: space.names for name, space in spaces.items()}
         age_s = scenario.time.max_command_age_ms / 1e3 / STAMPS_PER_AGE
@@ -293,12 +293,12 @@ class RunPage:
 
     def head(self) -> dict[str, Any]:
         head, stall = self._monitor.head(time.monotonic()), self._time_monitor.stall
-        stood = stall and {"lasted_s": stall.lasted_s, "ago_s": time.monotonic() - stall.ended_s}
-        ages = {"heard_s": self._time_monitor.heard_s, "stall": stood}
+        stalled = stall and {"lasted_s": stall.lasted_s, "ago_s": time.monotonic() - stall.ended_s}
+        ages = {"heard_s": self._time_monitor.heard_s, "stall": stalled}
         return {**head, **ages, "run_id": self._run.info.run_id, "orders": self.orders.rows()}
 
     def command(self, request: OrderRequest) -> dict[str, Any]:
-        """Carry out an order of a page; return its progress as plain data with its `state`."""
+        """Carry out an order from a page; return its progress as plain data with its `state`."""
         if request.op == "acknowledge":
             self._monitor.board.acknowledge()
             return {"id": request.id, "op": request.op, "state": "confirmed", "reason": ""}
@@ -308,8 +308,8 @@ class RunPage:
         """Return whether a page may use a shared control; if not, show the reason on it."""
         part = self._page.parts.get(control)
         refusal = "" if part is None else self.desk.use(client_id, part)
-        if refusal and time.monotonic() - self._told_s.get(client_id, -math.inf) > TOLD_S:
-            self._told_s[client_id] = time.monotonic()
+        if refusal and time.monotonic() - self._notified_s.get(client_id, -math.inf) > REFUSAL_S:
+            self._notified_s[client_id] = time.monotonic()
             self._tell("Control", "orange", client_id, f"Refused: {refusal}")
         return not refusal
 
@@ -378,7 +378,7 @@ class RunPage:
         self._scene.trails.number += bool(instants)
 
     def _keep_past(self, t_s: float) -> None:
-        """Read the record around the instant that a replay shows, and drop what is far from it."""
+        """Read the record around the time that a replay shows, and drop what is far from it."""
         self.record.fill(t_s)
         kept = t_s - KEPT_S, t_s + KEPT_S
         self._scene.trails.keep(*kept)
@@ -422,9 +422,9 @@ class RunPage:
         self._scene.draw_trails()
 
     def _on_outcome(self, outcome: RequestOutcome) -> None:
-        """Show the outcome of a request: a refusal in the corner of every page, and every outcome among the events.
+        """Show a refusal in the corner of every page, and the outcome of a request among the events.
 
-        The world publishes events of what it does, but not of requests to formations.
+        The world publishes no events about requests to formations.
         """
         if outcome.order and not self.orders.note(outcome):
             return
@@ -465,7 +465,7 @@ class RunPage:
 
 
 def picture_rate_hz(drones: int, rate: float) -> float:
-    """Return a suitable picture rate [Hz] for a number of drones and a rate of the run [× real time]."""
+    """Return the picture rate [Hz] for a number of drones and a rate of the run [× real time]."""
     return RATE_LOW_HZ if drones >= FEW_DRONES or rate >= FAST_RATE else RATE_HZ
 
 

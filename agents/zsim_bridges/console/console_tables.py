@@ -39,15 +39,15 @@ EVENT_COLOURS = {
 }
 LINK_COLOURS = {"waiting": AMBER, "connected": BLUE, "armed": GREEN, "lost": RED}
 SEVERITY_COLOURS = {"red": RED, "amber": AMBER}
-LEFT_MAX_S = 24 * 3600.0  # of a battery; a longer remaining time is not shown
-COLUMNS = 8  # of the table of drones
-PITCH_PX_PER_DEG, PITCH_MAX_PX = 0.9, 36.0  # of the artificial horizon
-NO_FAULT = "no fault acts"
+LEFT_MAX_S = 24 * 3600.0  # remaining time of a battery; a longer one is not shown
+COLUMNS = 8  # number of columns of the table of drones
+PITCH_PX_PER_DEG, PITCH_MAX_PX = 0.9, 36.0  # scale and limit of the artificial horizon
+NO_FAULT = "no active fault"
 FEW_LINES = "max-height:8em;overflow-y:auto"  # many formations must not push the emergency button off the page
 STYLE = "font-size:12px;line-height:1.35;font-variant-numeric:tabular-nums"
 BESIDE = "padding:2px 10px"  # padding of a text in a panel, equal to that of viser's controls
-TABLE_BESIDE = "padding:2px 12px 2px 8px;overflow-x:auto"  # of a table; the panel's scroll bar is 12 px wide
-NAME_WHOLE = 8  # characters of a name that fit on one line of the table of drones
+TABLE_BESIDE = "padding:2px 12px 2px 8px;overflow-x:auto"  # padding of a table; the panel's scroll bar is 12 px wide
+NAME_WHOLE = 8  # number of characters of a name that fit on one line of the table of drones
 WRAP = "white-space:normal"
 SPAN_NS = 1_000_000_000  # simulated; shortest time over which a sensor's rate is averaged
 
@@ -59,10 +59,10 @@ class DroneRow(NamedTuple):
     """A drone's row in the table of drones."""
 
     drone: DroneCondition
-    gps: str = "–"  # fixes used and refused
-    faults: tuple[str, ...] = ()  # active injected ones
+    gps: str = "–"  # number of fixes used and refused
+    faults: tuple[str, ...] = ()  # kinds of the active injected faults
     link: tuple[str, str] = ("", "")  # description of a driver's link, and its colour
-    severity: Severity | None = None  # of its worst alarm
+    severity: Severity | None = None  # severity of its worst alarm
 
     @property
     def name(self) -> str:
@@ -80,10 +80,10 @@ class DroneRow(NamedTuple):
 
 
 class TableRows:
-    """Makes rows and tables of the newest views.
+    """Derives rows and tables from the newest views.
 
     Args:
-        own_rates: of the user's sensors [Hz], by drone and sensor.
+        own_rates: configured rates of the user's sensors [Hz], by drone and sensor.
         severity_of: returns the severity of a drone's worst alarm.
     """
 
@@ -123,18 +123,18 @@ class TableRows:
 
 
 class SensorRates:
-    """Sensor rates of one drone at a time, from its estimator's counts, which are sampled now and then."""
+    """Sensor rates of one drone at a time, from irregular samples of its estimator's counts."""
 
     def __init__(self) -> None:
         self._drone = ""
         self._samples: list[tuple[int, Counts]] = []
 
     def update(self, drone: str, t_ns: int, counts: Counts) -> dict[str, float]:
-        """Add the counts of a drone's sensors at an instant; return the latest rates [Hz]."""
+        """Add the counts of a drone's sensors at simulated time t_ns; return the latest rates [Hz]."""
         if self._samples:
             last_ns, last = self._samples[-1]
             restarted = any(sum(counts.get(kind, (0, 0))) < sum(before) for kind, before in last.items())
-            if drone != self._drone or t_ns < last_ns or restarted:  # the estimator, or a replay has gone back
+            if drone != self._drone or t_ns < last_ns or restarted:  # the estimator restarted, or a replay was rewound
                 self._samples = []
             elif t_ns == last_ns:
                 self._samples.pop()  # the run is paused
@@ -162,9 +162,9 @@ def drone_table(
     """Return a table of drones.
 
     Args:
-        figures: of their flight by name.
-        selected: names of those selected for one command.
-        chosen: whose instruments are shown.
+        figures: flight figures by drone.
+        selected: names of the drones that are selected for one command.
+        chosen: name of the drone whose instruments are shown.
         empty: text shown if there are no rows.
     """
     if not rows and empty:
@@ -172,19 +172,19 @@ def drone_table(
     head = _head(
         ("", "selected for one command"),
         ("drone", ""),
-        ("state", "of its firmware"),
-        ("z [m]", "height over the origin"),
-        ("v [m/s]", "speed over the ground and up"),
-        ("hdg", "heading [deg], from east to north"),
-        ("battery", "with the time left at the present drain"),
-        ("σ [m]", "of the estimated position"),
+        ("state", "state of its firmware"),
+        ("z [m]", "height above the origin"),
+        ("v [m/s]", "speed, including the climb"),
+        ("hdg", "heading [deg], 0 = east, 90 = north"),
+        ("battery", "charge, and time left at the present drain"),
+        ("σ [m]", "σ of the estimated position"),
     )
     cells = (_drone_cells(row, (figures or {}).get(row.name), row.name in selected, row.name == chosen) for row in rows)
     return _table(head + "".join(cells))
 
 
 def _drone_cells(row: DroneRow, figures: FlightFigures | None, selected: bool, chosen: bool) -> str:
-    """Return the rows of a drone: its figures, its commander, and its faults."""
+    """Return the rows of a drone: its figures, and notes on its commander, failsafe, faults and link."""
     drone = row.drone
     name = _coloured(drone.name, SEVERITY_COLOURS[row.severity]) if row.severity else escape(drone.name)
     if len(drone.name) > NAME_WHOLE:
@@ -220,7 +220,7 @@ def _drone_cells(row: DroneRow, figures: FlightFigures | None, selected: bool, c
 
 
 def link_note(link: ReceivedLink | None) -> tuple[str, str]:
-    """Describe the link to an external drone, None before its driver has published; with the colour of the text."""
+    """Return a description of the link to an external drone and its colour; None: its driver has not published yet."""
     if link is None:
         return "external; no driver yet", AMBER
     state = link.state
@@ -252,10 +252,10 @@ def figure_lines(figures: FlightFigures | None) -> str:
         height=f"{z:.1f}",
         climb=f"{figures.climb_m_s:+.1f}",
     )
-    place = f"position {x:.2f}, {y:.2f}, {z:.2f} m"
+    position = f"position {x:.2f}, {y:.2f}, {z:.2f} m"
     speed = f"speed {figures.speed_m_s:.2f} m/s, climb {figures.climb_m_s:+.2f} m/s"
     turn = f"roll {figures.roll_deg:+.1f}°, pitch {figures.pitch_deg:+.1f}°, heading {figures.heading_deg:.0f}°"
-    return f"<div style='{STYLE};{BESIDE}'>{instruments}{place}<br>{speed}<br>{turn}</div>"
+    return f"<div style='{STYLE};{BESIDE}'>{instruments}{position}<br>{speed}<br>{turn}</div>"
 
 
 def sensor_table(
@@ -263,19 +263,20 @@ def sensor_table(
 ) -> str:
     """Return the table of one drone's sensors: measurements that its estimator used and refused, and rates [Hz].
 
-    `own_rates` are the configured rates of the user's sensors [Hz], which have a row even if they are not counted.
+    `own_rates` are the configured rates of the user's sensors [Hz], each of which has a row even if the estimator does
+    not count it.
     """
     counted = [
         (kind, used, refused, f"{rates[kind]:.0f} Hz" if kind in rates else "–")
         for kind, (used, refused) in counts.items()
     ]
-    others = [(kind, "–", "–", f"{rate:.0f} Hz as set") for kind, rate in own_rates.items() if kind not in counts]
+    others = [(kind, "–", "–", f"{rate:.0f} Hz (configured)") for kind, rate in own_rates.items() if kind not in counts]
     title = f"<div style='{STYLE};{BESIDE}'><b>{escape(name)}</b>: {escape(uncertainty)}</div>"
     head = _head(
-        ("sensor", "of the drone"),
+        ("sensor", "sensor of the drone"),
         ("used", "measurements that its estimator used"),
         ("refused", "measurements that were too unlikely or unusable"),
-        ("rate", "at which they arrive, in simulated time"),
+        ("rate", "rate of arrival in simulated time"),
     )
     rows = (_cells(escape(str(cell)) for cell in row) for row in (*counted, *others))
     return title + _table(head + "".join(rows))
@@ -285,7 +286,7 @@ def sensor_table(
 
 
 def formation_lines(states: Mapping[str, tuple[str, str]]) -> str:
-    """Return phase and reason of each formation by name."""
+    """Return the phase and reason of each formation as HTML; `states` has them by name."""
     lines = [
         f"<b>{escape(name)}</b>: {escape(phase.replace('_', ' '))}" + (f" – {escape(reason)}" if reason else "")
         for name, (phase, reason) in states.items()
@@ -294,7 +295,7 @@ def formation_lines(states: Mapping[str, tuple[str, str]]) -> str:
 
 
 def preflight_lines(checks: Mapping[str, Sequence[Check]]) -> str:
-    """Return the failed checks of drones before a take-off, and which are ready."""
+    """Return the failed pre-take-off checks of drones, and the names of those that are ready, as HTML."""
     lines = [
         _coloured(f"✗ {drone}: {check.name} {check.text}", RED if check.blocks else AMBER)
         for drone, each in checks.items()
@@ -312,7 +313,7 @@ def preflight_lines(checks: Mapping[str, Sequence[Check]]) -> str:
 
 
 def event_table(newest_first: Iterable[EventRow]) -> str:
-    """Return the table of events; the page unfolds long texts, by the mark of the row."""
+    """Return the table of events; the page uses the mark of a row to unfold its long text."""
     lines = []
     for event, times, _ in newest_first:
         kind = _coloured(event.kind, EVENT_COLOURS.get(event.kind, GREY))
@@ -328,7 +329,7 @@ def event_table(newest_first: Iterable[EventRow]) -> str:
 
 
 def fault_lines(active: Sequence[str], over: Sequence[str] = ()) -> str:
-    """Return the active faults, and those that are over in grey."""
+    """Return the active faults, followed by past ones in grey, as HTML."""
     lines = [_coloured(f"⚠ {fault}", AMBER) for fault in active] or [_coloured(NO_FAULT, GREY)]
     lines += [_coloured(f"over: {fault}", GREY) for fault in reversed(over)]
     return f"<div style='{STYLE};{FEW_LINES};{BESIDE};overflow-wrap:anywhere'>{'<br>'.join(lines)}</div>"

@@ -1,7 +1,7 @@
 """Which page of the console controls which part: a formation, or the run itself.
 
-A page takes control of a free part by using one of its controls. Another page requests it, and has it once that is
-granted, or once the controlling page is closed or lost. An emergency, a landing and a hold need no control.
+A page takes control of a free part by using one of its controls. Another page must request the part, and gets it when
+the controlling page grants the request, is closed or is lost. Emergencies, landings and holds need no control.
 """
 
 import threading
@@ -16,10 +16,10 @@ import viser
 
 from zsim_bridges.console.run_forms import assign
 
-RUN = "run"  # the part of time, faults and drones of no formation; a formation of that name shares it
-EVERY = ""  # the part of a control that acts on all parts
+RUN = "run"  # part with time, faults and single drones; a formation of that name shares it
+EVERY = ""  # part of the controls that affect all parts
 LOST_S = 10.0  # wall; a page that has not polled for so long counts as lost: its script or its machine has stopped
-SILENT_SHOWN_S = 3.0  # wall; pages poll twice a second
+SILENT_SHOWN_S = 3.0  # wall; shortest silence that is shown; pages poll twice a second
 HERE = ("", "127.0.0.1", "::1")  # addresses of pages on the console's machine
 OPERATOR, VIEWER = "operator", "viewer"
 Tell = Callable[[int, str], None]
@@ -27,7 +27,7 @@ CONTROL_STYLE = "font-size:12px;line-height:1.35;padding:2px 10px 6px;overflow-w
 
 
 class Holding(NamedTuple):
-    """The controlling page of a part and the page that requests control, as seen by one page; empty for none."""
+    """The page that controls a part and the one that requests it (each empty for none), as seen by one page."""
 
     part: str
     holder: str = ""
@@ -39,10 +39,10 @@ class Holding(NamedTuple):
 
 @dataclass
 class _Page:
-    number: int
+    number: int  # in order of opening
     role: str = OPERATOR
     address: str = ""
-    looked_s: float | None = None  # wall; None before the first poll
+    looked_s: float | None = None  # when it last polled [s; wall]; None before the first poll
 
     @property
     def name(self) -> str:
@@ -53,7 +53,7 @@ class ControlDesk:
     """Records which page, by viser's number, is in control; thread-safe.
 
     Args:
-        parts: the formations; RUN is added.
+        parts: names of the formations; RUN is added.
         tell: shows a line of text on a page.
     """
 
@@ -76,11 +76,11 @@ class ControlDesk:
                 self._pages[page] = _Page(self._count)
 
     def close(self, page: int) -> None:
-        """Note that a page is closed, which releases its parts."""
+        """Record that a page is closed, which releases its parts."""
         with self._lock:
             self._askers = {part: asker for part, asker in self._askers.items() if asker != page}
             for part in [part for part, holder in self._holders.items() if holder == page]:
-                self._pass_on(part, f"{self.name_of(page)} is gone, and with it")
+                self._pass_on(part, f"{self.name_of(page)} has left and released")
             self._pages.pop(page, None)
 
     def look(self, page: int, role: str, address: str) -> None:
@@ -99,10 +99,10 @@ class ControlDesk:
                 holder = self._holders[part]
                 if self._silent_s(holder) > LOST_S:
                     self._pass_on(part, f"{self.name_of(holder)} was silent for {LOST_S:.0f} s and has lost")
-                    self._tell(holder, f"Control of {words(part)} was given away: this page was silent")
+                    self._tell(holder, f"Control of {words(part)} was given to another page: this one was silent")
 
     def refusal(self, page: int, part: str) -> str:
-        """Return why a page may not use a control of a part; empty where it may."""
+        """Return why a page may not use a control of a part; empty if it may."""
         with self._lock:
             for each in self.parts if part == EVERY else (part,):
                 holder = self._holders.get(each, page)
@@ -111,7 +111,7 @@ class ControlDesk:
         return ""
 
     def use(self, page: int, part: str) -> str:
-        """Give a page control of a free part; return why it may not use it, empty where it may."""
+        """Give a page control of a free part; return why it may not use the part, empty if it may."""
         with self._lock:
             refusal = self.refusal(page, part)
             if not refusal and part != EVERY and part not in self._holders:
@@ -164,13 +164,13 @@ class ControlDesk:
             return [each.name for each in sorted(known, key=lambda each: (each.role == VIEWER, each.number))]
 
     def held_by_others(self, page: int) -> frozenset[str]:
-        """Return the parts whose controls a page may not use, EVERY among them."""
+        """Return the parts whose controls a page may not use; EVERY is one of them if there are any."""
         with self._lock:
             held = frozenset(part for part, holder in self._holders.items() if holder != page)
         return held | {EVERY} if held else held
 
     def name_of(self, page: int) -> str:
-        known = self._pages.get(page)  # without the lock: it may close meanwhile
+        known = self._pages.get(page)  # may be called without the lock, so the page may have closed
         return known.name if known else "a page"
 
     def _silent_s(self, page: int) -> float:
@@ -182,7 +182,7 @@ class ControlDesk:
         asker = self._askers.pop(part, None)
         if asker is not None:
             self._holders[part] = asker
-            self._tell(asker, f"{why} the control of {words(part)}: it is yours now")
+            self._tell(asker, f"{why} control of {words(part)}; it is yours now")
 
 
 def words(part: str) -> str:
@@ -192,7 +192,7 @@ def words(part: str) -> str:
 class ControlForm:
     """Shows on one page (viser's number) who is in control, with buttons to request, grant and release control.
 
-    `part_of` has the part of each shared control by its id, which its element on the page also has.
+    `part_of` has the part of each shared control by its id, which is also that of its element on the page.
     """
 
     def __init__(self, gui: viser.GuiApi, desk: ControlDesk, page: int, part_of: Mapping[str, str]) -> None:
@@ -202,10 +202,10 @@ class ControlForm:
         self._parts: list[str] = []
         self._text = gui.add_html("")
         self._buttons: list[tuple[Any, Any]] = []
-        for place in range(2):  # the formation that is shown, and the run
+        for row in range(2):  # the shown formation, and the run
             first, second = gui.add_button("Ask", visible=False), gui.add_button("Keep", visible=False, color="gray")
-            first.on_click(lambda _, place=place: self._press(place))
-            second.on_click(lambda _, place=place: self._answer(place, granted=False))
+            first.on_click(lambda _, row=row: self._press(row))
+            second.on_click(lambda _, row=row: self._answer(row, granted=False))
             self._buttons.append((first, second))
 
     def refresh(self, parts: list[str]) -> None:
@@ -225,18 +225,18 @@ class ControlForm:
             assign(first, label=label or first.label, visible=bool(label))
             assign(second, label=keep or second.label, visible=bool(keep))
 
-    def _press(self, place: int) -> None:
-        for holding in self._desk.holdings(self._page, self._parts[place : place + 1]):
+    def _press(self, row: int) -> None:
+        for holding in self._desk.holdings(self._page, self._parts[row : row + 1]):
             if not holding.mine:
                 self._desk.ask(self._page, holding.part)
             elif holding.asker:
-                self._answer(place, granted=True)
+                self._answer(row, granted=True)
             else:
                 self._desk.release(self._page, holding.part)
         self.refresh(self._parts)
 
-    def _answer(self, place: int, granted: bool) -> None:
-        for part in self._parts[place : place + 1]:
+    def _answer(self, row: int, granted: bool) -> None:
+        for part in self._parts[row : row + 1]:
             self._desk.answer(self._page, part, granted)
         self.refresh(self._parts)
 
@@ -256,7 +256,7 @@ def _holding_line(holding: Holding) -> str:
 
 
 def _offer(holding: Holding | None) -> tuple[str, bool]:
-    """Return the label of a part's first button (empty for none), and whether another page requests the part here."""
+    """Return the label of a part's first button (empty: hidden), and whether another page requests this page's part."""
     if holding is None or not holding.holder or holding.asked_by_me:
         return "", False
     if not holding.mine:

@@ -39,10 +39,10 @@ from zsim_bridges.console.run_forms import (
 PREVIEW_STYLE = "font-size:12px;line-height:1.3;padding:2px 10px;color:#d9480f"
 REST_S = 1.0  # wall; sliders must rest this long before their values are sent, since people type slowly
 STILL_S = 2.0  # wall; if a formation's goal has not changed for this long, it is not moving: the slider shows its goal
-OVER_MAX_S = 3600.0  # simulated; of a move, as controllers take it
+OVER_MAX_S = 3600.0  # simulated; longest duration of a move that controllers accept
 OPERATIONS = {"Take off": "takeoff", "Engage": "engage", "Hold": "hold", "Rejoin": "rejoin", "Land": "land"}
 SAFE = ("hold", "land")  # operations that need no control
-RETURN = "Return"  # above the middle of the starts, to land there
+RETURN = "Return"  # flies above the middle of the starts, and lands there
 LABELS = {
     **{op: label for label, op in OPERATIONS.items()},
     "target": "sliders",
@@ -58,17 +58,17 @@ EXPRESSIONS = "x_c = 5 + 3*cos(0.1*t)\nyaw = 90 + 6*t"
 WAYPOINTS = "0: x_c = 5, y_c = 0\n20: x_c = 5, y_c = 6"
 EXPRESSION_UNITS = "t in seconds, lengths in metres, angles in degrees as on the sliders; sin and cos are of radians"
 WAYPOINT_UNITS = "seconds from the start, lengths in metres, angles in degrees as on the sliders"
-SIDEWAYS_M = 50.0  # around the drones' starts; chosen: as far as a page shows a formation well
+SIDEWAYS_M = 50.0  # horizontally around the drones' starts; chosen: as far as a page shows a formation well
 HEIGHT_MIN_M, HEIGHT_MAX_M = 1.0, 30.0  # chosen: clear of the ground, and within sight
-SIDE_MAX_M = 20.0  # of a formation; chosen
-DISPLACEMENT_M = 5.0  # of a robot from its place in a template; chosen
-TILT_MAX_DEG = 29.0  # of a formation; controllers take less than 30, flight_check.py
-CORNER_DEG = 10.0  # least angle at a corner; at 0 and 180 degrees the robots are in line
-DIGITS = 6  # of a displayed value: 5.1, not 5.1000000000000005
+SIDE_MAX_M = 20.0  # longest side of a formation; chosen
+DISPLACEMENT_M = 5.0  # largest displacement of a robot from its position in a template; chosen
+TILT_MAX_DEG = 29.0  # tilt of a formation; controllers accept less than 30 (flight_check.py)
+CORNER_DEG = 10.0  # smallest angle at a corner; at 0 and 180 degrees the robots are collinear
+DIGITS = 6  # decimal digits of a displayed value: 5.1, not 5.1000000000000005
 STEPS = {"m": 0.1, "deg": 1.0}
-SHOWN_MAX = 16  # variables that a page shows one by one; of more, only those of the formation as a whole
-WAYPOINT_STEP_S = 20.0  # from the first to the second prefilled waypoint
-PREFILLED = ("x_c", "y_c", "z_c", "yaw")  # variables in prefilled waypoints, where a formation has them
+SHOWN_MAX = 16  # number of variables with sliders; of more, only those of the entire formation have one
+WAYPOINT_STEP_S = 20.0  # time from the first to the second prefilled waypoint
+PREFILLED = ("x_c", "y_c", "z_c", "yaw")  # variables in prefilled waypoints, if a formation has them
 
 
 class _Flight(NamedTuple):
@@ -76,7 +76,7 @@ class _Flight(NamedTuple):
 
     op: str
     shown: str  # the arguments as the page shows them
-    args: dict[str, Any]  # in SI units
+    args: dict[str, Any]  # arguments of the request, in SI units
 
 
 class FormationForm:
@@ -84,8 +84,8 @@ class FormationForm:
 
     Args:
         report: called with the outcome of requests that are refused here.
-        request_return: lets a formation move over the middle of its starts, and land.
-        show_preview: shows in the scene the path that would be flown; None: nothing.
+        request_return: moves a formation above the middle of its starts, and lands it there.
+        show_preview: shows in the scene the path that would be flown; None: removes it.
 
     Attributes:
         safe: the controls that a page may use without being in control.
@@ -109,8 +109,10 @@ class FormationForm:
         self._space = space
         self._ranges = {each.name: each for each in slider_ranges(space, cluster, scenario)}
         self._previewed: _Flight | None = None
-        self._shown: tuple[float, ...] | None = None  # where the formation is desired to be
-        self._written: tuple[float, ...] | None = None  # where the prefilled waypoints begin
+        self._shown: tuple[float, ...] | None = (
+            None  # desired variables, or estimated ones while it has no desired shape
+        )
+        self._written: tuple[float, ...] | None = None  # variables at which the prefilled waypoints begin
         self._edited = False
         self._controls: dict[str, Any] = {}
         for label, op in OPERATIONS.items():
@@ -131,12 +133,12 @@ class FormationForm:
         hint = "Duration of a move; 0: as fast as the robots' limits allow"
         self._over = gui.add_number("over [s]", 0.0, min=0.0, max=OVER_MAX_S, step=0.5, hint=hint)
         gui.add_html(limits_line(f"over: 0 to {OVER_MAX_S:g} s"))
-        hint = "Preview the path of a target or trajectory, and ask before it is flown"
+        hint = "Preview the path of a target or trajectory, and confirm it before it is flown"
         self._first = gui.add_checkbox("Preview first", False, hint=hint)
         self._preview_text = gui.add_html("", visible=False)
-        self._fly_it = gui.add_button("Fly what is previewed", icon=viser.Icon.PLAYER_PLAY, color="blue", visible=False)
+        self._fly_it = gui.add_button("Fly the preview", icon=viser.Icon.PLAYER_PLAY, color="blue", visible=False)
         self._fly_it.on_click(lambda _: self._end_preview(fly=True))
-        self._discard = gui.add_button("Discard it", color="gray", visible=False)
+        self._discard = gui.add_button("Discard the preview", color="gray", visible=False)
         self._discard.on_click(lambda _: self._end_preview(fly=False))
         shown = primary_variables(space.names)
         self._sliders = {name: VariableSlider(gui, self._ranges[name]) for name in shown}
@@ -145,10 +147,10 @@ class FormationForm:
         self._trajectories(gui, cluster.plan.trajectory)
 
     def offer(self, run: RunCondition) -> None:
-        """Disable, with the reason, what the controller would refuse; sliders still show the formation's state."""
+        """Disable what the controller would refuse, and show the reason; sliders still show the formation's state."""
         name = self._cluster.name
         refusals = offered(run, partial(formation_refusals, cluster=name))
-        refusals["return"] = refusals["target"]  # its first part
+        refusals["return"] = refusals["target"]  # a return begins with a target
         set_refusals(self._controls, refusals)
         for op, control in self._others:
             set_refusals({op: control}, refusals)
@@ -182,13 +184,13 @@ class FormationForm:
         moved = {name: value for name, slider in self._sliders.items() if (value := slider.pop_value()) is not None}
         if self.request_target(moved):
             for name in moved:
-                self._sliders[name].hold(wall_s)  # a previewed one returns without a request
+                self._sliders[name].hold(wall_s)  # unless it is requested, a previewed value returns to the goal
 
     def request_target(self, shown: dict[str, float]) -> bool:
         """Request values in the units of the page; return whether they are within their ranges."""
         over_s = float(self._over.value)
-        asked = [self._ranges[name].refusal(value) for name, value in shown.items()]
-        refusals = [each for each in (*asked, range_refusal("over", over_s, 0.0, OVER_MAX_S, "s")) if each]
+        found = [self._ranges[name].refusal(value) for name, value in shown.items()]
+        refusals = [each for each in (*found, range_refusal("over", over_s, 0.0, OVER_MAX_S, "s")) if each]
         if refusals and shown:
             self._report(RequestOutcome(f"{self._cluster.name}: target", "; ".join(refusals)))
             return False
@@ -205,7 +207,7 @@ class FormationForm:
             self._send(flight)
             return
         op, shown, args = flight
-        if op == "target" and self._previewed is not None and self._previewed.op == op:  # of sliders moved one by one
+        if op == "target" and self._previewed is not None and self._previewed.op == op:  # extend the preview
             shown = f"{self._previewed.shown}, {shown}"
             args = {**args, "values": {**self._previewed.args["values"], **args["values"]}}
         apart_m = self._cluster.gains.separation_min_m
@@ -272,7 +274,7 @@ class FormationForm:
             add("Fly the waypoints", lambda: self._fly(lambda: parse_waypoints(points.value, self._ranges)))
 
     def _prefill(self) -> None:
-        """Fill in the formation's place as the first waypoint, and again as the second, to be edited.
+        """Fill in the formation's position as the first and as the second waypoint, which the operator edits.
 
         The waypoints then follow the formation until they are edited.
         """
@@ -291,9 +293,9 @@ class FormationForm:
 
 
 class _HeldValue(NamedTuple):
-    value: float  # of a slider that was moved
-    goal: float  # of the formation
-    since_s: float  # since when that is the goal [wall]
+    value: float  # the value to which the slider was moved
+    goal: float  # the formation's last goal
+    since_s: float  # when that became the goal [s; wall]
 
 
 class VariableSlider:
@@ -305,17 +307,17 @@ class VariableSlider:
     def __init__(self, gui: viser.GuiApi, range_: "SliderRange") -> None:
         self._range = range_
         self._lock = threading.Lock()
-        self.moved: tuple[float, float] | None = None  # by an operator, to which value, and when [s; wall]
+        self.moved: tuple[float, float] | None = None  # the value to which an operator moved it, and when [s; wall]
         self._held: _HeldValue | None = None
         self._slider: Any = gui.add_slider(range_.label, range_.low, range_.high, range_.step, range_.start)
-        self._slider.label = f"{range_.label}: not known"
+        self._slider.label = f"{range_.label}: unknown"
         self._slider.on_update(self._on_update)
 
     def lock(self, locked: bool) -> None:
         assign(self._slider, disabled=locked)
 
     def pop_value(self) -> float | None:
-        """Return, once, the value to which it was moved; None if it was not."""
+        """Return the value to which it was moved, once; None if it was not moved."""
         with self._lock:
             moved, self.moved = self.moved, None
         return None if moved is None else moved[0]
@@ -325,7 +327,7 @@ class VariableSlider:
         self._held = _HeldValue(float(self._slider.value), float("nan"), wall_s)
 
     def follow(self, goal: float, wall_s: float) -> None:
-        """Show the formation's goal [m, rad], unless it was moved and the formation is on its way.
+        """Show the formation's goal [m, rad], unless it was moved and the formation is still moving there.
 
         The slider extends to the value that it shows; requests remain limited to the range.
         """
@@ -381,9 +383,10 @@ class SliderRange(NamedTuple):
         return math.radians(shown) if self.unit == "deg" else shown
 
     def to_display(self, value: float) -> float:
-        """Return a value [m, rad] in the unit of the range, rounded to its step; the limit if it is just beyond it.
+        """Return a value [m, rad] in the unit of the range, rounded to its step.
 
-        Limits need not be whole steps: those of sides come from the scenario.
+        A value beyond a limit by up to half a step becomes the limit, which need not be a multiple of the step: those
+        of sides come from the scenario.
         """
         shown = self.in_unit(value)
         rounded = round(round(shown / self.step) * self.step, DIGITS)
@@ -391,19 +394,19 @@ class SliderRange(NamedTuple):
         return within if abs(shown - within) <= self.step / 2.0 else rounded
 
     def label_of(self, value: float) -> str:
-        """Return the label; it contains the value [m, rad] if that is out of range."""
+        """Return the label, with the value [m, rad] if that is out of range."""
         shown, slack = self.in_unit(value), self.step / 2.0
         if self.low - slack <= shown <= self.high + slack:
             return self.label
         return f"{self.name} = {shown:.1f} {self.unit}: out of range"
 
     def refusal(self, shown: float) -> str | None:
-        """Return why a value may not be requested, None if it may."""
+        """Return why a value, in the unit of the range, may not be requested; None if it may."""
         return range_refusal(self.name, shown, self.low, self.high, self.unit)
 
 
 def height_range_m(drones: Iterable[Drone]) -> tuple[float, float]:
-    """Return the range of heights to which some drones may be sent, below the lowest of their ceilings."""
+    """Return the range of heights to which drones may be sent; it ends at or below the lowest of their ceilings."""
     top_m = min(HEIGHT_MAX_M, *(drone.limits.altitude_m for drone in drones))
     return min(HEIGHT_MIN_M, top_m / 2.0), top_m
 
@@ -425,28 +428,28 @@ def slider_ranges(space: ClusterSpace, cluster: Cluster, scenario: Scenario) -> 
     ranges = []
     for name in space.names:
         shown_in = shown_unit(name)
-        whole = (-180.0, 180.0) if shown_in == "deg" else (-DISPLACEMENT_M, DISPLACEMENT_M)
+        default = (-180.0, 180.0) if shown_in == "deg" else (-DISPLACEMENT_M, DISPLACEMENT_M)
         stem = name.rpartition(".")[2].rstrip("0123456789").rstrip("_")
-        low, high = bounds.get(name) or bounds.get(stem) or whole
+        low, high = bounds.get(name) or bounds.get(stem) or default
         ranges.append(SliderRange(name, shown_in, float(low), float(high), STEPS[shown_in]))
     return ranges
 
 
 def primary_variables(names: Sequence[str]) -> list[str]:
-    """Return the variables that a page shows one by one: all if few; if many, those of the formation as a whole."""
-    whole = ("x_c", "y_c", "z_c", "roll", "pitch", "yaw", "p", "q", "beta")
-    return list(names) if len(names) <= SHOWN_MAX else [name for name in names if name in whole]
+    """Return the variables that have sliders: all up to SHOWN_MAX; of more, those of the entire formation."""
+    primary = ("x_c", "y_c", "z_c", "roll", "pitch", "yaw", "p", "q", "beta")
+    return list(names) if len(names) <= SHOWN_MAX else [name for name in names if name in primary]
 
 
 def parse_expressions(text: str, names: Sequence[str], angles: Collection[str] = ()) -> dict[str, Any]:
-    """Return the arguments of a trajectory of lines `variable = expression`; other names are constants.
+    """Return the arguments of a trajectory given as lines `variable = expression`; other names are constants.
 
     Args:
-        names: of the formation's variables.
-        angles: those of them whose expressions are in degrees; `NAME_deg` is the same as `NAME`.
+        names: names of the formation's variables.
+        angles: names of those whose expressions are in degrees; `NAME_deg` is the same as `NAME`.
 
     Raises:
-        InputError: a line is neither.
+        InputError: a line is neither an expression nor a used constant, or there is no expression.
     """
     by_variable: dict[str, str] = {}
     constants: dict[str, float] = {}
@@ -461,7 +464,7 @@ def parse_expressions(text: str, names: Sequence[str], angles: Collection[str] =
         elif name in names:
             by_variable[name] = value
         else:
-            constants[name] = _number(value, f"line {number}: {name} is not a variable, and as a constant")
+            constants[name] = _number(value, f"line {number}: {name}, a constant since it is no variable,")
     if not by_variable:
         raise InputError("trajectory is empty; must have at least one line VARIABLE = EXPRESSION")
     for name in constants:
@@ -471,10 +474,10 @@ def parse_expressions(text: str, names: Sequence[str], angles: Collection[str] =
 
 
 def parse_waypoints(text: str, ranges: Mapping[str, SliderRange]) -> dict[str, Any]:
-    """Return the arguments of a trajectory of lines `seconds: variable = value, …`, values in the ranges' units.
+    """Return the arguments of a trajectory given as lines `seconds: variable = value, …` in the ranges' units.
 
     Raises:
-        InputError: a line has another form.
+        InputError: a line has another form, or there is none.
     """
     points = []
     for number, line in _lines(text):
@@ -491,7 +494,7 @@ def parse_waypoints(text: str, ranges: Mapping[str, SliderRange]) -> dict[str, A
 
 
 def waypoints_from(value: Sequence[float], ranges: Sequence[SliderRange]) -> str:
-    """Return waypoints that begin where a formation is, in the units of the page."""
+    """Return two waypoints at the present values of a formation's variables, in the units of the page."""
     pairs = [
         f"{each.name} = {round(each.in_unit(here), 2):g}"
         for each, here in zip(ranges, value, strict=True)
@@ -501,9 +504,9 @@ def waypoints_from(value: Sequence[float], ranges: Sequence[SliderRange]) -> str
 
 
 def is_apart(value: Sequence[float], other: Sequence[float], ranges: Sequence[SliderRange]) -> bool:
-    """Return whether a formation's prefilled waypoints at one place differ from those at another by more than a step.
+    """Return whether the prefilled waypoints at two states of a formation differ by more than a step.
 
-    Text that followed every estimate would change constantly.
+    Otherwise the text would change with every estimate.
     """
     return any(
         abs(round(each.in_unit(here - there), 2)) > each.step
@@ -513,7 +516,7 @@ def is_apart(value: Sequence[float], other: Sequence[float], ranges: Sequence[Sl
 
 
 def _lines(text: str) -> list[tuple[int, str]]:
-    """Return the lines with their numbers, without comments and blank lines."""
+    """Return the lines with their numbers, except comments and blank lines."""
     numbered = enumerate(text.splitlines(), start=1)
     return [(number, line.strip()) for number, line in numbered if line.strip() and not line.lstrip().startswith("#")]
 

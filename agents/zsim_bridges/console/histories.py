@@ -1,7 +1,7 @@
 """The recent past of a run, in memory: trails of its drones, and points of variables as plots show them. Pure.
 
 For a flight both cover a few minutes, and restart when time goes back. For a replayed record they hold whatever was
-read of it, in any order, until it is far from the shown instant.
+read of it, in any order, until it is far from the shown time.
 """
 
 import math
@@ -23,32 +23,39 @@ from zsim_bridges.console.picture import PLAN_DIGITS, Array, DronePoses
 
 Row = TypeVar("Row")
 
-SPAN_S = 180.0  # simulated; greatest length of trails and curves
+SPAN_S = 180.0  # simulated; longest trails and curves
 INTERVAL_S = 0.25  # simulated, between two points of a curve; a formation answers within seconds
 HISTORY_POINTS_MAX = int(SPAN_S / INTERVAL_S)
 SERIES = ("desired", "estimated", "true")
 
-TRAIL_POINTS_MAX = 6_000  # of all trails together: 144 kB sent to a browser each time
+TRAIL_POINTS_MAX = 6_000  # number of points of all trails together: 144 kB sent to a browser each time
 TRAILS_S = (10.0, 30.0, 60.0, SPAN_S)  # selectable lengths of trails, simulated
 TRAIL_S = 60.0  # initial length
-SPACING_M = 0.08  # between two points of a trail: a sixth of a hull
-SPACING_S = 0.05  # simulated, and in time: as often as pictures come at 1 × real time
+SPACING_M = 0.08  # shortest distance between two points of a trail: a sixth of a hull
+SPACING_S = 0.05  # simulated; shortest time between two points of a trail: the period of pictures at 1 × real time
 RECORD_GAP_S = 5.0  # simulated; a larger gap between points of a record was not read yet, so nothing is drawn across it
-STILL_M = 1e-3  # of a segment; a stationary drone leaves no trail
-PLOTS_SHOWN = 3  # plots
-COLOURS = ("#868e96", "#1971c2", "#e8590c")  # of SERIES
+STILL_M = 1e-3  # shortest segment that is drawn: a stationary drone leaves no trail
+PLOTS_SHOWN = 3  # number of plots
+COLOURS = ("#868e96", "#1971c2", "#e8590c")  # colours of SERIES
 HEIGHT_PX = 150
-PADDING_PX = (8, 24, 0, 0)  # at the top, for the whole of the highest figure; at the right as viser's
-AXIS_PX = 56  # wide enough for figures such as -12.5
-CURSOR_COLOUR = "#7048e8"  # of the instant that a replay shows
-BLANK = (np.array([0.0, 1.0]), *(np.full(2, np.nan) for _ in SERIES))  # of a plot without points yet
+PADDING_PX = (8, 24, 0, 0)  # clockwise from the top, with space for the topmost number; right as viser's
+AXIS_PX = 56  # wide enough for numbers such as -12.5
+CURSOR_COLOUR = "#7048e8"  # colour of the line at the time that a replay shows
+BLANK = (np.array([0.0, 1.0]), *(np.full(2, np.nan) for _ in SERIES))  # data of a plot without points yet
 NONE = "none"
-STEPS_PER_WINDOW = 6  # of the time axis; chosen: plots are recreated every 30 s at most
-LEAST_POINTS = 2  # of a curve
-VALUES_LEAST = 0.01  # least range of values, in their unit
+STEPS_PER_WINDOW = 6  # number of steps of the time axis; chosen: plots are recreated every 30 s at most
+CURVE_POINTS_MIN = 2  # number of points of a curve
+VALUE_RANGE_MIN = 0.01  # range of the values on an axis, in their unit
 WINDOWS_S = (SPAN_S, 60.0, 20.0)  # simulated
-FLIGHT = {"x": "m", "y": "m", "z": "m", "yaw": "deg", "roll": "deg", "pitch": "deg"}  # of each drone, with units
-ESTIMATED = 4  # the first of them: views of estimates have no roll and pitch
+FLIGHT = {
+    "x": "m",
+    "y": "m",
+    "z": "m",
+    "yaw": "deg",
+    "roll": "deg",
+    "pitch": "deg",
+}  # variables of each drone, with units
+ESTIMATED = 4  # number of the first of them: views of estimates have no roll and pitch
 DESIRED, TRUE = SERIES.index("desired"), SERIES.index("true")
 
 
@@ -60,14 +67,14 @@ class _TimedRows(Generic[Row]):
         self.rows: list[Row] = []
 
     def is_near(self, t_s: float, within_s: float) -> bool:
-        """Return whether there is a row closer in time than this."""
-        place = bisect_left(self.times, t_s)
-        return any(abs(other_s - t_s) < within_s for other_s in self.times[max(0, place - 1) : place + 1])
+        """Return whether there is a row less than `within_s` from a time."""
+        index = bisect_left(self.times, t_s)
+        return any(abs(other_s - t_s) < within_s for other_s in self.times[max(0, index - 1) : index + 1])
 
     def insert(self, t_s: float, row: Row) -> None:
-        place = bisect_left(self.times, t_s)
-        self.times.insert(place, t_s)
-        self.rows.insert(place, row)
+        index = bisect_left(self.times, t_s)
+        self.times.insert(index, t_s)
+        self.rows.insert(index, row)
 
     def keep(self, from_s: float, to_s: float = math.inf) -> None:
         old, late = bisect_left(self.times, from_s), bisect_left(self.times, to_s)
@@ -79,11 +86,11 @@ class CanvasTrails:
 
     Args:
         count: N.
-        around: whether they belong to a record.
+        around: whether they belong to a record, which is read on both sides of the shown time.
 
     Attributes:
         length_s: length of the trails, simulated.
-        number: changes whenever the trails are not merely the previous ones extended.
+        number: changes whenever the trails are more than an extension of the previous ones.
     """
 
     def __init__(self, count: int, around: bool = False) -> None:
@@ -94,9 +101,9 @@ class CanvasTrails:
         self.number = 0
 
     def add(self, t_s: float, p_W: Array) -> None:
-        """Add positions (N, 3) [m] at an instant, NaN for a drone that is not in the view.
+        """Add positions (N, 3) [m] at a simulated time, NaN for a drone that is not in the view.
 
-        In a flight, they are skipped while no drone has moved.
+        In a flight, positions are skipped while no drone has moved.
         """
         points = self._points
         if not self._around and points.times and t_s < points.times[-1]:
@@ -122,7 +129,7 @@ class CanvasTrails:
         self.number += 1
 
     def segments(self, t_s: float, p_W: Array) -> tuple[Array, NDArray[np.int64], Array]:
-        """Return M segments that end at the drones' present positions (N, 3); of many points, evenly spaced ones.
+        """Return M segments that end at the drones' present positions (N, 3); many points are thinned out evenly.
 
         Returns:
             ends (M, 2, 3), indices of the drones (M,), times at which they begin (M,).
@@ -132,17 +139,17 @@ class CanvasTrails:
         times = np.array(points.times[begin:end])
         rows = np.arange(len(times))
         if len(times) * self._count > TRAIL_POINTS_MAX:
-            # The step rarely changes and points are kept; otherwise trails would flicker.
+            # Trails would flicker if the step changed often, or other points were selected.
             step_s = 2.0 ** math.ceil(math.log2((times[-1] - times[0]) * self._count / TRAIL_POINTS_MAX))
             rows = np.flatnonzero(np.diff(np.floor(times / step_s), prepend=-math.inf))
         times = np.append(times[rows], t_s)
-        way = np.stack([*(points.rows[begin + k] for k in rows), p_W]).astype(float)
-        lines = np.stack((way[:-1], way[1:]), axis=2).transpose(1, 0, 2, 3)  # drone, instant, end, axis
+        path = np.stack([*(points.rows[begin + k] for k in rows), p_W]).astype(float)
+        lines = np.stack((path[:-1], path[1:]), axis=2).transpose(1, 0, 2, 3)  # drone, time, end, axis
         drawn = np.linalg.norm(lines[:, :, 1] - lines[:, :, 0], axis=2) > STILL_M  # False for NaN
         drawn &= np.isfinite(p_W[:, :1])
         drawn &= (np.diff(times) < RECORD_GAP_S) | (not self._around)
-        owners, instants = np.nonzero(drawn)
-        return lines[drawn], owners, times[instants]
+        owners, begins = np.nonzero(drawn)
+        return lines[drawn], owners, times[begins]
 
     def lines(self, t_s: float, p_W: Array) -> list[list[list[float]]]:
         """Return the segments of each drone's trail in plan: x and y [m; W] and time [s] at which each begins."""
@@ -155,14 +162,14 @@ class VariableHistory:
     """Points of some variables, each with the values of `SERIES`.
 
     Args:
-        around: whether they belong to a record.
+        around: whether they belong to a record, which is read on both sides of the shown time.
     """
 
     def __init__(self, size: int, around: bool = False) -> None:
         self._size = size
         self._around = around
         self._points = _TimedRows[Array]()
-        self._lock = threading.Lock()  # threads of pages read curves, too
+        self._lock = threading.Lock()  # pages read curves in their own threads
 
     def is_due(self, t_s: float) -> bool:
         """Return whether a point of that time [s] would be added."""
@@ -174,7 +181,7 @@ class VariableHistory:
     def add(
         self, t_s: float, desired: Sequence[float] | None, value: Sequence[float] | Array, true: Array | None
     ) -> bool:
-        """Add a point at a simulated instant, unless the last one is too recent; return whether it was added.
+        """Add a point at a simulated time, unless the last one is too recent; return whether it was added.
 
         `desired`, `value` and `true` have shape (size,), m and rad; None where unknown.
         """
@@ -188,7 +195,7 @@ class VariableHistory:
                 return False
             points.insert(t_s, row)
             if not self._around:
-                points.keep(max(t_s - SPAN_S, points.times[-HISTORY_POINTS_MAX:][0]))  # sparse in a fast run
+                points.keep(max(t_s - SPAN_S, points.times[-HISTORY_POINTS_MAX:][0]))  # a fast run has sparse points
         return True
 
     def keep(self, from_s: float, to_s: float) -> None:
@@ -203,14 +210,14 @@ class VariableHistory:
         less: int | None = None,
         at_s: float | None = None,
     ) -> tuple[Array, ...]:
-        """Return times (M,) and the three curves (M,) of a variable, as `SERIES`; angles in degrees, wrapped.
+        """Return times (M,) and three curves (M,) of a variable, ordered as `SERIES`; angles in degrees, wrapped.
 
-        A curve is broken (NaN) where an angle wraps around.
+        A curve is interrupted (NaN) where an angle wraps.
 
         Args:
             span_s: length of the curves.
-            less: the one of `SERIES` that is subtracted, for errors; None for values.
-            at_s: centre of the curves; None: they end at the newest point.
+            less: index in `SERIES` of the curve that is subtracted, for errors; None for values.
+            at_s: time at the centre of the curves; None: they end at the newest point.
         """
         with self._lock:
             t = np.array(self._points.times)
@@ -230,14 +237,14 @@ class PlottedVariable(NamedTuple):
     """A variable that can be plotted."""
 
     history: VariableHistory
-    column: int  # in the history
-    label: str  # with its unit
+    column: int  # its index in the history
+    label: str  # its name and unit
     angular: bool
-    reference: int  # index in SERIES of the curve that errors are relative to
+    reference: int  # index in SERIES of the curve to which errors are relative
 
 
 class FlightHistory:
-    """Points of all drones of a run, each with the variables of FLIGHT; `around`: of a record."""
+    """Points of all drones of a run, each with the variables of FLIGHT; `around` as of `VariableHistory`."""
 
     def __init__(self, names: Sequence[str], around: bool = False) -> None:
         self.names = tuple(names)
@@ -247,14 +254,14 @@ class FlightHistory:
         """Add the drones' true and estimated poses, if the last point is old enough."""
         if not self.history.is_due(drones.t_ns / 1e9):
             return
-        believed = np.full((len(self.names), len(FLIGHT)), np.nan)
+        estimated = np.full((len(self.names), len(FLIGHT)), np.nan)
         for i, name in enumerate(self.names):
             if name in estimates:
-                believed[i, :ESTIMATED] = *estimates[name].position_m, estimates[name].yaw_rad
+                estimated[i, :ESTIMATED] = *estimates[name].position_m, estimates[name].yaw_rad
         rpy = frames.rpy_from_quaternion(drones.q_WB)
         true = np.column_stack((drones.p_W, rpy[:, [2, 0, 1]]))
         true[~drones.present] = np.nan
-        self.history.add(drones.t_ns / 1e9, None, believed.ravel(), true.ravel())
+        self.history.add(drones.t_ns / 1e9, None, estimated.ravel(), true.ravel())
 
     def variables(self, name: str) -> list[PlottedVariable]:
         first = self.names.index(name) * len(FLIGHT)
@@ -267,7 +274,7 @@ class FlightHistory:
 class VariablePlots:
     """Plots of one formation and of its drones, three variables at a time.
 
-    The curves of a record that is replayed extend beyond the shown instant.
+    The curves of a replay extend beyond the shown time.
     """
 
     def __init__(
@@ -291,9 +298,9 @@ class VariablePlots:
         windows = {f"{span_s:g} s around" if replayed else f"the last {span_s:g} s": span_s for span_s in WINDOWS_S}
         self._window = gui.add_dropdown("window", list(windows))
         self._windows = windows
-        self._errors = gui.add_checkbox("Errors", False, hint="Against what is desired; of a drone, against truth")
-        self._still = gui.add_checkbox(
-            "Stand still", False, hint="Drag over a plot to zoom, double click for all of it"
+        self._errors = gui.add_checkbox("Errors", False, hint="Relative to desired values; for a drone, to true ones")
+        self._freeze = gui.add_checkbox(
+            "Freeze", False, hint="Drag over a plot to zoom, double-click to reset the zoom"
         )
         gui.add_markdown(f"<sub>{_legend(replayed)} over time [s]; below a plot, the values at the cursor</sub>")
         self._plots = [_plot(gui, each, replayed) for each in of_all[:PLOTS_SHOWN]]
@@ -304,14 +311,14 @@ class VariablePlots:
             control.on_update(lambda _: self._redraw())
 
     def draw(self, t_s: float = 0.0) -> None:
-        """Send the chosen curves, unless they are frozen; t_s is the instant that a replay shows."""
+        """Send the chosen curves, unless they are frozen; t_s is the time that a replay shows [s]."""
         if self._cursor_s is not None:
             self._cursor_s = t_s
-        if not self._still.value:
+        if not self._freeze.value:
             self._redraw()
 
     def _redraw(self) -> None:
-        """Send the chosen curves; after the end of a run, too."""
+        """Send the chosen curves; operators may also change them after the end of a run."""
         with self._lock:
             shown = self._choices.get(self._choice.value, ())
             if shown != self._shown:
@@ -328,7 +335,7 @@ class VariablePlots:
         less = each.reference if self._errors.value else None
         at_s = self._cursor_s
         curves = each.history.curves(each.column, each.angular, span_s, less, at_s)
-        if len(curves[0]) < LEAST_POINTS:
+        if len(curves[0]) < CURVE_POINTS_MIN:
             plot.data = BLANK if at_s is None else (*BLANK, BLANK[1])
             return
         scales = {"x": uplot.Scale(time=False, range=AxisRange.of_times(curves[0], span_s, at_s))}
@@ -343,22 +350,22 @@ class VariablePlots:
 
 
 def shown_unit(variable: str) -> str:
-    """Return the unit in which pages show a variable of a formation: m, or deg of an angle."""
+    """Return the unit in which pages show a variable of a formation: deg for an angle, otherwise m."""
     return "deg" if unit(variable) == "rad" else "m"
 
 
 class AxisRange(NamedTuple):
-    """The shown range of an axis, in whole steps, since viser recreates a plot when its range changes."""
+    """The shown range of an axis, in steps, since viser recreates a plot whenever its range changes."""
 
     low: float
     high: float
 
     @classmethod
     def of_times(cls, t_s: Array, span_s: float, at_s: float | None = None) -> "AxisRange":
-        """Return the range of points of these times (M,) [s], M > 0, in a window of `span_s`, around at_s if given.
+        """Return the range of times (M,) [s], M > 0, in a window of `span_s`, around `at_s` if given.
 
         Before the first range is committed, viser derives an automatic range from the previous data: a page that draws
-        slowly would show an empty interval for ever.
+        slowly would keep showing an empty interval.
         """
         step_s = span_s / STEPS_PER_WINDOW
         if at_s is not None:
@@ -368,27 +375,27 @@ class AxisRange(NamedTuple):
 
     @classmethod
     def of_values(cls, values: Sequence[Array], always: bool = False) -> "AxisRange | None":
-        """Return the range of curves (M,) of one unit, NaN where unknown; None where uPlot finds it itself.
+        """Return the range of curves (M,) of one unit, NaN where unknown; None if uPlot derives it.
 
-        uPlot does not where a curve is entirely unknown; `always`: return the range in other cases, too.
+        uPlot cannot if a curve is entirely unknown. `always`: return the range in all cases with a known value.
         """
         known = np.concatenate(values)
         known = known[np.isfinite(known)]
         if not len(known) or not (always or any(np.isnan(each).all() for each in values)):
             return None
         least, greatest = float(known.min()), float(known.max())
-        step = 10.0 ** math.floor(math.log10(max(greatest - least, VALUES_LEAST)))
+        step = 10.0 ** math.floor(math.log10(max(greatest - least, VALUE_RANGE_MIN)))
         return cls((math.floor(least / step) - 0.5) * step, (math.ceil(greatest / step) + 0.5) * step)
 
 
 def _with_cursor(curves: Sequence[Array], at_s: float, values: AxisRange) -> tuple[Array, ...]:
-    """Return the curves with an additional vertical line at an instant."""
-    place = int(np.searchsorted(curves[0], at_s))
-    nearest = min(place, len(curves[0]) - 1)
+    """Return the curves with a vertical line at a time as an additional curve."""
+    index = int(np.searchsorted(curves[0], at_s))
+    nearest = min(index, len(curves[0]) - 1)
     cursor = np.full(len(curves[0]) + 2, np.nan)
-    cursor[place : place + 2] = values
-    doubled = (np.insert(each, place, (each[nearest], each[nearest])) for each in curves[1:])
-    return np.insert(curves[0], place, (at_s, at_s)), *doubled, cursor
+    cursor[index : index + 2] = values
+    doubled = (np.insert(each, index, (each[nearest], each[nearest])) for each in curves[1:])
+    return np.insert(curves[0], index, (at_s, at_s)), *doubled, cursor
 
 
 def _triples(of: str, variables: list[PlottedVariable]) -> dict[str, tuple[PlottedVariable, ...]]:
@@ -397,7 +404,7 @@ def _triples(of: str, variables: list[PlottedVariable]) -> dict[str, tuple[Plott
 
 
 def _legend(replayed: bool) -> str:
-    lines = [*zip(SERIES, COLOURS, strict=True), *([("shown instant", CURSOR_COLOUR)] if replayed else [])]
+    lines = [*zip(SERIES, COLOURS, strict=True), *([("shown time", CURSOR_COLOUR)] if replayed else [])]
     return ", ".join(f"<span style='color:{c}'>{name}</span>" for name, c in lines)
 
 

@@ -1,9 +1,9 @@
-"""Single drones for the pages of one run: flown by a stick or to places, returned to their starts, seen from above.
+"""Single drones on the pages of one run: flown by a stick or to waypoints, returned to their starts, shown in plan.
 
 A drone is acquired, commanded at a steady rate, and released. It hovers unless motion is requested continuously: if the
-stick is released, or the page is silent, hidden or gone. A return to launch flies a drone back above its start, as if
-sent to a place on the map, and a formation, by its controller, above the middle of its starts; there they land. A later
-request ends a return. Axes of W, unless a name ends otherwise.
+stick is released, or the page is silent, hidden or gone. A return to launch flies a drone to a point above its start,
+and a formation, through its controller, above the middle of its starts; there they land. A later request ends a return.
+Positions and velocities are in W, unless the suffix of a name says otherwise.
 """
 
 import math
@@ -32,37 +32,37 @@ from zsim_bridges.console.picture import PLAN_DIGITS, plan_formations, plan_posi
 from zsim_bridges.console.run_monitor import RunMonitor
 from zsim_bridges.console.scene import RunScene
 
-PERIOD_S = 0.05  # wall; of commands: at 5 × real time ten of them within a drone's silence of 0.5 s
-STALE_S = 0.5  # wall; a page silent for longer no longer flies, as with the firmware's silence
-GONE_S = 5.0  # wall; after which the drone of a lost page is released; the page may be reloaded before
-REPEAT_S = 1.0  # wall; after which the request for a drone is repeated to a silent world
-SETTLED_S = 1.5  # wall; after which a view shows who has acquired a drone; views come 20 times a second
-RATE_MAX = 5.0  # × real time; chosen: above it manual flight is not feasible, and the firmware takes pauses for silence
-CLIMB_SHARE = 0.5  # of the horizontal speed, up and down; chosen: height is harder to see on a page
+PERIOD_S = 0.05  # wall; between commands: at 5 × real time, two in the 0.5 s simulated after which firmware hovers
+STALE_S = 0.5  # wall; a page silent for longer no longer flies its drone; equal to the firmware's limit of silence
+GONE_S = 5.0  # wall; after which the drone of a lost page is released, unless the page has been reloaded
+REPEAT_S = 1.0  # wall; after which an unanswered request for a drone is repeated
+SETTLED_S = 1.5  # wall; after which a view shows who has acquired a drone; views arrive 20 times a second
+RATE_MAX = 5.0  # × real time; chosen: above it nobody can fly manually, and the firmware takes pauses for silence
+CLIMB_SHARE = 0.5  # ratio of climb to horizontal speed; chosen: height is harder to see on a page
 YAW_RATE_RAD_S = math.radians(45.0)  # chosen: a full turn in 8 s
-SPEED_M_S = 1.5  # towards a place; chosen: as the paper's formations
-NEAR_M = 0.5  # distance from a place at which a drone proceeds to the next one; chosen
-PLACES_MAX = 50  # of one drone; chosen: more are no longer manual flight
-BRAKE_S = 1.0  # in which a drone comes to rest before the fence; chosen: three times the lag of its velocity loop
+SPEED_M_S = 1.5  # towards a waypoint; chosen: like the paper's formations
+NEAR_M = 0.5  # distance from a waypoint at which a drone proceeds to the next one; chosen
+WAYPOINTS_MAX = 50  # number per drone; chosen: more would no longer be manual flight
+BRAKE_S = 1.0  # time in which a drone comes to rest before the fence; chosen: three times the lag of its velocity loop
 ABOVE_START_M = 0.5  # horizontal distance from a start, near enough to land; chosen: the size of a hull
-OVER_STARTS_M = 0.5  # of a formation from the middle of its starts
-OVERRULED_M = 1.0  # increase of the goal's distance that shows that it was sent elsewhere
+OVER_STARTS_M = 0.5  # distance of a formation from the middle of its starts, near enough to land
+OVERRULED_M = 1.0  # increase of its goal's distance from which a formation counts as sent elsewhere
 MIDDLE = ("x_c", "y_c")  # variables of a formation that a return sets
-Place = tuple[float, float]
+Point = tuple[float, float]  # x, y [m; W]
 
 
 class Stick(NamedTuple):
-    """Deflections of a stick or of held keys, -1 to 1, in the drone's heading frame; yaw is positive to the left."""
+    """Deflections of a stick or of held keys, -1 to 1, in the drone's heading frame; a turn is positive to the left."""
 
     forward: float
     left: float
     up: float
     turn: float
-    speed_m_s: float  # at full deflection
+    speed_m_s: float  # horizontal speed at full deflection
 
 
 class DronePose(NamedTuple):
-    """Position, heading and velocity of a drone by its estimator, and their simulated time."""
+    """A drone's estimated position, heading and velocity, and their simulated time."""
 
     p_W: Vector  # m
     yaw_rad: float
@@ -81,7 +81,7 @@ HOVER = FlownVelocity()
 
 
 class DroneSight(NamedTuple):
-    """The state of a drone: that of its firmware (empty before it is seen), its commander, and its current estimate."""
+    """A drone as seen from here: its firmware's state (empty before the first view), commander and current estimate."""
 
     state: str = ""
     commander: str | None = None
@@ -89,12 +89,12 @@ class DroneSight(NamedTuple):
 
 
 class RunSight(NamedTuple):
-    """The state of the run, as far as it matters to manual flight."""
+    """The part of a run's state that matters to manual flight."""
 
     off: str = ""  # why nothing can be flown; otherwise empty
     rate: float = 1.0  # simulated per wall second, as measured
     paused: bool = False
-    silence: str = ""  # description of a silent world; a drone is requested regardless
+    silence: str = ""  # description of a silent world, which does not prevent a request for a drone
 
 
 class FlightAnswer(NamedTuple):
@@ -102,10 +102,10 @@ class FlightAnswer(NamedTuple):
 
     drone: str = ""
     state: str = "none"  # none, taking or flying
-    text: str = ""  # why it is not flown, or what it is doing
-    over: bool = False  # whether it may be taken over from its commander
+    text: str = ""  # why the page does not fly it, or what it is doing
+    over: bool = False  # whether the page may take it over from its commander
     commander: str = ""
-    id: str = ""  # of the page's request to take it
+    id: str = ""  # id of the page's request to take it
     goal: Vector | None = None  # its present destination [m; W]
     then: tuple[Vector, ...] = ()  # later destinations
 
@@ -117,16 +117,16 @@ class Geofence(NamedTuple):
     high_m: Vector
 
     def refusal(self, x_m: float, y_m: float) -> str:
-        """Return why no drone may be sent to a place; empty where it may."""
+        """Return why no drone may be sent to a point; empty if one may."""
         for axis, value, low, high in zip("xy", (x_m, y_m), self.low_m, self.high_m, strict=False):
             if not low <= value <= high:
                 return f"{axis} is {value:.1f} m, outside the geofence: {low:g} to {high:g} m"
         return ""
 
     def within(self, velocity_W: Vector, p_W: Vector) -> Vector:
-        """Return a demanded velocity [m/s] without its outward components; braking begins BRAKE_S before the fence.
+        """Return a demanded velocity [m/s], slowed down so that a drone at p_W [m] comes to rest at the fence.
 
-        Outside the fence, a drone at p_W [m] may return.
+        Braking begins BRAKE_S before the fence; a drone outside the fence may return.
         """
         x, y, z = (
             min(max(v, min(0.0, (low - p) / BRAKE_S)), max(0.0, (high - p) / BRAKE_S))
@@ -159,7 +159,7 @@ def _fenced(velocity_W: Vector, pose: DronePose, fence: Geofence) -> Vector:
 
 def _too_fast(rate: float) -> str:
     slower = f"to fly by hand set the rate to {RATE_MAX:g} or less"
-    return f"time goes {rate:.1f} × as fast as the wall clock; {slower}" if rate > RATE_MAX else ""
+    return f"simulated time passes {rate:.1f} × as fast as wall time; {slower}" if rate > RATE_MAX else ""
 
 
 @dataclass
@@ -167,25 +167,25 @@ class _Flight:
     """A drone that a page flies or has requested; times in s, wall."""
 
     drone: str
-    modes: int  # number of earlier mode requests for the drone; a later one ends the flight
+    modes: int  # number of modes requested of the drone before; a later one ends the flight
     begun_s: float  # when the page requested it
     seen_s: float  # when the page last sent something
-    id: str = ""  # of the page's request
-    owned_s: float | None = None  # since when it is commanded; None before
+    id: str = ""  # id of the page's request
+    owned_s: float | None = None  # when the world granted it; None before
     sent_s: float = 0.0  # when it was last commanded
-    stick: Stick | None = None  # present deflection; None: hover, or fly to `places_W`
-    places_W: tuple[Vector, ...] = ()  # its destinations, in order
-    sent_W: Vector | None = None  # destination of its course; None for none
+    stick: Stick | None = None  # present deflection; None: hover, or fly to `waypoints_W`
+    waypoints_W: tuple[Vector, ...] = ()  # its destinations, in order
+    sent_W: Vector | None = None  # waypoint to which its course leads; None for none
     lost: bool = False  # whether the page's connection is gone
-    asked_s: float = 0.0  # when the drone was last requested from the world
-    asking: bool = False  # whether its answer is outstanding
+    requested_s: float = 0.0  # when the drone was last requested from the world
+    is_requested: bool = False  # whether the world's answer is outstanding
 
 
 class ManualFlight:
     """Flies drones for pages, each identified by any hashable value; thread-safe.
 
     Args:
-        courses: of each drone, for flights to places.
+        courses: course of each drone, for flights to waypoints.
         gate_s: simulated duration of a gate, in which at most one command is sent.
     """
 
@@ -212,8 +212,8 @@ class ManualFlight:
         self._wall_s = wall_s
         self._lock = threading.RLock()
         self._flights: dict[Any, _Flight] = {}
-        self._texts: dict[Any, FlightAnswer] = {}  # why a page no longer flies
-        self._released: dict[str, float] = {}  # released drones, and when to check on them [s; wall]
+        self._texts: dict[Any, FlightAnswer] = {}  # why a page no longer flies a drone
+        self._released: dict[str, float] = {}  # released drones, and when to check their release [s; wall]
         self._ticked_s = wall_s()
         self._wake = threading.Event()  # set when something must be sent at once
 
@@ -241,7 +241,7 @@ class ManualFlight:
             self._give_back(self._wall_s())
 
     def take(self, page: Any, drone: str, over: bool, request: str = "") -> FlightAnswer:
-        """Take a drone for a page; `over`: even from its present commander, with an operator's priority.
+        """Acquire a drone for a page; with `over`, even from its present commander, by an operator's priority.
 
         A request repeated with the same id is carried out once; a page that has reconnected keeps its drone.
         """
@@ -265,30 +265,30 @@ class ManualFlight:
             now_s = self._wall_s()
             flight = _Flight(drone, self._client.modes_requested(drone), now_s, now_s, request)
             self._flights[page] = flight
-        self._ask(flight)
+        self._request(flight)
         return self.answer(page)
 
-    def _ask(self, flight: _Flight) -> None:
-        flight.asked_s, flight.asking = self._wall_s(), True
+    def _request(self, flight: _Flight) -> None:
+        flight.requested_s, flight.is_requested = self._wall_s(), True
         self._client.take(flight.drone, partial(self._on_taken, flight))
 
     def steer(self, page: Any, stick: Stick | None) -> FlightAnswer:
-        """Fly the page's drone by a stick; None: the dead-man key is not held, so hover, or continue to a place."""
+        """Fly the page's drone by a stick; None: the dead-man key is released; hover, or continue to the waypoint."""
         with self._lock:
             flight = self._flights.get(page)
             if flight is not None:
                 if stick is not None:
-                    flight.places_W = ()  # the stick overrides the place
+                    flight.waypoints_W = ()  # the stick overrides the waypoints
                 elif flight.stick is not None:
                     self._send_soon(flight)
                 flight.stick, flight.seen_s = stick, self._wall_s()
         return self.answer(page)
 
     def go(self, page: Any, x_m: float, y_m: float, z_m: float | None = None, then: bool = False) -> FlightAnswer:
-        """Fly the page's drone to a place, at its present height unless another is given.
+        """Fly the page's drone to a point [m; W], at its present height unless z_m is given.
 
         Args:
-            then: append the place to the present destinations instead of replacing them.
+            then: append the point to the present waypoints instead of replacing them.
         """
         with self._lock:
             flight = self._flights.get(page)
@@ -297,20 +297,20 @@ class ManualFlight:
             pose, refusal = self._sight_of(flight.drone).pose, self._fence.refusal(x_m, y_m)
             if refusal or pose is None:
                 return self.answer(page)._replace(text=refusal or f"no estimate of {flight.drone}")
-            place = x_m, y_m, pose.p_W[2] if z_m is None else z_m
-            before = flight.places_W if then else ()
+            waypoint = x_m, y_m, pose.p_W[2] if z_m is None else z_m
+            before = flight.waypoints_W if then else ()
             flight.stick, flight.seen_s = None, self._wall_s()
-            if before[-1:] != (place,):  # a page repeats an unconfirmed request
-                flight.places_W = (*before[: PLACES_MAX - 1], place)
+            if before[-1:] != (waypoint,):  # a page repeats an unconfirmed request
+                flight.waypoints_W = (*before[: WAYPOINTS_MAX - 1], waypoint)
         return self.answer(page)
 
     def is_on_way(self, page: Any) -> bool:
         with self._lock:
             flight = self._flights.get(page)
-            return flight is not None and bool(flight.places_W)
+            return flight is not None and bool(flight.waypoints_W)
 
     def leave(self, page: Any, text: str = "") -> FlightAnswer:
-        """Let the page's drone hover, and release it; `text` says why."""
+        """Let the page's drone hover, and release it; `text` is the reason."""
         with self._lock:
             flight = self._flights.pop(page, None)
             if flight is not None:
@@ -321,12 +321,12 @@ class ManualFlight:
         return self.answer(page)
 
     def lose(self, page: Any) -> None:
-        """Record that a page's connection is gone: its drone hovers at once, and is released after a while."""
+        """Record that a page's connection is lost: its drone hovers at once, and is released after GONE_S."""
         with self._lock:
             flight = self._flights.get(page)
             self._texts.pop(page, None)
             if flight is not None:
-                flight.stick, flight.places_W, flight.lost = None, (), True
+                flight.stick, flight.waypoints_W, flight.lost = None, (), True
                 self._send_soon(flight)
 
     def answer(self, page: Any) -> FlightAnswer:
@@ -336,15 +336,15 @@ class ManualFlight:
                 return self._texts.get(page, FlightAnswer())
             if flight.owned_s is None:
                 silence = self._run_sight().silence
-                text = f"asked for {self._wall_s() - flight.begun_s:.1f} s ago, not confirmed"
+                text = f"requested {self._wall_s() - flight.begun_s:.1f} s ago, not confirmed"
                 return FlightAnswer(flight.drone, "taking", f"{text}: {silence}" if silence else text, id=flight.id)
             if self._sight_of(flight.drone).pose is None:
                 text = f"hovers: no estimate of {flight.drone}"
-            elif flight.places_W:
-                text = "goes to {:.1f}, {:.1f} m at z = {:.1f} m".format(*flight.places_W[0])
+            elif flight.waypoints_W:
+                text = "goes to {:.1f}, {:.1f} m at z = {:.1f} m".format(*flight.waypoints_W[0])
             else:
                 text = "flown by hand" if flight.stick is not None else "hovers"
-            goal, then = next(iter(flight.places_W), None), flight.places_W[1:]
+            goal, then = next(iter(flight.waypoints_W), None), flight.waypoints_W[1:]
             return FlightAnswer(flight.drone, "flying", text, id=flight.id, goal=goal, then=then)
 
     def tick(self) -> None:
@@ -353,16 +353,16 @@ class ManualFlight:
         Everything is sent from here, in one thread, so that no command follows a newer one or the release of a drone.
         """
         wall_s, run = self._wall_s(), self._run_sight()
-        stood_s, self._ticked_s = wall_s - self._ticked_s, wall_s
-        stall = f"the console stood still for {stood_s:.0f} s" if stood_s > GONE_S else ""
-        period_s = max(PERIOD_S * 0.9, self._gate_s / max(run.rate, 1e-3))  # a slow run has few gates
+        stalled_s, self._ticked_s = wall_s - self._ticked_s, wall_s
+        stall = f"the console stood still for {stalled_s:.0f} s" if stalled_s > GONE_S else ""
+        period_s = max(PERIOD_S * 0.9, self._gate_s / max(run.rate, 1e-3))  # a slow run has few gates a second
         for page, flight in list(self._flights.items()):
             reason = stall or self._end_reason(flight, run, wall_s)
             if reason:
                 self.leave(page, reason)
             elif flight.owned_s is None:
-                if not flight.asking and not run.silence and wall_s - flight.asked_s >= REPEAT_S:
-                    self._ask(flight)
+                if not flight.is_requested and not run.silence and wall_s - flight.requested_s >= REPEAT_S:
+                    self._request(flight)
             elif not run.paused and wall_s - flight.sent_s >= period_s:
                 flight.sent_s = wall_s
                 flown = self._velocity(flight, wall_s)
@@ -370,7 +370,7 @@ class ManualFlight:
         self._give_back(wall_s)
 
     def _give_back(self, wall_s: float) -> None:
-        """Release drones; again if a command accepted after the release made the console commander."""
+        """Release drones, again if a command that was accepted after the release made the console their commander."""
         with self._lock:
             due = [drone for drone, at_s in self._released.items() if wall_s >= at_s]
             flown = {flight.drone for flight in self._flights.values()}
@@ -390,13 +390,13 @@ class ManualFlight:
 
     def _on_taken(self, flight: _Flight, refusal: str) -> None:
         with self._lock:
-            flight.asking = False
+            flight.is_requested = False
             page = next((key for key, each in self._flights.items() if each is flight), None)
             if page is None:
-                if not refusal or isinstance(refusal, NoAnswer):  # the page has released it meanwhile
+                if not refusal or isinstance(refusal, NoAnswer):  # the page has released it in the meantime
                     self._released[flight.drone] = -math.inf
             elif isinstance(refusal, NoAnswer):
-                return  # to be requested again
+                return  # `tick` requests it again
             elif refusal:
                 del self._flights[page]
                 if not flight.lost:
@@ -417,39 +417,39 @@ class ManualFlight:
 
     def _velocity(self, flight: _Flight, wall_s: float) -> FlownVelocity:
         pose, limits, stick = self._sight_of(flight.drone).pose, self._limits[flight.drone], flight.stick
-        place = self._next_place(flight, pose) if stick is None else None
+        waypoint = self._next_waypoint(flight, pose) if stick is None else None
         if wall_s - flight.seen_s > STALE_S or pose is None:
-            place = stick = None
-        before, flight.sent_W = flight.sent_W, place
-        if pose is None or place is None:
+            waypoint = stick = None
+        before, flight.sent_W = flight.sent_W, waypoint
+        if pose is None or waypoint is None:
             return HOVER if pose is None or stick is None else stick_velocity(stick, pose, limits, self._fence)
         course, here, moving = self._courses[flight.drone], (*pose.p_W, pose.yaw_rad), (*pose.v_W, 0.0)
         if before is None:
-            course.leave()  # it starts where the drone was last flown to a place
-        if place != before:
+            course.leave()  # it would continue from the end of the last flight to a waypoint
+        if waypoint != before:
             climb_m_s = CLIMB_SHARE * min(SPEED_M_S, limits.horizontal_speed_m_s)
-            course.send((*place, None), pose.t_s, here, moving, speeds=Cruise(SPEED_M_S, climb_m_s, climb_m_s))
+            course.send((*waypoint, None), pose.t_s, here, moving, speeds=Cruise(SPEED_M_S, climb_m_s, climb_m_s))
         velocity_W, turn = course.velocity(pose.t_s, here, moving)
         return FlownVelocity(_fenced(velocity_W, pose, self._fence), turn)
 
-    def _next_place(self, flight: _Flight, pose: DronePose | None) -> Vector | None:
-        """Return the drone's next destination, skipping those that it has approached."""
+    def _next_waypoint(self, flight: _Flight, pose: DronePose | None) -> Vector | None:
+        """Return the drone's next waypoint, without those that it has reached; the last one is kept."""
         with self._lock:
-            places = flight.places_W
-            if pose is not None and len(places) > 1 and el.distance(pose.p_W, places[0]) <= NEAR_M:
-                places = flight.places_W = places[1:]
-            return next(iter(places), None)
+            waypoints = flight.waypoints_W
+            if pose is not None and len(waypoints) > 1 and el.distance(pose.p_W, waypoints[0]) <= NEAR_M:
+                waypoints = flight.waypoints_W = waypoints[1:]
+            return next(iter(waypoints), None)
 
     def _send_soon(self, flight: _Flight) -> None:
-        """Let a command be sent at once, without waiting for the period."""
+        """Make the next command due at once."""
         flight.sent_s = -math.inf
         self._wake.set()
 
 
 class PageFlying:
-    """Single drones for the pages of one run; pages are identified by viser's number.
+    """Single drones on the pages of one run; pages are identified by viser's number.
 
-    `note` is called with each drone or formation whose return is over, and the reason.
+    `note` is called with each drone or formation whose return has ended otherwise than by landing, and the reason.
     """
 
     def __init__(
@@ -479,7 +479,7 @@ class PageFlying:
         self.returns = ReturnFlights(run.scenario, client, self.control, self._sight, lambda: views.clusters, note)
 
     def plan(self, client_id: int | None, whole: bool) -> dict[str, Any]:
-        """Return the plan view as plain data; `whole`: including what does not change, and the past trails."""
+        """Return the plan view as plain data; with `whole`, including what does not change, and the past trails."""
         drones, chosen = self._scene.drones, self.pages.chosen(client_id)
         if drones is None:
             return {"t_s": None, "chosen": chosen}
@@ -490,7 +490,7 @@ class PageFlying:
             "chosen": chosen,
             "drones": plan_positions(drones, states),
             "formations": plan_formations(self._run.spaces, self._members, dict(self._views.clusters)),
-            "previews": [np.round(way[:, :, :2], PLAN_DIGITS).tolist() for way in previews],
+            "previews": [np.round(paths[:, :, :2], PLAN_DIGITS).tolist() for paths in previews],
             "trail_s": self._scene.trails.length_s,
             "trails_number": self._scene.trails.number,
         }
@@ -514,8 +514,8 @@ class PageFlying:
     def _run_sight(self) -> RunSight:
         clock, run = self._monitor.time_monitor.clock, self._monitor.now()
         silence, off = run.off() if run.silent_s else "", run._replace(silent_s=0.0).grounded()
-        stands = clock is not None and clock.state != "running"
-        return RunSight(off, clock.rate if clock else 1.0, stands, "" if off else silence)
+        is_paused = clock is not None and clock.state != "running"
+        return RunSight(off, clock.rate if clock else 1.0, is_paused, "" if off else silence)
 
 
 class ReturningDrone(NamedTuple):
@@ -526,12 +526,12 @@ class ReturningDrone(NamedTuple):
 
 @dataclass
 class _ReturningFormation:
-    requests: int  # number of requests to it up to its return
-    nearest_m: float = math.inf  # least distance so far of its goal from the middle
+    requests: int  # number of requests to it, including its return
+    nearest_m: float = math.inf  # smallest distance so far of its goal from the middle of its starts
 
 
 class ReturnFlights:
-    """Returns of the drones and formations of a run; thread-safe. `control` flies drones to places."""
+    """Returns of the drones and formations of a run; thread-safe. `control` flies drones to waypoints."""
 
     def __init__(
         self,
@@ -548,8 +548,8 @@ class ReturnFlights:
         self._clusters = clusters
         self._note = note
         self._lock = threading.Lock()
-        self.starts: dict[str, Place] = {each.name: each.position_m[:2] for each in scenario.drones}
-        self.middles: dict[str, Place] = {}
+        self.starts: dict[str, Point] = {each.name: each.position_m[:2] for each in scenario.drones}
+        self.middles: dict[str, Point] = {}
         for cluster in scenario.clusters:
             x_m, y_m = np.mean([self.starts[name] for name in cluster.drones], axis=0).tolist()
             self.middles[cluster.name] = (round(x_m, 2), round(y_m, 2))
@@ -557,7 +557,7 @@ class ReturnFlights:
         self._formations: dict[str, _ReturningFormation] = {}
 
     def request_drones(self, drones: Sequence[str]) -> None:
-        """Take over each drone, fly it above its start at its present height, and land it."""
+        """Take over each drone, fly it above its start at its present height, and land it there."""
         for drone in drones:
             answer = self._control.take(ReturningDrone(drone), drone, over=True)
             if answer.state == "none":
@@ -567,14 +567,14 @@ class ReturnFlights:
                 self._drones.add(drone)
 
     def request_formation(self, cluster: str) -> None:
-        """Move a formation above the middle of its starts in its present shape, and land it."""
+        """Move a formation above the middle of its starts in its present shape, and land it there."""
         values = dict(zip(MIDDLE, self.middles[cluster], strict=True))
         self._client.request_cluster(cluster, "target", values=values)
         with self._lock:
             self._formations[cluster] = _ReturningFormation(self._client.cluster_requests[cluster])
 
     def refused(self, cluster: str) -> None:
-        """Record that a request to a formation was refused: its return is over."""
+        """Record that a request to a formation was refused, which ends its return."""
         with self._lock:
             self._formations.pop(cluster, None)
 
@@ -592,9 +592,9 @@ class ReturnFlights:
                     self._formations.pop(name, None)
 
     def _continue_drone(self, drone: str) -> bool:
-        """Send a drone on its way, or land it at the end; return whether it is still returning."""
+        """Send a drone to its start, or land it above it; return whether it is still returning."""
         key, pose = ReturningDrone(drone), self._sight_of(drone).pose
-        answer = self._control.steer(key, None)  # like a page that is still open
+        answer = self._control.steer(key, None)  # keeps the flight alive, as an open page does
         if answer.state == "none":
             self._note(drone, f"return of {drone} is over: {answer.text or 'it was released'}")
             return False

@@ -1,10 +1,10 @@
 """Requests of operators: sent outside the page's threads, and tracked until they have taken effect.
 
 `CommandClient` sends requests and modes, and reports the outcome of each. Orders must not be lost: `OrderBook` sends
-each until the world has carried it out or refused it. The page chooses its id, and repeats it until it is answered; the
-console carries out each id once, and repeats to the world whatever the world has not confirmed: after a missing answer,
-a command lost by a radio, or a stamp that grew old while a process stalled. Other requests are made once;
-`PendingRequests` tells when an accepted one is done.
+each until the world has carried it out or refused it. The page chooses the id of an order, and repeats the order until
+it is answered; the console carries out each id once, and repeats an order that the world has not confirmed: its answer
+may be missing, a radio may have lost the command, or its stamp may have become too old while a process stalled. Other
+requests are sent once; `PendingRequests` reports when an accepted one is done.
 """
 
 import math
@@ -29,20 +29,20 @@ from zsim.transport.session import Session, Unanswered
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_bridges.console.view_buffer import ViewBuffer, arguments_text, commanded_drone
 
-PRIORITY = 10  # contract: of operators
-PRIORITY_EMERGENCY = 100  # contract: the highest; an operator who flies a drone must not keep others from stopping it
-THREADS_PER_POOL = 8  # separate pools: unanswered requests must not delay modes
+PRIORITY = 10  # priority of operators in the contract
+PRIORITY_EMERGENCY = 100  # highest in the contract: an operator who flies a drone must not keep others from stopping it
+THREADS_PER_POOL = 8  # pools are separate: unanswered requests must not delay modes
 ANSWER_TIMEOUT_S = 5.0  # the world and controllers answer within a gate
-EMERGENCY_TIMEOUT_S = 1.0  # for acquiring a drone to stop it; afterwards the mode is sent anyway
+EMERGENCY_TIMEOUT_S = 1.0  # for acquiring a drone that is to be stopped; afterwards the mode is sent anyway
 ACCEPTANCE_TIMEOUT_S = 1.0  # for the world to accept a command before the drone is released
 OVERTAKEN = "superseded by a later emergency"
 Task = Callable[[], None]
 REPEAT_S = 1.0  # wall; an order without an effect for this long is sent again: the world answers within a gate
-KEPT = 200  # orders whose ids are remembered: three minutes' worth at one click a second
-SHOWN_S = 20.0  # wall; for which pages show a settled order
-NAME_MAX = 64  # characters
-REASONS_MAX = 2  # number of targets of an order that are named
-STALE_STAMP = "age is "  # begins the world's refusal of a command with too old a stamp, which is then stamped anew
+KEPT = 200  # number of settled orders that are remembered: three minutes at one click a second
+SHOWN_S = 20.0  # wall; how long pages show a settled order
+NAME_MAX = 64  # characters of an id or a name
+REASONS_MAX = 2  # number of targets of an order whose reasons are shown
+STALE_STAMP = "age is "  # start of the world's refusal of a stamp that is too old; the command is then stamped anew
 OrderState = Literal["sent", "confirmed", "refused", "replaced"]
 _CARRIED_OUT = {
     "emergency": frozenset({"emergency"}),
@@ -64,12 +64,12 @@ STATES_DONE = {
     "emergency": frozenset({"emergency"}),
     "reset": frozenset({"landed"}),
 }
-THERE_M, THERE_RAD = 0.2, 0.05  # of a variable from its target; chosen: about the accuracy of the paper's formations
+REACHED_M, REACHED_RAD = 0.2, 0.05  # error of a variable at its target; chosen: about the accuracy in the paper
 Name = Annotated[str, Meta(max_length=NAME_MAX)]
 
 
 class RequestOutcome(NamedTuple):
-    """A request as described, and why it was refused; empty if accepted."""
+    """The outcome of a request: its description, and why it was refused (empty if it was accepted)."""
 
     request: str
     refusal: str
@@ -77,7 +77,7 @@ class RequestOutcome(NamedTuple):
     op: str = ""
     args: Mapping[str, Any] = {}
     order: str = ""  # id of the order that it attempts to carry out; empty for none
-    unanswered: bool = False  # whether it may still be carried out, since there was no answer
+    unanswered: bool = False  # whether there was no answer, so that it may still be carried out
 
 
 class NoAnswer(str):
@@ -87,7 +87,7 @@ class NoAnswer(str):
 
 
 class PastInstant(NamedTuple):
-    """The views of one instant on record; estimates by drone, formations by name."""
+    """The recorded views of one gate; estimates by drone, formations by name."""
 
     drones: ViewDrones
     clusters: dict[str, ViewCluster]
@@ -97,8 +97,10 @@ class PastInstant(NamedTuple):
 class CommandClient:
     """Sends requests in the console's name.
 
-    `views` tells which commands have been answered, `now_ns` gives the time of a stamp and may poll the world, and
-    `report` is called with the outcome of each request, in any thread.
+    Args:
+        views: counts the commands that have been answered.
+        now_ns: returns the simulated time for a stamp; it may poll the world.
+        report: called with the outcome of each request, in any thread.
     """
 
     def __init__(
@@ -114,10 +116,10 @@ class CommandClient:
         self._views = views
         self._now_ns = now_ns
         self._report = report
-        self._seqs: Counter[str] = Counter()  # messages sent on each key
-        self._modes: Counter[str] = Counter()  # modes requested of each drone
-        self._emergencies: Counter[str] = Counter()  # those of them that are emergencies
-        self.cluster_requests: Counter[str] = Counter()  # made so far, by formation
+        self._seqs: Counter[str] = Counter()  # number of messages sent on each key
+        self._modes: Counter[str] = Counter()  # number of modes requested of each drone
+        self._emergencies: Counter[str] = Counter()  # how many of them are emergencies
+        self.cluster_requests: Counter[str] = Counter()  # number of requests so far, by formation
         self._lock = threading.RLock()
         self._pools = [
             ThreadPoolExecutor(THREADS_PER_POOL, thread_name_prefix=f"console-{kind}")
@@ -136,7 +138,7 @@ class CommandClient:
         self._submit(self._requests.submit, what, self._request, keys.CONTROL, op, args)
 
     def seek(self, t_s: float, step: bool) -> None:
-        """Let a replay continue from an instant; `step`: play one gate there, if it is paused."""
+        """Move a replay to a simulated time; with `step`, also play one gate there, which a paused replay shows."""
 
         def act() -> str:
             refusal = self._request(keys.CONTROL, "seek", {"t_s": t_s})
@@ -145,7 +147,7 @@ class CommandClient:
         self._submit(self._requests.submit, RequestOutcome(f"seek {t_s:g} s", ""), act)
 
     def timeline(self) -> dict[str, Any]:
-        """Return the timeline of a replay, empty without an answer."""
+        """Return the timeline of a replay; empty if there is no answer."""
         with suppress(ZsimError):
             answer = self._link.request(keys.CONTROL, "timeline", self._name, {}, ANSWER_TIMEOUT_S)
             if answer.ok and isinstance(answer.result, dict) and "to_s" in answer.result:
@@ -161,7 +163,7 @@ class CommandClient:
         return True
 
     def past_views(self, from_s: float, to_s: float, every_s: float) -> list[PastInstant]:
-        """Return views of a replay's record; empty without an answer."""
+        """Return the views of a replay's record, one gate every `every_s`; empty if there is no answer."""
         args = {"from_s": from_s, "to_s": to_s, "every_s": every_s}
         found: dict[int, PastInstant] = {}
         with suppress(ZsimError, LookupError, TypeError, ValueError):
@@ -184,7 +186,7 @@ class CommandClient:
         self._submit(self._requests.submit, what, self._request, keys.cluster_control(cluster), op, args)
 
     def send_mode(self, drones: Sequence[str], mode: str, order: str = "") -> None:
-        """Let drones take off, land, stop at once or leave the emergency, regardless of their commander.
+        """Send drones a mode: to take off, land, stop at once or leave the emergency, whoever commands them.
 
         Modes of one drone are sent in the order of the requests, except for an emergency: it does not wait for them,
         and no earlier request is sent after it.
@@ -204,12 +206,12 @@ class CommandClient:
         return self._modes[drone]
 
     def take(self, drone: str, done: Callable[[str], None]) -> None:
-        """Acquire a drone with an operator's priority; `done` receives the reason for a refusal, else an empty text."""
+        """Acquire a drone with an operator's priority; `done` receives the reason for a refusal, or an empty text."""
         with suppress(RuntimeError):  # closed; the run has ended
             self._requests.submit(lambda: done(_refusal_of(self._acquire, drone, PRIORITY)))
 
     def give_back(self, drone: str) -> None:
-        """Release a drone: it hovers until another process flies it."""
+        """Release a drone, which then hovers until another process flies it."""
         with suppress(RuntimeError):
             self._releases.submit(_refusal_of, self._request, keys.CONTROL, "release", {"drone": drone})
 
@@ -252,8 +254,8 @@ class CommandClient:
         """Send the mode even if the drone could not be acquired: the world may accept it anyway."""
         refusal = _refusal_of(self._acquire, drone, PRIORITY_EMERGENCY, EMERGENCY_TIMEOUT_S)
         self._send(drone, mode)
-        told = refusal and f"{refusal}; {mode} was sent anyway"
-        return NoAnswer(told) if isinstance(refusal, NoAnswer) else told
+        report = refusal and f"{refusal}; {mode} was sent anyway"
+        return NoAnswer(report) if isinstance(refusal, NoAnswer) else report
 
     def _acquire(self, drone: str, priority: int, timeout_s: float = ANSWER_TIMEOUT_S) -> str:
         return self._request(keys.CONTROL, "acquire", {"drone": drone, "priority": priority}, timeout_s)
@@ -272,7 +274,7 @@ class CommandClient:
         return OVERTAKEN if overtaken else ""
 
     def _release(self, drone: str, before: int) -> None:
-        """Release a drone once the world has the mode that was sent with an operator's priority."""
+        """Release a drone once the world has answered its mode, which needs the operator's priority until then."""
         self._views.await_answer(drone, before, ACCEPTANCE_TIMEOUT_S)
         with suppress(ZsimError):  # the run has ended
             self._request(keys.CONTROL, "release", {"drone": drone})
@@ -283,18 +285,18 @@ def _refusal_of(act: Callable[..., str], *args: Any) -> str:
         return act(*args)
     except ZsimError as error:
         return str(error)
-    except Exception as error:  # a pool's thread reports no exception itself
+    except Exception as error:  # a pool would swallow the exception
         return f"{type(error).__name__}: {error}"
 
 
 @dataclass
 class _DroneTasks:
-    busy: int = 0  # that run
+    busy: int = 0  # number of running tasks
     waiting: deque[Task] = field(default_factory=deque)
 
 
 class DroneQueue:
-    """Runs the tasks of each drone in order of submission in `pool`, urgent ones in `urgent`.
+    """Runs the tasks of each drone in order of submission in `pool`, and urgent ones at once in `urgent`.
 
     Tasks of different drones do not wait for each other. Submitting raises RuntimeError once closed.
     """
@@ -312,7 +314,7 @@ class DroneQueue:
             self._tasks.clear()
 
     def submit(self, name: str, act: Task) -> None:
-        """Run a task after all that were submitted for that name before."""
+        """Run a task after all earlier ones of that name."""
         with self._lock:
             tasks = self._tasks.get(name)
             if tasks is not None and tasks.busy:
@@ -352,16 +354,16 @@ class DroneQueue:
 
 
 class OrderRequest(Struct, frozen=True, forbid_unknown_fields=True):
-    """An order of a page, to be repeated with its id until it is confirmed."""
+    """An order from a page, which repeats it with the same id until it is confirmed."""
 
     op: Literal["emergency", "land", "hold", "acknowledge"]
     id: Name = ""
-    """Chosen by the page; carried out once. Empty: the order will not be repeated."""
+    """Chosen by the page; carried out once per id. Empty: the order will not be repeated."""
     run: Name = ""
-    """The run for which it was given; refused in any other. Empty: the run that is shown."""
+    """The run for which it was given; it is refused in any other. Empty: the run that is shown."""
     drone: Name = ""
     cluster: Name = ""
-    """The targets; all where both are empty."""
+    """The target, a drone or a formation; all of them if both are empty."""
 
 
 @dataclass
@@ -370,7 +372,7 @@ class _Target:
 
     is_drone: bool
     state: OrderState = "sent"
-    reason: str = ""  # why it is refused, or not confirmed
+    reason: str = ""  # why it is refused, or not yet confirmed
     busy: bool = False  # whether an attempt is in progress
     attempts: int = 0
     sent_s: float = 0.0  # when the last attempt began [s; wall]
@@ -384,12 +386,12 @@ class _Order:
     op: Any
     subject: str
     targets: dict[str, _Target]  # by name
-    given_s: float  # wall
-    since_ns: int
+    given_s: float  # when it was given [s; wall]
+    since_ns: int  # when it was given [simulated]
     over_s: float | None = None  # when it was settled [s; wall]
     confirmed_ns: int | None = None
     refusal: str = ""
-    told: set[str] = field(default_factory=set)
+    notified: set[str] = field(default_factory=set)  # targets of whose outcomes operators were notified
 
     @property
     def state(self) -> OrderState:
@@ -436,7 +438,7 @@ class OrderBook:
         self._lock = threading.RLock()
 
     def place(self, request: OrderRequest) -> dict[str, Any]:
-        """Carry out an order, unless one with its id was already carried out; return it as plain data."""
+        """Carry out an order, unless one with its id has been carried out; return its progress as plain data."""
         order_id = request.id or uuid4().hex
         with self._lock:
             order = self._orders.get(order_id)
@@ -451,7 +453,7 @@ class OrderBook:
             return self._row(order)
 
     def note(self, outcome: RequestOutcome) -> bool:
-        """Process the outcome of an attempt; return whether to notify operators, once for each target."""
+        """Process the outcome of an attempt; return whether to notify operators, once per target."""
         with self._lock:
             order = self._orders.get(outcome.order)
             target = order.targets.get(outcome.subject) if order else None
@@ -465,10 +467,10 @@ class OrderBook:
                 return False
             if not target.is_drone:
                 self._settle(order, target, "refused" if outcome.refusal else "confirmed", outcome.refusal)
-            elif outcome.refusal and order.op != "emergency":  # which is sent even if the drone could not be acquired
+            elif outcome.refusal and order.op != "emergency":  # an emergency is sent regardless
                 self._settle(order, target, "refused", outcome.refusal)
-            is_new = outcome.subject not in order.told
-            order.told.add(outcome.subject)
+            is_new = outcome.subject not in order.notified
+            order.notified.add(outcome.subject)
             return is_new
 
     def on_event(self, event: Event) -> None:
@@ -490,7 +492,8 @@ class OrderBook:
     def update(self, states: Mapping[str, str], t_ns: int, *, paused: bool) -> None:
         """Settle orders that have taken effect, and repeat the others.
 
-        `states` and the phases of formations are those at t_ns. Commands accepted in a paused run take effect later.
+        `states` has the states of drones and the phases of formations at t_ns. A command that is accepted in a paused
+        run takes effect when the run continues.
         """
         with self._lock:
             self._paused = paused
@@ -545,7 +548,7 @@ class OrderBook:
         return order
 
     def _replace_earlier(self, order: _Order) -> None:
-        """Settle earlier orders that a new one contradicts; an emergency, all of its drones and their formations."""
+        """Settle earlier orders for the same targets; an emergency also replaces those of formations that it stops."""
         concerned = set(order.targets)
         if order.op == "emergency":
             concerned |= {name for name, drones in self._members.items() if concerned.issuperset(drones)}
@@ -594,7 +597,7 @@ class OrderBook:
 
 
 class PendingRequest(NamedTuple):
-    """A request to a formation or drone, described by its text."""
+    """An accepted request to a formation or drone, with its description."""
 
     subject: str
     op: str
@@ -609,7 +612,7 @@ class PendingRequests:
         self._pending: dict[str, PendingRequest] = {}
 
     def accept(self, subject: str, op: str, text: str, args: Mapping[str, Any]) -> bool:
-        """Keep a request; return whether its end can be observed."""
+        """Keep a request; return whether its completion can be observed."""
         known = op in PHASES_DONE or op in STATES_DONE or (op == "target" and bool(args.get("values")))
         if known:
             self._pending[subject] = PendingRequest(subject, op, text, args.get("values", {}))
@@ -628,13 +631,13 @@ def _is_done(request: PendingRequest, clusters: Mapping[str, ViewCluster], drone
         return drones.get(request.subject) in STATES_DONE.get(request.op, ())
     if request.op != "target":
         return view.phase in PHASES_DONE[request.op]
-    flown = dict(zip(view.names, view.value, strict=True))
+    values = dict(zip(view.names, view.value, strict=True))
     for name, value in request.values.items():
-        away = flown.get(name, math.inf) - value
-        if unit(name) == "rad" and math.isfinite(away):
-            there = abs(math.remainder(away, math.tau)) < THERE_RAD
+        error = values.get(name, math.inf) - value
+        if unit(name) == "rad" and math.isfinite(error):
+            is_reached = abs(math.remainder(error, math.tau)) < REACHED_RAD
         else:
-            there = abs(away) < THERE_M
-        if not there:
+            is_reached = abs(error) < REACHED_M
+        if not is_reached:
             return False
     return True

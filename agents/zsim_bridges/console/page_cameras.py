@@ -20,36 +20,36 @@ from zsim_bridges.console.camera_feed import CameraPicture, field_of_view
 from zsim_bridges.console.page_server import show_jpeg
 from zsim_bridges.console.picture import Array, DronePoses
 
-OFFSET_M = np.array([-2.3, -3.9, 1.7])  # of a page's camera from its target, unless more is needed
+OFFSET_M = np.array([-2.3, -3.9, 1.7])  # offset of a page's camera from its target, unless it must be farther away
 DISTANCE_MIN_M = float(np.linalg.norm(OFFSET_M))
-SLOPE_MIN = 0.05  # of the narrowest page that is considered; a hidden one has no width
-REACH_M = 0.6  # of a drone around its position, with its name above it; chosen
-FAR_M = 15.0  # beyond which a drone on the page is too small to count as in view; chosen: about 15 pixels
-MARGIN = 0.85  # of half the page; a point within it counts as in view
+SLOPE_MIN = 0.05  # half width per distance on the narrowest page considered; a hidden page has no width
+REACH_M = 0.6  # radius of a drone with the name above it; chosen
+FAR_M = 15.0  # distance beyond which a drone is too small to count as in view; chosen: about 15 pixels
+MARGIN = 0.85  # share of half the page; points within it count as in view
 UP_W = np.array([0.0, 0.0, 1.0])
-DIRECTIONS = {  # from the centre to the camera; not straight from above, where the up direction is undefined
+DIRECTIONS = {  # directions from the target to the camera; not straight from above, where the up direction is undefined
     "reset": OFFSET_M / DISTANCE_MIN_M,
     "top": np.array([0.0, -0.02, 1.0]),
     "side": np.array([0.0, -1.0, 0.06]),
 }
-DEADBAND = 0.05  # of the distance; a shorter move does not move the camera, so pictures need not be drawn anew
-SPARE = 1.15  # of the distance at which everything is just in view
-NEARER = 0.6  # of the distance; the camera comes nearer if the fitting one is less
+DEADBAND = 0.05  # share of the distance; the camera does not follow a shorter move, so that the page need not redraw
+SPARE = 1.15  # ratio to the distance at which everything is just in view
+NEARER = 0.6  # ratio to the present distance; the camera comes nearer if the fitting distance is less
 NODE = "/camera_frustum"
-SCALE = 0.8  # of a frustum: the picture on it is about a metre wide; chosen: beside a hull of half a metre
+SCALE = 0.8  # size of a frustum, whose picture is about a metre wide; chosen: suits a hull of half a metre
 EDGE_PX = 2.0
 COLOUR = (226, 0, 134)
-FIELD_MAX_RAD = 2.6  # of a drawn angle of view; beyond it the picture would be wider than the formation
+FIELD_MAX_RAD = 2.6  # largest angle of view that is drawn; the picture would otherwise be wider than the formation
 PAGE_KEY_BYTES = 12
 
 
 class CameraView(NamedTuple):
-    """The view of a page's camera; fov is the vertical angle of view [rad]."""
+    """The view of a page's camera."""
 
     position: Array  # (3,) m; W
     look_at: Array  # (3,) m; W
     up: Array  # (3,); W
-    fov: float  # rad
+    fov: float  # vertical angle of view [rad]
     aspect: float  # width / height
 
     def contains(self, p_W: Array) -> bool:
@@ -62,7 +62,7 @@ class CameraView(NamedTuple):
         return bool(0.0 < z <= FAR_M and abs(y) <= half and abs(x) <= half * self.aspect)
 
     def offset(self) -> Array:
-        """Return the position from which to look at a point [m; W]: in the present direction, at most OFFSET_M away."""
+        """Return the camera's position relative to a new target [m; W]: the present one, at most |OFFSET_M| away."""
         back = self.position - self.look_at
         return back * min(1.0, float(np.linalg.norm(OFFSET_M) / np.linalg.norm(back)))
 
@@ -72,8 +72,8 @@ def fit_distance_m(points_W: Array, centre_W: Array, back_W: Array, up_W: Array,
 
     Args:
         points_W: (n, 3) m.
-        centre_W: (3,) m.
-        back_W: (3,), from the centre to the camera; not parallel to `up_W`.
+        centre_W: target of the camera, (3,) m.
+        back_W: direction from the centre to the camera, (3,); not parallel to `up_W`.
         up_W: (3,).
         fov: vertical angle of view [rad].
         aspect: width / height.
@@ -98,29 +98,29 @@ def _aim(client: viser.ClientHandle, centre: Array, offset: Array) -> None:
 
 @dataclass
 class _Page:
-    """A page: how its camera looks at the scene, and the frustum within it; `key` identifies it to its sockets."""
+    """A page: how its camera looks at the scene, and the frustum in it; `key` identifies the page to its sockets."""
 
     client: viser.ClientHandle
     key: str = field(default_factory=lambda: secrets.token_urlsafe(PAGE_KEY_BYTES))
     follows: bool = True  # whether its camera moves with the formation
     fits: bool = True  # whether its distance is adjusted to keep all drones in view
     direction: Array | None = field(default_factory=DIRECTIONS["reset"].copy)  # next viewing direction; None: unchanged
-    moved: bool = True  # whether it must be aimed anew
-    camera: str = ""  # whose frustum is shown
-    clicked: str = ""  # the drone clicked last in its scene
+    moved: bool = True  # whether its camera must be aimed again
+    camera: str = ""  # the camera whose frustum is shown; empty for none
+    clicked: str = ""  # the drone last clicked in its scene, until it is taken
 
 
 @dataclass
 class _Frustum:
     camera: str
-    node: Any  # viser's
-    number: int = 0  # of its picture
+    node: Any  # viser's handle
+    number: int = 0  # number of its picture
 
 
 class PageCameras:
     """The cameras with which all pages look at the scene, and the frusta within it.
 
-    A frustum that appears out of its page's view is brought into it.
+    A page's camera moves to a frustum that appears out of view.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -135,7 +135,7 @@ class PageCameras:
     def _on_connect(self, client: viser.ClientHandle) -> None:
         page = _Page(client)
         self._move(page)
-        page.moved = True  # again at the next picture: this one may be of another run
+        page.moved = True  # aim again at the next picture: the present target may be of another run
         with self._lock:
             self._pages[client.client_id] = page
         client.gui.add_html(f'<i data-zsim-page="{page.key}"></i>', order=-2.0)
@@ -170,12 +170,12 @@ class PageCameras:
             page.follows, page.fits = follows, fits
 
     def set_target(self, p_W: Array) -> None:
-        """Aim the cameras of later pages at positions (n, 3) [m], unless n is 0."""
+        """Aim the cameras of pages opened later at positions (n, 3) [m; W], unless n is 0."""
         if len(p_W):
             self._points = p_W
 
     def follow(self, p_W: Array) -> None:
-        """Move the cameras that follow the positions (n, 3) [m]."""
+        """Move the cameras that follow the formation to new positions (n, 3) [m; W]."""
         self.set_target(p_W)
         if not len(p_W):
             return
@@ -214,7 +214,7 @@ class PageCameras:
                 self._pages[client_id].clicked = drone
 
     def take_click(self, key: str) -> str:
-        """Return, once, the drone last clicked in a page's scene; empty for none."""
+        """Return the drone last clicked in a page's scene, once; empty for none."""
         clicked = ""
         with self._lock:
             for page in self._pages.values():
@@ -251,7 +251,7 @@ class PageCameras:
                 show_jpeg(frustum.node, picture.image.data)
 
     def clear_frusta(self) -> None:
-        """Remove all: the run is over."""
+        """Remove all frusta, at the end of a run."""
         with self._lock:
             for page in self._pages.values():
                 page.camera = ""
@@ -259,7 +259,7 @@ class PageCameras:
 
 
 def frustum_pose(info: CameraInfo, p_WB: Array, q_WB: Array) -> tuple[Array, Array]:
-    """Return position [m; W] and quaternion, K to W, of a usable camera of a drone at p_WB (3,) [m], q_WB (4,)."""
+    """Return position [m; W] and quaternion (K to W) of a usable camera; its drone is at p_WB (3,) [m], q_WB (4,)."""
     p_WK = p_WB + frames.rotate(q_WB, info.position_m)
     return p_WK, frames.quaternion_multiply(q_WB, rotation.normalised(info.orientation_wxyz))
 

@@ -68,9 +68,9 @@ CLIENT_HEADER = "X-Zsim-Client"  # key of a page, which maps to viser's number
 COPIED_HEADER = "X-Zsim-Copied"  # sent once a page has its copies from a console that is exiting
 SECRET_HEADER = "X-Zsim-Console"  # demanded by viser's server
 ALL_ADDRESSES = ("0.0.0.0", "::")
-PAGES_MAX = 50  # open at once, counted separately for operators and viewers, so that viewers do not exclude operators
-HEARTBEAT_S = 20.0  # after which a page on a machine that has gone is detected
-CLOSE_S = 0.3  # wall; twice at the end, for requests in progress, and for pages to close their sockets
+PAGES_MAX = 50  # number open at once, counted separately for operators and viewers: viewers must not exclude operators
+HEARTBEAT_S = 20.0  # after which a page whose machine has gone is detected
+CLOSE_S = 0.3  # wall; used twice on exit: for requests in progress, and for pages to close their sockets
 POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; frame-ancestors 'none'; form-action 'none'"
 HEADERS = {
     "Content-Security-Policy": POLICY,  # the page is one file and loads nothing from elsewhere
@@ -78,7 +78,7 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
-PARTS = (  # of the page, beside viser's; each part may use those before it
+PARTS = (  # parts of the page besides viser's; each may use those before it
     "layout.html",
     "orders.html",
     "head_bar.html",
@@ -91,13 +91,13 @@ PARTS = (  # of the page, beside viser's; each part may use those before it
     "touch.html",
 )
 LOOKED_S = 5.0  # wall; without a poll for this long a page counts as closed; above GONE_MS + LOOK_MS of head_bar.html
-MTIME_S = 2.0  # greatest amount by which a file's time may be too early: the resolution of FAT
+MTIME_S = 2.0  # largest amount by which a file's time may be too early: the resolution of FAT
 POLL_S = 0.1  # wall; between two checks whether all pages have their copies
-LOOKS_MAX = 200  # pages remembered: more than may be open, 50 of operators and 50 of viewers
+LOOKS_MAX = 200  # number of pages remembered; at most 50 of operators and 50 of viewers are open
 _ORDERS = msgspec.json.Decoder(OrderRequest)
 NAME_MAX = 64  # characters of a key that modifies a click
 VALUE_MAX = 2_000  # characters of a control's text: expressions of twelve variables, a line each
-EXACT_MAX = 2**53  # a page's numbers are exact up to it; a larger one does not fit any message
+EXACT_MAX = 2**53  # a page's numbers are exact up to this; larger ones do not fit any message
 Value = bool | message.Number | Annotated[str, Meta(max_length=VALUE_MAX)]
 Permits = Callable[[int, str], bool]
 """Returns whether a page, by viser's number, may use a shared control, by its id."""
@@ -121,21 +121,21 @@ class RunFiles:
     """The report and the record of one run; files older than this object belong to another run.
 
     Args:
-        folder: of the run; None where it is unknown.
+        folder: folder of the run; None if unknown.
 
     Attributes:
-        paths: by their names on pages; the files may not exist yet.
+        paths: paths of the files by their names on pages; the files may not exist yet.
     """
 
     def __init__(self, folder: Path | None) -> None:
-        whole = folder and folder.absolute()
-        self.paths = {"report": whole / "report.html", "record": whole / RECORD} if whole else {}
+        root = folder and folder.absolute()
+        self.paths = {"report": root / "report.html", "record": root / RECORD} if root else {}
         self._since_s = time.time()
         self._looked_s: dict[str, float] = {}  # when pages without copies last polled [s; monotonic], by their names
         self._leaves = False
 
     def shown(self, page: str, has_copies: bool) -> dict[str, Any]:
-        """Return the files for a page (empty: no page asks); `has_copies`: it has all that it wants to keep."""
+        """Return the state of the files for a page (empty: none); `has_copies`: it has all that it wants to keep."""
         self._looked_s.pop(page, None)
         if page and not has_copies:
             while len(self._looked_s) >= LOOKS_MAX:
@@ -145,7 +145,7 @@ class RunFiles:
         return {"files": files, "leaves": self._leaves}
 
     def offer(self, within_s: float, deserted: Callable[[], bool]) -> None:
-        """Tell pages to copy the files, since the console exits; wait until all open ones have, unless deserted."""
+        """Tell pages to copy the files, since the console exits; wait until all open ones have them, or `deserted`."""
         self._leaves = True
         until_s = time.monotonic() + within_s
         while (now_s := time.monotonic()) < until_s and not deserted():
@@ -166,20 +166,20 @@ class RunFiles:
 class ViserBackend(NamedTuple):
     """The services behind the HTTP server; sockets are served until they close."""
 
-    port: int  # of viser, on BACKEND_HOST
+    port: int  # viser's port on BACKEND_HOST
     secret: str  # demanded by viser in SECRET_HEADER
-    state: Callable[[], dict[str, Any]]  # what the console shows
-    permits: Callable[[bytes, str], bool]  # whether a message of a page in a role may reach viser
+    state: Callable[[], dict[str, Any]]  # returns what the console shows
+    permits: Callable[[bytes, str], bool]  # returns whether a page's message, in a role, may reach viser
     serve_cameras: Callable[[web.Request], Awaitable[web.StreamResponse]]  # a socket of pictures
     serve_actions: Callable[[web.Request, str], Awaitable[web.StreamResponse]]  # a socket of actions, in a role
-    head: Callable[[], dict[str, Any]]  # what the head of the page shows
+    head: Callable[[], dict[str, Any]]  # returns what the head of the page shows
     command: Callable[[OrderRequest], dict[str, Any]]  # takes an order; returns its progress
     files: RunFiles
     looked: Callable[[str, str, str], None]  # called with key, role and address of a page that is alive
 
 
 class HttpProxy:
-    """The server of the pages; `token` is that of operators, None where only this machine can connect.
+    """The server of the pages; `token` is the operators' token, None if only this machine can connect.
 
     Raises:
         RunError: other machines could reach it, and there is no token.
@@ -273,7 +273,7 @@ class HttpProxy:
     async def _file(self, path: Path, _: web.Request, role: str) -> web.StreamResponse:
         """Serve a file of the run: a page to display, or a file to download."""
         if self._backend.files.size_bytes(path) is None:
-            return web.Response(status=404, text=f"{path} is not there yet\n", headers=HEADERS)
+            return web.Response(status=404, text=f"{path} does not exist yet\n", headers=HEADERS)
         kept = {} if path.suffix == ".html" else {"Content-Disposition": f'attachment; filename="{path.name}"'}
         return web.FileResponse(path, headers={**HEADERS, **kept})
 
@@ -321,14 +321,17 @@ class HttpProxy:
         try:
             connecting = self._client.ws_connect(url, protocols=protocols, headers=headers, compress=0, max_msg_size=0)
             async with connecting as inner:
-                ways = forward(inner, page, lambda _: True), forward(page, inner, lambda data: permits(data, role))
-                tasks = [asyncio.ensure_future(way) for way in ways]
+                directions = (
+                    forward(inner, page, lambda _: True),
+                    forward(page, inner, lambda data: permits(data, role)),
+                )
+                tasks = [asyncio.ensure_future(each) for each in directions]
                 await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
                 for task in tasks:
                     task.cancel()
                 await asyncio.gather(*tasks, return_exceptions=True)
         except ClientError:
-            pass  # viser ends, or has ended
+            pass  # viser is stopping or has stopped
         await page.close()
         return page
 
@@ -348,9 +351,9 @@ def _page(style: str = "") -> bytes:
     folder = importlib.resources.files("zsim_bridges.console.frame")
     parts = "".join(folder.joinpath(name).read_text("utf-8") for name in PARTS)
     head, end, tail = html.rpartition("</body>")
-    whole = f"{head}{parts}{end}{tail}" if end else f"{html}{parts}"
+    document = f"{head}{parts}{end}{tail}" if end else f"{html}{parts}"
     shown_as = folder.joinpath(style).read_text("utf-8") if style else ""
-    return gzip.compress(whole.replace("</head>", f"{shown_as}</head>", 1).encode())
+    return gzip.compress(document.replace("</head>", f"{shown_as}</head>", 1).encode())
 
 
 # Who may open a page
@@ -360,9 +363,9 @@ class PageRequest(NamedTuple):
     """The fields of an HTTP request that identify its sender."""
 
     path: str
-    host: str  # of its Host header
+    host: str  # value of its Host header
     origin: str | None
-    token: str  # in its address; empty for none
+    token: str  # token in its URL; empty for none
     cookies: dict[str, str]
 
 
@@ -377,7 +380,7 @@ class PageTokens:
 
     Args:
         listen, port: the address at which pages are served.
-        operator, viewer: tokens; the first is None where only this machine can connect.
+        operator, viewer: their tokens; that of operators is None if only this machine can connect.
 
     Raises:
         RunError: other machines could reach it, and there is no token.
@@ -389,7 +392,7 @@ class PageTokens:
         self._port = port
 
     def cookie(self, role: str) -> str:
-        """Return the name of a role's cookie; browsers keep those of all ports of a host together."""
+        """Return the name of a role's cookie; browsers keep the cookies of all ports of a host together."""
         return f"zsim_{role}_{self._port}"
 
     def role_of(self, request: PageRequest) -> str | None:
@@ -397,7 +400,7 @@ class PageTokens:
         role = VIEWER if request.path.startswith(VIEW_PATH) else OPERATOR
         try:
             if request.origin is not None and urlsplit(request.origin).netloc != request.host:
-                return None  # a page of another server
+                return None  # the request comes from a page of another server
             if self._tokens[OPERATOR] is None:
                 return role if is_loopback_authority(request.host) else None
         except ValueError:
@@ -410,7 +413,7 @@ class PageTokens:
         return None
 
     def role_of_address(self, request: PageRequest) -> str | None:
-        """Return the role whose token is in the address, to be set as a cookie; None if there is none."""
+        """Return the role whose token is in the address, to be set as a cookie; None without a valid token."""
         roles = (role for role in (OPERATOR, VIEWER) if self._is_token(request.token, role))
         return next(roles, None) if request.token else None
 
@@ -420,9 +423,9 @@ class PageTokens:
 
 
 class AnyThreadEvent(asyncio.Event):
-    """An event that other threads may set; the tasks that wait wake when the loop sets it, too.
+    """An event that any thread may set; waiting tasks wake once the loop's own thread sets it.
 
-    An asyncio.Event iterates over its waiters, and fails if the loop changes them meanwhile.
+    An asyncio.Event iterates over its waiters, and fails if the loop changes them at the same time.
     """
 
     def set(self) -> None:
@@ -435,7 +438,7 @@ class AnyThreadEvent(asyncio.Event):
 
 
 class Buffer(AsyncMessageBuffer):
-    """viser's message buffer, which sets its event in every thread, and drops writes to closed pages silently."""
+    """viser's message buffer, with an event that any thread may set; it drops writes to closed pages silently."""
 
     def __init__(self, *args: Any, **more: Any) -> None:
         super().__init__(*args, **more)
@@ -561,7 +564,7 @@ class SceneClick(Struct, tag_field="type", tag="ScenePointerMessage"):
 
 
 _DECODER = msgspec.msgpack.Decoder(ViewerCamera | ControlUpdate | SceneClick)
-"""All other messages are refused, such as those that share the page on the Internet or upload files."""
+"""Other messages, such as those that share the page on the Internet or upload files, are refused."""
 
 
 class PageControls:
@@ -587,7 +590,7 @@ class PageControls:
 
 
 def is_permitted(data: bytes, role: str, controls: PageControls) -> bool:
-    """Return whether a message of a page of this role, a msgpack map with its type, may reach viser."""
+    """Return whether a message (a msgpack map with its type) from a page in this role may reach viser."""
     if len(data) > MESSAGE_MAX:
         return False
     try:

@@ -1,7 +1,7 @@
 """The console's own sockets, opened by a page: one for actions, one for pictures of the drones' cameras.
 
 Pictures have a separate socket, since a megabyte of them on a slow link must not delay the answers to a stick. Both
-are closed on an invalid message. Viewers look and choose; operators also fly and play a record.
+are closed on an invalid message. Viewers look and choose; operators also fly and play records.
 """
 
 import asyncio
@@ -18,17 +18,17 @@ from zsim_bridges.console.page_cameras import PageCameras
 from zsim_bridges.console.page_server import HEARTBEAT_S, OPERATOR
 from zsim_bridges.console.run_monitor import RecordPlayer
 
-ACTION_MAX = 2_000  # bytes
+ACTION_MAX = 2_000  # bytes of an action
 NAME_MAX = 64  # characters of the name of a drone or camera, or of a page's key
-PLACE_MAX_M = 1e5  # of a place on the plan view; the fence is much nearer
-SPEED_MAX_M_S = 100.0  # of a stick; the drones' own limits are much lower
-PERIOD_S = 0.1  # wall, from one picture of a camera to the next, at least
-WANTED_MAX = 16  # pictures on one page
-REQUEST_MAX = 10_000  # bytes
+COORDINATE_MAX_M = 1e5  # largest coordinate on the plan view; the fence is much nearer
+SPEED_MAX_M_S = 100.0  # speed of a stick; the drones' own limits are much lower
+PERIOD_S = 0.1  # wall; shortest time between two messages with pictures
+WANTED_MAX = 16  # number of pictures on one page
+REQUEST_MAX = 10_000  # bytes of a request
 
 Name = Annotated[str, Meta(max_length=NAME_MAX)]
 Deflection = Annotated[float, Meta(ge=-1.0, le=1.0)]
-Metres = Annotated[float, Meta(ge=-PLACE_MAX_M, le=PLACE_MAX_M)]
+Metres = Annotated[float, Meta(ge=-COORDINATE_MAX_M, le=COORDINATE_MAX_M)]
 
 
 class _Action(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do"):
@@ -36,7 +36,7 @@ class _Action(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do"):
 
 
 class LookFrom(_Action, frozen=True, tag="look"):
-    """Set whether the page's camera follows the formation and keeps all of it in view, and look from a direction."""
+    """Set whether the page's camera follows the formation and keeps all of it in view; look from a direction."""
 
     page: Name
     follows: bool
@@ -45,7 +45,7 @@ class LookFrom(_Action, frozen=True, tag="look"):
 
 
 class LookAtPlan(_Action, frozen=True, tag="plan"):
-    """Request the plan view; `whole`: including what does not change."""
+    """Request the plan view; with `whole`, including its constant part and the past trails."""
 
     page: Name
     whole: bool = False
@@ -59,14 +59,14 @@ class ChooseDrone(_Action, frozen=True, tag="choose"):
 
 
 class SelectDrone(_Action, frozen=True, tag="select"):
-    """Select a drone on the page itself for one command with others, or unselect it."""
+    """Select a drone on the page itself for a command to several drones, or deselect it."""
 
     page: Name
     drone: Name
 
 
 class PlayRecord(_Action, frozen=True, tag="play"):
-    """Let a replay continue from an instant, pause, resume, step, or change its rate; for operators only."""
+    """Seek in a replay, pause, resume or step it, or change its rate; for operators only."""
 
     op: Literal["seek", "pause", "resume", "step", "rate"]
     value: Annotated[float, Meta(ge=0.0, le=1e9)] = 1.0
@@ -74,9 +74,9 @@ class PlayRecord(_Action, frozen=True, tag="play"):
 
 
 class TakeDrone(_Action, frozen=True, tag="take"):
-    """Take a drone to fly it; `over`: even from its present commander; for operators only, like all below.
+    """Take a drone to fly it; with `over`, even from its present commander; for operators only, like all below.
 
-    The page repeats it until it is answered; requests with the same `id` are carried out once.
+    The page repeats it until it is answered; it is carried out once per `id`.
     """
 
     drone: Name
@@ -85,7 +85,7 @@ class TakeDrone(_Action, frozen=True, tag="take"):
 
 
 class SteerDrone(_Action, frozen=True, tag="steer"):
-    """Fly the taken drone, or let it hover if not `held`; to be repeated, since a silent page does not fly."""
+    """Fly the taken drone, or let it hover unless `held`; the page repeats this, since a silent page does not fly."""
 
     held: bool = False
     forward: Deflection = 0.0
@@ -96,9 +96,9 @@ class SteerDrone(_Action, frozen=True, tag="steer"):
 
 
 class GoToPlace(_Action, frozen=True, tag="go"):
-    """Send the taken drone to a place, at its present height unless `z_m` is given.
+    """Send the taken drone to a point in W, at its present height unless `z_m` is given.
 
-    `then`: append the place to the present destinations.
+    `then`: append the point to the present waypoints instead of replacing them.
     """
 
     x_m: Metres
@@ -108,7 +108,7 @@ class GoToPlace(_Action, frozen=True, tag="go"):
 
 
 class LeaveDrone(_Action, frozen=True, tag="leave"):
-    """Release the drone."""
+    """Release the taken drone."""
 
 
 _Look = LookFrom | LookAtPlan | ChooseDrone | SelectDrone
@@ -131,7 +131,7 @@ class ActionSockets:
         self._cameras = cameras
         self._record = record
         self._flying = flying
-        self._keys: dict[Any, str] = {}  # of the page at each socket
+        self._keys: dict[Any, str] = {}  # keys of pages by their sockets
 
     async def respond(self, request: web.Request, role: str) -> web.StreamResponse:
         """Answer a request for a socket; return when it is closed."""
@@ -145,21 +145,21 @@ class ActionSockets:
                 if answer:
                     await socket.send_bytes(msgspec.json.encode(answer))
         except ConnectionError:
-            pass  # the page closed while it was answered
+            pass  # the page closed before it was answered
         finally:
             self.lose(socket)
         await socket.close()
         return socket
 
     def lose(self, page: Any) -> None:
-        """Record that a page's socket is closed: the drone that it flies hovers."""
+        """Record that a page's socket is closed, so that the drone that it flies hovers."""
         self._keys.pop(page, None)
         flying = self._flying()
         if flying is not None:
             flying.control.lose(page)
 
     def act(self, text: str, role: str, page: Any = None) -> dict[str, Any] | None:
-        """Carry out an action, given as JSON, of a page in a role; return the answer, None if it is not permitted.
+        """Carry out an action (JSON) of a page in a role; return the answer, None if it is invalid or not permitted.
 
         `page` identifies the page that flies a drone.
         """
@@ -215,7 +215,7 @@ class ActionSockets:
 
 
 class PicturesRequest(Struct, frozen=True, forbid_unknown_fields=True):
-    """A page's request; each also confirms that the page has shown what it was sent before."""
+    """A page's request; it also confirms that the page has shown the previous message."""
 
     page: Name = ""
     want: Annotated[tuple[Name, ...], Meta(max_length=WANTED_MAX)] = ()
@@ -227,9 +227,9 @@ _PICTURES = msgspec.json.Decoder(PicturesRequest)
 
 
 class PageBatches:
-    """The messages to one page: all changes of the cameras that it requested, in one message.
+    """The messages to one page: each has all changes of the requested cameras since the last one.
 
-    A message is the length of its header (4 bytes, big-endian), the header as JSON, and the JPEGs one after the other.
+    A message is the length of its header (4 bytes, big-endian), the header as JSON, and the JPEGs in succession.
     The header has `cameras` (name, width, height; null if unchanged), `pictures` (camera, size [bytes; 0: unchanged],
     t_s, marks), and `clicked` if a drone was clicked in the scene.
     """

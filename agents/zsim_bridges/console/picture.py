@@ -1,6 +1,6 @@
 """The picture of a run as arrays: poses, ellipsoids, formations, and previews of their flight. Pure.
 
-Axes, units and quaternions as everywhere: W east, north, up; quaternions w first, body to world.
+Axes of W: east, north, up. Quaternions: w first, body to world.
 """
 
 import math
@@ -23,29 +23,29 @@ from zsim_agents.references.flight import FlightError, flight_of
 
 Array = NDArray[np.float64]
 
-ROTOR_SLOWDOWN = 50.0  # at 10 pictures/s the fastest turn by 57 degrees, so they do not appear to turn backwards
-SIGMAS = 2.0  # of an ellipsoid
+ROTOR_SLOWDOWN = 50.0  # at 10 pictures a second the fastest rotors turn by 57 degrees, so none seems to turn backwards
+SIGMAS = 2.0  # half axes of an ellipsoid, in standard deviations
 SHARE_WITHIN = 1 - math.erfc(SIGMAS / math.sqrt(2)) - math.sqrt(2 / math.pi) * SIGMAS * math.exp(-(SIGMAS**2) / 2)
-"""Of a Gaussian in three dimensions, within 2 sigma: chi-squared of three degrees of freedom at 4, 0.739."""
-RADIUS_MAX_M = 60.0  # of an ellipsoid; before the first fix it would enclose the viewer
-PATH_POINTS = 120  # of a part of a drone's reference: smooth at the size of a page
+"""Share of a Gaussian in three dimensions within 2 sigma: chi-squared of three degrees of freedom at 4, 0.739."""
+RADIUS_MAX_M = 60.0  # largest half axis of an ellipsoid, which would otherwise enclose the viewer before the first fix
+PATH_POINTS = 120  # number of points of a part of a drone's reference: smooth at the size of a page
 SHAPED_PHASES = frozenset({"assembling", "engaged", "held"})  # phases in which a formation has a desired shape
-CORNER_SHARE = 0.25  # of the way from a corner to the opposite side: position of its angle's label, clear of names
+CORNER_SHARE = 0.25  # position of an angle's label between its corner (0) and the opposite side (1), clear of names
 CLICK_RAD = 0.012  # half the angle within which a click hits a small, far drone; chosen: about five pixels
-LARGE_MAX = 12  # drones with full names at full size; more have short, smaller names
-PLAN_DIGITS = 2  # of a metre: finer than a pixel
-HEADING_DIGITS = 3  # of a radian
-SIDES = {"p": (0, 1), "q": (0, 2)}  # robots at their ends; docs/conventions.md
+LARGE_MAX = 12  # number of drones with full names at full size; more have short, smaller names
+PLAN_DIGITS = 2  # decimals of metres: finer than a pixel
+HEADING_DIGITS = 3  # decimals of radians
+SIDES = {"p": (0, 1), "q": (0, 2)}  # robots at the ends of each side; docs/conventions.md
 
 
 class DronePoses(NamedTuple):
-    """The N drones of a run, in its order, at one instant."""
+    """The N drones of a run, in its order, at one time."""
 
     t_ns: int
     names: tuple[str, ...]
-    p_W: Array  # (N, 3) m; NaN of a drone that is not in the view
+    p_W: Array  # (N, 3) m; NaN for a drone that is not in the view
     q_WB: Array  # (N, 4)
-    rotor: Array  # (N, ROTORS_MAX) rad/s; 0 where a drone has fewer
+    rotor: Array  # (N, ROTORS_MAX) rad/s; 0 beyond a drone's last rotor
     wind_W: Array  # (3,) m/s, the mean over the drones
 
     @property
@@ -80,7 +80,7 @@ class FormationShape(NamedTuple):
 
 
 def drone_poses(view: ViewDrones, names: Sequence[str]) -> DronePoses:
-    """Return a view as arrays over the named drones; a replay's view may lack some of them."""
+    """Return a view as arrays over the named drones, some of which a replay's view may lack."""
     count = len(names)
     p_W, q_WB = np.full((count, 3), np.nan), np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
     rotor = np.zeros((count, ROTORS_MAX))
@@ -95,9 +95,10 @@ def drone_poses(view: ViewDrones, names: Sequence[str]) -> DronePoses:
 
 
 def radio_lines(hears: Sequence[Sequence[int]], drones: DronePoses) -> tuple[Array, Array]:
-    """Return the ends (n, 2, 3) [m] of the links between visible drones: the bidirectional and the one-way ones."""
-    there = drones.present
-    links = {(i, j) for i, heard in enumerate(hears) for j in heard if max(i, j) < len(there) and there[i] and there[j]}
+    """Return the ends (n, 2, 3) [m] of the links between drones in the view: of bidirectional and of one-way ones."""
+    present = drones.present
+    known = [(i, j) for i, heard in enumerate(hears) for j in heard if max(i, j) < len(present)]
+    links = {(i, j) for i, j in known if present[i] and present[j]}
     both = sorted((i, j) for i, j in links if i < j and (j, i) in links)
     single = sorted((i, j) for i, j in links if (j, i) not in links)
     ends = [drones.p_W[np.array(each, dtype=int).reshape(-1, 2)] for each in (both, single)]
@@ -107,12 +108,12 @@ def radio_lines(hears: Sequence[Sequence[int]], drones: DronePoses) -> tuple[Arr
 def drone_on_ray(
     drones: DronePoses, radii_m: Array, origin_W: Sequence[float], direction_W: Sequence[float]
 ) -> str | None:
-    """Return the drone hit by a ray, of several the one whose centre is nearest to the ray; None if it hits none.
+    """Return the drone hit by a ray; of several, the one whose centre is nearest to the ray; None if it hits none.
 
     Args:
-        drones: N of them.
-        radii_m: (N,), of the spheres around them that count as hits; seen at CLICK_RAD at least.
-        origin_W, direction_W: of the ray [m; W]; a direction without length hits nothing.
+        drones: N drones.
+        radii_m: (N,) m, radii of the spheres that count as hits; a distant one subtends at least CLICK_RAD.
+        origin_W, direction_W: origin and direction of the ray [m; W]; a zero direction hits nothing.
     """
     direction = np.array(direction_W)
     length = float(np.linalg.norm(direction))
@@ -126,7 +127,7 @@ def drone_on_ray(
 
 
 def shown_names(names: Sequence[str]) -> list[str]:
-    """Return names; of more than LARGE_MAX without their common prefix, unless one would become empty."""
+    """Return names, without their common prefix if they are more than LARGE_MAX and none would become empty."""
     if len(names) <= LARGE_MAX:
         return list(names)
     alike = takewhile(lambda column: len(set(column)) == 1 and not column[0].isdigit(), zip(*names, strict=False))
@@ -139,7 +140,8 @@ def rotor_angles(angles: Array, speeds: Array, turns: Array, dt_s: float) -> Arr
     """Return the angles [rad] at which rotors are drawn dt_s later, slowed down to be visible.
 
     Args:
-        angles, speeds: (M,) rad, rad/s; turns: (M,), 1 of a rotor that turns clockwise seen from above, else -1.
+        angles, speeds: (M,) rad, rad/s.
+        turns: (M,), 1 for a rotor that turns clockwise seen from above, otherwise -1.
     """
     return (angles - turns * speeds * (dt_s / ROTOR_SLOWDOWN)) % math.tau
 
@@ -148,8 +150,8 @@ def rotor_poses(p_W: Array, q_WB: Array, hubs_B: Array, angles: Array) -> tuple[
     """Return centres (M, 3) [m] and quaternions (M, 4) of M rotors.
 
     Args:
-        p_W, q_WB: of the drone of each, (M, 3) m and (M, 4).
-        hubs_B: (M, 3) m.
+        p_W, q_WB: pose of each rotor's drone, (M, 3) m and (M, 4).
+        hubs_B: centres of the rotors, (M, 3) m.
         angles: (M,) rad.
     """
     p = p_W + np.einsum("mij,mj->mi", frames.rotation_matrix(q_WB), hubs_B)
@@ -167,13 +169,13 @@ def ellipsoids(estimates: Sequence[EstimateView]) -> Ellipsoids:
 
 
 def reference_lines(scenario: Scenario) -> Array:
-    """Return the paths of all drones that fly by themselves as segments (M, 2, 3) [m; W], as the scenario has them."""
+    """Return the references of single drones in the scenario as segments (M, 2, 3) [m; W]."""
     lines = [np.zeros((0, 2, 3))]
     for drone in scenario.piloted():
         try:
             legs = flight_of(scenario, drone).legs
         except FlightError:
-            continue  # demanded by its pilot
+            continue  # its pilot decides where it flies
         for leg in legs:
             length_s = leg.path.duration_s
             end_s = scenario.duration_s - leg.start_s if length_s is None else length_s
@@ -184,7 +186,7 @@ def reference_lines(scenario: Scenario) -> Array:
 
 
 def ghosts(space: ClusterSpace, view: ViewCluster) -> tuple[Array, Array] | None:
-    """Return the desired positions (n, 3) and quaternions (n, 4) of a formation's robots, None if it has none."""
+    """Return the desired positions (n, 3) and quaternions (n, 4) of a formation's robots; None if it has none."""
     if view.phase not in SHAPED_PHASES:
         return None
     try:
@@ -195,7 +197,7 @@ def ghosts(space: ClusterSpace, view: ViewCluster) -> tuple[Array, Array] | None
 
 
 def formation_shape(space: ClusterSpace, p_W: Array, yaw: Array) -> FormationShape | None:
-    """Return the formation of robots at p_W (n, 3) with headings yaw (n,), None where it has no frame."""
+    """Return the shape of robots at p_W (n, 3) [m] with headings yaw (n,) [rad]; None if it has no frame."""
     try:
         c = space.forward(p_W, yaw)
     except SingularClusterError:
@@ -218,7 +220,7 @@ def formation_shape(space: ClusterSpace, p_W: Array, yaw: Array) -> FormationSha
 
 
 def surroundings(scenario: Scenario) -> dict[str, Any]:
-    """Return what does not change: names, labels and colours of drones, outlines of obstacles."""
+    """Return the constant part of the plan: names, labels and colours of drones, outlines of obstacles and surfaces."""
     names = [drone.name for drone in scenario.drones]
     return {
         "names": names,
@@ -230,7 +232,7 @@ def surroundings(scenario: Scenario) -> dict[str, Any]:
                 "x_m": each.position_m[0],
                 "y_m": each.position_m[1],
                 "yaw_deg": each.yaw_deg,
-                "radius_m": each.radius_m,  # of a disc; None for a box
+                "radius_m": each.radius_m,  # radius of a disc; None for a box
                 "size_m": list(each.size_m[:2]) if each.size_m is not None else None,
             }
             for each in scenario.environment.obstacles
@@ -255,7 +257,7 @@ def plan_positions(drones: DronePoses, states: Mapping[str, str]) -> list[list[A
 def plan_formations(
     spaces: Mapping[str, ClusterSpace], members: Mapping[str, list[int]], views: Mapping[str, ViewCluster]
 ) -> list[dict[str, Any]]:
-    """Return phase, indices of drones, and desired places [m; W] of each formation."""
+    """Return phase, indices of drones, and desired positions (x, y) [m; W] of each formation."""
     shown = []
     for name, view in views.items():
         desired = ghosts(spaces[name], view)
@@ -266,8 +268,8 @@ def plan_formations(
 
 # What a formation would fly
 
-POINTS = 121  # of a path; chosen so that a curve in 3-D looks smooth
-WAY_SHARE = 0.25  # of these, on the way to the start of a trajectory
+POINTS = 121  # number of points of a path; chosen: a curve in 3-D looks smooth
+TRANSIT_SHARE = 0.25  # ratio of the points of the transit to a trajectory's start to POINTS
 ENDLESS_S = 120.0  # simulated; how much of a trajectory without an end is shown
 
 
@@ -279,7 +281,7 @@ class FlightPreview(NamedTuple):
     """The paths of n drones.
 
     Attributes:
-        paths_W: (n, M, 3) m, from where they are desired now.
+        paths_W: (n, M, 3) m, from the present desired positions.
         text: figures of the paths.
     """
 
@@ -291,25 +293,25 @@ def preview_of(space: ClusterSpace, op: str, args: Mapping[str, Any], base: Arra
     """Return the paths of a `target` or `trajectory`; the controller may still refuse it, or fly it slower.
 
     Args:
-        op, args: of the request, as sent.
-        base: (4n,), where the formation is desired now.
-        apart_min_m: least distance of two drones that the controller demands.
+        op, args: operation and arguments of the request, as sent.
+        base: present desired variables of the formation, (4n,).
+        apart_min_m: smallest distance between two drones that the controller permits.
 
     Raises:
-        PreviewError: no formation of this space can fly it.
+        PreviewError: the request is invalid, or no formation of this space can fly it.
     """
     lead, span_s, length = np.zeros((0, space.size)), 0.0, ""
     try:
         request = read_request(op, args)
         if isinstance(request, MoveTo):
-            flown = _way(space, base, request.goal(space, base), POINTS)
+            flown = _ramp(space, base, request.goal(space, base), POINTS)
         else:
             assert isinstance(request, Follow)
             reference = request.trajectory(space, base)
             span_s = reference.duration_s or ENDLESS_S
             length = f"{span_s:g} s{'' if reference.duration_s else ' of it'}"
             flown = np.array([reference.value(t_s)[0] for t_s in np.linspace(0.0, span_s, POINTS)])
-            lead = _way(space, base, flown[0], round(POINTS * WAY_SHARE))
+            lead = _ramp(space, base, flown[0], round(POINTS * TRANSIT_SHARE))
         paths_W = np.array([space.inverse(c)[0] for c in (*lead, *flown)]).transpose(1, 0, 2)
     except REFUSALS as error:
         raise PreviewError(str(error)) from None
@@ -327,6 +329,6 @@ def preview_of(space: ClusterSpace, op: str, args: Mapping[str, Any], base: Arra
     return FlightPreview(paths_W, "; ".join([*figures, f"drones {apart_m:.1f} m apart or more{too_near}"]))
 
 
-def _way(space: ClusterSpace, start: Array, goal: Array, count: int) -> Array:
-    """Return a straight ramp in cluster space, (count, 4n), angles the short way around."""
+def _ramp(space: ClusterSpace, start: Array, goal: Array, count: int) -> Array:
+    """Return a straight line in cluster space, (count, 4n); angles take the shorter direction."""
     return start + np.linspace(0.0, 1.0, count)[:, None] * space.difference(goal, start)

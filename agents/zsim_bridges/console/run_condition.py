@@ -1,6 +1,6 @@
 """The condition of the run that pages show: alarms, checks before a take-off, refusals, and the page's head. Pure.
 
-An alarm is amber or red. A control of a page is disabled with the reason for which its request would be refused; an
+An alarm is amber or red. A control on a page is disabled, and shows the reason, while its request would be refused; an
 empty reason means that the request would be accepted.
 """
 
@@ -27,11 +27,11 @@ from zsim_agents.formation.flight_check import (
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, unit
 
 Severity = Literal["amber", "red"]
-BATTERY_LOW_PERCENT, BATTERY_EMPTY_PERCENT = 20.0, 10.0  # the AR.Drone warns at the first
+BATTERY_LOW_PERCENT, BATTERY_EMPTY_PERCENT = 20.0, 10.0  # alarm thresholds; the AR.Drone warns at the first
 UPSIDE_DOWN_DEG = 90.0
-LATE_MS = 200.0  # of an estimator: ten gates of 20 ms
-SIGMA_HIGH_M = 2.0  # of a position; chosen: the greatest distance between the paper's drones
-LINK_OLD_MS, LINK_LOSS_PERCENT = 500.0, 10.0  # chosen; PX4 leaves offboard mode after the first
+LATE_MS = 200.0  # lag of an estimator that raises an alarm: ten gates of 20 ms
+SIGMA_HIGH_M = 2.0  # σ of a position that raises an alarm; chosen: the largest distance between the paper's drones
+LINK_OLD_MS, LINK_LOSS_PERCENT = 500.0, 10.0  # alarm thresholds, chosen; PX4 leaves offboard mode after the first
 LOST = {
     "death": "dead",
     "no_show": "missing",
@@ -41,9 +41,9 @@ LOST = {
     "diverged": "diverged",
 }
 """Kinds of events that report the loss of a process or drone, with the name of the alarm."""
-BACK = frozenset({*ADMISSIONS, "silent_end", "leave"})  # kinds that end a loss; a drop does not
-OFF_REFERENCE_M = 2.0  # of a length of an engaged formation; chosen: the least distance between the paper's drones
-FLOWN_PHASES = frozenset({"assembling", "engaged"})  # in which a formation's controller flies all of its drones
+BACK = frozenset({*ADMISSIONS, "silent_end", "leave"})  # event kinds that end a loss, unlike a drop
+OFF_REFERENCE_M = 2.0  # error of a length of a formation; chosen: the smallest distance between the paper's drones
+FLOWN_PHASES = frozenset({"assembling", "engaged"})  # phases in which a formation's controller flies all of its drones
 
 
 class Alarm(NamedTuple):
@@ -66,10 +66,10 @@ class DroneCondition(NamedTuple):
     yaw_sigma_deg: float | None = None
     estimate_lost: bool = False
     tilt_deg: float | None = None
-    failsafe: str = ""  # why its firmware is landing it or has stopped its rotors without a command; otherwise empty
+    failsafe: str = ""  # why its firmware landed it or stopped its rotors without a command; empty if it did not
     commander: str | None = None
     is_external: bool = False
-    link_age_s: float | None = None  # wall, since its driver has published the state of the link
+    link_age_s: float | None = None  # wall time since its driver last published the state of the link
     link_state: str | None = None
     link_age_ms: float | None = None
     link_loss_percent: float | None = None
@@ -116,7 +116,13 @@ def formation_alarms(
     foreign: Mapping[str, Mapping[str, str]],
     views: Mapping[str, ViewCluster],
 ) -> list[Alarm]:
-    """Return the alarms of formations, by their phases and reasons, other commanders of their drones, and views."""
+    """Return the alarms of formations.
+
+    Args:
+        phases: phase and reason of each formation.
+        foreign: commanders other than its controller, by drone, of each formation.
+        views: newest view of each formation.
+    """
     found = []
     for name, (phase, reason) in phases.items():
         if TOO_NEAR in reason:
@@ -124,7 +130,7 @@ def formation_alarms(
         elif phase == "held" and HELD_ON_REQUEST not in reason:
             found.append(Alarm("amber", name, "held", reason))
         if phase in FLOWN_PHASES and foreign.get(name):
-            found.append(Alarm("amber", name, "not flown whole", foreign_text(foreign[name])))
+            found.append(Alarm("amber", name, "partly flown by others", foreign_text(foreign[name])))
         if phase == "engaged" and (strayed := _strayed(views[name])):
             found.append(Alarm("red", name, "off reference", strayed))
     return found
@@ -142,7 +148,7 @@ def foreign_commanders(
     Args:
         controller: expected name of the formation's process; if it flies no drone, the controller may have another
             name, so only consoles count as foreign.
-        roles: of processes, as far as known.
+        roles: roles of the known processes, by name.
     """
     others = {drone: who for drone in members if (who := commanders.get(drone)) and who != controller}
     if any(commanders.get(drone) == controller for drone in members):
@@ -152,13 +158,13 @@ def foreign_commanders(
 
 def _strayed(view: ViewCluster) -> str:
     """Describe the length of an engaged formation that deviates most from its reference; empty if all are close."""
-    apart = [
+    errors = [
         (abs(value - desired), name, value, desired)
         for name, value, desired in zip(view.names, view.value, view.desired, strict=True)
         if unit(name) == "m"
     ]
-    away_m, name, value, desired = max(apart, default=(0.0, "", 0.0, 0.0))
-    return f"{name} is {value:.1f} m, to be {desired:.1f} m" if away_m > OFF_REFERENCE_M else ""
+    error_m, name, value, desired = max(errors, default=(0.0, "", 0.0, 0.0))
+    return f"{name} is {value:.1f} m; should be {desired:.1f} m" if error_m > OFF_REFERENCE_M else ""
 
 
 def run_alarms(losses: Mapping[str, Event], active: Iterable[Fault], silent_s: float) -> list[Alarm]:
@@ -170,7 +176,7 @@ def run_alarms(losses: Mapping[str, Event], active: Iterable[Fault], silent_s: f
 
 
 def parameters_text(fault: Fault) -> str:
-    """Return the parameters of a fault as in the terminal: NAME=VALUE."""
+    """Return the parameters of a fault as typed in a terminal: NAME=VALUE."""
     return " ".join(f"{name}={value}" for name, value in fault.parameters.items() if value not in (None, {}))
 
 
@@ -181,9 +187,9 @@ class Losses:
         self.now: dict[str, Event] = {}
 
     def note(self, event: Event) -> None:
-        """Process an event: a loss, or a return, of the process itself or of one that replaces it."""
-        no_process_joined = event.kind == "no_show" and "incarnation" in event.data  # it has returned
-        if event.kind in LOST and not no_process_joined:
+        """Process an event: the loss of a process or drone, its return, or the join of a replacement."""
+        is_false_join = event.kind == "no_show" and "incarnation" in event.data  # the process of that name is present
+        if event.kind in LOST and not is_false_join:
             self.now = {**self.now, event.subject: event}
         elif event.kind in BACK:
             self._remove({event.subject, *map(str, event.data.get("serves") or ())})
@@ -200,13 +206,13 @@ class Losses:
 
 
 @dataclass
-class _Standing:
-    """An alarm on the board: how often it was raised, and when it ended [s; wall]; None while it is active."""
+class _BoardEntry:
+    """An alarm on the board, with the number of times it was raised."""
 
     alarm: Alarm
-    since_s: float
+    since_s: float  # when it was last raised [s; wall]
     times: int = 1
-    over_s: float | None = None
+    over_s: float | None = None  # when it ended [s; wall]; None while it is active
     acknowledged: bool = False
 
 
@@ -215,44 +221,44 @@ class AlarmBoard:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._standing: dict[tuple[str, str], _Standing] = {}
+        self._entries: dict[tuple[str, str], _BoardEntry] = {}
         self.alarms: tuple[Alarm, ...] = ()
 
     def update(self, alarms: Sequence[Alarm], wall_s: float) -> None:
         with self._lock:
             now = {(each.subject, each.name): each for each in alarms}
-            for key, standing in list(self._standing.items()):
+            for key, entry in list(self._entries.items()):
                 if key in now:
                     continue
-                if standing.alarm.severity != "red" or standing.acknowledged:
-                    del self._standing[key]
-                elif standing.over_s is None:
-                    standing.over_s = wall_s
+                if entry.alarm.severity != "red" or entry.acknowledged:
+                    del self._entries[key]
+                elif entry.over_s is None:
+                    entry.over_s = wall_s
             for key, alarm in now.items():
-                standing = self._standing.setdefault(key, _Standing(alarm, wall_s))
-                if standing.over_s is not None:
-                    standing.since_s, standing.over_s, standing.times = wall_s, None, standing.times + 1
-                if alarm.severity != standing.alarm.severity:
-                    standing.acknowledged = False
-                standing.alarm = alarm
+                entry = self._entries.setdefault(key, _BoardEntry(alarm, wall_s))
+                if entry.over_s is not None:
+                    entry.since_s, entry.over_s, entry.times = wall_s, None, entry.times + 1
+                if alarm.severity != entry.alarm.severity:
+                    entry.acknowledged = False
+                entry.alarm = alarm
             self.alarms = tuple(sorted(now.values(), key=_rank))
 
     def acknowledge(self) -> None:
         """Acknowledge all alarms and remove ended ones; an alarm that turns red later needs a new acknowledgement."""
         with self._lock:
-            self._standing = {key: each for key, each in self._standing.items() if each.over_s is None}
-            for standing in self._standing.values():
-                standing.acknowledged = True
+            self._entries = {key: each for key, each in self._entries.items() if each.over_s is None}
+            for entry in self._entries.values():
+                entry.acknowledged = True
 
     def clear(self) -> None:
-        """Remove all: a replay has gone back."""
+        """Remove all alarms, as when a replay has been rewound."""
         with self._lock:
-            self._standing, self.alarms = {}, ()
+            self._entries, self.alarms = {}, ()
 
     def rows(self, wall_s: float) -> list[dict[str, object]]:
-        """Return the alarms as plain data, red ones first, with how long each has been active or over [s; wall]."""
+        """Return the alarms as plain data, red ones first, and how long each has been active or over [s; wall]."""
         with self._lock:
-            ordered = sorted(self._standing.values(), key=lambda each: _rank(each.alarm, each.over_s is not None))
+            ordered = sorted(self._entries.values(), key=lambda each: _rank(each.alarm, each.over_s is not None))
             return [
                 {
                     **each.alarm._asdict(),
@@ -265,7 +271,7 @@ class AlarmBoard:
             ]
 
     def severity_of(self, subject: str) -> Severity | None:
-        """Return the severity of the worst alarm of a drone, formation or process; None without one."""
+        """Return the severity of the worst alarm of a drone, formation or process; None if there is none."""
         return next((each.severity for each in self.alarms if each.subject == subject), None)
 
 
@@ -273,11 +279,11 @@ def _rank(alarm: Alarm, is_over: bool = False) -> tuple[bool, bool, str, str]:
     return alarm.severity != "red", is_over, alarm.subject, alarm.name
 
 
-TILT_MAX_DEG = 30.0  # of a drone that takes off; chosen: more than any slope, much less than on its side
+TILT_MAX_DEG = 30.0  # tilt of a drone before take-off; chosen: above any slope, far below a drone on its side
 LINK_SILENT_S = 3.0  # wall; drivers publish the state of a link once a second
-LIMITS = EngagementLimits()  # of a formation's controller that lets its drones take off
+LIMITS = EngagementLimits()  # limits within which a formation's controller lets its drones take off
 AT_END = "the record is at its end; go back on the timeline"
-STANDS_S = 2.0  # wall; a running world that waits for longer appears to have stopped
+STANDS_S = 2.0  # wall; a running world that waits for longer is shown as waiting
 NO_RUN = {"t_s": 0.0, "replay": False, "age_s": 0.0, "alarms": []}
 Level = Literal["no run", "waiting", "running", "paused", "emergency", "silent", "ended"]
 
@@ -318,7 +324,7 @@ class Check(NamedTuple):
     """One check of a drone before its take-off."""
 
     name: str  # what is checked
-    text: str  # figures, with what is allowed where the check fails
+    text: str  # the measured value, and the allowed range if the check fails
     ok: bool = True
     blocks: bool = False  # whether a failure disables the take-off
 
@@ -327,8 +333,8 @@ def preflight_checks(drone: DroneCondition, in_formation: bool, foreign: str = "
     """Return the checks of a drone.
 
     Args:
-        in_formation: whether a controller flies it, which needs its estimator.
-        foreign: its commander, if neither this console nor its formation's controller; otherwise empty.
+        in_formation: whether a formation's controller flies it, which needs its estimate.
+        foreign: its commander, if this is neither this console nor its formation's controller; otherwise empty.
     """
     percent, tilt_deg = drone.battery_percent, drone.tilt_deg or 0.0
     checks = []
@@ -360,7 +366,7 @@ def preflight_checks(drone: DroneCondition, in_formation: bool, foreign: str = "
 
     link, link_age_s = drone.link_state, drone.link_age_s
     if not drone.is_external:
-        pass  # it has no driver, whatever is published as its link
+        pass  # it has no driver, so a published link state is ignored
     elif link is None or link_age_s is None:
         checks.append(Check("link", "no driver yet", False, True))
     elif link_age_s > LINK_SILENT_S:
@@ -375,14 +381,14 @@ class RunCondition(NamedTuple):
     """The condition on which the controls of a page depend."""
 
     clock: str | None = None  # state of the run's clock; None before the first answer
-    silent_s: float = 0.0  # how long the world has not answered [wall]; 0 while it answers
-    ended: str = ""  # why the run is over; empty while it goes on
+    silent_s: float = 0.0  # how long the world has not answered [s; wall]; 0 while it answers
+    ended: str = ""  # why the run is over; empty while it continues
     replayed: bool = False  # whether it is a replay, in which nothing can be flown
     at_end: bool = False  # whether the replay is at the end of its record
     drones: Mapping[str, str] = {}  # state by name of the drones seen so far
     phases: Mapping[str, tuple[str, str]] = {}  # phase and reason of each formation by name
     members: Mapping[str, Collection[str]] = {}  # names of the drones of each formation
-    checks: Mapping[str, tuple[Check, ...]] = {}  # checks of each drone before a take-off, as far as known
+    checks: Mapping[str, tuple[Check, ...]] = {}  # checks before take-off of each drone seen so far
 
     @property
     def level(self) -> Level:
@@ -390,7 +396,7 @@ class RunCondition(NamedTuple):
             return "ended"
         if self.silent_s:
             return "silent"
-        if "emergency" in self.drones.values() and not self.replayed:  # a replay's needs no action
+        if "emergency" in self.drones.values() and not self.replayed:  # an emergency in a replay needs no action
             return "emergency"
         return "paused" if self.clock == "paused" else "running" if self.clock == "running" else "waiting"
 
@@ -444,7 +450,7 @@ def is_held_by_fault(run: RunCondition, cluster: str) -> bool:
 
 
 def formation_refusals(run: RunCondition, cluster: str) -> dict[str, str]:
-    """Return why each operation of a formation would be refused, as far as its phase determines it."""
+    """Return why each operation of a formation would be refused, to the extent that its phase determines this."""
     phase, reason = run.phases.get(cluster, ("", ""))
     off = run.grounded() or ("" if phase else f"{cluster} has no controller yet")
     flown = "" if phase == "engaged" else f"{cluster} is {_words(phase)}, not engaged"
@@ -477,7 +483,7 @@ def formation_refusals(run: RunCondition, cluster: str) -> dict[str, str]:
 
 
 def _takeoff_refusal(run: RunCondition, cluster: str, phase: str) -> str:
-    """Return why a formation would not take off; its drones must be landed or in the air."""
+    """Return why a formation would not take off; each of its drones must be landed or in the air."""
     members = run.members.get(cluster, ())
     if phase != "idle":
         idle_first = "; Land makes it idle" if phase == "held" and run.all_down(members) else ""
@@ -505,7 +511,7 @@ def fleet_refusals(run: RunCondition, single: Collection[str] = ()) -> dict[str,
     landed = [name for name in single if run.drones.get(name) == "landed"]
     unfit = [refusal for name in landed if (refusal := preflight_refusal(run, [name]))]
     takeoff = ""
-    if "" not in refusals.values() and len(landed) == len(unfit):  # neither a formation nor a single drone
+    if "" not in refusals.values() and len(landed) == len(unfit):  # no formation and no single drone can take off
         stopped = [name for name in single if run.drones.get(name) == "emergency"]
         on_ground = [refusal for name, refusal in refusals.items() if run.all_down(run.members.get(name, ()))]
         reasons = [*on_ground, *unfit, *([_reset_first(stopped)] if stopped else []), *refusals.values()]
@@ -537,14 +543,14 @@ def page_head(
     """Return the head of the page of a run as plain data.
 
     Args:
-        t_ns: simulated time of what is shown.
+        t_ns: simulated time of the views that are shown.
         alarms: as `AlarmBoard.rows`.
         single: drones without a formation.
         world: description of where the run is.
-        record_s: of a replay, times of the first and the last gate on record [s].
+        record_s: times of the first and the last recorded gate of a replay [s].
     """
-    stands = clock is not None and any(each.since_wall_s > STANDS_S for each in clock.waiting_for)
-    level = "waiting" if run.level == "running" and stands else run.level
+    is_waiting = clock is not None and any(each.since_wall_s > STANDS_S for each in clock.waiting_for)
+    level = "waiting" if run.level == "running" and is_waiting else run.level
     t_s = (t_ns or (clock.t_ns if clock else 0)) / 1e9
     if run.level == "ended":
         title, detail = f"run over at {t_s:.1f} s", run.ended
@@ -552,7 +558,7 @@ def page_head(
         title = f"no answer from the world for {run.silent_s:.0f} s"
         detail = f"the display is as of {t_s:.1f} s and may be outdated"
     else:
-        state = "waiting" if run.clock == "running" and stands else run.clock or "no clock yet"
+        state = "waiting" if run.clock == "running" and is_waiting else run.clock or "no clock yet"
         pace = f" × {clock.rate:.1f}" if clock is not None and state == "running" else ""
         title, detail = f"{state} {t_s:.1f} s{pace}", _waiting(clock, world)
         if run.replayed:
@@ -565,16 +571,16 @@ def page_head(
     formation = [f"{n}: {_words(p)}{f' – {reason}' if reason else ''}" for n, (p, reason) in phases.items()]
     lines = [name, "a record is played back" if run.replayed else "", detail, *formation]
     refusals = {"land": fleet_refusals(run, single)["land"], "emergency": run.grounded()}
-    whole = {"t_s": t_ns / 1e9, "replay": run.replayed, "age_s": run.silent_s, "alarms": list(alarms)}
-    return {"level": level, "title": title, "detail": " · ".join(filter(None, lines)), "refusals": refusals, **whole}
+    common = {"t_s": t_ns / 1e9, "replay": run.replayed, "age_s": run.silent_s, "alarms": list(alarms)}
+    return {"level": level, "title": title, "detail": " · ".join(filter(None, lines)), "refusals": refusals, **common}
 
 
 def no_run_head(world: str, ended: str = "") -> dict[str, Any]:
     """Return the head of a page without a run.
 
     Args:
-        world: description of where a run is searched for.
-        ended: why the launcher's run ended before the console had found it.
+        world: description of where the console looks for a run.
+        ended: why the launcher's run ended before the console found it.
     """
     reason = f"the run is over: {ended}" if ended else "there is no run yet"
     level, title, detail = ("ended", "run over", ended) if ended else ("waiting", "waiting for a world", world)

@@ -24,28 +24,28 @@ from zsim_bridges.console.run_condition import (
 )
 
 REASON_STYLE = "font-size:11px;line-height:1.3;color:#868e96;padding:0 10px 10px;overflow-wrap:anywhere"
-"""Padding for the row of tabs below, which overlaps the end of the text by 9 px."""
+"""The padding at the bottom is for the row of tabs below, which overlaps the end of the text by 9 px."""
 LIMITS_STYLE = "font-size:11px;line-height:1.2;color:#868e96;padding:0 12px 4px;text-align:right"
-HELD_HINT = "hold for 0.6 s, with the pointer, Space or Enter"  # as long as HOLD_MS of orders.html
-DURATION_MAX_S = 1e5  # of a fault; longer than any run
-DURATION_S = 30.0  # of a fault, unless another time is typed
-FIXES_LOST_PERCENT = 100.0
-THRUST_LEFT_PERCENT = 70.0  # of a weak motor; with less, the aircraft cannot be held level
-GUST_M_S = 4.0  # about the strongest that a formation's drones can withstand
+HELD_HINT = "hold for 0.6 s, with the pointer, Space or Enter"  # equal to HOLD_MS in orders.html
+DURATION_MAX_S = 1e5  # duration of a fault; longer than any run
+DURATION_S = 30.0  # initial value of a fault's duration
+FIXES_LOST_PERCENT = 100.0  # initial value, as are the following
+THRUST_LEFT_PERCENT = 70.0  # thrust of a weak motor; with less, the controller cannot hold the aircraft level
+GUST_M_S = 4.0  # about the strongest gust that a formation's drones can withstand
 MESSAGES_LOST_PERCENT = 30.0
 STRIKES = {
     "drone": "a drone",
     "world": "the world, hence all drones",
-    "link": "the messages between two processes A/B; the radio of a drone is the kind radio",
+    "link": "the messages between two processes A/B; a drone's radio is affected by the kind radio",
     "radio": "the radio between drones and others: the world's, or a formation's",
     "process": "a process",
 }
-"""Description of the target of each kind of fault."""
-ORDERS = ("hold", "land", "emergency")  # operations whose buttons are order buttons
+"""Descriptions of the targets of faults."""
+ORDERS = ("hold", "land", "emergency")  # operations with an `OrderButton`
 
 
 class RunForm:
-    """Pause or resume, single steps, and rate, initially that with which the run was started."""
+    """Pause or resume, single steps, and rate; `rate` is that with which the run was started."""
 
     def __init__(self, gui: viser.GuiApi, client: CommandClient, rate: float) -> None:
         pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
@@ -82,9 +82,9 @@ class RunForm:
 
 
 class FleetForm:
-    """Take-off and reset of all drones; their landing and emergency are orders in the head of the page.
+    """Take-off and reset of all drones; landing and emergency of all are orders in the head of the page.
 
-    Formations take off by their controllers, single drones individually.
+    Formations take off through their controllers, single drones individually.
     """
 
     def __init__(self, gui: viser.GuiApi, client: CommandClient, scenario: Scenario) -> None:
@@ -125,8 +125,8 @@ class FaultForm:
 
     Args:
         report: called with the outcome of requests that are refused here.
-        scenario: has the drones and processes.
-        drones: of the run, with the names of their rotors; where they have none, those of the AR.Drone.
+        scenario: names the drones and processes.
+        drones: drones of the run, with the names of their rotors; without names, those of the AR.Drone are used.
     """
 
     def __init__(
@@ -214,7 +214,7 @@ class FaultForm:
                     f"`{p.name}` {p.description}: {expected(p)}{'' if p in magnitudes else ' (may be left out)'}"
                     for p in chosen.parameters
                 ]
-                effect = f"{chosen.description}; strikes {STRIKES[chosen.strikes]}."
+                effect = f"{chosen.description}; affects {STRIKES[chosen.strikes]}."
                 help_.content = f"<sub>{effect} {'; '.join(lines)}</sub>"
                 estimator = f"estimator.{self._drone.value}"
                 targets = {"drone": self._drone.value, "link": f"world/{estimator}", "process": estimator}
@@ -240,7 +240,7 @@ def parse_fault(text: str, name: str, kind: FaultKind) -> dict[str, Any]:
     Every magnitude must be given, even one with a default: an empty text must not affect all samples.
 
     Raises:
-        InputError: the text is not such a list, names something unknown to the kind, or omits a magnitude.
+        InputError: the text is not such a list, names something that the kind does not have, or omits a magnitude.
     """
     where = f"parameters are {text[:40]!r}"
     try:
@@ -262,11 +262,11 @@ def parse_fault(text: str, name: str, kind: FaultKind) -> dict[str, Any]:
 
 
 class OrderButton:
-    """An order button; its page repeats the order until it is confirmed. It is HTML, not a control of viser.
+    """A button for an order, which its page repeats until it is confirmed. It is HTML, not a control of viser.
 
     Args:
-        of: its target: {"drone": name}, several separated by commas, or {"cluster": name}.
-        held: whether it must be held for a while.
+        of: target of the order: {"drone": name}, several names separated by commas, or {"cluster": name}.
+        held: whether it must be held down for a while.
     """
 
     visible = True
@@ -294,11 +294,11 @@ class OrderButton:
 
 
 class InputError(ValueError):
-    """An operator's text that cannot be parsed; the message has the line and what is allowed."""
+    """An operator's text that cannot be parsed; the message names the line and what is allowed."""
 
 
 def range_refusal(name: str, value: float, low: float, high: float, unit: str = "") -> str | None:
-    """Return why a typed number may not be requested, None if it may; it is never clipped to a limit."""
+    """Return why a typed number is refused, None if it is within its limits; it is never clipped to them."""
     if low <= value <= high:
         return None
     in_unit = f" {unit}" if unit else ""
@@ -327,7 +327,7 @@ def set_refusals(controls: Mapping[str, Any], refusals: Mapping[str, str]) -> No
 
 
 def offered(run: RunCondition, refusals_of: Callable[[RunCondition], Mapping[str, str]]) -> dict[str, str]:
-    """Return the refusals, adapted for orders (allowed while the world is silent) and emergencies (always allowed)."""
+    """Return the refusals; orders are also offered while the world is silent, and emergencies always."""
     orders = {op: reason for op, reason in refusals_of(run._replace(silent_s=0.0)).items() if op in ORDERS}
     if "emergency" in orders:
         orders["emergency"] = ""
@@ -335,7 +335,7 @@ def offered(run: RunCondition, refusals_of: Callable[[RunCondition], Mapping[str
 
 
 def refusal_lines(labels: Mapping[str, str], refusals: Mapping[str, str]) -> str:
-    """Return a line of HTML for each reason, with the disabled controls; `labels` are by operation."""
+    """Return a line of HTML for each reason, with the labels of the controls that it disables."""
     by_reason: dict[str, list[str]] = {}
     for op, label in labels.items():
         if refusals.get(op):

@@ -37,35 +37,38 @@ from zsim_bridges.console.run_condition import (
 )
 from zsim_bridges.console.view_buffer import ViewBuffer
 
-ROUNDING_NS = 1_000.0  # of a time given in seconds
-SPEED_S = 0.2  # simulated, over which a speed is averaged; less would show the rounding of positions
-FAULTS_KEPT = 8  # faults that are over and still shown
-SIGMA_GROWN = 1.2  # ratio; the sigma of an estimate changes by that much without a fault
-LAG_GROWN_MS = 40.0  # two gates
+ROUNDING_NS = 1_000.0  # rounding error of a time given in seconds
+SPEED_S = 0.2  # simulated; span over which a speed is averaged: a shorter one would show the rounding of positions
+FAULTS_KEPT = 8  # number of past faults that are still shown
+SIGMA_GROWN = 1.2  # ratio to the initial sigma; smaller changes occur without a fault
+LAG_GROWN_MS = 40.0  # increase that is shown: two gates
 LIFE = ("alive", "dead")  # states of a process
-DEATH_AND_RETURN = 3  # alive, dead, alive
-WIND_GROWN_M_S = 0.3  # chosen: above the rounding of what is shown
-BATTERY_S = 20.0  # simulated, for which a battery must have been seen before its remaining time is shown
+DEATH_AND_RETURN = 3  # number of states: alive, dead, alive
+WIND_GROWN_M_S = 0.3  # increase that is shown; chosen: above the rounding of the display
+BATTERY_S = 20.0  # simulated; how long a battery must have been observed before its remaining time is shown
 BATTERY_POINTS_MAX = 120
 BATTERY_SPACING_S = 1.0  # simulated
 POLL_S = 0.25  # wall; clock messages of every gate would cost the world time
 ANSWER_TIMEOUT_S = 1.0  # wall; the world answers within milliseconds
 BEAT_S = 0.1  # wall; between two beats of this process
-BEAT_MAX_S = 0.5  # wall; counted between two beats at most: a busy machine delays a thread by less
+BEAT_MAX_S = 0.5  # wall; at most this much counts between two beats: a busy machine delays a thread by less
 STALL_S = 2.0  # wall; a longer time without a beat is a stall
 SILENT_S = 1.7  # wall; after this long without an answer the world counts as silent: a stop is shown within 2 s
-PIECE_S = 10.0  # simulated; read in one request, which blocks the replay for 0.15 s with thirty drones
-INSTANT_DRONES_MAX = 9_000  # in a piece; a replay answers fewer than 10 000
-BEHIND_S, AHEAD_S = SPAN_S, SPAN_S / 2.0  # simulated; around the shown instant, as far as trails and curves reach
-KEPT_S = 2.0 * SPAN_S  # simulated; kept of what was read, on both sides of the shown instant
+PIECE_S = 10.0  # simulated; span read in one request, which blocks a replay of thirty drones for 0.15 s
+INSTANT_DRONES_MAX = 9_000  # number of drone views in a piece; a replay returns fewer than 10 000
+BEHIND_S, AHEAD_S = (
+    SPAN_S,
+    SPAN_S / 2.0,
+)  # simulated; read around the shown time, as far as trails and curves reach
+KEPT_S = 2.0 * SPAN_S  # simulated; span of the record that is kept on both sides of the shown time
 
 
 class RunMonitor:
     """Follows the condition of a run; `world` describes where the run is.
 
     Attributes:
-        condition: of the run, at the last update.
-        record_s: of a replay, simulated times of the first and the last gate on record.
+        condition: condition of the run at the last update.
+        record_s: simulated times of the first and the last recorded gate of a replay; None for a flight.
     """
 
     def __init__(self, views: ViewBuffer, time_monitor: "TimeMonitor", run: ShownRun, world: str = "") -> None:
@@ -143,7 +146,7 @@ class RunMonitor:
         return self.condition._replace(silent_s=self.time_monitor.silent_s)
 
     def _forget_future(self, t_ns: int) -> None:
-        """Remove alarms and losses of later times, if a replay has gone back."""
+        """Remove alarms and losses of later times if a replay was rewound."""
         if t_ns < self._t_ns:
             self.board.clear()
             self.fault_watch.clear()
@@ -154,7 +157,7 @@ class RunMonitor:
     def _reason(
         self, name: str, view: ViewCluster, drones: Mapping[str, DroneCondition], foreign: dict[str, str]
     ) -> str:
-        """Return a formation's reason: its controller's, other commanders of its drones, and failsafes."""
+        """Return the reason for a formation's phase: its controller's, other commanders, and failsafes."""
         notes = [run_condition.foreign_text(foreign)] if foreign and view.phase in run_condition.FLOWN_PHASES else []
         members = (drones[drone] for drone in self._members[name] if drone in drones)
         notes += [d.failsafe for d in members if d.failsafe and d.state in ("landing", "emergency", "landed")]
@@ -162,7 +165,7 @@ class RunMonitor:
 
 
 class FlightFigures(NamedTuple):
-    """Figures of one drone; positions and velocities in W, heading from east to north."""
+    """Figures of one drone; positions and velocities in W, heading counter-clockwise from east."""
 
     position_m: tuple[float, float, float]
     speed_m_s: float
@@ -170,8 +173,8 @@ class FlightFigures(NamedTuple):
     roll_deg: float
     pitch_deg: float
     heading_deg: float  # 0 to 360
-    battery_left_s: float | None  # at the present drain; None while unknown
-    obstacle_m: float | None = None  # from its centre to the nearest obstacle or surface; None without any
+    battery_left_s: float | None  # time left at the present drain; None while unknown
+    obstacle_m: float | None = None  # distance from its centre to the nearest obstacle or surface; None without any
 
 
 class FlightMeter:
@@ -179,10 +182,10 @@ class FlightMeter:
 
     def __init__(self, environment: Environment) -> None:
         self._around = Surroundings(environment)
-        # of each drone [m; W] and [%], with their simulated times [s]
-        self._places: defaultdict[str, deque[tuple[float, tuple[float, float, float]]]]
+        # positions [m; W] and charges [%] of each drone, with their simulated times [s]
+        self._positions: defaultdict[str, deque[tuple[float, tuple[float, float, float]]]]
         self._charges: defaultdict[str, deque[tuple[float, float]]]
-        self._places = defaultdict(lambda: deque(maxlen=64))
+        self._positions = defaultdict(lambda: deque(maxlen=64))
         self._charges = defaultdict(lambda: deque(maxlen=BATTERY_POINTS_MAX))
         self._t_s = -math.inf
         self._drones: tuple[DroneView, ...] = ()
@@ -191,24 +194,24 @@ class FlightMeter:
         """Process a view; an earlier one, as in a replay, restarts the history."""
         t_s = view.t_ns / 1e9
         if t_s < self._t_s:
-            self._places.clear()
+            self._positions.clear()
             self._charges.clear()
         self._t_s, self._drones = t_s, view.drones
         for drone in self._drones:
-            places, charges = self._places[drone.name], self._charges[drone.name]
-            if not places or t_s > places[-1][0]:
-                places.append((t_s, drone.position_m))
-            while len(places) > 2 and t_s - places[1][0] >= SPEED_S:
-                places.popleft()
+            positions, charges = self._positions[drone.name], self._charges[drone.name]
+            if not positions or t_s > positions[-1][0]:
+                positions.append((t_s, drone.position_m))
+            while len(positions) > 2 and t_s - positions[1][0] >= SPEED_S:
+                positions.popleft()
             if not charges or t_s - charges[-1][0] >= BATTERY_SPACING_S:
                 charges.append((t_s, drone.battery_percent))
 
     @property
     def figures(self) -> dict[str, FlightFigures]:
         found = {}
-        away_m = self._around.distances_m([drone.position_m for drone in self._drones]).tolist()
-        for drone, obstacle_m in zip(self._drones, away_m, strict=True):
-            (first_s, first), (last_s, last) = self._places[drone.name][0], self._places[drone.name][-1]
+        distances_m = self._around.distances_m([drone.position_m for drone in self._drones]).tolist()
+        for drone, obstacle_m in zip(self._drones, distances_m, strict=True):
+            (first_s, first), (last_s, last) = self._positions[drone.name][0], self._positions[drone.name][-1]
             span_s = max(last_s - first_s, 1e-9)  # a single view: at rest
             velocity_m_s = [(b - a) / span_s for a, b in zip(first, last, strict=True)]  # the mean over SPEED_S
             roll, pitch, yaw = np.degrees(frames.rpy_from_quaternion(np.array([drone.orientation_wxyz]))[0]).tolist()
@@ -267,7 +270,7 @@ class _WatchedFault:
     """A fault and the quantities of its target (drones, or processes named after them) that it may change."""
 
     fault: Fault
-    before: tuple[float, ...] = ()  # sigma [m], lag [ms] and wind [m/s] of the target at first
+    before: tuple[float, ...] = ()  # sigma [m], lag [ms] and wind [m/s] at the target when the fault began
     worst: tuple[float, ...] = ()  # the worst of these while the fault is active
     states: dict[str, list[str]] = field(default_factory=dict)  # successive states of drones, formations and processes
     over: bool = False
@@ -282,8 +285,8 @@ class _WatchedFault:
         """Record the worst figures and all states while the fault is active; a killed process returns afterwards."""
         parts = self.fault.target.split("/")
         things = {part.rpartition(".")[2] for part in parts}
-        everybody = not things & (set(drones) | set(phases))  # the world
-        struck = [drone for name, drone in drones.items() if everybody or name in things]
+        is_world = not things & (set(drones) | set(phases))
+        struck = [drone for name, drone in drones.items() if is_world or name in things]
         sigma_m = max((drone.sigma_m or 0.0 for drone in struck), default=0.0)
         lag_ms = max((drone.lag_ms or 0.0 for drone in struck), default=0.0)
         now = (sigma_m, lag_ms, wind_m_s if self.fault.kind == "gust" else 0.0)
@@ -291,7 +294,7 @@ class _WatchedFault:
         if not self.over:
             self.worst = tuple(map(max, self.worst or now, now))
         states = {drone.name: drone.state for drone in struck}
-        states |= phases if everybody or len(phases) == 1 else {name: phases[name] for name in things & set(phases)}
+        states |= phases if is_world or len(phases) == 1 else {name: phases[name] for name in things & set(phases)}
         states |= {part: LIFE[part in lost] for part in parts if "." in part}
         for name, state in states.items():
             seen = self.states.setdefault(name, [state])
@@ -356,8 +359,7 @@ class AwakeClock:
 class TimeMonitor:
     """Polls the run's clock in a separate thread, so that drawing never waits for an answer.
 
-    It also updates the console's observer in the run; `stamp_age_s` is the greatest age of a stamp's time
-        [simulated].
+    It also updates the clock of the console's observer. `stamp_age_s` is the greatest age of a stamp [simulated].
     """
 
     def __init__(
@@ -371,7 +373,7 @@ class TimeMonitor:
         self._observer = observer
         self._stamp_age_s = stamp_age_s
         self._wall_s = wall_s
-        self._one = threading.RLock()
+        self._poll_lock = threading.RLock()
         self._is_polling = False
         self._awake = AwakeClock(wall_s)
         self._answered_s = self._awake.now_s()
@@ -408,12 +410,12 @@ class TimeMonitor:
 
     def poll(self) -> None:
         """Poll once; one thread at a time."""
-        with self._one:
+        with self._poll_lock:
             start_s = self._wall_s()
             try:
                 samples = self._link.get(keys.CLOCK, timeout_s=ANSWER_TIMEOUT_S)
             except ZsimError:
-                return  # the link is lost and will return
+                return  # the link is lost, and will be restored
             for sample in samples:
                 clock = self._observer.update_clock(sample.payload)
                 if clock is not None:
@@ -423,11 +425,11 @@ class TimeMonitor:
         """Return simulated time for a stamp, after a poll if it may be too old; takes at most 2 ANSWER_TIMEOUT_S."""
 
         def is_old() -> bool:
-            rate = max(1.0, self.clock.rate) if self.clock else 1.0  # as measured: 0 at the beginning of a run
+            rate = max(1.0, self.clock.rate) if self.clock else 1.0  # the measured rate is 0 at the beginning of a run
             return (self._wall_s() - self._known_s) * rate > self._stamp_age_s
 
         if is_old():
-            with self._one:
+            with self._poll_lock:
                 if is_old():  # unless another thread has polled meanwhile
                     self.poll()
         return self._observer.now_ns
@@ -448,7 +450,7 @@ class TimeMonitor:
 
 
 class RecordPlayer:
-    """Controls the time of a replay, and reads its record around the shown instant in pieces.
+    """Controls the time of a replay, and reads its record around the shown time in pieces.
 
     Args:
         is_replay: whether the run is a replay; otherwise all methods do nothing.
@@ -465,12 +467,12 @@ class RecordPlayer:
         self._every_s = max(INTERVAL_S, PIECE_S * drones / INSTANT_DRONES_MAX)
         self._lock = threading.Lock()
         self._shown_s = 0.0
-        self._known: set[int] = set()  # numbers of the pieces read
+        self._known: set[int] = set()  # numbers of the pieces that were read
         self._is_reading = False
         self._arrived: deque[list[PastInstant]] = deque()
 
     def load(self) -> None:
-        """Read the timeline; let a paused replay publish its instant again, for later subscribers."""
+        """Read the timeline; let a paused replay publish its views again for later subscribers."""
         if not self._is_replay:
             return
         self.timeline = self._client.timeline()
@@ -495,7 +497,7 @@ class RecordPlayer:
             self._client.request_world(op, **args.get(op, {}))
 
     def fill(self, t_s: float) -> None:
-        """Read the missing pieces of the record around an instant in another thread, nearest first."""
+        """Read the missing pieces of the record around t_s in another thread, nearest first."""
         if "to_s" not in self.timeline:
             return
         with self._lock:
@@ -506,14 +508,14 @@ class RecordPlayer:
             self._is_reading = self._client.read(self._read_missing)
 
     def take(self) -> list[PastInstant]:
-        """Return the instants of the next piece read, each piece once; empty if there is none."""
+        """Return the views of the next piece read, each piece once; empty if there is none."""
         return self._arrived.popleft() if self._arrived else []
 
     def _middle_s(self, piece: int) -> float:
         return self.timeline["from_s"] + (piece + 0.5) * PIECE_S
 
     def _missing(self) -> int | None:
-        """Return the unread piece nearest to the shown instant, None if there is none."""
+        """Return the unread piece nearest to the shown time, None if there is none."""
         from_s, to_s = self.timeline["from_s"], self.timeline["to_s"]
         first_s, last_s = max(from_s, self._shown_s - BEHIND_S), min(to_s, self._shown_s + AHEAD_S)
         pieces = range(math.floor((first_s - from_s) / PIECE_S), math.floor((last_s - from_s) / PIECE_S) + 1)

@@ -1,4 +1,4 @@
-"""The 3-D scene of a run: its newest views as nodes of viser, of which only changes are sent.
+"""The 3-D scene of a run: its newest views as nodes of viser, which sends only changes.
 
 `RunScene` decides what is drawn, `SceneNodes` draws it for all pages; the ground follows each page's own theme, and the
 ring around the chosen drone belongs to one page.
@@ -52,31 +52,31 @@ from zsim_bridges.console.picture import (
 from zsim_bridges.console.run_condition import ShownRun
 from zsim_bridges.console.view_buffer import ViewBuffer
 
-NAMED_MAX = 60  # drones with names beside them; more would overlap
-SMALL = 0.8  # of the size of a name
+NAMED_MAX = 60  # largest number of drones with names beside them; more would overlap
+SMALL = 0.8  # size of the names of many drones, relative to those of few
 SOLID = (134, 142, 150)
-EDGE = (96, 102, 118)  # of the triangles of a surface, whose slopes differ little in shading
+EDGE = (96, 102, 118)  # edges of the triangles of a surface, whose slopes differ little in shading
 GHOST, ELLIPSOID, WIND, SIDE = (77, 171, 247), (250, 176, 5), (21, 170, 191), (226, 0, 134)
 PREVIEW = (217, 72, 15)
-PREVIEW_PX = 3.0  # of a previewed way
-RADIO, ONE_WAY = (64, 192, 87), (250, 82, 82)  # links of the radio: both ways, or one
+PREVIEW_PX = 3.0  # width of a previewed path
+RADIO, ONE_WAY = (64, 192, 87), (250, 82, 82)  # radio links: bidirectional, one-way
 RADIO_PX = 1.5
-SIDE_PX = 2.0  # of a formation's sides, at any distance
-WIND_M_PER_M_S = 0.5  # length of the arrow
-WIND_MIN_M_S = 0.05  # no arrow below it
-WIND_ABOVE_M = 1.5  # of the arrow above the highest drone
-LABEL_B = np.array([0.0, 0.0, 0.32])  # m; of a name above its drone
-MIDDLE = "center-center"  # of a label
-LABELS_MAX = 3  # p, q and beta
-LUMINANCE_MIN = 0.12  # of a trail: 2.5 times as bright as the ground of the dark theme, as WCAG 2.2 counts contrast
+SIDE_PX = 2.0  # width of a formation's sides, at any distance
+WIND_M_PER_M_S = 0.5  # length of the wind's arrow
+WIND_MIN_M_S = 0.05  # a weaker wind has no arrow
+WIND_ABOVE_M = 1.5  # height of the arrow above the highest drone
+LABEL_B = np.array([0.0, 0.0, 0.32])  # m; position of a name relative to its drone
+MIDDLE = "center-center"  # anchor of a label
+LABELS_MAX = 3  # figures of a formation: p, q and beta
+LUMINANCE_MIN = 0.12  # of a trail's colour: a contrast of 2.5 with the ground of the dark theme (WCAG 2.2)
 HIDDEN = (0.0, 0.0, -1000.0)  # m; position of hidden instances: viser cannot hide them one by one
 HALF_M = 150.0  # half a side of the ground
-FIELD_BELOW_M = 0.15  # of the field below the grid; a depth buffer cannot order surfaces closer to each other
-THICK_M = 0.02
-LIGHT = ((206, 219, 196), (190, 200, 184), (138, 150, 132))  # of the field, of the grid's cells and of its sections
+FIELD_BELOW_M = 0.15  # depth of the field below the grid; a depth buffer cannot order closer surfaces
+THICK_M = 0.02  # thickness of the field
+LIGHT = ((206, 219, 196), (190, 200, 184), (138, 150, 132))  # colours of the field, the grid's cells and its sections
 DARK = ((30, 35, 30), (84, 94, 82), (122, 134, 118))
 CHOSEN = (25, 113, 194)
-ARM_M = 0.1785  # from the centre to a rotor's axis
+ARM_M = 0.1785  # distance from the centre to a rotor's axis
 ROTOR_RADIUS_M = 0.10  # 8 inch propellers of the AR.Drone
 RING = 1.31  # rotor radii, outer radius of a hull ring: half of the 0.515 m of the hull, less 0.126 m to its centre
 ROTOR_Z_M = 0.030  # height of the rotors above the centre of mass, as drawn
@@ -98,8 +98,8 @@ class RunScene:
         self._cameras = cameras
         self._members = {name: [run.names.index(each) for each in drones] for name, drones in run.members.items()}
         self._drawn_ghosts: dict[str, Any] = {}
-        self.drones: DronePoses | None = None  # their newest poses
-        self.shapes: dict[str, FormationShape | None] = {}  # true ones by formation; None where a drone is missing
+        self.drones: DronePoses | None = None  # newest poses of the drones
+        self.shapes: dict[str, FormationShape | None] = {}  # true shapes by formation; None if a drone is missing
         self.previews: dict[str, Array] = {}  # paths (n, M, 3) [m] that formations would fly
         self.trails = CanvasTrails(len(run.names), around=run.is_replay)
         robots = sum(space.n for space in run.spaces.values())
@@ -127,7 +127,7 @@ class RunScene:
     def draw(self, view: ViewDrones, longest_s: float, chosen: str) -> DronePoses:
         """Draw a view of the drones, and return their poses.
 
-        Rotors turn for at most `longest_s` between pictures; `chosen` is the formation with figures.
+        Rotors turn for at most `longest_s` between pictures; `chosen` is the formation whose figures are shown.
         """
         before_ns = self.drones.t_ns if self.drones is not None else 0
         drones = self.store(view)
@@ -148,7 +148,7 @@ class RunScene:
         return drones
 
     def preview(self, cluster: str, shown: FlightPreview | None) -> None:
-        """Show a formation's preview instead of its previous one; None: nothing."""
+        """Replace a formation's preview; None: remove it."""
         others = {name: paths_W for name, paths_W in self.previews.items() if name != cluster}
         self.previews = {**others, cluster: shown.paths_W} if shown else others
         self.nodes.previews(list(self.previews.values()))
@@ -160,10 +160,10 @@ class RunScene:
             self.nodes.wind(self.drones)
 
     def shapes_of(self, drones: DronePoses) -> dict[str, FormationShape | None]:
-        """Return the formations' true shapes by name; None where a drone of one is missing."""
-        there, yaw = drones.present, frames.heading(drones.q_WB)
+        """Return the formations' true shapes by name; None if one of its drones is missing."""
+        present, yaw = drones.present, frames.heading(drones.q_WB)
         return {
-            name: formation_shape(space, drones.p_W[members], yaw[members]) if there[members].all() else None
+            name: formation_shape(space, drones.p_W[members], yaw[members]) if present[members].all() else None
             for name, space in self._run.spaces.items()
             for members in [self._members[name]]
         }
@@ -327,9 +327,10 @@ class SceneNodes:
             positions, attitudes, _ = _padded(len(self._ghosts.batched_positions), p_W, q)
             self._ghosts.batched_positions, self._ghosts.batched_wxyzs = positions, attitudes
 
-    def previews(self, ways: Sequence[Array]) -> None:
-        lines = [np.stack((way[:, :-1], way[:, 1:]), axis=2).reshape(-1, 2, 3) for way in ways]
-        ends = [way[:, -1] for way in ways]
+    def previews(self, paths_W: Sequence[Array]) -> None:
+        """Draw the previewed paths, each (n, M, 3) [m; W], and their ends."""
+        lines = [np.stack((path[:, :-1], path[:, 1:]), axis=2).reshape(-1, 2, 3) for path in paths_W]
+        ends = [path[:, -1] for path in paths_W]
         segments = np.asarray(np.concatenate(lines) if lines else np.tile(HIDDEN, (1, 2, 1)), np.float32)
         p_W = np.concatenate(ends) if ends else np.zeros((0, 3))
         self._preview_lines.points, self._preview_lines.visible = segments, bool(lines)
@@ -358,7 +359,7 @@ class SceneNodes:
                 label.text, label.position = texts[i]
 
     def trails(self, segments: Array, owners: NDArray[np.int64]) -> None:
-        if not len(segments):  # a replay went back: remove the old ones
+        if not len(segments):  # a replay was rewound: remove the old trails
             segments, owners = np.tile(HIDDEN, (1, 2, 1)), np.zeros(1, dtype=np.int64)
         colours = np.repeat(self._trail_colours[owners][:, None], 2, axis=1)
         if self._trail_node is None:
@@ -380,10 +381,10 @@ class _RotorNodes:
 
     def __init__(self, drones: Sequence[DroneInfo], looks: Sequence["DroneShape"], batch: Any) -> None:
         self._owners = np.repeat(np.arange(len(looks)), [len(look.hubs_B) for look in looks])
-        self._places = np.concatenate([np.arange(len(look.hubs_B)) for look in looks])
+        self._rotor_indices = np.concatenate([np.arange(len(look.hubs_B)) for look in looks])
         hubs = [(x, y, ROTOR_Z_M * look.size) for look in looks for x, y in look.hubs_B]
         rotors = [drone.rotors or cross_layout(ARM_M) for drone in drones]
-        self._turns = np.array([float(rotor.turn) for of_one in rotors for rotor in of_one])
+        self._turns = np.array([float(rotor.turn) for layout in rotors for rotor in layout])
         self._hubs_B, self._angles = np.array(hubs), np.zeros(len(hubs))
         self._node = batch("/rotors", rotor_mesh(), len(hubs), COLOURS["rotor"])
         scales = [look.radius_m / ROTOR_RADIUS_M for look in looks]
@@ -391,7 +392,7 @@ class _RotorNodes:
 
     def move(self, drones: DronePoses, dt_s: float) -> None:
         """Move the rotors, which have turned for dt_s."""
-        speeds = drones.rotor[self._owners, self._places]
+        speeds = drones.rotor[self._owners, self._rotor_indices]
         self._angles = rotor_angles(self._angles, speeds, self._turns, dt_s)
         p_W, q_WB = drones.p_W[self._owners], drones.q_WB[self._owners]
         self._node.batched_positions, self._node.batched_wxyzs = rotor_poses(p_W, q_WB, self._hubs_B, self._angles)
@@ -424,7 +425,7 @@ class ChosenRing:
         )  # fmt: skip
 
     def move(self, drones: DronePoses, chosen: str) -> None:
-        """Move the ring to the chosen drone; out of sight while that is missing."""
+        """Move the ring to the chosen drone; hide it while that drone is missing."""
         index = drones.names.index(chosen)
         self._node.batched_positions = drones.p_W[[index]] if drones.present[index] else np.reshape(HIDDEN, (1, 3))
         if index != self._chosen:
@@ -433,7 +434,7 @@ class ChosenRing:
 
 
 def draw_ground(scene: viser.SceneApi, *, dark: bool = False) -> None:
-    """Draw a field with a grid instead of the previous ground.
+    """Draw a field with a grid, replacing the previous ground.
 
     It is opaque, without a background image: viser's grid plane, or a sky, would hide transparent objects.
     """
@@ -458,7 +459,7 @@ def lightened(colour: Sequence[float]) -> Sequence[float]:
 
 
 def linear(colours: Array) -> NDArray[np.uint8]:
-    """Return sRGB colours, 0 to 255, in linear light, as viser takes the colours of lines; IEC 61966-2-1, 5.3."""
+    """Return sRGB colours, 0 to 255, in linear light, as viser expects the colours of lines; IEC 61966-2-1, 5.3."""
     share = colours / 255
     return np.round(255 * np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)).astype(np.uint8)
 
@@ -488,7 +489,7 @@ class DroneShape(NamedTuple):
 
 
 def shape_of(drone: DroneInfo, arm_m: float) -> DroneShape:
-    """Return the appearance of a drone; one without named rotors has four, on arms of this length [m]."""
+    """Return the appearance of a drone; without named rotors, it has four on arms of length arm_m [m]."""
     if not drone.rotors:
         hubs = tuple((rotor.x_m, rotor.y_m) for rotor in cross_layout(arm_m))
         return DroneShape(hubs, ROTOR_RADIUS_M * arm_m / ARM_M)
@@ -514,7 +515,7 @@ def whole_mesh(shape: DroneShape) -> Mesh:
 
 
 def _solids(shape: DroneShape) -> dict[str, list[trimesh.Trimesh]]:
-    """Return the solids of a drone by colour: drawn as large as the AR.Drone, then scaled."""
+    """Return the solids of a drone by colour: drawn at the size of the AR.Drone, then scaled."""
     hubs = [(x / shape.size, y / shape.size) for x, y in shape.hubs_B]
     radius = RING * shape.radius_m / shape.size
     cross = []
@@ -524,10 +525,10 @@ def _solids(shape: DroneShape) -> dict[str, list[trimesh.Trimesh]]:
         cross.append(_moved(beam, (x / 2, y / 2, 0.004), math.atan2(y, x)))
         cross += [_moved(motor, (x, y, ROTOR_Z_M / 2)), _moved(foot, (0.92 * x, 0.92 * y, -0.029))]
     ahead = trimesh.transformations.rotation_matrix(math.pi / 2, (0, 1, 0))
-    lens = cylinder(0.013, 0.03, sections=14)  # of the front camera
+    lens = cylinder(0.013, 0.03, sections=14)  # lens of the front camera
     lens.apply_transform(ahead)
-    rings = [annulus(radius - 0.016, radius, 0.042, sections=28) for _ in hubs]  # foam, of the indoor hull
-    body = capsule(height=0.19, radius=0.045, count=[14, 14])  # with the battery, from nose to tail
+    rings = [annulus(radius - 0.016, radius, 0.042, sections=28) for _ in hubs]  # foam of the indoor hull
+    body = capsule(height=0.19, radius=0.045, count=[14, 14])  # body with the battery, from nose to tail
     body.apply_transform(ahead)
     body.apply_scale((1.0, 1.0, 0.72))
     nose = icosphere(subdivisions=2, radius=0.042)
@@ -542,7 +543,7 @@ def _solids(shape: DroneShape) -> dict[str, list[trimesh.Trimesh]]:
     }
     for solid in (solid for of_one in solids.values() for solid in of_one):
         solid.apply_scale(shape.size)
-    hats = Hats()  # by which drones detect each other, in the size that the cameras assume
+    hats = Hats()  # drones detect each other by their hats, whose size cameras assume
     return {**solids, "hat": [_moved(icosphere(subdivisions=3, radius=hats.diameter_m / 2), hats.position_m)]}
 
 

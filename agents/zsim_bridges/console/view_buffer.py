@@ -1,4 +1,4 @@
-"""The messages of a run: the newest views, kept undecoded until the next picture, and the log of its events."""
+"""The messages of a run: the newest views, kept undecoded until the next update, and the log of its events."""
 
 import math
 import re
@@ -21,10 +21,10 @@ from zsim.runtime.participant import Participant
 from zsim.transport.session import RawSample, Session
 from zsim_bridges.console.run_condition import BACK, LOST, DroneCondition, Losses
 
-FRESH_S = 1.0  # simulated, or wall; views come 20 times a wall second: if one is older, its estimator is dead or stuck
-FAULTS_KEPT = 8  # number of the last faults that have begun
-EVENTS_KEPT = 200  # the newest, each by itself
-ROWS_KEPT, OWN_ROWS_KEPT = 200, 100  # of distinct events; of the console's own requests
+FRESH_S = 1.0  # simulated or wall; views arrive 20 times a wall second: an older one shows a dead or stuck estimator
+FAULTS_KEPT = 8  # number of most recently begun faults
+EVENTS_KEPT = 200  # number of newest single events
+ROWS_KEPT, OWN_ROWS_KEPT = 200, 100  # rows of distinct events; rows of the console's own requests
 OWN_KINDS = frozenset({"accepted", "done", "control", "refused"})  # kinds of events that answer an operator's request
 ALL, OWN = "all", "own actions"
 KINDS: dict[str, frozenset[str]] = {
@@ -36,11 +36,11 @@ KINDS: dict[str, frozenset[str]] = {
     "processes": frozenset({*LOST, *BACK, "drop"} - {"diverged"}),
 }
 """Filters, and the kinds of events in them; empty: all kinds."""
-_FIGURE = re.compile(r"\d[\d.e+-]*")
+_NUMBER = re.compile(r"\d[\d.e+-]*")
 
 
 class ReceivedEstimate(NamedTuple):
-    """A drone's last estimate, from an estimator process; fresh if it has the time of the drones' view."""
+    """A drone's newest estimate from a process; fresh if it is within FRESH_S of the drones' view."""
 
     process: str
     t_ns: int
@@ -66,7 +66,7 @@ class ReceivedLink(NamedTuple):
 
 
 class ViewBuffer:
-    """Keeps the newest message of each key until the next update; those in between are never decoded.
+    """Keeps the newest message of each key until the next update; earlier ones are never decoded.
 
     Callbacks run in Zenoh's threads.
 
@@ -93,7 +93,7 @@ class ViewBuffer:
         self._refused = refused
         self._asked = asked
         self._wall_s = wall_s
-        self._received_s: dict[str, float] = {}  # wall time by key, of views of drones and estimators
+        self._received_s: dict[str, float] = {}  # wall times of views and link states, by key
         self._new: dict[str, bytes] = {}
         self._arrived = threading.Condition()
         self._answers: Counter[str] = Counter()
@@ -103,15 +103,15 @@ class ViewBuffer:
         self.healths: dict[str, Health] = {}
         # names of drones whose bodies are external
         self.external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
-        self.radio: run_messages.RadioLinks | None = None  # who hears whom, where the scenario has a radio
+        self.radio: run_messages.RadioLinks | None = None  # which drones hear each other, if the scenario has a radio
         self._links: dict[str, LinkState] = {}
-        self.faults: tuple[Fault, ...] = ()  # injected ones, planned and active
+        self.faults: tuple[Fault, ...] = ()  # injected faults, planned and active
         self.log = EventLog(observer.name)
         self.losses = Losses()
-        self.failsafes: dict[str, Event] = {}  # automatic landing or stop of drones without a later mode
-        self.begun: deque[Fault] = deque(maxlen=FAULTS_KEPT)  # the last injected faults that have begun
-        self.end = ""  # why the run ended, by its last event; empty while it goes on
-        self.on_own_event: Callable[[Event], None] = lambda _: None  # called with events that our commands cause
+        self.failsafes: dict[str, Event] = {}  # last automatic landing or stop of each drone, until its next mode
+        self.begun: deque[Fault] = deque(maxlen=FAULTS_KEPT)  # the most recently begun faults
+        self.end = ""  # why the run ended, by its last event; empty while it continues
+        self.on_own_event: Callable[[Event], None] = lambda _: None  # called with events that the console causes
 
     def open(self) -> None:
         """Subscribe, and read the values published last."""
@@ -138,12 +138,12 @@ class ViewBuffer:
         return keys.VIEW_DRONES in new
 
     def estimates(self) -> dict[str, ReceivedEstimate]:
-        """Return the newest estimate of each drone by name, from any estimator; none of a replay's future."""
+        """Return the newest estimate of each drone by name, from any estimator; none later than a rewound replay."""
         now_ns = self.drones.t_ns if self.drones else 0
         newest: dict[str, ReceivedEstimate] = {}
         for process, view in sorted(self.estimators.items(), key=lambda each: each[1].t_ns):
             seen_s = self._received_s.get(keys.VIEW_DRONES, 0.0) - self._received_s[keys.estimates_view(process)]
-            fresh = abs(view.t_ns - now_ns) <= FRESH_S * 1e9 or abs(seen_s) <= FRESH_S  # both views skip gates
+            fresh = abs(view.t_ns - now_ns) <= FRESH_S * 1e9 or abs(seen_s) <= FRESH_S  # neither view covers every gate
             if fresh or view.t_ns <= now_ns:
                 known = (estimate for estimate in view.estimates if estimate.name in self._names)
                 newest |= {each.name: ReceivedEstimate(process, view.t_ns, each, fresh) for each in known}
@@ -184,7 +184,7 @@ class ViewBuffer:
         return [f for f in self.faults if f.from_ns <= now_ns and (f.until_ns is None or f.until_ns > now_ns)]
 
     def lag_ms(self, received: ReceivedEstimate) -> float:
-        """Return an estimator's lag: by its health, or by its view if the health is old."""
+        """Return an estimator's lag [ms]: by its health, or by the age of its view if that is not fresh."""
         health = self.healths.get(received.process)
         if health is not None and received.fresh:
             return health.lag_ns / 1e6
@@ -211,7 +211,7 @@ class ViewBuffer:
             if self._variables.get(cluster) == message.names and len(message.value) == len(message.desired) == size:
                 self.clusters[cluster] = message
             else:
-                self._observer.health.refused += 1  # of a controller of another scenario
+                self._observer.health.refused += 1  # from a controller of another scenario
         elif isinstance(message, ViewEstimates):
             self._received_s[key] = self._wall_s()
             self.estimators[key.rpartition("/")[2]] = message
@@ -233,7 +233,8 @@ class ViewBuffer:
             return
         if request.ok and request.source != self._observer.name:
             cluster = keys.thing(sample.key)
-            text = f"{cluster}: {request.op} by {request.source or 'somebody'} {arguments_text(request.args)}".strip()
+            source = request.source or "an unnamed client"
+            text = f"{cluster}: {request.op} by {source} {arguments_text(request.args)}".strip()
             self.log.add(Event(request.t_ns, 0, "accepted", request.source, cluster, text))
             self._asked(cluster, text)
 
@@ -265,7 +266,7 @@ class ViewBuffer:
 
 
 def arguments_text(args: Mapping[str, Any]) -> str:
-    """Describe the arguments of a request."""
+    """Return the arguments of a request as text: names and values."""
     return ", ".join(f"{name} {_value_text(value)}" for name, value in args.items())
 
 
@@ -275,8 +276,8 @@ def _value_text(value: Any) -> str:
     if isinstance(value, dict):
         return " ".join(f"{name}={_value_text(item)}" for name, item in value.items())[:120]
     if isinstance(value, list):
-        of_figures = all(isinstance(item, int | float) for item in value)
-        return " ".join(map(_value_text, value))[:120] if of_figures else f"({len(value)})"
+        are_numbers = all(isinstance(item, int | float) for item in value)
+        return " ".join(map(_value_text, value))[:120] if are_numbers else f"({len(value)})"
     return str(value)[:120]
 
 
@@ -286,7 +287,7 @@ def commanded_drone(event: Event) -> str:
 
 
 class EventRow(NamedTuple):
-    """The newest of events that differ only in their figures, and their number."""
+    """The newest of all events that differ only in numbers, and the number of those events."""
 
     event: Event
     times: int
@@ -294,19 +295,19 @@ class EventRow(NamedTuple):
 
 
 class EventLog:
-    """Keeps the newest events, with one row for all that differ only in their figures; thread-safe.
+    """Keeps the newest events, with one row for all that differ only in numbers; thread-safe.
 
-    Rows of events of the console's own process, which has this name, are kept separate.
+    Rows of events of the console's own process, `name`, are kept separately.
     """
 
     def __init__(self, name: str) -> None:
         self._name = name
         self._lock = threading.Lock()
         self._rows: dict[tuple[str, ...], EventRow] = {}
-        self.newest: deque[Event] = deque(maxlen=EVENTS_KEPT)  # single ones, newest first
+        self.newest: deque[Event] = deque(maxlen=EVENTS_KEPT)  # single events, newest first
 
     def add(self, event: Event) -> None:
-        key = (event.kind, event.source, event.subject, _FIGURE.sub("#", event.text))
+        key = (event.kind, event.source, event.subject, _NUMBER.sub("#", event.text))
         own = event.source == self._name and event.kind in OWN_KINDS
         with self._lock:
             self.newest.appendleft(event)
@@ -322,7 +323,7 @@ class EventLog:
 
 
 def chosen_rows(rows: Iterable[EventRow], drone: str = ALL, kind: str = ALL) -> list[EventRow]:
-    """Return the rows about a drone (or `ALL`), of one of `KINDS`."""
+    """Return the rows that concern a drone (or `ALL`) and belong to one of `KINDS`."""
     kinds, name = KINDS[kind], re.compile(rf"(?<![\w-]){re.escape(drone)}(?![\w-])")
     return [
         row

@@ -1,6 +1,6 @@
-"""Writes the Foxglove file of a record, in order of time and in bounded memory: its topics, and when each is written.
+"""Writes a record as a file for Foxglove, ordered by time and in bounded memory: its topics, and when each is written.
 
-Foxglove shows all of it; Rerun reads the transforms, poses, points, fixes, pictures, log and numbers.
+Foxglove shows all of them; Rerun reads the transforms, poses, points, fixes, pictures, log and numbers.
 """
 
 import math
@@ -41,26 +41,26 @@ from zsim_analysis.reading.recorded_run import decode_or_none, scenario_of, sear
 TF, LOG, DRONES, GROUND, TRAILS = "/tf", "/log", "/scene/drones", "/scene/ground", "/scene/trails"
 FORMATIONS, ESTIMATES = "/scene/formations", "/scene/estimates"
 POINTS, DESIRED = "/points/drones", "/points/desired"
-SCENE_STEP_NS = 100_000_000  # between two messages of a scene or of points
+SCENE_STEP_NS = 100_000_000  # interval between messages of a scene or of points
 DRAWN = (Truth, Estimate, Status, Gps, ClusterState, Event, CameraImage, CameraInfo)
-LATEST_NS = 2**32 * 10**9  # Foxglove counts seconds in 32 bits
-ARM_M = 0.1785  # m, the AR.Drone's, if the scenario is not known
-ROTOR_RADIUS = 0.57  # of the arm, if the rotors are not known: 0.102 m at the AR.Drone's 0.1785 m
+LATEST_NS = 2**32 * 10**9  # Foxglove stores seconds in 32 bits
+ARM_M = 0.1785  # arm length of the AR.Drone, for drones of an unknown scenario
+ROTOR_RADIUS = 0.57  # share of the arm length, for unknown rotors: the AR.Drone's 0.102 m / 0.1785 m
 
 
 class ConvertedRun(NamedTuple):
     """The content of a written file."""
 
-    topics: dict[str, int]  # messages by topic
-    variables: dict[str, tuple[str, ...]]  # by cluster, the fields of its numbers
-    rotors: dict[str, list[RotorDisc]]  # of every drone, in the order of the scenario
+    topics: dict[str, int]  # number of messages by topic
+    variables: dict[str, tuple[str, ...]]  # names of the numeric fields by cluster
+    rotors: dict[str, list[RotorDisc]]  # by drone, in the order of the scenario
     refused: int  # number of messages that could not be read
 
 
 def convert(
     reader: RecordReader, selection: MessageSelection, path: Path, progress: Callable[[int, int], None]
 ) -> ConvertedRun:
-    """Write the MCAP file; return its content. `progress` is called with the number of messages read, and of all."""
+    """Write the MCAP file; return its content. `progress` is called with the numbers of messages read and in all."""
     wanted = [key for key in selection.keys(reader) if messages.type_of(key) in DRAWN or key == keys.INFO]
     total = sum(reader.topics()[key] for key in wanted)
     recorded = reader.last(keys.INFO)
@@ -92,9 +92,9 @@ def convert(
 
 @contextmanager
 def deferred_signals() -> Iterator[Callable[[], None]]:
-    """Yield a function that handles SIGINT or SIGTERM received since.
+    """Defer SIGINT and SIGTERM; yield a function that handles those received meanwhile.
 
-    What their handlers raise within a call of the library would be printed there and lost.
+    An exception raised by their handlers within a call of the library would only be printed, and lost.
     """
     came: list[int] = []
     numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
@@ -122,7 +122,7 @@ def _decode(recorded: Recorded) -> Any:
 def _rotors(info: Info | None, scenario: Scenario | None, present: Mapping[str, None]) -> dict[str, list[RotorDisc]]:
     """Return the rotors of every drone on record, in the order of the scenario.
 
-    If `world/info` does not name a drone's rotors, they are assumed in a cross.
+    If `world/info` does not give a drone's rotors, they are assumed to form a cross.
     """
     arms_m = {drone.name: drone.arm_m for drone in scenario.drones} if scenario else {}
     named = {drone.name: drone.rotors for drone in info.drones} if info else {}
@@ -136,7 +136,7 @@ def _rotors(info: Info | None, scenario: Scenario | None, present: Mapping[str, 
 
 @dataclass
 class Instant:
-    """Messages of one time: the last one of each key, but all events and all of cameras."""
+    """The messages of one time: the last one of each key, but all events and all messages of cameras."""
 
     t_ns: int
     truth: dict[str, Truth] = field(default_factory=dict)
@@ -150,7 +150,7 @@ class Instant:
 
 
 def _instants(decoded: Iterable[tuple[Recorded, Any]]) -> Iterator[Instant]:
-    """Gather messages, which come in order of time, by their time; `world/info` is left out."""
+    """Group messages, given in order of time, by time; `world/info` is left out."""
     drawn = ((recorded.key, message) for recorded, message in decoded if not isinstance(message, Info))
     for t_ns, group in groupby(drawn, key=lambda pair: pair[1].t_ns):
         instant = Instant(t_ns)
@@ -187,7 +187,7 @@ def _cameras_before(reader: RecordReader, selection: MessageSelection, wanted: I
 
 
 class FoxgloveFile:
-    """An MCAP file that is being written; rotors by drone in the order of the scenario, spaces by cluster."""
+    """An MCAP file that is being written; `rotors` are by drone in the order of the scenario, `spaces` by cluster."""
 
     def __init__(
         self, path: Path, rotors: Mapping[str, Sequence[RotorDisc]], spaces: Mapping[str, ClusterSpace]
@@ -199,21 +199,21 @@ class FoxgloveFile:
         self._spaces = spaces
         self._colours = colours_of(rotors)
         self._channels: dict[str, Any] = {}
-        self.variables: dict[str, NumericMessageType] = {}  # of each cluster
+        self.variables: dict[str, NumericMessageType] = {}  # by cluster
         self._drone = NumericMessageType("Drone", made.DRONE_NUMBERS, ("state",))
         self._trails = made.DroneTrails()
         self._status: dict[str, Status] = {}
         self._next_ns: dict[str, int] = {}
         self._has_static_scene = False
-        self.counts: Counter[str] = Counter()  # messages by topic
+        self.counts: Counter[str] = Counter()  # number of messages by topic
 
     def close(self) -> None:
-        """End the file; raise OSError if it could not be written."""
+        """Finish the file; OSError if it could not be written."""
         self._file.close()
         self._checked_file.close()
 
     def write(self, instant: Instant) -> None:
-        """Write all messages of an instant; raise OSError if it cannot be written."""
+        """Write all messages of one time; OSError if they cannot be written."""
         self._checked_file.check()
         self._status.update(instant.status)
         if not self._has_static_scene and instant.truth:
@@ -275,14 +275,14 @@ class FoxgloveFile:
             kind = NumericMessageType(f"Cluster_{made.tidy(name)}", [*fields, "margin"], ("phase", "reason"))
             self.variables[name] = kind
         numbers = self.variables[name]
-        true = [math.nan] * len(state.names)  # unless they are known and not singular
+        true = [math.nan] * len(state.names)  # stays unless all drones' truth is known and their shape is not singular
         space, truths = self._spaces.get(name), [instant.truth[d] for d in state.drones if d in instant.truth]
         if space is not None and space.names == state.names and len(truths) == len(state.drones):
             yaw = heading([truth.orientation_wxyz for truth in truths])
             with suppress(SingularClusterError):
                 true = space.forward(np.array([truth.position_m for truth in truths]), yaw).tolist()
         values = [*state.desired, *state.value, *true, state.margin]
-        if len(values) == len(numbers.numbers):  # if the number of variables changes, only the first ones are written
+        if len(values) == len(numbers.numbers):  # after a change of the number of variables, no more are written
             encoded = numbers.encode(values, (state.phase, state.reason))
             self._log(f"/cluster/{name}/variables", numbers, encoded, instant.t_ns)
 
@@ -305,7 +305,7 @@ class FoxgloveFile:
             self._log(ESTIMATES, channels.SceneUpdateChannel, scene, t_ns)
 
     def _places(self, name: str, state: ClusterState) -> Any:
-        """Return the desired positions of a cluster's drones (n, 3), None if they are unknown or singular."""
+        """Return the desired positions of a cluster's drones (n, 3); None if they are unknown or singular."""
         space = self._spaces.get(name)
         if space is None or space.names != state.names or not any(state.desired):
             return None
@@ -321,7 +321,7 @@ class FoxgloveFile:
         return True
 
     def _log(self, topic: str, channel: Any, message: Any, t_ns: int) -> None:
-        """Log a message on a topic, whose channel, or type of numbers, is that of its first message."""
+        """Log a message on a topic; the topic's first message decides its channel, or its type of numbers."""
         if topic not in self._channels:
             if isinstance(channel, NumericMessageType):
                 schema = foxglove.Schema(name=channel.name, encoding="protobuf", data=channel.schema)
@@ -334,18 +334,18 @@ class FoxgloveFile:
 
 
 def _camera_of(key: str) -> tuple[str, str]:
-    """Return drone and frame of a camera by its key; x of the frame is to the right of the picture, y down, z ahead."""
+    """Return drone and frame of a camera from its key; in the frame, x points right in the picture, y down, z ahead."""
     _, drone, what = keys.parts(key)
     return drone, f"{made.frame(drone)}/{what.split('/')[1]}_camera"
 
 
 class CheckedFile:
-    """A file for a library that prints a failed write, at every further write again, rather than raise it.
+    """A file for a library that prints failed writes, each time anew, instead of raising an error.
 
     After a failed write, nothing more is written.
 
     Raises:
-        OSError: it cannot be created.
+        OSError: the file cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
@@ -368,12 +368,12 @@ class CheckedFile:
         self._try(self._file.flush)
 
     def check(self) -> None:
-        """Raise OSError if a write has failed."""
+        """Raise the OSError of a failed write, if there was one."""
         if self._failure is not None:
             raise self._failure
 
     def close(self) -> None:
-        """End the file; raise OSError if a write has failed."""
+        """Close the file; OSError if a write has failed."""
         self.flush()
         try:
             self._file.close()

@@ -1,4 +1,4 @@
-"""`python -m zsim_deploy.cli`: the command line of this interpreter's environment."""
+"""`python -m zsim_deploy.cli`: the command line in the environment of this interpreter."""
 
 from zsim_deploy.roles.closed_output import renew_streams
 

@@ -1,4 +1,4 @@
-"""The command line: assembles the commands, runs them, and reports a user's fault in one line."""
+"""The command line: assembles the commands, runs them, and reports a user's mistake in one line."""
 
 import errno
 import importlib
@@ -25,12 +25,12 @@ from zsim_deploy.arguments import HOSTS, POKE, TRANSLATE, endpoint_origin, note,
 from zsim_deploy.cli import federation_commands, hosts_commands, role_commands, run_commands
 from zsim_deploy.roles.closed_output import STREAMS, is_unread
 
-UsageError: Any = importlib.import_module(typer.BadParameter.__module__).UsageError  # of the click that typer uses
-UNREAD = 128 + 13  # exit code of a command whose output is no longer read: that of SIGPIPE
-# faults of a path given by the user, or of its disk, wherever it is first accessed
+UsageError: Any = importlib.import_module(typer.BadParameter.__module__).UsageError  # from the click that typer uses
+UNREAD = 128 + 13  # exit code of a command whose output is no longer read, as of one killed by SIGPIPE
+# errors of a path given by the user, or of its disk, wherever it is first accessed
 FILE_FAULTS = {errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ELOOP, errno.EROFS, errno.EIO, errno.ESTALE}
-PATH_SHOWN = 200  # characters
-EXIT_CODES = {  # of errors that are not wrong input
+PATH_SHOWN = 200  # characters of a path in an error; a longer one is shortened in the middle
+EXIT_CODES = {  # by class, for errors other than wrong input
     **dict.fromkeys((BehindError, RequestRefusedError, RunFailedError, UserCodeError), 1),
     SupersededError: 3,
 }
@@ -70,33 +70,35 @@ def _version(wanted: bool) -> None:
 
 @app.callback(help=ABOUT)
 def options(
-    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print it.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
 ) -> None: ...
 
 
 @cache
 def command() -> Any:
-    """Return the command line, built once; a forked process inherits it."""
+    """Return the command line, built once, so that a forked process inherits it."""
     return get_command(app)
 
 
 def main() -> None:
-    """Run the command line; a user's fault is a line, not a traceback."""
+    """Run the command line, and exit with its code; a user's mistake is reported in one line, without a traceback."""
     try:
         code = _run()
     except BrokenPipeError:
         if not any(map(is_unread, STREAMS)):
-            raise  # it was a connection
+            raise  # the pipe was not an output stream, but a connection
         code = UNREAD
-    except SystemExit as ended:  # click exits with 1 if the output is not read
+    except SystemExit as ended:  # click exits with 1 when the output is not read
         code = UNREAD if isinstance(ended.__context__, BrokenPipeError) else ended.code
     try:
         sys.stdout.flush()
     except BrokenPipeError:
         code = code or UNREAD
-        into = os.open(os.devnull, os.O_WRONLY)  # for output that is no longer read, as behind `| head`
+        null = os.open(os.devnull, os.O_WRONLY)  # takes the output that is no longer read, as behind `| head`
         for stream in filter(is_unread, STREAMS):
-            os.dup2(into, stream)
+            os.dup2(null, stream)
     sys.exit(code)
 
 
@@ -139,11 +141,11 @@ def _is_in_a_folder() -> bool:
 
 
 def _show_usage(error: Any) -> None:
-    """Print a usage error in one line; after a bare `zsim` its text is empty, because the help was printed."""
+    """Print a usage error in one line; nothing after a bare `zsim`, which has printed the help."""
     if isinstance(error, typer.BadParameter) and error.param is None:
         text = error.message
     else:
-        text = " ".join(error.format_message().split()).replace("Value error, ", "")  # newer typers ask pydantic
+        text = " ".join(error.format_message().split()).replace("Value error, ", "")  # pydantic's, in newer typers
     command = error.ctx.command_path if error.ctx else "zsim"
     if text:
         line = f"{command}: {text[0].lower()}{text[1:].rstrip('.')}; see `{command} --help`"

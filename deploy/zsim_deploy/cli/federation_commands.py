@@ -1,4 +1,4 @@
-"""The commands on a running federation: keys, echo, hz, pub, ask, and `zsim fault`."""
+"""The commands that inspect and control a running federation: keys, echo, hz, pub, ask, and `zsim fault`."""
 
 import json
 import math
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from zsim.contract.run_messages import Fault
     from zsim.transport.session import Session
 
-SOURCE = "zsim.fault"
+SOURCE = "zsim.fault"  # source of the requests
 ALL = "all"
 
 app = typer.Typer()
@@ -34,10 +34,10 @@ faults = typer.Typer(
 def keys(
     reach: WorldAccess,
     expression: Annotated[
-        str, Argument(metavar="[KEY]", help="Only these, e.g. 'drone/drone1/**'.", show_default=False)
+        str, Argument(metavar="[KEY]", help="Only keys that match, e.g. 'drone/drone1/**'.", show_default=False)
     ] = "**",
 ) -> None:
-    """List the keys in use, with their message type and the number of messages within a second."""
+    """List the keys in use, with message type and number of messages within one second."""
     from zsim_deploy.cli import inspection
 
     with connected(reach) as (link, _):
@@ -54,19 +54,19 @@ def echo(
     reach: WorldAccess,
     key: Annotated[str, Argument(help="Key or expression, e.g. drone/drone1/sensor/imu or 'drone/*/truth'.")],
     count: Annotated[int | None, Option("--count", "-n", min=1, help="Stop after this many messages.")] = None,
-    raw: Annotated[bool, Option("--raw", help="Payload as hexadecimal digits.")] = False,
+    raw: Annotated[bool, Option("--raw", help="Print payloads as hexadecimal digits.")] = False,
     timeout: Annotated[float | None, Option(callback=positive, help="Stop after this many seconds.")] = None,
 ) -> None:
-    """Print the messages on a key as JSON lines; exit code 1 if they have not arrived when --timeout expires."""
+    """Print the messages on a key as JSON lines; exit code 1 if too few have arrived when --timeout expires."""
     from zsim_deploy.cli import inspection
 
     def emit(name: str, message: Any) -> None:
         print(json.dumps({"key": name, "message": message}), flush=True)
 
     with connected(reach) as (link, _):
-        came = inspection.echo(link, key, count, emit, raw, timeout or math.inf, note)
-    if came < (count or 1):
-        raise failed(f"{came or 'no'} messages on {key} within {timeout:g} s")
+        received = inspection.echo(link, key, count, emit, raw, timeout or math.inf, note)
+    if received < (count or 1):
+        raise failed(f"{received or 'no'} messages on {key} within {timeout:g} s")
 
 
 @app.command(rich_help_panel=POKE)
@@ -74,15 +74,17 @@ def echo(
 def hz(
     reach: WorldAccess,
     key: Annotated[str, Argument(help="Key or expression.")],
-    window: Annotated[int, Option(help="Messages over which the rate is measured.", min=2, max=1_000_000)] = 1000,
+    window: Annotated[
+        int, Option(help="Number of messages over which the rate is measured.", min=2, max=1_000_000)
+    ] = 1000,
     seconds: Annotated[float | None, Option(callback=positive, help="Stop after this many seconds.")] = None,
 ) -> None:
-    """Print the rate of messages on a key, in wall and in simulated time."""
+    """Print the message rate on a key, in wall time and in simulated time."""
     from zsim_deploy.cli import inspection
 
     with connected(reach) as (link, _):
-        came = inspection.hz(link, key, window, seconds or math.inf, say)
-    if not came:
+        received = inspection.hz(link, key, window, seconds or math.inf, say)
+    if not received:
         raise failed(f"no message on {key} within {seconds:g} s")
 
 
@@ -92,8 +94,8 @@ def pub(
     reach: WorldAccess,
     key: Annotated[str, Argument(help="Key, e.g. drone/drone1/cmd/velocity.")],
     message: Annotated[str, Argument(help='JSON, e.g. \'{"velocity_m_s": [1, 0, 0], "yaw_rate_rad_s": 0}\'.')],
-    count: Annotated[int, Option("--count", "-n", min=1, help="How many times.")] = 1,
-    rate_hz: Annotated[float, Option(callback=positive, max=1000, help="How often per wall second.")] = 10.0,
+    count: Annotated[int, Option("--count", "-n", min=1, help="Number of times to send it.")] = 1,
+    rate_hz: Annotated[float, Option(callback=positive, max=1000, help="Rate, per wall second.")] = 10.0,
 ) -> None:
     """Send a command to a drone; t_ns, seq and source are filled in. Exit code 1 if the world refuses it."""
     from zsim_deploy.cli import inspection
@@ -112,10 +114,10 @@ def pub(
 def ask(
     reach: WorldAccess,
     key: Annotated[str, Argument(help="world/control or cluster/NAME/control.")],
-    op: Annotated[str, Argument(help="E.g. pause, resume, step, stop; engage, hold, land, target.")],
-    args: Annotated[str, Argument(help="JSON map, e.g. '{\"gates\": 50}'.")] = "{}",
+    op: Annotated[str, Argument(help="Operation, e.g. pause, resume, step, stop; engage, hold, land, target.")],
+    args: Annotated[str, Argument(help="Arguments as a JSON object, e.g. '{\"gates\": 50}'.")] = "{}",
 ) -> None:
-    """Send a request to the world or a controller and print the answer. Exit code 1 if it is refused."""
+    """Send a request to the world or a controller, and print the answer. Exit code 1 if it is refused."""
     from zsim_deploy.cli import inspection
 
     with connected(reach) as (link, _):
@@ -125,7 +127,7 @@ def ask(
 
 @contextmanager
 def connected(reach: WorldAccess) -> Iterator[tuple["Session", "Info"]]:
-    """Yield a session to the federation's hub, and the `world/info` of its run."""
+    """Yield a session with the hub of the federation, and the `world/info` of its run."""
     from zsim.transport.connection import find_world
 
     world = find_world(reach.endpoint, reach.federation, reach.wait_s, note, reader=True, identity=reach.who)
@@ -137,7 +139,7 @@ def connected(reach: WorldAccess) -> Iterator[tuple["Session", "Info"]]:
 
 
 def duration(text: str | None) -> str | None:
-    """Refuse an option that is not a duration such as 10s, 500ms or 2min."""
+    """Return an option's text; BadParameter if it is not a duration such as 10s, 500ms or 2min."""
     _seconds(text)
     return text
 
@@ -152,10 +154,10 @@ def _seconds(text: str | None) -> float | None:
 
 
 For = Annotated[
-    str | None, Option("--for", callback=duration, help="E.g. 10s, 500ms, 2min; by default until it is cleared.")
+    str | None, Option("--for", callback=duration, help="Duration, e.g. 10s, 500ms, 2min (default: until cleared).")
 ]
 At = Annotated[
-    str | None, Option("--at", callback=duration, help="Simulated time when it begins, e.g. 40s; by default now.")
+    str | None, Option("--at", callback=duration, help="Simulated time at which it begins, e.g. 40s (default: now).")
 ]
 
 
@@ -166,7 +168,7 @@ def add(
     target: Annotated[
         str, Argument(help="Drone, link (a/b), process, cluster or world, depending on the kind.", show_default=False)
     ],
-    kind: Annotated[str, Argument(help="One of `zsim fault kinds`.", show_default=False)],
+    kind: Annotated[str, Argument(help="Kind, one of those that `zsim fault kinds` lists.", show_default=False)],
     parameters: Annotated[
         list[str] | None, Argument(help="NAME=VALUE, e.g. factor=3 or 'value_m=[2, 0, 0]'.", show_default=False)
     ] = None,
@@ -191,9 +193,9 @@ def add(
 @observer_options
 def clear(
     reach: WorldAccess,
-    which: Annotated[str, Argument(help="Number, target or kind of faults, or all.")] = ALL,
+    which: Annotated[str, Argument(help="Number, target or kind of the faults, or all.")] = ALL,
 ) -> None:
-    """End faults: all, or those of a number, a target or a kind."""
+    """End all faults, or those with a given number, target or kind."""
     with connected(reach) as (link, info):
         done = _ask(link, "fault_clear", selector(which, info.scenario))
     cleared = ", ".join(map(str, done["cleared"])) or "nothing: no fault was planned or active"
@@ -222,11 +224,11 @@ def list_(reach: WorldAccess) -> None:
 @faults.command()
 def kinds(
     scenario: Annotated[
-        Path | None, Argument(help="A scenario, for the kinds of its custom sensors too.", show_default=False)
+        Path | None, Argument(help="Scenario; the kinds of its custom sensors are listed too.", show_default=False)
     ] = None,
     trust: Trust = False,
 ) -> None:
-    """List the kinds of faults: their targets and parameters."""
+    """List the kinds of faults, with their targets and parameters."""
     from zsim.presentation import Column, FittedTable, print_table
     from zsim.scenario import faults as fault_kinds
     from zsim.scenario import scenario_file
@@ -238,17 +240,20 @@ def kinds(
     rows = []
     for name, kind in fault_kinds.kinds_of(own).items():
         parameters = [
-            f"{parameter.name}: {fault_kinds.expected(parameter)}{'' if parameter.required else ' (may be left out)'}"
+            f"{parameter.name}: {fault_kinds.expected(parameter)}{'' if parameter.required else ' (optional)'}"
             for parameter in kind.parameters
         ]
-        needed = ["--for is needed"] if kind.lasts == "ends" else []
+        needed = ["--for is required"] if kind.lasts == "ends" else []
         rows.append((name, kind.strikes, "  ".join([*parameters, *needed]) or "-"))
     print_table(FittedTable([Column("", "name"), Column(""), Column("", "text")], rows))
     note_skipped(skipped)
 
 
 def selector(which: str, scenario: str) -> dict[str, Any]:
-    """Return the arguments of `fault_clear` for a word: a number, kind or target in the run of a scenario's text."""
+    """Return the arguments of `fault_clear` for the word of a command line.
+
+    `which`: a number, kind or target, or ALL; `scenario`: text of the run's scenario, which may add kinds.
+    """
     from zsim.scenario import faults as fault_kinds
     from zsim.scenario import scenario_file
     from zsim.sensors.sensor_catalogue import declarations
@@ -263,7 +268,7 @@ def selector(which: str, scenario: str) -> dict[str, Any]:
 
 def row(fault: "Fault", now_ns: int) -> tuple[str, ...]:
     until = "..." if fault.until_ns is None else f"{fault.until_ns / 1e9:.2f}"
-    state = "acts" if fault.from_ns <= now_ns else "planned"
+    state = "active" if fault.from_ns <= now_ns else "planned"
     parameters = " ".join(f"{name}={value}" for name, value in fault.parameters.items() if value is not None)
     times = f"{fault.from_ns / 1e9:.2f} to {until} s"
     return (str(fault.id), state, fault.target, fault.kind, times, parameters)

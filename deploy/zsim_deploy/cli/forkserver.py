@@ -1,10 +1,10 @@
-"""The fork server: imports what roles need, loads the compiled kernels, and forks a role for each request.
+"""The fork server: imports the modules of roles, loads the compiled kernels, and forks a role for each request.
 
-Standard input is a socket of sequenced packets from the launcher. When all is loaded, the fork server sends READY. From
-then on each packet from the launcher is the arguments of a `zsim` command as a JSON list, with four open files: the
-role's standard input, output and error, and one from which it reads a byte before it begins. The answer is the role's
-process id. The role is a child of the launcher, not of this process, which ends as soon as the launcher closes the
-socket or dies. A role whose process id has not reached the launcher never gets that byte, and ends too.
+Standard input is a sequenced-packet socket to the launcher. When everything is loaded, the fork server sends READY.
+From then on each packet from the launcher holds the arguments of a `zsim` command as a JSON list, with four open files:
+the role's standard input, output and error, and one from which it reads a byte before it begins. The reply is the
+role's process id. The role is a child of the launcher, not of this process, which ends as soon as the launcher closes
+the socket or dies. A role whose process id has not reached the launcher never gets that byte, and ends too.
 """
 
 import atexit
@@ -26,16 +26,16 @@ from zsim_deploy import SAFE_PATH
 from zsim_deploy.roles.closed_output import renew_streams
 
 READY = b"ready"
-PACKET_MAX = 1 << 17  # bytes, of a command line
-FILES = 4  # standard input, output, error, and the byte to begin
-ARG_START, ARG_END = 47, 48  # fields of /proc/self/stat, proc(5), counted from 0
+PACKET_MAX = 1 << 17  # size of a packet, bytes
+FILES = 4  # files with each packet: standard input, output and error, and the one with the byte to begin
+ARG_START, ARG_END = 47, 48  # indices of fields in /proc/self/stat, from 0; proc(5)
 PR_SET_PDEATHSIG, PR_SET_NAME = 1, 15  # linux/prctl.h
 
 
 def main() -> None:
     """Fork roles until the launcher closes the socket; in a role, run it."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # not inherited by what is forked
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # not inherited by forked processes
     _show_as("forkserver", [sys.executable, SAFE_PATH, "-m", "zsim_deploy.cli.forkserver", *sys.argv[1:2]])
     launcher = socket.socket(fileno=os.dup(0))
     _prepare()
@@ -54,7 +54,7 @@ def main() -> None:
 
 
 def _prepare() -> None:
-    """Import the modules of roles, and load the kernels; errors are reported by the roles when they start."""
+    """Import the modules of roles, and load the kernels; errors are left to the roles, which report them."""
     with suppress(Exception):
         import zsim_agents.recorder  # noqa: F401
         from zsim_deploy.cli import cli
@@ -67,9 +67,9 @@ def _prepare() -> None:
 
 
 def _fork() -> int:
-    """Fork a process whose parent is the launcher; return its process id, and 0 in the new process.
+    """Fork a process whose parent is the launcher; return its process id, or 0 in the new process.
 
-    The process between them ends at once; the launcher inherits its child (PR_SET_CHILD_SUBREAPER).
+    An intermediate process ends at once, and the launcher inherits its child (PR_SET_CHILD_SUBREAPER).
     """
     reader, writer = os.pipe()
     intermediate = os.fork()
@@ -116,7 +116,7 @@ def _run_role(arguments: list[str], files: list[int]) -> NoReturn:
 def finish(code: object) -> NoReturn:
     """End this process as the interpreter does, but without freeing objects.
 
-    A role shares the pages of all modules that the fork server imported; freeing the objects would copy every page.
+    A role shares with the fork server the memory pages of all imported modules; freeing objects would copy every page.
     """
     with suppress(BaseException):
         threading._shutdown()  # type: ignore[attr-defined]
@@ -131,7 +131,7 @@ def finish(code: object) -> NoReturn:
 
 
 def _show_as(name: str, command: list[str]) -> None:
-    """Set the command line that `ps` and `pgrep -f` show, cut to the length of this process's original one."""
+    """Set the command line that `ps` and `pgrep -f` show, truncated to the length of this process's original one."""
     with suppress(OSError, ValueError, IndexError):
         fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
         start, end = (int(fields[i - 2]) for i in (ARG_START, ARG_END))

@@ -26,12 +26,12 @@ from zsim_deploy.arguments import failed, note, require, say
 from zsim_deploy.hosts import control_socket
 
 UP_NEEDS = {"hosts": ("asyncssh", "cryptography"), "record": ("mcap", "zstandard")}
-EVERY = ""  # federation
-FOLLOW_S = 0.2  # polling interval of a log that is followed
-FIRST_OPERATOR = "main"
-DAYS_MIN = 0.05  # an hour, longer than a flight
-DAYS_MAX = 825.0  # the longest lifetime that browsers accepted; CA/Browser Forum, ballot 193
-WARN = timedelta(days=3)  # remaining lifetime of a certificate from which `show` warns
+EVERY = ""  # value of --federation that selects all federations
+FOLLOW_S = 0.2  # polling interval of a log with --follow, wall time
+FIRST_OPERATOR = "main"  # operator who gets a certificate if none is named
+DAYS_MIN = 0.05  # about an hour, longer than a flight
+DAYS_MAX = 825.0  # the longest lifetime of TLS certificates allowed by CA/Browser Forum ballot 193
+WARN = timedelta(days=3)  # remaining lifetime below which `show` warns
 
 app = typer.Typer()
 certs = typer.Typer(name="certs", help="Make and show the certificates of a federation.", no_args_is_help=True)
@@ -39,14 +39,18 @@ rendering = typer.Typer(
     name="render", help="Write systemd units, compose files or manifests for an inventory.", no_args_is_help=True
 )
 
-Hosts = Annotated[Path, Option("--hosts", help="Inventory (YAML): hosts, and which role runs where.")]
-Inventory = Annotated[Path, Argument(help="Inventory (YAML): hosts, and which role runs where.", show_default=False)]
-Federation = Annotated[str, Option(help="Federation that is up.")]
+Hosts = Annotated[Path, Option("--hosts", help="Inventory (YAML): the hosts, and which role runs where.")]
+Inventory = Annotated[
+    Path, Argument(help="Inventory (YAML): the hosts, and which role runs where.", show_default=False)
+]
+Federation = Annotated[str, Option(help="Federation of the run.")]
 Only = Annotated[
     list[str] | None,
-    Option("--only", help="Only matching roles, drones, formations or hosts: 'drone1*'. Repeatable."),
+    Option("--only", help="Show only matching roles, drones, formations or hosts, e.g. 'drone1*'. Repeatable."),
 ]
-Sort = Annotated[opt.RowOrder | None, Option("--sort", help="Sort the rows; numbers in descending order.")]
+Sort = Annotated[
+    opt.RowOrder | None, Option("--sort", help="Sort key of the rows; numbers are sorted in descending order.")
+]
 Role = Annotated[str, Argument(help="Process name, e.g. estimator.drone2.", show_default=False)]
 
 
@@ -55,10 +59,10 @@ def push(
     hosts: Hosts,
     host: Annotated[list[str] | None, Option("--host", help="Only this host. Repeatable.")] = None,
     extra: Annotated[
-        list[str] | None, Option("--extra", help="An extra beside those of the host's roles. Repeatable.")
+        list[str] | None, Option("--extra", help="Extra to install besides those of the host's roles. Repeatable.")
     ] = None,
 ) -> None:
-    """Install zsim on the hosts with the extras that their roles need; they need ssh and Python, but no internet."""
+    """Install zsim on the hosts, with the extras that their roles need; they need ssh and Python, but no internet."""
     import asyncio
 
     from zsim_deploy import inventory
@@ -77,14 +81,16 @@ def push(
 @app.command(rich_help_panel=opt.HOSTS)
 def doctor(
     scenario: Annotated[
-        Path | None, Argument(help="Scenario whose roles are placed on the hosts; without --hosts it is flown.")
+        Path | None, Argument(help="Scenario whose roles are placed on the hosts; without --hosts, the one to fly.")
     ] = None,
-    hosts: Annotated[Path | None, Option("--hosts", help="Inventory (YAML): hosts, and which role runs where.")] = None,
+    hosts: Annotated[
+        Path | None, Option("--hosts", help="Inventory (YAML): the hosts, and which role runs where.")
+    ] = None,
     duration: Annotated[float, Option(callback=opt.between(0.1, 1e6), help="Simulated seconds to fly.")] = 20.0,
 ) -> None:
     """Check every host: ssh, versions, clock, load, and the network between the hosts.
 
-    Without --hosts, fly the scenario as on two different processors, and tell whether the flights are identical.
+    Without --hosts, fly the scenario as on two different processors, and report whether the flights are identical.
     """
     if hosts is None:
         if scenario is None:
@@ -124,7 +130,7 @@ def older_processor() -> dict[str, str]:
 
 
 def _check_processor(scenario: Path, duration_s: float) -> str:
-    """Fly the first seconds of a scenario as on two processors; return where they first differ, empty if they do not.
+    """Fly the start of a scenario as on two processors; return where the flights first differ, empty if nowhere.
 
     The scenario is flown normally; its record is then rerun with the code of the C library, BLAS and numpy for a
     processor of 2008 without fused operations. zsim's own code gives the same results with both. A difference comes
@@ -136,12 +142,13 @@ def _check_processor(scenario: Path, duration_s: float) -> str:
         flight = ("run", str(scenario), "--in-process", "--no-report", "--out", out, "--duration", f"{duration_s:g}")
         _finished(flight, {}, (0,))
         say(f"{scenario.name}: {duration_s:g} s flown on this processor")
-        code, text = _finished(("rerun", out, "--trust"), older_processor(), (0, 1))  # the same code has just flown
+        # --trust adds no risk: the flight has just run the same code.
+        code, text = _finished(("rerun", out, "--trust"), older_processor(), (0, 1))
     if code:
         named = [line for line in text.splitlines() if "differs" in line]
         found = "; ".join(dict.fromkeys(named)) or (text.strip() or "it printed nothing").splitlines()[-1]
         return f"{scenario}: on another processor, {found}; see docs/extending.md, The same bits on every processor"
-    say("flown again as on an older processor: the same to the bit")
+    say("flown again as on an older processor: identical to the bit")
     return ""
 
 
@@ -166,9 +173,9 @@ def up(
     sort: Sort = None,
     force: opt.Force = False,
 ) -> None:
-    """Fly a scenario on several hosts: check them, start every role over ssh, watch, record, end everything.
+    """Fly a scenario on several hosts: check them, start all roles over ssh, watch, record, and end everything.
 
-    --only and --sort affect only the table; every role is started.
+    --only and --sort affect the table alone; every role is started.
     """
     require("up", UP_NEEDS | (opt.REPORT_NEEDS if report else {}))
     from zsim.transport.zenoh_settings import host_launcher_files, require_files
@@ -196,7 +203,7 @@ def up(
                 outcome = HostRun(loaded, placed, folder, launch, status).run()
             conclude(outcome, folder, report)
         finally:
-            if not was_there:  # fails unless it is empty because the run was refused
+            if not was_there:  # removing fails unless the folder is empty, because the run was refused
                 with contextlib.suppress(OSError):
                     folder.rmdir()
 
@@ -204,16 +211,16 @@ def up(
 @app.command(rich_help_panel=opt.HOSTS)
 def ps(
     roles: Annotated[
-        list[str] | None, Argument(metavar="[ROLE]...", help="The same as --only.", show_default=False)
+        list[str] | None, Argument(metavar="[ROLE]...", help="Same as --only.", show_default=False)
     ] = None,
     only: Only = None,
     sort: Sort = None,
     federation: Annotated[str, Option(help="Only runs of this federation.")] = EVERY,
-    as_json: Annotated[bool, Option("--json", help="As a JSON line.")] = False,
+    as_json: Annotated[bool, Option("--json", help="Print JSON, one line per run.")] = False,
 ) -> None:
     """Show the processes of the runs on this machine: role, host, pid, state, lag, age, messages/s, restarts.
 
-    A narrow terminal shows fewer columns; --json has all of them, one line for each run.
+    A narrow terminal shows fewer columns; --json prints all of them.
     """
     from zsim.presentation import print_table
     from zsim_deploy.hosts.status_table import RowChoice, table
@@ -241,10 +248,10 @@ def ps(
 @app.command(rich_help_panel=opt.HOSTS)
 def logs(
     role: Role,
-    follow: Annotated[bool, Option("--follow", "-f", help="Continue with new lines as they are written.")] = False,
+    follow: Annotated[bool, Option("--follow", "-f", help="Keep printing new lines as they are written.")] = False,
     federation: Federation = "zsim",
 ) -> None:
-    """Print the log of a process of the active run; progress and events are shown by `zsim up` itself."""
+    """Print the log of a process of the active run; `zsim up` itself shows progress and events."""
     where = control_socket.ask(federation, "where")
     if role not in where["roles"]:
         raise RunError(f"role is {role!r}; must be one of {', '.join(where['roles'])}")
@@ -253,28 +260,28 @@ def logs(
         shown = "its progress and events are shown by `zsim up`, and are in the record"
         note(f"{role} has logged nothing; {shown}" if role == WORLD else f"{role} has logged nothing yet")
 
-    done, last = 0, not follow
+    position, is_last = 0, not follow
     decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")
     while True:
         if path.exists():
             with path.open("rb") as log:
-                log.seek(done)
+                log.seek(position)
                 new = log.read()
-            done += len(new)
+            position += len(new)
             sys.stdout.write(printable(decoder.decode(new)))
             sys.stdout.flush()
-        if last:
+        if is_last:
             return
         time.sleep(FOLLOW_S)
         try:
-            last = control_socket.ask(federation, "where")["out"] != where["out"]
+            is_last = control_socket.ask(federation, "where")["out"] != where["out"]
         except RunError:
-            last = True
+            is_last = True
 
 
 @app.command(rich_help_panel=opt.HOSTS)
 def restart(role: Role, federation: Federation = "zsim") -> None:
-    """Restart a process of the run on its host; it takes over from its predecessor."""
+    """Restart a process of the run on its host; the new process takes over from the old one."""
     say(f"restarting {control_socket.ask(federation, 'restart', role=role)}")
 
 
@@ -297,19 +304,23 @@ def down(federation: Federation = "zsim") -> None:
 @certs.command()
 def init(
     hosts: Inventory,
-    scenario: Annotated[Path, Option(help="Scenario whose processes get certificates.", show_default=False)],
+    scenario: Annotated[Path, Option(help="Scenario for whose processes certificates are made.", show_default=False)],
     set_: opt.Set = None,
     operator: Annotated[
         list[str] | None,
-        Option(help=f"NAME or NAME@HOST of a further operator (default: those there are, {FIRST_OPERATOR} at first)."),
+        Option(
+            help=f"NAME or NAME@HOST of an operator to add (default: existing ones, else {FIRST_OPERATOR}). Repeatable."
+        ),
     ] = None,
-    days: Annotated[float, Option(callback=opt.between(DAYS_MIN, DAYS_MAX), help="Lifetime of certificates.")] = DAYS,
-    renew: Annotated[bool, Option("--renew", help="Renew all of them, with the same authority.")] = False,
+    days: Annotated[
+        float, Option(callback=opt.between(DAYS_MIN, DAYS_MAX), help="Lifetime of the certificates, days.")
+    ] = DAYS,
+    renew: Annotated[bool, Option("--renew", help="Renew all certificates, with the same authority.")] = False,
     force: Annotated[
         bool, Option("--force", help="Make a new authority; earlier certificates become invalid.")
     ] = False,
 ) -> None:
-    """Make missing certificates, their authority, and access control for the world and the routers."""
+    """Make the missing certificates, their authority, and access control for the world and the routers."""
     from zsim_deploy import certificates, inventory
 
     placed, now = inventory.load(hosts), datetime.now(UTC)
@@ -331,7 +342,7 @@ def init(
 
 @certs.command()
 def show(hosts: Inventory) -> None:
-    """List the certificates: process, addresses, expiry."""
+    """List the certificates with host, process, expiry, addresses and faults."""
     from zsim.presentation import Column, FittedTable, print_table
     from zsim_deploy import certificates, inventory
 
@@ -342,7 +353,7 @@ def show(hosts: Inventory) -> None:
         raise RunError(f"{folder}: has no certificates; make them with `{certificates.init_command(placed)}`")
     rows, over = [], False
     for status in statuses:
-        soon = "ends soon" if status.until - now < WARN else ""
+        soon = "expires soon" if status.until - now < WARN else ""
         over = over or bool(soon) or certificates.EXPIRED in status.fault
         until, addresses = f"{status.until:%Y-%m-%d %H:%M}Z", ", ".join(status.addresses)
         rows.append((status.host, status.process, until, addresses, status.fault or soon))
@@ -353,7 +364,7 @@ def show(hosts: Inventory) -> None:
         note(f"warning: {warning}")
 
 
-Out = Annotated[Path, Option("--out", help="Folder to write into; an earlier rendering there is replaced.")]
+Out = Annotated[Path, Option("--out", help="Folder to write to; an earlier rendering there is replaced.")]
 ForceRendering = Annotated[
     bool, Option("--force", help="Overwrite files that were not rendered, or were changed since.")
 ]
@@ -362,14 +373,14 @@ ForceRendering = Annotated[
 @rendering.command()
 @opt.flight_options
 def systemd(flight: opt.FlightOptions, hosts: Hosts, out: Out, force: ForceRendering = False) -> None:
-    """Write HOST/zsim-PROCESS.service and HOST/zsim.target for every host."""
+    """Write HOST/zsim-PROCESS.service and HOST/zsim.target for each host."""
     _render("systemd", flight, hosts, out, force)
 
 
 @rendering.command()
 @opt.flight_options
 def compose(flight: opt.FlightOptions, hosts: Hosts, out: Out, force: ForceRendering = False) -> None:
-    """Write HOST/compose.yaml and HOST/Dockerfile for every host."""
+    """Write HOST/compose.yaml and HOST/Dockerfile for each host."""
     _render("compose", flight, hosts, out, force)
 
 

@@ -1,4 +1,4 @@
-"""Inspecting a running federation, as `ros2 topic` does, and sending messages and requests to it by hand."""
+"""Inspection of a running federation, as with `ros2 topic`, and messages and requests sent to it by hand."""
 
 import json
 import math
@@ -16,20 +16,20 @@ from zsim.contract.framing import pairs_of
 from zsim.errors import DecodeError, RunError
 from zsim.transport.session import RawSample, ReceivedSample, Session, Subscription, check_expression, result_of
 
-LISTEN_S = 1.0  # wall time that `keys` listens: every live key of the contract has a message at least once a second
-PACKET_S = 0.05  # polling interval of an empty subscription
-LINE_S = 1.0  # between two lines of `hz`
-SILENCE_S = 1.0  # after which a key with messages is reported as silent; twice its longest gap if that is longer
-UNHEARD_S = 3.0  # after which a key without messages is reported; every live key has one at least once a second
-NAMED_MAX = 5  # similar keys that are suggested for a key without a publisher
-OUTCOME_S = 3.0  # wall time for the world to report the outcome of a command; a paused one does not
-UNKNOWN_SENDER = "somebody"  # source in the event of a message that could not be decoded
+LISTEN_S = 1.0  # how long `keys` listens, wall time; every live key of the contract has at least one message a second
+POLL_S = 0.05  # polling interval of a subscription, wall time
+LINE_S = 1.0  # interval between lines of `hz`, wall time
+SILENCE_S = 1.0  # wall time without a message after which `hz` reports silence; twice the longest gap if that is longer
+UNHEARD_S = 3.0  # wall time after which a key without any message is reported; live keys have at least one a second
+NAMED_MAX = 5  # number of similar keys suggested for a key without a publisher
+OUTCOME_S = 3.0  # wall time for the world to report the outcome of a command; a paused world does not report it
+UNKNOWN_SENDER = "somebody"  # source that the world's event gives for a message that it could not decode
 PUB, ASK = "zsim.pub", "zsim.ask"
 COMMANDS = "drone/*/cmd/*"
 
 
 def list_keys(link: Session, expression: str) -> list[tuple[str, str, int]]:
-    """Return (key, message, messages received) of every key with a message or an answer within LISTEN_S."""
+    """Return (key, message type, number of messages) for every key with a message or an answer within LISTEN_S."""
     check_expression(expression)
     counts: Counter[str] = Counter()
     for known in (keys.INFO, keys.CLOCK, "drone/*/truth", "drone/*/estimate", "cluster/*/state"):
@@ -37,7 +37,7 @@ def list_keys(link: Session, expression: str) -> list[tuple[str, str, int]]:
     for sample in _samples(link.subscribe(expression), time.monotonic() + LISTEN_S):
         counts[sample.key] += 1
     kinds = {key: messages.type_of(key) for key in counts}
-    names = {key: kind.__name__ if kind else "not of the contract" for key, kind in kinds.items()}
+    names = {key: kind.__name__ if kind else "not in the contract" for key, kind in kinds.items()}
     return [(key, names[key], count) for key, count in sorted(counts.items())]
 
 
@@ -50,9 +50,10 @@ def echo(
     timeout_s: float = math.inf,
     note: Callable[[str], None] = lambda text: None,
 ) -> int:
-    """Pass the messages on an expression to `emit` until `count` or the timeout is reached; return their number.
+    """Pass the messages on a key expression to `emit` until `count` or the timeout is reached; return their number.
 
-    `emit` takes key and message, or the payload in hexadecimal digits if `raw`; `note` takes notices for the user.
+    `emit` takes the key and the message, with `raw` the payload in hexadecimal digits; `note` takes notices for the
+    user.
     """
     subscription = link.subscribe(expression)
     until_s, number = time.monotonic() + timeout_s, 0
@@ -71,14 +72,14 @@ def echo(
 
 
 def keys_like(link: Session, expression: str) -> str:
-    """Return the end of a line about a key without a publisher: similar keys that are in use."""
+    """Return the end of a line on a key without a publisher: similar keys that are in use."""
     in_use = [key for key, _, _ in list_keys(link, "**")]
     named = ", ".join(get_close_matches(expression, in_use, NAMED_MAX))
     return f"; similar keys in use: {named}" if named else "; `zsim keys` lists the keys in use"
 
 
 def readable(sample: ReceivedSample) -> Any:
-    """Return a message as JSON values; one outside the contract is decoded as far as possible."""
+    """Return a message as JSON values; one outside the contract as its MessagePack value, or else why it is refused."""
     try:
         return _plain(messages.decode(sample.key, sample.payload))
     except DecodeError as error:
@@ -97,7 +98,7 @@ def _plain(value: Any) -> Any:
 
 
 class MessageRate:
-    """The rate of messages, in wall and in simulated time, over a window of messages."""
+    """The message rate over a window of messages, in wall time and in simulated time."""
 
     def __init__(self, window: int) -> None:
         self._walls: deque[float] = deque(maxlen=window)
@@ -126,12 +127,15 @@ class MessageRate:
 
 
 def hz(link: Session, expression: str, window: int, seconds: float, emit: Callable[[str], None]) -> int:
-    """Show the rate of messages on an expression once a second and at the end; return their number."""
+    """Pass a line on the message rate to `emit`, once a second and at the end; return the number of messages.
+
+    `seconds`: duration, wall time; `window`: see `MessageRate`.
+    """
     check_expression(expression)
     arrived: deque[tuple[float, bytes]] = deque()
 
-    def arrive(sample: RawSample) -> None:  # called in Zenoh's thread, so that times are those of arrival
-        if sample.payload:  # empty: a deletion
+    def arrive(sample: RawSample) -> None:  # called in Zenoh's thread, so that the times are those of arrival
+        if sample.payload:  # an empty payload is a deletion
             arrived.append((time.monotonic(), sample.payload))
 
     link.declare_subscriber(expression, arrive)
@@ -157,7 +161,7 @@ class _Stamp(msgspec.Struct):
 
 
 def _samples(subscription: Subscription, until_s: float) -> Iterator[ReceivedSample]:
-    """Yield samples until a wall time; polls, so that Ctrl-C is handled."""
+    """Yield samples until a monotonic time [s]; poll, so that Ctrl-C is handled."""
     while time.monotonic() < until_s:
         arrived = False
         for sample in subscription.drain():
@@ -166,28 +170,30 @@ def _samples(subscription: Subscription, until_s: float) -> Iterator[ReceivedSam
             if time.monotonic() >= until_s:
                 return
         if not arrived:
-            time.sleep(min(PACKET_S, max(0.0, until_s - time.monotonic())))
+            time.sleep(min(POLL_S, max(0.0, until_s - time.monotonic())))
 
 
 class Published(NamedTuple):
-    """The outcome of commands that were sent by hand."""
+    """The outcome of commands sent by hand."""
 
     sent: int
-    refused: int = 0  # number that the world refused, according to its events
-    reason: str = ""  # of the first refusal
+    refused: int = 0  # number of those that the world refused, according to its events
+    reason: str = ""  # reason of the first refusal
     note: str = ""  # why the outcome is not known, empty if it is
 
 
 def publish(link: Session, info: messages.Info, key: str, text: str, count: int, rate_hz: float) -> Published:
-    """Publish a JSON text as a command on its key, `count` times, and wait for the outcome.
+    """Publish a JSON text as a command `count` times, and wait for the outcome.
 
-    t_ns, seq and source are filled in. RunError if the text is not the key's message in JSON, or the key is not a
-    command of a drone in the run.
+    t_ns, seq and source are filled in. RunError if the text is not a message of the key, or the key is not that of a
+    command to a drone of the run.
     """
     _refuse_wildcards(key, "pub")
     kind = messages.type_of(key)
     if kind is None:
-        raise RunError(f"{key}: is not a key of the contract; `zsim keys` lists those in use, docs/protocol.md all")
+        raise RunError(
+            f"{key}: is not a key of the contract; `zsim keys` lists those in use, docs/protocol.md all of them"
+        )
     if not keys.matches(COMMANDS, key):
         raise RunError(f"{key}: is written only by its own process; must be {COMMANDS.replace('*', '…')}")
     drones = [drone.name for drone in info.drones]
@@ -198,7 +204,7 @@ def publish(link: Session, info: messages.Info, key: str, text: str, count: int,
     fields = _map(f"{key}: the message", text, example)
     if "source" in kind.__struct_fields__:
         fields = {"source": PUB, **fields}
-    events, clock, start_s = link.subscribe(keys.EVENT), _Now(link), time.monotonic()
+    events, clock, start_s = link.subscribe(keys.EVENT), _SimulatedTime(link), time.monotonic()
     for seq in range(count):
         time.sleep(max(0.0, start_s + seq / rate_hz - time.monotonic()))
         payload = msgspec.msgpack.encode({"t_ns": clock.t_ns(), "seq": seq, **fields})
@@ -210,8 +216,10 @@ def publish(link: Session, info: messages.Info, key: str, text: str, count: int,
     return _outcome(events, clock, info.gate_ns, (key, str(fields.get("source", PUB))), count)
 
 
-def _outcome(events: Subscription, clock: "_Now", gate_ns: int, ours: tuple[str, str], sent: int) -> Published:
-    """Return the outcome of commands from the world's events, once the last has taken effect or was refused."""
+def _outcome(
+    events: Subscription, clock: "_SimulatedTime", gate_ns: int, ours: tuple[str, str], sent: int
+) -> Published:
+    """Return the outcome of commands from the world's events, once the last one has taken effect or was refused."""
     key, source = ours
     accepted, refused, last_ns, reason = 0, 0, 0, ""
     until_s = time.monotonic() + OUTCOME_S
@@ -231,12 +239,12 @@ def _outcome(events: Subscription, clock: "_Now", gate_ns: int, ours: tuple[str,
         if time.monotonic() >= until_s:
             now = clock.clock()
             state = now.state if now else "unknown"
-            note = f"the world is {state}; the outcome is known only when time continues"
+            note = f"the world is {state}; the outcome will be known only when time continues"
             return Published(sent, min(refused, sent), reason, note)
-        time.sleep(PACKET_S)
+        time.sleep(POLL_S)
 
 
-class _Now:
+class _SimulatedTime:
     """The simulated time, from the published clock."""
 
     def __init__(self, link: Session) -> None:
@@ -259,7 +267,7 @@ def _refuse_wildcards(key: str, command: str) -> None:
 
 
 def _map(what: str, text: str, example: str) -> dict[str, Any]:
-    """Parse a JSON text that must be a map; `what` begins the error line."""
+    """Parse a JSON text that must be a map; RunError, beginning with `what`, if it is not."""
     try:
         fields = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -274,7 +282,7 @@ def _map(what: str, text: str, example: str) -> dict[str, Any]:
 
 
 def ask(link: Session, key: str, op: str, text: str) -> Any:
-    """Send a request with arguments as JSON text; return its result as JSON values, or raise its refusal."""
+    """Send a request, its arguments as a JSON text; return the result as JSON values, or raise the refusal."""
     _refuse_wildcards(key, "ask")
     result = result_of(link.request(key, op, ASK, _map(f"{op}: args", text, '{"gates": 50}')))
     with suppress(DecodeError):  # only the result of a replay contains messages

@@ -1,6 +1,6 @@
-"""The commands that each run one process of a federation: its roles, and the bridges to other programs.
+"""The commands that each run one process of a federation: the roles, and the bridges to other programs.
 
-Roles    `world`, those of agents, `host`, `agent`, `record`, `router`, `camera`, `detect`
+Roles    `world`, one command per kind of agent, `host`, `agent`, `record`, `router`, `camera`, `detect`
 Bridges  `console`, `gateway`, `ros1`, `ros2`, `mavlink`, `ardrone`, `fmu`
 """
 
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
     from zsim_bridges.vehicle_links.vehicle_session import FlightLimits
     from zsim_deploy.roles.roles import Remain, Serve
 
-FIRST_ADDRESS = "127.0.0.2"  # of the first AR.Drone; programs on this host send from 127.0.0.1
+FIRST_ADDRESS = "127.0.0.2"  # address of the first AR.Drone; programs on this host send from 127.0.0.1
 TOKEN = "ZSIM_TOKEN"  # environment variable, because a command line is visible to all users of the machine
 DOMAIN_MAX = 232  # the highest ROS_DOMAIN_ID of ROS 2
-KEY_BYTES = 32
-GCS_PORT, GCS_LOCAL_PORT = 14550, 18570  # of PX4's simulation: the ground station, and the first local port
-API_PORT, API_LOCAL_PORT = 14540, 14580  # likewise for programs
+KEY_BYTES = 32  # MAVLink 2, "Message Signing"
+GCS_PORT, GCS_LOCAL_PORT = 14550, 18570  # UDP ports of PX4's simulation: of the ground station, and the first local one
+API_PORT, API_LOCAL_PORT = 14540, 14580  # the same for programs (offboard API)
 GATEWAY_NEEDS = {"gateway": ("aiohttp",)}
 FMU_NEEDS = {"fmu": ("fmpy",)}
 ROS1_NEEDS = {"ros1": ("rosbags",)}
@@ -44,20 +44,29 @@ ROS2_NEEDS = {"ros2": ("rosbags", "xxhash")}
 app = typer.Typer()
 bridges = typer.Typer()
 mavlink = typer.Typer(
-    name="mavlink", no_args_is_help=True, help="MAVLink: the drones of a run as vehicles of PX4 or ArduPilot."
+    name="mavlink",
+    no_args_is_help=True,
+    help="Bridge to MAVLink: offer drones as PX4 or ArduPilot vehicles, or fly a real one as a drone.",
 )
-ardrone = typer.Typer(name="ardrone", help="Programs for the AR.Drone fly drones of a run.", no_args_is_help=True)
+ardrone = typer.Typer(
+    name="ardrone",
+    help="Bridge to the AR.Drone: offer drones as AR.Drones, or fly a real one as a drone.",
+    no_args_is_help=True,
+)
 
-SOME_DRONES = "Drones, or patterns: 'drone*'; all that have cameras if not given."
+SOME_DRONES = "Drones, or patterns such as 'drone*' (default: all with cameras)."
 Drones = Annotated[list[str] | None, Argument(metavar="[DRONE]...", help=SOME_DRONES, show_default=False)]
-PaceAsked = Annotated[
-    float | None, opt.positive_option("Simulated per wall second, asked of the world.", show_default=False)
+RequestedPace = Annotated[
+    float | None,
+    opt.positive_option("Pace to request from the world, simulated seconds per wall second.", show_default=False),
 ]
 SigningKey = Annotated[
-    Path | None, Option(help="File with the key of MAVLink 2 signatures; unsigned messages are refused.")
+    Path | None, Option(help="File with the key for MAVLink 2 signatures; unsigned messages are refused.")
 ]
-DroneName = Annotated[str, Argument(help="Its drone in the run, with `body: external` in the scenario.")]
-Armed = Annotated[bool, Option("--armed", help="Obey from the start; otherwise an operator must ask `arm` first.")]
+DroneName = Annotated[str, Argument(help="Drone of the run that it flies as, with `body: external` in the scenario.")]
+Armed = Annotated[
+    bool, Option("--armed", help="Accept commands from the start; otherwise an operator must first request `arm`.")
+]
 
 
 @app.command(rich_help_panel=opt.ROLES)
@@ -67,22 +76,22 @@ def world(
     flight: opt.FlightOptions,
     who: "Identity",
     listen: opt.Listen = None,
-    expect: Annotated[list[str] | None, Option(help="Wait for this process too, e.g. recorder.")] = None,
+    expect: Annotated[list[str] | None, Option(help="Wait for this process too, e.g. recorder. Repeatable.")] = None,
     journal: Annotated[
-        Path | None, Option(help="Folder of the run's journal, with which a restarted world continues.")
+        Path | None, Option(help="Folder of the run's journal, from which a restarted world continues.")
     ] = None,
     all_died: Annotated[bool, Option("--all-died", hidden=True)] = False,
     changed: Annotated[list[str] | None, Option(opt.CHANGED, hidden=True)] = None,
     launched: opt.Launched = None,
 ) -> None:
-    """Run the world: integrates all drones and owns simulated time."""
+    """Run the world, which integrates all drones and owns simulated time."""
     require("world", {"agents": ("numba", "scipy")})
     from zsim.scenario import scenario_file
     from zsim.schema import plugin
     from zsim_deploy.roles import world_role
 
     path, overrides = flight.path, flight.overrides or ()
-    # a launcher has written the resolved scenario into the run's folder, and passes the folders of its modules
+    # A launcher has written the resolved scenario into the run's folder, and passes the folders of its modules.
     modules = plugin.folders() if launched else ()
     loaded = scenario_file.load(
         path, overrides, modules, imports=not launched, seed=flight.seed, duration_s=flight.duration
@@ -95,7 +104,7 @@ def world(
 
 def _agent_command(name: str, role: Role) -> Callable[..., None]:
     about = str(role.about)
-    several_help = f"{about.capitalize()}s, or patterns: '{about}*'."
+    several_help = f"{about.capitalize()}s, or patterns such as '{about}*'."
 
     def start(things: list[str], reach: opt.WorldAccess) -> None:
         require(name, {"agents": ("scipy",)})
@@ -129,7 +138,7 @@ for _name, _role in AGENTS.items():
 def host_agents(
     reach: opt.WorldAccess,
     names: Annotated[
-        list[str], Argument(metavar="NAME...", help="Processes, or patterns: 'estimator.*' controller.main.")
+        list[str], Argument(metavar="NAME...", help="Processes, or patterns, e.g. 'estimator.*' controller.main.")
     ],
 ) -> None:
     """Run several estimators and controllers in one process, which is faster."""
@@ -146,14 +155,14 @@ def own_agent(
         str,
         Argument(
             metavar="MODULE:CLASS",
-            help="A subclass of zsim.Agent; or the process name of one of the scenario's agents, as pilot.drone1.",
+            help="A subclass of zsim.Agent, or the process name of one of the scenario's agents, e.g. pilot.drone1.",
             show_default=False,
         ),
     ],
     settings: Annotated[
         list[str] | None, Argument(metavar="[NAME=VALUE]...", help="Arguments of the class.", show_default=False)
     ] = None,
-    name: Annotated[str, Option(help="Process name (default: the class's own).", show_default=False)] = "",
+    name: Annotated[str, Option(help="Process name (default: that of the class).", show_default=False)] = "",
 ) -> None:
     """Run your own agent: a class in a module on PYTHONPATH or in this folder."""
     from zsim.schema import plugin
@@ -173,9 +182,9 @@ def own_agent(
 @opt.participant_options
 def record(
     reach: opt.WorldAccess,
-    out: Annotated[Path, Option(help=f"Folder for run.mcap; {opt.RUN_ID} in its name is the id of the run.")] = Path(
-        "."
-    ),
+    out: Annotated[
+        Path, Option(help=f"Folder for run.mcap; {opt.RUN_ID} in its name stands for the id of the run.")
+    ] = Path("."),
 ) -> None:
     """Record every message of a federation into run.mcap."""
     from zsim_deploy.roles import roles
@@ -196,7 +205,7 @@ def router(
     realtime: opt.Realtime = False,
     launched: opt.Launched = None,
 ) -> None:
-    """Run a router: connects the clients of one network to a world, or a router, in another."""
+    """Run a router, which connects the clients of one network to a world or a router in another."""
     from zsim_deploy.roles import roles
 
     roles.router(name, listen, connect, federation, "realtime" if realtime else "lockstep", launched, who)
@@ -207,9 +216,9 @@ def router(
 def camera(
     reach: opt.WorldAccess,
     drones: Drones = None,
-    name: Annotated[str, opt.process_option("camera.DRONE, camera.main for several")] = "",
+    name: Annotated[str, opt.process_option("camera.DRONE; camera.main for several drones")] = "",
 ) -> None:
-    """Render the cameras of one drone, or of several in one process, as JPEG."""
+    """Render the camera images of one drone, or of several in one process, as JPEG."""
     require("camera", opt.CAMERA_NEEDS)
     from zsim_deploy.roles import roles
 
@@ -222,11 +231,12 @@ def detect(
     reach: opt.WorldAccess,
     drones: Drones = None,
     diameter: Annotated[
-        float | None, Option(callback=opt.positive, help="Of a hat, m (default the scenario's).", show_default=False)
+        float | None,
+        Option(callback=opt.positive, help="Diameter of a hat, m (default: the scenario's).", show_default=False),
     ] = None,
-    name: Annotated[str, opt.process_option("detector.DRONE, detector.main for several")] = "",
+    name: Annotated[str, opt.process_option("detector.DRONE; detector.main for several drones")] = "",
 ) -> None:
-    """Detect magenta hats in the pictures of one drone, or of several in one process."""
+    """Detect magenta hats in the camera images of one drone, or of several in one process."""
     require("detect", opt.CAMERA_NEEDS)
     from zsim_deploy.roles import roles
 
@@ -242,9 +252,10 @@ def serve_as(
     lowered: bool = False,
     remain: "Remain | None" = None,
 ) -> None:
-    """Serve one run after the other, as the process named by role, name and thing.
+    """Serve one run after another, as the process that `process_name` names.
 
-    `lowered`: with lower priority than the processes that the world waits for; `remain`: called after a launched run.
+    `lowered`: run at a lower priority than the processes that the world waits for; `remain`: called after a launched
+    run.
     """
     from zsim_deploy.roles import roles
     from zsim_deploy.roles.roles import process_name
@@ -259,22 +270,29 @@ def serve_as(
 @opt.participant_options
 def console(
     reach: opt.WorldAccess,
-    listen: Annotated[str, Option(help="Address on which the page is served.")] = "127.0.0.1",
+    listen: Annotated[str, Option(help="Address to serve the page on.")] = "127.0.0.1",
     port: Annotated[
         int | None,
-        opt.port_option(f"Port of the page ({opt.CONSOLE_PORT}, or another if that is in use).", show_default=False),
+        opt.port_option(
+            f"Port of the page (default {opt.CONSOLE_PORT}, or another if that is in use).", show_default=False
+        ),
     ] = None,
-    token: Annotated[str | None, Option(envvar=TOKEN, help="What operators must show; needed off loopback.")] = None,
+    token: Annotated[
+        str | None, Option(envvar=TOKEN, help="Token that operators must present; required on non-loopback addresses.")
+    ] = None,
     rate_hz: Annotated[
         float | None,
-        opt.positive_option("Pictures a second (20; 10 from 20 drones or 4 × real time on).", show_default=False),
+        opt.positive_option(
+            "Frames per second (default 20; 10 with 20 or more drones, or at 4 × real time or faster).",
+            show_default=False,
+        ),
     ] = None,
-    name: Annotated[str, Option(help="Process name (default the certificate's, or console.1, .2, …).")] = "",
+    name: Annotated[str, Option(help="Process name (default: the certificate's, or console.1, .2, …).")] = "",
     folder: Annotated[
-        Path | None, Option(help="Folder of the run, shown on the page when it is over.", show_default=False)
+        Path | None, Option(help="Folder of the run, shown on the page at the end.", show_default=False)
     ] = None,
 ) -> None:
-    """Show a run in the browser, and steer it: scene, plots, events, faults."""
+    """Show a run in the browser, and control it: scene, plots, events, faults."""
     require("console", opt.CONSOLE_NEEDS)
     from zsim.runtime.progress import JsonProgress
     from zsim.transport.zenoh_settings import SERVER_FILES, require_files
@@ -282,13 +300,13 @@ def console(
     from zsim_bridges.console.page_server import ListenAddress
     from zsim_deploy.roles.roles import log_printer, process_name
 
-    # Of normal priority, because an operator's emergency stop goes through it.
+    # It keeps normal priority, because an operator's emergency stop goes through it.
     own_name = process_name("console", name, reach.who, "*")
-    tell = JsonProgress().say if reach.launched else log_printer(None)
+    say_line = JsonProgress().say if reach.launched else log_printer(None)
     require_files(SERVER_FILES, "a console and its pages")
     world = f"federation {reach.federation!r} on {reach.endpoint}"
     address = ListenAddress(listen, port or opt.CONSOLE_PORT, or_any=port is None)
-    shown = Console(address, own_name.removesuffix(".*"), token, rate_hz, tell, world, folder)
+    shown = Console(address, own_name.removesuffix(".*"), token, rate_hz, say_line, world, folder)
     with shown.open():
         serve_as("console", own_name, shown.serve, reach, remain=shown.remain)
 
@@ -297,13 +315,15 @@ def console(
 @opt.participant_options
 def gateway(
     reach: opt.WorldAccess,
-    listen: Annotated[str, Option(help="Address on which clients connect.")] = "127.0.0.1",
-    http: Annotated[int, opt.port_option("Port of HTTP and WebSocket.")] = 8000,
-    lines: Annotated[int, opt.port_option("Port of JSON lines on TCP.")] = 7470,
-    token: Annotated[str | None, Option(envvar=TOKEN, help="What clients must show; needed off loopback.")] = None,
+    listen: Annotated[str, Option(help="Address to accept clients on.")] = "127.0.0.1",
+    http: Annotated[int, opt.port_option("Port for HTTP and WebSocket.")] = 8000,
+    lines: Annotated[int, opt.port_option("Port for JSON lines over TCP.")] = 7470,
+    token: Annotated[
+        str | None, Option(envvar=TOKEN, help="Token that clients must present; required on non-loopback addresses.")
+    ] = None,
     name: Annotated[str, opt.process_option("gateway.main")] = "",
 ) -> None:
-    """Let in MATLAB, Octave, C, JavaScript, scripts: JSON lines, WebSocket, REST."""
+    """Serve MATLAB, Octave, C, JavaScript and scripts by JSON lines, WebSocket and REST."""
     require("gateway", GATEWAY_NEEDS)
     from zsim.transport.connection import find_world
     from zsim.transport.zenoh_settings import SERVER_FILES, allow_files, require_files
@@ -337,18 +357,18 @@ def gateway(
 @opt.participant_options
 def ros1(
     reach: opt.WorldAccess,
-    master: Annotated[str, Option(envvar="ROS_MASTER_URI", help="The ROS master.")] = DEFAULT_MASTER,
+    master: Annotated[str, Option(envvar="ROS_MASTER_URI", help="URI of the ROS master.")] = DEFAULT_MASTER,
     ros_host: Annotated[
         str | None,
         Option(
             "--ros-host",
             "--ip",
-            help="Name or address under which ROS nodes reach this host (default $ROS_HOSTNAME, $ROS_IP, or found).",
+            help="Name or address at which ROS nodes reach this host (default $ROS_HOSTNAME, $ROS_IP, or detected).",
         ),
     ] = None,
     name: Annotated[str, opt.process_option("ros1.main")] = "",
 ) -> None:
-    """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
+    """Offer the drones to ROS 1 nodes as ardrone_autonomy does; needs no ROS here."""
     require("ros1", ROS1_NEEDS)
     from zsim_bridges.ros1.ros1_bridge import NodeShutdownError, serve
 
@@ -365,14 +385,14 @@ def ros2(
     reach: opt.WorldAccess,
     domain: Annotated[int, Option(envvar="ROS_DOMAIN_ID", min=0, max=DOMAIN_MAX, help="ROS_DOMAIN_ID.")] = 0,
     router: Annotated[
-        str | None, Option(help="Where ROS's own router (rmw_zenohd) listens; the world's hub if not given.")
+        str | None, Option(help="Endpoint of ROS's own router, rmw_zenohd (default: the world's hub).")
     ] = None,
     name: Annotated[str, opt.process_option("ros2.main")] = "",
     write_package: Annotated[
-        Path | None, Option(help="Only write the ROS package zsim_msgs into this folder, for a ROS workspace.")
+        Path | None, Option(help="Write the ROS package zsim_msgs into this folder of a ROS workspace, and exit.")
     ] = None,
 ) -> None:
-    """Show the drones to ROS 2 (RMW_IMPLEMENTATION=rmw_zenoh_cpp) as topics and services, without ROS here."""
+    """Offer the drones to ROS 2 (RMW_IMPLEMENTATION=rmw_zenoh_cpp) as topics and services; needs no ROS here."""
     require("ros2", ROS2_NEEDS)
     if write_package is not None:
         from zsim_bridges.ros2.rmw_zenoh import PACKAGE
@@ -389,8 +409,8 @@ def ros2(
     from zsim_bridges.ros2.ros2_bridge import RosNetwork, serve
 
     if reach.tls and router is None:
-        why = "the world's access control lets no ROS keys pass"
-        raise BadParameter(f"--tls needs --router, the endpoint of a rmw_zenohd: {why}")
+        why = "the world's access control does not allow ROS keys"
+        raise BadParameter(f"--tls needs --router, the endpoint of an rmw_zenohd: {why}")
     who = reach.who
     to_router = who if router and is_tls(router) else Identity(host=who.host, insecure=reach.insecure)
     network = RosNetwork(domain, router, to_router)
@@ -401,40 +421,42 @@ def ros2(
 @opt.participant_options
 def serve_mavlink(
     reach: opt.WorldAccess,
-    autopilot: Annotated[Literal["px4", "ardupilot"], Option(help="Whose modes and parameters.")] = "px4",
-    gcs: Annotated[str, Option(help="The ground station, HOST:PORT.")] = f"127.0.0.1:{GCS_PORT}",
+    autopilot: Annotated[
+        Literal["px4", "ardupilot"], Option(help="Autopilot whose modes and parameters are offered.")
+    ] = "px4",
+    gcs: Annotated[str, Option(help="Ground station, HOST:PORT.")] = f"127.0.0.1:{GCS_PORT}",
     api: Annotated[
-        str | None, Option(help=f"Programs, HOST:PORT of the first; +1 each (default 127.0.0.1:{API_PORT}).")
+        str | None, Option(help=f"HOST:PORT for programs of the first drone; +1 each (default 127.0.0.1:{API_PORT}).")
     ] = None,
-    listen: Annotated[str, Option(help="Address on which the vehicles' ports are opened.")] = "127.0.0.1",
+    listen: Annotated[str, Option(help="Address to open the vehicles' ports on.")] = "127.0.0.1",
     gcs_local: Annotated[
         int | None,
-        opt.port_option(f"First port that talks with the ground station; +1 each (default {GCS_LOCAL_PORT})."),
+        opt.port_option(f"Local port of the first drone for the ground station; +1 each (default {GCS_LOCAL_PORT})."),
     ] = None,
     api_local: Annotated[
-        int | None, opt.port_option(f"First port that talks with programs; +1 each (default {API_LOCAL_PORT}).")
+        int | None, opt.port_option(f"Local port of the first drone for programs; +1 each (default {API_LOCAL_PORT}).")
     ] = None,
     first_system_id: Annotated[
-        int, Option(min=1, max=254, help="Of the first drone; +1 each. The default ports move with it.")
+        int, Option(min=1, max=254, help="System id of the first drone; +1 each. The default ports shift with it.")
     ] = 1,
     signing_key: SigningKey = None,
-    rate: PaceAsked = None,
-    telemetry: Annotated[Literal["normal", "full"], Option(help="Rates of the messages.")] = "normal",
-    protocol: Annotated[int, Option(min=1, max=2, help="Version of MAVLink that is sent; both are read.")] = 2,
+    rate: RequestedPace = None,
+    telemetry: Annotated[Literal["normal", "full"], Option(help="Message rates.")] = "normal",
+    protocol: Annotated[int, Option(min=1, max=2, help="Version of MAVLink to send; both are accepted.")] = 2,
     name: Annotated[str, opt.process_option("mavlink.main")] = "",
 ) -> None:
-    """Offer each drone as a vehicle: QGroundControl, MAVSDK, DroneKit, MAVProxy fly it."""
+    """Offer each drone as a vehicle that QGroundControl, MAVSDK, DroneKit and MAVProxy can fly."""
     from zsim_bridges.mavlink.mavlink_server import MavlinkOptions, MavlinkServer
 
-    ahead = first_system_id - 1  # PX4's simulation derives its ports from the system id, too
+    offset = first_system_id - 1  # PX4's simulation derives its ports from the system id, too
     options = MavlinkOptions(
         autopilot=autopilot,
         level=telemetry,
         listen=listen,
         gcs=_endpoint("--gcs", gcs, listen),
-        gcs_local=gcs_local or GCS_LOCAL_PORT + ahead,
-        api=_endpoint("--api", api or f"127.0.0.1:{API_PORT + ahead}", listen),
-        api_local=api_local or API_LOCAL_PORT + ahead,
+        gcs_local=gcs_local or GCS_LOCAL_PORT + offset,
+        api=_endpoint("--api", api or f"127.0.0.1:{API_PORT + offset}", listen),
+        api_local=api_local or API_LOCAL_PORT + offset,
         key=read_key(signing_key) if signing_key else None,
         version=1 if protocol == 1 else 2,
         rate=rate,
@@ -456,14 +478,14 @@ def _endpoint(option: str, text: str, listen: str) -> tuple[str, int]:
     try:
         address = gethostbyname(host)
     except (gaierror, UnicodeError) as error:
-        raise BadParameter(f"{option} is {text!r}; host {host} is not known here") from error
+        raise BadParameter(f"{option} is {text!r}; host {host} cannot be resolved") from error
     if is_loopback(listen) and not is_loopback(address):
-        raise BadParameter(f"{option} is {text!r}, which {listen} does not reach; give --listen an address")
+        raise BadParameter(f"{option} is {text!r}, which {listen} cannot reach; give --listen a non-loopback address")
     return address, int(port)
 
 
 def read_key(path: Path) -> bytes:
-    """Read a key from a file: 32 bytes, 64 hexadecimal digits, or a passphrase, of which it is the SHA-256."""
+    """Read a key from a file: 32 bytes, 64 hexadecimal digits, or a passphrase, whose SHA-256 is the key."""
     from hashlib import sha256
 
     with file_fault(path, "cannot be read", "give --signing-key a file with the key"):
@@ -485,13 +507,13 @@ def read_key(path: Path) -> bytes:
 def serve_ardrone(
     reach: opt.WorldAccess,
     addresses: Annotated[
-        str, Option(help="Address of the first drone, +1 each; or DRONE=ADDRESS,DRONE=ADDRESS.")
+        str, Option(help="Address of the first drone; +1 each; or DRONE=ADDRESS,DRONE=ADDRESS.")
     ] = FIRST_ADDRESS,
     peer: Annotated[
         list[str] | None,
-        Option(help="Host that may command drones on non-loopback addresses. Repeatable.", show_default=False),
+        Option(help="Host allowed to command drones on non-loopback addresses. Repeatable.", show_default=False),
     ] = None,
-    rate: PaceAsked = None,
+    rate: RequestedPace = None,
     name: Annotated[str, opt.process_option("ardrone.main")] = "",
 ) -> None:
     """Offer each drone as an AR.Drone 2.0 on its own address."""
@@ -512,10 +534,13 @@ driver_options = opt.option_group(
     _bounds,
     {
         "armed": (Armed, False),
-        "speed": (Annotated[float, opt.positive_option("Greatest horizontal speed, m/s.")], 2.0),
-        "climb": (Annotated[float, opt.positive_option("Greatest vertical speed, m/s.")], 1.0),
-        "radius": (Annotated[float | None, opt.positive_option("Fence about the origin of W, m.")], None),
-        "ceiling": (Annotated[float | None, opt.positive_option("Greatest height over the origin of W, m.")], None),
+        "speed": (Annotated[float, opt.positive_option("Maximum horizontal speed, m/s.")], 2.0),
+        "climb": (Annotated[float, opt.positive_option("Maximum vertical speed, m/s.")], 1.0),
+        "radius": (
+            Annotated[float | None, opt.positive_option("Radius of the fence around the origin of W, m.")],
+            None,
+        ),
+        "ceiling": (Annotated[float | None, opt.positive_option("Maximum height above the origin of W, m.")], None),
     },
 )
 
@@ -528,14 +553,16 @@ def drive_mavlink(
     bounds: "tuple[FlightLimits, bool]",
     drone: DroneName,
     address: Annotated[str, Argument(help="UDP port of the vehicle: udp://HOST:PORT.")],
-    local_port: Annotated[int, opt.port_option("UDP port here; 0 for any.", least=0)] = 0,
-    system: Annotated[int, Option(min=0, max=255, help="Its system id; 0 for the first that sends.")] = 0,
+    local_port: Annotated[int, opt.port_option("Local UDP port; 0 for any.", least=0)] = 0,
+    system: Annotated[
+        int, Option(min=0, max=255, help="System id of the vehicle; 0 for the first one that sends.")
+    ] = 0,
     signing_key: SigningKey = None,
     origin: Annotated[
-        str | None, Option(help="Origin of its local frame, X,Y,Z m in W (default: as it reports).")
+        str | None, Option(help="Origin of its local frame, X,Y,Z m in W (default: as reported).")
     ] = None,
 ) -> None:
-    """Let a MAVLink vehicle (PX4, ArduPilot, or its simulator) fly as a drone of the run."""
+    """Fly a MAVLink vehicle (PX4, ArduPilot, or a simulator of one) as a drone of the run."""
     from zsim_bridges.mavlink.autopilot_session import AutopilotSession
     from zsim_bridges.vehicle_links.driver import DriverOptions, check_host, drive, position, udp_channel
 
@@ -554,19 +581,17 @@ def drive_ardrone(
     reach: opt.WorldAccess,
     bounds: "tuple[FlightLimits, bool]",
     drone: DroneName,
-    address: Annotated[str, Argument(help="Address of the aircraft, such as 192.168.1.12.")],
-    origin: Annotated[
-        str | None, Option(help="Its position at the start, X,Y,Z m in W (default: the scenario's).")
-    ] = None,
+    address: Annotated[str, Argument(help="IP address of the aircraft, e.g. 192.168.1.12.")],
+    origin: Annotated[str | None, Option(help="Initial position, X,Y,Z m in W (default: the scenario's).")] = None,
     yaw: Annotated[
         float | None,
-        Option(callback=opt.finite, help="Its heading at the start, deg from east (default: by its magnetometer)."),
+        Option(callback=opt.finite, help="Initial heading, deg from east (default: by its magnetometer)."),
     ] = None,
     ultrasound: Annotated[
         int, Option(min=7, max=8, help="Channel of its sonar; different channels interfere less.")
     ] = 8,
 ) -> None:
-    """Let an AR.Drone 2.0 fly as a drone of the run."""
+    """Fly an AR.Drone 2.0 as a drone of the run."""
     from zsim_bridges.ardrone.aircraft_session import AircraftSession
     from zsim_bridges.vehicle_links.driver import DriverOptions, aircraft_host, check_host, drive, position
 
@@ -580,32 +605,42 @@ def drive_ardrone(
 @opt.participant_options
 def fmu(
     reach: opt.WorldAccess,
-    path: Annotated[Path, Argument(metavar="FILE", help="The FMU: FMI 2 or 3, for co-simulation. Its code is run.")],
-    drone: Annotated[str | None, Option(help="Drone of the places that name none.", show_default=False)] = None,
+    path: Annotated[Path, Argument(metavar="FILE", help="FMU for co-simulation, FMI 2 or 3. Its code is run.")],
+    drone: Annotated[str | None, Option(help="Drone of the PLACEs that name none.", show_default=False)] = None,
     map_: Annotated[
         list[str] | None,
-        Option("--map", metavar="NAME=PLACE", help="vx=velocity_m_s.0, or z=drone2/estimate.position_m.2. Repeatable."),
+        Option(
+            "--map",
+            metavar="NAME=PLACE",
+            help="Variable and its place in zsim: vx=velocity_m_s.0, z=drone2/estimate.position_m.2. Repeatable.",
+        ),
     ] = None,
     param: Annotated[
         list[str] | None, Option(metavar="NAME=VALUE", help="Start value of a parameter or an input. Repeatable.")
     ] = None,
     period: Annotated[
         float | None,
-        opt.positive_option("Communication step, s (default the FMU's, or the gate).", show_default=False),
+        opt.positive_option("Communication step, s (default: the FMU's, or the gate period).", show_default=False),
     ] = None,
     takeoff: Annotated[
         float | None,
-        Option(callback=opt.not_negative, help="When the drones that it commands take off, s; by default not by it."),
+        Option(
+            callback=opt.not_negative,
+            help="Time at which it has the drones that it commands take off, s (default: it does not).",
+        ),
     ] = None,
-    frame: Annotated[Literal["heading", "world"], Option(help="Of velocity commands.")] = "heading",
+    frame: Annotated[Literal["heading", "world"], Option(help="Frame of velocity commands.")] = "heading",
     log: Annotated[
-        bool, Option("--log", help="Print all log messages of the FMU, not only warnings and errors.")
+        bool, Option("--log", help="Print all log messages of the FMU, not just warnings and errors.")
     ] = False,
     name: Annotated[
-        str, Option(help="Process name (default fmu.DRONE, or the certificate's); controller.main replaces that one.")
+        str,
+        Option(
+            help="Process name (default fmu.DRONE, or the certificate's); controller.main replaces that controller."
+        ),
     ] = "",
 ) -> None:
-    """Let an FMU of Simulink, Modelica, Dymola or pythonfmu control drones, or estimate."""
+    """Run an FMU of Simulink, Modelica, Dymola or pythonfmu as a controller or an estimator."""
     require("fmu", FMU_NEEDS)
     from zsim_bridges.fmu.agent import Fmu
     from zsim_deploy.roles import roles
@@ -617,7 +652,7 @@ def fmu(
             raise BadParameter(f"--param is {text!r}; must be NAME=VALUE")
         params[variable] = value
     own_name = roles.process_name("fmu", name, reach.who, drone or "main")
-    made = Fmu(
+    agent = Fmu(
         path,
         drone,
         map_ or (),
@@ -629,4 +664,4 @@ def fmu(
         log=log,
         say=roles.log_printer(reach.launched),
     )
-    roles.agent(made, reach, own_name)
+    roles.agent(agent, reach, own_name)

@@ -1,9 +1,9 @@
-"""Flights on this machine, and their records.
+"""The commands for flights on this machine and their records.
 
-run       one flight                              validate  checks a scenario
-sweep     many, with different seeds and values   hunt      searches for one that breaks a requirement
+run       flies once                                  validate  checks a scenario
+sweep     flies with different seeds and values       hunt      searches for a flight that breaks a requirement
 board     compares formation laws
-report, export, replay, bundle, rerun             work on the record of a flight
+report, export, replay, bundle, rerun                 work on the record of a flight
 """
 
 import shlex
@@ -36,9 +36,9 @@ DASK_NEEDS = {**SWEEP_NEEDS, "dask": ("distributed",)}
 BUNDLE_NEEDS = {**opt.FLIGHT_NEEDS, "report": ("matplotlib", "jinja2", "packaging")}
 REPLAY_NEEDS = {"record": ("mcap", "zstandard")}
 WRITERS = {Format.CSV: "pyarrow", Format.PARQUET: "pyarrow", Format.MAT: "scipy", Format.FOXGLOVE: "foxglove"}
-BUDGET_S = 600.0  # of a hunt, if neither --budget nor --flights is given
-MOST = 3  # faults of one flight, chosen: software failures seldom need more conditions
-GATE = "a gate: an instant at which the processes meet"
+BUDGET_S = 600.0  # budget of a hunt if neither --budget nor --flights is given, wall time
+MOST = 3  # faults in one flight of a hunt; software failures seldom need more conditions
+GATE = "a gate: a time step at which the processes synchronize"
 OF_PROCESSES = ("--realtime", "--rate", "--listen", "--hosted", "--console", "--cameras", "--detect")
 OF_A_NEW_RUN = (
     *("--seed", "--duration", "--realtime", "--rate", "--set", "--out"),
@@ -60,26 +60,26 @@ def run(
     ] = None,
     insecure: opt.Insecure = False,
     hosted: Annotated[
-        bool, Option("--hosted", help="Estimators and controllers in one process: faster, the same bits.")
+        bool, Option("--hosted", help="Estimators and controllers in one process: faster, identical to the bit.")
     ] = False,
-    console: Annotated[bool, Option("--console", help="Show it in the browser, and steer it there.")] = False,
+    console: Annotated[bool, Option("--console", help="Show the run in the browser, and control it there.")] = False,
     cameras: Annotated[
         bool, Option("--cameras", help="Render the cameras; front and bottom if no drone has any.")
     ] = False,
-    detect: Annotated[bool, Option("--detect", help="Find hats in the cameras' pictures.")] = False,
+    detect: Annotated[bool, Option("--detect", help="Detect hats in the camera images.")] = False,
     agent: Annotated[
         list[str] | None,
         Option(help="An agent of your own, 'MODULE:CLASS [NAME=VALUE]...', or 'PROCESS=MODULE:CLASS …'. Repeatable."),
     ] = None,
     report: opt.Report = True,
     continue_: Annotated[
-        bool, Option("--continue", help="SCENARIO is the folder of an interrupted run, which is continued.")
+        bool, Option("--continue", help="Continue an interrupted run; SCENARIO is its folder.")
     ] = False,
     force: opt.Force = False,
     order: Annotated[str, Option(hidden=True)] = "",
     json_progress: Annotated[bool, Option("--json-progress", hidden=True)] = False,
 ) -> None:
-    """Fly a scenario: start every process, show progress, record, report."""
+    """Fly a scenario: start every process, show progress, record, and report."""
     require("run", opt.FLIGHT_NEEDS | (opt.REPORT_NEEDS if report else {}))
     from zsim.schema import plugin
     from zsim_agents.hosting import AgentSpec, check_plans, with_own_agents
@@ -89,7 +89,7 @@ def run(
     from zsim_deploy.launch.run import RunOptions, check_endpoint, check_open_files, fly, options_of, with_cameras
 
     if in_process and (useless := _given(context, OF_PROCESSES)):
-        raise BadParameter(f"--in-process is lockstep, unpaced, without Zenoh; leave out {useless}, or it")
+        raise BadParameter(f"--in-process is lockstep, unpaced and without Zenoh; leave out {useless}, or --in-process")
     if console:
         require("console", opt.CONSOLE_NEEDS)
     shown = RunConsole() if console else None
@@ -128,13 +128,13 @@ def run(
 
 
 def _given(context: typer.Context, options: Sequence[str]) -> str:
-    """Return which of some options the command line has, joined by "and"; empty if none."""
+    """Return those of `options` that the command line gives, joined by "and"; empty if none."""
     sources = {each.opts[0]: context.get_parameter_source(each.name or "") for each in context.command.params}
     return " and ".join(option for option in options if (source := sources[option]) and source.name == "COMMANDLINE")
 
 
 def conclude(outcome: Any, out: Path, report: bool) -> None:
-    """Print how a run ended, make its report, and exit with the code for it."""
+    """Print how a run ended, make its report, and exit with the matching code."""
     record, fault = out / "run.mcap", "nothing was recorded"
     if outcome.interrupted:
         note(f"ended: {outcome.reason}")
@@ -167,21 +167,21 @@ def conclude(outcome: Any, out: Path, report: bool) -> None:
 
 
 def _fault_of(complete: bool, state: str, shortfalls: "Sequence[Shortfall]") -> str:
-    """Print whether the record is complete; return its fault, or the first one of the flight; empty if none."""
+    """Print whether the record is complete; return its fault, else the first fault of the flight, else ""."""
     say(f"record: {state}{f' ({GATE})' if 'gates' in state else ''}")
     lacking = "" if complete else f"the record is {state}"
     return lacking or next((each.text for each in shortfalls if each.fails), "")
 
 
 def note_skipped(names: Sequence[str]) -> None:
-    """Print which modules named by a document were found but not imported."""
+    """Print the modules that a document names and that were found but not imported."""
     for name in names:
         note(f"note: {name} was found but not imported; --trust imports it and checks its parameters")
 
 
 @app.command(rich_help_panel=opt.RUN)
 def validate(scenario: opt.ScenarioPath, set_: opt.Set = None, trust: opt.Trust = False) -> None:
-    """Check a scenario and print it resolved; every fault is one line. Code that it names is not run."""
+    """Check a scenario and print it resolved, with one line per fault. The code that it names is not run."""
     from zsim.scenario import scenario_file
     from zsim.scenario.consistency import unflown_plans
     from zsim.schema import plugin
@@ -190,7 +190,7 @@ def validate(scenario: opt.ScenarioPath, set_: opt.Set = None, trust: opt.Trust 
     with plugin.names_only(not trust) as skipped:
         loaded = opt.load_scenario(scenario, set_)
         check_plans(loaded, scenario.name)
-    if modules := [name for name in skipped if ":" not in name]:  # they hold parameters of vehicles and sensors
+    if modules := [name for name in skipped if ":" not in name]:  # they define parameters of vehicles and sensors
         note(f"{scenario.name}: the resolved scenario is not printed because it depends on {', '.join(modules)}")
     else:
         print(printable(scenario_file.to_text(loaded)), end="", flush=True)
@@ -203,15 +203,15 @@ def validate(scenario: opt.ScenarioPath, set_: opt.Set = None, trust: opt.Trust 
 @app.command(rich_help_panel=opt.RUN)
 def report(
     directories: Annotated[
-        list[Path], Argument(metavar="DIR...", help="Folder of a run or a sweep; of several runs, to compare.")
+        list[Path], Argument(metavar="DIR...", help="Folder of a run or a sweep; several runs are compared.")
     ],
     out: Annotated[
-        Path | None, Option(help="Page that compares runs (default compare-NAMES.html beside the first).")
+        Path | None, Option(help="Page of the comparison (default compare-NAMES.html beside the first run).")
     ] = None,
     formats: opt.Formats = None,
     trust: opt.Trust = False,
 ) -> None:
-    """Make summary.json, figures and report.html of a run or a sweep; or compare several runs."""
+    """Make summary.json, figures and report.html of a run or a sweep, or compare several runs."""
     require("report", opt.REPORT_NEEDS)
     from zsim.output_folder import record_in
     from zsim.schema import plugin
@@ -240,7 +240,7 @@ def report(
 
 
 def _report(folder: Path, formats: Sequence[str] = ()) -> str:
-    """Make the report of a run or a sweep, and print its table; return the fault of a run as `_fault_of`."""
+    """Make the report of a run or a sweep, and print its table; return the fault of a run as `_fault_of` does."""
     from zsim.runtime.progress import PipedConsole
     from zsim_analysis.sweep.design import is_sweep
 
@@ -266,7 +266,7 @@ def _report(folder: Path, formats: Sequence[str] = ()) -> str:
 def sweep(
     scenario: opt.ScenarioPath,
     runs: Annotated[
-        int | None, Option(min=1, help="How many runs (default: one per combination).", show_default=False)
+        int | None, Option(min=1, help="Number of runs (default: one per combination).", show_default=False)
     ] = None,
     vary: Annotated[
         list[str] | None,
@@ -281,15 +281,15 @@ def sweep(
         Path | None, Option(help="Folder (default runs/NAME-sweep-TIME); an unfinished one is continued.")
     ] = None,
     workers: opt.Workers = None,
-    dask: Annotated[str | None, Option(help="Scheduler of a Dask cluster that flies the runs instead.")] = None,
+    dask: Annotated[str | None, Option(help="Address of a Dask scheduler; its cluster flies the runs.")] = None,
     keep_records: Annotated[bool, Option("--keep-records", help="Keep the record of every run.")] = False,
     report: opt.Report = True,
-    force: Annotated[bool, Option("--force", help="Sweep into a folder that holds other files, too.")] = False,
+    force: Annotated[bool, Option("--force", help="Accept a folder with other files.")] = False,
 ) -> None:
-    """Fly a scenario many times with different seeds and values of its fields: one table, one report."""
+    """Fly a scenario many times with different seeds and field values; make one table and one report."""
     if dask is not None and (keep_records or workers is not None):
         useless = "--keep-records" if keep_records else "--workers"
-        raise BadParameter(f"{useless} is for processes of this host; leave it out, or --dask")
+        raise BadParameter(f"{useless} is for processes on this host; leave it out, or --dask")
     require("sweep", SWEEP_NEEDS if dask is None else DASK_NEEDS)
     from rich.console import Console
 
@@ -313,16 +313,16 @@ def sweep(
 
 
 def _conclude(folder: Path, failures: list[str], runs: int, report: bool, short: Sequence[str] = ()) -> None:
-    """Make the report, and fail if a run did not end well, or none followed its plan."""
+    """Make the report; fail if a run failed, or no run was flown as planned."""
     if report:
         _report(folder)
     say(f"table: {folder / 'sweep.parquet'}")
     if len(failures) == runs:
-        raise failed(f"none of {runs} runs ended well: {failures[0]}")
+        raise failed(f"all {runs} runs failed: {failures[0]}")
     if failures:
         raise failed(f"{len(failures)} of {runs} runs failed: {failures[0]}")
     if len(failures) + len(short) == runs:
-        raise failed(f"none of {runs} runs was flown as planned: {short[0]}")
+        raise failed(f"none of the {runs} runs was flown as planned: {short[0]}")
 
 
 @app.command(rich_help_panel=opt.RUN)
@@ -336,11 +336,11 @@ def export(
     to: opt.To = None,
     out: Annotated[
         Path | None,
-        Option(help="Where (default DIR/csv, DIR/parquet, DIR/run.mat, DIR/foxglove.mcap).", show_default=False),
+        Option(help="Output (default DIR/csv, DIR/parquet, DIR/run.mat, DIR/foxglove.mcap).", show_default=False),
     ] = None,
     force: Annotated[bool, Option("--force", help="Replace an earlier export.")] = False,
     by_name: Annotated[
-        bool, Option("--by-name", help="One table per drone, cluster and process, each ordered by time.")
+        bool, Option("--by-name", help="One table per drone, cluster and process, each in order of time.")
     ] = False,
     trust: opt.Trust = False,
 ) -> None:
@@ -384,24 +384,25 @@ def replay(
     who: "Identity",
     directory: opt.Recorded,
     rate: Annotated[
-        float, Option(callback=opt.between(0, RATE_MAX), help="Simulated per wall second; 0 = as fast as possible.")
+        float,
+        Option(callback=opt.between(0, RATE_MAX), help="Simulated seconds per wall second; 0 for as fast as possible."),
     ] = 1.0,
     from_: opt.From = 0.0,
     to: opt.To = None,
     keys: opt.Keys = None,
     expect: Annotated[
         list[str] | None,
-        Option(help="Begin when this process has joined, e.g. estimator.drone1, console.1. Repeatable."),
+        Option(help="Wait for this process to join, e.g. estimator.drone1, console.1. Repeatable."),
     ] = None,
-    paused: Annotated[bool, Option("--paused", help="Pause at the first instant until asked to resume.")] = False,
+    paused: Annotated[bool, Option("--paused", help="Start paused, until resumed on request.")] = False,
     console: Annotated[
-        bool, Option("--console", help="Show it in the browser, with a timeline; pause at its end.")
+        bool, Option("--console", help="Show the replay in the browser, with a timeline; pause at the end.")
     ] = False,
     listen: opt.Listen = None,
-    federation: Annotated[str | None, Option(help="Name of the federation (default the record's).")] = None,
+    federation: Annotated[str | None, Option(help="Name of the federation (default: the record's).")] = None,
     trust: opt.Trust = False,
 ) -> None:
-    """Play a record back onto the keys, for a console, an estimator under test or any client; it takes no commands."""
+    """Play a record back onto its keys, for a console, an estimator under test or any client; commands are refused."""
     require("replay", REPLAY_NEEDS)
     if console:
         require("console", opt.CONSOLE_NEEDS)
@@ -424,15 +425,16 @@ def replay(
 def bundle(
     run: opt.Recorded,
     out: Annotated[
-        Path | None, Option("--out", "-o", help="File (default NAME.zsim of the scenario).", show_default=False)
+        Path | None,
+        Option("--out", "-o", help="File to write (default NAME.zsim, by the scenario's name).", show_default=False),
     ] = None,
     no_record: Annotated[
-        bool, Option("--no-record", help="Omit the record: much smaller, but differences are known only by gate.")
+        bool, Option("--no-record", help="Omit the record: much smaller, but differences are located only to the gate.")
     ] = False,
     force: Annotated[bool, Option("--force", help="Replace the file.")] = False,
     trust: opt.Trust = False,
 ) -> None:
-    """Pack a flight into one file, with all that is needed to fly it again on another machine."""
+    """Pack a flight into one file, with everything needed to fly it again on another machine."""
     require("bundle", BUNDLE_NEEDS)
     from zsim.schema import plugin
     from zsim_analysis.bundle.bundle_file import SUFFIX
@@ -453,23 +455,23 @@ def rerun(
         Path, Argument(metavar="DIR|BUNDLE", help="Folder of a run, its run.mcap, or a bundle.", show_default=False)
     ],
     commands_only: Annotated[
-        bool, Option("--commands-only", help="Feed the world all recorded commands; run no agents.")
+        bool, Option("--commands-only", help="Run no agents; feed all recorded commands to the world.")
     ] = False,
     trust: opt.Trust = False,
     install: Annotated[
-        bool, Option("--install", help="For a bundle: fly it in a new environment with its package versions.")
+        bool, Option("--install", help="For a bundle: fly in a new environment with the bundle's package versions.")
     ] = False,
     python: Annotated[
-        Path | None, Option("--python", help="Python of that environment (default: this one).", show_default=False)
+        Path | None, Option("--python", help="Python for that environment (default: this one).", show_default=False)
     ] = None,
 ) -> None:
-    """Fly the run of a record or a bundle again, and print whether it is identical; exit code 0 or 1."""
+    """Fly a recorded or bundled run again, and print whether it is identical (exit code 0) or not (1)."""
     require("rerun", opt.FLIGHT_NEEDS)
     from zsim.schema import plugin
     from zsim_analysis.bundle.bundle_file import is_bundle
 
-    is_one = is_bundle(place)
-    if (install or python) and not is_one:
+    from_bundle = is_bundle(place)
+    if (install or python) and not from_bundle:
         raise BadParameter(f"--install is for a bundle, and {place} is not one; leave it out")
     if python and not install:
         raise BadParameter("--python is for the environment that --install makes; leave it out, or give --install")
@@ -478,7 +480,7 @@ def rerun(
             from zsim_deploy.environment import rerun_in_environment
 
             raise typer.Exit(rerun_in_environment(place, python, commands_only, trust, note))
-        if is_one:
+        if from_bundle:
             require("rerun", BUNDLE_NEEDS)
             from zsim_analysis.bundle.bundle_rerun import rerun_bundle
 
@@ -496,21 +498,21 @@ def hunt(
     scenario: opt.ScenarioPath,
     require_: Annotated[
         list[str] | None,
-        Option("--require", help="What must hold: 'min_separation_m > 1.5', or module:function. Repeatable."),
+        Option("--require", help="Requirement: 'min_separation_m > 1.5', or module:function. Repeatable."),
     ] = None,
-    budget: Annotated[str | None, Option(help="Wall time of the search, as 90s or 10min (default 10min).")] = None,
-    flights: Annotated[int | None, Option(min=1, max=10**9, help="Flights of the search.", show_default=False)] = None,
+    budget: Annotated[str | None, Option(help="Wall time of the search, e.g. 90s (default 10min).")] = None,
+    flights: Annotated[int | None, Option(min=1, max=10**9, help="Number of flights.", show_default=False)] = None,
     fault: Annotated[
         list[str] | None,
-        Option(help="A kind to draw, and its ranges: 'gust velocity_m_s=1..6' (default all). Repeatable."),
+        Option(help="Kind of fault to draw, and its ranges: 'gust velocity_m_s=1..6' (default: all). Repeatable."),
     ] = None,
-    without: Annotated[list[str] | None, Option(help="A kind not to draw. Repeatable.")] = None,
-    most: Annotated[int, Option(min=0, max=6, help="Faults in one flight.")] = MOST,
+    without: Annotated[list[str] | None, Option(help="Kind of fault not to draw. Repeatable.")] = None,
+    most: Annotated[int, Option(min=0, max=6, help="Maximum number of faults in one flight.")] = MOST,
     vary: Annotated[
         list[str] | None,
-        Option(help="a.b.c=uniform(low,high), … as of a sweep (default wind.gust_m_s=uniform(0,2)). Repeatable."),
+        Option(help="a.b.c=uniform(low,high), … as for a sweep (default wind.gust_m_s=uniform(0,2)). Repeatable."),
     ] = None,
-    draws: Annotated[int, Option("--draws", min=0, max=2**62, help="Seed of the draws.")] = 1,
+    draws: Annotated[int, Option("--draws", min=0, max=2**62, help="Seed for drawing flights.")] = 1,
     set_: opt.Set = None,
     seed: opt.Seed = None,
     duration: opt.Duration = None,
@@ -578,27 +580,31 @@ def hunt(
 def board(
     laws: Annotated[
         str | None,
-        Option(help="Names with commas, or package.module:Class of your own (default all).", show_default=False),
+        Option(
+            help="Names separated by commas, or package.module:Class of your own (default all).", show_default=False
+        ),
     ] = None,
-    scenarios: Annotated[str | None, Option(help="Names with commas (default all).", show_default=False)] = None,
-    seeds: Annotated[int, Option(min=1, max=1000, help="Flights of each law in each scenario.")] = 3,
+    scenarios: Annotated[
+        str | None, Option(help="Names separated by commas (default all).", show_default=False)
+    ] = None,
+    seeds: Annotated[int, Option(min=1, max=1000, help="Number of flights of each law in each scenario.")] = 3,
     out: Annotated[
         Path | None, Option("--out", "-o", help="Folder (default runs/board-TIME); an unfinished one is continued.")
     ] = None,
     workers: opt.Workers = None,
     formats: opt.Formats = None,
-    force: Annotated[bool, Option("--force", help="Use a folder that holds other files, too.")] = False,
+    force: Annotated[bool, Option("--force", help="Accept a folder with other files.")] = False,
     papers: Annotated[
-        bool, Option("--papers", help="Instead of flying, reproduce figures of the laws' papers and compare numbers.")
+        bool, Option("--papers", help="Fly nothing; reproduce figures of the laws' papers and compare the numbers.")
     ] = False,
 ) -> None:
-    """Fly formation laws in the same scenarios with the same seeds and sensors: one table, with figures."""
+    """Fly formation laws in the same scenarios with the same seeds and sensors; make a table and figures."""
     require("sweep", SWEEP_NEEDS)
     from zsim.runtime.progress import PipedConsole
 
     if papers:
         if laws or scenarios or formats:
-            raise BadParameter("--papers flies no law in a scenario; leave --laws, --scenarios and --format out")
+            raise BadParameter("--papers flies no scenario; leave out --laws, --scenarios and --format")
         from zsim_analysis.board.papers import terminal_table, write_papers
 
         place = out or Path("runs") / "papers"

@@ -1,4 +1,4 @@
-"""A run on several hosts: installed by `zsim push`, checked by `zsim doctor`, started, watched and fetched over ssh.
+"""Runs on several hosts: zsim is installed and the hosts are checked, then a run is started and supervised over ssh.
 
 `host_link` reaches the hosts; `probe` and `on_host` run there. Imports launch, roles, certificates, inventory.
 """

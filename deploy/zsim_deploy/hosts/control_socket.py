@@ -1,6 +1,6 @@
-"""How `zsim ps`, `logs`, `restart`, `move` and `down` reach the launcher that runs on this machine: a local socket.
+"""The local socket by which `zsim ps`, `logs`, `restart`, `move` and `down` reach the launcher on this machine.
 
-One request and one answer per connection, a JSON line each: {op, args} and {ok, error, result}.
+A connection carries one request and one answer, a JSON line each: {op, args} and {ok, error, result}.
 """
 
 import contextlib
@@ -20,31 +20,37 @@ from zsim.errors import RunError, ZsimError, file_fault
 from zsim.output_folder import no_locks, take_lock
 from zsim_deploy.arguments import note
 
-REQUEST_S = 5.0  # from the same machine
-ANSWER_S = 150.0  # a move connects to a host, checks it, and copies a certificate: 135 s at most
-LINE_MAX = 1_000_000  # bytes
-PATH_MAX = 107  # bytes of a socket's path, without the final zero; unix(7). On macOS 103, and its error says so
+REQUEST_S = 5.0  # wall time for a request to arrive, from the same machine
+ANSWER_S = 150.0  # wall time for an answer; a move, with a connection, checks and a copy, takes 135 s at most
+LINE_MAX = 1_000_000  # length of a request, bytes
+PATH_MAX = 107  # length of a socket's path on Linux without the final zero, bytes; unix(7). macOS reports its own 103
 
 Act = Callable[..., Any]
 
 
 def place(federation: str) -> Path:
-    """Return the socket of a federation's launcher; only its user may connect. RunError on Windows."""
+    """Return the path of the socket of a federation's launcher, to which only its user can connect.
+
+    RunError on Windows, which has no such sockets.
+    """
     if not hasattr(socket, "AF_UNIX") or not hasattr(os, "getuid"):
-        raise RunError("launchers are reached by Unix sockets with owners, which this system lacks; use Linux or WSL")
+        raise RunError("launchers are reached through Unix sockets, which this system lacks; use Linux or WSL")
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     folder = Path(runtime) / "zsim" if runtime else Path(tempfile.gettempdir()) / f"zsim-{os.getuid()}"
     return folder / f"{federation}.sock"
 
 
 def launchers() -> list[str]:
-    """Return the names of this user's launchers on this machine; remove the sockets of killed ones."""
+    """Return the names of this user's launchers on this machine: FEDERATION of `zsim up`, FEDERATION@PID of `zsim run`.
+
+    The sockets of killed launchers of `zsim run` are removed.
+    """
     found = []
     for path in sorted(place("").parent.glob("*.sock")):
         _, is_of_run, pid = path.stem.partition("@")
         try:
             if is_of_run:
-                os.kill(int(pid), 0)  # fails if there is no such process
+                os.kill(int(pid), 0)  # raises if there is no such process
             found.append(path.stem)
         except (OSError, ValueError):
             path.unlink(missing_ok=True)
@@ -53,7 +59,10 @@ def launchers() -> list[str]:
 
 
 def ask(federation: str, op: str, **args: Any) -> Any:
-    """Send a request to a federation's launcher on this machine; RunError if none runs, answers or accepts it."""
+    """Send a request to a federation's launcher on this machine, and return the result.
+
+    RunError if no launcher runs, or it does not answer, or refuses the request.
+    """
     path = place(federation)
     with socket.socket(socket.AF_UNIX) as line:
         line.settimeout(ANSWER_S)
@@ -77,41 +86,44 @@ def ask(federation: str, op: str, **args: Any) -> Any:
 
 @contextlib.contextmanager
 def seen_by_ps(federation: str, status: Callable[[], dict[str, Any]]) -> Iterator[None]:
-    """Show a run of this process in `zsim ps` for the duration of the block, if this machine allows a socket."""
+    """Show a run of this process in `zsim ps` for the duration of the block, if a socket can be opened."""
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(RunError):
-            name = f"{federation}@{os.getpid()}"  # there may be several of a federation
+            name = f"{federation}@{os.getpid()}"  # a federation may have several runs
             stack.enter_context(ControlSocket(name, {"ps": status}))
         yield
 
 
 class ControlSocket:
-    """The launcher's end. RunError if another launcher of the federation runs here, or no socket can be opened.
+    """The launcher's end of the socket, a context.
 
     Args:
-        acts: by name; each is called in a thread, with the request's arguments, and returns a JSON value.
+        acts: function for each `op`; called in a thread with the request's arguments, it returns a JSON value.
+
+    Raises:
+        RunError: another launcher of the federation runs here, or no socket can be opened.
     """
 
     def __init__(self, federation: str, acts: dict[str, Act]) -> None:
         self._acts = acts
         self._path = path = place(federation)
-        with file_fault(path.parent, "cannot be made", "set XDG_RUNTIME_DIR to a folder of yours"):
+        with file_fault(path.parent, "cannot be created", "set XDG_RUNTIME_DIR to a folder of yours"):
             path.parent.mkdir(mode=0o700, exist_ok=True)
         _refuse_if_foreign(path.parent)
-        lock = path.with_suffix(".lock")  # held for as long as the launcher lives, however it ends
-        with file_fault(lock, "cannot be made", "set XDG_RUNTIME_DIR to another folder"):
+        lock = path.with_suffix(".lock")  # held while the launcher lives, and released however it ends
+        with file_fault(lock, "cannot be created", "set XDG_RUNTIME_DIR to another folder"):
             self._lock = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         if not take_lock(self._lock):
             os.close(self._lock)
             raise RunError(
-                f"federation {federation!r} is up already on this machine; end it with "
+                f"federation {federation!r} is already up on this machine; end it with "
                 f"`zsim down --federation {federation}`, or fly in another one: --set federation=NAME"
             )
-        if "@" not in path.stem and (warning := no_locks(path.parent)):  # the name of a single run is unique
+        if "@" not in path.stem and (warning := no_locks(path.parent)):  # the name of a `zsim run` is unique
             note(warning)
         self._socket = socket.socket(socket.AF_UNIX)
         try:
-            path.unlink(missing_ok=True)  # of a launcher that was killed: its lock is ours
+            path.unlink(missing_ok=True)  # left by a killed launcher, since we hold its lock
             self._socket.bind(str(path))
             self._socket.listen()
         except OSError as error:
@@ -119,7 +131,7 @@ class ControlSocket:
             os.close(self._lock)
             is_long = len(os.fsencode(path)) > PATH_MAX
             why = f"the path is longer than {PATH_MAX} bytes; set XDG_RUNTIME_DIR or TMPDIR to a shorter one"
-            raise RunError(f"{path}: cannot listen there ({why if is_long else error.strerror or error})") from error
+            raise RunError(f"{path}: cannot listen on it ({why if is_long else error.strerror or error})") from error
         self._thread = threading.Thread(target=self._serve, name="control socket", daemon=True)
         self._thread.start()
 
@@ -142,8 +154,8 @@ class ControlSocket:
                 act, args = self._acts[request["op"]], request.get("args", {})
                 inspect.signature(act).bind(**args)
             except (ValueError, KeyError, TypeError) as error:
-                other = "is `zsim up` of another version?"
-                answer["error"] = f"it is not a request of zsim {__version__} ({error}); {other}"
+                remedy = "use the version of zsim that runs `zsim up`"
+                answer["error"] = f"it is not a request of zsim {__version__} ({error}); {remedy}"
             else:
                 try:
                     answer = {"ok": True, "result": act(**args)}
@@ -160,7 +172,7 @@ class ControlSocket:
         self._path.unlink(missing_ok=True)
         self._thread.join(1.0)
         os.close(self._lock)
-        if "@" in self._path.stem:  # of a single run: no other launcher uses its lock
+        if "@" in self._path.stem:  # the lock of a `zsim run`, which no other launcher uses
             self._path.with_suffix(".lock").unlink(missing_ok=True)
 
     def __enter__(self) -> "ControlSocket":
@@ -171,10 +183,10 @@ class ControlSocket:
 
 
 def _refuse_if_foreign(folder: Path) -> None:
-    """Refuse a folder in which another user could listen instead of us."""
+    """Raise RunError for a folder in which another user could open a socket in our place."""
     status = folder.lstat()
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
         raise RunError(
             f"{folder}: is not your private folder (owner {status.st_uid}, mode {status.st_mode & 0o777:o}); "
-            f"must belong to user {os.getuid()} with mode 700; remove it, or set XDG_RUNTIME_DIR to a folder of yours"
+            f"must belong to user {os.getuid()}, with mode 700; remove it, or set XDG_RUNTIME_DIR to a folder of yours"
         )

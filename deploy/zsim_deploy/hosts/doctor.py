@@ -1,6 +1,6 @@
-"""`zsim doctor`: check whether the hosts of an inventory can fly together, without starting a run.
+"""`zsim doctor`: checks whether the hosts of an inventory can fly together, without starting a run.
 
-`zsim up` makes the same checks, and tries the ports of the run.
+`zsim up` makes the same checks, and also checks whether the ports of the run are free.
 """
 
 import asyncio
@@ -31,19 +31,19 @@ from zsim_deploy.hosts.host_link import (
 from zsim_deploy.inventory import SSH_PORT, Host, InventoryFile
 from zsim_deploy.roles.stop_channel import FOLDER
 
-CLOCK_OFFSET_MAX_S = 1.0  # certificates are back-dated by a day and logs are compared; time on the wire is simulated
-LOAD_MAX = 0.5  # share of the cores; a busy host slows all the others in lockstep
-FREE_MIN_BYTES = 1_000_000_000  # about the record of an hour with three drones
-BITS_PER_S_MIN = 10e6  # three drones in realtime send 2 Mbit/s to a recorder; lockstep goes as fast as the link
-PERFORMANCE = {"performance"}
-ABOUT_S = 20.0  # wall time to answer; a small computer takes 5 s to import numpy
-READY_S = 20.0  # wall time to listen, which includes importing numpy
+CLOCK_OFFSET_MAX_S = 1.0  # enough to compare logs; certificates are back-dated by a day, messages carry simulated time
+LOAD_MAX = 0.5  # load average per core; in lockstep a busy host slows down all others
+FREE_MIN_BYTES = 1_000_000_000  # about the size of a record of an hour with three drones
+BITS_PER_S_MIN = 10e6  # three drones in realtime send 2 Mbit/s to a recorder; lockstep runs as fast as the link allows
+PERFORMANCE = {"performance"}  # CPU governors that cause no warning
+ABOUT_S = 20.0  # wall time for a probe to report; a small computer takes 5 s to import numpy
+READY_S = 20.0  # wall time for a probe to listen, which includes importing numpy
 REACH_S = 60.0  # wall time to measure a path; 9 pings and at most 9 bulk transfers take 40 s at a round trip of 2 s
-NO_MODULE = "no module named"  # in Python's error, in lower case
-NO_PROGRAM = ("not found", "no such file")  # in the errors of shells, in lower case …
-NO_PROGRAM_CODES = (126, 127)  # … and their exit codes; POSIX, 2.8.2
-NEEDED_TO_COMPUTE = "scipy"  # needed by world and agents; a router or a recorder runs without it
-OFFSET_ASKS = 3  # the answer with the shortest round trip gives the best estimate of the clock offset
+NO_MODULE = "no module named"  # part of Python's error, in lower case
+NO_PROGRAM = ("not found", "no such file")  # parts of shells' errors on a missing program, in lower case
+NO_PROGRAM_CODES = (126, 127)  # shells' exit codes for a missing program; POSIX, 2.8.2
+NEEDED_TO_COMPUTE = "scipy"  # a host without it runs only routers and recorders; world and agents need it
+OFFSET_SAMPLES = 3  # the one with the shortest round trip gives the best estimate of the clock offset
 HOST_COLUMNS = (
     Column("host", "name"),
     Column("python", worth=3),
@@ -62,8 +62,8 @@ PATH_COLUMNS = (
     Column("round trip", "text"),
     Column("bandwidth", worth=1, right=True),
 )
-RUNS = "runs"  # below the folder of zsim on a host: a folder per run
-# A run whose processes are still running is not listed; without ps all are.
+RUNS = "runs"  # folder below that of zsim on a host, with a folder per run
+# A run whose processes are still alive is not listed; without ps, all runs are.
 LIST_RUNS = f"""
 alive=$(ps -A -ww -o args 2>/dev/null || ps -A -o args 2>/dev/null)
 for run in *; do
@@ -73,22 +73,23 @@ for run in *; do
 done
 true
 """
-# Run by the host's Python: `- ADDRESS PORT...`. Other faults of a port are in the log of the process that uses it.
+# Program for the host's Python, run as `python - ADDRESS PORT...`. It reports only ports in use; the log of a process
+# has any other fault of its port.
 TRY_PORTS = """
 import errno, json, socket, sys
 address, taken = sys.argv[1], []
 for port in map(int, sys.argv[2:]):
-    family, kind, _, _, place = socket.getaddrinfo(address, port, type=socket.SOCK_STREAM)[0]
+    family, kind, _, _, target = socket.getaddrinfo(address, port, type=socket.SOCK_STREAM)[0]
     with socket.socket(family, kind) as tried:
         tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            tried.bind(place)
+            tried.bind(target)
             tried.listen()
         except OSError as error:
             taken += [port] if error.errno == errno.EADDRINUSE else []
 print(json.dumps({"taken": taken}))
 """
-TRY_PORTS_S = 20.0  # wall time to start Python on a small computer
+TRY_PORTS_S = 20.0  # wall time for TRY_PORTS, enough to start Python on a small computer
 
 
 class HostReport(NamedTuple):
@@ -96,19 +97,19 @@ class HostReport(NamedTuple):
 
     facts: dict[str, Any]
     round_trip_s: float
-    clock_offset_s: float  # its wall clock minus ours, accurate to half the round trip
-    remedy: str = "run `zsim push --hosts FILE`"  # how another zsim is installed there
+    clock_offset_s: float  # the host's wall clock minus that of this machine, accurate to half the round trip
+    remedy: str = "run `zsim push --hosts FILE`"  # how to install another zsim there
 
 
 class NetworkPath(NamedTuple):
     source: str
     target: str
     port: int
-    figures: dict[str, Any]
+    measured: dict[str, Any]  # answer of `probe reach`: round_trip_s, bits_per_s; or error
 
 
 class CheckResult(NamedTuple):
-    """Tables on the hosts, and their faults and warnings, a line each."""
+    """Tables on the hosts and the network paths; faults and warnings, one line each."""
 
     tables: list[FittedTable]
     faults: list[str]
@@ -116,21 +117,24 @@ class CheckResult(NamedTuple):
 
 
 def check_hosts(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
-    """Check certificates and hosts; with a placement also the network paths to the world and the routers."""
+    """Check the certificates and the hosts; with a placement, also the network paths to the world and the routers.
+
+    `places`: host of each process; None: no network paths.
+    """
 
     async def check() -> tuple[list[FittedTable], list[str], list[str]]:
         links = {name: HostLink(name, host, placed.folder) for name, host in placed.inventory.hosts.items()}
         pythons = {name: inv.python(host) for name, host in placed.inventory.hosts.items()}
         try:
-            asked = (host_report(link, pythons[name], placed.word) for name, link in links.items())
-            results = await asyncio.gather(*asked, return_exceptions=True)
+            work = (host_report(link, pythons[name], placed.word) for name, link in links.items())
+            results = await asyncio.gather(*work, return_exceptions=True)
             reports = {name: each for name, each in zip(links, results, strict=True) if isinstance(each, HostReport)}
             for result in results:
                 if isinstance(result, BaseException) and not isinstance(result, ZsimError):
                     raise result
             faults = [str(result) for result in results if isinstance(result, ZsimError)]
             wrong, warnings = compare_reports(reports)
-            paths: list[NetworkPath] = []  # one after the other
+            paths: list[NetworkPath] = []  # measured one after another
             for (target, port), sources in inv.connections(placed, places).items() if places else ():
                 if target in reports:
                     chosen = [links[name] for name in sorted(sources & set(reports))]
@@ -150,14 +154,17 @@ def check_hosts(placed: InventoryFile, places: dict[str, str] | None) -> CheckRe
 
 
 async def host_report(link: HostLink, python: str, hosts: str = "FILE") -> HostReport:
-    """Ask a host about itself; HostsError if it has no zsim or cannot be reached. `hosts`: the inventory's path."""
-    push = f"run `zsim push --hosts {hosts}`"  # has no effect on a host with a `python` of its own
+    """Run a probe on a host; HostsError if the host has no zsim or cannot be reached.
+
+    `python`: its interpreter; `hosts`: path of the inventory, for remedies.
+    """
+    push = f"run `zsim push --hosts {hosts}`"  # without effect on a host with a `python` of its own
     remedy = f"install it there, or leave hosts.{link.name}.python out and {push}" if link.host.python else push
-    answers: list[tuple[float, float]] = []  # round trip of a line and the clock's offset, in seconds
+    answers: list[tuple[float, float]] = []  # round trip of a line, and the clock offset, s
     try:
         async with _probe(link, python, "about", link.host.folder) as there:
             facts = await there.answer(ABOUT_S)
-            for _ in range(OFFSET_ASKS):
+            for _ in range(OFFSET_SAMPLES):
                 start_s, sent_s = time.time(), time.monotonic()
                 there.send("\n")
                 there_s = (await there.answer(ABOUT_S))["time_ns"] / 1e9
@@ -184,20 +191,20 @@ def _probe(link: HostLink, python: str, *words: str) -> AbstractAsyncContextMana
 
 
 def compare_reports(reports: dict[str, HostReport]) -> tuple[list[str], list[str]]:
-    """Return faults that keep the hosts from flying together, and warnings, a line each."""
+    """Return the faults that keep hosts from flying together, and warnings, one line each."""
     faults, warnings = [], []
     for name, report in reports.items():
         facts = report.facts
         if facts["zsim"] != __version__:
             faults.append(f"{name}: zsim is {facts['zsim']}; must be {__version__} as here; {report.remedy}")
         if why := facts["unwritable"]:
-            remedy = f"correct hosts.{name}.folder, or make it there"
+            remedy = f"correct hosts.{name}.folder, or create the folder there"
             faults.append(f"{name}: its folder cannot be used ({why}); {remedy}")
         if abs(report.clock_offset_s) > CLOCK_OFFSET_MAX_S + report.round_trip_s:
             warnings.append(f"{name}: its clock is {report.clock_offset_s:+.1f} s off; set it with chrony or ntp")
         if facts["load"] > LOAD_MAX * facts["cores"]:
             load = f"load is {facts['load']:.1f} on {facts['cores']} cores"
-            warnings.append(f"{name}: {load}; lockstep goes at the pace of the slowest")
+            warnings.append(f"{name}: {load}; lockstep runs at the pace of the slowest host")
         if slow := set(facts["governors"]) - PERFORMANCE:
             governors = f"the CPU governor is {', '.join(sorted(slow))}"
             warnings.append(f"{name}: {governors}; performance is steadier (cpupower frequency-set)")
@@ -209,7 +216,7 @@ def compare_reports(reports: dict[str, HostReport]) -> tuple[list[str], list[str
 
 
 def _different_fingerprints(reports: dict[str, HostReport]) -> Iterator[str]:
-    """Yield a warning if fingerprints differ, with the parts that differ."""
+    """Yield a warning if the fingerprints differ, with the parts that cause it."""
     prints = {name: report.facts["fingerprint"] for name, report in reports.items()}
     if len(set(prints.values())) < 2:
         return
@@ -219,11 +226,11 @@ def _different_fingerprints(reports: dict[str, HostReport]) -> Iterator[str]:
     differing = [part for part in names if len({each.get(part) for each in parts.values()}) > 1]
     values = {part: [f"{name} {each.get(part, 'none')}" for name, each in parts.items()] for part in differing}
     causes = "; ".join(f"{part}: {', '.join(found)}" for part, found in values.items())
-    yield f"the hosts have different code, so the same bits are not promised (fingerprints {shown}); {causes}"
+    yield f"the hosts have different code, so identical results are not guaranteed (fingerprints {shown}); {causes}"
 
 
 def _lacking(reports: dict[str, HostReport]) -> Iterator[str]:
-    """Yield a warning for each host that lacks a package other hosts compute with: it is slower, with the same bits."""
+    """Yield a warning for each host that lacks a package with which others compute: slower, but with the same bits."""
     for name, report in reports.items():
         others = {part for each in reports.values() for part in each.facts["machine"]}
         if lacking := " and ".join(sorted(others - set(report.facts["machine"]))):
@@ -242,7 +249,7 @@ def hosts_table(reports: Mapping[str, HostReport]) -> FittedTable:
 async def network_paths(
     links: Sequence[HostLink], target: HostLink, python: dict[str, str], port: int
 ) -> list[NetworkPath]:
-    """Measure how hosts reach a port of another host; no other program may listen on it."""
+    """Measure the network paths from hosts to a port of another host, on which no other program may listen."""
 
     async def reach(link: HostLink) -> dict[str, Any]:
         try:
@@ -262,18 +269,18 @@ async def network_paths(
 
 
 def path_faults(paths: Sequence[NetworkPath]) -> tuple[list[str], list[str]]:
-    """Return a line for each path that is blocked, and for each that is slow."""
+    """Return a fault for each blocked path and a warning for each slow one, one line each."""
     faults, slow = [], []
     for path in paths:
-        why, taken = path.figures.get("error"), path.figures.get("taken")
+        why, taken = path.measured.get("error"), path.measured.get("taken")
         if why is None:
-            if path.figures["bits_per_s"] < BITS_PER_S_MIN:
-                shown = f"{path.figures['bits_per_s'] / 1e6:.1f} Mbit/s"
+            if path.measured["bits_per_s"] < BITS_PER_S_MIN:
+                shown = f"{path.measured['bits_per_s'] / 1e6:.1f} Mbit/s"
                 slow.append(f"{path.source} reaches {path.target} at only {shown}")
         elif taken:
             faults.append(port_in_use(path.target, path.port))
         elif taken is False:
-            fault = f"port {path.port} there cannot be listened on ({why}); give another port in the inventory"
+            fault = f"cannot listen on port {path.port} there ({why}); give another port in the inventory"
             faults.append(f"{path.target}: {fault}")
         else:
             fault = f"port {path.port} of {path.target} cannot be reached ({why}); is it open in the firewall?"
@@ -284,9 +291,9 @@ def path_faults(paths: Sequence[NetworkPath]) -> tuple[list[str], list[str]]:
 def paths_table(paths: Sequence[NetworkPath]) -> FittedTable:
     rows = []
     for path in paths:
-        figures, cells = path.figures, (path.figures.get("error", ""), "-")
-        if "error" not in figures:
-            cells = (f"{1e3 * figures['round_trip_s']:.2f} ms", f"{figures['bits_per_s'] / 1e6:.0f} Mbit/s")
+        measured, cells = path.measured, (path.measured.get("error", ""), "-")
+        if "error" not in measured:
+            cells = (f"{1e3 * measured['round_trip_s']:.2f} ms", f"{measured['bits_per_s'] / 1e6:.0f} Mbit/s")
         rows.append((path.source, path.target, str(path.port), *cells))
     return FittedTable(PATH_COLUMNS, rows)
 
@@ -297,9 +304,9 @@ def runs_folder(host: Host) -> str:
 
 
 async def leftovers(link: HostLink, base: Path) -> list[str]:
-    """Describe the leftovers of earlier runs on a host: at most a line on records, and one on private keys.
+    """Describe what earlier runs have left on a host: at most one line on records, and one on private keys.
 
-    A greeting of the login shell is skipped. HostsError if the host cannot be asked.
+    A greeting of the login shell is skipped. HostsError if the host cannot be reached.
     """
     name, folder = link.name, runs_folder(link.host)
     script = f"cd {shell_word(folder)} 2>/dev/null || exit 0{LIST_RUNS}"
@@ -333,7 +340,7 @@ def scp(host: Host, base: Path, path: str) -> str:
 
 
 async def port_faults(link: HostLink, python: str, ports: Sequence[int]) -> list[str]:
-    """Return a line for each port of a host that another program uses; HostsError if the host cannot be asked."""
+    """Return a line for each port of a host that is in use; HostsError if the host cannot be reached."""
     if not ports:
         return []
     command = f"{shell_word(python)} - {shell_line([link.host.address, *map(str, ports)])}"
@@ -343,5 +350,5 @@ async def port_faults(link: HostLink, python: str, ports: Sequence[int]) -> list
 
 
 def port_in_use(host: str, port: int) -> str:
-    remedy = "end that (`ss -ltnp` there shows it), or give another port in the inventory"
+    remedy = "end that program (`ss -ltnp` there shows it), or give another port in the inventory"
     return f"{host}: port {port} is in use there, perhaps by another run; {remedy}"

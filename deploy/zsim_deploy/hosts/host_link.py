@@ -1,7 +1,7 @@
-"""Access to the hosts of an inventory over ssh: connections, commands, long-lived programs, and file transfer.
+"""Access to the hosts of an inventory over ssh: connections, commands, long-running programs, and file transfer.
 
-Every failure is one line: host, what failed, what to do. All connections belong to one event loop in its own thread
-(`EventLoopThread`), so that the supervisor of a run stays a plain loop.
+Every failure is one line: the host, what failed, and what to do. All connections belong to one event loop in its own
+thread (`EventLoopThread`), so that the supervisor of a run stays a plain loop.
 """
 
 import asyncio
@@ -26,17 +26,19 @@ from asyncssh.constants import OPEN_REQUEST_SESSION_FAILED
 from zsim.errors import HostsError, ZsimError
 from zsim_deploy.inventory import SSH_PORT, Host, InventoryFile
 
-CONNECT_S = 10.0  # wall time; a host on a poor link answers within a few round trips
-KEEPALIVE_S = 15.0  # a keepalive is sent after this long without data …
-KEEPALIVE_COUNT = 4  # … and the connection given up after a minute: it survives an outage of 20 s
-ECHO_S = 0.5  # interval at which a line is echoed by the host
-RETRY_S = 0.5  # between two attempts to reconnect
-CLOSE_S = 1.0  # how long a connection may take to close; a cut one never does
-ANSWER_S = 10.0  # how long a short command may take; a host on a poor link answers within a few round trips
-CHANNELS = 8  # open on one connection; sshd allows 10 (MaxSessions of sshd_config(5)), and counts closed ones a while
-OPEN_S = 10.0  # until SFTP is open; a few round trips of a poor link
-STALL_S = 20.0  # after this long without data the host is considered lost; TCP retransmits well within that
-BLOCK_BYTES = 32_768  # requested at once; even at 100 kbit/s one arrives within 3 s
+# Wall times; a host on a poor link answers within a few round trips
+CONNECT_S = 10.0  # time limit for logging in
+KEEPALIVE_S = 15.0  # time without data after which a keepalive is sent
+KEEPALIVE_COUNT = 4  # unanswered keepalives until the connection is given up, a minute: it survives an outage of 20 s
+ECHO_S = 0.5  # interval at which the host echoes a line
+RETRY_S = 0.5  # interval between attempts to reconnect
+CLOSE_S = 1.0  # time limit for closing a connection; a cut one never closes
+ANSWER_S = 10.0  # time limit for a short command
+OPEN_S = 10.0  # time limit for opening SFTP
+STALL_S = 20.0  # time without data after which the host is considered lost; TCP retransmits well within that
+
+CHANNELS = 8  # channels on a connection; sshd allows 10 (sshd_config(5), MaxSessions), and counts closed ones a while
+BLOCK_BYTES = 32_768  # size of an SFTP request; even at 100 kbit/s one is answered within 3 s
 
 Result = TypeVar("Result")
 Connection = asyncssh.SSHClientConnection
@@ -49,7 +51,7 @@ class EventLoopThread:
         self._thread.start()
 
     def call(self, work: Coroutine[Any, Any, Result], timeout_s: float | None = None) -> Result:
-        """Run a coroutine and return its result; TimeoutError, after cancelling it, if it takes longer."""
+        """Run a coroutine and return its result; if it takes longer than the timeout, cancel it: TimeoutError."""
         future = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return future.result(timeout_s)
@@ -80,19 +82,19 @@ class EventLoopThread:
 
 
 class HostLink:
-    """One host; further connections are opened to it when all channels of one are in use."""
+    """Access to one host; when all channels of a connection are in use, another connection is opened."""
 
     def __init__(self, name: str, host: Host, base: Path) -> None:
         self.name = name
         self.host = host
-        self.round_trip_s = 0.0  # of the last echoed line
-        self.answered_s = 0.0  # monotonic time of that; 0 before the first
-        self._base = base  # folder of the inventory, to which relative paths refer
-        self._channels: dict[Connection, int] = {}  # number in use, by connection
+        self.round_trip_s = 0.0  # round trip of the last echoed line, wall time
+        self.answered_s = 0.0  # monotonic time at which that line arrived; 0 before the first one
+        self._base = base  # folder of the inventory, to which its relative paths refer
+        self._channels: dict[Connection, int] = {}  # number of channels in use, by connection
         self._lock = asyncio.Lock()
 
     async def open(self) -> Connection:
-        """Return a connection with a free channel; HostsError if the host cannot be logged into."""
+        """Return a connection with a free channel; HostsError if logging in to the host fails."""
         async with self._lock:
             for connection, channels in list(self._channels.items()):
                 if connection.is_closed():
@@ -105,7 +107,7 @@ class HostLink:
 
     @contextlib.asynccontextmanager
     async def channel(self, retry: bool = False) -> AsyncIterator[Connection]:
-        """Yield a connection for one channel; `retry`: try until the host is reached, else raise as `open` does."""
+        """Yield a connection for one channel; `retry`: try until the host is reached, else HostsError as for `open`."""
         while True:
             try:
                 connection = await self.open()
@@ -124,9 +126,9 @@ class HostLink:
     async def run(
         self, command: str, stdin: bytes = b"", timeout_s: float = ANSWER_S, what: str = "", retry: bool = False
     ) -> bytes:
-        """Return the output of a POSIX shell command; HostsError with its last line if it fails or takes too long.
+        """Run a POSIX shell command and return its output; HostsError if it fails or takes too long.
 
-        `what`: what it does, for errors; `retry`: try until the host is reached; the time counts from then.
+        `what`: what it does, for errors; `retry`: try until the host is reached; the timeout counts from then.
         """
         async with self.channel(retry) as connection:
             try:
@@ -146,9 +148,9 @@ class HostLink:
     async def put_files(
         self, folder: str, files: Mapping[str, bytes], timeout_s: float = ANSWER_S, retry: bool = False
     ) -> None:
-        """Write files, by path below a folder, readable by their owner alone; none if the link breaks.
+        """Write files, given by path below a folder, readable by their owner alone.
 
-        HostsError if they cannot be written.
+        HostsError if they cannot be written; if the link breaks, none is.
         """
         packed = io.BytesIO()
         with tarfile.open(fileobj=packed, mode="w", format=tarfile.USTAR_FORMAT) as tar:
@@ -157,32 +159,32 @@ class HostLink:
                 entry.size, entry.mode, entry.mtime = len(content), 0o600, int(time.time())
                 tar.addfile(entry, io.BytesIO(content))
         archive, into = packed.getvalue(), shell_word(folder)
-        part = f"{into}/.part.$$"  # others may be writing there at the same time
-        is_whole = f"[ $(wc -c < {part}) -eq {len(archive)} ] || {{ echo it came in part >&2; false; }}"
-        unpack = f"cat > {part} && {{ {is_whole}; }} && tar -xof {part} -C {into}"
+        part = f"{into}/.part.$$"  # another command may be writing there at the same time
+        is_complete = f"[ $(wc -c < {part}) -eq {len(archive)} ] || {{ echo it arrived only in part >&2; false; }}"
+        unpack = f"cat > {part} && {{ {is_complete}; }} && tar -xof {part} -C {into}"
         script = f"umask 077; mkdir -p {into} && {{ {unpack}; code=$?; rm -f {part}; exit $code; }}"
         await self.run(script, archive, timeout_s, what=f"writing into {folder}", retry=retry)
 
     async def measure_round_trips(self) -> None:
-        """Have the host echo a line again and again, so that a lost host is noticed within a second."""
+        """Have the host echo a line every ECHO_S, so that a lost host is noticed within a second; never returns."""
         while True:
             with contextlib.suppress(HostsError, asyncssh.Error, OSError):
-                async with self.channel() as connection, connection.create_process("cat", encoding="utf-8") as mirror:
+                async with self.channel() as connection, connection.create_process("cat", encoding="utf-8") as echo:
                     sent_s = time.monotonic()
-                    mirror.stdin.write(".\n")
-                    while await mirror.stdout.readline():
+                    echo.stdin.write(".\n")
+                    while await echo.stdout.readline():
                         self.answered_s = time.monotonic()
                         self.round_trip_s = self.answered_s - sent_s
                         await asyncio.sleep(ECHO_S)
                         sent_s = time.monotonic()
-                        mirror.stdin.write(".\n")
+                        echo.stdin.write(".\n")
             await asyncio.sleep(RETRY_S)
 
     def silent_s(self) -> float:
         return max(0.0, time.monotonic() - self.answered_s - ECHO_S) if self.answered_s else 0.0
 
     async def close(self) -> None:
-        """Close all connections; programs that still run on their pipes end by themselves."""
+        """Close all connections; programs that still read from them end by themselves."""
         for connection in self._channels:
             connection.close()
         closed = asyncio.gather(*(each.wait_closed() for each in self._channels), return_exceptions=True)
@@ -195,12 +197,14 @@ def _broken(name: str, error: Exception) -> HostsError:
 
 
 class HostLinks:
-    """A link to each host that takes part."""
+    """A link to each host of a run."""
 
     def __init__(self, placed: InventoryFile, names: Iterable[str], loop: EventLoopThread) -> None:
         self._placed = placed
         self._loop = loop
-        self.by_name = {name: self.to(name) for name in names}  # replaced, not changed: other threads read it
+        self.by_name = {
+            name: self.to(name) for name in names
+        }  # replaced, never modified, because other threads read it
 
     def to(self, name: str) -> HostLink:
         """Return a new link to a host of the inventory, without adding it."""
@@ -216,16 +220,16 @@ class HostLinks:
             self._loop.spawn(link.measure_round_trips())
 
     def on_all(self, work: Callable[[HostLink], Coroutine[Any, Any, Any]], within_s: float) -> dict[str, Any]:
-        """Run a coroutine for all hosts at once; return results by name.
+        """Run a coroutine for all hosts at once; return the results by host.
 
-        HostsError with a line for each host at which it failed or took longer.
+        HostsError with a line for each host for which it failed or took longer than `within_s`.
         """
 
         async def bounded(link: HostLink) -> Any:
             try:
                 return await asyncio.wait_for(work(link), within_s)
             except TimeoutError as error:
-                why = f"not done within {within_s:g} s; is the link slow, the host busy?"
+                why = f"not done within {within_s:g} s; is the link slow or the host busy?"
                 raise HostsError(f"{link.name}: {why}") from error
 
         async def gathered() -> list[Any]:
@@ -238,7 +242,10 @@ class HostLinks:
 
 
 def raise_faults(results: list[Any]) -> list[Any]:
-    """Return results that were gathered with exceptions; raise those of hosts as lines of one error, others as is."""
+    """Return results that were gathered with exceptions.
+
+    HostsError with a line for each ZsimError among them; any other exception is raised as it is.
+    """
     for result in results:
         if isinstance(result, BaseException) and not isinstance(result, ZsimError):
             raise result
@@ -248,7 +255,7 @@ def raise_faults(results: list[Any]) -> list[Any]:
 
 
 class ProgramEndedError(HostsError):
-    """A program on a host ended without an answer: its exit code, and its last line on standard error."""
+    """A program on a host ended without an answer; has its exit code, and its last line on standard error."""
 
     def __init__(self, name: str, status: int | None, last: str) -> None:
         super().__init__(f"{name}: it ended with code {status} ({last or 'it printed nothing'})")
@@ -266,9 +273,9 @@ class RemoteProgram:
         self._process.stdin.write(text)
 
     async def answer(self, within_s: float, late: str = "") -> dict[str, Any]:
-        """Return its next answer, skipping any greeting of the login shell.
+        """Return the program's next answer, skipping any greeting of the login shell.
 
-        ProgramEndedError if it has ended; HostsError if it took longer, with the text `late` if that is given.
+        ProgramEndedError if it has ended; HostsError, with the text `late` if given, if it takes too long.
         """
         try:
             async with asyncio.timeout(within_s):
@@ -278,30 +285,30 @@ class RemoteProgram:
                 lines = (await self._process.stderr.read()).strip().splitlines()
                 await self._process.wait_closed()
         except TimeoutError as error:
-            slow = f"no answer within {within_s:g} s; is the link slow, the host busy?"
+            slow = f"no answer within {within_s:g} s; is the link slow or the host busy?"
             raise HostsError(f"{self._host}: {late or slow}") from error
         raise ProgramEndedError(self._host, self._process.exit_status, lines[-1][:200] if lines else "")
 
 
 @contextlib.asynccontextmanager
 async def open_program(link: HostLink, command: str) -> AsyncIterator[RemoteProgram]:
-    """Run a program on a host while the block lasts; HostsError if the host is not reached or the connection breaks."""
+    """Run a program on a host for the duration of the block; HostsError if the connection fails or breaks."""
     try:
         async with link.channel() as connection:
             process = await connection.create_process(command, encoding="utf-8", errors="replace")
             try:
                 yield RemoteProgram(link.name, process)
             finally:
-                process.close()  # not waited for: on a link that is cut it would take a minute
+                process.close()  # not awaited: on a cut link that would take a minute
     except (asyncssh.Error, OSError) as error:
         raise _broken(link.name, error) from error
 
 
 async def fetch(link: HostLink, source: str, into: Path) -> bool:
-    """Copy a file from a host; return False if there is none.
+    """Copy a file from a host; return False if it does not exist there.
 
-    Until it is complete, it is written to the same path with .part appended. HostsError if it cannot be read or the
-    transfer stalls; OSError if it cannot be written here.
+    An incomplete copy has .part appended to its name. HostsError if the file cannot be read or the transfer stalls;
+    OSError if it cannot be written here.
     """
     part, moved = into.with_name(f"{into.name}.part"), asyncio.Event()
     try:
@@ -320,7 +327,7 @@ async def fetch(link: HostLink, source: str, into: Path) -> bool:
                     moved.clear()
             finally:
                 copy.cancel()
-                sftp.exit()  # not waited for: on a link that is cut it would not return
+                sftp.exit()  # not awaited: on a cut link that would never return
             copy.result()
     except TimeoutError as error:
         raise HostsError(f"{link.name}: no answer within {OPEN_S:g} s") from error
@@ -333,7 +340,7 @@ async def fetch(link: HostLink, source: str, into: Path) -> bool:
 
 
 async def start_sftp(name: str, connection: Connection) -> asyncssh.SFTPClient:
-    """Open SFTP on a connection; HostsError if the host has none."""
+    """Open SFTP on a connection; HostsError if the host does not offer it."""
     try:
         return await connection.start_sftp_client()
     except (asyncssh.ChannelOpenError, asyncssh.SFTPConnectionLost, asyncssh.SFTPEOFError) as error:
@@ -341,11 +348,11 @@ async def start_sftp(name: str, connection: Connection) -> asyncssh.SFTPClient:
         if not is_refused and (isinstance(error, asyncssh.ChannelOpenError) or connection.is_closed()):
             raise
         remedy = "set `Subsystem sftp internal-sftp` in sshd_config there and restart sshd"
-        raise HostsError(f"{name}: its sshd has no SFTP; {remedy}") from error
+        raise HostsError(f"{name}: its sshd offers no SFTP; {remedy}") from error
 
 
 def shell_word(path: str) -> str:
-    """Quote a path as one word of a shell; a leading ~/ stays the home of the user there."""
+    """Quote a path as one word for a shell; a leading ~/ still stands for the home of the user there."""
     return f"~/{shlex.quote(path[2:])}" if path.startswith("~/") else shlex.quote(path)
 
 
@@ -354,7 +361,7 @@ def shell_line(words: Iterable[str]) -> str:
 
 
 def json_answer(lines: Iterable[str]) -> dict[str, Any] | None:
-    """Return the first JSON object among lines; None if there is none."""
+    """Return the first JSON object among lines; None without one."""
     for line in lines:
         with contextlib.suppress(ValueError):
             value = json.loads(line)
@@ -364,7 +371,7 @@ def json_answer(lines: Iterable[str]) -> dict[str, Any] | None:
 
 
 class _Client(asyncssh.SSHClient):
-    """Remembers a refused host key: the host name, address and port that it was looked up by, and the key."""
+    """Remembers a refused host key: the host name, address and port for which it was looked up, and the key."""
 
     refused: tuple[str, str, int, asyncssh.SSHKey] | None = None
 
@@ -396,7 +403,7 @@ async def connect(name: str, host: Host, base: Path) -> Connection:
         refused = client.refused
         if refused is None and isinstance(
             error, asyncssh.ConnectionLost | asyncssh.KeyExchangeFailed | ConnectionResetError
-        ):  # perhaps no host key algorithm was agreed on: only those in known_hosts are asked for
+        ):  # perhaps no host key algorithm was agreed on: only those in known_hosts are offered
             with contextlib.suppress(asyncssh.Error, OSError, ValueError, TimeoutError):
                 key = await asyncio.wait_for(asyncssh.get_server_host_key(address, host.port), CONNECT_S)
                 refused = (address, "", host.port, key) if key else None
@@ -407,7 +414,7 @@ async def connect(name: str, host: Host, base: Path) -> Connection:
 def _changed_key(
     name: str, host: Host, known: Path, looked_for: str, address: str, port: int, shown: asyncssh.SSHKey
 ) -> str:
-    """Describe a host key that differs from the known one; empty if it does not, or none is known."""
+    """Describe a host key that differs from the known one; empty if it does not differ, or none is known."""
     path = str(known.expanduser())
     try:
         keys = asyncssh.match_known_hosts(path, looked_for, address, None if port == SSH_PORT else port)[0]
@@ -424,7 +431,7 @@ def _changed_key(
 
 
 def _reason(name: str, host: Host, base: Path, known: Path, error: Exception) -> str:
-    """Describe what failed and what to do."""
+    """Describe why a connection failed, and what to do."""
     address = host.ssh or host.address
     at = f"{address} port {host.port}"
     user = host.user or getpass.getuser()
@@ -442,9 +449,9 @@ def _reason(name: str, host: Host, base: Path, known: Path, error: Exception) ->
         case OSError() if error.filename:
             return f"{error.filename} cannot be read ({error.strerror}); correct hosts.{name}.key or known_hosts"
         case TimeoutError() if error.errno is None:
-            return f"ssh at {at} did not answer within {CONNECT_S:g} s; is it on, the address right and the port open?"
+            return f"ssh at {at} did not answer within {CONNECT_S:g} s; is it on, the address right, and the port open?"
         case socket.gaierror():
-            return f"address {address!r} is not known; correct hosts.{name}.address or ssh"
+            return f"address {address!r} cannot be resolved; correct hosts.{name}.address or ssh"
         case OSError():
             why = os.strerror(error.errno) if error.errno else error
             return f"ssh at {at} cannot be reached ({why}); is sshd running there and the port open?"

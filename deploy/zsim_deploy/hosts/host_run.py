@@ -1,7 +1,7 @@
-"""A run on several hosts: checked, prepared, started over ssh, watched, ended, and its record brought home.
+"""A run on several hosts: checks and prepares them, starts the processes over ssh, supervises them, fetches the record.
 
 The requests of `zsim ps`, `logs`, `restart`, `move` and `down` are carried out here, each in a thread of the control
-socket. A `HostPlan` says which process runs where, with which command line and files.
+socket. A `HostPlan` holds the host, command line and files of each process.
 """
 
 from __future__ import annotations
@@ -49,27 +49,29 @@ from zsim_deploy.launch.role_launcher import SINGLE_THREADED, programs_of
 from zsim_deploy.launch.supervisor import EndSignals, Outcome, Supervisor, end_text
 from zsim_deploy.roles.stop_channel import FOLDER
 
-CONNECT_S = 30.0  # how long all hosts together may take to accept the login, …
-CHECK_S = 60.0  # … to be checked: a small computer takes 5 s to import numpy, a poor link adds a dozen round trips, …
-PREPARE_S = 30.0  # … and to receive their files
-CLEAN_S = 5.0  # how long a host may take to remove the run's folder; a lost host delays the end no longer than this
-JOIN_S = 60.0  # until a host that was not used so far is connected and checked
-IMPORT_S = 20.0  # until a Python has shown that it can run a role; a small computer takes 5 s
-BRING_S = 30.0  # until a certificate is on a host
-LEAVE_S = 20.0  # until a process that was replaced a moment ago has ended, which takes a second
-LOOK_S = 0.1  # between two checks whether it has ended
-ORDER_S = 5.0  # until the supervisor, which polls every 50 ms, carries out an order
+# Wall times
+CONNECT_S = 30.0  # time limit for logging in to all hosts
+CHECK_S = 60.0  # for checking all hosts; a small computer imports numpy in 5 s, a poor link adds a dozen round trips
+PREPARE_S = 30.0  # for copying files to all hosts
+CLEAN_S = 5.0  # for a host to remove the run's folder; a lost host delays the end by no more than this
+JOIN_S = 60.0  # for connecting and checking a host that the run has not used so far
+IMPORT_S = 20.0  # for a Python to import the modules of a role; a small computer takes 5 s
+BRING_S = 30.0  # for copying a certificate to a host
+LEAVE_S = 20.0  # for a process that was just replaced to end; normally it takes a second
+LOOK_S = 0.1  # polling interval of that end
+ORDER_S = 5.0  # time limit for the supervisor, which polls every 50 ms, to carry out an order
 BEAT_S = 1.0  # interval of the launcher's heartbeat
-ORPHAN_S = 60.0  # a process ends itself after this long without a heartbeat; shorter link outages are survived
-LEND_S = 60.0  # how long its files may take to reach the host again; as long as a link may be cut
-KILL_S = 5.0  # how long a kill may take to reach the host: a few round trips
-LOST = -1000  # code of a process whose end is not known
-ACCESS = "access.json"
-PID = "zsim-pid "  # prefix of the line with the process id; a login shell may print something before it
+ORPHAN_S = 60.0  # without a heartbeat for this long, a process ends itself; shorter link outages are survived
+LEND_S = 60.0  # time limit for copying the files of a restarted process; as long as a link may be down
+KILL_S = 5.0  # for a kill to reach the host, which takes a few round trips
+
+LOST = -1000  # exit code of a process whose end is unknown
+ACCESS = "access.json"  # file with the access control of a listening process
+PID = "zsim-pid "  # prefix of the line with the process id; a login shell may print other lines before it
 
 
 class HostRun:
-    """One run on several hosts; InventoryError if a process has no place."""
+    """One run on several hosts; InventoryError if a process has no host."""
 
     def __init__(
         self, scenario: Scenario, placed: InventoryFile, out: Path, launch: Launch, status: StatusTable
@@ -79,16 +81,16 @@ class HostRun:
         self._out = out
         self._status = status
         pace = [*pace_options(launch.mode, launch.rate), *changed_options(launch.changed)]
-        self._plan = HostPlan(placed, scenario, launch.run_id, pace)  # another one after each move
+        self._plan = HostPlan(placed, scenario, launch.run_id, pace)  # replaced after each move
         self._supervisor = Supervisor(scenario.processes, status)
         self._loop = EventLoopThread()
         self._links = HostLinks(placed, self._plan.hosts(), self._loop)
         self._record_stays = False
         self._signals = EndSignals(out / "up.log", status.hang_up)
-        self._one_at_a_time = threading.Lock()  # of requests that replace a process
+        self._replacing = threading.Lock()  # held by a request that replaces a process
 
     def run(self) -> Outcome:
-        """Run to the end; in every case, no process or key of the run is left on a host that can be reached.
+        """Run to the end; however it ends, no process or key of the run is left on a host that can be reached.
 
         RunError if the federation already runs on this machine; HostsError with a line for every missing certificate
         and every host that cannot take part.
@@ -127,7 +129,7 @@ class HostRun:
 
     def _check(self) -> None:
         async def inspect(link: HostLink) -> tuple[HostReport, list[str], list[str]]:
-            """Return the report of a host, its ports that are in use, and what earlier runs have left there."""
+            """Return the report of a host, faults of its ports, and a line on what earlier runs have left there."""
             python = self._plan.python(link.name)
             report = await host_report(link, python, self._placed.word)
             taken = await port_faults(link, python, self._plan.ports(link.name))
@@ -161,7 +163,7 @@ class HostRun:
             outcome = self._supervisor.run(self._look)
             fault = self._fetch()
         except KeyboardInterrupt:
-            where = self._plan.way_to_record()
+            where = self._plan.record_location()
             self._status.say(f"the record was not fetched; what was recorded is at {where}")
             raise
         if fault and not outcome.failed and not outcome.interrupted:
@@ -171,7 +173,7 @@ class HostRun:
         return outcome
 
     def _look(self) -> None:
-        """End the run on a hang-up or termination signal; report the hosts that have stopped answering."""
+        """End the run if its output can no longer be seen; report hosts that have stopped answering."""
         if reason := self._signals.look():
             self._supervisor.interrupt(reason)
         self._status.report_silent_hosts()
@@ -185,22 +187,22 @@ class HostRun:
         return RemoteProcess(name, command, self._links.by_name[host], self._loop, log, on_line, files)
 
     def _fetch(self) -> str:
-        """Fetch the record; return why that failed, or an empty string."""
+        """Fetch the record; return why that failed, empty if it did not."""
         host, into = self._plan.host(RECORDER), self._out / RECORD
         self._status.say(f"fetching the record from {host}:{self._plan.record()} …")
         try:
-            is_there = self._loop.call(fetch(self._links.by_name[host], self._plan.record(), into))
-            if is_there:
+            exists = self._loop.call(fetch(self._links.by_name[host], self._plan.record(), into))
+            if exists:
                 repair(into)
         except (ZsimError, OSError) as error:
-            where = self._plan.way_to_record()
+            where = self._plan.record_location()
             return f"the record could not be fetched ({error}); what was recorded is at {where}"
         self._record_stays = False
-        return "" if is_there else "nothing was recorded"
+        return "" if exists else "nothing was recorded"
 
     @contextlib.contextmanager
     def _cleaned(self) -> Iterator[None]:
-        """Clean the hosts at the end of the run, except for a record that could not be fetched."""
+        """Remove the run's folder from the hosts after the block, except for a record that could not be fetched."""
 
         async def clean(link: HostLink) -> None:
             folder, keys = shell_word(self._plan.folder(link.name)), shell_word(self._plan.keys(link.name))
@@ -215,7 +217,7 @@ class HostRun:
             try:
                 self._links.on_all(clean, 2 * CLEAN_S)
             except HostsError as error:
-                self._status.say(f"{error}\nkeys of this run may be left there; remove its folder")
+                self._status.say(f"{error}\nkeys of this run may be left there; remove the folder of the run")
             except KeyboardInterrupt:
                 self._status.say("keys of this run may be left on its hosts; `zsim up` or `zsim doctor` lists them")
                 raise
@@ -229,7 +231,7 @@ class HostRun:
         self._refuse_unless_runs(role)
         if role in (WORLD, RECORDER):
             raise RunError(f"{role} cannot be restarted: the run depends on it; end the run with `zsim down`")
-        with self._one_at_a_time:
+        with self._replacing:
             return self._take_over(self._plan, role)
 
     def _move(self, role: str, host: str) -> str:
@@ -238,7 +240,7 @@ class HostRun:
             raise RunError(f"{role} cannot be moved while the run goes on; change the inventory and run again")
         if host not in (hosts := self._plan.placed.inventory.hosts):
             raise RunError(f"host is {host!r}; must be one of {', '.join(hosts)}")
-        with self._one_at_a_time:
+        with self._replacing:
             plan = self._plan.moved(role, host)
             if faults := plan.certificate_faults(datetime.now(UTC)):
                 raise HostsError("\n".join(faults))
@@ -248,12 +250,12 @@ class HostRun:
 
     def _refuse_unless_runs(self, role: str) -> None:
         if not self._supervisor.members:
-            raise RunError("the run has not started yet; try again once it flies")
+            raise RunError("the run has not started yet; try again when it flies")
         if role not in self._plan.processes:
             raise RunError(f"role is {role!r}; must be one of {', '.join(self._plan.processes)}")
 
     def _join(self, host: str) -> HostLink:
-        """Return a link to a host that the run has not used so far, after checking the host."""
+        """Check a host that the run has not used so far; return a link to it."""
         link = self._links.to(host)
         try:
             report = self._loop.call(host_report(link, self._plan.python(host)), JOIN_S)
@@ -270,7 +272,7 @@ class HostRun:
         return link
 
     def _take_over(self, plan: HostPlan, role: str) -> str:
-        """Start a process that takes over another's name; the old one leaves by itself, or is killed if it hangs."""
+        """Start the new process of a role; the old one leaves by itself, or is killed if it hangs."""
         host = plan.host(role)
         if files := plan.identity(role):
             self._loop.call(self._links.by_name[host].put_files(plan.folder(host), files, BRING_S))
@@ -289,12 +291,12 @@ class HostRun:
         try:
             carried_out.result()
         except CancelledError as error:
-            raise RunError("the run is ending; no process is started any more") from error
+            raise RunError("the run is ending; no more processes are started") from error
         return f"{role} on {host}"
 
 
 async def _refuse_unless_able(link: HostLink, python: str, role: str) -> None:
-    """Refuse a host whose Python cannot import what a role needs: HostsError with what is missing."""
+    """Raise HostsError if the Python of a host cannot import what a role needs; it names what is missing."""
     for extra in extras([role]):
         code = f"import {MODULES[extra]}"
         command = f"{shell_word(python)} -c {shell_word(code)}"
@@ -306,17 +308,17 @@ async def _refuse_unless_able(link: HostLink, python: str, role: str) -> None:
 
 
 class HostPlan:
-    """The processes of one run that zsim starts, and their hosts; immutable. InventoryError if one has no place."""
+    """The processes of one run that zsim starts, and their hosts; immutable. InventoryError if one has no host."""
 
     def __init__(self, placed: InventoryFile, scenario: Scenario, run_id: str, pace: Sequence[str] = ()) -> None:
         self.placed = placed
         self._scenario = scenario
         self._run_id = run_id  # names the run's folder on each host
-        self._pace = pace  # options of the world
+        self._pace = pace  # command line options of the world
         in_order = sorted(inv.processes(placed, scenario, pace), key=lambda process: process.role != ROUTER)
-        self.processes = {process.name: process for process in in_order}  # each after the one that it connects to
-        self.programs = inv.programs_here(placed, scenario)  # the user's own, started on this machine
-        # on the user's programs that are placed on a host: zsim does not start those
+        self.processes = {process.name: process for process in in_order}  # each after the process that it connects to
+        self.programs = inv.programs_here(placed, scenario)  # the user's own programs, started on this machine
+        # a line on each of the user's programs that is placed on a host; zsim does not start those
         self.remarks = [line for host in placed.inventory.hosts for line in inv.own_programs(placed, scenario, host)]
 
     def moved(self, name: str, host: str) -> HostPlan:
@@ -345,8 +347,8 @@ class HostPlan:
     def record(self) -> str:
         return f"{self.folder(self.host(RECORDER))}/{RECORD}"
 
-    def way_to_record(self) -> str:
-        """Return the location of the record, with the command that fetches it."""
+    def record_location(self) -> str:
+        """Return host and path of the record, with the command that fetches it."""
         name = self.host(RECORDER)
         command = scp(self.placed.inventory.hosts[name], self.placed.folder, self.record())
         return f"{name}:{self.record()} (fetch it with `{command}`)"
@@ -370,7 +372,7 @@ class HostPlan:
         return [role, "--launched", self._run_id, *journal, *options]
 
     def files(self, host: str) -> dict[str, bytes]:
-        """Return the files that a host needs, by path below the run's folder; HostsError as in `identity`."""
+        """Return the files that a host needs, by path below the run's folder; HostsError as for `identity`."""
         contents: dict[str, bytes] = {}
         for name, process in self.processes.items():
             if process.host == host:
@@ -380,9 +382,9 @@ class HostPlan:
         return contents
 
     def identity(self, name: str) -> dict[str, bytes]:
-        """Return certificate, key and access control of a process, by path below the run's folder.
+        """Return certificates, key and access control of a process, by path below the run's folder.
 
-        HostsError if one is missing.
+        HostsError if one cannot be read.
         """
         process = self.processes[name]
         if not process.secure:
@@ -401,14 +403,16 @@ class HostPlan:
 
 
 class RemoteProcess:
-    """A role on another host, over ssh: started, watched and stopped; its output goes to a file on this machine.
+    """A role on another host, started, watched and stopped over ssh; its output goes to a file on this machine.
 
-    The standard input of the process is the ssh channel. The process ends when that closes, which sshd does when the
-    launcher dies, and when nothing has come on it for ORPHAN_S, as when the launcher's host is down
+    The standard input of the process is the ssh channel. The process ends when sshd closes that, because the launcher
+    has died, and when it has received nothing for ORPHAN_S, for instance because the launcher's host is down
     (roles/stop_channel.py).
 
-    `on_line` takes every line of its standard output; with None they go to the log too. `files`: a folder, and the
-    files that it needs below it; it removes them when it ends, so each restart copies them again.
+    Args:
+        on_line: takes every line of its standard output; None: they go to the log too.
+        files: a folder on the host, and the contents of the files that the process needs, by path below that folder.
+            The process removes its key when it ends, so each restart copies the files again.
     """
 
     is_program = False
@@ -449,21 +453,21 @@ class RemoteProcess:
         return "running" if self.pid else "starting"
 
     def start(self) -> None:
-        """Start or restart it; return at once."""
+        """Start or restart the process, without waiting."""
         self._starts += 1
         self.pid, self.code, self._process, self._stop, self._fault = 0, None, None, None, ""
         self._ended.clear()
         self._life = self._loop.spawn(self._live())
 
     async def _live(self) -> None:
-        """Run the process to its end, and record how it ended in every case."""
+        """Run the process to its end; set `code` however it ends."""
         code = LOST
         try:
             code = await self._run()
         except (asyncssh.Error, OSError, HostsError) as error:
             self._fault = f"the connection to {self.host} broke ({error})"
         except Exception as error:
-            self._fault = f"the launcher could not follow it ({error!r})"
+            self._fault = f"the launcher could not watch it ({error!r})"
         finally:
             if self._fault:
                 self._log.write(f"{self._fault}\n")
@@ -517,7 +521,7 @@ class RemoteProcess:
         return self._log.last
 
     def request_stop(self, reason: str) -> None:
-        """Ask it to leave: no effect once it has ended, and remembered while it is still starting."""
+        """Ask the process to leave; remembered while it is starting, without effect once it has ended."""
         self._stop = reason
         self._loop.call_soon(self._send, f"stop {reason}\n")
 
@@ -530,7 +534,7 @@ class RemoteProcess:
         return self._ended.wait(max(0.0, timeout_s))
 
     def kill(self) -> None:
-        """Send SIGKILL, or stop trying to start it; return at once."""
+        """Send SIGKILL, or stop trying to start the process, without waiting."""
         if self.code is not None or self._life is None:
             return
         if not self.pid:
@@ -544,20 +548,20 @@ class RemoteProcess:
         self._loop.spawn(kill(f"kill -9 {self.pid}"))
 
     def close(self) -> None:
-        """End it; one that cannot be reached ends by itself."""
+        """Kill the process; one that cannot be reached ends by itself."""
         if self._life is not None:
             self.kill()
             self._ended.wait(KILL_S)
 
 
 class ProcessLog:
-    """The log file of a process; if it cannot be written, that is said once, and only the last line is kept."""
+    """The log file of a process; if it cannot be written, that is reported once, and only the last line is kept."""
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:
         self.last = ""  # the last line that is not empty
         self._path = path
         self._say = say
-        self._is_whole = True
+        self._is_written = True
 
     def write(self, line: str) -> None:
         self.last = line.strip() or self.last
@@ -565,6 +569,6 @@ class ProcessLog:
             with self._path.open("a", errors="replace") as file:
                 file.write(line)
         except OSError as error:
-            if self._is_whole:
-                self._is_whole = False
+            if self._is_written:
+                self._is_written = False
                 self._say(f"{self._path}: cannot be written ({error.strerror}); this process's output is lost")

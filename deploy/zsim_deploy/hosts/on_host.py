@@ -1,14 +1,14 @@
-"""The program that `zsim push` runs on a host; it is sent as text and needs only the Python there.
+"""The program that `zsim push` runs on a host; it is sent as text, and needs nothing there but Python.
 
 Standard input is this text, followed by orders, one JSON line each; each is answered by a JSON line on standard output.
-When standard input ends, or not even an empty line has come for a while, the push is over or its launcher is gone: the
-current command is killed.
+When standard input ends, or has been silent for a while, the push is over or its launcher is lost: the current command
+is killed.
 
-{"act": "look"}                      report Python and platform, what is installed, and the wheels in FOLDER
+{"act": "look"}                      report the Python, the platform, what is installed, and the wheels in FOLDER
 {"act": "install", ...}              install wheels into FOLDER/venv
 {"act": "warm_up", ...}              run an installed module, with the extras as its arguments
 
-Only one instance works in a folder at a time; another one reports who holds it, and waits.
+Only one instance works in a folder at a time; any other one reports who does, and waits.
 """
 
 import contextlib
@@ -28,8 +28,8 @@ import venv
 from collections.abc import Iterator
 from pathlib import Path
 
-LOCK = "push.lock"  # in the folder: locked by the instance that works in it, and names it
-NOTE = "zsim-installed.json"  # in the environment: what was installed; missing during an installation
+LOCK = "push.lock"  # file in the folder, locked by the instance that works there; it contains who that is
+NOTE = "zsim-installed.json"  # file in the environment with what was installed; missing during an installation
 
 
 def inspect_folder(folder: Path) -> dict:
@@ -49,7 +49,7 @@ def inspect_folder(folder: Path) -> dict:
 
 
 def _installed(environment: Path) -> dict | None:
-    """Return the note of an earlier push, if its environment has the Python that runs this."""
+    """Return the note of an earlier push; None if its environment has another Python than the running one."""
     if not os.access(environment / "bin" / "python", os.X_OK):
         return None
     with contextlib.suppress(OSError, ValueError):
@@ -59,18 +59,18 @@ def _installed(environment: Path) -> dict | None:
 
 
 class CommandError(Exception):
-    """The error line of a command that failed."""
+    """A command failed; the text is its error line."""
 
 
 class CommandRunner:
-    """Runs one command after the other, until `end`."""
+    """Runs one command after another, until `end` is called."""
 
     def __init__(self) -> None:
         self._gate = threading.Lock()
         self._child: subprocess.Popen | None = None
 
     def run(self, command: list) -> None:
-        """Run a command to its end; CommandError if it failed."""
+        """Run a command to its end; CommandError if it fails."""
         with self._gate:
             self._child = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -83,7 +83,7 @@ class CommandRunner:
             raise CommandError(f"{' '.join(command[-2:])[-80:]}: {errors[-1]}")
 
     def end(self) -> None:
-        """Kill the running command with its children, and start no other."""
+        """Kill the running command with its children, and start no more."""
         self._gate.acquire()
         if self._child and self._child.poll() is None:
             with contextlib.suppress(ProcessLookupError):
@@ -94,8 +94,8 @@ class CommandRunner:
 def install(folder: Path, order: dict, children: CommandRunner) -> None:
     """Install wheels from FOLDER/wheels alone.
 
-    Order: project and pip (names of their wheels), wheels (names of other new ones), extras, modules (imported as a
-    check), note (to keep). CommandError if pip or the check fails, OSError if the disk is full.
+    `order` has project and pip (names of their wheels), wheels (names of other new ones), extras, modules (to import as
+    a check), and note (to store). CommandError if pip or the check fails, OSError if the disk is full.
     """
     environment, wheels = folder / "venv", folder / "wheels"
     fresh = _installed(environment) is None
@@ -117,7 +117,10 @@ def install(folder: Path, order: dict, children: CommandRunner) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path, who: str) -> Iterator[str]:
-    """Lock a folder; while another instance holds it, report which, and wait. Yield why it cannot be locked, or ''."""
+    """Lock a folder; while another instance holds the lock, report which, and wait.
+
+    Yield why the folder cannot be locked, empty if it is. `who`: user and machine that push.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / LOCK, "a+") as file:
         fault = ""
@@ -153,7 +156,7 @@ def execute(folder: Path, order: dict, children: CommandRunner) -> dict:
 
 
 def main(folder: Path, who: str, silent_s: float) -> None:
-    """Carry out orders until standard input ends or stays silent for `silent_s`."""
+    """Carry out orders until standard input ends, or is silent for `silent_s` (wall time)."""
     orders, children, received = queue.SimpleQueue(), CommandRunner(), threading.Event()
 
     def exit_now() -> None:
@@ -162,7 +165,7 @@ def main(folder: Path, who: str, silent_s: float) -> None:
         os._exit(0)
 
     def follow() -> None:
-        """Queue orders, and note each sign of life."""
+        """Queue the orders, and note that lines arrive."""
         try:
             for line in sys.stdin.buffer:
                 received.set()

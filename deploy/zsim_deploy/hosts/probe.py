@@ -1,10 +1,10 @@
-"""Facts of a host, and its network path to another: run there by `zsim doctor`; prints JSON lines.
+"""The program that `zsim doctor` runs on a host: reports on the host and on network paths, as JSON lines.
 
-python -m zsim_deploy.hosts.probe about FOLDER           then its clock, for each line of standard input
-python -m zsim_deploy.hosts.probe serve PORT             until standard input ends
-python -m zsim_deploy.hosts.probe reach ADDRESS PORT
+python -m zsim_deploy.hosts.probe about FOLDER         facts of the host, then its clock for each line of standard input
+python -m zsim_deploy.hosts.probe serve PORT           answers on a port until standard input ends
+python -m zsim_deploy.hosts.probe reach ADDRESS PORT   measures the path to such a port
 
-What is sent to a port: a size as 8 bytes, big-endian, and that many bytes; the answer is one byte after the last.
+A transfer to a port is its size in 8 bytes, big-endian, and that many bytes; one byte confirms that all have arrived.
 """
 
 import errno
@@ -23,20 +23,20 @@ from typing import Any, TextIO
 from zsim import __version__
 from zsim.contract.fingerprint import fingerprint, machine, parts
 
-GOVERNORS = "/sys/devices/system/cpu"  # Linux, cpufreq
-PINGS = 9
-SIZE_BYTES = 8  # of the size prefix
-BULKS_BYTES = tuple(16_384 << power for power in range(9))  # up to 4 MB, which take 0.3 s on a link of 100 Mbit/s
-BULK_S = 1.0  # a transfer of this length is long enough to measure the bandwidth
-CHUNK_BYTES = 65_536
-TIMEOUT_S = 10.0  # wall time; the smallest transfer takes as long at 13 kbit/s
-SERVE_S = 60.0  # without a connection for this long a server ends by itself
-SHORTEST_S = 1e-4  # lower limit of a transfer's time without the round trip; 4 MB in it are 300 Gbit/s
-DONE = b"."
+GOVERNORS = "/sys/devices/system/cpu"  # folder of the CPU governors; Linux, cpufreq
+PINGS = 9  # empty transfers whose median is the round trip
+SIZE_BYTES = 8  # length of the size prefix
+BULKS_BYTES = tuple(16_384 << power for power in range(9))  # transfers of up to 4 MB, which take 0.3 s at 100 Mbit/s
+BULK_S = 1.0  # wall time of a transfer that is long enough to measure the bandwidth
+CHUNK_BYTES = 65_536  # read at a time
+TIMEOUT_S = 10.0  # wall time for a transfer; the smallest one takes this long at 13 kbit/s
+SERVE_S = 60.0  # wall time without a connection after which a server ends by itself
+SHORTEST_S = 1e-4  # lower bound of a transfer's time without the round trip; 4 MB in that time are 300 Gbit/s
+DONE = b"."  # confirms a transfer
 
 
 def about(folder: Path) -> dict[str, Any]:
-    """Return the facts of this host that matter for a run; `folder`: of zsim, to be written."""
+    """Return the facts of this host that matter for a run; `folder`: zsim's folder, which must be writable."""
     return {
         "python": platform.python_version(),
         "zsim": __version__,
@@ -52,15 +52,15 @@ def about(folder: Path) -> dict[str, Any]:
 
 
 def unwritable(folder: Path) -> str | None:
-    """Return why a folder cannot be made or written, None if it can."""
-    there = _nearest(folder)
-    if not there.is_dir():
-        return f"{there} is not a folder"
-    return None if os.access(there, os.W_OK | os.X_OK) else f"{there} cannot be written"
+    """Return why a folder cannot be created or written; None if it can."""
+    nearest = _nearest(folder)
+    if not nearest.is_dir():
+        return f"{nearest} is not a folder"
+    return None if os.access(nearest, os.W_OK | os.X_OK) else f"{nearest} cannot be written"
 
 
 def _nearest(folder: Path) -> Path:
-    """Return the nearest existing part of a path."""
+    """Return the deepest existing part of a path."""
     return next(path for path in (folder, *folder.parents) if os.path.exists(path))
 
 
@@ -81,7 +81,7 @@ def governors(folder: Path) -> list[str]:
 
 
 def serve(port: int) -> None:
-    """Answer on a port until standard input ends; print "ready" once it listens, or why it cannot."""
+    """Confirm transfers on a port until standard input ends; first print that it listens, or why it cannot."""
     try:
         server = listening(port)
     except OSError as error:
@@ -108,10 +108,10 @@ def answer(connection: socket.socket) -> None:
     connection.settimeout(TIMEOUT_S)
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     try:
-        with connection.makefile("rb") as came:
-            while size := came.read(SIZE_BYTES):
+        with connection.makefile("rb") as stream:
+            while size := stream.read(SIZE_BYTES):
                 left = int.from_bytes(size, "big")
-                while left > 0 and (data := came.read(min(left, CHUNK_BYTES))):
+                while left > 0 and (data := stream.read(min(left, CHUNK_BYTES))):
                     left -= len(data)
                 connection.sendall(DONE)
     except OSError:
@@ -119,9 +119,10 @@ def answer(connection: socket.socket) -> None:
 
 
 def reach(address: str, port: int) -> dict[str, Any]:
-    """Return the round trip [s] and the bandwidth [bit/s] to a serving host, or an error.
+    """Return the round trip [s] and the bandwidth [bit/s] to a host on which `serve` runs, or an error.
 
-    The bandwidth is that of the first transfer that takes BULK_S, so that a slow link is not kept busy for minutes.
+    The bandwidth is that of the first transfer that takes BULK_S, so that a slow link is not kept busy for minutes, or
+    else that of the largest transfer.
     """
     try:
         with socket.create_connection((address, port), TIMEOUT_S) as link:

@@ -1,4 +1,4 @@
-"""`zsim push`: install zsim on the hosts of an inventory over ssh; the hosts need no internet access."""
+"""`zsim push`: installs zsim on the hosts of an inventory over ssh; the hosts need no internet access."""
 
 import asyncio
 import contextlib
@@ -35,19 +35,19 @@ from zsim_deploy.hosts.wheelhouse import Wheel, Wheelhouse, WheelSet, wheel_targ
 from zsim_deploy.inventory import MODULES, Host, InventoryFile, needed_extras
 from zsim_deploy.roles import warm_up
 
-LAUNCHER = "launcher"  # name of this machine among the hosts, in progress lines
+LAUNCHER = "launcher"  # name of this machine in progress lines
 ASK_S = 30.0  # wall time for a host to start a few Pythons; a small computer takes seconds
 INSTALL_S = 900.0  # wall time to unpack 100 MB of wheels on a slow memory card
-COMPILE_S = 900.0  # wall time to compile the kernels; half a minute on a laptop's core
-COPIES = 4  # files copied to one host at a time
+COMPILE_S = 900.0  # wall time to compile the kernels; a laptop takes half a minute
+COPIES = 4  # number of files copied to a host at a time
 START_S = 30.0  # wall time to start a Python on a small computer, over a poor link
-BEAT_S = 5.0  # interval of the launcher's heartbeat
-SILENT_S = 60.0  # without a heartbeat for this long the program ends itself; shorter link outages are survived
-WAIT_S = 1800.0  # wall time for another push to end: as long as installing and compiling may take
-OLDEST_MINOR = 11  # pyproject.toml, requires-python
-NEWEST_MINOR = 14  # the newest Python that is looked for
-PLAIN = "python3"
-ANSWER = re.compile(r"(python3(?:\.\d+)?) (\d+)\.(\d+)\.(\d+) (/.*)")  # command, version, path
+BEAT_S = 5.0  # interval of the launcher's heartbeat, wall time
+SILENT_S = 60.0  # without a heartbeat for this long, on_host.py ends itself; shorter link outages are survived
+WAIT_S = 1800.0  # wall time for another push to end, as long as installing and compiling may take
+OLDEST_MINOR = 11  # the oldest Python 3 to look for; requires-python in pyproject.toml
+NEWEST_MINOR = 14  # the newest Python 3 to look for
+PLAIN = "python3"  # preferred name of the interpreter
+ANSWER = re.compile(r"(python3(?:\.\d+)?) (\d+)\.(\d+)\.(\d+) (/.*)")  # command, version, path of an interpreter
 
 Progress = Callable[[str, str], None]  # host, current step
 
@@ -55,10 +55,10 @@ Progress = Callable[[str, str], None]  # host, current step
 async def push(
     placed: InventoryFile, names: Sequence[str], more: Iterable[str], progress: Progress, cache: Path
 ) -> dict[str, bool]:
-    """Install on hosts, by default on all, what their roles need; return for each whether anything was installed.
+    """Install what their roles need on hosts, by default on all; return for each whether anything was installed.
 
-    `more`: extras for each of them beside those of its roles; `cache`: folder of the wheelhouse. InventoryError if a
-    host or an extra is unknown; HostsError with a line for each host that failed, after all others were installed.
+    `names`: the hosts; `more`: extras besides those of the roles; `cache`: folder of the wheelhouse. InventoryError if
+    a host or an extra is unknown; HostsError with a line for each host that failed, once the others are done.
     """
     hosts = placed.inventory.hosts
     more = list(more)
@@ -79,7 +79,7 @@ async def _push_to(
     name: str, host: Host, base: Path, wanted: frozenset[str], wheelhouse: Wheelhouse, progress: Progress
 ) -> bool:
     if host.python:
-        progress(name, f"uses its own zsim, in {host.python}")
+        progress(name, f"has its own zsim, of {host.python}")
         return False
     link = HostLink(name, host, base)
     try:
@@ -104,7 +104,7 @@ async def _install(
     needed = await wheelhouse.wheel_set(link.name, wheel_target(link.name, facts), wanted)
     described = " ".join(("zsim", __version__, *(f"+{extra}" for extra in needed.extras)))
     if is_installed(needed, facts["installed"]):
-        progress(f"{described} is there")
+        progress(f"{described} is already installed")
         return False
     await _copy(link, f"{facts['folder']}/wheels", missing(needed, facts), progress)
     progress("installing")
@@ -125,7 +125,7 @@ async def _install(
 
 
 def is_installed(wanted: WheelSet, installed: dict[str, Any] | None) -> bool:
-    """Return whether a host has these wheels installed, according to the note of the last push."""
+    """Return whether these wheels are installed on a host, by the note of the last push (`installed`)."""
     if installed is None or installed["project"] != wanted.project.sha256:
         return False
     return set(wanted.extras) <= set(installed["extras"]) and not _new(wanted, installed)
@@ -138,7 +138,7 @@ def _new(wanted: WheelSet, installed: dict[str, Any] | None) -> list[Wheel]:
 
 
 def missing(wanted: WheelSet, facts: dict[str, Any]) -> list[Wheel]:
-    """Return the wheels that must be copied to a host, small ones last for smooth progress."""
+    """Return the wheels that must be copied to a host, the largest first, so that progress is smooth at the end."""
     needed = [wanted.project, wanted.pip, *_new(wanted, facts["installed"])]
     lacking = [wheel for wheel in needed if facts["wheels"].get(wheel.path.name) != wheel.sha256]
     return sorted(lacking, key=lambda wheel: -wheel.size_bytes)
@@ -166,7 +166,7 @@ async def _copy(link: HostLink, folder: str, wheels: Sequence[Wheel], progress: 
             await sftp.makedirs(folder, exist_ok=True)
             await asyncio.gather(*(one(sftp, wheel) for wheel in wheels))
     except (asyncssh.Error, OSError) as error:
-        why = f"copying to {folder} failed ({error}); is there space, is the link up?"
+        why = f"copying to {folder} failed ({error}); is there space, and is the link up?"
         raise HostsError(f"{link.name}: {why}") from error
 
 
@@ -177,7 +177,7 @@ class Interpreter(NamedTuple):
 
 
 def interpreter_query() -> str:
-    """Return a POSIX shell command that prints command, version and path of every Python of a host."""
+    """Return a POSIX shell command that prints command, version and path of each Python on a host."""
     names = [PLAIN, *(f"python3.{minor}" for minor in range(NEWEST_MINOR, OLDEST_MINOR - 1, -1))]
     code = 'import sys; print("%d.%d.%d" % sys.version_info[:3], sys.executable)'
     return f"for p in {' '.join(names)}; do facts=$($p -c '{code}' 2>/dev/null) && echo $p $facts; done; true"
@@ -190,9 +190,9 @@ def parse_interpreters(answer: str) -> list[Interpreter]:
 
 
 def choose_interpreter(name: str, interpreters: Sequence[Interpreter], here: tuple[int, int]) -> Interpreter:
-    """Return the Python to install for: one of the launcher's minor version, preferably called `python3`.
+    """Return the Python to install for: one with the launcher's minor version (`here`), preferably called `python3`.
 
-    HostsError if there is none: runs with different Pythons would not have the same bits.
+    HostsError if the host has none, because runs with different Pythons would not be identical.
     """
     fit = [each for each in interpreters if each.version[:2] == here]
     if fit:
@@ -203,21 +203,21 @@ def choose_interpreter(name: str, interpreters: Sequence[Interpreter], here: tup
     by_version = {".".join(map(str, each.version)): each.command for each in reversed(interpreters)}
     found = ", ".join(f"{command} {version}" for version, command in by_version.items())
     raise HostsError(
-        f"{name}: has {found}; must be Python {wanted} as here, for the same bits; install python{wanted} beside it, "
+        f"{name}: has {found}; must be Python {wanted} as here, for identical results; install python{wanted} too, "
         "or run zsim here with a Python that the host has"
     )
 
 
 class Installer:
-    """on_host.py running on a host, reached over one ssh channel; it ends, with its children, when that closes."""
+    """on_host.py running on a host, over one ssh channel; when that closes, it ends with its children."""
 
     def __init__(self, name: str, python: str, program: RemoteProgram) -> None:
         self._name, self._python, self._program = name, python, program
 
     async def ask(self, act: str, timeout_s: float, **order: Any) -> dict[str, Any]:
-        """Give an order and return the answer; HostsError if it failed, took longer, or the host is gone."""
+        """Send an order and return the answer; HostsError if it fails, takes too long, or the host is lost."""
         self._program.send(json.dumps({"act": act, **order}) + "\n")
-        message = await self.answer(timeout_s, f"to {act} took longer than {timeout_s:g} s; is it busy?")
+        message = await self.answer(timeout_s, f"{act} took longer than {timeout_s:g} s; is the host busy?")
         if "error" in message:
             raise HostsError(f"{self._name}: {message['error'][:300]}")
         return message
@@ -234,13 +234,13 @@ class Installer:
 async def open_installer(
     link: HostLink, python: str, folder: str, progress: Callable[[str], None]
 ) -> AsyncIterator[Installer]:
-    """Run on_host.py with a Python of a host for the duration of the block; only one instance installs at a time.
+    """Run on_host.py with a Python of a host for the duration of the block, after any other push to it has ended.
 
-    `folder`: of zsim on the host; `progress` takes a line on which push is waited for. HostsError if the host cannot
-    be reached, its folder cannot be used or another push takes too long.
+    `folder`: that of zsim on the host; `progress` takes a line on the push that is being waited for. HostsError if the
+    host cannot be reached, its folder cannot be used, or the other push takes too long.
     """
     script = Path(on_host.__file__).read_bytes()
-    start = f"import sys; exec(sys.stdin.buffer.read({len(script)}))"  # orders follow on the same stream
+    start = f"import sys; exec(sys.stdin.buffer.read({len(script)}))"  # the orders follow in the same stream
     who = f"{getpass.getuser()}@{socket.gethostname()}"
     async with open_program(link, shell_line([python, "-P", "-c", start, folder, who, f"{SILENT_S:g}"])) as program:
 
@@ -257,13 +257,13 @@ async def open_installer(
             message = await there.answer(START_S)
             if holder := message.get("waits"):
                 progress(f"waiting for the push of {holder}")
-                late = f"{holder} is pushing to it; wait for that to end, or end it there"
+                late = f"{holder} is pushing to it; wait for that push to end, or end it there"
                 message = await there.answer(WAIT_S, late)
             if why := message.get("unwritable"):
-                remedy = f"correct hosts.{link.name}.folder, or make it there"
+                remedy = f"correct hosts.{link.name}.folder, or create the folder there"
                 raise HostsError(f"{link.name}: its folder cannot be used ({why}); {remedy}")
             if why := message.get("unlocked"):
-                progress(f"its folder cannot be locked ({why}); do not let two commands push to it at a time")
+                progress(f"its folder cannot be locked ({why}); do not run two pushes to it at a time")
             yield there
         finally:
             beats.cancel()

@@ -1,4 +1,4 @@
-"""The table of all processes on all hosts that `zsim up` shows and `zsim ps` prints."""
+"""The table of the processes on all hosts that `zsim up` shows and `zsim ps` prints."""
 
 import time
 from collections import Counter
@@ -19,16 +19,16 @@ from zsim_deploy.launch.supervisor import status_row
 if TYPE_CHECKING:
     from zsim_deploy.hosts.host_link import HostLink
 
-FIRST_S = 1.0  # simulated; from then on it flies
-SILENT_S = 1.0  # a host that has not answered for this long is shown as silent; it is asked twice a second …
+FIRST_S = 1.0  # simulated time from which the run counts as flying
+SILENT_S = 1.0  # wall time without an answer after which a host is shown as silent; it is probed twice a second …
 ROUND_TRIPS = 2.0  # … plus this many of its round trips, because over a slow link every answer takes long
-WAITED_S = 0.5  # a process that is waited for longer is shown so; shorter waits are normal in lockstep
-SILENT_PROCESS_S = 1.8  # health comes once a second; a stopped process is shown within 2 s
-STALE_S = 3.0  # health comes once a second; older figures are not shown
-AROUND = 4  # lines of a terminal beside the rows: progress, two of the head, and the count of hidden rows
-NAMED_MAX = 8  # roles that a refusal names
-LONGEST_S = float("inf")  # of a process that has sent no health yet: shown before all others
-ATTENTION = (  # prefixes of states, the most urgent first; then all others, and last those of NOTHING_AMISS
+WAITED_S = 0.5  # wall time of a wait for a process from which it is shown; shorter waits are normal in lockstep
+SILENT_PROCESS_S = 1.8  # wall time; health arrives once a second, so a stopped process is shown within 2 s
+STALE_S = 3.0  # wall time after which a process's health is no longer shown; it arrives once a second
+AROUND = 4  # lines of a terminal besides the rows: progress, two of the table's head, and the count of hidden rows
+NAMED_MAX = 8  # number of roles named in a refusal
+LONGEST_S = float("inf")  # age and lag of a process that has sent no health yet, so that it is shown first
+ATTENTION = (  # prefixes of states, the most urgent first; all other states follow, and NOTHING_AMISS comes last
     "ended (",
     "lost",
     "no sign of life",
@@ -37,7 +37,7 @@ ATTENTION = (  # prefixes of states, the most urgent first; then all others, and
     "waits for",
 )
 NOTHING_AMISS = ("running", "ended")
-FIGURES = {  # sort keys, the greatest first: field, and the value in place of an unknown one
+NUMBERS = {  # by sort key, in descending order: field, and the value in place of an unknown one
     "age": ("age_s", LONGEST_S),
     "lag": ("lag_ms", LONGEST_S),
     "messages": ("messages_per_s", 0.0),
@@ -58,14 +58,14 @@ Row = Mapping[str, Any]
 
 
 class StatusTable(Screen):
-    """Progress of a run on several hosts; a table of chosen rows on a terminal, lines elsewhere."""
+    """Progress of a run on several hosts: a table of the chosen rows on a terminal, lines elsewhere."""
 
     def __init__(self, duration_s: float, console: Console | None = None, choice: "RowChoice | None" = None) -> None:
         super().__init__(duration_s, console)
         self._choice = choice or RowChoice()
-        self.members: Sequence[Any] = ()  # must be set before it is shown
+        self.members: Sequence[Any] = ()  # must be set before the table is shown
         self.links: dict[str, HostLink] = {}
-        self.stages_s: dict[str, float] = {}  # how long each step before the processes' start took
+        self.stages_s: dict[str, float] = {}  # wall time of each step before the start of the processes, by name
         self._begun_s = time.monotonic()
         self._flies = False
         self._health: dict[str, dict[str, Any]] = {}
@@ -84,7 +84,7 @@ class StatusTable(Screen):
             super().clock(line)
 
     def health(self, line: dict[str, Any]) -> None:
-        """Take a process's health; its message rate is the difference to the previous one."""
+        """Take the health of a process; its message rate follows from the previous one."""
         now_s = time.monotonic()
         former = self._health.get(line["name"])
         rate = None
@@ -93,13 +93,13 @@ class StatusTable(Screen):
         self._health[line["name"]] = {**line, "wall_s": now_s, "per_s": rate}
 
     def report_silent_hosts(self) -> None:
-        """Report once that a host no longer answers, and once that it is back."""
+        """Report each host once when it stops answering, and once when it answers again."""
         for name, link in self.links.items():
             silent_s = link.silent_s()
             if _is_silent(link) and name not in self._silent:
                 self._silent.add(name)
                 roles = ", ".join(member.name for member in self.members if member.host == name)
-                self.say(f"host {name} does not answer (since {silent_s:.1f} s); on it: {roles or 'nothing'}")
+                self.say(f"host {name} does not answer (silent for {silent_s:.1f} s); on it: {roles or 'nothing'}")
             elif silent_s == 0.0 and name in self._silent:
                 self._silent.discard(name)
                 self.say(f"host {name} answers again")
@@ -112,7 +112,7 @@ class StatusTable(Screen):
             if member.name == WORLD and self.clock_now is not None:
                 last_s = max(last_s or 0.0, self.clock_now["wall_s"])
             row = status_row(member.name, member.host, member.pid, self._state(member, link), member.restarts)
-            row["age_s"] = None if last_s is None else now_s - last_s  # since its last sign of life
+            row["age_s"] = None if last_s is None else now_s - last_s  # time since the last sign of life
             if health and now_s - health["wall_s"] < STALE_S:
                 row |= {"lag_ms": health["lag_ns"] / 1e6, "messages_per_s": health["per_s"]}
             if link and link.answered_s and not _is_silent(link):
@@ -136,9 +136,9 @@ class StatusTable(Screen):
         return member.state
 
     def _no_sign_s(self, name: str, round_trip_s: float) -> float:
-        """Return how long a process has been silent, 0 if not unusually long [s, wall].
+        """Return how long a process has been silent [s, wall]; 0 if that is not unusually long.
 
-        The health of all other processes comes through the world: while the world is silent, only it is called silent.
+        The health of all other processes arrives through the world: while the world is silent, only it is reported.
         """
         now_s, patience_s = time.monotonic(), SILENT_PROCESS_S + ROUND_TRIPS * round_trip_s
         heard_s = self._health[name]["wall_s"] if name in self._health else None
@@ -157,8 +157,8 @@ class StatusTable(Screen):
             return Group(head, table(rows, one_line=True))
         first = rows if self._choice.sort else sorted(rows, key=needs_attention)
         states = Counter(row["state"] for row in first[lines:])
-        counted = ", ".join(f"{count} {state}" for state, count in states.most_common(3))
-        more = f"… and {len(first) - lines} more: {counted}{', …' if len(states) > 3 else ''}; `zsim ps` shows all"
+        summary = ", ".join(f"{count} {state}" for state, count in states.most_common(3))
+        more = f"… and {len(first) - lines} more: {summary}{', …' if len(states) > 3 else ''}; `zsim ps` shows all"
         return Group(head, table(first[:lines], one_line=True), cell(more))
 
 
@@ -167,17 +167,17 @@ def _is_silent(link: "HostLink") -> bool:
 
 
 def table(rows: Sequence[dict[str, Any]], one_line: bool = False) -> FittedTable:
-    """Return the rows as a table; `one_line`: text that does not fit on its line is cut."""
+    """Return the rows as a table; `one_line`: each row has one line, and text that does not fit is cut."""
     cells = [
         (
             row["role"],
             row["host"],
             str(row["pid"] or "-"),
             row["state"],
-            _figure(row["lag_ms"], "{:.0f} ms"),
-            _figure(row.get("age_s"), "{:.1f} s"),
-            _figure(row["messages_per_s"], "{:.0f}"),
-            _figure(row["round_trip_ms"], "{:.1f} ms"),
+            _number(row["lag_ms"], "{:.0f} ms"),
+            _number(row.get("age_s"), "{:.1f} s"),
+            _number(row["messages_per_s"], "{:.0f}"),
+            _number(row["round_trip_ms"], "{:.1f} ms"),
             str(row["restarts"]),
         )
         for row in rows
@@ -185,31 +185,31 @@ def table(rows: Sequence[dict[str, Any]], one_line: bool = False) -> FittedTable
     return FittedTable(COLUMNS, cells, one_line=one_line)
 
 
-def _figure(value: float | None, form: str) -> str:
+def _number(value: float | None, form: str) -> str:
     return "-" if value is None else form.format(value)
 
 
 class RowChoice(NamedTuple):
-    """Which rows are shown, and in what order: patterns of roles (`estimator.*2`), of their subjects, or of hosts."""
+    """Which rows are shown, and in what order."""
 
-    only: Sequence[str] = ()  # all rows if empty
-    sort: RowOrder | None = None  # unsorted if None
+    only: Sequence[str] = ()  # patterns of roles (`estimator.*2`), drones, formations or hosts; empty: all rows
+    sort: RowOrder | None = None  # None: in the order of the processes
 
     def of(self, rows: Sequence[Row]) -> list[Any]:
-        """Return the selected rows in order; the sort is stable."""
+        """Return the selected rows, in a stable order."""
         shown = [row for row in rows if not self.only or any(_matches(pattern, row) for pattern in self.only)]
         if self.sort is None:
             return shown
         by = self.sort.value
         if self.sort is RowOrder.ATTENTION:
             return sorted(shown, key=needs_attention)
-        if by not in FIGURES:
+        if by not in NUMBERS:
             return sorted(shown, key=lambda row: row[by])
-        field, unknown = FIGURES[by]
+        field, unknown = NUMBERS[by]
         return sorted(shown, key=lambda row: -(unknown if row.get(field) is None else row[field]))
 
     def check(self, rows: Sequence[Row]) -> None:
-        """Refuse a pattern that matches no row: RunError with some of the existing roles."""
+        """Raise RunError, naming some of the roles, if a pattern matches no row."""
         for pattern in self.only:
             if not any(_matches(pattern, row) for row in rows):
                 roles = [row["role"] for row in rows]
@@ -224,7 +224,7 @@ def _matches(pattern: str, row: Row) -> bool:
 
 
 def needs_attention(row: Row) -> int:
-    """Return the rank of a row by its state: 0 is the most urgent."""
+    """Return the rank of a row by the urgency of its state; 0 is the most urgent."""
     state = row["state"]
     if state in NOTHING_AMISS:
         return len(ATTENTION) + 1 + NOTHING_AMISS.index(state)

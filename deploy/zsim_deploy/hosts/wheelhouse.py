@@ -1,9 +1,9 @@
-"""The wheels that hosts need, collected on the launcher's machine by pip, and cached.
+"""The wheels that hosts need, collected by pip on the launcher's machine, and cached.
 
 CACHE/wheels/*.whl           wheels of other projects, for all hosts
 CACHE/build/*.whl            wheels of this project's build requirements, for this machine
-CACHE/houses/KEY.json        names of the wheels that one kind of host needs; KEY is a hash of the request
-CACHE/zsim/KEY/zsim-*.whl    this project, built; KEY is a hash of its sources
+CACHE/houses/KEY.json        names of the wheels for one kind of host and its extras; KEY is a hash of these
+CACHE/zsim/KEY/zsim-*.whl    wheel of this project; KEY is a hash of its sources
 """
 
 import asyncio
@@ -29,19 +29,19 @@ from zsim_deploy import SAFE_PATH
 
 PROJECT = "zsim"
 KEY_DIGITS = 16  # 64 bits of a SHA-256
-LOCK = "constraints.txt"  # in a checkout
-PIP = "pip"  # for hosts without it; not constrained to the version here, which may be too old for a newer Python
-RETRIES = "1"  # of pip, for each page of an index; its default of 5 takes minutes without a network
-LINE_BYTES = 1 << 20  # limit of a line that pip prints
-NO_INDEX = re.compile(r"connection broken by '\w+\((.*)\)': ")  # printed by pip before it retries, with the reason
-MANYLINUX_OLDEST = 5  # glibc 2.5; PEP 600
-MANYLINUX2014 = 17  # glibc 2.17; PEP 599. pip takes manylinux2010 and manylinux1 together with manylinux2014
+LOCK = "constraints.txt"  # file in a checkout with the versions of packages
+PIP = "pip"  # copied for hosts without pip, unconstrained: this machine's version may be too old for a newer Python
+RETRIES = "1"  # pip's retries for each page of an index; its default of 5 takes minutes without a network
+LINE_BYTES = 1 << 20  # maximum length of a line that pip prints
+NO_INDEX = re.compile(r"connection broken by '\w+\((.*)\)': ")  # pip prints this, with the reason, before a retry
+MANYLINUX_OLDEST = 5  # minor version of the oldest glibc with a tag, 2.5; PEP 600
+MANYLINUX2014 = 17  # minor version of its glibc, 2.17; PEP 599. With manylinux2014 pip also accepts the older aliases
 
 Progress = Callable[[str], None]
 
 
 class PipError(Exception):
-    """pip failed; with its error line."""
+    """pip failed; the text is its error line."""
 
 
 class UnreachableError(Exception):
@@ -56,7 +56,7 @@ class WheelTarget(NamedTuple):
     platforms: tuple[str, ...]  # compatible platform tags, the best first
 
     def options(self) -> list[str]:
-        """Return the options of pip that select it."""
+        """Return the pip options that select this target."""
         platforms = [word for name in self.platforms for word in ("--platform", name)]
         version = ".".join(map(str, self.version))
         return ["--implementation", "cp", "--python-version", version, "--abi", self.abi, *platforms]
@@ -66,10 +66,10 @@ class WheelTarget(NamedTuple):
 
 
 def wheel_target(name: str, facts: Mapping[str, Any]) -> WheelTarget:
-    """Return the target of wheels for a host from the facts of on_host.py; HostsError if there are no wheels for it."""
+    """Return the target of wheels for a host, from the facts of on_host.py; HostsError if no wheels exist for it."""
     major, minor = facts["version"]
     if facts["implementation"] != "cpython":
-        raise HostsError(f"{name}: its Python is {facts['implementation']}; must be CPython; install that there")
+        raise HostsError(f"{name}: its Python is {facts['implementation']}; must be CPython; install CPython there")
     platforms = _platforms(facts["platform"], facts["libc"])
     if not platforms:
         shown = " ".join(filter(None, (facts["platform"], *facts["libc"])))
@@ -118,17 +118,17 @@ class Wheelhouse:
         self._unreachable = ""
         self._lock = asyncio.Lock()
         self._wheels, self._builders, self._houses = folder / "wheels", folder / "build", folder / "houses"
-        for made in (self._wheels, self._builders, self._houses):
-            made.mkdir(parents=True, exist_ok=True)
+        for each in (self._wheels, self._builders, self._houses):
+            each.mkdir(parents=True, exist_ok=True)
 
     async def wheel_set(self, host: str, target: WheelTarget, extras: Iterable[str]) -> WheelSet:
         """Return the wheels that a host needs.
 
-        HostsError if the project cannot be built, there is no wheel for the host, or no package index is reached.
+        HostsError if the project cannot be built, a wheel for the host is missing, or no package index is reached.
         """
         async with self._lock:
             if self._unreachable:
-                raise HostsError(self._unreachable)  # another attempt would take as long again
+                raise HostsError(self._unreachable)  # another attempt would take just as long
             try:
                 project = await self._project()
                 wanted = tuple(sorted(extras))
@@ -151,7 +151,7 @@ class Wheelhouse:
     async def _project(self) -> Path:
         """Return the wheel of this project, built from the checkout or from the installed version.
 
-        Its build requirements are kept, so that the next build needs no index.
+        Its build requirements are cached, so that the next build needs no index.
         """
         root = checkout()
         source = str(root) if root else requirement(importlib.metadata.distribution(PROJECT))
@@ -172,7 +172,7 @@ class Wheelhouse:
                 try:
                     built.rename(folder)
                 except OSError:
-                    if not folder.is_dir():  # else another process has built the same meanwhile
+                    if not folder.is_dir():  # else another process has built the same wheel meanwhile
                         raise
                     shutil.rmtree(built)
         return next(folder.glob("*.whl"))
@@ -197,7 +197,7 @@ class Wheelhouse:
             for name in names:
                 os.replace(Path(temporary, name), self._wheels / name)
         if other_versions:
-            self._progress(f"{host}: {target} gets other package versions than this machine: not the same bits")
+            self._progress(f"{host}: {target} gets other package versions than this machine: results are not identical")
         note.with_suffix(".part").write_text(json.dumps(names))
         os.replace(note.with_suffix(".part"), note)
         return names
@@ -211,7 +211,7 @@ def requirements(project: Path) -> list[str]:
 
 
 def requirement(installed: importlib.metadata.Distribution) -> str:
-    """Return the requirement with which pip finds an installed distribution again: its origin or its version."""
+    """Return the requirement by which pip finds an installed distribution again: its origin, or its version."""
     origin = json.loads(installed.read_text("direct_url.json") or "{}")  # PEP 610
     if "vcs_info" in origin:
         return f"{PROJECT} @ {origin['vcs_info']['vcs']}+{origin['url']}@{origin['vcs_info']['commit_id']}"
@@ -220,7 +220,7 @@ def requirement(installed: importlib.metadata.Distribution) -> str:
 
 @cache
 def constraints() -> list[str]:
-    """Return the versions of the packages that are installed here from an index, as constraints of pip."""
+    """Return the versions of the packages installed here from an index, as pip constraints."""
     versions = set()
     for each in importlib.metadata.distributions():
         name = each.metadata["Name"].lower()
@@ -230,14 +230,14 @@ def constraints() -> list[str]:
 
 
 def lock() -> list[str]:
-    """Return the versions that a checkout is tested with, as constraints of pip; none without a checkout."""
+    """Return the versions with which a checkout is tested, as pip constraints; none without a checkout."""
     root = checkout()
     path = root / LOCK if root else None
     return path.read_text("utf-8").splitlines() if path and path.exists() else []
 
 
 def checkout() -> Path | None:
-    """Return the folder that this code is imported from, if it is a checkout of the project."""
+    """Return the root of the checkout from which this code is imported; None if it is installed."""
     root = Path(zsim.__file__).resolve().parents[1]
     is_checkout = (root / "pyproject.toml").exists() and _description(root).get("project", {}).get("name") == PROJECT
     return root if is_checkout else None
@@ -248,7 +248,7 @@ def _description(root: Path) -> dict[str, Any]:
 
 
 def _sources(root: Path) -> list[tuple[str, str]]:
-    """Return path and hash of every file that affects the wheel."""
+    """Return path and hash of each file that affects the wheel."""
     files = [root / "pyproject.toml", root / "README.md"]
     for package in _description(root)["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]:
         files += sorted(path for path in (root / package).rglob("*") if path.is_file())
@@ -289,21 +289,27 @@ async def download_wheels(
     kept: Path,
     progress: Progress,
 ) -> bool:
-    """Collect wheels for a target; projects that have only sources are built here.
+    """Collect wheels for a target in a folder; return whether the first list of constraints could not be met.
 
-    `held` are lists of pip constraints, in order of preference: first the versions of this machine, because equal bits
-    need equal versions. The first list that can be met is used, else the newest versions. No index is needed where the
-    folder `kept` has all wheels. Return whether another list than the first was used. PipError if there are no wheels
-    for the target; UnreachableError if the index does not answer.
+    Projects of which the index has only sources are built here.
+
+    Args:
+        held: lists of pip constraints, the preferred one first: the versions of this machine, because identical results
+            need identical versions. The first list that can be met is used, else the newest versions.
+        kept: folder of cached wheels; no index is needed if it has all of them.
+
+    Raises:
+        PipError: there are no wheels for the target.
+        UnreachableError: the index does not answer.
     """
     fit = ("download", "--only-binary=:all:", *target.options(), "--dest", str(into))
 
     async def download(wanted: Sequence[str], built: str) -> None:
-        """Download wheels; if that fails, first build the projects that have only sources, into a folder."""
+        """Download wheels; if that fails, first build wheels from sources into the folder `built`."""
         try:
             await pip(*fit, *wanted, progress=progress)
         except PipError:
-            progress("building packages that have only sources")
+            progress("building packages from sources")
             await pip("wheel", "--wheel-dir", built, *wanted, progress=progress)
             await pip(*fit, "--find-links", built, *wanted, progress=progress)
 
@@ -324,7 +330,7 @@ async def download_wheels(
 
 
 async def is_kept(kept: Path, arguments: Sequence[str], progress: Progress) -> bool:
-    """Run pip with the wheels of a folder and no index; return whether they were enough."""
+    """Run pip with the wheels of a folder and no index; return whether these were enough."""
     if not any(kept.glob("*.whl")):
         return False
     try:
@@ -335,9 +341,9 @@ async def is_kept(kept: Path, arguments: Sequence[str], progress: Progress) -> b
 
 
 async def pip(*arguments: str, progress: Progress) -> None:
-    """Run pip of this Python with the user's configuration, except for the number of retries.
+    """Run this Python's pip with the user's configuration, except for the number of retries.
 
-    PipError with its error line; UnreachableError with the reason why an index did not answer.
+    PipError if it fails; UnreachableError, with the reason, if an index does not answer.
     """
     options = ("--disable-pip-version-check", "--no-input", "-q")
     process = await asyncio.create_subprocess_exec(
@@ -367,6 +373,6 @@ async def pip(*arguments: str, progress: Progress) -> None:
 
 
 def _reason(error: str) -> str:
-    """Extract the reason from a connection error that pip prints."""
+    """Extract the reason from a connection error printed by pip."""
     last = re.split(r"[:,] ", error)[-1].strip("\"')")
     return re.sub(r"\[Errno -?\d+\] ", "", last) + (")" if "(" in last else "")

@@ -301,7 +301,7 @@ def test_the_doctor_tells_of_certificates_with_and_without_a_scenario(lab: Path)
     for given in (None, places):
         found = check_hosts(placed, given)
         assert [line for line in found.faults if "certificate" in line] == []
-        assert any(has_terms(line, "read", "others") for line in found.warnings)
+        assert any(has_terms(line, "read", "other users") for line in found.warnings)
     shutil.rmtree(lab / "certs/h1/world")
     for given in (None, places):
         assert any(has_terms(line, "certificate missing", "world", "h1") for line in check_hosts(placed, given).faults)
@@ -330,7 +330,7 @@ def test_show_advises_a_command_that_mends(lab: Path) -> None:
     now = datetime.now(UTC)
     signer = certificates.authority(lab / "certs", now)
     assert run("show", lab / "hosts.yaml").stderr == ""
-    for days, state in ((-0.5, "expired on "), (1.0, "ends soon")):
+    for days, state in ((-0.5, "expired on "), (1.0, "expires soon")):
         issue(lab / "certs", signer, CertificateRequest("h1", "world", ("127.0.0.1",)), now, days)
         shown = run("show", lab / "hosts.yaml")
         (row,) = [line for line in shown.stdout.splitlines() if state in line]

@@ -40,7 +40,7 @@ def test_a_sensor_of_the_user_s_has_a_row_counted_or_not():
     own = {"pitot": 20.0, "my_uwb": 10.0}
     table = console_tables.sensor_table("drone1", {"gps": (5, 0), "my_uwb": (7, 1)}, {}, "", own)
     rows = [without_tags(row.replace("</td>", " ")).split() for row in table.split("<tr>")[2:]]
-    assert rows == [["gps", "5", "0", "–"], ["my_uwb", "7", "1", "–"], ["pitot", "–", "–", "20", "Hz", "as", "set"]]
+    assert rows == [["gps", "5", "0", "–"], ["my_uwb", "7", "1", "–"], ["pitot", "–", "–", "20", "Hz", "(configured)"]]
 
 
 def test_tables_show_text_of_others_as_text():

@@ -178,12 +178,12 @@ def test_what_is_previewed_is_flown_once_it_is_asked_for(bench: Bench):
     ways = [each.paths_W for each in shown if each is not None]
     assert len(ways) == 2
     assert ways[1][:, -1].mean(axis=0)[[0, 2]] == pytest.approx([7.0, 9.0])  # both, one after the other
-    bench.gui.press("Fly what is previewed")
+    bench.gui.press("Fly the preview")
     assert bench.client.asked == [(bench.cluster.name, "target", {"values": {"x_c": 7.0, "z_c": 9.0}})]
     assert shown[-1] is None
     form.request_target({"x_c": 8.0})
-    bench.gui.press("Discard it")
-    bench.gui.press("Fly what is previewed")
+    bench.gui.press("Discard the preview")
+    bench.gui.press("Fly the preview")
     assert len(bench.client.asked) == 1
     bench.gui.at["Preview first"].value = False
     form.request_target({"x_c": 8.0})
@@ -337,7 +337,7 @@ def test_a_slider_shows_a_value_out_of_its_range_as_it_is_and_does_not_ask_for_i
     form = bench.formation()
     height, tilt, side = (bench.gui.at[label] for label in ("z_c [m]", "pitch [deg]", "p [m]"))
     limits = [(each.min, each.max) for each in (height, tilt, side)]
-    assert has_terms(side.label, "p", "not known")
+    assert has_terms(side.label, "p", "unknown")
     form.refresh(bench.view(z_c=0.1, pitch=math.radians(74.9), p=25.37), LATER_S)
     assert (height.value, tilt.value, side.value) == (0.1, 75.0, 25.4)
     assert (height.min, tilt.max, side.max) == (0.1, 75.0, 25.4)

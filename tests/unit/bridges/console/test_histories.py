@@ -212,7 +212,7 @@ def test_plots_that_stand_still_keep_what_they_show():
     shown.choice.value = shown.choice.options[-1]
     shown.plots.draw()
     shown.plots.draw()
-    shown.gui.at["Stand still"].value = True
+    shown.gui.at["Freeze"].value = True
     before = shown.gui.plots[0].data
     shown.flights.add(poses(100.0), {})
     shown.plots.draw()

@@ -156,7 +156,10 @@ def test_an_engaged_formation_with_a_drone_flown_by_hand_is_an_alarm_with_its_fi
     view = ViewCluster(0, 0, "engaged", ("p", "yaw"), (11.6, 3.0), (4.0, 0.0), "")
     foreign = {"main": {"drone2": "console.run"}}
     found = run_condition.formation_alarms({"main": ("engaged", "")}, foreign, {"main": view})
-    assert [(each.severity, each.name) for each in found] == [("amber", "not flown whole"), ("red", "off reference")]
+    assert [(each.severity, each.name) for each in found] == [
+        ("amber", "partly flown by others"),
+        ("red", "off reference"),
+    ]
     assert has_terms(found[0].text, "drone2", "console.run")
     assert has_terms(found[1].text, "p", "11.6 m", "4.0 m")
     near = ViewCluster(0, 0, "engaged", ("p", "yaw"), (5.9, 3.0), (4.0, 0.0), "")

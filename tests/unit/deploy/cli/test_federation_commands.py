@@ -112,7 +112,7 @@ def test_which_are_cleared(mine: Path, which: str, args: dict[str, object]):
 def test_a_row_says_when_and_what():
     fault = Fault(1, "gps_dropout", "drone1", {"probability": 0.5}, 2_000_000_000, None, "me")
     cells = [cell.strip() for cell in row(fault, 3_000_000_000)]
-    assert cells == ["1", "acts", "drone1", "gps_dropout", "2.00 to ... s", "probability=0.5"]
+    assert cells == ["1", "active", "drone1", "gps_dropout", "2.00 to ... s", "probability=0.5"]
     assert row(fault, 0)[1].strip() == "planned"
 
 

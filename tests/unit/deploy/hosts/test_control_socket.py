@@ -39,7 +39,7 @@ def line():
 def test_an_answer_comes_back_and_a_federation_is_up_only_once():
     assert control_socket.ask("zsim", "add", a=2, b=3) == 5
     assert control_socket.place("zsim").parent.stat().st_mode & 0o077 == 0
-    with refused(RunError, "up already", "zsim down --federation zsim", "--set federation=NAME"):
+    with refused(RunError, "already up", "zsim down --federation zsim", "--set federation=NAME"):
         ControlSocket("zsim", {})
 
 

@@ -180,7 +180,7 @@ class Silent(HostLink):
 
 
 def test_a_greeting_of_the_login_shell_is_passed_over():
-    clocks = [json.dumps({"time_ns": 10**18})] * doctor.OFFSET_ASKS
+    clocks = [json.dumps({"time_ns": 10**18})] * doctor.OFFSET_SAMPLES
     output = "\n".join(["Welcome to lab", "17", json.dumps(SOUND), *clocks, ""])
     assert asyncio.run(doctor.host_report(Silent(output), "python")).facts == SOUND
 
@@ -191,7 +191,7 @@ def test_a_host_that_says_nothing_is_a_line(monkeypatch):
     with refused(HostsError, "h1", "no answer", "0.01 s"):
         asyncio.run(doctor.host_report(Silent(), "python"))
     (path,) = asyncio.run(doctor.network_paths([Silent()], Silent(), {"h1": "python"}, 7447))
-    assert has_terms(path.figures["error"], "h1", "no answer", "0.01 s")
+    assert has_terms(path.measured["error"], "h1", "no answer", "0.01 s")
 
 
 PUSH = "zsim push --hosts lab.yaml"

@@ -133,7 +133,7 @@ def test_a_federation_that_is_up_already_is_refused_before_any_host_is_asked(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     with (
         ControlSocket("zsim", {}),
-        refused(RunError, "'zsim'", "up already", "--set federation=NAME"),
+        refused(RunError, "'zsim'", "already up", "--set federation=NAME"),
     ):
         hosts_commands.up(scenario=paths[0], hosts=paths[1], out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
