@@ -74,7 +74,7 @@ def rerun_record(
             reason = f"has drones whose bodies are external ({listed(external)}); they cannot be flown again"
             raise RunError(f"{place}: {reason}")
         agents = recorded_run.recorded_agents(record.reader, record.info, record.scenario)
-        nobody = agents._replace(processes=(), requests=(), failure="")
+        no_agents = agents._replace(processes=(), requests=(), failure="")
         here, recorded_by = fingerprint(), record.info.version
         if others := {record.info.fingerprint, *agents.fingerprints} - {here}:
             of = f"{', '.join(sorted(others))}; here {here}"
@@ -84,7 +84,7 @@ def rerun_record(
         if commands_only or agents.why_not:
             why = "as asked" if commands_only else agents.why_not
             say(f"agents are not run again: {why}; the world alone, with all recorded commands")
-            return _judge(record.reader, agents.truth_sha256, _fly(record, nobody), say)
+            return _judge(record.reader, agents.truth_sha256, _fly(record, no_agents), say)
         say(f"run again: world, {', '.join(map(str, agents.processes))}")
         again = _fly(record, agents)
         fault = _judge(record.reader, agents.truth_sha256, again, say)
@@ -97,7 +97,7 @@ def rerun_record(
             fault = _compare_outputs(outputs, again, say)
         if again.compared.first is None:
             return fault
-        alone = _fly(record, nobody)
+        alone = _fly(record, no_agents)
         if alone.compared.first is not None:
             say(f"the world alone, with all recorded commands, differs too: first {alone.compared.first}")
         else:

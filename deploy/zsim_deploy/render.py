@@ -36,7 +36,7 @@ TEMPLATES = Path(__file__).with_name("templates")
 
 STATE = "/var/lib/zsim"  # folder that StateDirectory=zsim stands for
 CACHE = "/var/cache/zsim"  # folder that CacheDirectory=zsim stands for
-PATH_MAX = 4000  # length of a folder's path, bytes; Linux allows 4095, with the names of the files in the folder
+PATH_MAX = 4000  # length of a folder's path, bytes; Linux allows 4095, including the names of the files in it
 STOP_S = 15  # time to stop before SIGKILL; a world waits 5 s for byes, and a recorder may wait for its disk
 BASE = "python:3.11-slim"  # base image, with the oldest Python that zsim runs on
 WHEEL = f"zsim-{RELEASE}-py3-none-any.whl"
@@ -78,7 +78,7 @@ def systemd(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ())
 
 def _lacks(host: Host) -> Iterator[str]:
     if host.user is None:
-        yield "user is missing; must be the user as whom the units run; add it"
+        yield "user is missing; must be the user that the units run as; add it"
     elif not _home(host.user):
         yield f"user is {show(host.user)}; must be letters, digits, `_`, `-` and `.`, at most 31"
     for name, path in (("folder", host.folder), ("python", host.python or "/")):

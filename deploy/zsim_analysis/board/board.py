@@ -45,7 +45,7 @@ from zsim_analysis.sweep.sweep_run import Row, Task
 JOURNAL, CSV, MARKDOWN = "journal.jsonl", "board.csv", "board.md"
 OWN_FILES = (JOURNAL, CSV, MARKDOWN, "summary.json", "report.html", "figures", ".lock")
 TRACK_S = 0.5  # interval between the samples of a flight that are kept for the figures
-DECIMALS = 3  # of the positions that are kept [m]: a millimetre
+DECIMALS = 3  # decimals of the positions that are kept: a millimetre
 CLUSTER_SPACE = "cluster_space"
 LAW_NAMES = (CLUSTER_SPACE, *LAWS)
 PILOT, CONTROLLER = "pilot", "main"

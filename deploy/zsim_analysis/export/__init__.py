@@ -1,4 +1,4 @@
-"""Tables, MATLAB files and Foxglove files of a run, made from its record alone.
+"""Tables, MATLAB files and Foxglove files of a run, from its record alone.
 
     export(DIR, Format.CSV, OUT, MessageSelection())     writes OUT completely or not at all
 

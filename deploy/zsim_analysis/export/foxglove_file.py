@@ -33,7 +33,7 @@ from zsim.scenario.scenario import Scenario
 from zsim.vehicles.vehicle import cross_layout
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
 from zsim_agents.formation.spaces.scenario_space import scenario_space
-from zsim_analysis.export import foxglove_messages as made
+from zsim_analysis.export import foxglove_messages as build
 from zsim_analysis.export.columns import DecodedMessages, MessageSelection, subject
 from zsim_analysis.export.foxglove_messages import GREY, MAGENTA, TRAIL_STEP_NS, NumericMessageType, RotorDisc
 from zsim_analysis.reading.recorded_run import decode_or_none, scenario_of, search_modules
@@ -200,8 +200,8 @@ class FoxgloveFile:
         self._colours = colours_of(rotors)
         self._channels: dict[str, Any] = {}
         self.variables: dict[str, NumericMessageType] = {}  # by cluster
-        self._drone = NumericMessageType("Drone", made.DRONE_NUMBERS, ("state",))
-        self._trails = made.DroneTrails()
+        self._drone = NumericMessageType("Drone", build.DRONE_NUMBERS, ("state",))
+        self._trails = build.DroneTrails()
         self._status: dict[str, Status] = {}
         self._next_ns: dict[str, int] = {}
         self._has_static_scene = False
@@ -217,62 +217,62 @@ class FoxgloveFile:
         self._checked_file.check()
         self._status.update(instant.status)
         if not self._has_static_scene and instant.truth:
-            self._log(DRONES, channels.SceneUpdateChannel, made.drones(instant.t_ns, self._rotors), instant.t_ns)
-            self._log(GROUND, channels.SceneUpdateChannel, made.ground(instant.t_ns), instant.t_ns)
+            self._log(DRONES, channels.SceneUpdateChannel, build.drones(instant.t_ns, self._rotors), instant.t_ns)
+            self._log(GROUND, channels.SceneUpdateChannel, build.ground(instant.t_ns), instant.t_ns)
             self._has_static_scene = True
-        frames: list[made.FramePose] = []
+        frames: list[build.FramePose] = []
         for name, truth in instant.truth.items():
-            frames.append((made.frame(name), truth.position_m, truth.orientation_wxyz))
+            frames.append((build.frame(name), truth.position_m, truth.orientation_wxyz))
         for name, estimate in instant.estimates.items():
-            frames.append((f"{made.frame(name)}/estimate", estimate.position_m, estimate.orientation_wxyz))
+            frames.append((f"{build.frame(name)}/estimate", estimate.position_m, estimate.orientation_wxyz))
         for name, state in instant.states.items():
             for end, values in (("", state.value), ("/desired", state.desired)):
-                if placed := made.cluster_frame(state.names, values):
+                if placed := build.cluster_frame(state.names, values):
                     frames.append((f"cluster/{name}{end}", *placed))
         if frames:
-            self._log(TF, channels.FrameTransformsChannel, made.transforms(instant.t_ns, frames), instant.t_ns)
+            self._log(TF, channels.FrameTransformsChannel, build.transforms(instant.t_ns, frames), instant.t_ns)
         for name in dict.fromkeys([*instant.truth, *instant.estimates]):
             self._write_drone(instant, name)
         for name, gps in instant.gps.items():
-            fix = made.location_fix(gps, name, self._colours.get(name, GREY))
+            fix = build.location_fix(gps, name, self._colours.get(name, GREY))
             self._log(f"/drone/{name}/gps", channels.LocationFixChannel, fix, gps.t_ns)
         for name, state in instant.states.items():
             self._write_cluster(instant, name, state)
         for event in instant.events:
-            self._log(LOG, channels.LogChannel, made.log_line(event), event.t_ns)
+            self._log(LOG, channels.LogChannel, build.log_line(event), event.t_ns)
         for key, info in instant.cameras:
             drone, frame = _camera_of(key)
-            calibration = made.camera_calibration(info, frame)
+            calibration = build.camera_calibration(info, frame)
             self._log(f"/{frame}/calibration", channels.CameraCalibrationChannel, calibration, info.t_ns)
             placed = [(frame, info.position_m, info.orientation_wxyz)]
             self._log(
-                TF, channels.FrameTransformsChannel, made.transforms(info.t_ns, placed, made.frame(drone)), info.t_ns
+                TF, channels.FrameTransformsChannel, build.transforms(info.t_ns, placed, build.frame(drone)), info.t_ns
             )
         for key, image in instant.pictures:
             _, frame = _camera_of(key)
             self._log(
-                f"/{frame}/image", channels.CompressedImageChannel, made.compressed_image(image, frame), image.t_ns
+                f"/{frame}/image", channels.CompressedImageChannel, build.compressed_image(image, frame), image.t_ns
             )
         self._write_scene(instant)
 
     def _write_drone(self, instant: Instant, name: str) -> None:
-        at, t_ns = made.timestamp(instant.t_ns), instant.t_ns
+        at, t_ns = build.timestamp(instant.t_ns), instant.t_ns
         truth, estimate = instant.truth.get(name), instant.estimates.get(name)
         for topic, state in ((f"/drone/{name}/pose", truth), (f"/drone/{name}/estimate", estimate)):
             if state is not None:
-                placed = made.pose(state.position_m, state.orientation_wxyz)
-                message = PoseInFrame(timestamp=at, frame_id=made.WORLD, pose=placed)
+                placed = build.pose(state.position_m, state.orientation_wxyz)
+                message = PoseInFrame(timestamp=at, frame_id=build.WORLD, pose=placed)
                 self._log(topic, channels.PoseInFrameChannel, message, t_ns)
         status = self._status.get(name)
-        values = made.drone_numbers(truth, estimate, status)
+        values = build.drone_numbers(truth, estimate, status)
         encoded = self._drone.encode(values, (status.state if status else "",))
         self._log(f"/drone/{name}/numbers", self._drone, encoded, t_ns)
 
     def _write_cluster(self, instant: Instant, name: str, state: ClusterState) -> None:
         if name not in self.variables:
-            tidied = [made.tidy(each) for each in state.names]
+            tidied = [build.tidy(each) for each in state.names]
             fields = [f"{what}_{each}" for what in ("desired", "estimated", "true") for each in tidied]
-            kind = NumericMessageType(f"Cluster_{made.tidy(name)}", [*fields, "margin"], ("phase", "reason"))
+            kind = NumericMessageType(f"Cluster_{build.tidy(name)}", [*fields, "margin"], ("phase", "reason"))
             self.variables[name] = kind
         numbers = self.variables[name]
         true = [math.nan] * len(state.names)  # stays unless all drones' truth is known and their shape is not singular
@@ -292,16 +292,16 @@ class FoxgloveFile:
             self._log(TRAILS, channels.SceneUpdateChannel, self._trails.update(t_ns, truth, self._colours), t_ns)
         if truth and self._is_due(POINTS, t_ns):
             places = [(state.position_m, self._colours.get(d, GREY)) for d, state in truth.items()]
-            self._log(POINTS, channels.PointCloudChannel, made.points(t_ns, places), t_ns)
+            self._log(POINTS, channels.PointCloudChannel, build.points(t_ns, places), t_ns)
         if instant.states and self._is_due(FORMATIONS, t_ns):
             desired = {c: m for c, state in instant.states.items() if (m := self._places(c, state)) is not None}
-            scene = made.formations(t_ns, instant.states, truth, desired)
+            scene = build.formations(t_ns, instant.states, truth, desired)
             self._log(FORMATIONS, channels.SceneUpdateChannel, scene, t_ns)
             if desired:
                 places = [(place, MAGENTA) for each in desired.values() for place in each.tolist()]
-                self._log(DESIRED, channels.PointCloudChannel, made.points(t_ns, places), t_ns)
+                self._log(DESIRED, channels.PointCloudChannel, build.points(t_ns, places), t_ns)
         if instant.estimates and self._is_due(ESTIMATES, t_ns):
-            scene = made.ellipsoids(t_ns, instant.estimates, self._colours)
+            scene = build.ellipsoids(t_ns, instant.estimates, self._colours)
             self._log(ESTIMATES, channels.SceneUpdateChannel, scene, t_ns)
 
     def _places(self, name: str, state: ClusterState) -> Any:
@@ -336,7 +336,7 @@ class FoxgloveFile:
 def _camera_of(key: str) -> tuple[str, str]:
     """Return drone and frame of a camera from its key; in the frame, x points right in the picture, y down, z ahead."""
     _, drone, what = keys.parts(key)
-    return drone, f"{made.frame(drone)}/{what.split('/')[1]}_camera"
+    return drone, f"{build.frame(drone)}/{what.split('/')[1]}_camera"
 
 
 class CheckedFile:

@@ -171,7 +171,7 @@ def hunt(request: HuntRequest) -> Hunted:
     if (request.out / PLAN).exists() and not request.force:
         raise RunError(f"{request.out}: already holds a hunt; --force replaces it, or give --out another folder")
     with held_folder(request.out, PLAN, OWN_FILES, request.force, "hunt into", "another hunt is running"):
-        rmtree(request.out / VIOLATION, ignore_errors=True)  # of an earlier hunt
+        rmtree(request.out / VIOLATION, ignore_errors=True)  # left by an earlier hunt
         for name in (SCENARIO, BUNDLE):
             (request.out / name).unlink(missing_ok=True)
         current = _Hunt(request, space, texts, requirements)
@@ -197,15 +197,15 @@ def _with_functions(given: Sequence[str], document: Mapping[str, Any]) -> tuple[
 
 
 def _requirements(texts: Sequence[str]) -> list[Requirement]:
-    made, faults = [], []
+    requirements, faults = [], []
     for text in texts:
         try:
-            made.append(Requirement(text))
+            requirements.append(Requirement(text))
         except ScenarioError as error:
             faults += error.faults
-    if faults or not made:
+    if faults or not requirements:
         raise ScenarioError(faults or ["--require is missing; must be a condition, as 'min_separation_m > 1.5'"])
-    return made
+    return requirements
 
 
 _requirement = lru_cache(maxsize=64)(Requirement)
@@ -218,8 +218,8 @@ def judged(requirements: Sequence[str], twin: Scenario | None, summary: RunSumma
     """
     columns = {name: row[name] for name in row if name in FIXED or name.startswith((METRIC, "clusters."))}
     figures = {**columns, **dict(figures_of(msgspec.to_builtins(summary)))}
-    made = [_requirement(text) for text in requirements]
-    names = [name for each in made for name in each.names]
+    parsed = [_requirement(text) for text in requirements]
+    names = [name for each in parsed for name in each.names]
     if SAME_BITS in names:
         same = twin is None
         if twin is not None:
@@ -228,9 +228,9 @@ def judged(requirements: Sequence[str], twin: Scenario | None, summary: RunSumma
         figures[SAME_BITS] = same
     if row.get("metrics_failure"):  # missing metrics are unknown, not wrong
         figures = {**{name: None for name in names if name.startswith(METRIC)}, **figures}
-    faults = [fault for each in made for fault in each.faults(figures)]
+    faults = [fault for each in parsed for fault in each.faults(figures)]
     try:
-        return {"faults": faults, "margins": [] if faults else [tuple(each.margin(figures)) for each in made]}
+        return {"faults": faults, "margins": [] if faults else [tuple(each.margin(figures)) for each in parsed]}
     except ScenarioError as error:
         return {"faults": error.faults, "margins": []}
 

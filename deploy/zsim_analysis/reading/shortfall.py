@@ -28,14 +28,14 @@ from zsim_analysis.reading.formation import cluster_of
 from zsim_analysis.reading.recorded_flight import Array, ClusterStates, RecordedFlight, read_flight
 
 NOT_AS_PLANNED = "NOT AS PLANNED"
-ENGAGES_S = 20.0  # from the take-off, within which a formation must engage; chosen: it takes 4 to 12 s
+ENGAGES_S = 20.0  # time from take-off within which a formation must engage; chosen: it takes 4 to 12 s
 MOVES_NS, MOVES_MIN = 500_000_000, 1e-3  # a reference that moves less (m or rad) in this time is at rest; chosen
 HELD_MAX_S = 2.0  # longest total hold that still follows the plan; chosen: four times the wait after a fault
 LATE_MAX_S = 1.0  # longest missing part of a reference that is not reported; chosen: two attempts at a step of the plan
 SAMPLE_NS = 100_000_000  # sampling interval of a reference that is compared with the plan's
 # a drone that is farther off for that many successive seconds has strayed; chosen: twice the minimum separation
 STRAYED_M, STRAYED_S = 5.0, 3
-SETTLED_S = 10.0  # from the engagement until drones must be at their positions; chosen
+SETTLED_S = 10.0  # time from the engagement until drones must be at their positions; chosen
 SAME = 1e-3  # m or rad; tolerance of the reference against the plan's, which is computed by the same formulas
 CONTROLLER, CONSOLE = ("controller.", f"{PILOT}."), "console"  # name prefixes of plans' controllers, and of operators
 CRASHES = ("emergency", "flip", "impact", "touchdown")  # incidents that bring a drone down

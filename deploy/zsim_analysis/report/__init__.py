@@ -1,4 +1,4 @@
-"""The report of a run, made from its record alone, and the comparison of several runs.
+"""The report of a run, from its record alone, and the comparison of several runs.
 
     make_report(DIR)     reads DIR/run.mcap and writes DIR/summary.json, DIR/figures/*.png, DIR/report.html
     judge(PATH)          returns flight, formations and summary without writing files; needs no matplotlib

@@ -114,8 +114,8 @@ class Grid(Struct, frozen=True):
     def names(self) -> list[str]:
         """Abbreviated values; those with equal abbreviations are shown by their differing part, or numbered."""
         texts = [f"{value:g}" if isinstance(value, float) else text_of(value) for value in self.values]
-        made = {place: without_made(text) for place, text in enumerate(texts) if text.startswith(plugin.MADE)}
-        names = [*map(_cut, distinct(texts, made))]
+        generated = {place: without_made(text) for place, text in enumerate(texts) if text.startswith(plugin.MADE)}
+        names = [*map(_cut, distinct(texts, generated))]
         for short in [name for name, often in Counter(names).items() if often > 1]:
             alike = [place for place, name in enumerate(names) if name == short]
             texts = parts = [text_of(self.values[place]) for place in alike]
@@ -212,14 +212,14 @@ def without_made(value: Any) -> str:
     return text.partition(":")[2] if text.startswith(plugin.MADE) else text
 
 
-def distinct(texts: Sequence[str], made: Mapping[int, str]) -> list[str]:
-    """Return `texts` with those of `made` at their indices, numbered if already in use: `Law-2`.
+def distinct(texts: Sequence[str], generated: Mapping[int, str]) -> list[str]:
+    """Return `texts` with those of `generated` at their indices, numbered if already in use: `Law-2`.
 
     All classes that a function creates have the same name.
     """
     found = [*texts]
-    known = {text for place, text in enumerate(texts) if place not in made}
-    for place, name in made.items():
+    known = {text for place, text in enumerate(texts) if place not in generated}
+    for place, name in generated.items():
         numbered = (f"{name}-{number}" if number > 1 else name for number in count(1))
         found[place] = next(each for each in numbered if each not in known)
         known.add(found[place])
